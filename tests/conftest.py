@@ -197,11 +197,10 @@ def one_line() -> Callable[[BaseException], str]:
 @pytest.fixture
 def run_evaluate(tmp_path: Path) -> Callable[..., str]:
     """Run `deepdetect evaluate` on one sample and return what it prints."""
-    from click.testing import CliRunner
     from PIL import Image
 
-    from deepdetect.cli import main
     from deepdetect.detector.pretrained import pretrained_weights
+    from tests.command_line import run_command
 
     generator = np.random.default_rng(0)
     Image.fromarray(generator.integers(0, 256, (64, 64, 3), np.uint8)).save(
@@ -211,7 +210,7 @@ def run_evaluate(tmp_path: Path) -> Callable[..., str]:
 
     def run(*arguments: object) -> str:
         given = [pretrained_weights() if str(a).endswith(".onnx") else a for a in arguments]
-        result = CliRunner().invoke(main, ["evaluate", str(tmp_path), *map(str, given)])
+        result = run_command(["evaluate", str(tmp_path), *map(str, given)])
         assert result.exit_code == 0, result.output
         return result.output
 

@@ -6,10 +6,9 @@ import pkgutil
 import re
 from pathlib import Path
 
-import click
 import pytest
 
-from deepdetect.cli import main
+from deepdetect.cli._app import make_app
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src/deepdetect"
@@ -63,16 +62,14 @@ def test_paths_exist(page: str) -> None:
 def test_commands_have_these_flags(page: str) -> None:
     for part in code(WITH_COMMANDS[page]):
         for name, rest in re.findall(r"(?<!from )\bdeepdetect ([a-z][a-z-]+)\b([^#|]*)", part):
-            command = main.commands[name]
-            if isinstance(command, click.Group):
-                word = rest.split()[0] if rest.split() else ""
-                command = command.commands.get(word, command)
-            flags = {
-                flag
-                for option in command.get_params(click.Context(command))
-                for flag in (*option.opts, *option.secondary_opts)
-            }
-            assert set(re.findall(r"(?<!\S)--[\w-]+", rest)) <= flags | {"--help"}, (name, rest)
+            command = make_app()[name]
+            word = rest.split()[0] if rest.split() else ""
+            command = command[word] if word in command and word[0] != "-" else command
+            flags = {flag for each in command.assemble_argument_collection() for flag in each.names}
+            assert set(re.findall(r"(?<!\S)--[\w-]+", rest)) <= flags | {"--help", "--help-all"}, (
+                name,
+                rest,
+            )
 
 
 @pytest.mark.parametrize("page", PRESENT)

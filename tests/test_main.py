@@ -25,7 +25,7 @@ except KeyboardInterrupt:
 @pytest.mark.parametrize("reaction", ["raise", "raise ImportError('half imported')"])
 @pytest.mark.parametrize(
     ("package", "command"),
-    [("click", "label"), ("click", "train"), ("numpy", "detect"), ("numpy", "match")],
+    [("cyclopts", "label"), ("cyclopts", "train"), ("numpy", "detect"), ("numpy", "match")],
 )
 def test_ctrl_c_while_packages_are_imported(
     package: str, command: str, reaction: str, tmp_path: Path

@@ -13,11 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 from skimage import data
 
-from deepdetect.cli import main
+from tests.command_line import run_command
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -45,7 +44,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def run(words: list[str]) -> None:
     """Run a command line in this process."""
-    result = CliRunner().invoke(main, words[1:], catch_exceptions=False)
+    result = run_command(words[1:])
     assert result.exit_code == 0, result.output
 
 

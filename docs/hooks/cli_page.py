@@ -5,117 +5,81 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterator
-
-import click
+from typing import Any
 
 INTRODUCTION = """\
 # Command line
 
-Made from the commands: it says what `deepdetect COMMAND --help` says. How results are written,
+Made from the commands: it says what `deepdetect COMMAND --help-all` says. How results are written,
 when a command goes on where it stopped, and what the exit codes mean is in the
 [README](../README.md#use).
 
-`-h` or `--help` helps with each command, `--version` prints the version.
+`-h` or `--help` shows the common options of a command, `--help-all` shows all, `--version` prints
+the version.
 
 | command | what it does |
 |---|---|
 """
 
-COMPLETION = """
-## Completion by Tab
-
-The shell completes commands and options when it is told how, once. Bash (4.4 or later), in
-`~/.bashrc`:
-
-```sh
-eval "$(_DEEPDETECT_COMPLETE=bash_source deepdetect)"
-```
-
-Zsh, in `~/.zshrc`:
-
-```sh
-eval "$(_DEEPDETECT_COMPLETE=zsh_source deepdetect)"
-```
-
-Fish, in `~/.config/fish/completions/deepdetect.fish`:
-
-```sh
-_DEEPDETECT_COMPLETE=fish_source deepdetect | source
-```
-
-Each new shell then starts `deepdetect` once. To spare that, write what it prints to a file, and
-`source` the file instead; make it again after an update:
-
-```sh
-_DEEPDETECT_COMPLETE=bash_source deepdetect > ~/.deepdetect-completion.bash
-```
-"""
-
 
 def make_page() -> str:
     """Return the page in Markdown."""
-    from deepdetect.cli import main
-
-    commands = list(_walk(main, "deepdetect"))
+    commands = dict(walk())
     table = "".join(
-        f"| [`{name}`](#{_anchor(name)}) | {command.get_short_help_str(200)} |\n"
-        for name, command in commands
+        f"| [`{name}`](#{_anchor(name)}) | {_text(_help(app).partition(chr(10))[0])} |\n"
+        for name, app in commands.items()
     )
-    return (
-        INTRODUCTION
-        + table
-        + "".join(_section(name, command) for name, command in commands)
-        + COMPLETION
-    )
+    return INTRODUCTION + table + "".join(_section(*each) for each in commands.items())
 
 
-def _walk(group: click.Group, name: str) -> Iterator[tuple[str, click.Command]]:
+def walk() -> Iterator[tuple[str, Any]]:
     """Yield all commands that can be run, with their whole names."""
-    for word, command in group.commands.items():
-        if isinstance(command, click.Group):
-            yield from _walk(command, f"{name} {word}")
-        else:
-            yield f"{name} {word}", command
+    from deepdetect.cli._app import make_app
+    from deepdetect.cli._commands import COMMANDS
+
+    for word in (word for group in COMMANDS.values() for word in group):
+        app = make_app()[word]
+        parts = [part for part in app if not part.startswith("-")]
+        for part in parts:
+            yield f"deepdetect {word} {part}", app[part]
+        if not parts:
+            yield f"deepdetect {word}", app
+
+
+def _help(app: Any) -> str:
+    """Return what a command says of itself, without its arguments."""
+    doc = inspect.getdoc(app.default_command) or ""
+    return doc.partition("\nArgs:\n")[0].strip()
 
 
 def _anchor(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
-def _section(name: str, command: click.Command) -> str:
-    context = click.Context(command, info_name=name, max_content_width=100)
-    parameters = command.get_params(context)
-    usage = " ".join([name, *command.collect_usage_pieces(context)])
-    lines = [f"\n## {name}\n", f"```text\n{usage}\n```\n", _help(command)]
-    rows = [
-        record
-        for parameter in parameters
-        if isinstance(parameter, click.Option) and "--help" not in parameter.opts
-        if (record := parameter.get_help_record(context)) is not None
+def _section(name: str, app: Any) -> str:
+    arguments = [
+        each for each in app.assemble_argument_collection(parse_docstring=True) if each.show
     ]
-    if rows:
-        lines.append("| option | what it does |\n|---|---|")
-        lines += [f"| `{_cell(flags)}` | {_cell(_text(text))} |" for flags, text in rows]
+    usage = [name, *(each.name for each in arguments if not each.name.startswith("-"))]
+    lines = [f"\n## {name}\n", f"```text\n{' '.join(usage)} [OPTIONS]\n```\n"]
+    for paragraph in _help(app).split("\n\n"):
+        code = paragraph.startswith("    ")
+        lines.append(f"```sh\n{inspect.cleandoc(paragraph)}\n```\n" if code else _text(paragraph))
+        lines.append("")
+    lines.append("| option | what it does |\n|---|---|")
+    for each in arguments:
+        shown = f"  [default: {each.field_info.default}]" if _has_default(each) else ""
+        lines.append(f"| `{', '.join(each.names)}` | {_text(each.parameter.help + shown)} |")
     return "\n".join(lines) + "\n"
 
 
-def _help(command: click.Command) -> str:
-    """Return a command's help; paragraphs that click does not wrap are code."""
-    parts = []
-    for paragraph in inspect.cleandoc(command.help or "").split("\n\n"):
-        if paragraph.startswith("\b\n"):
-            parts.append("```sh\n" + paragraph.removeprefix("\b\n") + "\n```")
-        else:
-            parts.append(_text(paragraph))
-    return "\n\n".join(parts) + "\n"
+def _has_default(argument: Any) -> bool:
+    default = argument.field_info.default
+    return isinstance(default, (str, int, float)) and "[default:" not in argument.parameter.help
 
 
 def _text(text: str) -> str:
     """Return plain text as Markdown: outside of code, underscores and stars mean themselves."""
-    parts = re.split(r"(`[^`]+`)", text)
-    parts[::2] = [re.sub(r"([*_<\[])", r"\\\1", part) for part in parts[::2]]
+    parts = re.split(r"(`[^`]+`)", " ".join(text.split()))
+    parts[::2] = [re.sub(r"([*_<\[|])", r"\\\1", part) for part in parts[::2]]
     return "".join(parts)
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|")

@@ -32,7 +32,9 @@ def main() -> None:
     try:
         from .cli import main as command
 
-        command(prog_name="deepdetect")
+        code = command()
+        if not stopped or code in (0, STOPPED):
+            sys.exit(code)
     except SystemExit as error:
         if not stopped or error.code in (None, 0, STOPPED):
             raise

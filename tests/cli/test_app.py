@@ -9,9 +9,8 @@ import urllib.request
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from deepdetect.cli import main
+from tests.command_line import run_command
 
 
 def test_it_prints_its_address_and_ends_without_a_trace(tmp_path: Path) -> None:
@@ -80,6 +79,6 @@ def test_what_a_killed_server_left_is_removed_at_the_next_start(tmp_path: Path) 
 
 
 def test_a_port_out_of_range() -> None:
-    result = CliRunner().invoke(main, ["app", "--port", "70000"])
+    result = run_command(["app", "--port", "70000"])
     assert result.exit_code == 2
     assert result.output == "deepdetect: --port must lie in [0, 65535], not 70000\n"

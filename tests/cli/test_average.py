@@ -60,7 +60,7 @@ def test_files_of_another_run_are_not_written_over(run, tmp_path: Path) -> None:
     before = trained.read_bytes()
     for words, message in (
         ((trained, "dense"), "would be written over, which is an input"),
-        (("default", "dense"), "best.safetensors exists already"),
+        (("default", "dense"), "best.safetensors exists"),
     ):
         result = run("average", *words, "-o", folder)
         assert result.exit_code == 2

@@ -6,13 +6,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 from skimage import data
 
-from deepdetect.cli import main
-from deepdetect.cli.benchmark import NAMES
-from deepdetect.evaluation.benchmarks import BENCHMARKS
+from tests.command_line import run_command
 
 FILES = {"report.md", "report.json", "tables/foreground.csv"}
 
@@ -34,13 +31,9 @@ def made(folder: Path, tmp_path_factory: pytest.TempPathFactory):
     """The first run, whose results the others find."""
     output = tmp_path_factory.mktemp("output")
     arguments = ["benchmark", "foreground", "--data", str(folder), "-o", str(output)]
-    result = CliRunner().invoke(main, [*arguments, "--baselines", "fast, harris"])
+    result = run_command([*arguments, "--baselines", "fast, harris"])
     assert result.exit_code == 0, result.output
     return result, output
-
-
-def test_the_names_are_those_of_the_benchmarks_and_all() -> None:
-    assert set(NAMES) == {*BENCHMARKS, "all"}
 
 
 def test_the_report_is_written_and_printed(made, folder: Path) -> None:
@@ -181,14 +174,3 @@ def test_an_output_that_is_a_file_ends_with_one_line(run, folder: Path, made) ->
     (message,) = [line for line in result.stderr.splitlines() if line.startswith("deepdetect: ")]
     assert "cannot write" in message
     assert "Traceback" not in result.output
-
-
-def test_help_has_words_for_every_option(run) -> None:
-    result = run("benchmark", "--help")
-    assert result.exit_code == 0
-    unwrapped = "".join(result.stdout.split())
-    for name in NAMES:
-        assert name in unwrapped
-    for parameter in main.commands["benchmark"].params:
-        if parameter.param_type_name == "option":
-            assert parameter.help, parameter.name

@@ -6,8 +6,6 @@ import pytest
 
 pytest.importorskip("requests", reason="needs requests (pip install '.[data]')")
 
-from deepdetect import datasets
-
 
 def test_list_names_size_and_licence(run) -> None:
     result = run("datasets", "list")
@@ -30,7 +28,7 @@ def test_get_reports_what_it_has_written(run, tmp_path, monkeypatch: pytest.Monk
         Image.new("RGB", (16, 16)).save(folder / "a.png")
         return folder
 
-    monkeypatch.setattr(datasets, "get_dataset", fake)
+    monkeypatch.setattr("deepdetect.cli.datasets.get_dataset", fake)
     result = run("datasets", "get", "coco", "--json")
     assert json.loads(result.output)["images"] == 1
     assert (tmp_path / "data" / "coco" / "a.png").exists()

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
-from deepdetect.cli import main
+from tests.command_line import run_command
 
 
 @pytest.mark.slow
@@ -27,15 +26,15 @@ def test_the_command_prints_a_row_for_each(photo: np.ndarray, tmp_path: Path) ->
         "--weights",
         "default",
     ]
-    result = CliRunner().invoke(main, arguments)
+    result = run_command(arguments)
     assert result.exit_code == 0, result.output
     for source in ("labels dense", "weights default", "random, as weights", "all pixels"):
         assert source in result.output
-    result = CliRunner().invoke(main, [*arguments, "--json"])
+    result = run_command([*arguments, "--json"])
     rows = json.loads(result.stdout)
     assert len(rows) == 5
     assert rows[0]["precision"] > 0.9
-    result = CliRunner().invoke(main, [*arguments, "--json", str(tmp_path / "gone")])
+    result = run_command([*arguments, "--json", str(tmp_path / "gone")])
     assert result.exit_code == 1, result.output
     assert json.loads(result.stdout) == rows
     assert "1 of 2 scenes failed, the others are done" in result.stderr
@@ -44,9 +43,9 @@ def test_the_command_prints_a_row_for_each(photo: np.ndarray, tmp_path: Path) ->
 
 def test_scenes_none_of_which_can_be_read(tmp_path: Path) -> None:
     gone = [str(tmp_path / name) for name in ("first", "second")]
-    alone = CliRunner().invoke(main, ["evaluate-stereo", gone[0]])
+    alone = run_command(["evaluate-stereo", gone[0]])
     assert alone.exit_code == 2, alone.output
     assert gone[0] in alone.stderr
-    result = CliRunner().invoke(main, ["evaluate-stereo", *gone])
+    result = run_command(["evaluate-stereo", *gone])
     assert result.exit_code == 1, result.output
     assert all(name in result.stderr for name in gone)

@@ -105,10 +105,10 @@ def test_nothing_is_replaced_silently(run, saved: Path) -> None:
         ("colmap pairs.txt -o a.db", "no HDF5 file"),
         ("colmap f.h5 -o a.txt", "must end in .db"),
         ("colmap f.h5 -o a.db --focal 9 --calibration c.json", "not both"),
-        ("colmap {photos} -o a.db --matches m.h5", "leave out --matches"),
+        ("colmap {photos} -o a.db --matches m.h5", "--matches is for saved files"),
         ("hloc f.h5 -o a --pairs pairs.txt", "--pairs is for a folder"),
         ("hloc f.h5 out/cat.npz -o a", "one HDF5 file of features"),
-        ("hloc out/left_right_matches.npz --matches m.h5 -o a", "leave out --matches"),
+        ("hloc out/left_right_matches.npz --matches m.h5 -o a", "--matches is for saved files"),
         ("colmap out/cat.npz -o a", "no SIFT descriptors"),
         ("hloc m.h5 -o a", "holds no features"),
         ("hloc {photos} -o a --pairs none.txt", "no file none.txt"),
@@ -136,7 +136,7 @@ def test_a_bad_photograph_does_not_stop_the_export(run, photos: Path, tmp_path: 
     words = ("photos", "--max-keypoints", 200, "--workers", 1)
     result = run("export", "hloc", *words, "-o", "made", "--json")
     assert result.exit_code == 1, result.output
-    assert "1 of the photographs and pairs failed" in result.stderr
+    assert "1 of the images and pairs failed" in result.stderr
     assert "broken.jpg is not an image" in result.stderr
     made = json.loads(result.stdout)
     assert (made["images"], made["pairs"], len(made["failures"])) == (3, 3, 1)

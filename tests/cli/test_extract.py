@@ -41,8 +41,8 @@ def test_extract_and_match(run, photos: Path) -> None:
     ("flags", "least", "most"),
     [
         ((), 500, 2048),
-        (("--mode", "dense"), 5000, 32_000),
-        (("--mode", "dense", "--max-keypoints", 99), 99, 99),
+        (("--detector", "network"), 5000, 32_000),
+        (("--detector", "network", "--max-keypoints", 99), 99, 99),
     ],
 )
 def test_how_many_keypoints(run, photos: Path, flags: tuple, least: int, most: int) -> None:

@@ -1,51 +1,52 @@
 from __future__ import annotations
 
-import inspect
-from collections.abc import Iterator
+import re
+import subprocess
+import sys
+from pathlib import Path
 
-import click
 import pytest
-from click.testing import CliRunner
 
-from deepdetect.cli import main
-from deepdetect.cli.main import OLD_FLAGS, with_flags
+from deepdetect.cli._app import make_app, with_flags
+from deepdetect.cli._commands import COMMANDS
+from deepdetect.cli._options import attribute_helps
+from tests.command_line import run_command
 
-
-def commands(command: click.Command, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """Yield every command's words, those of groups among them."""
-    yield words
-    if isinstance(command, click.Group):
-        for name, each in command.commands.items():
-            yield from commands(each, (*words, name))
-
-
-def command_of(words: tuple[str, ...]) -> click.Command:
-    command: click.Command = main
-    for word in words:
-        assert isinstance(command, click.Group)
-        command = command.commands[word]
-    return command
+WORDS = [
+    [name, *([part] if part else [])]
+    for group in COMMANDS.values()
+    for name in group
+    for part in {"export": ("colmap", "hloc", "onnx"), "datasets": ("list", "get")}.get(name, ("",))
+]
 
 
-@pytest.mark.parametrize("words", list(commands(main)), ids=" ".join)
-def test_the_help_shows_examples_line_by_line(words: tuple[str, ...]) -> None:
-    result = CliRunner().invoke(main, [*words, "--help"])
+def test_help_names_every_command() -> None:
+    text = run_command(["--help"]).stdout
+    for name in make_app():
+        assert name.startswith("-") or re.search(rf"^  {name} ", text, re.M)
+
+
+@pytest.mark.parametrize("words", WORDS, ids=" ".join)
+def test_every_option_says_what_it_is(words: list[str]) -> None:
+    result = run_command([*words, "--help-all"])
     assert result.exit_code == 0
-    assert "\\b" not in result.output, "the mark that keeps click from wrapping is not seen"
-    lines = {line.strip() for line in result.output.splitlines()}
-    text = inspect.cleandoc(command_of(words).help or "")
-    examples = [line.strip() for line in text.splitlines() if line.startswith("deepdetect ")]
-    for example in examples:
-        assert example in lines
-    if words and not isinstance(command_of(words), click.Group) and words != ("demo",):
-        assert examples or words == ("datasets", "list"), "a newcomer wants an example"
+    assert f"Usage: deepdetect {' '.join(words)}" in result.stdout
+    app = make_app()
+    for word in words:
+        app = app[word]
+    for argument in app.assemble_argument_collection(parse_docstring=True):
+        assert argument.parameter.help, argument.name
+        if argument.field_info.is_keyword:
+            assert argument.name in result.stdout
 
 
-@pytest.mark.parametrize("words", list(commands(main)), ids=" ".join)
-def test_every_option_says_what_it_is(words: tuple[str, ...]) -> None:
-    for parameter in command_of(words).params:
-        if isinstance(parameter, click.Option) and parameter.name not in ("help", "version"):
-            assert parameter.help, parameter.name
+def test_common_options_come_first_and_the_others_on_request() -> None:
+    short, long = (run_command(["match", flag]).stdout for flag in ("--help", "--help-all"))
+    assert "--max-keypoints" in short
+    assert "--estimator" not in short
+    assert len(short.splitlines()) < 60
+    assert "--estimator magsac|ransac" in long
+    assert run_command(["match", "--help"]).stdout == short
 
 
 @pytest.mark.parametrize(
@@ -61,32 +62,63 @@ def test_every_option_says_what_it_is(words: tuple[str, ...]) -> None:
     ],
 )
 def test_errors_name_flags_instead_of_parameters(message: str, expected: str | None) -> None:
-    assert with_flags(message, main.commands["reconstruct"]) == (expected or message)
+    assert with_flags(message, ["reconstruct", "a", "b"]) == (expected or message)
 
 
 @pytest.mark.parametrize(
     ("arguments", "right"),
     [
-        ("benchmark oxford --only sift", "--baselines"),
-        ("benchmark oxford --baselnes sift", "--baselines"),
-        ("evaluate samples --against other.onnx", "--compare"),
+        ("benchmark oxford --data x --baselnes sift", "--baselines"),
         ("evaluate samples --comparee other.onnx", "--compare"),
-        ("reconstruct a.png b.png --calib c.json", "--calibration"),
-        ("train photographs --loaders 2", "--num-workers"),
+        ("detect photo.jpg --max-keypiont 3", "--max-keypoints"),
+        ("detect photo.jpg --detector point", "points"),
+        ("detec photo.jpg", "detect"),
+        ("export colmp photos", "colmap"),
     ],
 )
-def test_an_old_or_misspelt_flag_names_the_right_one(arguments: str, right: str) -> None:
-    result = CliRunner().invoke(main, arguments.split())
+def test_what_is_misspelt_names_the_right_word(arguments: str, right: str) -> None:
+    result = run_command(arguments.split())
     assert result.exit_code == 2
-    assert f"'{right}'" in result.stderr or f"{right}?" in result.stderr, result.stderr
+    assert re.search(f"[dD]id you mean .?{right}.?\\?", result.stderr), result.stderr
+    assert len(result.stderr.splitlines()) == 1
 
 
-def test_every_old_flag_has_a_new_one() -> None:
-    flags = {
-        o
-        for c in main.commands.values()
-        for p in c.get_params(click.Context(c))
-        for o in (*p.opts, *p.secondary_opts)
-    }
-    assert set(OLD_FLAGS.values()) <= flags
-    assert not set(OLD_FLAGS) & flags
+@pytest.mark.parametrize("flag", ["--num-keypoints", "--top-k", "--max-num-keypoints"])
+def test_other_names_of_the_number_of_keypoints(flag: str) -> None:
+    _, bound, _ = make_app().parse_args(["detect", "photo.jpg", flag, "7"], exit_on_error=False)
+    assert bound.arguments["max_keypoints"] == 7
+
+
+def test_completion_knows_commands_options_and_choices() -> None:
+    for shell in ("bash", "zsh", "fish"):
+        script = run_command(["completion", shell]).stdout
+        for word in ("train-points", "max-keypoints", "magsac", "patchmatch"):
+            assert word in script
+
+
+def test_the_help_is_fast() -> None:
+    code = (
+        "import sys; from deepdetect.cli import main; main(['--help']); print(sorted(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = done.stdout.splitlines()[-1]
+    for name in ("numpy", "cv2", "onnxruntime", "openvino", "torch", "PIL", "rich", "cyclopts"):
+        assert f"'{name}'" not in loaded
+
+
+def test_the_first_sentence_of_each_argument_is_its_help() -> None:
+    doc = "Options.\n\nArgs:\n  ratio, mutual: of the test. More.\n  size: in\n    px (all).\n"
+    expected = {"ratio": "Of the test.", "mutual": "Of the test.", "size": "In px (all)."}
+    assert attribute_helps(doc) == expected
+
+
+def test_a_folder_or_a_file_is_named_by_o(tmp_path: Path) -> None:
+    from deepdetect import OptionError
+    from deepdetect.cli._options import output_file, output_folder
+
+    assert output_file(tmp_path, "model.ply") == tmp_path / "model.ply"
+    assert output_file(Path("rec"), "model.ply") == Path("rec/model.ply")
+    assert output_file(Path("rec/scene.glb"), "model.ply") == Path("rec/scene.glb")
+    assert output_folder(Path("run.2")) == Path("run.2")
+    with pytest.raises(OptionError, match="names the folder"):
+        output_folder(Path("points.npz"))

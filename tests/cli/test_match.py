@@ -160,7 +160,7 @@ def test_matches_of_other_images_are_not_written_over(run, photos: Path) -> None
     written = Path("out/left_right_matches.npz").read_bytes()
     refused = run(*other)
     assert refused.exit_code == 2
-    assert "exists already, made from" in refused.stderr
+    assert "exists, made from" in refused.stderr
     assert "--overwrite" in refused.stderr
     assert Path("out/left_right_matches.npz").read_bytes() == written
     assert run(*first, "--no-pictures").exit_code == 0, "the same images again"

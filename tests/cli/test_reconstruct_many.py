@@ -61,7 +61,7 @@ def test_a_folder_becomes_a_model(run, fountain: Path) -> None:
     refused = run("reconstruct", copy, *arguments[2:], "--max-keypoints", 1500)
     assert refused.exit_code == 2
     assert one_sentence(refused.stderr)
-    assert "exists already, made from" in refused.stderr
+    assert "exists, made from" in refused.stderr
     assert not Path("model/model.ply").exists()
     resumed = run(*arguments, "--max-keypoints", 1500)
     assert resumed.exit_code == 0, resumed.output

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
-from deepdetect.cli import main
+from tests.command_line import run_command
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +30,7 @@ def test_what_cannot_be_connected_is_told(views: list[np.ndarray], tmp_path: Pat
         Image.fromarray(view).save(tmp_path / f"{name}.png")
     files = [str(tmp_path / f"{name}.png") for name in "abc"]
     words = ["stitch", *files, "-o", str(tmp_path / "p.png"), "--reference", files[2]]
-    result = CliRunner().invoke(main, [*words, "--json"])
+    result = run_command([*words, "--json"])
     assert result.exit_code == 0, result.output
     report = json.loads(result.stdout)
     assert report["unregistered"] == [
@@ -44,7 +43,7 @@ def test_what_cannot_be_connected_is_told(views: list[np.ndarray], tmp_path: Pat
     np.testing.assert_allclose(report["homographies"][1], moved, atol=1e-9)
     assert report["pairs"][0]["images"] == [files[0], files[2]]
     assert report["pairs"][0]["matches"] > 1000
-    values = CliRunner().invoke(main, words)
+    values = run_command(words)
     assert f"not in the panorama: {files[1]}, as it overlaps with no other image" in values.stderr
     assert "2 of 3" in values.stdout
 
@@ -55,13 +54,13 @@ def test_the_command_writes_the_file(views: list[np.ndarray], tmp_path: Path) ->
     files = [str(tmp_path / f"{name}.png") for name in "cab"]
     output = tmp_path / "panorama.jpg"
     words = ["--projection", "cylindrical", "--crop"]
-    result = CliRunner().invoke(main, ["stitch", *files, "-o", str(output), *words])
+    result = run_command(["stitch", *files, "-o", str(output), *words])
     assert result.exit_code == 0, result.output
     with Image.open(output) as picture:
         width, height = picture.size
         assert picture.format == "JPEG"
     assert f"{width}x{height}" in result.output
-    alone = CliRunner().invoke(main, ["stitch", files[0], "-o", str(tmp_path / "no.jpg")])
+    alone = run_command(["stitch", files[0], "-o", str(tmp_path / "no.jpg")])
     assert alone.exit_code == 2
     assert not (tmp_path / "no.jpg").exists()
 
@@ -76,7 +75,7 @@ def files(views: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 def refused(*arguments: object, code: int = 2) -> str:
-    result = CliRunner().invoke(main, ["stitch", *map(str, arguments)])
+    result = run_command(["stitch", *map(str, arguments)])
     assert result.exit_code == code, result.output
     assert len(result.stderr.strip().splitlines()) == 1, result.stderr
     return result.stderr
@@ -86,7 +85,7 @@ def test_photographs_are_not_written_over(files: list[Path]) -> None:
     Path("link.png").symlink_to("b.png")
     before = {path: path.read_bytes() for path in files}
     for output in ("a.png", Path("a.png").resolve(), "link.png"):
-        assert "would be written over, which is an input: give the panorama" in refused(
+        assert "would be written over, which is an input: choose another place" in refused(
             *files, "-o", output
         )
     Path("panorama.jpg").write_bytes(files[0].read_bytes())  # of the time before
@@ -94,16 +93,16 @@ def test_photographs_are_not_written_over(files: list[Path]) -> None:
     assert Path("panorama.jpg").read_bytes() == before[files[0]]
     assert {path: path.read_bytes() for path in files} == before
     # A file that is no input is written over where that is wanted.
-    assert CliRunner().invoke(main, ["stitch", *map(str, files), "--overwrite"]).exit_code == 0
+    assert run_command(["stitch", *map(str, files), "--overwrite"]).exit_code == 0
     assert Path("panorama.jpg").read_bytes() != before[files[0]]
 
 
-@pytest.mark.parametrize("output", ["panorama", "panorama.tif"])
+@pytest.mark.parametrize("output", ["panorama.gif", "panorama.tif"])
 def test_an_unknown_ending_ends_before_the_work(
     files: list[Path], output: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "deepdetect.matching.stitching.stitch", lambda *_, **__: pytest.fail("it worked")
+        "deepdetect.cli.stitch.stitch_images", lambda *_, **__: pytest.fail("it worked")
     )
     assert "must end in .png, .jpg or .jpeg" in refused(*files, "-o", output)
 
@@ -129,7 +128,7 @@ def test_errors_speak_of_files_and_flags(
 def test_photographs_that_cannot_be_read_are_listed(files: list[Path]) -> None:
     Path("bad.png").write_bytes(b"no image")
     words = ["stitch", "bad.png", "a.png", "gone.png", "b.png", "-o", "p.png"]
-    result = CliRunner().invoke(main, [*words, "--reference", "b.png", "--json"])
+    result = run_command([*words, "--reference", "b.png", "--json"])
     assert result.exit_code == 1, result.output
     report = json.loads(result.stdout)
     assert report["images"] == ["a.png", "b.png"]
@@ -147,7 +146,7 @@ def test_too_few_that_can_be_read(bad: str, files: list[Path]) -> None:
     Path("bad.png").write_bytes(b"no image")
     words = ["a.png", "b.png", "bad.png", "--reference", "bad.png"]
     words = words if bad == "reference" else ["a.png", "bad.png"]
-    result = CliRunner().invoke(main, ["stitch", *words, "-o", "p.png"])
+    result = run_command(["stitch", *words, "-o", "p.png"])
     assert result.exit_code == 2, result.output
     assert "there is no panorama" in result.stderr
     assert "bad.png" in result.stderr.splitlines()[-1]
@@ -159,8 +158,8 @@ def test_a_panorama_of_other_photographs_is_not_replaced(files: list[Path]) -> N
     before = Path("panorama.jpg").read_bytes()
     assert "--overwrite" in refused(*files)
     assert Path("panorama.jpg").read_bytes() == before
-    replaced = CliRunner().invoke(main, ["stitch", *map(str, files), "--overwrite"])
+    replaced = run_command(["stitch", *map(str, files), "--overwrite"])
     assert replaced.exit_code == 0, replaced.output
     assert Path("panorama.jpg").read_bytes() != before
-    again = CliRunner().invoke(main, ["stitch", *map(str, files)])  # of the same photographs
+    again = run_command(["stitch", *map(str, files)])  # of the same photographs
     assert again.exit_code == 0, again.output

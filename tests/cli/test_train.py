@@ -6,11 +6,11 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+
+from tests.command_line import run_command
 
 pytest.importorskip("torch", reason="needs torch, which is for training only")
 
-from deepdetect.cli import main
 from deepdetect.training import training_preset
 
 TINY = [
@@ -92,7 +92,7 @@ def test_a_preset_is_changed_by_options(
     monkeypatch.setattr(dense, "initial_network", initial_network)
     words = ["train", str(images), "-o", str(tmp_path), "--preset", "paper", "--stage", "480x64x9"]
     words += ["--no-interleave", "--flips", "--batch-norm", "--init", "default", "--init", "dense"]
-    assert CliRunner().invoke(main, words).exit_code == 130
+    assert run_command(words).exit_code == 130
     ((options, init_weights),) = seen
     assert [stage.epochs for stage in options.stages] == [9]
     assert options.flips

@@ -6,11 +6,9 @@ import re
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
-import click
 import pytest
 
 import deepdetect
-from deepdetect.cli import main
 
 ROOT = Path(__file__).parents[2]
 GITHUB = "https://github.com/deepdetect/deepdetect/blob/main/"
@@ -111,57 +109,15 @@ def test_every_exported_name_is_on_one_page_of_the_interface(hooks: ModuleType) 
 INTEGRATIONS = (ROOT / "docs/other-programs.md").read_text("utf-8")
 
 
-def commands(group: click.Group, name: str = "deepdetect") -> list[tuple[str, click.Command]]:
-    found = []
-    for word, command in group.commands.items():
-        if isinstance(command, click.Group):
-            found += commands(command, f"{name} {word}")
-        else:
-            found.append((f"{name} {word}", command))
-    return found
-
-
 def test_the_page_of_commands_has_all_of_them_with_all_options(hooks: ModuleType) -> None:
     page = hooks.cli_page.make_page()
     sections = dict(re.findall(r"^## (deepdetect [^\n]+)\n(.*?)(?=^## |\Z)", page, re.S | re.M))
-    assert list(sections) == [name for name, _ in commands(main)]
-    for name, command in commands(main):
+    commands = dict(hooks.cli_page.walk())
+    assert list(sections) == list(commands)
+    assert {"deepdetect detect", "deepdetect export colmap"} < {*commands}
+    for name, app in commands.items():
         rows = re.findall(r"^\| `(.+?)` \| (.+) \|$", sections[name], re.M)
-        options = [
-            one
-            for one in command.get_params(click.Context(command))
-            if isinstance(one, click.Option) and "--help" not in one.opts and not one.hidden
-        ]
-        assert len(rows) == len(options), name
-        for option, (flags, text) in zip(options, rows, strict=True):
-            assert option.opts[-1] in flags
-            assert text.strip()
-    assert "`max_keypoints`" in page
+        arguments = [each for each in app.assemble_argument_collection() if each.show]
+        assert [flags.split(", ") for flags, _ in rows] == [[*each.names] for each in arguments]
+        assert all(text.strip() for _, text in rows)
     assert "\\_matches.npz" in page  # no emphasis between two underscores
-    for shell in ("bash", "zsh", "fish"):
-        assert f"_DEEPDETECT_COMPLETE={shell}_source deepdetect" in page
-
-
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_the_scripts_of_completion_are_there(
-    shell: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """What the page of commands says of completion: the variable's name, and the shells."""
-    monkeypatch.setenv("_DEEPDETECT_COMPLETE", f"{shell}_source")
-    if shell == "bash":
-        from click.shell_completion import BashComplete
-
-        monkeypatch.setattr(BashComplete, "_check_version", staticmethod(lambda: None))
-    with pytest.raises(SystemExit) as ended:
-        main(prog_name="deepdetect")
-    assert ended.value.code == 0
-    assert f"_DEEPDETECT_COMPLETE={shell}_complete" in capsys.readouterr().out
-
-
-def test_completion_names_commands_and_options() -> None:
-    from click.shell_completion import ShellComplete
-
-    complete = ShellComplete(main, {}, "deepdetect", "_DEEPDETECT_COMPLETE")
-    assert {"detect", "doctor"} <= {one.value for one in complete.get_completions([], "d")}
-    options = {one.value for one in complete.get_completions(["match"], "--max-")}
-    assert "--max-keypoints" in options

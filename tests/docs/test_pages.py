@@ -10,10 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
-from deepdetect.cli import main
+from tests.command_line import run_command
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -55,7 +54,7 @@ def test_first_steps(folder: Path) -> None:
     ]
     printed = {}
     for command in commands:
-        result = CliRunner().invoke(main, shlex.split(command)[1:])
+        result = run_command(shlex.split(command)[1:])
         assert result.exit_code == 0, result.output
         printed[command.split()[1]] = result.output
     detected, matched = blocks("first-steps.md", "text")

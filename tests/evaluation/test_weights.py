@@ -158,11 +158,9 @@ def test_the_foreground_is_measured(run_evaluate, tmp_path: Path) -> None:
 
 
 def test_equal_density_without_images_is_refused(tmp_path: Path) -> None:
-    from click.testing import CliRunner
+    from tests.command_line import run_command
 
-    from deepdetect.cli import main
-
-    result = CliRunner().invoke(main, ["evaluate", str(tmp_path), "--equal-density"])
+    result = run_command(["evaluate", str(tmp_path), "--equal-density"])
     assert result.exit_code == 2
     assert "--equal-density is for the keypoints of --oxford and --foreground" in result.output
     with pytest.raises(OptionError, match="`equal_density` is for the keypoints of `oxford`"):
@@ -192,11 +190,9 @@ def test_other_options_of_the_detector_stay(folder: Path) -> None:
 
 
 def test_labels_without_oxford_are_refused(tmp_path: Path) -> None:
-    from click.testing import CliRunner
+    from tests.command_line import run_command
 
-    from deepdetect.cli import main
-
-    result = CliRunner().invoke(main, ["evaluate", str(tmp_path), "--labels"])
+    result = run_command(["evaluate", str(tmp_path), "--labels"])
     assert result.exit_code == 2
     assert "--oxford" in result.output
     assert "Traceback" not in result.output
@@ -273,9 +269,7 @@ def test_wrong_options_are_said(options: dict, named: str, one_line) -> None:
 def test_samples_that_cannot_be_read_are_listed_and_not_scored(
     tmp_path: Path, photo: np.ndarray
 ) -> None:
-    from click.testing import CliRunner
-
-    from deepdetect.cli import main
+    from tests.command_line import run_command
 
     for name in "abc":
         Image.fromarray(photo[:64, :64]).save(tmp_path / f"image_{name}.png")
@@ -288,7 +282,7 @@ def test_samples_that_cannot_be_read_are_listed_and_not_scored(
     assert [score.images for score in found.masks.values()] == [1]
     assert found.masks["normal"].loss == pytest.approx(whole.masks["normal"].loss)
     assert len(found.failures) == 2
-    result = CliRunner().invoke(main, ["evaluate", str(tmp_path)])
+    result = run_command(["evaluate", str(tmp_path)])
     assert result.exit_code == 1
     assert "normal" in result.stdout
     *_, told, first, second = result.stderr.splitlines()
@@ -296,19 +290,17 @@ def test_samples_that_cannot_be_read_are_listed_and_not_scored(
     assert "image_a.png" in first
     assert "mask_image_b.png" in second
     (tmp_path / "image_c.png").unlink()
-    assert CliRunner().invoke(main, ["evaluate", str(tmp_path)]).exit_code == 2
+    assert run_command(["evaluate", str(tmp_path)]).exit_code == 2
 
 
 def test_photographs_that_cannot_be_read_are_listed_and_not_scored(
     tmp_path: Path, photo: np.ndarray
 ) -> None:
-    from click.testing import CliRunner
-
-    from deepdetect.cli import main
+    from tests.command_line import run_command
 
     Image.fromarray(photo[:64, :64]).save(tmp_path / "a.png")
     (tmp_path / "b.png").write_bytes(b"damaged")
-    result = CliRunner().invoke(main, ["evaluate", str(tmp_path), "--scale", "1", "--scale", "2"])
+    result = run_command(["evaluate", str(tmp_path), "--scale", "1", "--scale", "2"])
     assert result.exit_code == 1
     assert "x1 normal" in result.stdout
     *_, told, first = result.stderr.splitlines()
@@ -319,10 +311,9 @@ def test_photographs_that_cannot_be_read_are_listed_and_not_scored(
 def test_damaged_photographs_do_not_end_the_measurement_of_the_others(
     run_evaluate, tmp_path: Path
 ) -> None:
-    from click.testing import CliRunner
     from skimage import data
 
-    from deepdetect.cli import main
+    from tests.command_line import run_command
 
     photographs = tmp_path / "photographs"
     photographs.mkdir()
@@ -341,7 +332,7 @@ def test_damaged_photographs_do_not_end_the_measurement_of_the_others(
     assert (found.fraction, found.density) == pytest.approx((whole.fraction, whole.density))
     run_evaluate()  # writes a sample
     words = ["evaluate", str(tmp_path), "--foreground", str(photographs), "--compare", "dense"]
-    result = CliRunner().invoke(main, words)
+    result = run_command(words)
     assert result.exit_code == 1
     assert "fraction (density)" in result.stdout
     *_, told, first, second = result.stderr.splitlines()
@@ -360,9 +351,7 @@ def test_damaged_images_do_not_end_the_measurement_of_the_other_scenes(
 ) -> None:
     import shutil
 
-    from click.testing import CliRunner
-
-    from deepdetect.cli import main
+    from tests.command_line import run_command
 
     oxford = tmp_path / "oxford"
     for scene in ("bark", "boat", "graf"):
@@ -370,7 +359,7 @@ def test_damaged_images_do_not_end_the_measurement_of_the_other_scenes(
     (oxford / "graf" / "img1.png").write_bytes(b"damaged")
     (oxford / "boat" / "img6.png").write_bytes(b"damaged")
     run_evaluate()  # writes a sample
-    result = CliRunner().invoke(main, ["evaluate", str(tmp_path), "--oxford", str(oxford)])
+    result = run_command(["evaluate", str(tmp_path), "--oxford", str(oxford)])
     assert result.exit_code == 1
     assert "boat 1-2" in result.stdout
     assert "graf" not in result.stdout
@@ -384,18 +373,16 @@ def test_damaged_images_do_not_end_the_measurement_of_the_other_scenes(
 def test_probabilities_are_calibrated_against_masks_and_labels(tmp_path: Path, photo) -> None:
     import json
 
-    from click.testing import CliRunner
-
-    from deepdetect.cli import main
+    from tests.command_line import run_command
 
     Image.fromarray(photo).save(tmp_path / "a.png")
     found = evaluate(samples=tmp_path, scales=[0.5])
     assert found.masks == {}
     (row,) = found.scales
     assert 0 < row.calibration.expected_error < 0.2
-    result = CliRunner().invoke(main, ["evaluate", str(tmp_path), "--scale", "0.5", "--json"])
+    result = run_command(["evaluate", str(tmp_path), "--scale", "0.5", "--json"])
     (told,) = json.loads(result.stdout)["scales"]
     assert told["calibration_error"] == row.calibration.expected_error
     assert told["label_density"] == row.label_density
-    refused = CliRunner().invoke(main, ["evaluate", str(tmp_path)])
+    refused = run_command(["evaluate", str(tmp_path)])
     assert "there are no samples in" in refused.output

@@ -6,7 +6,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
 from deepdetect import (
@@ -17,10 +16,10 @@ from deepdetect import (
     load_image,
     match_images,
 )
-from deepdetect.cli import main
 from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.io.image import luma
 from deepdetect.matching.registration import agree, register
+from tests.command_line import run_command
 
 WARP = np.array([[0.92, -0.1, 25.0], [0.08, 0.97, -6.0], [1e-4, 2e-4, 1.0]])
 
@@ -73,7 +72,7 @@ def test_the_command_writes_pictures_and_the_homography(
     for name, image in (("a", photo), ("b", second)):
         Image.fromarray(image).save(tmp_path / f"{name}.png")
     words = ["register", str(tmp_path / "a.png"), str(tmp_path / "b.png"), "--json"]
-    result = CliRunner().invoke(main, [*words, "-o", str(tmp_path / "out")])
+    result = run_command([*words, "-o", str(tmp_path / "out")])
     assert result.exit_code == 0, result.output
     report = json.loads(result.stdout)
     for name in ("", "_checkerboard", "_difference"):
@@ -100,7 +99,7 @@ def test_a_homography_that_the_images_contradict_is_refused(
     with pytest.raises(RegistrationError, match="the images contradict the homography"):
         register(photo, poster(photo))
     words = ["register", str(tmp_path / "a.png"), str(tmp_path / "b.png")]
-    result = CliRunner().invoke(main, [*words, "-o", str(tmp_path / "out")])
+    result = run_command([*words, "-o", str(tmp_path / "out")])
     assert result.exit_code == 3
     assert result.stderr.startswith("deepdetect: the images contradict the homography")
     assert not (tmp_path / "out").exists()
@@ -124,7 +123,7 @@ def test_the_command_refuses_in_one_sentence(photo: np.ndarray, tmp_path: Path) 
     for name, image in (("a", photo), ("b", noise)):
         Image.fromarray(image).save(tmp_path / f"{name}.png")
     words = ["register", str(tmp_path / "a.png"), str(tmp_path / "b.png")]
-    result = CliRunner().invoke(main, [*words, "-o", str(tmp_path / "out")])
+    result = run_command([*words, "-o", str(tmp_path / "out")])
     assert result.exit_code == 3
     assert result.stderr.startswith("deepdetect: no homography can be trusted")
     assert not (tmp_path / "out").exists()

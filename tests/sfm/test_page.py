@@ -11,9 +11,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from deepdetect.cli import main
+from tests.command_line import run_command
 
 PAGE = (Path(__file__).parents[2] / "docs/reconstruction.md").read_text(encoding="utf-8")
 PAGE = PAGE.partition("\n## Many images\n")[2].partition("\n## ")[0]
@@ -39,7 +38,7 @@ def test_the_page_runs(
             words = shlex.split(line.partition("#")[0])
             if words[:1] != ["deepdetect"] or "../shared" in line:  # large, as its figures are
                 continue
-            result = CliRunner().invoke(main, words[1:], catch_exceptions=False)
+            result = run_command(words[1:])
             assert result.exit_code == 0, f"{line}\n{result.output}"
             done += 1
     assert done == 4

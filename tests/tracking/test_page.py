@@ -10,9 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
 
-from deepdetect.cli import main
+from tests.command_line import run_command
 
 PAGE = (Path(__file__).parents[2] / "docs/many-images.md").read_text(encoding="utf-8")
 PAGE = PAGE.partition("\n## Videos\n")[2].partition("\n## ")[0]
@@ -44,7 +43,7 @@ def test_the_page_runs(
             words = shlex.split(line.partition("#")[0])
             if words[:1] != ["deepdetect"] or words[2] == "0":  # a camera
                 continue
-            result = CliRunner().invoke(main, words[1:], catch_exceptions=False)
+            result = run_command(words[1:])
             assert result.exit_code == 0, f"{line}\n{result.output}"
             done += 1
     assert done == 3

@@ -1,286 +1,163 @@
-"""Options, and ways to print results, that several commands share."""
+"""Options of commands, made from the library's signatures, and ways to print results."""
 
 from __future__ import annotations
 
-import dataclasses
+import inspect
 import json
-from collections.abc import Callable, Iterable, Sequence
+import re
+import sys
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any, Literal, TypeVar
 
-import click
+from cyclopts import Group, Parameter
+from cyclopts.validators import Number
 
+from .._shared.atomic import atomic_path
 from .._shared.errors import BatchError, DeepDetectError, OptionError
-from ._generated import FieldOptions, given_only
-
-if TYPE_CHECKING:
-    from ..detector.detector import DeepDetect
-    from ..detector.point_detector import PointDetector
-    from ..features.selection import SelectionOptions
-    from ..labels import LabelOptions
-    from ..training import TrainingOptions
-
-PATH = click.Path(path_type=Path)
+from .._shared.records import Outputs, check_not_made, outputs_in
+from .._shared.signals import handle_signals
 
 NOTHING_FOUND = 3
 """Exit code where all went well and nothing was found."""
 
+MORE = Group("More options")
+"""Shown by --help-all."""
 
-class Resolution(click.ParamType):  # type: ignore[type-arg]  # generic in new versions only
-    """The word "auto" or "native", or a number of pixels."""
+ALIASES = {"max_keypoints": ("--num-keypoints", "--top-k", "--max-num-keypoints")}
+"""What people type."""
 
-    name = "auto|native|PIXELS"
-
-    def convert(self, value: Any, param: Any, context: Any) -> str | int:
-        if value in ("auto", "native") or isinstance(value, int):
-            return value
-        try:
-            return int(value)
-        except ValueError:
-            message = f"{value!r} is neither 'auto' nor 'native' nor a number of pixels"
-            self.fail(message, param, context)
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-class TileSize(click.ParamType):  # type: ignore[type-arg]  # as above
-    """The word "auto", or a number of megapixels."""
+@dataclass(frozen=True)
+class From:
+    """Parameters of a function or class that are options of a command.
 
-    name = "auto|MEGAPIXELS"
+    Name, type, default and help of an option are those of the parameter and of its docstring.
 
-    def convert(self, value: Any, param: Any, context: Any) -> str | float:
-        if value == "auto" or isinstance(value, float):
-            return value
-        try:
-            return float(value)
-        except ValueError:
-            self.fail(f"{value!r} is neither 'auto' nor a number of megapixels", param, context)
+    Attributes:
+        target: the function or class.
+        names: of the parameters, with blanks between; empty for all.
+        common: those that --help shows; the others are shown by --help-all.
+        flags: flags that are not the name, as {"focal_px": "--focal"}, or with the negative one
+            after a slash.
+        types: types of parameters that are wider than what can be typed.
+        defaults: what the help says of the default, where the value does not say it.
+    """
+
+    target: Callable[..., Any]
+    names: str = ""
+    common: str = ""
+    flags: Mapping[str, str] = field(default_factory=dict)
+    types: Mapping[str, Any] = field(default_factory=dict)
+    defaults: Mapping[str, str] = field(default_factory=dict)
+
+    def parameters(self) -> Iterator[inspect.Parameter]:
+        """Make the options as keyword parameters."""
+        parameters = inspect.signature(self.target).parameters
+        helps = attribute_helps(inspect.getdoc(self.target) or "")
+        scope = vars(sys.modules[self.target.__module__])
+        for name in self.names.split() or parameters:
+            hint = self.types.get(name) or eval(str(parameters[name].annotation), scope)
+            flag, _, negative = self.flags.get(name, "").partition("/")
+            settings: dict[str, Any] = {"name": flag or None, "alias": ALIASES.get(name)}
+            settings |= {"negative": negative.split()} if negative else {}
+            if name in self.defaults:
+                settings["show_default"] = lambda _, text=self.defaults[name]: text
+            settings |= {} if name in self.common.split() else {"group": MORE}
+            annotation: Any = Annotated[hint, Parameter(help=helps.get(name), **settings)]
+            yield parameters[name].replace(
+                kind=inspect.Parameter.KEYWORD_ONLY, annotation=annotation
+            )
+
+    def take(self, values: dict[str, Any]) -> dict[str, Any]:
+        """Take these options out of those that were given."""
+        names = self.names.split() or inspect.signature(self.target).parameters
+        return {name: values.pop(name) for name in names if name in values}
 
 
-DETECTOR = FieldOptions(
-    "detector.detector:DeepDetect",
-    names=(
-        "weights",
-        "resolution",
-        "backend",
-        "device",
-        "threads",
-        "precision",
-        "tta",
-        "tile_megapixels",
+def with_options(*sources: From) -> Callable[[Function], Function]:
+    """Give a command with `**values` the options of other functions: those that are given."""
+
+    def decorate(function: Function) -> Function:
+        own = [*inspect.signature(function).parameters.values()][:-1]
+        made = [option for source in sources for option in source.parameters()]
+        function.__signature__ = inspect.Signature([*own, *made])  # type: ignore[attr-defined]
+        return function
+
+    return decorate
+
+
+def attribute_helps(doc: str) -> dict[str, str]:
+    """Return the first sentence on each attribute or argument of a Google style docstring.
+
+    Example:
+        >>> helps = attribute_helps('''Options.
+        ...
+        ... Attributes:
+        ...     ratio, mutual: of the ratio test, which
+        ...         is Lowe's. More text.
+        ... ''')
+        >>> helps["mutual"]
+        "Of the ratio test, which is Lowe's."
+    """
+    match = re.search(r"^(?:Attributes|Args):\n((?:[ \t]+.*\n?|\n)*)", doc, flags=re.MULTILINE)
+    section = textwrap.dedent(match.group(1)) if match else ""
+    helps: dict[str, str] = {}
+    for entry in re.split(r"\n(?=\S)", section.strip()):
+        names, _, text = " ".join(entry.split()).partition(": ")
+        sentence = re.split(r"(?<=[.)])\s(?=[A-Z])", text)[0]
+        helps |= {name.strip(): sentence[:1].upper() + sentence[1:] for name in names.split(",")}
+    return helps
+
+
+Images = Annotated[list[Path], Parameter(help="Image files or folders.")]
+Image = Annotated[Path, Parameter(help="Image file.")]
+Output = Annotated[Path, Parameter(name=("--output", "-o"))]
+Folder = Annotated[Path, Parameter(name=("--output", "-o"), help="Folder for the results.")]
+Overwrite = Annotated[
+    bool, Parameter(negative="", help="Replace what exists already, and do all of it again.")
+]
+Json = Annotated[bool, Parameter("--json", negative="", help="Print the result as JSON.")]
+Format = Annotated[Literal["npz", "csv"], Parameter("--format", help="Format of the data files.")]
+MaxMegapixels = Annotated[
+    float, Parameter(group=MORE, help="Refuse larger images before they are decoded.")
+]
+Workers = Annotated[
+    int | None,
+    Parameter(
+        group=MORE,
+        validator=Number(gte=1),
+        help="Processes at work.  [default: one per processor of the machine or cluster]",
     ),
-    types={"resolution": Resolution(), "tile_megapixels": TileSize()},
-    metavars={"weights": "NAME|FILE", "device": "cpu|cuda|PROVIDER"},
-    defaults={"threads": "the backend's choice"},
-)
-POINTS = FieldOptions(
-    "detector.point_detector:PointDetector",
-    names=("spread", "ranker"),
-    metavars={"ranker": "FILE"},
-)
-
-SELECTION = FieldOptions(
-    "features.selection:SelectionOptions",
-    defaults={"max_keypoints": "2048 with --detector points, else all"},
-)
+]
+Engine = Annotated[
+    str,
+    Parameter(
+        group=MORE,
+        help="What does the work: processes of this machine, or ray for a cluster (RAY_ADDRESS).",
+    ),
+]
 
 
-def detector_option(default: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Return the option that chooses between the two detectors.
+def output_file(output: Path, name: str) -> Path:
+    """Return the file that -o names: itself where it has an ending, else one of a folder."""
+    return output if output.suffix and not output.is_dir() else output / name
 
-    Args:
-        default: one of them; or what the help says of a command that chooses itself.
+
+def output_folder(output: Path) -> Path:
+    """Return the folder that -o names.
+
+    Raises:
+        OptionError: it has the ending of a file.
     """
-    kinds = ["network", "points"]
-    return click.option(
-        "--detector",
-        "kind",
-        type=click.Choice(kinds),
-        default=default if default in kinds else None,
-        help="Pixels of the network's heat map, or ranked points of all scales.  "
-        f"[default: {default}]",
-    )
-
-
-output_option = click.option(
-    "-o",
-    "--output",
-    type=PATH,
-    default=Path("deepdetect-output"),
-    show_default=True,
-    help="Folder for the results.",
-)
-
-
-def _limit_megapixels(context: click.Context, _: click.Parameter, value: float | None) -> None:
-    if value is not None:
-        from ..io.image_file import limit_megapixels
-
-        context.with_resource(limit_megapixels(value))
-
-
-max_megapixels_option = click.option(
-    "--max-megapixels",
-    type=float,
-    callback=_limit_megapixels,
-    expose_value=False,
-    help="Refuse larger photographs before they are decoded.  [default: 200]",
-)
-format_option = click.option(
-    "--format",
-    "file_format",
-    type=click.Choice(["npz", "csv"]),
-    default="npz",
-    show_default=True,
-    help="Format of the data files.",
-)
-pictures_option = click.option(
-    "--pictures/--no-pictures", default=True, show_default=True, help="Write pictures, too."
-)
-overwrite_option = click.option(
-    "--overwrite", is_flag=True, help="Replace what exists already, and do all of it again."
-)
-workers_option = click.option(
-    "--workers",
-    type=click.IntRange(min=1),
-    help="Processes that make labels.  [default: one a processor]",
-)
-processes_option = click.option(
-    "--workers",
-    type=click.IntRange(min=1),
-    help="Processes at work.  [default: one per processor of the machine or cluster]",
-)
-engine_option = click.option(
-    "--engine",
-    metavar="NAME",
-    default="processes",
-    show_default=True,
-    help="What does the work: processes of this machine, or ray for a cluster (RAY_ADDRESS).",
-)
-label_settings_option = click.option(
-    "--label-settings",
-    metavar="NAME|FILE.toml",
-    help="Detectors and their settings: paper or dense, or a file.  [default: paper]",
-)
-json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-
-
-def chosen_label_settings(detectors: str | None, chosen: str | None) -> LabelOptions:
-    """Find settings by name or TOML file; detectors (with commas between) replace theirs."""
-    from ..labels import find_label_settings
-
-    settings = find_label_settings("paper" if chosen is None else chosen)
-    if detectors is None:
-        return settings
-    names = tuple(name.strip() for name in detectors.split(",") if name.strip())
-    return dataclasses.replace(settings, detectors=names)
-
-
-RECIPE = FieldOptions(
-    "training.recipe:TrainingOptions",
-    skip=("labels",),
-    flags={
-        "stages": "--stage",
-        "short_sides": "--short-side",
-        "frozen_batch_norm": "--frozen-batch-norm/--batch-norm",
-    },
-    metavars={"stages": "CROPxBATCHxEPOCHS[@SIDE,...]"},
-    defaults={
-        "stages": "240x16x44 480x8x10",
-        "max_images": "all",
-        "frozen_batch_norm": "with --init",
-        "low_light_pos_weight": "that of --pos-weight",
-    },
-)
-
-SHARDS = FieldOptions(
-    RECIPE.path,
-    names=("short_sides", "square", "max_images", "val_fraction", "augmentations"),
-    flags=RECIPE.flags,
-    defaults=RECIPE.defaults,
-)
-"""What of a recipe is fixed once the labels are made."""
-
-
-def recipe_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that choose a recipe, before others change it."""
-    function = label_settings_option(function)
-    function = click.option(
-        "--detectors", metavar="NAME,NAME,...", help="Label detectors.  [default: all nine]"
-    )(function)
-    return click.option(
-        "--preset",
-        default="default",
-        show_default=True,
-        help="Recipe that the other options change: default (its values are shown here), paper "
-        "(the paper's own), or dense (normal light only, denser labels).",
-    )(function)
-
-
-def chosen_recipe(
-    preset: str, detectors: str | None, label_settings: str | None, values: dict[str, Any]
-) -> TrainingOptions:
-    """Return a preset's training options with the given values changed."""
-    from ..training import Stage, training_preset
-
-    given = given_only(values)
-    if "stages" in given:
-        given["stages"] = tuple(
-            Stage.parse(stage) if isinstance(stage, str) else stage for stage in given["stages"]
-        )
-    recipe = training_preset(preset)
-    if label_settings is not None:
-        given["labels"] = chosen_label_settings(detectors, label_settings)
-    elif detectors is not None:  # the preset's settings, for the detectors that are used
-        chosen = chosen_label_settings(detectors, None).detectors
-        given["labels"] = recipe.labels.with_detectors(chosen)
-    return dataclasses.replace(recipe, **given)
-
-
-def make_detector(values: dict[str, Any], weights: str = "default") -> DeepDetect:
-    """Make the network that `DETECTOR`'s options describe, taking them out of the values."""
-    from ..detector.detector import DeepDetect
-
-    given = given_only({name: values.pop(name) for name in DETECTOR.names})
-    return DeepDetect(**{"weights": weights, **given})
-
-
-SELECTED = ("threshold", "density", "nms_radius", "subpixel")
-"""Options of the network's keypoints alone."""
-
-
-def chosen_detector(
-    kind: str,
-    values: dict[str, Any],
-    *,
-    weights: str = "default",
-    max_keypoints: int = 2048,
-    threads: int | None = None,
-) -> tuple[DeepDetect | PointDetector, SelectionOptions | None]:
-    """Make the detector that is chosen, and its selection, taking their options out of the values.
-
-    Args:
-        kind: "network" or "points".
-        values: of `DETECTOR`, `POINTS` and `SELECTION`.
-        weights, threads: of the network, where nothing else is given.
-        max_keypoints: of points, where nothing else is given.
-    """
-    from ..detector.detector import DeepDetect
-    from ..detector.point_detector import PointDetector
-    from ..features.selection import SelectionOptions
-
-    names = (*DETECTOR.names, *POINTS.names, *SELECTED, "max_keypoints")
-    given = given_only({name: values.pop(name) for name in names if name in values})
-    network = [name for name in DETECTOR.names if name != "resolution"]
-    others = (*network, *SELECTED) if kind == "points" else POINTS.names
-    for name in given:
-        if name in others:
-            other = "network" if kind == "points" else "points"
-            flag = "--" + name.replace("_", "-")
-            raise OptionError(f"{flag} is for --detector {other}: leave it out, or choose that")
-    if kind == "points":
-        return PointDetector(**{"max_keypoints": max_keypoints, **given}), None
-    own = {name: given.pop(name) for name in DETECTOR.names if name in given}
-    detector = DeepDetect(**{"weights": weights, "threads": threads, **own})
-    return detector, SelectionOptions(**given)
+    if re.fullmatch(r"\.(npz|csv|json|txt|png|jpe?g|tiff?|webp)", output.suffix.lower()):
+        raise OptionError(f"-o names the folder for all results: {output} looks like one file")
+    return output
 
 
 def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
@@ -293,56 +170,71 @@ def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
         ImageError: a folder holds no image.
         OptionError: two images have one name, or a folder holds only what earlier runs made.
     """
-    images: list[Path] = []
+    from ..io.image import find_images
+
+    images: dict[Path, None] = {}
     for path in paths:
-        images += _images_below(path, output) if path.is_dir() else [path]
+        below = find_images(path, [output]) if path.is_dir() else [path]
+        if path.is_dir() and path.resolve() == output.resolve():
+            made = outputs_in(output)
+            below = [each for each in below if not (each.parent == path and each.name in made)]
+            if not below:
+                raise OptionError(f"all images in {path} are results of earlier runs")
+        images |= dict.fromkeys(below)
     seen: dict[str, Path] = {}
-    for image in dict.fromkeys(images):
+    for image in images:
         if image.stem in seen:
             raise OptionError(
                 f"{seen[image.stem]} and {image} would write the same files: "
                 "rename one, or do them one after the other into two folders"
             )
         seen[image.stem] = image
-    return list(seen.values())
+    return list(images)
 
 
-def _images_below(folder: Path, output: Path) -> list[Path]:
-    """List the images below a folder that no earlier run has made."""
-    from ..io.image import find_images
-    from ._records import recorded_outputs
-
-    images = find_images(folder, [output])
-    if folder.resolve() != output.resolve():
-        return images
-    made = recorded_outputs(output)
-    left = [image for image in images if image.resolve() not in made]
-    if not left:
-        raise OptionError(
-            f"all images in {folder} are results of earlier runs: choose another folder with -o"
-        )
-    return left
-
-
-def check_inputs_survive(outputs: Iterable[Path], inputs: Sequence[Path], advice: str) -> None:
+def check_inputs_survive(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
     """Check that no file to be written is one of those that are read, under whatever name.
 
-    The advice says what to do, as "give the model another name by -o".
+    Raises:
+        OptionError: one is.
     """
     # Not by name: links, and capitals on some systems, give one file several.
-    there = {_identity(path) for path in inputs} - {None}
+    existing = [path for path in inputs if path.exists()]
     for output in outputs:
-        if _identity(output) in there:
-            raise OptionError(f"{output} would be written over, which is an input: {advice}")
+        if output.exists() and any(output.samefile(path) for path in existing):
+            raise OptionError(
+                f"{output} would be written over, which is an input: choose another place with -o"
+            )
 
 
-def _identity(path: Path) -> tuple[int, int] | None:
-    """Return what tells a file from all others, or None where there is none."""
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_dev, found.st_ino
+def check_folder_not_made(folder: Path, output: Path) -> None:
+    """Refuse a folder that holds images which earlier runs made, but for those below the output.
+
+    Raises:
+        OptionError: one of them is an output, or lies in a folder that is one.
+    """
+    from ..io.image import find_images
+
+    if any(folder.glob("**/.deepdetect")):
+        check_not_made(folder, find_images(folder, [output]))
+
+
+@contextmanager
+def whole(files: Mapping[str, Path]) -> Iterator[dict[str, Path]]:
+    """Give temporary paths for files; all of them appear when the block succeeds, else none."""
+    with ExitStack() as stack:
+        yield {name: stack.enter_context(atomic_path(path)) for name, path in files.items()}
+
+
+@contextmanager
+def writing(outputs: Outputs) -> Iterator[dict[str, Any]]:
+    """Write outputs, as `Outputs.writing`; signals that end the process leave no trace either."""
+
+    def end(number: int, _: object) -> None:
+        raise SystemExit(128 + number)  # as a shell has it
+
+    with handle_signals(end), outputs.writing() as values:
+        yield values
 
 
 def report_failures(failures: Sequence[str], total: int, what: str = "images") -> None:
@@ -353,9 +245,14 @@ def report_failures(failures: Sequence[str], total: int, what: str = "images") -
         raise BatchError(f"{len(failures)} of {total} {what} failed, the others are done", failures)
 
 
+def note(text: str) -> None:
+    """Print a line to standard error."""
+    print(text, file=sys.stderr)
+
+
 def print_json(value: Any) -> None:
     """Print a value as JSON; paths become text."""
-    click.echo(json.dumps(value, indent=2, default=str))
+    print(json.dumps(value, indent=2, default=str))
 
 
 def print_result(
@@ -371,13 +268,13 @@ def print_result(
 def print_table(rows: Iterable[tuple[str, str]], title: str = "") -> None:
     """Print names and values in two columns."""
     if title:
-        click.echo(title)
+        print(title)
     rows = list(rows)
     width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:
-        click.echo(f"  {name:<{width}}  {value}")
+        print(f"  {name:<{width}}  {value}")
 
 
-def seconds_rows(seconds: dict[str, float]) -> list[tuple[str, str]]:
+def seconds_rows(seconds: Mapping[str, float]) -> list[tuple[str, str]]:
     """Make the table rows for the time of each stage."""
     return [(f"seconds: {stage}", f"{value:.3f}") for stage, value in seconds.items()]

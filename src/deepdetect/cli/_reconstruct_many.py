@@ -1,32 +1,27 @@
-"""`deepdetect reconstruct` with a folder, or with three or more photographs."""
+"""`deepdetect reconstruct` with a folder, or with three or more images."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import click
+from .._shared.errors import OptionError
+from .._shared.records import Outputs, check_not_made
+from ..sfm.colmap import import_pycolmap
+from ..sfm.options import MultiViewOptions
+from ..sfm.pipeline import MAX_KEYPOINTS, check_output_folder, output_files, reconstruct_many
+from ..sfm.result import MultiViewReconstruction
+from ..sfm.stages import check_images
+from ._detection import Kind, chosen_detector
+from ._options import From, print_result, seconds_rows
 
-from ._generated import FieldOptions, given_only
-from ._options import chosen_detector, print_result, seconds_rows
-
-if TYPE_CHECKING:
-    from ..sfm.result import MultiViewReconstruction
-
-MANY = FieldOptions(
-    "sfm.options:MultiViewOptions",
-    names=("pairs", "sequential", "dense", "stride_px", "single_camera"),
-    flags={
-        "stride_px": "--stride",
-        "single_camera": "--single-camera/--camera-each",
-    },
-    metavars={"sequential": "N", "stride_px": "PX"},
+MANY = From(
+    MultiViewOptions,
+    flags={"stride_px": "--stride", "single_camera": "--single-camera/--camera-each"},
 )
-"""Options that two photographs do not have."""
-
-OUTPUT = Path("deepdetect-output/model")
+"""Options that two images do not have."""
 
 MAX_UNREGISTERED_ROWS = 10
 """Images that are named with a reason on the terminal; model.json names all."""
@@ -34,52 +29,41 @@ MAX_UNREGISTERED_ROWS = 10
 
 def reconstruct_folder(
     images: Sequence[Path],
-    output: Path | None,
-    kind: str,
+    output: Path,
+    kind: Kind,
     workers: int | None,
     overwrite: bool,
     as_json: bool,
     values: dict[str, Any],
 ) -> None:
-    """Reconstruct many photographs, and print what was found."""
-    from ..sfm.colmap import import_pycolmap
-    from ..sfm.options import MultiViewOptions
-    from ..sfm.pipeline import (
-        MAX_KEYPOINTS,
-        check_output_folder,
-        output_files,
-        reconstruct_many,
-    )
-    from ..sfm.stages import check_images
-    from ._records import check_not_made, claim_outputs
-
-    target = OUTPUT if output is None else output
+    """Reconstruct many images, and print what was found."""
+    if "rectified" in values:
+        raise OptionError("--rectified and --not-rectified are for two images")
     detector, selection = chosen_detector(kind, values, max_keypoints=MAX_KEYPOINTS, threads=1)
-    if values.pop("rectified") is not None:
-        raise click.UsageError("--rectified and --not-rectified are for two photographs")
-    chosen = given_only({name: values.pop(name) for name in MANY.names})
-    if "sequential" in chosen:
-        chosen.setdefault("pairs", "sequential")
-    photographs: Path | Sequence[Path] = images[0] if len(images) == 1 else images
+    source: Path | Sequence[Path] = images[0] if len(images) == 1 else images
+    many = MANY.take(values)
+    if "sequential" in many:
+        many.setdefault("pairs", "sequential")
     # What is missing or wrong is said before anything is written.
     import_pycolmap()
-    check_output_folder(target)
-    found_images = check_images(photographs)
-    if isinstance(photographs, Path):
-        check_not_made(photographs, found_images.values())
-    claim_outputs("reconstruct", sorted(images), output_files(target), overwrite, growing=True)
-    found = reconstruct_many(
-        photographs,
-        target,
-        detector,
-        selection=selection,
-        workers=workers,
-        overwrite=overwrite,
-        quiet=False,
-        options=MultiViewOptions(**chosen),
-        **given_only(values),
-    )
-    numbers = json.loads((target / "model.json").read_text(encoding="utf-8"))
+    check_output_folder(output)
+    found_images = check_images(source)
+    if isinstance(source, Path):
+        check_not_made(source, found_images.values())
+    outputs = Outputs(output_files(output), sorted(images), overwrite=overwrite, growing=True)
+    with outputs.writing():
+        found = reconstruct_many(
+            source,
+            output,
+            detector,
+            selection=selection,
+            options=MultiViewOptions(**many),
+            workers=workers,
+            overwrite=overwrite,
+            quiet=False,
+            **values,
+        )
+    numbers = json.loads((output / "model.json").read_text(encoding="utf-8"))
     print_result(as_json, numbers, _rows(found, numbers), str(images[0].parent))
 
 

@@ -2,45 +2,45 @@
 
 from __future__ import annotations
 
-from typing import Any
+import webbrowser
+from typing import Annotated, Any
 
-import click
+from cyclopts import Parameter
 
 from .._shared.errors import MissingExtraError, install_command
-from ._generated import FieldOptions, generated_command, given_only
+from ..app.options import AppOptions
+from ._options import From, note, with_options
 
-LIMITS = FieldOptions("app.options:AppOptions")
 
-
-@generated_command(LIMITS, short_help="A page in the browser, on this computer.")
-@click.option("--open", "open_browser", is_flag=True, help="Open the page in the browser.")
-def app(open_browser: bool, **values: Any) -> None:
+@with_options(From(AppOptions, common="port"))
+def app(
+    *,
+    open_browser: Annotated[bool, Parameter("--open", negative="")] = False,
+    **values: Any,
+) -> None:
     """Serve a page at 127.0.0.1: keypoints, matches, registration, panoramas and 3D models.
 
     It prints the address to open, which ends in a key that is new at each start. Images stay
     on this computer, and are removed after each task. Ctrl+C ends it.
 
-    \b
-    deepdetect app
-    deepdetect app --port 0 --open
+        deepdetect app
+        deepdetect app --port 0 --open
+
+    Args:
+        open_browser: Open the page in the browser.
     """
-    import webbrowser
-
-    from ..app.options import AppOptions
-
     try:
         from ..app.server import AppServer
     except ModuleNotFoundError as error:
         raise MissingExtraError(
-            f"deepdetect app needs {error.name}: {install_command('starlette', 'uvicorn')}"
+            f"deepdetect app needs {error.name}: run {install_command('starlette', 'uvicorn')}"
         ) from None
-
-    with AppServer(AppOptions(**given_only(values))) as server:
+    with AppServer(AppOptions(**values)) as server:
         try:
-            click.echo(f"DeepDetect is at {server.address}")
-            click.echo("Ctrl+C ends it.", err=True)
+            print(f"DeepDetect is at {server.address}", flush=True)
+            note("Ctrl+C ends it.")
             if open_browser:
                 webbrowser.open(server.address)
             server.serve_forever()
         except KeyboardInterrupt:
-            click.echo("deepdetect: ended; nothing was kept", err=True)
+            note("deepdetect: ended; nothing was kept")

@@ -2,58 +2,52 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-from pathlib import Path
+from typing import Annotated
 
-import click
+from cyclopts import Parameter
 
-from ._options import PATH, check_inputs_survive, json_option, overwrite_option, print_result
+from .._shared.errors import MissingWeightsError, OptionError
+from .._shared.provenance import provenance
+from .._shared.records import Outputs
+from ..detector.pretrained import resolve_weights
+from ..training.run import require_packages
+from . import _options as cli
 
 
-@click.command(short_help="The mean of several weights.")
-@click.argument("weights", nargs=-1, required=True, metavar="WEIGHTS...")
-@click.option("-o", "--output", type=PATH, required=True, help="Folder for both files.")
-@overwrite_option
-@json_option
-def average(weights: tuple[str, ...], output: Path, overwrite: bool, as_json: bool) -> None:
-    """Average WEIGHTS (a model soup) into best.safetensors and deepdetect.onnx.
+def average(
+    weights: Annotated[
+        list[str],
+        Parameter(help=".safetensors files, or default, dense or free; one twice counts double."),
+    ],
+    /,
+    *,
+    output: cli.Output,
+    overwrite: cli.Overwrite = False,
+    as_json: cli.Json = False,
+) -> None:
+    """Average weights (a model soup) into best.safetensors and deepdetect.onnx.
 
-    The mean of runs that continue each other is often better than each of them; name one
-    twice to give it twice the weight. WEIGHTS are .safetensors files, or default, dense or free.
-    Files of another run are replaced with --overwrite only.
+    The mean of runs that continue each other is often better than each of them. Files of another
+    run are replaced with --overwrite only.
 
-    \b
-    deepdetect average first/best.safetensors second/best.safetensors -o mean
-    deepdetect evaluate samples/ --weights mean/deepdetect.onnx
+        deepdetect average first/best.safetensors second/best.safetensors -o mean
+        deepdetect evaluate samples/ --weights mean/deepdetect.onnx
+
+    Args:
+        output: Folder for both files.
     """
-    from .._shared.errors import (
-        MissingExtraError,
-        MissingWeightsError,
-        OptionError,
-        install_command,
-    )
-
-    for package in ("torch", "safetensors", "onnx"):
-        if importlib.util.find_spec(package) is None:
-            raise MissingExtraError(
-                f"averaging weights needs the package {package}, which is not installed: "
-                f"run {install_command('torch', 'safetensors', 'onnx')}"
-            )
-    from ..detector.pretrained import resolve_weights
-    from ._records import claimed_outputs
-
+    require_packages()
     if len(weights) < 2:
         raise OptionError("give at least two weights: the mean of one is itself")
     paths = [resolve_weights(name, ".safetensors") for name in weights]
     for path in paths:  # before torch is imported, which takes a second
         if not path.exists():
             raise MissingWeightsError(f"there is no weights file {path}: check the path")
+    folder = cli.output_folder(output)
+    files = {"weights": folder / "best.safetensors", "onnx": folder / "deepdetect.onnx"}
+    cli.check_inputs_survive(files.values(), paths)
 
-    files = {"weights": output / "best.safetensors", "onnx": output / "deepdetect.onnx"}
-    check_inputs_survive(files.values(), paths, "choose another folder with -o")
-
-    from .._shared.provenance import provenance
     from ..detector.network.onnx_export import export_onnx
     from ..detector.network.weights import (
         average_weights,
@@ -63,10 +57,13 @@ def average(weights: tuple[str, ...], output: Path, overwrite: bool, as_json: bo
         weights_digest,
     )
 
-    with claimed_outputs("average", paths, list(files.values()), overwrite):
+    with (
+        cli.writing(Outputs([*files.values()], paths, overwrite=overwrite)),
+        cli.whole(files) as made,
+    ):
         network = average_weights(paths)
         parts = [{"sha256": weights_digest(load_network(p)), **read_notes(p)} for p in paths]
-        save_weights(network, files["weights"], {"parts": json.dumps(parts), **provenance()})
-        export_onnx(network, files["onnx"])
+        save_weights(network, made["weights"], {"parts": json.dumps(parts), **provenance()})
+        export_onnx(network, made["onnx"])
     rows = [("mean of", f"{len(paths)} weights"), *((k, str(v)) for k, v in files.items())]
-    print_result(as_json, files, rows)
+    cli.print_result(as_json, files, rows)

@@ -2,154 +2,93 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-import click
+from cyclopts import Parameter
 
-from ._generated import generated_command
-from ._options import DETECTOR, PATH, POINTS, json_option, make_detector, print_json
-
-NAMES = (
-    *("oxford", "hpatches", "middlebury", "pose", "sfm"),
-    *("foreground", "low-visibility", "speed"),
-    "all",
-)
-
-
-RANKER = dataclasses.replace(POINTS, names=("ranker",))
+from .._shared.errors import BatchError, OptionError
+from .._shared.registry import look_up
+from ..detector.detector import DeepDetect
+from ..detector.point_detector import PointDetector
+from ..evaluation.baselines.plugin import find_feature
+from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
+from ..evaluation.options import BASELINES, DEFAULT_PROTOCOLS, BenchmarkOptions
+from ._detection import NETWORK
+from ._options import From, Json, Output, output_folder, print_json, with_options
 
 
-@generated_command(
-    DETECTOR, RANKER, short_help="The tables and figures of the paper, with baselines."
-)
-@click.argument("name", metavar="|".join(NAMES))
-@click.option("--data", type=PATH, required=True, help="Folder of the data sets.")
-@click.option(
-    "-o",
-    "--output",
-    type=PATH,
-    default=Path("benchmark"),
-    show_default=True,
-    help="For the report.",
-)
-@click.option(
-    "--protocol",
-    "protocols",
-    multiple=True,
-    help="paper, standard, guided or degraded; may be repeated.  [default: all but degraded]",
-)
-@click.option(
-    "--degraded-images",
-    metavar="second|both",
-    default="second",
-    show_default=True,
-    help="degraded: which images of a pair are made dark or blurred.",
-)
-@click.option(
-    "--method",
-    "words",
-    multiple=True,
-    metavar="NAME|FILE.onnx|MODULE:FUNCTION",
-    help="A further method as one more row; may be repeated.",
-)
-@click.option(
-    "--baselines",
-    metavar="NAMES",
-    help="Classical methods to compare with, separated by commas; none for none.  "
-    "[default: all 14]",
-)
-@click.option(
-    "--preset",
-    type=click.Choice(["default", "published"]),
-    default="default",
-    show_default=True,
-    help="published: show the network the channels as the paper's code does (BGR).",
-)
-@click.option(
-    "--cache", type=PATH, help="Folder of the stages' results.  [default: cache in the output]"
-)
-@click.option(
-    "--geometry-weights",
-    multiple=True,
-    default=("dense",),
-    help="Weights for stereo pairs, as --weights; may be repeated.  [default: dense]",
-)
-@click.option(
-    "--max-pairs",
-    type=int,
-    default=60,
-    show_default=True,
-    help="Of each scene at most this many pairs, evenly spaced; 1 for a first look.",
-)
-@click.option(
-    "--max-photographs",
-    type=int,
-    default=20,
-    show_default=True,
-    help="sfm: of each scene at most this many, of a sequence the first, else evenly spaced.",
-)
-@json_option
+@with_options(NETWORK, From(PointDetector, "ranker"))
 def benchmark(
-    name: str,
+    name: Annotated[str, Parameter(help=f"One of {', '.join(BENCHMARKS)}, or all.")],
+    /,
+    *,
     data: Path,
-    output: Path,
-    protocols: tuple[str, ...],
-    degraded_images: Any,
-    words: tuple[str, ...],
-    baselines: str | None,
-    preset: str,
-    cache: Path | None,
-    geometry_weights: tuple[str, ...],
-    max_pairs: int,
-    max_photographs: int,
-    as_json: bool,
+    output: Output = Path("benchmark"),
+    protocol: list[Literal["paper", "standard", "guided", "degraded"]] | None = None,
+    degraded_images: Literal["second", "both"] = "second",
+    method: list[str] | None = None,
+    baselines: str | None = None,
+    preset: Literal["default", "published"] = "default",
+    cache: Path | None = None,
+    geometry_weights: list[str] | None = None,
+    max_pairs: int = 60,
+    max_photographs: int = 20,
+    as_json: Json = False,
     **values: Any,
 ) -> None:
     """Write a report on the detectors: report.md with figures, tables/*.csv, report.json.
 
-    NAME is one of the data sets or all. A second run does only what is new. What cannot be
-    measured, as a data set that is missing, an image that is damaged or a method that fails, does
-    not stop the rest: it is listed at the end, with exit code 1.
+    A second run does only what is new. What cannot be measured, as a data set that is missing, an
+    image that is damaged or a method that fails, does not stop the rest: it is listed at the end,
+    with exit code 1.
 
-    \b
-    deepdetect benchmark oxford --data data -o report
-    deepdetect benchmark oxford --data data --max-pairs 1 --baselines sift -o quick
-    deepdetect benchmark oxford --data data -o report --method xfeat.onnx
-    deepdetect benchmark foreground --data data --baselines sift,fast-low -o report
-    deepdetect benchmark pose --data data/fountain -o report
-    deepdetect benchmark sfm --data data/fountain -o report
+        deepdetect benchmark oxford --data data -o report
+        deepdetect benchmark oxford --data data --max-pairs 1 --baselines sift -o quick
+        deepdetect benchmark oxford --data data -o report --method xfeat.onnx
+        deepdetect benchmark foreground --data data --baselines sift,fast-low -o report
+        deepdetect benchmark pose --data data/fountain -o report
+        deepdetect benchmark sfm --data data/fountain -o report
+
+    Args:
+        data: Folder of the data sets.
+        output: Folder for the report.
+        protocol: May be repeated.  [default: all but degraded]
+        degraded_images: Protocol degraded: which images of a pair are made dark or blurred.
+        method: A further method, NAME, FILE.onnx or MODULE:FUNCTION, as one more row; may be
+            repeated.
+        baselines: Classical methods to compare with, with commas between; none for none.
+            [default: all 14]
+        preset: published: show the network the channels as the paper's code does (BGR).
+        cache: Folder of the stages' results.  [default: cache in the output]
+        geometry_weights: Weights for stereo pairs, as --weights; may be repeated.  [default: dense]
+        max_pairs: Of each scene at most this many pairs, evenly spaced; 1 for a first look.
+        max_photographs: sfm: of each scene at most this many, of a sequence the first, else evenly
+            spaced.
     """
-    from .._shared.errors import BatchError, OptionError
-    from .._shared.registry import look_up
-    from ..evaluation.baselines.plugin import find_feature
-    from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
-    from ..evaluation.options import BASELINES, DEFAULT_PROTOCOLS, BenchmarkOptions
-
-    if values["resolution"] not in (None, "auto", "native"):
+    output = output_folder(output)
+    if values.get("resolution") not in (None, "auto", "native"):
         raise OptionError(
             "the protocols fix the resolution (480x480 and native): leave out --resolution"
         )
     names = list(BENCHMARKS) if name == "all" else [name]
     for each in names:
-        look_up("benchmark", each, dict.fromkeys(NAMES))
+        look_up("benchmark", each, BENCHMARKS)
     classical = tuple(BASELINES)
     if baselines is not None:
         listed = [word.strip() for word in baselines.split(",")]
         classical = tuple(word for word in listed if word not in ("", "none"))
-    ranker = values.pop("ranker")
     options = BenchmarkOptions(
-        make_detector(values),
-        protocols or DEFAULT_PROTOCOLS,
+        DeepDetect(**NETWORK.take(values)),
+        tuple(protocol or DEFAULT_PROTOCOLS),
         classical,
-        tuple(find_feature(word) for word in words),
+        tuple(find_feature(word) for word in method or ()),
         "bgr" if preset == "published" else "rgb",
-        geometry_weights,
+        tuple(geometry_weights or ()) or ("dense",),
         max_pairs,
         degraded_images,
         max_photographs,
-        ranker,
+        values.get("ranker"),
     )
     report = run_benchmarks(names, data, options, cache=cache or output / "cache", quiet=as_json)
     paths = report.save(output)
@@ -158,11 +97,11 @@ def benchmark(
     else:
         for table in report.tables():
             if table.in_text:
-                click.echo(f"{table.title}\n\n{table.to_markdown()}\n")
+                print(f"{table.title}\n\n{table.to_markdown()}\n")
         for reason in report.skipped:
             if reason not in report.failures:
-                click.echo(f"skipped: {reason}")
-        click.echo(f"report: {paths[0]}")
+                print(f"skipped: {reason}")
+        print(f"report: {paths[0]}")
     if count := len(report.failures):
         what = "one part" if count == 1 else f"{count} parts"
         raise BatchError(

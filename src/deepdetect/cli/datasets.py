@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
-import click
+from cyclopts import App, Parameter
 
-from ._options import PATH, json_option, print_json, print_result, print_table
+from ..datasets import find_remote_dataset, get_dataset, remote_datasets
+from ..io.image import find_images
+from ._options import Json, Output, print_json, print_result, print_table
+
+datasets = App("datasets", help="Download data sets for training and for the benchmarks.")
 
 
-@click.group(short_help="Download data sets.")
-def datasets() -> None:
-    """Download data sets for training and for the benchmarks."""
-
-
-@datasets.command("list", short_help="Show the available data sets.")
-@json_option
-def list_datasets(as_json: bool) -> None:
+@datasets.command(name="list")
+def list_datasets(*, as_json: Json = False) -> None:
     """Show the data sets that can be downloaded."""
-    from ..datasets import remote_datasets
-
     if as_json:
         print_json(
             [
@@ -44,25 +41,26 @@ def list_datasets(as_json: bool) -> None:
         print_table(rows, f"{dataset.name}: {dataset.title}")
 
 
-@datasets.command(short_help="Download and unpack a data set.")
-@click.argument("name")
-@click.option("-o", "--output", type=PATH, help="Folder for the images.  [default: data/NAME]")
-@json_option
-def get(name: str, output: Path | None, as_json: bool) -> None:
-    """Download the data set NAME and unpack it.
+@datasets.command
+def get(
+    name: Annotated[str, Parameter(help=f"One of {', '.join(remote_datasets())}.")],
+    /,
+    *,
+    output: Output | None = None,
+    as_json: Json = False,
+) -> None:
+    """Download a data set and unpack it.
 
     Run it again to resume a download that broke off.
 
-    \b
-    deepdetect datasets get coco
-    deepdetect train --preset paper data/coco -o run
-    deepdetect datasets get photographs-free
-    deepdetect datasets get oxford
-    deepdetect benchmark oxford --data data -o report
-    """
-    from ..datasets import find_remote_dataset, get_dataset
-    from ..io.image import find_images
+        deepdetect datasets get coco
+        deepdetect train --preset paper data/coco -o run
+        deepdetect datasets get oxford
+        deepdetect benchmark oxford --data data -o report
 
+    Args:
+        output: Folder for the images.  [default: data/NAME]
+    """
     dataset = find_remote_dataset(name)
     folder = get_dataset(dataset, output or Path("data") / dataset.name, quiet=as_json)
     images = len(find_images(folder))

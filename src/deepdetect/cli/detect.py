@@ -1,77 +1,46 @@
-"""`deepdetect detect`: keypoints of photographs."""
+"""`deepdetect detect`: keypoints of images."""
 
 from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import click
+import numpy as np
 
 from .. import __version__
-from ._generated import generated_command, with_flags
-from ._options import (
-    DETECTOR,
-    NOTHING_FOUND,
-    PATH,
-    POINTS,
-    SELECTION,
-    check_inputs_survive,
-    chosen_detector,
-    detector_option,
-    expand_images,
-    format_option,
-    json_option,
-    max_megapixels_option,
-    output_option,
-    overwrite_option,
-    pictures_option,
-    print_json,
-    report_failures,
-)
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from ..detector.detector import DeepDetect
-    from ..detector.point_detector import PointDetector
-    from ..features.selection import SelectionOptions
-    from ._records import OutputRecords
-
-NUMBERS = ("width", "height", "keypoints", "density", "seconds")
-"""What is told of each image, and recorded."""
-
-POINT_PICTURES, PICTURES = ("keypoints",), ("keypoints", "dense", "heatmap")
+from .._shared.errors import DeepDetectError, MissingExtraError, OptionError, WeightsError
+from .._shared.opencv import import_opencv
+from .._shared.progress import progress
+from .._shared.records import Outputs, plain
+from ..detector.detector import DeepDetect, find_keypoints
+from ..detector.point_detector import PointDetector
+from ..features.selection import SelectionOptions, select_keypoints
+from ..io.image import load_image
+from ..io.masks import load_mask
+from ..io.tables import save_keypoints
+from ..viz.draw import draw_best_keypoints, draw_dense_keypoints, draw_logits, save_picture
+from . import _options as cli
+from ._detection import NETWORK, POINTS, SELECTION, Detector, chosen_detector
 
 
-@generated_command(SELECTION, POINTS, DETECTOR, short_help="Keypoints of photographs.")
-@click.argument("images", type=PATH, nargs=-1, required=True)
-@output_option
-@detector_option("network")
-@click.option(
-    "--ignore",
-    type=PATH,
-    help="Mask image of the same size: no keypoints where it is bright.",
-)
-@format_option
-@pictures_option
-@overwrite_option
-@max_megapixels_option
-@json_option
+@cli.with_options(SELECTION, POINTS, NETWORK)
 def detect(
-    images: tuple[Path, ...],
-    output: Path,
-    kind: str,
-    ignore: Path | None,
-    file_format: str,
-    pictures: bool,
-    overwrite: bool,
-    as_json: bool,
+    images: cli.Images,
+    /,
+    *,
+    output: cli.Folder = Path("deepdetect-output"),
+    detector: Detector = "network",
+    ignore: Path | None = None,
+    file_format: cli.Format = "npz",
+    pictures: bool = True,
+    overwrite: cli.Overwrite = False,
+    as_json: cli.Json = False,
+    max_megapixels: cli.MaxMegapixels = 200,
     **values: Any,
-) -> None:
-    """Detect the keypoints of IMAGES (files or folders).
+) -> int:
+    """Detect the keypoints of images (files or folders).
 
     Writes for each image STEM.npz (or .csv) with the positions and scores, and the pictures
     STEM_keypoints.jpg (the best of all parts of the image, coloured by score), and of the network
@@ -79,140 +48,123 @@ def detect(
 
     Images that are done are skipped when the same command runs again, and done again with other
     options. What was made from other images of the same name, or by something else, is replaced
-    with --overwrite only. An image
-    that cannot be read does not stop the others: they are listed at the end, with exit code 1.
-    Where no image has any keypoint the exit code is 3.
+    with --overwrite only. An image that cannot be read does not stop the others: they are listed
+    at the end, with exit code 1. If no image has any keypoint the exit code is 3.
 
-    \b
-    deepdetect detect photo.jpg
-    deepdetect detect photos/ -o keypoints --detector points --spread grid
-    deepdetect detect photo.jpg --density 0.1 --format csv
+        deepdetect detect photo.jpg
+        deepdetect detect photos/ -o keypoints --detector points --spread grid
+        deepdetect detect photo.jpg --density 0.1 --format csv
+
+    Args:
+        ignore: Mask image of the same size: no keypoints where it is bright.
+        pictures: Write pictures, too.
     """
-    from .._shared.opencv import import_opencv
-    from .._shared.progress import progress
-    from ..io.masks import load_mask
-    from ._records import OutputRecords, file_digest
-
     import_opencv()  # what is missing is said before anything is written
-    paths = expand_images(images, output)
-    shown = (POINT_PICTURES if kind == "points" else PICTURES) if pictures else ()
-    outputs = {path: _outputs(path, output, file_format, shown) for path in paths}
-    written = [file for files in outputs.values() for file in files.values()]
-    check_inputs_survive(written, paths, "choose another folder with -o")
-    mask = load_mask(ignore) if ignore is not None else None
-    detector, selection = chosen_detector(kind, values)
-    settings = {
-        **detector.settings,
-        **({} if selection is None else vars(selection)),
-        "ignore": None if ignore is None else file_digest(ignore),
-        "version": __version__,
+    folder = cli.output_folder(output)
+    paths = cli.expand_images(images, folder)
+    drawn = ("keypoints", "dense", "heatmap") if detector == "network" else ("keypoints",)
+    outputs = {
+        path: {"file": folder / f"{path.stem}.{file_format}"}
+        | {name: folder / f"{path.stem}_{name}.jpg" for name in drawn if pictures}
+        for path in paths
     }
-    backend = getattr(detector, "runtime", None)
-    records = OutputRecords("detect", output, settings, overwrite)
-    for path, files in outputs.items():  # before any work
-        records.find(path, list(files.values()))
-    if records.changed:
-        names = sorted({name for changed in records.changed.values() for name in changed})
-        others = with_flags(
-            ", ".join(f"`{name}`" for name in names), click.get_current_context().command
-        )
-        count = len(records.changed)
-        whose = str(next(iter(records.changed))) if count == 1 else f"{count} images"
-        click.echo(f"replacing the results of {whose} with other options ({others})", err=True)
+    cli.check_inputs_survive([file for files in outputs.values() for file in files.values()], paths)
+    mask = None if ignore is None else load_mask(ignore)
+    given = {*values}
+    chosen, selection = chosen_detector(detector, values)
+    if detector == "network" and "max_keypoints" in given:
+        cli.note("these are the best pixels of the heat map: --detector points finds better points")
+    settings = plain(
+        chosen.settings
+        | vars(selection or SelectionOptions())
+        | {"ignore": mask, "version": __version__}
+    )
+    _check_and_say_what_is_replaced(outputs, settings, overwrite)
     results: list[dict[str, Any]] = []
-    failures = []
+    failures: list[str] = []
     with progress(len(paths), "detecting", "image", quiet=len(paths) == 1) as bar:
         for path, files in outputs.items():
             try:
-                results.append(_detect_one(path, detector, selection, mask, files, records))
+                results.append(
+                    _detect_one(path, files, chosen, selection, mask, settings, overwrite)
+                )
             except _Failure as failure:
                 failures.append(str(failure))
             except MemoryError:
                 failures.append(f"{path}: there is not enough memory for it: use a smaller image")
             bar.update(1)
     if as_json:
-        print_json({"backend": backend, "images": results, "failures": failures})
+        backend = getattr(chosen, "runtime", None)
+        cli.print_json({"backend": backend, "images": results, "failures": failures})
     else:
         for result in results:
             how = "already done" if result["skipped"] else f"{result['seconds']:.2f} s"
             count = result["keypoints"]
             found = f"{count:,} keypoint{'' if count == 1 else 's'}"
-            if kind == "network":  # else the number was asked for
+            if detector == "network":  # else the number was asked for
                 found += f", density {result['density']:.3f}"
-            click.echo(f"{result['image']}: {found}, {how} -> {result['file']}")
-    report_failures(failures, len(paths))
+            print(f"{result['image']}: {found}, {how} -> {result['file']}")
+    cli.report_failures(failures, len(paths))
     if not any(result["keypoints"] for result in results):
-        click.echo(
-            "no keypoint was found: the image is uniform, or the options leave none", err=True
-        )
-        raise click.exceptions.Exit(NOTHING_FOUND)
+        cli.note("no keypoint was found: the image is uniform, or the options leave none")
+        return cli.NOTHING_FOUND
+    return 0
 
 
 class _Failure(Exception):
     """One image cannot be worked on; whatever else is raised concerns all of them."""
 
 
-def _outputs(
-    path: Path, output: Path, file_format: str, pictures: Sequence[str]
-) -> dict[str, Path]:
-    """Return the files that are made of an image, by what they hold."""
-    files = {"file": output / f"{path.stem}.{file_format}"}
-    return files | {name: output / f"{path.stem}_{name}.jpg" for name in pictures}
+def _check_and_say_what_is_replaced(
+    outputs: dict[Path, dict[str, Path]], settings: dict[str, Any], overwrite: bool
+) -> None:
+    """Refuse outputs of other images; name the options in which earlier ones differ."""
+    changed, names = [], set()
+    for path, files in outputs.items():
+        Outputs([*files.values()], [path], overwrite=overwrite).find()
+        before = Outputs([files["file"]], [path], overwrite=overwrite).find()
+        if before is not None and before["settings"] != settings:
+            both = {**before["settings"], **settings}
+            names |= {n for n in both if before["settings"].get(n) != settings.get(n)}
+            changed.append(path)
+    if changed:
+        flags = ", ".join("--" + name.replace("_", "-") for name in sorted(names))
+        whose = str(changed[0]) if len(changed) == 1 else f"{len(changed)} images"
+        cli.note(f"replacing the results of {whose} with other options ({flags})")
 
 
 def _detect_one(
     path: Path,
+    files: dict[str, Path],
     detector: DeepDetect | PointDetector,
     selection: SelectionOptions | None,
     mask: np.ndarray | None,
-    files: dict[str, Path],
-    records: OutputRecords,
+    settings: dict[str, Any],
+    overwrite: bool,
 ) -> dict[str, Any]:
     """Detect, save and draw the keypoints of one image unless it is done; return its numbers."""
-    from .._shared.atomic import atomic_path
-    from .._shared.errors import DeepDetectError, MissingExtraError, WeightsError
-    from ..detector.detector import DeepDetect, find_keypoints
-    from ..features.selection import SelectionOptions, select_keypoints
-    from ..io.image import load_image
-    from ..io.tables import save_keypoints
-    from ..viz.draw import draw_best_keypoints, draw_dense_keypoints, draw_logits, save_picture
-
-    paths = list(files.values())
-    drawn = {name: file for name, file in files.items() if name != "file"}
-    shown = {"file": files["file"], "pictures": drawn}
+    shown = {"file": files["file"], "pictures": {n: files[n] for n in files if n != "file"}}
+    outputs = Outputs([*files.values()], [path], overwrite=overwrite)
+    done = outputs.find()  # another command may have done it meanwhile
+    if done is not None and done["settings"] == settings:
+        return {"image": path, **done["numbers"], **shown, "skipped": True}
+    before = Outputs([files["file"]], [path]).find() or {} if not overwrite else {}
     try:
-        # Another command may have done it meanwhile.
-        done = records.find(path, paths)
-        if done is not None and all(isinstance(done.get(n), int | float) for n in NUMBERS):
-            return {"image": path, **{n: done[n] for n in NUMBERS}, **shown, "skipped": True}
         started = time.perf_counter()
-        if drawn:
-            rgb = load_image(path)
-        if drawn and isinstance(detector, DeepDetect):  # the network is run once for both
+        rgb = load_image(path)
+        if "dense" in files and isinstance(detector, DeepDetect):  # the network is run once
             heatmap, logits = detector.heatmap_and_logits(rgb)
             keypoints = select_keypoints(
                 heatmap, selection or SelectionOptions(), logits, ignore=mask
             )
-        elif drawn:
-            keypoints = find_keypoints(detector, rgb, selection, mask)
         else:
-            # Nobody holds the image while keypoints are selected and written.
-            keypoints = find_keypoints(detector, load_image(path), selection, mask)
+            keypoints = find_keypoints(detector, rgb, selection, mask)
         seconds = time.perf_counter() - started
     except (MissingExtraError, WeightsError):  # concern all images
         raise
     except DeepDetectError as error:
         named = str(error) if str(path) in str(error) else f"{path}: {error}"
         raise _Failure(named) from error
-    records.begin(path, paths)
-    with contextlib.ExitStack() as whole:  # all of them appear, or none
-        made = {name: whole.enter_context(atomic_path(file)) for name, file in files.items()}
-        save_keypoints(keypoints, made["file"])
-        if drawn:
-            save_picture(draw_best_keypoints(rgb, keypoints), made["keypoints"])
-        if "dense" in drawn:
-            save_picture(draw_dense_keypoints(rgb, keypoints), made["dense"])
-            save_picture(draw_logits(logits), made["heatmap"])
     numbers = {
         "width": keypoints.image_size[0],
         "height": keypoints.image_size[1],
@@ -220,5 +172,21 @@ def _detect_one(
         "density": round(keypoints.density, 6),
         "seconds": round(seconds, 4),
     }
-    records.finish(path, paths, numbers)
+    with outputs.writing() as noted, cli.whole(files) as made:
+        save_keypoints(keypoints, made["file"])
+        if "keypoints" in made:
+            save_picture(draw_best_keypoints(rgb, keypoints), made["keypoints"])
+        if "dense" in made:
+            save_picture(draw_dense_keypoints(rgb, keypoints), made["dense"])
+            save_picture(draw_logits(logits), made["heatmap"])
+        noted |= {
+            "numbers": numbers,
+            "settings": settings,
+            "files": [f.name for f in outputs.paths],
+        }
+    for name in before.get("files", ()):  # of other options
+        old = files["file"].with_name(name)
+        with contextlib.suppress(OptionError):  # it has been changed since
+            if old not in outputs.paths and Outputs([old], [path]).find():
+                old.unlink()
     return {"image": path, **numbers, **shown, "skipped": False}

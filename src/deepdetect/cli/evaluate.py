@@ -5,72 +5,39 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any
 
-import click
+from cyclopts import Parameter
 
-from ._generated import generated_command
-from ._options import DETECTOR, PATH, json_option, make_detector, print_json
-
-if TYPE_CHECKING:
-    from ..evaluation.weights import Evaluation, OxfordScore
+from .._shared.errors import BatchError, OptionError
+from ..datasets.oxford import load_oxford
+from ..detector.detector import DeepDetect
+from ..detector.heatmap import HeatmapOptions
+from ..evaluation.options import PAPER_RESOLUTION_PX
+from ..evaluation.protocols.masks import LabelDetector
+from ..evaluation.weights import Evaluation, OxfordScore, evaluate_oxford
+from ..evaluation.weights import evaluate as run
+from ._detection import NETWORK
+from ._options import Json, print_json, with_options
 
 WIDTH = 14
 
 
-@generated_command(DETECTOR, short_help="How good weights are.")
-@click.argument("samples", type=PATH)
-@click.option(
-    "--compare",
-    multiple=True,
-    metavar="NAME|FILE",
-    help="Evaluate these weights too, beside the first; may be repeated.",
-)
-@click.option(
-    "--oxford",
-    type=PATH,
-    metavar="FOLDER",
-    help="Measure density, repeatability and correct matches on the eight Oxford scenes too.",
-)
-@click.option(
-    "--labels",
-    is_flag=True,
-    help="With --oxford: measure the labels too, which weights without error would give.",
-)
-@click.option(
-    "--foreground",
-    type=PATH,
-    metavar="FOLDER",
-    help="Measure the fraction of the keypoints on the foreground of photographs NAME.jpg, as "
-    "NAME_mask.png has it, too.",
-)
-@click.option(
-    "--equal-density",
-    is_flag=True,
-    help="With --oxford and --foreground: of each image take as many keypoints as its label marks, "
-    "not those above 0.5, so that weights which mark more have no advantage.",
-)
-@click.option(
-    "--scale",
-    "scales",
-    type=float,
-    multiple=True,
-    metavar="FACTOR",
-    help="Score the images scaled by this factor too, on labels of their own; may be repeated.",
-)
-@json_option
+@with_options(NETWORK)
 def evaluate(
-    samples: Path,
-    compare: tuple[str, ...],
-    oxford: Path | None,
-    labels: bool,
-    foreground: Path | None,
-    equal_density: bool,
-    scales: tuple[float, ...],
-    as_json: bool,
+    samples: Annotated[Path, Parameter(help="Folder of image_NAME.png with mask_image_NAME.png.")],
+    /,
+    *,
+    compare: list[str] | None = None,
+    oxford: Path | None = None,
+    labels: bool = False,
+    foreground: Path | None = None,
+    equal_density: bool = False,
+    scale: list[float] | None = None,
+    as_json: Json = False,
     **values: Any,
 ) -> None:
-    """Score the network on a folder SAMPLES of image_NAME.png with mask_image_NAME.png.
+    """Score the network on a folder of images with known masks.
 
     Prints the mean binary cross-entropy (BCE) and intersection over union (IoU), the expected
     calibration error over all pixels, and the density of keypoints at 0.5 and of the masks,
@@ -78,37 +45,39 @@ def evaluate(
     protocol gives: images squashed to 480x480, FLANN (mean of three seeds, of 64 where fewer than
     1,000 matches are correct), ratio 0.99, correct under 1 px; with --labels also what the
     labels give there, and with --equal-density at the labels' number of keypoints. With --scale,
-    whether the quality holds on larger and smaller images; SAMPLES may then be photographs without
+    whether the quality holds on larger and smaller images; SAMPLES may then be images without
     masks.
 
     Samples that cannot be read, and images of --oxford and --foreground that cannot be measured,
     are listed at the end, with exit code 1, and are in no score.
 
-    \b
-    deepdetect evaluate samples/
-    deepdetect evaluate samples/ --weights run/deepdetect.onnx --compare other.onnx
-    deepdetect evaluate samples/ --scale 0.5 --scale 1 --scale 2
-    deepdetect evaluate photos/ --scale 1
-    deepdetect evaluate samples/ --oxford oxford/ --equal-density --compare other.onnx
-    """
-    from .._shared.errors import OptionError
-    from ..datasets.oxford import load_oxford
-    from ..detector.heatmap import HeatmapOptions
-    from ..evaluation.options import PAPER_RESOLUTION_PX
-    from ..evaluation.protocols.masks import LabelDetector
-    from ..evaluation.weights import evaluate as run
-    from ..evaluation.weights import evaluate_oxford
+        deepdetect evaluate samples/
+        deepdetect evaluate samples/ --weights run/deepdetect.onnx --compare other.onnx
+        deepdetect evaluate samples/ --scale 0.5 --scale 1 --scale 2
+        deepdetect evaluate photos/ --scale 1
+        deepdetect evaluate samples/ --oxford oxford/ --equal-density --compare other.onnx
 
+    Args:
+        compare: Evaluate these weights too, beside the first; may be repeated.
+        oxford: Folder of the eight Oxford scenes: measure density, repeatability and correct
+            matches on them, too.
+        labels: With --oxford: measure the labels too, which weights without error would give.
+        foreground: Folder of images NAME.jpg and NAME_mask.png: measure the fraction of the
+            keypoints on the foreground, too.
+        equal_density: With --oxford and --foreground: of each image take as many keypoints as its
+            label marks, not those above 0.5, so that weights which mark more have no advantage.
+        scale: Score the images scaled by this factor too, on labels of their own; may be repeated.
+    """
     if labels and oxford is None:
         raise OptionError("--labels measures on the Oxford scenes: name their folder with --oxford")
     scenes = load_oxford(oxford) if oxford is not None else []  # before hours of work
-    weights = [values["weights"] or "default", *compare]
-    detectors = [make_detector({**values, "weights": path}) for path in weights]
+    weights = [values.pop("weights", "default"), *(compare or ())]
+    detectors = [DeepDetect(path, **values) for path in weights]
     found = [
         run(
             detector,
             samples=samples,
-            scales=scales,
+            scales=tuple(scale or ()),
             oxford=oxford,
             foreground=foreground,
             equal_density=equal_density,
@@ -132,24 +101,22 @@ def evaluate(
         print_json({**results[0], **further})
     else:
         _print_scores(names, found)
-        if scales:
+        if scale:
             if found[0].masks:
-                click.echo()
+                print()
             _print_scales(names, found)
         if on_oxford:
-            click.echo()
+            print()
             columns = [*names, "labels"] if labels else names
             _print_oxford(columns, on_oxford, equal_density)
         if foreground is not None:
-            click.echo()
+            print()
             _print_foreground(names, found)
     _report_failures(found, on_oxford)
 
 
 def _report_failures(found: Sequence[Evaluation], on_oxford: Sequence[OxfordScore]) -> None:
     """Raise a BatchError when something is in no score; what all weights lack is listed once."""
-    from .._shared.errors import BatchError
-
     samples = found[0].failures
     lists = [each.failures for each in on_oxford]
     lists += [each.foreground.failures for each in found if each.foreground is not None]
@@ -200,7 +167,7 @@ def _short_names(detectors: Sequence[Any]) -> list[str]:
 
 
 def _row(title: str, values: Sequence[str]) -> None:
-    click.echo(f"{title:<24}" + "".join(f"{value:>{2 * WIDTH + 2}}" for value in values))
+    print(f"{title:<24}" + "".join(f"{value:>{2 * WIDTH + 2}}" for value in values))
 
 
 def _print_scores(names: Sequence[str], found: Sequence[Evaluation]) -> None:
@@ -209,10 +176,10 @@ def _print_scores(names: Sequence[str], found: Sequence[Evaluation]) -> None:
     if len(names) == 1:
         titles = {"images": 8, "BCE": 9, "IoU": 8, "calibration error": 19, "density": 9}
         head = "".join(f"{title:>{width}}" for title, width in titles.items())
-        click.echo(f"{'visibility':<12}{head}  labels'")
+        print(f"{'visibility':<12}{head}  labels'")
         for name, score in found[0].masks.items():
             pixels = found[0].calibration[name]
-            click.echo(
+            print(
                 f"{name:<12}{score.images:>8}{score.loss:>9.4f}{score.iou:>8.3f}"
                 f"{pixels.expected_error:>19.4f}{pixels.density:>9.4f}{pixels.label_density:>9.4f}"
             )

@@ -2,37 +2,299 @@
 
 from __future__ import annotations
 
-from typing import Any
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
 
-import click
+from cyclopts import App, Parameter
 
-from .._shared.errors import BatchError, DeepDetectError
-from ._generated import with_flags
-from .export_matches import EXPORTS_OF_MATCHES
-from .export_onnx import export_onnx
+from .._shared.errors import BatchError, MissingFileError, OptionError
+from .._shared.records import Outputs, check_not_made
+from ..detector.network.onnx_variants import OnnxOptions, write_onnx
+from ..detector.point_detector import PointDetector
+from ..detector.pretrained import resolve_weights
+from ..geometry.camera import Camera
+from ..interchange import (
+    Collection,
+    describe_collection,
+    match_folder,
+    read_collection,
+    write_colmap,
+    write_colmap_text,
+    write_hloc,
+)
+from ..interchange.collection import check_names, check_upright
+from ..io.image import find_images
+from ..sfm.colmap import import_pycolmap
+from ..sfm.intrinsics import initial_intrinsics, known_cameras
+from . import _options as cli
 
-EXPORTS: tuple[click.Command, ...] = (export_onnx, *EXPORTS_OF_MATCHES)
-"""To add a kind of file, write its command in a module beside this one, and add it here."""
+export = App("export", help="Write files for other programs.")
+
+SAVED = cli.From(
+    read_collection,
+    "matches images",
+    common="matches images",
+    types={"matches": Path | None, "images": Path | None},
+)
+FOLDER = cli.From(
+    match_folder,
+    "pairs sequential",
+    common="pairs sequential",
+    types={"pairs": Path | None},
+)
+MAX_KEYPOINTS = cli.From(PointDetector, "max_keypoints", common="max_keypoints")
+Sources = Annotated[
+    list[Path],
+    Parameter(
+        help="File of `deepdetect extract` (with --matches), npz files of `detect` and `match` "
+        "(with --images), or a folder of images, which are matched first."
+    ),
+]
 
 
-class Exports(click.Group):
-    """A group whose errors name the options of the command that was called."""
+@export.command
+@cli.with_options(SAVED, FOLDER, MAX_KEYPOINTS)
+def colmap(
+    sources: Sources,
+    /,
+    *,
+    output: cli.Output = Path("database.db"),
+    verify: bool = True,
+    calibration: Path | None = None,
+    focal_px: Annotated[float | None, Parameter("--focal")] = None,
+    single_camera: Annotated[
+        bool | None, Parameter(negative="--camera-each", group=cli.MORE)
+    ] = None,
+    workers: cli.Workers = None,
+    overwrite: cli.Overwrite = False,
+    as_json: cli.Json = False,
+    max_megapixels: cli.MaxMegapixels = 200,
+    **values: Any,
+) -> None:
+    """Write keypoints, descriptors and matches as a database of COLMAP 4.
 
-    def invoke(self, context: click.Context) -> Any:
-        try:
-            return super().invoke(context)
-        except DeepDetectError as error:
-            command = self.get_command(context, context.invoked_subcommand or "")
-            error.args = (with_flags(str(error), command),)
-            if isinstance(error, BatchError):
-                error.failures = tuple(with_flags(each, command) for each in error.failures)
-            raise
+    With a folder as -o, the text files of colmap feature_importer and matches_importer are written.
+
+        deepdetect export colmap photos/ -o database.db
+        deepdetect export colmap features.h5 --matches matches.h5 --images photos/ -o database.db
+        deepdetect export colmap out/*.npz --images photos/ -o database.db
+        colmap mapper --database_path database.db --image_path photos/ --output_path sparse/
+
+    Args:
+        output: Database (.db), or a folder for text files.
+        verify: Estimate two-view geometries, which COLMAP's mapper needs.
+        calibration: JSON file of the camera (docs/reconstruction.md), taken to be exact.
+        focal_px: Focal length in pixels, roughly.  [default: of EXIF, or a guess]
+        single_camera: Whether images of one size share a camera.  [default: where the focal
+            lengths are equal]
+    """
+    cameras = {"calibration": calibration, "focal_px": focal_px, "single_camera": single_camera}
+    if output.suffix.lower() != ".db":
+        if output.suffix:
+            raise OptionError(f"{output} must end in .db, or be the name of a folder")
+        for name in (name for name in cameras if cameras[name] is not None):
+            raise OptionError(f"text files hold no cameras: leave out `{name}`, or write a .db")
+        marker = _new_folder(output, "matches.txt", overwrite)
+        _export(write_colmap_text, sources, output, marker, workers, overwrite, as_json, values)
+        return
+    import_pycolmap("a database of COLMAP")  # what is missing is said before the work
+    if calibration is not None and focal_px is not None:
+        raise OptionError("give --calibration or --focal, not both")
+    if focal_px is not None:
+        Camera((1, 1), focal_px)
+    if calibration is not None and not calibration.is_file():
+        raise MissingFileError(f"there is no file {calibration}: check the path")
+
+    def write(collection: Collection, path: Path) -> tuple[Path, ...]:
+        sizes = {name: points.image_size for name, points in collection.keypoints.items()}
+        known = {} if calibration is None else known_cameras(calibration, sizes)
+        for name in sorted(sizes.keys() - known.keys()) if calibration is not None else ():
+            raise OptionError(
+                f"{name} is {sizes[name][0]}x{sizes[name][1]} pixels, and the calibration is for "
+                "another size: leave the image out"
+            )
+        folder = collection.folder or Path("no-such-folder")
+        intrinsics = initial_intrinsics(folder, sizes, known, focal_px, single_camera)
+        return write_colmap(collection, path, verify=verify, intrinsics=intrinsics)
+
+    _export(write, sources, output, output, workers, overwrite, as_json, values, describe=False)
 
 
-@click.group(cls=Exports, short_help="Files for other programs.")
-def export() -> None:
-    """Write files for other programs."""
+@export.command
+@cli.with_options(SAVED, FOLDER, MAX_KEYPOINTS)
+def hloc(
+    sources: Sources,
+    /,
+    *,
+    output: cli.Output = Path("hloc-files"),
+    descriptors: bool = True,
+    workers: cli.Workers = None,
+    overwrite: cli.Overwrite = False,
+    as_json: cli.Json = False,
+    max_megapixels: cli.MaxMegapixels = 200,
+    **values: Any,
+) -> None:
+    """Write features.h5, matches.h5 and pairs.txt, the arguments of hloc.reconstruction.main.
+
+    Numbers are float32 and int32.
+
+        deepdetect export hloc photos/ -o hloc/
+        deepdetect export hloc out/*.npz --images photos/ -o hloc/
+
+    Args:
+        output: Folder for the files.
+        descriptors: Describe keypoints that have no descriptors (needs --images).
+    """
+    marker = _new_folder(cli.output_folder(output), "features.h5", overwrite)
+    if sources[0].is_dir():
+        check_upright(find_images(sources[0]))
+    _export(
+        write_hloc,
+        *(sources, output, marker, workers, overwrite, as_json, values),
+        describe=descriptors,
+    )
 
 
-for command in EXPORTS:
-    export.add_command(command)
+def _new_folder(folder: Path, marker: str, overwrite: bool) -> Path:
+    """Return the file by which it is known whose a folder is; refuse one that holds other files."""
+    known = overwrite or (folder / marker).exists() or not folder.is_dir()
+    if not known and any(not path.name.startswith(".") for path in folder.iterdir()):
+        raise OptionError(f"{folder} is not empty: choose another folder with -o, or --overwrite")
+    return folder / marker
+
+
+def _export(
+    write: Callable[[Collection, Path], tuple[Path, ...]],
+    sources: list[Path],
+    output: Path,
+    marker: Path,
+    workers: int | None,
+    overwrite: bool,
+    as_json: bool,
+    values: dict[str, Any],
+    describe: bool = True,
+) -> None:
+    """Read or make a collection, and write it.
+
+    Args:
+        write: writes a collection to the output, and returns the files.
+        sources: files, or a folder of images.
+        output: file or folder.
+        marker: file by which it is known whose the output is.
+        workers, overwrite, as_json: as of the commands.
+        values: of `SAVED`, `FOLDER` and `MAX_KEYPOINTS`.
+        describe: whether keypoints without descriptors are described.
+    """
+    inputs = [*sources, *(values[name] for name in ("matches", "pairs") if name in values)]
+    cli.check_inputs_survive([marker], inputs)
+    of_folder = len(sources) == 1 and sources[0].is_dir()
+    saved, points = SAVED.take(values), MAX_KEYPOINTS.take(values)
+    for name in saved if of_folder else (*points, *values):
+        what = "saved files" if of_folder else "a folder of images"
+        raise OptionError(f"`{name}` is for {what}: leave it out")
+    if of_folder:
+        paths = find_images(sources[0])
+        check_not_made(sources[0], paths)
+        if marker != output:
+            check_names(path.relative_to(sources[0]).as_posix() for path in paths)
+    with cli.writing(Outputs([marker], inputs, {"command": marker.name}, overwrite=overwrite)):
+        if of_folder:
+            detector = PointDetector(**points)
+            collection = match_folder(sources[0], detector, workers=workers, quiet=False, **values)
+        else:
+            collection = read_collection(sources, **saved)
+        if describe:
+            collection = describe_collection(collection, quiet=False)
+        files = write(collection, output)
+    keypoints = sum(len(points) for points in collection.keypoints.values())
+    matches = sum(len(found) for found in collection.matches.values())
+    cli.print_result(
+        as_json,
+        {
+            "images": len(collection.keypoints),
+            "keypoints": keypoints,
+            "pairs": len(collection.matches),
+            "matches": matches,
+            "files": files,
+            "failures": collection.failures,
+        },
+        [
+            ("images", f"{len(collection.keypoints):,} with {keypoints:,} keypoints"),
+            ("pairs", f"{len(collection.matches):,} with {matches:,} matches"),
+            ("written", str(output) if len(files) == 1 else f"{len(files)} files in {output}"),
+        ],
+    )
+    if count := len(collection.failures):
+        raise BatchError(
+            f"{count} of the images and pairs failed, the others are in {output}",
+            collection.failures,
+        )
+
+
+def size_of(_: object, tokens: Any) -> tuple[int, int] | None:
+    """Read height and width, as 480x640."""
+    match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", tokens[0].value)
+    if match is None:
+        raise ValueError(f"{tokens[0].value!r} is no height and width, as 480x640")
+    return int(match[1]), int(match[2])
+
+
+@export.command
+@cli.with_options(
+    cli.From(
+        OnnxOptions,
+        common="size precision",
+        types={
+            "size": Annotated[
+                tuple[int, int] | None, Parameter(converter=size_of, n_tokens=1, accepts_keys=False)
+            ]
+        },
+        defaults={"size": "any"},
+    )
+)
+def onnx(
+    weights: str = "default",
+    /,
+    *,
+    output: cli.Output,
+    calibration: list[Path] | None = None,
+    licence: str | None = None,
+    as_json: cli.Json = False,
+    **values: Any,
+) -> None:
+    """Write weights as an ONNX file, for ONNX Runtime, OpenVINO, OpenCV and others.
+
+    WEIGHTS are default, dense, free, an ONNX file that this package has written in fp32 for any
+    size, or a .safetensors file, which needs torch. Input `image`: RGB from 0 to 1; outputs
+    `probability` and `logits` for each pixel, and the best `keypoints` with `keypoint_logits`.
+    docs/other-programs.md says which file is for which runtime.
+
+        deepdetect export onnx -o deepdetect.onnx
+        deepdetect export onnx dense -o dense-480x640.onnx --size 480x640 --max-keypoints 0
+        deepdetect export onnx run/best.safetensors -o half.onnx --precision fp16
+        deepdetect export onnx -o maps.onnx --max-keypoints 0
+        deepdetect export onnx -o small.onnx --precision int8 --calibration photos/
+
+    Args:
+        weights: Name or file of the weights.
+        output: The .onnx file, or a folder for deepdetect.onnx.
+        calibration: Images or folders for int8, like those that it will be used on.
+        licence: What the file says of the licence of the weights.
+    """
+    file = cli.output_file(output, "deepdetect.onnx")
+    options = OnnxOptions(**values)
+    images = [
+        image
+        for path in calibration or ()
+        for image in (find_images(path) if path.is_dir() else [path])
+    ]
+    cli.check_inputs_survive([file], [resolve_weights(weights), *images])
+    metadata = write_onnx(weights, file, options, calibration=images, licence=licence)
+    size = file.stat().st_size
+    cli.print_result(
+        as_json,
+        {"file": file, "bytes": size, "metadata": metadata},
+        [("written", f"{file}, {size / 1e6:.2f} MB"), *metadata.items()],
+    )

@@ -1,79 +1,52 @@
-"""`deepdetect extract`: features of a collection of photographs."""
+"""`deepdetect extract`: features of a collection of images."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import click
+from cyclopts import Parameter
 
-from ._generated import generated_command
-from ._options import (
-    DETECTOR,
-    PATH,
-    POINTS,
-    SELECTION,
-    chosen_detector,
-    detector_option,
-    engine_option,
-    json_option,
-    max_megapixels_option,
-    overwrite_option,
-    print_json,
-    processes_option,
-)
+from ..batch.extraction import extract_features
+from . import _options as cli
+from ._detection import NETWORK, POINTS, SELECTION, Detector, chosen_detector
 
 
-@generated_command(
-    SELECTION, POINTS, DETECTOR, short_help="Features of a collection of photographs."
-)
-@click.argument("folder", type=PATH)
-@click.option(
-    "-o",
-    "--output",
-    type=PATH,
-    default=Path("features.h5"),
-    show_default=True,
-    help="File for the features.",
-)
-@detector_option("points")
-@max_megapixels_option
-@engine_option
-@processes_option
-@overwrite_option
-@json_option
+@cli.with_options(SELECTION, POINTS, NETWORK)
 def extract(
-    folder: Path,
-    output: Path,
-    kind: str,
-    engine: str,
-    workers: int | None,
-    overwrite: bool,
-    as_json: bool,
+    folder: Annotated[Path, Parameter(help="Folder of the images.")],
+    /,
+    *,
+    output: cli.Output = Path("features.h5"),
+    detector: Detector = "points",
+    engine: cli.Engine = "processes",
+    workers: cli.Workers = None,
+    overwrite: cli.Overwrite = False,
+    as_json: cli.Json = False,
+    max_megapixels: cli.MaxMegapixels = 200,
     **values: Any,
 ) -> None:
-    """Extract the keypoints and RootSIFT descriptors of all images below FOLDER.
+    """Extract the keypoints and RootSIFT descriptors of all images below a folder.
 
     Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. When it is
     interrupted or killed, the same command goes on; new and changed images are added later, and
-    the features of images that are gone are removed.
-    An image that cannot be read does not stop the others: they are listed at the end, with exit
-    code 1.
+    the features of images that are gone are removed. An image that cannot be read does not stop
+    the others: they are listed at the end, with exit code 1.
 
-    \b
-    deepdetect extract photos/ -o features.h5
-    deepdetect extract photos/ -o features.h5 --engine ray --workers 64
-    deepdetect match-many features.h5 --pairs pairs.txt
+        deepdetect extract photos/ -o features.h5
+        deepdetect extract photos/ -o features.h5 --engine ray --workers 64
+        deepdetect match-many features.h5 --pairs pairs.txt
+
+    Args:
+        output: File for the features, or a folder for it.
     """
-    from ..batch.extraction import extract_features
-    from ._records import check_none_made
-
-    check_none_made(folder, output)
-    detector, selection = chosen_detector(kind, values, threads=1)  # one a process
+    file = cli.output_file(output, "features.h5")
+    cli.check_folder_not_made(folder, file)
+    chosen, selection = chosen_detector(detector, values, threads=1)  # one a process
     report = extract_features(
         folder,
-        output,
-        detector,
+        file,
+        chosen,
         selection=selection,
         engine=engine,
         workers=workers,
@@ -81,7 +54,7 @@ def extract(
         quiet=False,
     )
     if as_json:
-        print_json(
+        cli.print_json(
             {
                 "path": report.path,
                 "images": list(report.counts),
@@ -91,8 +64,8 @@ def extract(
             }
         )
     else:
-        click.echo(
+        print(
             f"{len(report.counts)} images with {sum(report.counts.values()):,} keypoints, "
-            f"{report.skipped} already done" + (f" -> {output}" if output.exists() else "")
+            f"{report.skipped} already done" + (f" -> {file}" if file.exists() else "")
         )
     report.check()

@@ -1,152 +1,130 @@
-"""`deepdetect match`: matches between two photographs."""
+"""`deepdetect match`: matches between two images."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
-import click
+import numpy as np
 
-from ._generated import FieldOptions, generated_command, given_only
-from ._options import (
-    DETECTOR,
-    NOTHING_FOUND,
-    PATH,
-    POINTS,
-    SELECTED,
-    SELECTION,
-    check_inputs_survive,
-    chosen_detector,
-    detector_option,
-    format_option,
-    json_option,
-    max_megapixels_option,
-    output_option,
-    overwrite_option,
-    pictures_option,
-    print_result,
-    seconds_rows,
+from .._shared.errors import OptionError
+from .._shared.progress import stage_progress
+from .._shared.records import Outputs
+from ..detector.detector import DeepDetect
+from ..features.matchers.matching import MATCHERS
+from ..features.matches import Matches
+from ..features.sift import DESCRIPTORS
+from ..geometry import GeometryOptions
+from ..geometry.estimation import ESTIMATORS, MODEL_NAMES
+from ..io.image import load_image
+from ..io.tables import save_matches
+from ..matching.options import (
+    PUBLISHED_MATCHING,
+    TWO_VIEW_MODELS,
+    UNGUIDED_ONLY,
+    MatchingOptions,
+)
+from ..matching.pipeline import match_images
+from ..viz.draw import add_caption, save_picture
+from . import _options as cli
+from ._detection import NETWORK, POINTS, SELECTION, Detector, chosen_detector
+
+PAIR = cli.From(
+    match_images,
+    "guided_matching model mutual seed",
+    common="guided_matching model mutual",
+    flags={"guided_matching": "--guided-matching/--no-guided-matching --unguided"},
+    types={"model": Literal[MODEL_NAMES]},
+)
+MATCHING = cli.From(
+    MatchingOptions,
+    "two_view_model descriptor keypoint_size angle matcher ratio",
+    common="ratio",
+    types={
+        "two_view_model": Literal[TWO_VIEW_MODELS],
+        "descriptor": Literal[tuple(DESCRIPTORS)],
+        "matcher": Literal[tuple(name for name in MATCHERS if name != "hamming")],
+    },
+)
+GEOMETRY = cli.From(
+    GeometryOptions,
+    "estimator inlier_threshold confidence iterations",
+    types={"estimator": Literal[ESTIMATORS]},
 )
 
-if TYPE_CHECKING:
-    from ..features.matches import Matches
 
-DETECTED = (*DETECTOR.names, *POINTS.names, "max_keypoints")
-MATCHING = FieldOptions(
-    "matching.options:MatchingOptions",
-    skip=("geometry",),
-)
-MATCH = FieldOptions(
-    "matching.pipeline:match_images",
-    names=("guided_matching", "model", "mutual", "seed"),
-    flags={"guided_matching": "--guided/--unguided"},
-)
-GEOMETRY = FieldOptions(
-    "geometry.estimation:GeometryOptions",
-    names=("estimator", "inlier_threshold", "confidence", "iterations"),
-)
-
-
-@generated_command(
-    SELECTION,
-    POINTS,
-    MATCH,
-    MATCHING,
-    GEOMETRY,
-    DETECTOR,
-    short_help="Matches between two photographs.",
-)
-@click.argument("image0", type=PATH)
-@click.argument("image1", type=PATH)
-@output_option
-@detector_option("network")
-@click.option(
-    "--preset",
-    type=click.Choice(["default", "published"]),
-    default="default",
-    show_default=True,
-    help="Options to start from: default, or published (exactly the paper's code).",
-)
-@click.option(
-    "--homography", type=PATH, help="Text file of a known 3x3 homography to evaluate matches by."
-)
-@click.option("--camera0", type=PATH, help="Text file of the 3x3 camera matrix, for essential.")
-@click.option("--camera1", type=PATH, help="The same of the second image.  [default: camera0]")
-@format_option
-@pictures_option
-@max_megapixels_option
-@overwrite_option
-@json_option
+@cli.with_options(PAIR, SELECTION, MATCHING, GEOMETRY, POINTS, NETWORK)
 def match(
-    image0: Path,
-    image1: Path,
-    output: Path,
-    kind: str,
-    preset: str,
-    homography: Path | None,
-    camera0: Path | None,
-    camera1: Path | None,
-    file_format: str,
-    pictures: bool,
-    overwrite: bool,
-    as_json: bool,
+    image0: cli.Image,
+    image1: cli.Image,
+    /,
+    *,
+    output: cli.Folder = Path("deepdetect-output"),
+    detector: Detector = "network",
+    preset: Literal["default", "published"] = "default",
+    homography: Path | None = None,
+    camera0: Path | None = None,
+    camera1: Path | None = None,
+    file_format: cli.Format = "npz",
+    pictures: bool = True,
+    overwrite: cli.Overwrite = False,
+    as_json: cli.Json = False,
+    max_megapixels: cli.MaxMegapixels = 200,
     **values: Any,
-) -> None:
-    """Match the keypoints of IMAGE0 and IMAGE1.
+) -> int:
+    """Match the keypoints of two images.
 
-    Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their scores,
-    the estimated geometry and which matches agree with it, and a picture of them. The options
+    Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their scores, the
+    estimated geometry and which matches agree with it, and a picture of them. The options
     --descriptor, --keypoint-size, --angle, --matcher and --ratio apply with --unguided.
 
     Ends with exit code 3 where there are no matches, as where no geometry between the images can
     be trusted; the file then holds none.
 
-    \b
-    deepdetect match left.jpg right.jpg
-    deepdetect match page1.jpg page2.jpg --model homography --mutual
-    deepdetect match left.jpg right.jpg --unguided --ratio 0.9 --mutual
-    deepdetect match a.png b.png --preset published --homography H1to2p
-    """
-    from .._shared.progress import stage_progress
-    from ..detector.detector import DeepDetect
-    from ..geometry import GeometryOptions
-    from ..io.image import load_image
-    from ..io.tables import save_matches
-    from ..matching.options import PUBLISHED_MATCHING, UNGUIDED_ONLY, MatchingOptions
-    from ..matching.pipeline import match_images
-    from ._records import claimed_outputs
+        deepdetect match left.jpg right.jpg
+        deepdetect match page1.jpg page2.jpg --model homography --mutual
+        deepdetect match left.jpg right.jpg --unguided --ratio 0.9 --mutual
+        deepdetect match a.png b.png --preset published --homography H1to2p
 
-    stem = f"{image0.stem}_{image1.stem}_matches"
-    file = output / f"{stem}.{file_format}"
-    picture = output / f"{stem}.jpg" if pictures else None
-    files = [path for path in (file, picture) if path is not None]
-    check_inputs_survive(files, [image0, image1], "choose another folder with -o")
+    Args:
+        preset: Options to start from: default, or published (exactly the paper's code).
+        homography: Text file of a known 3x3 homography to evaluate matches by.
+        camera0: Text file of the 3x3 camera matrix, for the model essential.
+        camera1: The same of the second image.  [default: camera0]
+        pictures: Write a picture, too.
+    """
+    stem = cli.output_folder(output) / f"{image0.stem}_{image1.stem}_matches"
+    files = {"file": stem.with_name(f"{stem.name}.{file_format}")}
+    files |= {"picture": stem.with_name(f"{stem.name}.jpg")} if pictures else {}
+    cli.check_inputs_survive(files.values(), [image0, image1])
     rgb0, rgb1 = load_image(image0), load_image(image1)
-    start, given = MatchingOptions(), given_only(values)
+    start = MatchingOptions()
     if preset == "published":
         start = PUBLISHED_MATCHING
-        given = {"resolution": 480, "guided_matching": False, "model": "none", **given}
-    for_detector = {name: given.pop(name, None) for name in (*DETECTED, *SELECTED)}
-    detector, selection = chosen_detector(kind, for_detector)
-    if preset == "published" and isinstance(detector, DeepDetect):
-        detector = detector.configured(replace(detector.heatmap_options, network_channels="bgr"))
+        values = {"resolution": 480, "guided_matching": False, "model": "none", **values}
+    chosen, selection = chosen_detector(detector, values)
+    if preset == "published" and isinstance(chosen, DeepDetect):
+        chosen = chosen.configured(replace(chosen.heatmap_options, network_channels="bgr"))
     matrices = {"homography": homography, "camera0": camera0, "camera1": camera1 or camera0}
-    geometry = {name: _read_matrix(path) for name, path in matrices.items() if path is not None}
-    geometry |= {name: given.pop(name) for name in GEOMETRY.names if name in given}
-    changes = {name: given.pop(name) for name in vars(start) if name in given}
+    geometry: dict[str, Any] = {
+        name: _read_matrix(path) for name, path in matrices.items() if path is not None
+    }
+    geometry |= GEOMETRY.take(values)
+    changes = MATCHING.take(values)
     options = replace(start, geometry=GeometryOptions(**geometry), **changes)
-    stages = GUIDED_STAGES if given.get("guided_matching", True) else UNGUIDED_STAGES
-    with claimed_outputs("match", [image0, image1], files, overwrite):
+    stages = GUIDED_STAGES if values.get("guided_matching", True) else UNGUIDED_STAGES
+    with cli.writing(Outputs([*files.values()], [image0, image1], overwrite=overwrite)):
         with stage_progress("matching", stages) as done:
             matches = match_images(
-                rgb0, rgb1, detector, selection=selection, options=options, progress=done, **given
+                rgb0, rgb1, chosen, selection=selection, options=options, progress=done, **values
             )
-        save_matches(matches, file)
-        if picture is not None:
-            _draw(rgb0, rgb1, matches, picture)
-    guide = matches.two_view_geometry
+        with cli.whole(files) as made:
+            save_matches(matches, made["file"])
+            if pictures:
+                _draw(rgb0, rgb1, matches, made["picture"])
+    inliers = int(matches.inliers.sum())
     numbers = {
         "image0": image0,
         "image1": image1,
@@ -155,59 +133,50 @@ def match(
         "density0": round(matches.keypoints0.density, 6),
         "density1": round(matches.keypoints1.density, 6),
         "matches": len(matches),
-        "inliers": int(matches.inliers.sum()),
+        "inliers": inliers,
         "model": matches.model,
         "matrix": None if matches.matrix is None else matches.matrix.tolist(),
         "guided": matches.guided,
         "success": matches.success,
         "two_view_geometry": _two_view_numbers(matches),
-        "backend": getattr(detector, "runtime", None),
+        "backend": getattr(chosen, "runtime", None),
         "seconds": {stage: round(value, 4) for stage, value in matches.seconds.items()},
-        "file": file,
-        "picture": picture,
+        "file": files["file"],
+        "picture": files.get("picture"),
     }
     if matches.guided and (unused := [name for name in UNGUIDED_ONLY if name in changes]):
-        words = " and ".join("--" + name.replace("_", "-") for name in unused)
-        verb = "applies" if len(unused) == 1 else "apply"
-        click.echo(f"{words} {verb} only to unguided matching: add --unguided", err=True)
-    print_result(
+        flags = " and ".join("--" + name.replace("_", "-") for name in unused)
+        cli.note(f"only unguided matching uses {flags}: add --unguided")
+    guide = matches.two_view_geometry
+    kind = "within the threshold of --homography" if homography else f"inliers ({matches.model})"
+    cli.print_result(
         as_json,
         numbers,
         [
             ("keypoints", f"{numbers['keypoints0']:,} and {numbers['keypoints1']:,}"),
             ("density", f"{numbers['density0']:.3f} and {numbers['density1']:.3f}"),
             ("matches", f"{len(matches):,}"),
-            (_inliers_label(matches.model, homography is not None), f"{numbers['inliers']:,}"),
+            (kind, f"{inliers:,}"),
             ("guided by", guide.model if guide and matches.guided else "nothing"),
-            *seconds_rows(matches.seconds),
-            ("written", ", ".join(str(path) for path in files)),
+            *cli.seconds_rows(matches.seconds),
+            ("written", ", ".join(map(str, files.values()))),
         ],
         f"{image0} and {image1}",
     )
     if not matches.success:
-        click.echo(
+        cli.note(
             "no geometry between these images can be trusted, so there are no matches: if they "
-            "show the same scene, --unguided matches by descriptors alone",
-            err=True,
+            "show the same scene, --unguided matches by descriptors alone"
         )
-        raise click.exceptions.Exit(NOTHING_FOUND)
-    if not len(matches):
-        click.echo(
-            "there are no matches: the images show too little, or the options leave none", err=True
-        )
-        raise click.exceptions.Exit(NOTHING_FOUND)
-    if as_json:
-        return
-    if matches.matrix is None and matches.model != "none":
-        click.echo(f"no {matches.model} could be estimated from these matches", err=True)
+    elif not len(matches):
+        cli.note("there are no matches: the images show too little, or the options leave none")
+    elif matches.matrix is None and matches.model != "none":
+        cli.note(f"no {matches.model} could be estimated from these matches")
+    return 0 if len(matches) and matches.success else cli.NOTHING_FOUND
 
 
 GUIDED_STAGES = ("keypoints", "guided matching", "geometry")
 UNGUIDED_STAGES = ("keypoints", "descriptors", "matching", "geometry")
-
-
-def _inliers_label(model: str, given: bool) -> str:
-    return "within the threshold of --homography" if given else f"inliers ({model})"
 
 
 def _two_view_numbers(matches: Matches) -> dict[str, Any] | None:
@@ -218,24 +187,16 @@ def _two_view_numbers(matches: Matches) -> dict[str, Any] | None:
     return {**numbers, "log10_nfa": found.log10_nfa if math.isfinite(found.log10_nfa) else None}
 
 
-def _draw(rgb0: Any, rgb1: Any, matches: Any, path: Path) -> None:
-    from ..viz.draw import add_caption, save_picture
-
+def _draw(rgb0: np.ndarray, rgb1: np.ndarray, matches: Matches, path: Path) -> None:
     picture = matches.draw(rgb0, rgb1, by_position=True)
     others = len(matches) - int(matches.inliers.sum())
-    caption = (
-        f"{len(matches):,} matches ({matches.model}), of equal colour where they belong together"
-    )
+    caption = f"{len(matches):,} matches ({matches.model}): matching points share a colour"
     if others:
         caption += f"; {others:,} that do not fit it: red"
     save_picture(add_caption(picture, caption), path)
 
 
-def _read_matrix(path: Path) -> Any:
-    import numpy as np
-
-    from .._shared.errors import OptionError
-
+def _read_matrix(path: Path) -> np.ndarray:
     try:
         return np.loadtxt(path, ndmin=2)
     except FileNotFoundError:

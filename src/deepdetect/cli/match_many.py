@@ -1,91 +1,75 @@
-"""`deepdetect match-many`: matches of many pairs of photographs."""
+"""`deepdetect match-many`: matches of many pairs of images."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-import click
+from cyclopts import Parameter
 
-from ._generated import FieldOptions, generated_command, given_only
-from ._options import (
-    PATH,
-    engine_option,
-    json_option,
-    overwrite_option,
-    print_json,
-    processes_option,
+from ..batch.pair_matching import PairMatchingOptions, match_pairs
+from ..features.matchers.matching import MATCHERS
+from . import _options as cli
+
+MATCHING = cli.From(
+    PairMatchingOptions,
+    common="ratio mutual verify",
+    types={
+        "matcher": Literal[tuple(name for name in MATCHERS if name != "hamming")],
+        "verify": Literal["none", "fundamental", "homography", "auto"],
+    },
 )
 
-MATCHING = FieldOptions("batch.pair_matching:PairMatchingOptions")
 
-
-@generated_command(MATCHING, short_help="Matches of many pairs of photographs.")
-@click.argument("features", type=PATH)
-@click.option(
-    "--pairs",
-    type=PATH,
-    required=True,
-    help="Text file with the names of two images on each line, as hloc writes it.",
-)
-@click.option(
-    "-o",
-    "--output",
-    type=PATH,
-    default=Path("matches.h5"),
-    show_default=True,
-    help="File for the matches.",
-)
-@engine_option
-@processes_option
-@overwrite_option
-@json_option
+@cli.with_options(MATCHING)
 def match_many(
-    features: Path,
+    features: Annotated[Path, Parameter(help="File of `deepdetect extract`, or of hloc.")],
+    /,
+    *,
     pairs: Path,
-    output: Path,
-    engine: str,
-    workers: int | None,
-    overwrite: bool,
-    as_json: bool,
+    output: cli.Output = Path("matches.h5"),
+    engine: cli.Engine = "processes",
+    workers: cli.Workers = None,
+    overwrite: cli.Overwrite = False,
+    as_json: cli.Json = False,
     **values: Any,
 ) -> None:
-    """Match the descriptors in FEATURES, a file of `deepdetect extract` or of hloc, pair by pair.
+    """Match the descriptors in a file of features, pair by pair.
 
     Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. When it is
     interrupted or killed, the same command goes on; new pairs are added later. Pairs of which
     an image has no features do not stop the others: they are listed at the end, with exit code 1.
 
-    \b
-    deepdetect match-many features.h5 --pairs pairs.txt -o matches.h5
-    deepdetect match-many features.h5 --pairs pairs.txt --verify fundamental
-    """
-    from ..batch.pair_matching import PairMatchingOptions, match_pairs
+        deepdetect match-many features.h5 --pairs pairs.txt -o matches.h5
+        deepdetect match-many features.h5 --pairs pairs.txt --verify fundamental
 
+    Args:
+        pairs: Text file with the names of two images on each line, as hloc writes it.
+        output: File for the matches, or a folder for it.
+    """
+    file = cli.output_file(output, "matches.h5")
     report = match_pairs(
         features,
         pairs,
-        output,
-        options=PairMatchingOptions(**given_only(values)),
+        file,
+        options=PairMatchingOptions(**values),
         engine=engine,
         workers=workers,
         overwrite=overwrite,
         quiet=False,
     )
-    total = sum(report.counts.values())
     if as_json:
-        matched = [{"pair": pair, "matches": count} for pair, count in report.counts.items()]
-        print_json(
+        cli.print_json(
             {
                 "path": report.path,
-                "matches": matched,
+                "matches": [{"pair": p, "matches": count} for p, count in report.counts.items()],
                 "skipped": report.skipped,
                 "failures": report.failures,
             }
         )
     else:
-        click.echo(
-            f"{len(report.counts)} pairs with {total:,} matches, {report.skipped} already done"
-            + (f" -> {output}" if output.exists() else "")
+        print(
+            f"{len(report.counts)} pairs with {sum(report.counts.values()):,} matches, "
+            f"{report.skipped} already done" + (f" -> {file}" if file.exists() else "")
         )
     report.check()

@@ -1,95 +1,74 @@
-"""`deepdetect register`: one photograph registered to another."""
+"""`deepdetect register`: one image registered to another."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-import click
+import numpy as np
 
-from ._generated import generated_command
-from ._options import (
-    DETECTOR,
-    PATH,
-    POINTS,
-    SELECTION,
-    check_inputs_survive,
-    chosen_detector,
-    detector_option,
-    json_option,
-    max_megapixels_option,
-    output_option,
-    overwrite_option,
-    print_result,
-)
+from .._shared.progress import stage_progress
+from .._shared.records import Outputs
+from ..matching.registration import register as register_images
+from ..viz.draw import save_picture
+from . import _options as cli
+from ._detection import NETWORK, POINTS, SELECTION, Detector, chosen_detector
 
 STAGES = ("keypoints", "guided matching", "geometry")
 
 
-@generated_command(SELECTION, POINTS, DETECTOR, short_help="One photograph registered to another.")
-@click.argument("image0", type=PATH)
-@click.argument("image1", type=PATH)
-@output_option
-@detector_option("network")
-@max_megapixels_option
-@overwrite_option
-@json_option
+@cli.with_options(SELECTION, POINTS, NETWORK)
 def register(
-    image0: Path,
-    image1: Path,
-    output: Path,
-    kind: str,
-    overwrite: bool,
-    as_json: bool,
+    image0: cli.Image,
+    image1: cli.Image,
+    /,
+    *,
+    output: cli.Folder = Path("deepdetect-output"),
+    detector: Detector = "network",
+    overwrite: cli.Overwrite = False,
+    as_json: cli.Json = False,
+    max_megapixels: cli.MaxMegapixels = 200,
     **values: Any,
 ) -> None:
-    """Register IMAGE1 to IMAGE0: for planes, and for photographs from one place.
+    """Register the second image to the first: for planes, and for images from one place.
 
     Writes STEM1_on_STEM0.png (the second image in the frame of the first), the same as
     _checkerboard.png and _difference.png with the first, and _homography.txt (3x3, from the
     first image to the second).
 
-    \b
-    deepdetect register map.jpg photo-of-the-map.jpg -o registered
+        deepdetect register map.jpg photo-of-the-map.jpg -o registered
     """
-    import numpy as np
-
-    from .._shared.atomic import atomic_path
-    from .._shared.progress import stage_progress
-    from ..matching.registration import register as register_images
-    from ..viz.draw import save_picture
-    from ._records import claimed_outputs
-
-    stem = f"{image1.stem}_on_{image0.stem}"
-    files = [output / f"{stem}{name}.png" for name in ("", "_checkerboard", "_difference")]
-    files.append(output / f"{stem}_homography.txt")
-    check_inputs_survive(files, [image0, image1], "choose another folder with -o")
-    detector, selection = chosen_detector(kind, values)
-    with claimed_outputs("register", [image0, image1], files, overwrite):
+    stem = cli.output_folder(output) / f"{image1.stem}_on_{image0.stem}"
+    endings = (".png", "_checkerboard.png", "_difference.png", "_homography.txt")
+    files = {ending: stem.with_name(stem.name + ending) for ending in endings}
+    cli.check_inputs_survive(files.values(), [image0, image1])
+    chosen, selection = chosen_detector(detector, values)
+    with cli.writing(Outputs([*files.values()], [image0, image1], overwrite=overwrite)):
         with stage_progress("registering", STAGES) as done:
-            found = register_images(image0, image1, detector, selection=selection, progress=done)
-        pictures = found.warped, found.checkerboard(), found.difference()
-        for path, picture in zip(files[:-1], pictures, strict=True):
-            save_picture(picture, path)
-        with atomic_path(files[-1]) as temporary:
-            np.savetxt(temporary, found.homography, fmt="%.12e")
-    numbers = {
-        "image0": image0,
-        "image1": image1,
-        "homography": found.homography.tolist(),
-        "matches": found.matches,
-        "overlap": round(float(found.valid.mean()), 4),
-        "correlation": round(found.zncc, 4),
-        "files": files,
-    }
-    print_result(
+            found = register_images(image0, image1, chosen, selection=selection, progress=done)
+        with cli.whole(files) as made:
+            for ending, picture in zip(
+                endings, (found.warped, found.checkerboard(), found.difference()), strict=False
+            ):
+                save_picture(picture, made[ending])
+            np.savetxt(made["_homography.txt"], found.homography, fmt="%.12e")
+    overlap = round(float(found.valid.mean()), 4)
+    cli.print_result(
         as_json,
-        numbers,
+        {
+            "image0": image0,
+            "image1": image1,
+            "homography": found.homography.tolist(),
+            "matches": found.matches,
+            "overlap": overlap,
+            "correlation": round(found.zncc, 4),
+            "files": [*files.values()],
+        },
         [
             ("matches", f"{found.matches:,}"),
-            ("overlap", f"{numbers['overlap']:.1%} of the first image"),
+            ("overlap", f"{overlap:.1%} of the first image"),
             ("correlation", f"{found.zncc:.3f} (median of small windows; 1 is the same)"),
-            ("written", ", ".join(str(path) for path in files)),
+            ("written", ", ".join(map(str, files.values()))),
         ],
         f"{image1} on {image0}",
     )

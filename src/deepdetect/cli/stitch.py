@@ -1,141 +1,95 @@
-"""`deepdetect stitch`: a panorama of overlapping photographs."""
+"""`deepdetect stitch`: a panorama of overlapping images."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import click
+from .._shared.errors import ImageError, OptionError, RegistrationError
+from .._shared.progress import stage_progress
+from .._shared.records import Outputs
+from ..detector.point_detector import PointDetector
+from ..io.image import load_image
+from ..matching.stitching import STAGES, Panorama, StitchingOptions
+from ..matching.stitching import stitch as stitch_images
+from ..viz.draw import picture_suffix, save_picture
+from . import _options as cli
+from ._detection import NETWORK, POINTS, Detector, chosen_detector
 
-from .._shared.errors import DeepDetectError, ImageError, OptionError, RegistrationError
-from ._generated import FieldOptions, generated_command, given_only
-from ._options import (
-    DETECTOR,
-    PATH,
-    POINTS,
-    check_inputs_survive,
-    chosen_detector,
-    detector_option,
-    json_option,
-    max_megapixels_option,
-    overwrite_option,
-    print_result,
-    report_failures,
-    seconds_rows,
-)
-
-if TYPE_CHECKING:
-    from ..matching.stitching import Panorama
-
-PANORAMA = FieldOptions(
-    "matching.stitching.panorama:stitch",
-    names=("projection", "crop", "seed"),
-)
-OPTIONS = FieldOptions(
-    "matching.stitching.panorama:StitchingOptions",
-    names=("scale", "max_canvas_megapixels", "registration_side"),
-)
-MAX_KEYPOINTS = FieldOptions(POINTS.path, names=("max_keypoints",))
+PANORAMA = cli.From(stitch_images, "projection crop seed", common="projection crop")
+OPTIONS = cli.From(StitchingOptions)
+MAX_KEYPOINTS = cli.From(PointDetector, "max_keypoints")
 
 
-@generated_command(
-    *(PANORAMA, OPTIONS, MAX_KEYPOINTS, POINTS, DETECTOR),
-    short_help="A panorama of overlapping images.",
-)
-@click.argument("images", type=PATH, nargs=-1, required=True)
-@click.option(
-    "-o",
-    "--output",
-    type=PATH,
-    default=Path("panorama.jpg"),
-    show_default=True,
-    help="The panorama's file.",
-)
-@click.option(
-    "--reference",
-    type=PATH,
-    help="The one of IMAGES that is not distorted, or in the middle of a curved panorama.  "
-    "[default: the one in the middle]",
-)
-@detector_option("network")
-@max_megapixels_option
-@overwrite_option
-@json_option
+@cli.with_options(PANORAMA, OPTIONS, MAX_KEYPOINTS, POINTS, NETWORK)
 def stitch(
-    images: tuple[Path, ...],
-    output: Path,
-    reference: Path | None,
-    kind: str,
-    overwrite: bool,
-    as_json: bool,
+    images: cli.Images,
+    /,
+    *,
+    output: cli.Output = Path("panorama.jpg"),
+    reference: Path | None = None,
+    detector: Detector = "network",
+    overwrite: cli.Overwrite = False,
+    as_json: cli.Json = False,
+    max_megapixels: cli.MaxMegapixels = 200,
     **values: Any,
 ) -> None:
-    """Make a panorama of IMAGES: overlapping ones from one place, or of a plane.
+    """Make a panorama of overlapping images from one place, or of a plane.
 
     They may be in any order. Those that overlap with no other are named. Those that cannot be read
     do not stop the others: they are listed at the end, with exit code 1. A flat panorama shows 100
     to 120 degrees at the most, a cylindrical or spherical one all around.
 
-    \b
-    deepdetect stitch left.jpg middle.jpg right.jpg -o panorama.jpg
-    deepdetect stitch *.jpg --projection cylindrical --crop -o panorama.jpg
-    """
-    from .._shared.progress import stage_progress
-    from ..matching.stitching import STAGES, StitchingOptions
-    from ..matching.stitching import stitch as stitch_images
-    from ..viz.draw import picture_suffix, save_picture
-    from ._records import claimed_outputs
+        deepdetect stitch left.jpg middle.jpg right.jpg -o panorama.jpg
+        deepdetect stitch *.jpg --projection cylindrical --crop -o panorama.jpg
 
-    # Before the work, which would else be lost.
-    picture_suffix(output)
-    check_inputs_survive([output], images, "give the panorama another name by -o")
+    Args:
+        output: The panorama's file, or a folder for it.
+        reference: The image that is not distorted, or in the middle of a curved panorama.
+            [default: the one in the middle]
+    """
+    file = cli.output_file(output, "panorama.jpg")
+    picture_suffix(file)  # before the work, which would else be lost
+    cli.check_inputs_survive([file], images)
     if reference is not None and reference not in images:
-        raise OptionError(f"--reference {reference} must be one of the photographs: name it there")
-    if kind == "network" and values["max_keypoints"] is not None:
+        raise OptionError(f"--reference {reference} must be one of the images: name it there")
+    if detector == "network" and "max_keypoints" in values:
         raise OptionError("--max-keypoints is for --detector points: leave it out, or choose that")
-    detector, _ = chosen_detector(kind, values)
-    options = StitchingOptions(**given_only({name: values.pop(name) for name in OPTIONS.names}))
+    chosen, _ = chosen_detector(detector, values)
+    options = StitchingOptions(**OPTIONS.take(values))
     given = len(images)
     images, failures = _readable(images)
     if len(images) < min(given, 2) or (reference is not None and reference not in images):
-        what = "too few photographs, or not the reference, can be read"
+        what = "too few images, or not the reference, can be read"
         raise ImageError(f"there is no panorama, as {what}: {'; '.join(failures)}")
-    with claimed_outputs("stitch", images, [output], overwrite):
+    with cli.writing(Outputs([file], images, overwrite=overwrite)):
         try:
             with stage_progress("stitching", STAGES) as done:
                 panorama = stitch_images(
                     images,
-                    detector=detector,
+                    detector=chosen,
                     reference=None if reference is None else images.index(reference),
                     options=options,
                     progress=done,
-                    **given_only(values),
+                    **values,
                 )
-        except DeepDetectError as error:
-            if type(error) not in (
-                DeepDetectError,
-                OptionError,
-                RegistrationError,
-            ):  # an image, named as it was given
-                raise
+        except (OptionError, RegistrationError) as error:  # they name images by their number
             text = str(error)
             for number, path in enumerate(images):
                 text = text.replace(f"images[{number}]", str(path))
             raise type(error)(text) from error
-        save_picture(panorama.image, output)
-    numbers = {**_numbers(panorama, images, output), "failures": failures}
-    print_result(as_json, numbers, _rows(panorama, images, output), "panorama")
+        save_picture(panorama.image, file)
+    numbers = {**_numbers(panorama, images, file), "failures": failures}
+    cli.print_result(as_json, numbers, _rows(panorama, images, file), "panorama")
     if not as_json:
         for other in numbers["unregistered"]:
-            click.echo(f"not in the panorama: {other['image']}, as {other['reason']}", err=True)
-    report_failures(failures, given)
+            cli.note(f"not in the panorama: {other['image']}, as {other['reason']}")
+    cli.report_failures(failures, given)
 
 
-def _readable(images: Sequence[Path]) -> tuple[tuple[Path, ...], list[str]]:
-    """Return the photographs that can be read, and a sentence on each of the others."""
-    from ..io.image import load_image
-
+def _readable(images: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """Return the images that can be read, and a sentence on each of the others."""
     readable, failures = [], []
     for path in images:
         try:
@@ -144,7 +98,7 @@ def _readable(images: Sequence[Path]) -> tuple[tuple[Path, ...], list[str]]:
             failures.append(str(error))
         else:
             readable.append(path)
-    return tuple(readable), failures
+    return readable, failures
 
 
 def _numbers(panorama: Panorama, images: Sequence[Path], output: Path) -> dict[str, Any]:
@@ -177,12 +131,12 @@ def _rows(panorama: Panorama, images: Sequence[Path], output: Path) -> list[tupl
     height, width = panorama.valid.shape
     counts, gains = panorama.matches.values(), panorama.gains.values()
     return [
-        ("photographs", f"{len(panorama.homographies)} of {len(images)}"),
+        ("images", f"{len(panorama.homographies)} of {len(images)}"),
         ("reference", str(images[panorama.reference])),
         ("registered pairs", f"{len(counts)}, with {min(counts):,} to {max(counts):,} matches"),
         ("residual", f"{panorama.residual_px:.2f} px (root mean square, reduced images)"),
         ("brightness", f"changed by {min(gains):.2f} to {max(gains):.2f} times"),
         ("size", f"{width}x{height}, {panorama.valid.mean():.0%} covered"),
-        *seconds_rows(panorama.seconds),
+        *cli.seconds_rows(panorama.seconds),
         ("written", str(output)),
     ]

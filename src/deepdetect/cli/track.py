@@ -2,49 +2,40 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Annotated, Any
 
-import click
+from cyclopts import Parameter
 
 from .._shared.errors import OptionError
-from ._generated import FieldOptions, generated_command, given_only
-from ._options import (
-    PATH,
-    check_inputs_survive,
-    json_option,
-    max_megapixels_option,
-    overwrite_option,
-    print_result,
-    report_failures,
-)
+from .._shared.records import Outputs
+from ..tracking.frames import FrameSource
+from ..tracking.pipeline import TrackingReport, output_files
+from ..tracking.pipeline import track as track_points
+from ..tracking.tracker import TrackingOptions
+from . import _options as cli
 
-if TYPE_CHECKING:
-    from ..tracking.pipeline import TrackingReport
-
-TRACKING = FieldOptions("tracking.tracker:TrackingOptions")
-FRAMES = FieldOptions(
-    "tracking.pipeline:track",
-    names=("every", "max_frames", "max_side", "tail"),
+TRACKING = cli.From(TrackingOptions, common="max_keypoints")
+FRAMES = cli.From(
+    track_points,
+    "every max_frames max_side tail",
+    common="every max_frames max_side",
     defaults={"max_frames": "all", "max_side": "no limit"},
 )
 
 
-@generated_command(TRACKING, FRAMES, short_help="Points followed through a video.")
-@click.argument("source", metavar="VIDEO|FOLDER|CAMERA")
-@click.option(
-    "-o",
-    "--output",
-    type=PATH,
-    default=Path("tracks.mp4"),
-    show_default=True,
-    help="Video to be written (.mp4, .mov, .mkv, .avi); or .csv for the table of tracks alone.",
-)
-@max_megapixels_option
-@overwrite_option
-@json_option
-def track(source: str, output: Path, overwrite: bool, as_json: bool, **values: Any) -> None:
+@cli.with_options(FRAMES, TRACKING)
+def track(
+    source: Annotated[str, Parameter(help="A video file, a folder, or the number of a camera.")],
+    /,
+    *,
+    output: cli.Output = Path("tracks.mp4"),
+    overwrite: cli.Overwrite = False,
+    as_json: cli.Json = False,
+    max_megapixels: cli.MaxMegapixels = 200,
+    **values: Any,
+) -> None:
     """Follow keypoints through a video file, a folder of frames, or the camera of this number.
 
     Writes a video with the points, their last positions and the frames per second of the work, and
@@ -53,39 +44,32 @@ def track(source: str, output: Path, overwrite: bool, as_json: bool, **values: A
     read, or has another size than the first one, does not stop the others: they are listed at the
     end, with exit code 1.
 
-    \b
-    deepdetect track drive.mp4 -o tracks.mp4
-    deepdetect track frames/ -o tracks.mp4 --max-keypoints 500
-    deepdetect track 0 -o webcam.mp4 --max-side 640
-    """
-    from ..tracking.frames import FrameSource
-    from ..tracking.pipeline import output_files
-    from ..tracking.pipeline import track as track_points
-    from ..tracking.tracker import TrackingOptions
-    from ._records import claimed_outputs
+        deepdetect track drive.mp4 -o tracks.mp4
+        deepdetect track frames/ -o tracks.mp4 --max-keypoints 500
+        deepdetect track 0 -o webcam.mp4 --max-side 640
 
-    files = [path for path in output_files(output) if path is not None]
-    given = given_only(values)
-    frames = {name: given.pop(name) for name in FRAMES.names if name in given}
-    options = TrackingOptions(**given)
+    Args:
+        output: Video to be written (.mp4, .mov, .mkv, .avi), .csv for the table of tracks alone,
+            or a folder for both.
+    """
+    file = cli.output_file(output, "tracks.mp4")
+    files = [path for path in output_files(file) if path is not None]
+    frames = FRAMES.take(values)
+    options = TrackingOptions(**values)
     with FrameSource(source) as opened:
         live = opened.live
-    claim: AbstractContextManager[None] = nullcontext()
-    if live:
-        for path in files if not overwrite else ():
-            if path.exists():
-                raise OptionError(
-                    f"{path} exists, of an earlier recording: choose another name with -o, or "
-                    "replace it with --overwrite"
-                )
-    else:
-        inputs = [Path(source)]
-        if inputs[0].is_file():
-            check_inputs_survive(files, inputs, "choose another name with -o")
-        claim = claimed_outputs("track", inputs, files, overwrite)
-    with claim:
-        report = track_points(source, output, options=options, quiet=False, **frames)
-    print_result(
+    if live and not overwrite:
+        for path in (path for path in files if path.exists()):
+            raise OptionError(
+                f"{path} exists, of an earlier recording: choose another name with -o, or "
+                "replace it with --overwrite"
+            )
+    if Path(source).is_file():
+        cli.check_inputs_survive(files, [Path(source)])
+    outputs = Outputs(files, [Path(source)], overwrite=overwrite)
+    with nullcontext() if live else cli.writing(outputs):
+        report = track_points(source, file, options=options, quiet=False, **frames)
+    cli.print_result(
         as_json,
         vars(report),
         [
@@ -96,9 +80,9 @@ def track(source: str, output: Path, overwrite: bool, as_json: bool, **values: A
             ("frames per second", f"{report.fps:.1f}"),
             ("written", ", ".join(str(path) for path in report.files)),
         ],
-        str(source),
+        source,
     )
-    report_failures(report.failures, report.frames + len(report.failures), "frames")
+    cli.report_failures(report.failures, report.frames + len(report.failures), "frames")
 
 
 def _frames_text(report: TrackingReport) -> str:

@@ -3,103 +3,86 @@
 from __future__ import annotations
 
 import os
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import click
+from cyclopts import Parameter
 
-from ._generated import FieldOptions, generated_command, given_only
-from ._options import (
-    PATH,
-    RECIPE,
-    chosen_recipe,
-    json_option,
-    print_json,
-    print_table,
-    recipe_options,
-    workers_option,
-)
+from ..training import DeviceOptions, StageProfile, profile
+from ..training import train as train_network
+from ..training.run import require_packages
+from . import _options as cli
+from ._training import RECIPE, Detectors, LabelSettings, Preset, chosen_recipe
 
 if TYPE_CHECKING:
-    from ..training import StageProfile, TrainingResult
+    from ..training import TrainingResult
 
-RUN = FieldOptions(
-    "training.run:train",
-    names=("validation", "labels", "init_weights"),
+RUN = cli.From(
+    train_network,
+    "validation labels init_weights",
+    common="validation init_weights",
     flags={"init_weights": "--init"},
+    types={"init_weights": list[str] | None},
     defaults={
         "validation": "one image in twenty is held out",
         "labels": "in the run's folder",
         "init_weights": "random ones, by the seed",
     },
-    metavars={"validation": "FOLDER", "labels": "FOLDER", "init_weights": "NAME|FILE"},
 )
-DEVICE = FieldOptions("training.recipe:DeviceOptions")
+DEVICE = cli.From(DeviceOptions, common="device")
 
 
-@generated_command(RUN, RECIPE, DEVICE, short_help="Train the network on images.")
-@click.argument("images", type=PATH)
-@click.option("-o", "--output", type=PATH, required=True, help="Folder of the run.")
-@recipe_options
-@click.option(
-    "--profile",
-    "profiling",
-    is_flag=True,
-    help="Time 30 steps of each stage and report what limits the speed; train nothing.",
-)
-@workers_option
-@json_option
+@cli.with_options(RUN, RECIPE, DEVICE)
 def train(
-    images: Path,
-    output: Path,
-    preset: str,
-    detectors: str | None,
-    label_settings: str | None,
-    profiling: bool,
-    workers: int | None,
-    as_json: bool,
+    images: Annotated[Path, Parameter(help="Folder of images, or of shards.")],
+    /,
+    *,
+    output: cli.Output,
+    preset: Preset = "default",
+    detectors: Detectors = None,
+    label_settings: LabelSettings = None,
+    profiling: Annotated[bool, Parameter("--profile", negative="")] = False,
+    workers: cli.Workers = None,
+    as_json: cli.Json = False,
     **values: Any,
 ) -> None:
-    """Train the network on the images, or the shards, in the folder IMAGES.
+    """Train the network on the images, or the shards, in a folder.
 
     Labels are made first, once, by the detectors of `deepdetect label`. The run's folder gets
-    checkpoint.safetensors, best.safetensors and deepdetect.onnx (the weights of the
-    lowest validation loss) and the loss curves, curves.csv and curves.png. An interrupted
-    run resumes when the same command is given again.
+    checkpoint.safetensors, best.safetensors and deepdetect.onnx (the weights of the lowest
+    validation loss) and the loss curves, curves.csv and curves.png. An interrupted run resumes when
+    the same command is given again.
 
-    \b
-    deepdetect train photos/ -o run
-    deepdetect detect photo.jpg --weights run/deepdetect.onnx
+        deepdetect train photos/ -o run
+        deepdetect detect photo.jpg --weights run/deepdetect.onnx
+
+    Args:
+        output: Folder of the run.
+        profiling: Time 30 steps of each stage and report what limits the speed; train nothing.
     """
-    from ..training.run import require_packages
-
     require_packages()
-    from ..training import DeviceOptions, profile
-    from ..training import train as train_network
-    from ._records import check_none_made
-
-    check_none_made(images, output)
-    arguments = given_only({name: values.pop(name) for name in RUN.names})
-    chosen = {name: values.pop(name) for name in DeviceOptions.__dataclass_fields__}
-    arguments["device"] = DeviceOptions(**given_only(chosen))
-    arguments |= {"workers": workers, "log": None if as_json else click.echo}
+    cli.check_folder_not_made(images, output)
+    arguments = RUN.take(values)
+    if given := arguments.pop("init_weights", None):
+        arguments["init_weights"] = given[0] if len(given) == 1 else tuple(given)
+    arguments["device"] = DeviceOptions(**DEVICE.take(values))
+    arguments |= {"workers": workers, "log": None if as_json else print}
     options = chosen_recipe(preset, detectors, label_settings, values)
     if profiling:
-        _print_profiles(profile(images, output, options, **arguments), as_json)
-    else:
-        _print_result(train_network(images, output, options, **arguments), as_json)
-
-
-def _is_main_process() -> bool:
-    return int(os.environ.get("RANK", 0)) == 0  # of torchrun
+        profiles = profile(images, output, options, **arguments)
+        if int(os.environ.get("RANK", 0)) == 0:  # of torchrun
+            _print_profiles(profiles, as_json)
+        return
+    result = train_network(images, output, options, **arguments)
+    if int(os.environ.get("RANK", 0)) == 0:
+        _print_result(result, as_json)
 
 
 def _print_result(result: TrainingResult, as_json: bool) -> None:
-    if not _is_main_process():
-        return
     best = result.best
     if as_json:
-        print_json(
+        cli.print_json(
             {
                 "weights": result.weights,
                 "onnx": result.onnx,
@@ -111,7 +94,7 @@ def _print_result(result: TrainingResult, as_json: bool) -> None:
             }
         )
         return
-    print_table(
+    cli.print_table(
         [
             ("best after epoch", f"{best['epoch']:.1f}"),
             ("validation loss", f"{best['validation_loss']:.4f}"),
@@ -124,23 +107,19 @@ def _print_result(result: TrainingResult, as_json: bool) -> None:
 
 
 def _print_profiles(profiles: list[StageProfile], as_json: bool) -> None:
-    from dataclasses import asdict
-
-    if not _is_main_process():
-        return
     if as_json:
-        print_json([asdict(profile) for profile in profiles])
+        cli.print_json([asdict(each) for each in profiles])
         return
-    for profile in profiles:
+    for each in profiles:
         rows = [
-            ("steps timed", f"{profile.steps}"),
-            ("crops/s", f"{profile.images_per_second:.1f}"),
-            ("480x480 images/s", f"{profile.full_images_per_second:.1f}"),
-            ("waiting for data", f"{100 * profile.waiting_fraction:.1f} %"),
+            ("steps timed", f"{each.steps}"),
+            ("crops/s", f"{each.images_per_second:.1f}"),
+            ("480x480 images/s", f"{each.full_images_per_second:.1f}"),
+            ("waiting for data", f"{100 * each.waiting_fraction:.1f} %"),
         ]
-        if profile.memory_bytes is not None:
-            rows.append(("peak memory", f"{profile.memory_bytes / 1e9:.2f} GB"))
-        if profile.device_memory_bytes is not None:
-            rows.append(("peak GPU memory", f"{profile.device_memory_bytes / 1e9:.2f} GB"))
-        stage = profile.stage
-        print_table(rows, f"{stage.batch} crops of {stage.crop}x{stage.crop} pixels per step")
+        if each.memory_bytes is not None:
+            rows.append(("peak memory", f"{each.memory_bytes / 1e9:.2f} GB"))
+        if each.device_memory_bytes is not None:
+            rows.append(("peak GPU memory", f"{each.device_memory_bytes / 1e9:.2f} GB"))
+        stage = each.stage
+        cli.print_table(rows, f"{stage.batch} crops of {stage.crop}x{stage.crop} pixels per step")
