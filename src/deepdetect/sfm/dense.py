@@ -87,30 +87,22 @@ def find_references(sparse: SparseModel) -> list[Reference]:
             )
             if len(common) < MIN_COMMON_POINTS:
                 continue
-            score = _angle_weights(
-                sparse.points[common],
-                sparse.views[number].centre,
-                sparse.views[other].centre,
-            ).sum()
+            lines = [sparse.points[common] - sparse.views[k].centre for k in (number, other)]
+            angle = np.degrees(angles_between(*lines))
+            weights = np.minimum(angle / IDEAL_ANGLE_DEG, 1) ** 1.5
+            weights = weights * np.minimum(MAX_ANGLE_DEG / np.maximum(angle, 1e-9), 1) ** 2
             neighbour = Neighbour(
                 sparse.views[other],
                 sparse.intrinsics[other],
                 sparse.seen.xy[rows[number][own]],
                 sparse.seen.xy[rows[other][its]],
             )
-            scored.append((float(score), neighbour))
+            scored.append((float(weights.sum()), neighbour))
         scored.sort(key=lambda each: -each[0])
         best = tuple(neighbour for _, neighbour in scored[:NEIGHBOURS])
         if len(best) + 1 >= MIN_VIEWS:
             found.append(Reference(sparse.views[number], sparse.intrinsics[number], best))
     return found
-
-
-def _angle_weights(points: np.ndarray, centre0: np.ndarray, centre1: np.ndarray) -> np.ndarray:
-    """Return what each point says for matching two views, by its triangulation angle."""
-    angle = np.degrees(angles_between(points - centre0, points - centre1))
-    weight = np.minimum(angle / IDEAL_ANGLE_DEG, 1) ** 1.5
-    return np.asarray(weight * np.minimum(MAX_ANGLE_DEG / np.maximum(angle, 1e-9), 1) ** 2)
 
 
 def dense_points(folder: Path, reference: Reference, stride_px: int) -> DensePoints:

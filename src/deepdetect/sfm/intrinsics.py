@@ -136,14 +136,16 @@ def known_cameras(
     problem: ReconstructionError | None = None
     for name, size in sizes.items():
         try:
-            if not isinstance(calibration, (Camera, Calibration)):
-                known[name] = read_calibration(calibration, size, size).camera0
-                continue
-            camera = calibration.camera0 if isinstance(calibration, Calibration) else calibration
+            if isinstance(calibration, Calibration):
+                camera = calibration.camera0
+            elif isinstance(calibration, Camera):
+                camera = calibration
+            else:
+                camera = read_calibration(calibration, size, size).camera0
             if camera.size != size:
                 raise ReconstructionError(
                     f"the calibration is for images of {camera.size[0]}x{camera.size[1]} pixels, "
-                    f"the images have {size[0]}x{size[1]}: give the calibration of this size"
+                    f"{name} has {size[0]}x{size[1]}: give the calibration of this size"
                 )
             known[name] = camera
         except ReconstructionError as error:

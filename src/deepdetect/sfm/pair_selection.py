@@ -67,18 +67,12 @@ def largest_component(pairs: Sequence[Pair]) -> int:
         >>> largest_component([("a", "b"), ("c", "d"), ("b", "e")]), largest_component([])
         (3, 0)
     """
-    neighbours: dict[str, set[str]] = {}
-    for first, second in pairs:
-        neighbours.setdefault(first, set()).add(second)
-        neighbours.setdefault(second, set()).add(first)
-    largest = 0
-    while neighbours:
-        count, edge = 0, {next(iter(neighbours))}
-        while edge:
-            count += len(edge)
-            edge = set[str]().union(*(neighbours.pop(name) for name in edge)) & neighbours.keys()
-        largest = max(largest, count)
-    return largest
+    components: list[set[str]] = []
+    for pair in pairs:
+        touched = [names for names in components if not names.isdisjoint(pair)]
+        components = [names for names in components if names.isdisjoint(pair)]
+        components.append(set(pair).union(*touched))
+    return max(map(len, components), default=0)
 
 
 def vlad_vectors(
