@@ -364,6 +364,18 @@ def test_a_body_that_trickles_is_ended(serve: Any) -> None:
             trickle()
 
 
+def test_images_that_cannot_be_written_are_said(
+    serve: Any, capfd: pytest.CaptureFixture[str]
+) -> None:
+    client, temporary = serve()
+    (home,) = temporary.iterdir()
+    home.rmdir()  # as programs do that clean up
+    answer = client.start("folder-keypoints", [("a.png", b"x")])
+    assert answer.status == 400
+    assert answer.values["error"].startswith("the task cannot be started (No such file")
+    assert capfd.readouterr().err == ""
+
+
 def test_the_last_place_is_taken_once(serve: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def slow(*given: Any) -> Job:
         time.sleep(0.3)  # so that the requests overlap

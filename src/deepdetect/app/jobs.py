@@ -11,13 +11,12 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from .._shared.atomic import private_folder
-from .._shared.errors import DeepDetectError, OptionError
+from .._shared.errors import OptionError
 from .._shared.signals import signals_held
 from . import worker
 from .options import AppOptions
@@ -107,26 +106,9 @@ class Jobs:
         self._jobs: dict[str, Job] = {}
         self._folder = private_folder(FOLDER_PREFIX)
 
-    @contextmanager
-    def new_folder(self) -> Iterator[Path]:
-        """Make a folder for the images of a task, which nobody else can read.
-
-        It is removed where the task cannot be started.
-
-        Raises:
-            DeepDetectError: files cannot be written, or the process cannot be started.
-        """
-        with contextlib.ExitStack() as made:
-            try:
-                folder = Path(tempfile.mkdtemp(dir=self._folder))
-                made.callback(shutil.rmtree, folder, ignore_errors=True)
-                yield folder
-            except OSError as error:
-                raise DeepDetectError(
-                    f"the task cannot be started ({error.strerror or error}): free some space and "
-                    "memory, or start deepdetect app again"
-                ) from error
-            made.pop_all()
+    def new_folder(self) -> Path:
+        """Make a folder for the images of a task, which nobody else can read."""
+        return Path(tempfile.mkdtemp(dir=self._folder))
 
     def check_room(self) -> None:
         """Raise an OptionError where too many tasks are at work."""

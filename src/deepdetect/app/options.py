@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from .._shared.options import check_ranges, suggest_keywords
 
@@ -39,17 +39,5 @@ class AppOptions:
     max_request_s: float = 30.0
 
     def __post_init__(self) -> None:
-        check_ranges(
-            self,
-            between={"port": (0, 65535)},
-            positive=(
-                "max_file_mb",
-                "max_task_mb",
-                "max_files",
-                "max_megapixels",
-                "max_tasks",
-                "max_task_s",
-                "abandoned_s",
-                "max_request_s",
-            ),
-        )
+        limits = [field.name for field in fields(self) if field.name != "port"]
+        check_ranges(self, between={"port": (0, 65535)}, positive=limits)

@@ -12,6 +12,7 @@ import hmac
 import json
 import mimetypes
 import secrets
+import shutil
 import signal
 import socket
 import threading
@@ -69,6 +70,10 @@ MAX_DESCRIPTION_BYTES = 1 << 18
 """Of the names and sizes of images, and of the options of a task."""
 
 MAX_NAME_LENGTH = 200
+
+CANNOT_START = (
+    "the task cannot be started ({}): free some space and memory, or start deepdetect app again"
+)
 
 HEADERS = {
     "Content-Security-Policy": (
@@ -183,6 +188,7 @@ class AppServer:
             exception_handlers={
                 HTTPException: lambda _, error: _refusal(error.status_code, error.detail),
                 DeepDetectError: lambda _, error: _refusal(400, str(error)),
+                OSError: lambda _, error: _refusal(400, CANNOT_START.format(error.strerror)),
             },
             lifespan=self._watched,
         )
@@ -286,7 +292,9 @@ class AppServer:
         if sum(sizes) != left - 4 - size:
             raise HTTPException(400, "the images are not as long as is said")
         numbers = TASKS[kind].check(len(names), given)
-        with self.jobs.new_folder() as folder:
+        with contextlib.ExitStack() as made:
+            folder = self.jobs.new_folder()
+            made.callback(shutil.rmtree, folder, ignore_errors=True)
             images = [
                 SentImage(folder / f"{number:04d}{_suffix(name)}", name)
                 for number, name in enumerate(names)
@@ -296,6 +304,7 @@ class AppServer:
                     async for piece in body.pieces(bytes_):
                         file.write(piece)
             job = self.jobs.start(folder, kind, images, numbers)
+            made.pop_all()
         return JSONResponse({"job": job.name})
 
     def _job(self, request: Request) -> Any:

@@ -130,8 +130,7 @@ def load_matches(path: str | Path) -> Matches:
     """Read matches from the npz file that `save_matches` wrote.
 
     Returns:
-        The matches. Their `seconds` are empty, and their keypoints have no logits. Files of earlier
-        versions hold no indices: the nearest keypoints are looked up.
+        The matches. Their `seconds` are empty, and their keypoints have no logits.
 
     Raises:
         DeepDetectError: the file is missing or is no such file.
@@ -146,9 +145,9 @@ def load_matches(path: str | Path) -> Matches:
             )
             for side in (0, 1)
         ]
-        guide = None
+        geometry = None
         if "two_view_model" in arrays:
-            guide = TwoViewGeometry(
+            geometry = TwoViewGeometry(
                 str(arrays["two_view_model"]),
                 _or_none(arrays["two_view_matrix"]),
                 _integer(arrays["two_view_tentative_matches"]),
@@ -165,10 +164,10 @@ def load_matches(path: str | Path) -> Matches:
             _or_none(arrays["matrix"]),
             keypoints[0],
             keypoints[1],
-            two_view_geometry=guide,
-            subpixel="subpixel" in arrays and bool(arrays["subpixel"]),
-            indices0=arrays.get("indices0"),  # type: ignore[arg-type]  # older files have none
-            indices1=arrays.get("indices1"),  # type: ignore[arg-type]
+            two_view_geometry=geometry,
+            subpixel=bool(arrays["subpixel"]),
+            indices0=arrays["indices0"],
+            indices1=arrays["indices1"],
         )
 
 
