@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -86,19 +85,16 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
     if options.threads is not None:
         settings.intra_op_num_threads = options.threads
 
-    def start(chosen: str) -> Any:
-        # Falling back to the CPU after a failure, it would print blocks of text.
-        return onnxruntime.InferenceSession(
-            _maps_only(path), settings, providers=[chosen], enable_fallback=0
-        )
-
     try:
-        session = start(provider)
+        # Falling back to the CPU after a failure, it would print blocks of text.
+        session = onnxruntime.InferenceSession(
+            _maps_only(path), settings, providers=[provider], enable_fallback=0
+        )
     except Exception as error:  # its exceptions share no base class
         reason = (str(error).splitlines() or [type(error).__name__])[0]
-        if provider != CPU and _starts(start):
+        if provider != CPU:
             raise OptionError(
-                f"the device {device} could not start ({reason}): check its driver and "
+                f"the device {device} could not start with {path} ({reason}): check its driver and "
                 "libraries, or leave it out"
             ) from None
         raise WeightsError(
@@ -135,12 +131,3 @@ def _maps_only(path: Path) -> str | bytes:
         if without is not model:
             return without
     return str(path)
-
-
-def _starts(start: Callable[[str], Any]) -> bool:
-    """Return whether the processor can read the file: then what failed is another device."""
-    try:
-        start(CPU)
-    except Exception:  # its exceptions share no base class
-        return False
-    return True
