@@ -14,7 +14,6 @@ from PIL import Image
 
 from deepdetect import DeepDetect
 from deepdetect.detector.pretrained import pretrained_weights
-from tests.cli.conftest import one_sentence
 
 FOLDER = Path(__file__).parents[2] / "examples/onnx_cpp"
 
@@ -50,27 +49,3 @@ def test_the_keypoints_are_those_of_the_package(
     words.append("0.9")
     fewer = subprocess.run(words, capture_output=True, text=True, check=True).stdout
     assert len(fewer.splitlines()) == np.sum(found[:, 2] > 0.9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("content", "words", "message"),
-    [
-        (b"P6 4 4 255\nshort", [], "photo.ppm is cut off"),
-        (b"P6 -4 4 255\n", [], "photo.ppm is missing, or no binary PPM of 8 bits"),
-        (None, [], "photo.ppm is missing, or no binary PPM of 8 bits"),
-        (b"P6 4 4 255\n" + bytes(48), ["half"], "usage: keypoints MODEL.onnx PHOTO.ppm"),
-        (b"P6 4 4 255\n" + bytes(48), ["0.5", "none.onnx"], "none.onnx"),
-    ],
-)
-def test_a_mistake_is_one_sentence(
-    program: Path, content: bytes | None, words: list[str], message: str, tmp_path: Path
-) -> None:
-    if content is not None:
-        (tmp_path / "photo.ppm").write_bytes(content)
-    model = words.pop() if len(words) > 1 else str(pretrained_weights())
-    command = [str(program), model, str(tmp_path / "photo.ppm"), *words]
-    ended = subprocess.run(command, capture_output=True, text=True)
-    assert (ended.returncode, ended.stdout) == (2, "")
-    assert message in ended.stderr
-    assert one_sentence(ended.stderr)

@@ -12,7 +12,6 @@ from PIL import Image
 
 from deepdetect import DeepDetect
 from deepdetect.detector.pretrained import pretrained_weights
-from tests.cli.conftest import one_sentence
 
 FOLDER = Path(__file__).parents[2] / "examples/onnx_js"
 NO_NETWORK = ("ENOTFOUND", "EAI_AGAIN", "ECONNREFUSED", "ETIMEDOUT", "ENETUNREACH")
@@ -97,32 +96,3 @@ for (let k = 0; k < keypoint_logits.data.length; k++) {
         gaps = np.linalg.norm(xy[:, None] - expected.xy, axis=2)
         assert gaps.min(0).max() < 1e-3
         assert (found[len(expected) :] == (-1, -1, -np.inf)).all()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("model", "photo", "words", "message"),
-    [
-        ("", "none.png", [], "none.png"),
-        ("", "text.png", [], "keypoints: "),
-        ("none.onnx", "photo.png", [], "none.onnx"),
-        ("text.png", "photo.png", [], "keypoints: "),
-        ("", "photo.png", ["half"], "usage: node keypoints.mjs"),
-    ],
-)
-def test_a_mistake_is_one_sentence(
-    model: str,
-    photo: str,
-    words: list[str],
-    message: str,
-    installed: Path,
-    tmp_path: Path,
-) -> None:
-    (tmp_path / "text.png").write_text("I am neither a picture nor a network")
-    Image.new("RGB", (16, 16)).save(tmp_path / "photo.png")
-    given = [tmp_path / model if model else pretrained_weights(), tmp_path / photo, *words]
-    command = ["node", "keypoints.mjs", *map(str, given)]
-    ended = subprocess.run(command, cwd=installed, capture_output=True, text=True)
-    assert (ended.returncode, ended.stdout) == (2, "")
-    assert message in ended.stderr
-    assert one_sentence(ended.stderr)

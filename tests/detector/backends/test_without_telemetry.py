@@ -47,10 +47,6 @@ except WeightsError as error:
 needs_openvino = pytest.mark.skipif(
     importlib.util.find_spec("openvino") is None, reason="needs openvino, which is not installed"
 )
-needs_openvino_telemetry = pytest.mark.skipif(
-    importlib.util.find_spec("openvino_telemetry") is None,
-    reason="needs openvino_telemetry, which is not installed",
-)
 
 
 def run(code: str, home: Path, **variables: str) -> list[str]:
@@ -101,17 +97,3 @@ def test_the_watch_sees_files_processes_and_connections(tmp_path: Path) -> None:
     events = [line.split()[0] for line in run(code, tmp_path)]
     assert events == ["open", "os.mkdir", "subprocess.Popen", "socket.getaddrinfo"]
     assert list(tmp_path.rglob("*")) == []
-
-
-@needs_openvino
-@needs_openvino_telemetry
-def test_openvino_telemetry_can_be_imported_afterwards(tmp_path: Path) -> None:
-    code = (
-        "from deepdetect.detector.backends.without_telemetry import import_openvino\n"
-        "openvino = import_openvino()\n"
-        "from openvino.frontend import FrontEndManager\n"
-        "from openvino_telemetry import Telemetry\n"
-        "assert openvino.tools.ovc.telemetry_utils.tm.Telemetry is not Telemetry\n"
-        "assert callable(openvino.convert_model)\n"
-    )
-    assert run(code, tmp_path) == []

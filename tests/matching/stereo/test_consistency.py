@@ -71,13 +71,6 @@ def test_a_gap_wider_than_an_occlusion_stays() -> None:
     assert between[1, 20:40].all()
 
 
-def test_rows_without_anything_known() -> None:
-    nothing = np.zeros((3, 8), bool)
-    whole, between = fill_occlusions(np.full((3, 8), np.nan, np.float32), nothing)
-    assert (whole == 0).all()
-    assert not between.any()
-
-
 def test_the_edge_of_what_hides_is_its_outermost_pixels() -> None:
     disparity = np.zeros((30, 40), np.float32)
     disparity[10:20, 10:20] = 5
