@@ -87,19 +87,6 @@ def test_dark_pairs_are_two_pictures(level: Any, photo: np.ndarray, mean: float,
         check_images(dark[0], dark[0])
 
 
-def test_what_moves_in_a_small_part_makes_two_pictures(photo: np.ndarray) -> None:
-    """A textured thing over a hundredth of a dark frame, and before a far textured view."""
-    for behind in (np.full((256, 256), 8, np.uint8), luma(photo)):
-        left, right = behind.copy(), behind.copy()
-        left[100:126, 100:126] = right[100:126, 88:114] = luma(photo)[60:86, 120:146]
-        assert cv2.absdiff(left, right).mean() < 2
-        check_images(left, right)
-    small_left, small_right = np.full((2, 480, 640), 8, np.uint8)
-    small_left[100:126, 100:126] = small_right[100:126, 88:114] = luma(photo)[60:86, 120:146]
-    assert cv2.absdiff(small_left, small_right).mean() < 0.5
-    check_images(small_left, small_right)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("guide", ["auto", pytest.param("fundamental", marks=pytest.mark.slow)])
 def test_a_camera_that_only_rotated(

@@ -192,14 +192,6 @@ def test_a_post_before_a_wall_has_points_of_both_depths(facade: Any, detector: D
         assert (off < 0.1).mean() > 0.9
 
 
-@pytest.mark.slow
-def test_a_wall_alone_gives_no_depth(facade: Any, detector: DeepDetect, one_line: Any) -> None:
-    pair = facade(0)
-    with pytest.raises(ReconstructionError, match="one homography explains all") as error:
-        reconstruct(pair.left, pair.right, detector, focal_px=400)
-    one_line(error.value)
-
-
 def test_the_right_camera_is_where_it_is_seen_from(posed: Any, turned: Any) -> None:
     """Points seen from there lie on their true matches, and the parallax is the rays' angle."""
     there = (posed.points - posed.baseline_vector) @ posed.pose.rotation.T
@@ -211,22 +203,6 @@ def test_the_right_camera_is_where_it_is_seen_from(posed: Any, turned: Any) -> N
     others /= np.linalg.norm(others, axis=1, keepdims=True)
     angle = np.degrees(2 * np.arcsin(np.linalg.norm(rays - others, axis=1) / 2))
     np.testing.assert_allclose(posed.triangulation_angles(), angle, rtol=1e-3)
-
-
-@pytest.mark.slow
-def test_a_baseline_gives_millimetres_and_the_same_points(turned: Any, level: Any) -> None:
-    detector = DeepDetect("dense")
-    for pair in (level, turned):
-        calibration = replace(pair.calibration, baseline_mm=193.0)
-        metric, plain = (
-            reconstruct(pair.left, pair.right, detector, calibration=each, max_keypoints=20_000)
-            for each in (calibration, pair.calibration)
-        )
-        assert (metric.unit, plain.unit) == ("mm", "baseline")
-        np.testing.assert_allclose(metric.points, plain.points * 193, rtol=1e-4)
-        np.testing.assert_allclose(
-            metric.triangulation_angles(), plain.triangulation_angles(), rtol=1e-3
-        )
 
 
 @pytest.mark.slow
@@ -340,23 +316,6 @@ def test_a_pair_taken_in_the_dark_has_depth(level: Any) -> None:
     assert np.nanmedian(off) < 0.5
 
 
-def test_cameras_that_contradict_rectified_rows_are_refused(level: Any, one_line: Any) -> None:
-    calibration = level.calibration
-    right = calibration.camera1
-    assert right.centre is not None
-    pair = level.left, level.right
-    for other in (
-        replace(right, focal_px=1.2 * right.focal_px[0]),
-        replace(right, centre=(right.centre[0], right.centre[1] + 20)),
-    ):
-        wrong = replace(calibration, camera1=other)
-        for rectified in (True, None):
-            message = refusal(
-                one_line, *pair, focal_px=None, calibration=wrong, rectified=rectified
-            )
-            assert "fix the calibration (calib.json), or pass `rectified=False`" in message
-
-
 @pytest.mark.parametrize("density", [None, 1])
 def test_a_small_rotation_said_to_be_rectified_gives_no_cloud(
     density: int | None, level: Any, one_line: Any
@@ -390,19 +349,6 @@ def test_what_is_wrong_is_said(level: Any, one_line: Any, tmp_path: Path) -> Non
     )
     with pytest.raises(ImageError, match="must have one size"):
         reconstruct(level.left, narrow, AllPixels(), focal_px=500, rectified=True)
-
-
-def test_the_values_are_plain_and_complete(found: Any, posed: Any) -> None:
-    for made in (found, posed):
-        values = made.summary()
-        assert json.loads(json.dumps(values, allow_nan=False)) == values
-        assert values["points"] == len(made)
-        assert values["depth"]["50%"] == pytest.approx(np.median(made.points[:, 2]), rel=1e-4)
-        assert values["median_triangulation_angle_degrees"] == pytest.approx(
-            np.median(made.triangulation_angles()), abs=1e-3
-        )
-        assert "true scale is not known" in values["scale"]
-    assert values["pose"]["rotation"] == posed.pose.rotation.tolist()
 
 
 @pytest.mark.parametrize("spread", ["none", "grid"])

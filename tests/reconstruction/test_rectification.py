@@ -203,33 +203,3 @@ def test_rows_bent_by_a_lens_are_not_taken_for_level(motorcycle: Any) -> None:
     found, initial = find_rectification(left, bent)
     assert not found.rectified
     assert initial is not None
-
-
-def test_small_images_and_images_of_two_sizes_are_looked_at_once(
-    motorcycle: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    left, right = motorcycle
-    monkeypatch.setattr("deepdetect.reconstruction.rectification.COARSE_SIDE_PX", 741)
-    found, initial = find_rectification(left, right)
-    assert found.rectified
-    assert initial is not None
-    found, initial = find_rectification(left, right[:, :-4])
-    assert "differ in size" in found.reason
-    assert found.matches == 0
-    assert initial is None
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["art", "cones", "teddy", "cloth", "dolls", "moebius", "rocks"])
-def test_small_copies_decide_as_larger_ones_do(shared: Path, name: str) -> None:
-    folder = shared / "data" / "middlebury" / name
-    pair = [luma(load_image(folder / f"{side}.png")) for side in ("left", "right")]
-    left, right = pair if max(pair[0].shape) > 1000 else enlarged(tuple(pair), 3)
-    found, initial = find_rectification(left, right)
-    assert found.rectified
-    assert not found.swapped
-    assert initial is None
-    assert find_rectification(right, left)[0].swapped
-    for shift in (-2, 1.5, 3):
-        other = moved(right, [[1, 0, 0], [0, 1, shift]])
-        assert not find_rectification(left, other)[0].rectified

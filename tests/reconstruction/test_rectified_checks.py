@@ -17,20 +17,8 @@ from deepdetect.reconstruction.checks import (
     check_cameras,
     check_depths,
     check_disparities,
-    check_matched,
     check_pure_rotation,
 )
-
-
-@pytest.mark.parametrize(("unique", "least"), [(True, 0.1), (False, 0.25)])
-def test_too_few_matches_are_refused_with_their_number(
-    unique: bool, least: float, one_line
-) -> None:
-    enough = int(np.ceil(least * 10_000))
-    check_matched(enough, 10_000, unique)
-    with pytest.raises(ReconstructionError, match=f"only {enough - 1:,} of 10,000") as error:
-        check_matched(enough - 1, 10_000, unique)
-    one_line(error.value)
 
 
 def test_disparities_that_do_not_differ(shared: Path, one_line) -> None:

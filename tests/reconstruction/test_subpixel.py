@@ -120,19 +120,6 @@ def test_bands_of_rows_do_not_matter(
     assert whole.converged.mean() > 0.5
 
 
-def test_of_very_many_matches_some_tell_how_patches_are_deformed(
-    gray: np.ndarray, pixels: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    second = moved(gray, 0.4, -0.3)
-    start = pixels.astype(float)
-    every = refine_matches(gray, second, pixels, start)
-    monkeypatch.setattr(subpixel, "MIN_MATCHES_OF_LATTICE", 0)
-    some = refine_matches(gray, second, pixels, start)
-    both = every.converged & some.converged
-    assert both.mean() > 0.9 * every.converged.mean()
-    assert np.median(np.abs(some.points1 - every.points1)[both]) < 0.01
-
-
 def test_corners_come_from_all_parts_of_the_image_each_once(
     gray: np.ndarray, pixels: np.ndarray
 ) -> None:

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.io.image import luma
 from deepdetect.matching.guided.asift import TILTS, simulate_view, simulated_views
 
 
@@ -13,13 +12,6 @@ def blob(x: float, y: float, across: float, down: float) -> np.ndarray:
     row, column = np.indices((160, 220))
     away = ((column - x) / across) ** 2 + ((row - y) / down) ** 2
     return np.rint(40 + 180 * np.exp(-away / 2)).astype(np.uint8)
-
-
-def test_a_tilt_shortens_the_width_only(photo: np.ndarray) -> None:
-    gray = luma(photo)[:100]
-    view, affine = simulate_view(gray, 2.0, 0.0)
-    assert view.shape == (100, 128)
-    np.testing.assert_allclose(affine, [[0.5, 0, 0], [0, 1, 0]], atol=1e-12)
 
 
 @pytest.mark.parametrize("tilt", [1.0, *TILTS])
@@ -71,12 +63,3 @@ def test_keypoints_lie_at_their_positions_in_the_image_itself(tilt: float) -> No
     near = gaps[np.argmin(np.linalg.norm(gaps, axis=1))]
     assert abs(near[0]) < 0.15 * tilt
     assert abs(near[1]) < 0.15
-
-
-@pytest.mark.parametrize("tilt", TILTS)
-@pytest.mark.parametrize("shape", [(1, 1), (5, 5), (1, 40), (40, 1)])
-def test_tiny_images_have_views_without_keypoints(shape: tuple[int, int], tilt: float) -> None:
-    gray = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
-    for found in simulated_views(gray, tilt, 50):
-        assert found.xy.shape == (len(found), 2)
-        assert found.descriptors.shape == (len(found), 128)
