@@ -23,7 +23,7 @@ for name in ("AgastFeatureDetector_create", "BRISK_create"):
     if hasattr(cv2, name):
         delattr(cv2, name)
 """
-NOTHING_MORE = "for name in ('matplotlib', 'psutil', 'scipy', 'torch'): sys.modules[name] = None"
+NOTHING_MORE = "for name in ('matplotlib', 'scipy', 'torch'): sys.modules[name] = None"
 
 Run = Callable[..., tuple[int, str]]
 

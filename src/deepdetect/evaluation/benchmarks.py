@@ -17,7 +17,7 @@ from .._shared.records import file_digest
 from .._shared.registry import look_up
 from ..detector.pretrained import resolve_weights
 from .options import BenchmarkOptions
-from .profiling import StageProfiler, peak_memory
+from .profiling import peak_memory
 from .report import Report, Section
 from .run import Run
 
@@ -58,7 +58,6 @@ def run_benchmarks(
     """
     started = time.monotonic()
     entries = [look_up("benchmark", name, BENCHMARKS) for name in names]
-    StageProfiler()  # says at once when its package is missing
     run = Run(Path(data), None if cache is None else Path(cache), quiet)
     sections: list[Section] = []
     for name, (module, function) in zip(names, entries, strict=True):

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from types import TracebackType
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from .._shared.errors import DeepDetectError, MissingExtraError
+from .._shared.errors import DeepDetectError
 from .._shared.parallel import start_child
 
 Outcome = TypeVar("Outcome")
-
-SAMPLING_INTERVAL_S = 0.005
 
 
 @dataclass
@@ -47,8 +44,8 @@ class Profile:
 class StageProfiler:
     """Measures stages that follow each other, in a `with` block: `record` ends one.
 
-    A thread samples the memory of the process; a peak that it misses counts where it is the highest
-    of the process so far.
+    The memory is exact on Linux, which is told to forget the peak where a stage begins; elsewhere a
+    peak counts where it is the highest of the process so far.
 
     Attributes:
         stages: by name; stages of one name add up their seconds, the largest memory counts.
@@ -66,48 +63,47 @@ class StageProfiler:
     def __init__(self) -> None:
         self.stages: dict[str, Profile] = {}
         self.memory = 0
-        self._process = _process()
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._sample, daemon=True)
 
     def __enter__(self) -> StageProfiler:
+        _RUNNING.append(self)
         self._begin()
         self._first = self._before
-        self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._stop.set()
-        self._thread.join()
+    def __exit__(self, *_: object) -> None:
+        _RUNNING.remove(self)
 
     def record(self, name: str) -> None:
         """End a stage, and begin the next one."""
         seconds = time.perf_counter() - self._started
-        peak = max(self._peak, self._resident())
-        if peak_memory() > self._peak_before:
-            peak = max(peak, peak_memory())
+        _forget_peak()
         profile = self.stages.setdefault(name, Profile())
         profile.seconds += seconds
-        profile.memory = max(profile.memory, peak - self._before, 0)
-        self.memory = max(self.memory, peak - self._first)
+        profile.memory = max(profile.memory, self._peak - self._before)
+        self.memory = max(self.memory, self._peak - self._first)
         self._begin()
 
     def _begin(self) -> None:
-        self._before = self._peak = self._resident()
-        self._peak_before = peak_memory()
+        _forget_peak()
+        self._before = self._peak = _memory("VmRSS")
         self._started = time.perf_counter()
 
-    def _resident(self) -> int:
-        return int(self._process.memory_info().rss)
 
-    def _sample(self) -> None:
-        while not self._stop.wait(SAMPLING_INTERVAL_S):
-            self._peak = max(self._peak, self._resident())
+_RUNNING: list[StageProfiler] = []
+"""Those in whose blocks the process is: blocks may be nested."""
+
+_highest = 0
+
+
+def _forget_peak() -> None:
+    """Note the peak of the process in all that are running, and let it begin anew."""
+    global _highest
+    peak = _memory("VmHWM")
+    _highest = max(_highest, peak)
+    for profiler in _RUNNING:
+        profiler._peak = max(getattr(profiler, "_peak", 0), peak)
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM, see man 5 proc
 
 
 @contextmanager
@@ -137,16 +133,18 @@ def peak_memory() -> int:
         >>> peak_memory() > 1_000_000
         True
     """
-    # Linux counts what the process that started this one held as its maximum, too; here it does
-    # not.
+    return max(_highest, _memory("VmHWM"))
+
+
+def _memory(name: str) -> int:
+    """Return a number of bytes of /proc/self/status; the highest so far on other systems."""
+    # Linux's ru_maxrss counts what the process that started this one held, too; this does not.
     with suppress(OSError), open("/proc/self/status", encoding="ascii") as status:
-        for line in status:
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
+        return next(int(line.split()[1]) * 1024 for line in status if line.startswith(f"{name}:"))
     try:
         import resource
     except ImportError:  # on Windows
-        return int(getattr(_process().memory_info(), "peak_wset", 0))
+        return 0
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
@@ -181,14 +179,3 @@ def run_in_child(function: Callable[..., Outcome], *arguments: Any) -> Outcome:
                 "its process was ended by the system, probably for lack of memory: take fewer or "
                 "smaller images"
             ) from None
-
-
-def _process() -> Any:
-    try:
-        import psutil
-    except ImportError:
-        raise MissingExtraError(
-            "measuring memory needs the package psutil, which is not installed: "
-            "run pip install psutil"
-        ) from None
-    return psutil.Process()

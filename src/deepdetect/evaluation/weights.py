@@ -139,6 +139,7 @@ def evaluate(
 
     Example:
         >>> import tempfile
+        >>> import numpy as np
         >>> from PIL import Image
         >>> folder = Path(tempfile.mkdtemp())
         >>> for name in ("image_1.png", "mask_image_1.png"):

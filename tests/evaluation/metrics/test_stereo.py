@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from deepdetect.evaluation.metrics.stereo import (
     DISPARITY_TOLERANCES_PX,
-    counterpart_outside,
     disparity_accuracy,
-    outside_accuracy,
+    half_occluded_accuracy,
     score_errors,
     stereo_score,
 )
@@ -23,7 +22,6 @@ EVERY = np.column_stack([part.ravel() for part in np.indices((4, 5))[::-1]])
 def test_the_truth_itself_is_perfect() -> None:
     found = disparity_accuracy(EVERY, TRUTH.ravel(), TRUTH)
     assert found.accuracy == (1, 1, 1, 1)
-    assert (found.points, found.evaluated) == (20, 20)
     assert (found.epe_px, found.completeness, found.f_score) == (0, 1, 1)
 
 
@@ -50,14 +48,13 @@ def test_unknown_truth_is_not_evaluated_and_not_asked_for() -> None:
     truth = TRUTH.copy()
     truth[0] = np.nan
     found = disparity_accuracy(EVERY[:10], TRUTH.ravel()[:10], truth)
-    assert (found.points, found.evaluated) == (10, 5)
+    assert found.accuracy == (1, 1, 1, 1)
     assert found.completeness == pytest.approx(5 / 15)
 
 
 def test_a_pixel_with_many_points_counts_once_for_completeness() -> None:
     found = disparity_accuracy([[0, 0]] * 7, np.full(7, 10.0), TRUTH)
     assert found.completeness == pytest.approx(1 / 20)
-    assert found.evaluated == 7
 
 
 def test_one_wrong_point_does_not_undo_a_right_one_on_its_pixel() -> None:
@@ -68,7 +65,7 @@ def test_one_wrong_point_does_not_undo_a_right_one_on_its_pixel() -> None:
 
 def test_points_outside_are_counted_and_not_evaluated() -> None:
     found = disparity_accuracy([[-1, 0], [5, 0], [0, 4], [4, 3]], np.full(4, 10.0), TRUTH)
-    assert (found.points, found.evaluated) == (4, 1)
+    assert found.completeness == 1 / 20
 
 
 def test_no_points_have_no_shares() -> None:
@@ -101,20 +98,19 @@ def test_no_match_is_no_error() -> None:
     assert score_errors(np.array([np.nan])).precision == 0
 
 
-def test_outside_are_the_pixels_the_right_image_does_not_hold() -> None:
+def test_half_occluded_are_the_pixels_the_right_image_does_not_hold() -> None:
     column = np.arange(30)
-    for shift in (-4.0, 0.0, 0.4, 6.6):
+    pixels = np.column_stack([part.ravel() for part in np.indices((2, 30))[::-1]])
+    for shift in (-4.0, 0.4, 6.6):
         truth = np.full((2, 30), shift)
         truth[1, 0] = np.nan
         place = np.rint(column - shift)
         expected = np.tile((place < 0) | (place > 29), (2, 1))
         expected[1, 0] = False
-        np.testing.assert_array_equal(counterpart_outside(truth), expected)
         count = int(expected.sum())
-        pixels = np.column_stack([part.ravel() for part in np.indices((2, 30))[::-1]])
-        found = outside_accuracy(pixels, np.full(60, shift + 1), truth)
-        assert (found.outside, found.given, found.correct) == (count, count, count)
-        assert outside_accuracy(pixels, np.full(60, shift + 1.1), truth).correct == 0
-        none = outside_accuracy(np.empty((0, 2)), np.empty(0), truth)
-        assert (none.outside, none.given) == (count, 0)
-        assert np.isnan(none.accuracy)
+        if count:
+            assert half_occluded_accuracy(pixels, np.full(60, shift + 1), truth) == (count, 1)
+            assert half_occluded_accuracy(pixels, np.full(60, shift + 1.1), truth) == (count, 0)
+    number, fraction = half_occluded_accuracy(np.empty((0, 2)), np.empty(0), TRUTH)
+    assert number == 0
+    assert np.isnan(fraction)

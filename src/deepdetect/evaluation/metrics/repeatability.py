@@ -99,11 +99,6 @@ class Repeatability:
         """Fraction of the keypoints that are repeated, in [0, 1]."""
         return self.repeated / self.fewest if self.fewest else 0.0
 
-    @property
-    def chance_corrected(self) -> float:
-        """The value, with chance at 0 and all at 1; below 0 when worse than chance."""
-        return (self.value - self.chance) / (1 - self.chance) if self.chance < 1 else 0.0
-
 
 def mutual_nn_repeatability(
     points0: np.ndarray,
@@ -160,9 +155,9 @@ def repeated_fractions(
         >>> repeated_fractions(corners, corners + [[0, 0], [2, 0]], np.eye(3), ((16, 16), (16, 16)))
         [0.5, 1.0]
     """
-    visible0, visible1 = _in_overlap(points0, points1, homography, sizes)
-    fewest = min(len(visible0), len(visible1))
-    distances = _mutual_distances(visible0, visible1, max(radii_px))
+    visible = _in_overlap(points0, points1, homography, sizes)
+    fewest = min(map(len, visible))
+    distances = _mutual_distances(*visible, max(radii_px))
     return [float((distances <= r).sum() / fewest) if fewest else 0.0 for r in radii_px]
 
 

@@ -60,17 +60,13 @@ class DisparityAccuracy:
     """Points evaluated by the true disparity.
 
     Attributes:
-        points: their number.
-        evaluated: those of them whose true disparity is known.
-        accuracy: fraction of the evaluated at most 0.5, 1, 2 and 4 px off (1 - bad-0.5, ...); NaN
-            without any.
-        epe_px: mean error of the evaluated (end-point error).
+        accuracy: fraction of those with a known truth at most 0.5, 1, 2 and 4 px off (1 - bad-0.5,
+            ...); NaN without any.
+        epe_px: their mean error (end-point error).
         completeness: fraction of the pixels with known truth, hidden ones too, that have a point
             at most 1 px off.
     """
 
-    points: int
-    evaluated: int
     accuracy: tuple[float, ...]
     epe_px: float
     completeness: float
@@ -95,8 +91,8 @@ def disparity_accuracy(
     Example:
         >>> truth = np.array([[5.0, 5.0, np.nan, 7.0]])
         >>> found = disparity_accuracy([[0, 0], [1, 0], [2, 0]], np.array([5.2, 8, 1]), truth)
-        >>> found.evaluated, found.accuracy, round(found.completeness, 3), round(found.f_score, 3)
-        (2, (0.5, 0.5, 0.5, 1.0), 0.333, 0.4)
+        >>> found.accuracy, round(found.completeness, 3), round(found.f_score, 3)
+        ((0.5, 0.5, 0.5, 1.0), 0.333, 0.4)
     """
     columns, rows = np.rint(np.asarray(pixels, np.float64).reshape(-1, 2)).astype(np.int64).T
     height, width = truth.shape
@@ -110,8 +106,6 @@ def disparity_accuracy(
     complete[rows[good], columns[good]] = True
     knowable = np.isfinite(truth).sum()
     return DisparityAccuracy(
-        points=len(inside),
-        evaluated=int(known.sum()),
         accuracy=tuple(
             float((near <= tolerance).mean()) if len(near) else np.nan
             for tolerance in DISPARITY_TOLERANCES_PX
@@ -121,61 +115,27 @@ def disparity_accuracy(
     )
 
 
-@dataclass(frozen=True)
-class OutsideAccuracy:
-    """Points at pixels whose counterpart lies outside the right image.
-
-    Attributes:
-        outside: number of such pixels, by the true disparity.
-        given: how many of them have a point.
-        correct: those of the given at most 1 px off.
-    """
-
-    outside: int
-    given: int
-    correct: int
-
-    @property
-    def accuracy(self) -> float:
-        """Fraction of the given that are correct; NaN without any."""
-        return self.correct / self.given if self.given else np.nan
-
-
-def counterpart_outside(disparity: np.ndarray) -> np.ndarray:
-    """Find the pixels whose counterpart lies outside the right image.
-
-    Args:
-        disparity: (H, W) true disparity of the left image, NaN where it is unknown.
-
-    Returns:
-        (H, W) bool, False where it is unknown.
-
-    Example:
-        >>> counterpart_outside(np.array([[1.0, 1.4, 1.0, np.nan, -1.0]])).tolist()
-        [[True, False, False, False, True]]
-    """
-    width = disparity.shape[1]
-    place = np.arange(width) - disparity
-    return (place < -0.5) | (place > width - 0.5)
-
-
-def outside_accuracy(
+def half_occluded_accuracy(
     pixels: np.ndarray, disparity: np.ndarray, truth: np.ndarray
-) -> OutsideAccuracy:
-    """Evaluate points at pixels whose counterpart lies outside the right image.
+) -> tuple[int, float]:
+    """Evaluate the points at pixels whose counterpart lies outside the right image.
 
     Args:
         pixels: (N, 2) whole pixels of the left image, each once.
         disparity: (N,) in pixels.
         truth: (H, W) true disparity of the left image, NaN where it is unknown.
 
+    Returns:
+        Their number, and the fraction of them at most 1 px off, NaN without any.
+
     Example:
-        >>> truth = np.array([[3.0, 3.0, 3.0, 3.0]])
-        >>> outside_accuracy([[0, 0], [1, 0], [3, 0]], np.array([3.5, 9, 3]), truth)
-        OutsideAccuracy(outside=3, given=2, correct=1)
+        >>> points = [[0, 0], [1, 0], [3, 0]]
+        >>> half_occluded_accuracy(points, np.array([3.5, 9, 3]), np.full((1, 4), 3.0))
+        (2, 0.5)
     """
     columns, rows = np.rint(np.asarray(pixels, np.float64).reshape(-1, 2)).astype(np.int64).T
-    outside = counterpart_outside(truth)
-    there = outside[rows, columns]
-    errors = np.abs(np.asarray(disparity, np.float64) - truth[rows, columns])[there]
-    return OutsideAccuracy(int(outside.sum()), len(errors), int((errors <= TOLERANCE_PX).sum()))
+    true = truth[rows, columns]
+    counterpart = columns - true
+    outside = (counterpart < -0.5) | (counterpart > truth.shape[1] - 0.5)
+    errors = np.abs(np.asarray(disparity, np.float64) - true)[outside]
+    return len(errors), float((errors <= TOLERANCE_PX).mean()) if len(errors) else np.nan

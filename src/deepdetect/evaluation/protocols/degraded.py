@@ -69,7 +69,8 @@ def degraded_rows(
         images: which of a pair are degraded.
 
     Returns:
-        The rows of `standard.pair_row` with "light" and "pair".
+        The rows of `standard.pair_row` with "light" and, in others than daylight, "daylight", the
+        row of the same pair; those of pairs that could not be measured in both are missing.
     """
     items = {
         f"{pair.name}, {light}": (light, pair)
@@ -84,7 +85,13 @@ def degraded_rows(
             seen = degraded_pair(pair, DEGRADATIONS[light], run.files_folder(), images)
         return {"light": light, "pair": pair.name, **pair_row(run, feature, seen, BUDGETS)}
 
-    return run.rows("", features, items, measure)
+    rows = run.rows("", features, items, measure)
+    daylight = {(r["method"], r["pair"]): r for r in rows if r["light"] == DAYLIGHT}
+    return [
+        row | {"daylight": daylight[row["method"], row["pair"]]}
+        for row in rows
+        if row["light"] != DAYLIGHT and (row["method"], row["pair"]) in daylight
+    ]
 
 
 def degraded_pair(
@@ -126,16 +133,10 @@ def degraded_tables(
     ]
 
 
-def _in_both(rows: Rows, light: str) -> tuple[Rows, Rows]:
-    """Return the rows in a light, and in daylight, of the pairs that could be measured in both."""
-    there, daylight = (where(rows, light=name) for name in (light, DAYLIGHT))
-    pairs = {row["pair"] for row in there} & {row["pair"] for row in daylight}
-    first, second = ([r for r in each if r["pair"] in pairs] for each in (there, daylight))
-    return first, second
-
-
 def _relative(rows: Rows, light: str, value: Callable[[Rows], float | None]) -> Cell:
-    degraded, daylight = (value(own) for own in _in_both(rows, light))
+    """Return a score in a light over that of the same pairs in daylight."""
+    own = where(rows, light=light)
+    degraded, daylight = value(own), value([row["daylight"] for row in own])
     return degraded / daylight if degraded is not None and daylight else None
 
 
@@ -165,16 +166,9 @@ def degraded_table(
     """Tabulate the scores with a degradation, each with its fraction of that in daylight."""
     light = degradation.name
 
-    def of_daylight(own: Rows, value: Callable[[Rows], float | None]) -> Cell:
-        return _relative([*own, *daylight[own[0]["method"]]], light, value) if own else None
-
     def accuracy(own: Rows) -> Cell:
         return mean_of(accuracy_at(row["corner errors"], HOMOGRAPHY_THRESHOLD_PX) for row in own)
 
-    daylight = {f.name: where(rows, method=f.name, light=DAYLIGHT) for f in features}
-    measured = [
-        row for feature in features for row in _in_both(where(rows, method=feature.name), light)[0]
-    ]
     most = BUDGETS[-1]
     columns: Columns = [
         PAIRS,
@@ -185,7 +179,7 @@ def degraded_table(
                 (Column(f"{title}, {budget_name(budget)}", style), value),
                 (
                     Column(f"{title}, {budget_name(budget)}: of daylight", ".0%"),
-                    partial(of_daylight, value=value),
+                    partial(_relative, light=light, value=value),
                 ),
             )
         ),
@@ -198,4 +192,4 @@ def degraded_table(
         "dash. Keypoints: in the image that has fewer."
     )
     title = f"{degradation.title}, {what}"
-    return tabulate(f"{key}_{light}", title, features, measured, columns, note)
+    return tabulate(f"{key}_{light}", title, features, where(rows, light=light), columns, note)

@@ -182,13 +182,9 @@ class LabelDensityDetector:
         count = int(np.count_nonzero(self.labels.heatmap(rgb) > 0.5))
         heatmap, logits = self.detector.heatmap_and_logits(rgb)
         taken = np.zeros(heatmap.size, np.float32)
-        taken[_highest(logits, count)] = 1
+        # Of equal ones the first in the order of rows.
+        taken[np.argsort(-logits.ravel(), kind="stable")[:count]] = 1
         return taken.reshape(heatmap.shape)
-
-
-def _highest(values: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices of the highest values; of equal ones the first in the order of rows."""
-    return np.argsort(-values.ravel(), kind="stable")[:count]
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from ..charts import picture
 from ..metrics.stereo import (
     DISPARITY_TOLERANCES_PX,
     disparity_accuracy,
-    outside_accuracy,
+    half_occluded_accuracy,
 )
 from ..options import BenchmarkOptions
 from ..profiling import Profile
@@ -168,9 +168,9 @@ def points_table(
         accuracy: tuple[Cell, ...] = (None,) * (len(DISPARITY_TOLERANCES_PX) + 5)
         if truth is not None:
             score = disparity_accuracy(points.pixels, points.disparity, truth)
-            outside = outside_accuracy(points.pixels, points.disparity, truth)
+            outside = half_occluded_accuracy(points.pixels, points.disparity, truth)
             accuracy = (*score.accuracy, score.epe_px, score.completeness, score.f_score)
-            accuracy += (outside.given, outside.accuracy)
+            accuracy += outside
         profiles = [points.profiles.get(stage) for stage in STAGES]
         return (
             pipeline.title,
