@@ -164,23 +164,6 @@ def test_what_a_killed_process_left_is_removed_and_what_a_live_one_writes_is_not
             process.communicate()
 
 
-def test_machines_of_one_name_are_told_apart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    boot, fallback = tmp_path / "boot_id", tmp_path / "machine-id"
-    monkeypatch.setattr(atomic, "_HOST_FILES", (boot, fallback))
-    machine = atomic._machine.__wrapped__
-    monkeypatch.setattr(atomic.uuid, "getnode", lambda: 7)
-    found = [machine()]
-    monkeypatch.setattr(atomic.uuid, "getnode", lambda: 8)
-    found.append(machine())
-    for path, text in ((fallback, "one"), (fallback, "other"), (boot, "one more"), (boot, "last")):
-        path.write_text(f"{text}\n")
-        found.append(machine())
-    assert len({*found}) == 6
-    assert machine() == found[-1]
-
-
 @pytest.mark.parametrize(("age_s", "stays"), [(3600.0, True), (2 * atomic.ABANDONED_S, False)])
 def test_files_of_another_machine_are_removed_after_a_day(
     tmp_path: Path, age_s: float, stays: bool

@@ -3,7 +3,6 @@ from __future__ import annotations
 import sys
 from types import ModuleType
 
-import cv2
 import pytest
 
 from deepdetect._shared import opencv
@@ -24,12 +23,6 @@ def put(monkeypatch: pytest.MonkeyPatch, **names: object) -> None:
     other = ModuleType("cv2")
     vars(other).update(names)
     monkeypatch.setitem(sys.modules, "cv2", other)
-
-
-def test_it_stands_for_the_installed_one() -> None:
-    assert opencv.cv2.resize is cv2.resize
-    assert opencv.cv2.__version__ == cv2.__version__
-    assert not hasattr(opencv.cv2, "no_such_name")
 
 
 def test_none(monkeypatch: pytest.MonkeyPatch) -> None:

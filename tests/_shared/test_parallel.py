@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect._shared import parallel
-from deepdetect._shared.errors import DeepDetectError, ImageError, OptionError
+from deepdetect._shared.errors import DeepDetectError, ImageError
 from deepdetect._shared.parallel import (
     map_in_processes,
     parallel_for,
@@ -44,12 +44,6 @@ def test_one_worker_or_one_task_stays_in_this_process(
     tasks: list[str], workers: int | None
 ) -> None:
     assert [pid for pid, _ in map_in_processes(eval, tasks, workers)] == [os.getpid()] * len(tasks)
-
-
-@pytest.mark.parametrize("workers", [0, -3])
-def test_too_few_workers(workers: int) -> None:
-    with pytest.raises(OptionError, match=f"workers must be at least 1, not {workers}"):
-        list(map_in_processes(math.sqrt, [1.0], workers))
 
 
 @pytest.mark.parametrize(

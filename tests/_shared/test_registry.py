@@ -25,8 +25,3 @@ def test_a_path_stays_a_path(value: str | Path) -> None:
 def test_an_unknown_name_suggests_the_nearest(find) -> None:
     with pytest.raises(OptionError, match="unknown weights 'dens': did you mean 'dense'"):
         find("weights", "dens", REGISTRY)
-
-
-def test_a_name_that_is_no_path_says_that_a_path_would_do() -> None:
-    with pytest.raises(OptionError, match="or the path of a file"):
-        resolve_name_or_path("weights", "mine", REGISTRY)

@@ -20,12 +20,6 @@ def test_another_reader_finds_the_same_points_and_colours(
     np.testing.assert_array_equal(read.colors[:, :3], cones.colors)
 
 
-def test_double_precision_becomes_float32(small: PointCloud, tmp_path: Path) -> None:
-    save_point_cloud(small, tmp_path / "small.ply")
-    read = trimesh.load(tmp_path / "small.ply")
-    np.testing.assert_array_equal(read.vertices, small.points.astype(np.float32))
-
-
 def header(path: Path) -> list[str]:
     return path.read_bytes().split(b"end_header\n")[0].decode("ascii").splitlines()
 
@@ -41,15 +35,3 @@ def test_the_header_tells_unit_frame_and_notes(small: PointCloud, tmp_path: Path
     assert "comment sc?ne foo: line element vertex 7" in lines
     assert "comment share: 0.9531" in lines
     assert len(trimesh.load(path).vertices) == 256
-
-
-def test_an_unknown_baseline_is_told(small: PointCloud, tmp_path: Path) -> None:
-    cloud = PointCloud(small.points, small.colors, "baseline")
-    save_point_cloud(cloud, tmp_path / "b.ply")
-    assert any("distance of the two cameras" in line for line in header(tmp_path / "b.ply"))
-
-
-def test_a_point_takes_15_bytes(small: PointCloud, tmp_path: Path) -> None:
-    save_point_cloud(small, tmp_path / "small.ply")
-    body = (tmp_path / "small.ply").read_bytes().split(b"end_header\n", 1)[1]
-    assert len(body) == 15 * 256

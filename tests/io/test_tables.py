@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from deepdetect import DeepDetectError, Keypoints, Matches, OptionError
+from deepdetect import DeepDetectError, Keypoints, Matches
 from deepdetect.features.matches import TwoViewGeometry
 from deepdetect.io import tables
 from deepdetect.io.tables import load_keypoints, load_matches, save_keypoints, save_matches
@@ -113,12 +113,6 @@ def test_matches_as_csv(tmp_path: Path) -> None:
     np.testing.assert_allclose(table[:, :2], matches.points0, rtol=1e-6)
     np.testing.assert_allclose(table[:, 4], matches.scores, rtol=1e-6)
     np.testing.assert_array_equal(table[:, 5], matches.inliers)
-
-
-@pytest.mark.parametrize("name", ["k.pkl", "k", "k.npy"])
-def test_other_endings_are_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(OptionError, match=r"\.npz or \.csv"):
-        save_keypoints(keypoints(1), tmp_path / name)
 
 
 def test_files_of_something_else_are_refused(tmp_path: Path) -> None:

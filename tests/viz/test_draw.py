@@ -10,7 +10,6 @@ from PIL import Image
 
 from deepdetect import DeepDetectError, Keypoints, OptionError
 from deepdetect.features.display import PICTURE_SIDE_PX, draw_matches
-from deepdetect.viz import draw
 from deepdetect.viz.draw import (
     CAPTION_HEIGHT,
     add_caption,
@@ -116,14 +115,6 @@ def test_the_best_keypoints_of_all_parts_are_shown_by_score(photo: np.ndarray) -
     assert right[of[1]][:, 0].mean() > right[of[1]][:, 2].mean() + 20
 
 
-@pytest.mark.parametrize("count", [0, 1])
-def test_few_keypoints_are_drawn(count: int) -> None:
-    keypoints = Keypoints(np.full((count, 2), 20), np.ones(count), (60, 40))
-    picture = draw_best_keypoints(np.zeros((40, 60, 3), np.uint8), keypoints)
-    assert picture.shape == (40 + CAPTION_HEIGHT, 60, 3)
-    assert picture[:40].any() == bool(count)
-
-
 def test_a_map_of_logits_is_not_saturated() -> None:
     logits = np.linspace(-12, 40, 200, dtype=np.float32)[None].repeat(20, 0)
     picture = draw_logits(logits)[:20]
@@ -146,57 +137,3 @@ def test_a_scale_is_below_the_picture_and_as_wide(width: int) -> None:
     picture = add_scale(np.zeros((20, width, 3), np.uint8), "logit", -3, 12)
     assert picture.shape == (20 + CAPTION_HEIGHT, width, 3)
     assert picture[20:].any()
-
-
-@pytest.fixture
-def captions(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """All lines of text that are drawn."""
-    texts, caption = [], draw._caption
-
-    def noted(text: str, width: int, unit: float) -> np.ndarray:
-        texts.append(text)
-        return caption(text, width, unit)
-
-    monkeypatch.setattr(draw, "_caption", noted)
-    return texts
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "expected"),
-    [
-        (1.142, 66.06, ["1.1", "66"]),
-        (-10.21, 34.11, ["-10", "34"]),
-        (0.4033, 70.33, ["0.4", "70"]),
-        (-0.0003, 70.33, ["0.0", "70"]),
-        (1842.3, 901.7, ["1,840", "900"]),
-        (12345.6, 987.6, ["12,000", "1,000"]),
-        (988.2, 985.1, ["988.2", "985.1"]),
-        (0.5012, 0.9987, ["0.50", "1.00"]),
-        (0.99, 0.99, ["0.99", "0.99"]),
-        (0, 0, ["0.0", "0.0"]),
-    ],
-)
-def test_the_ends_of_a_scale_have_few_digits(
-    low: float, high: float, expected: list[str], captions: list[str]
-) -> None:
-    add_scale(np.zeros((20, 400, 3), np.uint8), "values", low, high)
-    assert sorted(captions) == sorted(["values", *expected])
-
-
-@pytest.mark.parametrize(
-    ("count", "logits", "expected"),
-    [
-        (0, False, "no keypoints"),
-        (1, False, "1 keypoint, coloured by score"),
-        (20, True, "20 keypoints, coloured by logit"),
-        (2500, True, "1,000 of 2,500 keypoints, coloured by logit"),
-    ],
-)
-def test_the_caption_counts_the_keypoints(
-    count: int, logits: bool, expected: str, captions: list[str]
-) -> None:
-    xy = np.random.default_rng(0).uniform(0, 899, (count, 2))
-    values = np.arange(count, dtype=np.float32)
-    keypoints = Keypoints(xy, np.ones(count), (900, 900), values if logits else None)
-    draw_best_keypoints(np.zeros((900, 900, 3), np.uint8), keypoints)
-    assert expected in captions
