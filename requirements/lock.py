@@ -108,6 +108,18 @@ def _group(name: str) -> list[str]:
     ]
 
 
+def _extra(name: str) -> list[str]:
+    """Return the requirements of an extra and of those of this package that it includes."""
+    found = []
+    for text in PROJECT["project"]["optional-dependencies"][name]:
+        requirement = Requirement(text)
+        if requirement.name == PROJECT["project"]["name"]:
+            found += [each for inner in requirement.extras for each in _extra(inner)]
+        else:
+            found.append(text)
+    return found
+
+
 def _declared(lock: LockFile) -> list[Requirement]:
     """Return what pyproject.toml asks for in a lock file."""
     project = PROJECT["project"]
@@ -117,7 +129,7 @@ def _declared(lock: LockFile) -> list[Requirement]:
     if "build" in lock.groups or "dev" in lock.groups:
         listed += PROJECT["build-system"]["requires"]
     for extra in lock.extras:
-        listed += project["optional-dependencies"][extra]
+        listed += _extra(extra)
     text = re.sub("#.*", "", (FOLDER.parent / lock.overrides).read_text())
     overrides = [Requirement(line) for line in text.splitlines() if line]
     left_out = {each.name for each in overrides if each.marker} | {project["name"]}
@@ -139,6 +151,8 @@ def problems(lock: LockFile) -> list[str]:
     direct: set[str] = set()
     found: list[str] = []
     for name, version, hashes, comments in entry.findall(text):
+        if "== 'never'" in hashes:  # by an override
+            continue
         pins.setdefault(canonicalize_name(name), []).append(Version(version))
         if "pyproject.toml" in comments:
             direct.add(canonicalize_name(name))
