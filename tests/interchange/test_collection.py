@@ -9,10 +9,11 @@ from PIL import Image
 from deepdetect import ImageError, Keypoints, OptionError, PointDetector
 from deepdetect.features.sift import describe_keypoints
 from deepdetect.interchange import Collection, PairMatches, describe_collection
-from deepdetect.interchange.collection import check_upright, sift_bytes
+from deepdetect.interchange.collection import check_upright
 from deepdetect.interchange.colmap import write_colmap_text
 from deepdetect.interchange.hloc import write_hloc
 from deepdetect.io.image import ORIENTATION_TAG, luma
+from deepdetect.sfm.database import sift_bytes
 
 
 def test_each_keypoint_is_matched_once() -> None:

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import Camera
+from deepdetect import Camera, Keypoints
 from deepdetect.sfm import mapping
-from deepdetect.sfm.database import DatabaseImage, write_database
+from deepdetect.sfm.database import write_database
 from deepdetect.sfm.intrinsics import CameraIntrinsics
 from deepdetect.sfm.mapping import (
     adjust,
@@ -115,7 +115,7 @@ def write_scenes(path: Path, steps: dict[str, tuple[np.ndarray, int]]) -> None:
     """Write a database of cameras that pass random points, by name: step and number of cameras."""
     rng = np.random.default_rng(0)
     intrinsics = CameraIntrinsics.of_camera(Camera((640, 480), 500.0))
-    images: list[DatabaseImage] = []
+    images = {}
     matches = {}
     for scene, (step, count) in steps.items():
         points = rng.uniform((-5, -3, 7), (5, 3, 13), (400, 3))
@@ -126,7 +126,9 @@ def write_scenes(path: Path, steps: dict[str, tuple[np.ndarray, int]]) -> None:
             inside = ((xy > 0) & (xy < (639, 479))).all(axis=1)
             own.append((f"{scene}{number}.jpg", np.flatnonzero(inside)))
             noisy = xy[inside] + rng.normal(0, 0.2, (inside.sum(), 2))
-            images.append(DatabaseImage(own[-1][0], intrinsics, noisy))
+            noisy = noisy.clip(0, (639, 479))
+            points_seen = Keypoints(noisy, np.ones(len(noisy)), (640, 480))
+            images[own[-1][0]] = points_seen, intrinsics
         for (name0, rows0), (name1, rows1) in itertools.combinations(own, 2):
             rows = np.intersect1d(rows0, rows1, return_indices=True)[1:]
             matches[name0, name1] = np.column_stack(rows)

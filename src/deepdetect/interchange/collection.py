@@ -11,17 +11,11 @@ import numpy as np
 from .._shared.errors import ImageError, OptionError
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
+from ..batch.pair_list import Pair
 from ..features.keypoints import Keypoints
 from ..features.sift import describe_keypoints
 from ..io.image import ORIENTATION_TAG, load_image, luma
 from ..io.image_file import open_image
-
-Pair = tuple[str, str]
-
-ROOT_SIFT_NORM = 512
-"""Length of RootSIFT descriptors as bytes."""
-
-SIFT_NUMBERS = 128
 
 
 @suggest_keywords
@@ -170,18 +164,3 @@ def check_upright(paths: Iterable[Path]) -> None:
                 f"{path} is turned by its EXIF orientation, which hloc does not do: save it "
                 "upright, without that tag (mogrify -auto-orient)"
             )
-
-
-def sift_bytes(keypoints: Keypoints) -> np.ndarray | None:
-    """Return descriptors as SIFT's (N, 128) uint8, or None where they are of another kind.
-
-    Descriptors of length 1 are multiplied by 512, as SIFT does it.
-    """
-    found = keypoints.descriptors
-    if found is None or found.shape[1] != SIFT_NUMBERS:
-        return None
-    if found.dtype == np.uint8:
-        return found
-    if found.size and found.min() < 0:
-        return None
-    return np.rint(found * ROOT_SIFT_NORM).clip(0, 255).astype(np.uint8)

@@ -1,8 +1,4 @@
-"""COLMAP: a database, or its text files of features and matches.
-
-COLMAP's centre of the first pixel is (0.5, 0.5): half a pixel is added to all positions. Its scale
-is sigma, half of OpenCV's diameter, and its orientation is in radians, clockwise as OpenCV's.
-"""
+"""COLMAP: a database, or its text files of features and matches; `sfm.database` has the units."""
 
 from __future__ import annotations
 
@@ -14,12 +10,11 @@ import numpy as np
 from .._shared.atomic import atomic_path
 from .._shared.errors import OptionError
 from .._shared.options import suggest_keywords
-from ..features.keypoints import UNSET_ANGLE, Keypoints
 from ..sfm.colmap import PIXEL_CENTRE, import_pycolmap
-from ..sfm.database import DatabaseImage, write_database
+from ..sfm.database import orientations_of, sift_bytes, write_database
 from ..sfm.intrinsics import CameraIntrinsics
 from ..sfm.mapping import verify_pairs
-from .collection import Collection, check_names, sift_bytes
+from .collection import Collection, check_names
 
 MATCHES_NAME = "matches"
 """Of the text file of all matches, without its ending."""
@@ -38,9 +33,6 @@ def write_colmap(
     seed: int = 0,
 ) -> tuple[Path, ...]:
     """Write COLMAP's database, whole or not at all; it is replaced where it exists.
-
-    Keypoints with sizes have four columns (x, y, scale, orientation), others two. Descriptors are
-    written where they are SIFT's.
 
     Args:
         collection: the images.
@@ -61,36 +53,16 @@ def write_colmap(
     path = Path(output)
     if path.suffix.lower() != ".db":
         raise OptionError(f"{path} must end in .db")
-    images = []
-    for name, points in collection.keypoints.items():
+    for name in collection.keypoints:
         if name not in intrinsics:
             raise OptionError(f"{name} has no camera: give one in `intrinsics`")
-        scales, orientations = _frames(points)
-        images.append(
-            DatabaseImage(
-                name, intrinsics[name], points.xy, scales, orientations, sift_bytes(points)
-            )
-        )
+    images = {name: (points, intrinsics[name]) for name, points in collection.keypoints.items()}
     with atomic_path(path) as temporary:
         rows = {pair: found.rows for pair, found in collection.matches.items()}
         write_database(temporary, images, rows)
         if verify and rows:
             verify_pairs(temporary, seed)
     return (path,)
-
-
-def _frames(points: Keypoints) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Return sigma in pixels and orientation in radians, or None twice without sizes."""
-    if points.sizes is None:
-        return None, None
-    return points.sizes / 2, orientations_of(points)
-
-
-def orientations_of(points: Keypoints) -> np.ndarray:
-    """Return (N,) orientations in radians, clockwise; 0 where there are none."""
-    if points.angles is None:
-        return np.zeros(len(points), np.float32)
-    return np.deg2rad(np.where(points.angles == UNSET_ANGLE, 0, points.angles))
 
 
 @suggest_keywords

@@ -13,7 +13,7 @@ from .._shared.errors import InvalidFileError, OptionError
 from .._shared.options import suggest_keywords
 from ..batch.extraction import extract_features, keypoints_of
 from ..batch.hdf5 import import_h5py, open_hdf5
-from ..batch.pair_list import read_pairs
+from ..batch.pair_list import Pair, read_pairs
 from ..batch.pair_matching import match_pairs
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
@@ -21,7 +21,7 @@ from ..features.keypoints import Keypoints
 from ..io.image import find_images
 from ..io.tables import load_keypoints, load_matches
 from ..sfm.pair_selection import sequential_pairs
-from .collection import Collection, Pair, PairMatches
+from .collection import Collection, PairMatches
 
 MAX_ALL_PAIRS = 50
 """Images that are all matched with each other where no pairs are named."""

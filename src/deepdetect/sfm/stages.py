@@ -30,10 +30,11 @@ from ..batch.pair_list import Pair, pair_name
 from ..batch.pair_matching import PairMatchingOptions, match_pairs
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
+from ..features.keypoints import Keypoints
 from ..features.selection import SelectionOptions
 from ..io.image import find_images
 from .colmap import import_pycolmap
-from .database import DatabaseImage, write_database
+from .database import write_database
 from .dense import Reference, dense_points, find_references, limited_view
 from .fusion import DensePoints, merge_dense_points
 from .intrinsics import CameraIntrinsics
@@ -213,14 +214,14 @@ class Stages:
             and the names of the images in each component that is no part of it.
         """
         pycolmap = import_pycolmap()
+        images = {}
         with open_hdf5(self.features) as file:
-            images = [
-                DatabaseImage(name, own, file[name]["keypoints"][()])
-                for name, own in intrinsics.items()
-            ]
-        cameras = [id(image.intrinsics) for image in images]
+            for name, own in intrinsics.items():
+                xy = file[name]["keypoints"][()]
+                images[name] = Keypoints(xy, np.ones(len(xy), np.float32), own.size), own
+        cameras = [id(own) for own in intrinsics.values()]
         made_of = key(
-            [(each.name, each.intrinsics, each.xy) for each in images],
+            [(name, own, points.xy) for name, (points, own) in images.items()],
             [cameras.index(camera) for camera in cameras],
             list(matches.items()),
             (known, self.seed, pycolmap.__version__, __version__),
