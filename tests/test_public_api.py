@@ -71,6 +71,8 @@ def test_every_public_name_is_documented(name: str) -> None:
 )
 def test_public_functions_have_explicit_typed_parameters(name: str) -> None:
     signature = inspect.signature(getattr(deepdetect, name))
+    kinds = [parameter.kind for parameter in signature.parameters.values()]
+    assert kinds.count(inspect.Parameter.KEYWORD_ONLY) <= 12
     for parameter in signature.parameters.values():
         assert parameter.kind is not inspect.Parameter.VAR_KEYWORD, parameter
         assert parameter.annotation is not inspect.Parameter.empty, parameter

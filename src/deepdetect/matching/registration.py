@@ -157,7 +157,8 @@ def agree(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> bool:
 
     Example:
         >>> rng = np.random.default_rng(0)
-        >>> first, second = (cv2.GaussianBlur(rng.random((99, 99)), (0, 0), 2) for _ in range(2))
+        >>> noise = rng.integers(0, 256, (2, 99, 99)).astype(np.uint8)
+        >>> first, second = (cv2.GaussianBlur(each, (0, 0), 2) for each in noise)
         >>> agree(first, first, np.eye(3)), agree(first, second, np.eye(3))
         (True, False)
     """
