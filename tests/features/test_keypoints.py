@@ -227,10 +227,7 @@ def test_features_for_lightglue() -> None:
     assert "descriptors" not in plain
     assert plain["scales"].tolist() == [[7, 7, 7]]
     np.testing.assert_allclose(plain["oris"][0], np.full(3, np.pi / 2), rtol=1e-6)
-    given = POINTS.to_lightglue(np.eye(3, 128))
-    np.testing.assert_array_equal(given["descriptors"][0], np.eye(3, 128))
-    with pytest.raises(OptionError, match=r"need \(3, D\) descriptors"):
-        POINTS.to_lightglue(np.eye(2, 128))
+    assert points.to_lightglue(scale="sigma")["scales"].tolist() == (found["scales"] / 2).tolist()
 
 
 def test_lightglue_takes_them() -> None:
@@ -240,9 +237,10 @@ def test_lightglue_takes_them() -> None:
     matcher = kornia.LightGlue(None, input_dim=128, add_scale_ori=True).eval()
     rng = np.random.default_rng(0)
     features = [
-        Keypoints(rng.uniform(0, 99, (40, 2)), np.ones(40), (100, 100)).to_lightglue(
-            rng.random((40, 128)).astype(np.float32)
-        )
+        Keypoints(
+            *(rng.uniform(0, 99, (40, 2)), np.ones(40), (100, 100)),
+            descriptors=rng.random((40, 128)).astype(np.float32),
+        ).to_lightglue()
         for _ in range(2)
     ]
     with torch.inference_mode():

@@ -6,7 +6,7 @@ import pytest
 
 from deepdetect import Keypoints, PointDetector
 from deepdetect.features.sift import describe_keypoints
-from deepdetect.integrations.lightglue import DeepDetectExtractor, to_lightglue
+from deepdetect.integrations.lightglue import DeepDetectExtractor
 from deepdetect.io.image import luma
 
 from .conftest import Views
@@ -24,7 +24,7 @@ def test_sift_keypoints_become_what_lightglues_extractor_makes_of_them(views: Vi
     sift = cv2.SIFT_create(50, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(gray, None)
     points = describe_keypoints(gray, Keypoints.from_opencv(keypoints, (256, 200)))
-    features = to_lightglue(points)
+    features = points.to_lightglue()
     assert np.array_equal(features["keypoints"][0], [k.pt for k in keypoints])
     assert np.array_equal(features["scales"][0], np.float32([k.size for k in keypoints]))
     assert np.allclose(features["oris"][0], np.deg2rad([k.angle for k in keypoints]))
@@ -33,7 +33,7 @@ def test_sift_keypoints_become_what_lightglues_extractor_makes_of_them(views: Vi
     cosine = (features["descriptors"][0].numpy() * expected).sum(axis=1)
     assert np.median(cosine) > 0.99
     assert np.allclose(features["descriptors"][0].norm(dim=1), 1, atol=1e-6)
-    sigma = to_lightglue(points, "sigma")["scales"]
+    sigma = points.to_lightglue(scale="sigma")["scales"]
     assert np.array_equal(2 * sigma, features["scales"])
 
 

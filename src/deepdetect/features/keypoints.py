@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from .._shared.errors import MissingExtraError, OptionError, install_command
+from .._shared.errors import MissingExtraError, OptionError, install_command, unknown_name
 from .._shared.image_array import Channels
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.parallel import parallel_for
+
+SIZES_PER_SCALE = {"diameter": 1.0, "sigma": 2.0}
+"""Of a keypoint of SIFT, by what a scale is."""
 
 MAX_COORDINATE_BITS = 12
 """Of a position in `bayer_order`: float32 holds the order exactly up to this many."""
@@ -160,7 +163,11 @@ class Keypoints:
 
     @suggest_keywords
     def to_lightglue(
-        self, descriptors: np.ndarray | None = None, *, size: float = 3.0, angle: float = 0.0
+        self,
+        *,
+        scale: Literal["diameter", "sigma"] = "diameter",
+        size: float = 3.0,
+        angle: float = 0.0,
     ) -> dict[str, Any]:
         """Convert to the features of one image that LightGlue takes, as PyTorch tensors.
 
@@ -168,20 +175,23 @@ class Keypoints:
         keypoints are usual. Its pixels are as ours: the centre of the first is (0, 0).
 
         Args:
-            descriptors: (N, D) float32; None: those that the keypoints have. Without any the
-                dictionary has none.
+            scale: what its scales are: "diameter", as its own extractor has them from OpenCV, or
+                "sigma", half of it, as it has them from COLMAP, and as kornia's `LightGlueMatcher`
+                gives them. Both authors' programs use the same weights.
             size: diameter in pixels where the keypoints have no sizes.
             angle: orientation in degrees where they have no angles, or OpenCV's -1.
 
         Returns:
             float32 tensors with a batch dimension: "keypoints" (1, N, 2), "keypoint_scores"
             (1, N), "scales" (1, N) in pixels, "oris" (1, N) in radians, "image_size" (1, 2) as
-            (width, height), and "descriptors" (1, N, D) of length 1.
+            (width, height), and of described keypoints "descriptors" (1, N, D) of length 1.
 
         Raises:
-            OptionError: there is not one descriptor for each keypoint.
+            OptionError: the scale is unknown.
             MissingExtraError: torch is not installed.
         """
+        if scale not in SIZES_PER_SCALE:
+            raise unknown_name("scale", scale, SIZES_PER_SCALE)
         try:
             import torch
         except ImportError:
@@ -189,8 +199,6 @@ class Keypoints:
                 "features for LightGlue need the package torch, which is not installed: "
                 f"run {install_command('torch')}"
             ) from None
-        # Checks the descriptors.
-        described = self if descriptors is None else replace(self, descriptors=descriptors)
         count = len(self)
         sizes = np.full(count, size, np.float32) if self.sizes is None else self.sizes
         angles = np.full(count, angle, np.float32) if self.angles is None else self.angles
@@ -198,14 +206,12 @@ class Keypoints:
         arrays = {
             "keypoints": self.xy,
             "keypoint_scores": self.scores,
-            "scales": sizes,
+            "scales": sizes / SIZES_PER_SCALE[scale],
             "oris": np.deg2rad(angles),
             "image_size": np.array(self.image_size),
         }
-        if described.descriptors is not None:
-            found = described.descriptors.astype(np.float32)
-            lengths = np.linalg.norm(found, axis=1, keepdims=True)
-            arrays["descriptors"] = found / np.maximum(lengths, np.finfo(np.float32).tiny)
+        if self.descriptors is not None:
+            arrays["descriptors"] = unit_length(self.descriptors)
         return {name: torch.tensor(a, dtype=torch.float32)[None] for name, a in arrays.items()}
 
     @suggest_keywords
@@ -289,6 +295,19 @@ class Keypoints:
         if self.descriptors is not None:
             text += f", {self.descriptors.shape[1]}-D {self.descriptors.dtype} descriptors"
         return f"Keypoints({text})"
+
+
+def unit_length(descriptors: np.ndarray) -> np.ndarray:
+    """Return (N, D) descriptors as float32 of length 1.
+
+    Example:
+        >>> unit_length(np.array([[3, 4]], np.uint8)).round(3).tolist()
+        [[0.6000000238418579, 0.800000011920929]]
+    """
+    values = descriptors.astype(np.float32)
+    lengths = np.linalg.norm(values, axis=1, keepdims=True)
+    unit: np.ndarray = values / np.maximum(lengths, np.finfo(np.float32).tiny)
+    return unit
 
 
 def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:

@@ -15,10 +15,11 @@ import numpy as np
 from .._shared.errors import OptionError, unknown_name
 from ..detector.detector import AnyDetector, DeepDetect
 from ..detector.point_detector import PointDetector
+from ..features.keypoints import unit_length
 from ..features.matchers import get_matcher, match_descriptors
 from ..matching.pipeline import match_images
 from .packages import base_class, import_package
-from .tensors import image_from_tensor, unit_descriptors
+from .tensors import image_from_tensor
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -89,10 +90,11 @@ class DeepDetectExtractor(BaseModel):
         image = data["image"]
         points = self._detector.extract(image_from_tensor(image[0]))
         assert points.angles is not None
+        assert points.descriptors is not None
         arrays = {
             "keypoints": points.xy.astype(np.float64),
             "scores": points.scores,
-            "descriptors": unit_descriptors(points).T.copy(),
+            "descriptors": unit_length(points.descriptors).T.copy(),
             "scales": points.sizes,
             "oris": np.deg2rad(points.angles) if self._radians else points.angles,
         }

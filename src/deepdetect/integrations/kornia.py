@@ -9,9 +9,9 @@ import numpy as np
 from .._shared.errors import OptionError
 from .._shared.options import suggest_keywords
 from ..detector.point_detector import PointDetector
-from ..features.keypoints import Keypoints
+from ..features.keypoints import Keypoints, unit_length
 from .packages import base_class, import_package
-from .tensors import image_from_tensor, unit_descriptors
+from .tensors import image_from_tensor
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -115,7 +115,11 @@ class DeepDetectFeature(DeepDetectDetector):
         ]
         lafs = [self._lafs(points) for points in found]
         scores = [torch.from_numpy(points.scores) for points in found]
-        descriptors = [torch.from_numpy(unit_descriptors(points)) for points in found]
+        descriptors = [
+            torch.from_numpy(unit_length(points.descriptors))
+            for points in found
+            if points.descriptors is not None  # always
+        ]
         return _padded(lafs, img), _padded(scores, img), _padded(descriptors, img)
 
 

@@ -1,4 +1,4 @@
-"""What the drop-ins share: images from tensors, and descriptors of length 1."""
+"""Images from tensors."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..features.keypoints import Keypoints
 from ..io.image import load_image
 
 if TYPE_CHECKING:
@@ -14,21 +13,6 @@ if TYPE_CHECKING:
 
 OVERSHOOT = 0.25
 """Of the values of tensors beyond [0, 1] that is cut off: bicubic filters leave some."""
-
-
-def unit_descriptors(points: Keypoints) -> np.ndarray:
-    """Return (N, D) float32 descriptors of keypoints, each of length 1.
-
-    Example:
-        >>> points = Keypoints([[3, 4]], [1], (8, 8), descriptors=np.array([[3, 4]], np.uint8))
-        >>> unit_descriptors(points).tolist()
-        [[0.6000000238418579, 0.800000011920929]]
-    """
-    assert points.descriptors is not None
-    descriptors = points.descriptors.astype(np.float32)
-    lengths = np.linalg.norm(descriptors, axis=1, keepdims=True)
-    unit: np.ndarray = descriptors / np.maximum(lengths, np.finfo(np.float32).tiny)
-    return unit
 
 
 def image_from_tensor(image: torch.Tensor) -> np.ndarray:

@@ -274,8 +274,10 @@ def _save_npz(path: str | Path, **arrays: np.ndarray) -> None:
 
 
 def _save_csv(path: str | Path, header: str, columns: list[np.ndarray]) -> None:
+    # Scores rank: no two that differ may be rounded to one.
+    digits = ["%.9g" if name == "score" else "%.7g" for name in header.split(",")]
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(f"{header}\n".encode())
         for start in range(0, len(columns[0]), CSV_ROWS):
             table = np.column_stack([values[start : start + CSV_ROWS] for values in columns])
-            np.savetxt(file, table, fmt="%.7g", delimiter=",")
+            np.savetxt(file, table, fmt=digits, delimiter=",")
