@@ -61,7 +61,7 @@ def dense_sift(
         )
     if not on_pixels(xy, gray.shape):
         raise OptionError("dense SIFT needs keypoints on whole pixels within the image")
-    from .descriptor_kernels import TILE_COLUMNS, TILE_HEIGHT, describe_tiles
+    from .kernels import TILE_COLUMNS, TILE_HEIGHT, describe_tiles
 
     if not len(xy):
         return np.empty((0, 128), np.uint8)
@@ -109,7 +109,7 @@ def _taps(size: float) -> tuple[np.ndarray, np.ndarray]:
         (4, T) float32 weights for the four spatial bins, and (4, 3) int64 spans, as of
         `describe_tiles`.
     """
-    from .descriptor_kernels import TAPS_AT_ONCE
+    from .kernels import TAPS_AT_ONCE
 
     width = BIN_WIDTH * size
     reach = int(np.ceil(2.5 * width)) - 1  # bins overlap: half of one beyond four

@@ -358,7 +358,7 @@ def nearest_keypoints(
         >>> [values.round(1).tolist() for values in nearest_keypoints(places, points, (8, 8))]
         [[1, 0, -1], [0.1, 0.0, inf]]
     """
-    from .nearest_kernel import nearest_of_nine
+    from .kernels import nearest_of_nine
 
     width, height = image_size
     pixels = np.floor(np.asarray(xy) + np.float32(0.5)).astype(np.int64).reshape(-1, 2)

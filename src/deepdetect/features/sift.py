@@ -224,7 +224,7 @@ def correlation_distance(
         >>> correlation_distance(a, np.array([0, 0]), a, np.array([0, 1]), mean).round(3)
         array([0., 2.], dtype=float32)
     """
-    from .descriptor_kernels import correlation_distances
+    from .kernels import correlation_distances
 
     rows0, rows1 = (np.ascontiguousarray(rows, np.int64) for rows in (rows0, rows1))
     mean = np.ascontiguousarray(mean, np.float32)

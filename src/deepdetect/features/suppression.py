@@ -44,7 +44,7 @@ def suppress_neighbors(
     cell = float(radii.min())
     columns, rows = (int(side) + 1 for side in places.max(0) / cell)
     if _saves_time(len(order)):
-        from .suppression_kernel import keep_distant
+        from .kernels import keep_distant
 
         x, y = (np.ascontiguousarray(axis) for axis in places.T)
         kept: np.ndarray = keep_distant(x, y, radii, cell, columns, rows)
@@ -129,7 +129,7 @@ def spread_by_distance(xy: np.ndarray, scores: np.ndarray, count: int) -> np.nda
     near, far = 0.0, float(np.linalg.norm(np.ptp(np.asarray(xy, np.float64), axis=0))) + 1
     passes = math.ceil(math.log2(far / DISTANCE_STEP_PX))
     if _saves_time(passes * len(best)):
-        from . import suppression_kernel  # noqa: F401 (each pass then finds it imported)
+        from . import kernels  # noqa: F401 (each pass then finds it imported)
     while far - near > DISTANCE_STEP_PX:
         middle = (near + far) / 2
         kept = suppress_neighbors(xy, scores, middle)

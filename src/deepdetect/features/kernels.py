@@ -1,4 +1,4 @@
-"""Compiled parts of `dense_sift` and `sift`. Importing it needs numba; the first call compiles.
+"""Compiled parts of descriptors, nearest keypoints and suppression. The first call compiles.
 
 Dense SIFT works in tiles, so that intermediate results stay in the processor's cache: for each
 pixel of a tile eight soft orientations, summed along its row into the descriptor's four columns,
@@ -167,3 +167,67 @@ def correlation_distances(start, stop, first, rows0, second, rows1, mean, out): 
             one += x * x
             other += y * y
         out[k] = np.float32(1) - both / np.sqrt(max(one * other, np.float32(MIN_SQUARED_NORMS)))
+
+
+@compiled(nogil=True)
+def nearest_of_nine(first, last, places, xy, grid, nearest, distances):  # type: ignore[no-untyped-def]
+    """Find the nearest keypoint in the 3x3 pixels around the places from `first` to before `last`.
+
+    Args:
+        first, last: rows of the places.
+        places: (N, 2) float64; not finite: none is found.
+        xy: (M, 2) float64 keypoints.
+        grid: (H, W) int32 row of the keypoint on each pixel, or -1.
+        nearest: (N,) int32, written: the row of the nearest keypoint where there is one.
+        distances: (N,) float64, written.
+    """
+    height, width = grid.shape
+    for k in range(first, last):
+        x, y = places[k, 0], places[k, 1]
+        if not (-1.5 < x < width + 0.5 and -1.5 < y < height + 0.5):
+            continue
+        column, row = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
+        least = np.inf
+        for j in range(max(row - 1, 0), min(row + 2, height)):
+            for i in range(max(column - 1, 0), min(column + 2, width)):
+                one = grid[j, i]
+                if one < 0:
+                    continue
+                squared = (xy[one, 0] - x) ** 2 + (xy[one, 1] - y) ** 2
+                if squared < least:
+                    least = squared
+                    nearest[k] = one
+        distances[k] = np.sqrt(least)
+
+
+@compiled(nogil=True)
+def keep_distant(x, y, radii, cell, columns, rows):  # type: ignore[no-untyped-def]
+    """Return which points, best first, have no kept point closer than the smaller of their radii.
+
+    Args:
+        x, y: (N,) float64 positions, all of them 0 or more.
+        radii: (N,) float64 in pixels.
+        cell: side of the cells of a grid that kept points are listed in.
+        columns, rows: of that grid.
+
+    Returns:
+        (N,) bool.
+    """
+    kept = np.zeros(len(x), np.bool_)
+    first = np.full((rows, columns), -1, np.int64)
+    following = np.full(len(x), -1, np.int64)
+    for k in range(len(x)):
+        row, column = int(y[k] / cell), int(x[k] / cell)
+        reach = int(np.ceil(radii[k] / cell))
+        free = True
+        for r in range(max(row - reach, 0), min(row + reach + 1, rows)):
+            for c in range(max(column - reach, 0), min(column + reach + 1, columns)):
+                other = first[r, c]
+                while other >= 0 and free:
+                    radius = min(radii[k], radii[other])
+                    free = (x[other] - x[k]) ** 2 + (y[other] - y[k]) ** 2 >= radius * radius
+                    other = following[other]
+        if free:
+            kept[k] = True
+            following[k], first[row, column] = first[row, column], k
+    return kept
