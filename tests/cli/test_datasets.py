@@ -11,7 +11,7 @@ def test_list_names_size_and_licence(run) -> None:
     result = run("datasets", "list")
     assert result.exit_code == 0
     assert "coco" in result.output
-    assert "19.3 GB" in result.output
+    assert "19,336,861,798" in result.output
     assert "licence" in result.output
     entries = {e["name"]: e for e in json.loads(run("datasets", "list", "--json").output)}
     names = {"coco", "photographs", "photographs-free", "oxford", "hpatches", "middlebury"}

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,6 @@ def test_what_cannot_be_connected_is_told(views: list[np.ndarray], tmp_path: Pat
     assert report["pairs"][0]["matches"] > 1000
     values = run_command(words)
     assert f"not in the panorama: {files[1]}, as it overlaps with no other image" in values.stderr
-    assert "2 of 3" in values.stdout
 
 
 def test_the_command_writes_the_file(views: list[np.ndarray], tmp_path: Path) -> None:
@@ -57,9 +57,10 @@ def test_the_command_writes_the_file(views: list[np.ndarray], tmp_path: Path) ->
     result = run_command(["stitch", *files, "-o", str(output), *words])
     assert result.exit_code == 0, result.output
     with Image.open(output) as picture:
-        width, height = picture.size
         assert picture.format == "JPEG"
-    assert f"{width}x{height}" in result.output
+        assert re.search(
+            rf"width +{picture.width:,}\n +height +{picture.height:,}\n", result.output
+        )
     alone = run_command(["stitch", files[0], "-o", str(tmp_path / "no.jpg")])
     assert alone.exit_code == 2
     assert not (tmp_path / "no.jpg").exists()

@@ -37,7 +37,7 @@ def test_a_folder(run, frames: Path, tmp_path: Path) -> None:
     # The tracks of the video that was just written, of every second frame, as a table alone.
     result = run("track", "out.mp4", "-o", "again.csv", "--every", 2)
     assert result.exit_code == 0, result.output
-    assert "frames per second" in result.stdout
+    assert "tracks per frame" in result.stdout
     assert [frame.number for frame in load_tracks(tmp_path / "again.csv")] == [0, 2]
     assert not (tmp_path / "again.mp4").exists()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -35,7 +36,7 @@ def test_train_and_shards(run, images: Path, tmp_path: Path) -> None:
     fixed = ["--short-side", "64", "--detectors", "fast", "--workers", "1"]
     packed = run("shards", images, "-o", "packed", "--shard-size", "3", *fixed)
     assert packed.exit_code == 0, packed.output
-    assert "5 images in 2 shards" in packed.output
+    assert re.search(r"training +5\n", packed.output)
     packed = run("shards", images, "-o", "packed", "--shard-size", "3", *fixed, "--json")
     assert json.loads(packed.output)["validation"] == 1
     trained = run("train", "packed", "-o", "run", *TINY, "--workers", "1", "--json")
@@ -44,13 +45,12 @@ def test_train_and_shards(run, images: Path, tmp_path: Path) -> None:
     assert Path(values["onnx"]).is_file()
     assert values["validation_loss"] > 0
     again = run("train", "packed", "-o", "run", *TINY, "--workers", "1")
-    assert "best after epoch" in again.output
+    assert "validation loss" in again.output
     other = run("train", "packed", "-o", "run", *TINY, "--short-side", "96")
     assert other.exit_code == 2
     assert "other settings (--short-side)" in other.stderr
     timed = run("train", images, "-o", "timed", *TINY, "--workers", "1", "--profile")
-    assert "waiting for data" in timed.output, timed.output
-    assert "4 crops of 64x64 pixels per step" in timed.output
+    assert re.search(r"stage: crop +64\n +stage: batch +4\n", timed.output), timed.output
     timed = run("train", images, "-o", "timed", *TINY, "--workers", "1", "--profile", "--json")
     assert json.loads(timed.output)[0]["stage"]["crop"] == 64
 

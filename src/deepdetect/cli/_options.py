@@ -255,14 +255,46 @@ def print_json(value: Any) -> None:
     print(json.dumps(value, indent=2, default=str))
 
 
-def print_result(
-    as_json: bool, values: Any, rows: Iterable[tuple[str, str]], title: str = ""
-) -> None:
-    """Print the result of a command: as JSON, or as a table of names and values."""
+def print_result(as_json: bool, values: Mapping[str, Any], title: str = "") -> None:
+    """Print the result of a command: as JSON, or as a table of its names and values."""
     if as_json:
         print_json(values)
     else:
-        print_table(rows, title)
+        print_table(_rows(values), title)
+
+
+def print_columns(values: Sequence[Mapping[str, Any]]) -> None:
+    """Print several results of the same kind side by side."""
+    columns = [dict(_rows(each)) for each in values]
+    names = dict.fromkeys(name for column in columns for name in column)
+    wide = max(len(name) for name in names)
+    for name in names:
+        print(f"  {name:<{wide}}", *(f"{column.get(name, '-'):>20}" for column in columns))
+
+
+def _rows(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the rows of a table; tables and matrices within are left to JSON."""
+    for name, value in values.items():
+        title = prefix + str(name).replace("_", " ")
+        if isinstance(value, Mapping):
+            yield from _rows(value, f"{title}: ")
+        elif isinstance(value, (list, tuple)):
+            if value and not any(isinstance(each, (list, tuple, Mapping)) for each in value):
+                yield title, ", ".join(map(_text, value))
+        elif value is not None:
+            yield title, _text(value)
+
+
+def _text(value: object) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return (
+        f"{value:,}"
+        if isinstance(value, int)
+        else f"{value:.6g}"
+        if isinstance(value, float)
+        else str(value)
+    )
 
 
 def print_table(rows: Iterable[tuple[str, str]], title: str = "") -> None:
@@ -273,8 +305,3 @@ def print_table(rows: Iterable[tuple[str, str]], title: str = "") -> None:
     width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:
         print(f"  {name:<{width}}  {value}")
-
-
-def seconds_rows(seconds: Mapping[str, float]) -> list[tuple[str, str]]:
-    """Make the table rows for the time of each stage."""
-    return [(f"seconds: {stage}", f"{value:.3f}") for stage, value in seconds.items()]

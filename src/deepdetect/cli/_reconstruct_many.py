@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,9 @@ from .._shared.records import Outputs, check_not_made
 from ..sfm.colmap import import_pycolmap
 from ..sfm.options import MultiViewOptions
 from ..sfm.pipeline import MAX_KEYPOINTS, check_output_folder, output_files, reconstruct_many
-from ..sfm.result import MultiViewReconstruction
 from ..sfm.stages import check_images
 from ._detection import Kind, chosen_detector
-from ._options import From, print_result, seconds_rows
+from ._options import From, print_result
 
 MANY = From(
     MultiViewOptions,
@@ -23,8 +23,8 @@ MANY = From(
 )
 """Options that two images do not have."""
 
-MAX_UNREGISTERED_ROWS = 10
-"""Images that are named with a reason on the terminal; model.json names all."""
+MAX_UNREGISTERED = 10
+"""Images that are named with a reason on the terminal."""
 
 
 def reconstruct_folder(
@@ -52,7 +52,7 @@ def reconstruct_folder(
         check_not_made(source, found_images.values())
     outputs = Outputs(output_files(output), sorted(images), overwrite=overwrite, growing=True)
     with outputs.writing():
-        found = reconstruct_many(
+        reconstruct_many(
             source,
             output,
             detector,
@@ -64,77 +64,7 @@ def reconstruct_folder(
             **values,
         )
     numbers = json.loads((output / "model.json").read_text(encoding="utf-8"))
-    print_result(as_json, numbers, _rows(found, numbers), str(images[0].parent))
-
-
-def _rows(found: MultiViewReconstruction, numbers: dict[str, Any]) -> list[tuple[str, str]]:
-    """Make the table of the terminal."""
-    cameras = list(numbers["cameras"].values())
-    focal = sorted({(camera["focal_px"][0], camera["intrinsics"]) for camera in cameras})
-    shown = ", ".join(f"{px:g} px ({source})" for px, source in focal[:3])
-    rows = [
-        ("images", f"{numbers['registered']} of {numbers['images']}"),
-        *unregistered_rows(numbers["unregistered"], numbers["components"]),
-        ("focal length", shown + (", ..." if len(focal) > 3 else "")),
-        ("keypoints", f"{numbers['keypoints']:,}"),
-        ("pairs", _pairs(numbers)),
-        (
-            "sparse points",
-            f"{numbers['sparse_points']:,}, reprojection error "
-            f"{numbers['mean_sparse_reprojection_error_px']:.3f} px (mean)",
-        ),
-    ]
-    if numbers["dense_points"]:
-        error = numbers["median_dense_reprojection_error_px"]
-        rows.append(
-            (
-                "dense points",
-                f"{numbers['dense_points']:,}, reprojection error {error:.3f} px (median)",
-            )
-        )
-    rows += [("scale", numbers["scale"]), *seconds_rows(numbers["seconds"])]
-    rows.append(("written", ", ".join(numbers["files"])))
-    return rows
-
-
-def unregistered_rows(
-    unregistered: Mapping[str, str], components: Sequence[Sequence[str]]
-) -> list[tuple[str, str]]:
-    """Name components that are no part of the model, and the other images one by one.
-
-    Args:
-        unregistered: reasons by name.
-        components: names of those that hang together among themselves.
-
-    Returns:
-        Rows for the table of the terminal.
-    """
-    rows: list[tuple[str, str]] = []
-    grouped: set[str] = set()
-    for group in components:
-        grouped |= set(group)
-        rows.append(
-            (
-                f"unregistered: {len(group)} images",
-                f"{group[0]} and {len(group) - 1} more hang together, but not with the others: "
-                "they show something else, or too little of the same; model.json lists them",
-            )
-        )
-    alone = [(name, why) for name, why in unregistered.items() if name not in grouped]
-    rows += [(f"unregistered: {name}", why) for name, why in alone[:MAX_UNREGISTERED_ROWS]]
-    if len(alone) > MAX_UNREGISTERED_ROWS:
-        rows.append(
-            ("unregistered", f"{len(alone) - MAX_UNREGISTERED_ROWS} more, listed in model.json")
-        )
-    return rows
-
-
-def _pairs(numbers: dict[str, Any]) -> str:
-    """Say how many pairs were matched, of how many, and how they were chosen."""
-    count = numbers["images"]
-    choice = {
-        "all": "all of them",
-        "sequential": "neighbours by name",
-        "similar": f"the most similar of {count * (count - 1) // 2:,}",
-    }[numbers["pair_choice"]]
-    return f"{numbers['verified_pairs']:,} verified of {numbers['pairs']:,} ({choice})"
+    if not as_json:  # model.json names all, and where each camera is
+        numbers["unregistered"] = dict(islice(numbers["unregistered"].items(), MAX_UNREGISTERED))
+        del numbers["cameras"]
+    print_result(as_json, numbers)

@@ -65,5 +65,4 @@ def average(
         parts = [{"sha256": weights_digest(load_network(p)), **read_notes(p)} for p in paths]
         save_weights(network, made["weights"], {"parts": json.dumps(parts), **provenance()})
         export_onnx(network, made["onnx"])
-    rows = [("mean of", f"{len(paths)} weights"), *((k, str(v)) for k, v in files.items())]
-    cli.print_result(as_json, files, rows)
+    cli.print_result(as_json, files)

@@ -9,7 +9,7 @@ from cyclopts import App, Parameter
 
 from ..datasets import find_remote_dataset, get_dataset, remote_datasets
 from ..io.image import find_images
-from ._options import Json, Output, print_json, print_result, print_table
+from ._options import Json, Output, print_json, print_result
 
 datasets = App("datasets", help="Download data sets for training and for the benchmarks.")
 
@@ -17,28 +17,23 @@ datasets = App("datasets", help="Download data sets for training and for the ben
 @datasets.command(name="list")
 def list_datasets(*, as_json: Json = False) -> None:
     """Show the data sets that can be downloaded."""
+    values = [
+        {
+            "name": dataset.name,
+            "title": dataset.title,
+            "images": dataset.images,
+            "bytes": dataset.size,
+            "licence": dataset.licence,
+            "urls": [url for file in dataset.files for url in file.urls],
+        }
+        for dataset in remote_datasets().values()
+    ]
     if as_json:
-        print_json(
-            [
-                {
-                    "name": dataset.name,
-                    "title": dataset.title,
-                    "images": dataset.images,
-                    "bytes": dataset.size,
-                    "licence": dataset.licence,
-                    "urls": [url for file in dataset.files for url in file.urls],
-                }
-                for dataset in remote_datasets().values()
-            ]
-        )
+        print_json(values)
         return
-    for dataset in remote_datasets().values():
-        rows = [
-            ("images", f"{dataset.images:,}"),
-            ("download", f"{dataset.size / 1e9:.1f} GB, and as much again unpacked"),
-            ("licence", dataset.licence),
-        ]
-        print_table(rows, f"{dataset.name}: {dataset.title}")
+    for each in values:
+        print_result(False, {**each, "urls": None})
+        print()
 
 
 @datasets.command
@@ -64,8 +59,5 @@ def get(
     dataset = find_remote_dataset(name)
     folder = get_dataset(dataset, output or Path("data") / dataset.name, quiet=as_json)
     images = len(find_images(folder))
-    print_result(
-        as_json,
-        {"name": dataset.name, "folder": folder, "images": images},
-        [("images", f"{images:,}"), ("written", str(folder)), ("licence", dataset.licence)],
-    )
+    values = {"name": dataset.name, "folder": folder, "images": images}
+    print_result(as_json, values | {"licence": dataset.licence})

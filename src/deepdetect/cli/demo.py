@@ -31,27 +31,7 @@ def demo(
     detector = DeepDetect(**values)
     folder = cli.output_folder(output)
     numbers = run_demo(load_stereo_pair("motorcycle"), detector, folder)
-    if as_json:
-        cli.print_json(numbers)
-        return
-
-    def scored(name: str) -> str:
-        score = numbers[name]
-        return f"{score['matches']:,}, {score['precision']:.1%} of them within 1 px of the truth"
-
-    cli.print_table(
-        [
-            ("network", f"{detector.weights.name}, {detector.runtime}"),
-            ("keypoints", "{:,} and {:,}".format(*numbers["keypoints"])),
-            ("density", "{:.3f} and {:.3f}".format(*numbers["density"])),
-            ("matches", scored("all_matches")),
-            ("matches that fit the geometry", scored("inliers")),
-            ("baseline: random points", scored("random")),
-            *cli.seconds_rows(numbers["seconds"]),
-            ("pictures", ", ".join(map(str, numbers["pictures"]))),
-        ],
-        "The Motorcycle stereo pair (two images of 741x500 pixels)",
-    )
+    cli.print_result(as_json, {"weights": detector.weights, "backend": detector.runtime, **numbers})
 
 
 def run_demo(pair: StereoPair, detector: HeatmapDetector, folder: Path) -> dict[str, Any]:

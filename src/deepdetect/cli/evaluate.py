@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,9 +18,7 @@ from ..evaluation.protocols.masks import LabelDetector
 from ..evaluation.weights import Evaluation, OxfordScore, evaluate_oxford
 from ..evaluation.weights import evaluate as run
 from ._detection import NETWORK
-from ._options import Json, print_json, with_options
-
-WIDTH = 14
+from ._options import Json, print_columns, print_json, with_options
 
 
 @with_options(NETWORK)
@@ -85,33 +83,24 @@ def evaluate(
         )
         for detector in detectors
     ]
-    names = _short_names(detectors)
     on_oxford = [each.oxford for each in found if each.oxford is not None]
+    results = [
+        {"weights": detector.weights, "backend": detector.runtime, **_values(evaluation)}
+        for detector, evaluation in zip(detectors, found, strict=True)
+    ]
+    further: dict[str, Any] = {"compare": results[1:]} if compare else {}
     if labels:
         squashed = LabelDetector(heatmap_options=HeatmapOptions(PAPER_RESOLUTION_PX))
         on_oxford.append(evaluate_oxford(squashed, scenes, quiet=as_json))
+        further["labels"] = {"oxford": asdict(on_oxford[-1])}
     if as_json:
-        results = [
-            {"weights": detector.weights, "backend": detector.runtime, **_values(evaluation)}
-            for detector, evaluation in zip(detectors, found, strict=True)
-        ]
-        further: dict[str, Any] = {"compare": results[1:]} if compare else {}
-        if labels:
-            further["labels"] = {"oxford": asdict(on_oxford[-1])}
         print_json({**results[0], **further})
     else:
-        _print_scores(names, found)
-        if scale:
-            if found[0].masks:
-                print()
-            _print_scales(names, found)
-        if on_oxford:
-            print()
-            columns = [*names, "labels"] if labels else names
-            _print_oxford(columns, on_oxford, equal_density)
-        if foreground is not None:
-            print()
-            _print_foreground(names, found)
+        columns = [*results, *([{"weights": "labels", **further["labels"]}] if labels else [])]
+        for each in columns:
+            rows = each.pop("scales", ())
+            each |= {f"x{row['scale']:g} {row['visibility']}": row for row in rows}
+        print_columns(columns)
     _report_failures(found, on_oxford)
 
 
@@ -155,89 +144,3 @@ def _values(evaluation: Evaluation) -> dict[str, Any]:
     if evaluation.foreground is not None:
         values["foreground"] = asdict(evaluation.foreground)
     return values
-
-
-def _short_names(detectors: Sequence[Any]) -> list[str]:
-    """Return names that fit a table: the files', with their folders where they are the same."""
-    paths = [detector.weights for detector in detectors]
-    names = [path.stem for path in paths]
-    if len(set(names)) < len(names):
-        names = [f"{path.parent.name}/{path.stem}" for path in paths]
-    return [name if len(name) <= 2 * WIDTH else f"...{name[3 - 2 * WIDTH :]}" for name in names]
-
-
-def _row(title: str, values: Sequence[str]) -> None:
-    print(f"{title:<24}" + "".join(f"{value:>{2 * WIDTH + 2}}" for value in values))
-
-
-def _print_scores(names: Sequence[str], found: Sequence[Evaluation]) -> None:
-    if not found[0].masks:
-        return
-    if len(names) == 1:
-        titles = {"images": 8, "BCE": 9, "IoU": 8, "calibration error": 19, "density": 9}
-        head = "".join(f"{title:>{width}}" for title, width in titles.items())
-        print(f"{'visibility':<12}{head}  labels'")
-        for name, score in found[0].masks.items():
-            pixels = found[0].calibration[name]
-            print(
-                f"{name:<12}{score.images:>8}{score.loss:>9.4f}{score.iou:>8.3f}"
-                f"{pixels.expected_error:>19.4f}{pixels.density:>9.4f}{pixels.label_density:>9.4f}"
-            )
-        return
-    _row("known masks, BCE / IoU", names)
-    for name, score in found[0].masks.items():
-        scores = [each.masks[name] for each in found]
-        cells = [f"{score.loss:.4f} / {score.iou:.3f}" for score in scores]
-        _row(f"  {name} ({score.images} images)", cells)
-    _row("calibration error (density)", names)
-    for name in found[0].masks:
-        calibrations = [each.calibration[name] for each in found]
-        title = f"  {name} ({calibrations[0].label_density:.4f})"
-        _row(title, [f"{each.expected_error:.4f} ({each.density:.4f})" for each in calibrations])
-
-
-def _print_scales(names: Sequence[str], found: Sequence[Evaluation]) -> None:
-    _row("scales, BCE / IoU, calibration error (density)", names)
-    for rows in zip(*(each.scales for each in found), strict=True):
-        title = f"  x{rows[0].scale:g} {rows[0].visibility} ({rows[0].label_density:.3f})"
-        cells = [
-            f"{r.score.loss:.3f} / {r.score.iou:.3f}, {r.calibration.expected_error:.3f} "
-            f"({r.density:.3f})"
-            for r in rows
-        ]
-        _row(title, cells)
-
-
-def _print_oxford(names: Sequence[str], found: Sequence[OxfordScore], equal_density: bool) -> None:
-    _row("Oxford, density", names)
-    for threshold in found[0].density:
-        title = "  that of the labels" if equal_density else f"  tau {threshold}"
-        _row(title, [f"{each.density[threshold]:.4f}" for each in found])
-    _row("repeatability at 1 px", names)
-    for scene in _names(each.repeatability for each in found):
-        _row(f"  {scene}", [_decimals(each.repeatability.get(scene)) for each in found])
-    _row("  mean", [_decimals(_mean(each.repeatability.values())) for each in found])
-    _row("correct matches of all", names)
-    for pair in _names(each.correct for each in found):
-        cells = [(each.correct.get(pair), each.matches.get(pair)) for each in found]
-        _row(f"  {pair}", ["-" if a is None else f"{a:,} / {b:,}" for a, b in cells])
-
-
-def _names(found: Iterable[Iterable[str]]) -> list[str]:
-    """Return what any of the weights was measured on, each once."""
-    return list(dict.fromkeys(name for names in found for name in names))
-
-
-def _mean(values: Collection[float]) -> float | None:
-    return sum(values) / len(values) if values else None
-
-
-def _decimals(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4f}"
-
-
-def _print_foreground(names: Sequence[str], found: Sequence[Evaluation]) -> None:
-    scores = [each.foreground for each in found if each.foreground is not None]
-    _row("on the foreground", names)
-    _row("  fraction (density)", [f"{each.fraction:.4f} ({each.density:.4f})" for each in scores])
-    _row("  of random keypoints", [f"{each.covered:.4f}" for each in scores])

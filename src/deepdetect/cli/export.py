@@ -208,24 +208,15 @@ def _export(
         if describe:
             collection = describe_collection(collection, quiet=False)
         files = write(collection, output)
-    keypoints = sum(len(points) for points in collection.keypoints.values())
-    matches = sum(len(found) for found in collection.matches.values())
-    cli.print_result(
-        as_json,
-        {
-            "images": len(collection.keypoints),
-            "keypoints": keypoints,
-            "pairs": len(collection.matches),
-            "matches": matches,
-            "files": files,
-            "failures": collection.failures,
-        },
-        [
-            ("images", f"{len(collection.keypoints):,} with {keypoints:,} keypoints"),
-            ("pairs", f"{len(collection.matches):,} with {matches:,} matches"),
-            ("written", str(output) if len(files) == 1 else f"{len(files)} files in {output}"),
-        ],
-    )
+    numbers = {
+        "images": len(collection.keypoints),
+        "keypoints": sum(len(points) for points in collection.keypoints.values()),
+        "pairs": len(collection.matches),
+        "matches": sum(len(found) for found in collection.matches.values()),
+        "files": files,
+        "failures": collection.failures,
+    }
+    cli.print_result(as_json, numbers)
     if count := len(collection.failures):
         raise BatchError(
             f"{count} of the images and pairs failed, the others are in {output}",
@@ -292,9 +283,5 @@ def onnx(
     ]
     cli.check_inputs_survive([file], [resolve_weights(weights), *images])
     metadata = write_onnx(weights, file, options, calibration=images, licence=licence)
-    size = file.stat().st_size
-    cli.print_result(
-        as_json,
-        {"file": file, "bytes": size, "metadata": metadata},
-        [("written", f"{file}, {size / 1e6:.2f} MB"), *metadata.items()],
-    )
+    values = {"file": file, "bytes": file.stat().st_size, "metadata": metadata}
+    cli.print_result(as_json, values)

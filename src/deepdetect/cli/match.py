@@ -124,7 +124,6 @@ def match(
             save_matches(matches, made["file"])
             if pictures:
                 _draw(rgb0, rgb1, matches, made["picture"])
-    inliers = int(matches.inliers.sum())
     numbers = {
         "image0": image0,
         "image1": image1,
@@ -133,7 +132,7 @@ def match(
         "density0": round(matches.keypoints0.density, 6),
         "density1": round(matches.keypoints1.density, 6),
         "matches": len(matches),
-        "inliers": inliers,
+        "inliers": int(matches.inliers.sum()),
         "model": matches.model,
         "matrix": None if matches.matrix is None else matches.matrix.tolist(),
         "guided": matches.guided,
@@ -144,25 +143,10 @@ def match(
         "file": files["file"],
         "picture": files.get("picture"),
     }
+    cli.print_result(as_json, numbers)
     if matches.guided and (unused := [name for name in UNGUIDED_ONLY if name in changes]):
         flags = " and ".join("--" + name.replace("_", "-") for name in unused)
         cli.note(f"only unguided matching uses {flags}: add --unguided")
-    guide = matches.two_view_geometry
-    kind = "within the threshold of --homography" if homography else f"inliers ({matches.model})"
-    cli.print_result(
-        as_json,
-        numbers,
-        [
-            ("keypoints", f"{numbers['keypoints0']:,} and {numbers['keypoints1']:,}"),
-            ("density", f"{numbers['density0']:.3f} and {numbers['density1']:.3f}"),
-            ("matches", f"{len(matches):,}"),
-            (kind, f"{inliers:,}"),
-            ("guided by", guide.model if guide and matches.guided else "nothing"),
-            *cli.seconds_rows(matches.seconds),
-            ("written", ", ".join(map(str, files.values()))),
-        ],
-        f"{image0} and {image1}",
-    )
     if not matches.success:
         cli.note(
             "no geometry between these images can be trusted, so there are no matches: if they "

@@ -107,7 +107,7 @@ def reconstruct(
         )
         with cli.writing(outputs), cli.whole(files) as made:
             numbers = _write(found, made, files, images)
-    cli.print_result(as_json, numbers, _rows(found, numbers), f"{images[0]} and {images[1]}")
+    cli.print_result(as_json, numbers)
 
 
 def _write(
@@ -135,30 +135,3 @@ def _write(
     text = json.dumps(numbers, indent=2, default=str) + "\n"
     made[".json"].write_text(text, encoding="utf-8")
     return numbers
-
-
-def _rows(found: Reconstruction, numbers: dict[str, Any]) -> list[tuple[str, str]]:
-    """Make the table of the terminal."""
-    unit = {"mm": "mm", "baseline": "baselines"}[found.unit]
-    depth, source = numbers["depth"], found.calibration.source
-    angle = numbers["median_triangulation_angle_degrees"]
-    filled = f", {numbers['filled']:,} of them filled in" if numbers["filled"] else ""
-    rows = [
-        ("rectified", f"{'yes' if found.rectified else 'no'} ({numbers['rectified_why']})"),
-        ("focal length", f"{numbers['calibration']['left']['focal_px'][0]:g} px ({source})"),
-        ("keypoints", f"{found.keypoints:,}"),
-        ("matches", f"{found.matches:,}"),
-        *((f"dropped: {reason}", f"{count:,}") for reason, count in found.dropped.items()),
-        ("points", f"{len(found):,} ({numbers['density']:.1%} of the pixels{filled})"),
-        ("depth", f"{depth['5%']:.4g} to {depth['95%']:.4g} {unit}, median {depth['50%']:.4g}"),
-        ("scale", numbers["scale"]),
-        ("triangulation angle", f"{angle:.2f} degrees (median)"),
-    ]
-    if found.reprojection_errors is not None:
-        error = numbers["median_reprojection_error_px"]
-        rows.append(("reprojection error", f"{error:.3f} px (median)"))
-    per_unit = numbers["depth_png"]["value_per_unit"]
-    rows += cli.seconds_rows(numbers["seconds"])
-    rows.append(("depth PNG", f"value / {per_unit:g} = depth in {unit}; 0 is unknown"))
-    rows.append(("written", ", ".join(str(path) for path in numbers["files"])))
-    return rows

@@ -52,23 +52,13 @@ def register(
             ):
                 save_picture(picture, made[ending])
             np.savetxt(made["_homography.txt"], found.homography, fmt="%.12e")
-    overlap = round(float(found.valid.mean()), 4)
-    cli.print_result(
-        as_json,
-        {
-            "image0": image0,
-            "image1": image1,
-            "homography": found.homography.tolist(),
-            "matches": found.matches,
-            "overlap": overlap,
-            "correlation": round(found.zncc, 4),
-            "files": [*files.values()],
-        },
-        [
-            ("matches", f"{found.matches:,}"),
-            ("overlap", f"{overlap:.1%} of the first image"),
-            ("correlation", f"{found.zncc:.3f} (median of small windows; 1 is the same)"),
-            ("written", ", ".join(map(str, files.values()))),
-        ],
-        f"{image1} on {image0}",
-    )
+    numbers = {
+        "image0": image0,
+        "image1": image1,
+        "homography": found.homography.tolist(),
+        "matches": found.matches,
+        "overlap": round(float(found.valid.mean()), 4),
+        "correlation": round(found.zncc, 4),
+        "files": [*files.values()],
+    }
+    cli.print_result(as_json, numbers)

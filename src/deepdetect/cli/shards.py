@@ -53,15 +53,11 @@ def shards(
         map_tasks=get_engine(engine),
         **chosen,
     )
-    training = sum(count for _, count in made.training)
-    validation = sum(count for _, count in made.validation)
-    size = sum(path.stat().st_size for path, _ in made.training + made.validation)
-    cli.print_result(
-        as_json,
-        {"folder": folder, "training": training, "validation": validation, "bytes": size},
-        [
-            ("to train on", f"{training:,} images in {len(made.training)} shards"),
-            ("to validate with", f"{validation:,} images"),
-            ("written", f"{folder}, {size / 1e6:,.1f} MB"),
-        ],
-    )
+    values = {
+        "folder": folder,
+        "training": sum(count for _, count in made.training),
+        "validation": sum(count for _, count in made.validation),
+        "shards": len(made.training) + len(made.validation),
+        "bytes": sum(path.stat().st_size for path, _ in made.training + made.validation),
+    }
+    cli.print_result(as_json, values)

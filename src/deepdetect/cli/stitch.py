@@ -81,7 +81,7 @@ def stitch(
             raise type(error)(text) from error
         save_picture(panorama.image, file)
     numbers = {**_numbers(panorama, images, file), "failures": failures}
-    cli.print_result(as_json, numbers, _rows(panorama, images, file), "panorama")
+    cli.print_result(as_json, numbers)
     if not as_json:
         for other in numbers["unregistered"]:
             cli.note(f"not in the panorama: {other['image']}, as {other['reason']}")
@@ -124,19 +124,3 @@ def _numbers(panorama: Panorama, images: Sequence[Path], output: Path) -> dict[s
         "seconds": {stage: round(value, 4) for stage, value in panorama.seconds.items()},
         "file": output,
     }
-
-
-def _rows(panorama: Panorama, images: Sequence[Path], output: Path) -> list[tuple[str, str]]:
-    """Make the table of the terminal."""
-    height, width = panorama.valid.shape
-    counts, gains = panorama.matches.values(), panorama.gains.values()
-    return [
-        ("images", f"{len(panorama.homographies)} of {len(images)}"),
-        ("reference", str(images[panorama.reference])),
-        ("registered pairs", f"{len(counts)}, with {min(counts):,} to {max(counts):,} matches"),
-        ("residual", f"{panorama.residual_px:.2f} px (root mean square, reduced images)"),
-        ("brightness", f"changed by {min(gains):.2f} to {max(gains):.2f} times"),
-        ("size", f"{width}x{height}, {panorama.valid.mean():.0%} covered"),
-        *cli.seconds_rows(panorama.seconds),
-        ("written", str(output)),
-    ]

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from .._shared.errors import OptionError
 from .._shared.records import Outputs
 from ..tracking.frames import FrameSource
-from ..tracking.pipeline import TrackingReport, output_files
+from ..tracking.pipeline import output_files
 from ..tracking.pipeline import track as track_points
 from ..tracking.tracker import TrackingOptions
 from . import _options as cli
@@ -69,25 +69,7 @@ def track(
     outputs = Outputs(files, [Path(source)], overwrite=overwrite)
     with nullcontext() if live else cli.writing(outputs):
         report = track_points(source, file, options=options, quiet=False, **frames)
-    cli.print_result(
-        as_json,
-        vars(report),
-        [
-            ("frames", _frames_text(report)),
-            ("tracks", f"{report.tracks:,}"),
-            ("tracks per frame", f"{report.tracks_per_frame:.0f}"),
-            ("frames per track", f"{report.frames_per_track:.1f}"),
-            ("frames per second", f"{report.fps:.1f}"),
-            ("written", ", ".join(str(path) for path in report.files)),
-        ],
-        source,
-    )
+    cli.print_result(as_json, vars(report))
+    if report.expected is not None and report.frames + len(report.failures) < report.expected:
+        cli.note(f"the file states {report.expected:,} frames, and may be cut off")
     cli.report_failures(report.failures, report.frames + len(report.failures), "frames")
-
-
-def _frames_text(report: TrackingReport) -> str:
-    """Return the number of frames, and how many the source states where these are more."""
-    found = report.frames + len(report.failures)
-    if report.expected is None or found >= report.expected:
-        return f"{report.frames:,}"
-    return f"{report.frames:,}; the file states {report.expected:,}, and may be cut off"

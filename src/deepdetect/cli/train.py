@@ -5,18 +5,15 @@ from __future__ import annotations
 import os
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from ..training import DeviceOptions, StageProfile, profile
+from ..training import DeviceOptions, profile
 from ..training import train as train_network
 from ..training.run import require_packages
 from . import _options as cli
 from ._training import RECIPE, Detectors, LabelSettings, Preset, chosen_recipe
-
-if TYPE_CHECKING:
-    from ..training import TrainingResult
 
 RUN = cli.From(
     train_network,
@@ -72,54 +69,21 @@ def train(
     if profiling:
         profiles = profile(images, output, options, **arguments)
         if int(os.environ.get("RANK", 0)) == 0:  # of torchrun
-            _print_profiles(profiles, as_json)
+            if as_json:
+                cli.print_json([asdict(each) for each in profiles])
+            for each in () if as_json else profiles:
+                cli.print_result(False, asdict(each))
         return
     result = train_network(images, output, options, **arguments)
     if int(os.environ.get("RANK", 0)) == 0:
-        _print_result(result, as_json)
-
-
-def _print_result(result: TrainingResult, as_json: bool) -> None:
-    best = result.best
-    if as_json:
-        cli.print_json(
-            {
-                "weights": result.weights,
-                "onnx": result.onnx,
-                "epoch": best["epoch"],
-                "validation_loss": best["validation_loss"],
-                "normal": {"loss": best["normal_loss"], "iou": best["normal_iou"]},
-                "dark": {"loss": best["dark_loss"], "iou": best["dark_iou"]},
-                "images_per_second": round(result.images_per_second, 3),
-            }
-        )
-        return
-    cli.print_table(
-        [
-            ("best after epoch", f"{best['epoch']:.1f}"),
-            ("validation loss", f"{best['validation_loss']:.4f}"),
-            ("normal images", f"loss {best['normal_loss']:.4f}, IoU {best['normal_iou']:.3f}"),
-            ("dark images", f"loss {best['dark_loss']:.4f}, IoU {best['dark_iou']:.3f}"),
-            ("480x480 images/s", f"{result.images_per_second:.1f}"),
-            ("written", f"{result.weights}, {result.onnx}"),
-        ]
-    )
-
-
-def _print_profiles(profiles: list[StageProfile], as_json: bool) -> None:
-    if as_json:
-        cli.print_json([asdict(each) for each in profiles])
-        return
-    for each in profiles:
-        rows = [
-            ("steps timed", f"{each.steps}"),
-            ("crops/s", f"{each.images_per_second:.1f}"),
-            ("480x480 images/s", f"{each.full_images_per_second:.1f}"),
-            ("waiting for data", f"{100 * each.waiting_fraction:.1f} %"),
-        ]
-        if each.memory_bytes is not None:
-            rows.append(("peak memory", f"{each.memory_bytes / 1e9:.2f} GB"))
-        if each.device_memory_bytes is not None:
-            rows.append(("peak GPU memory", f"{each.device_memory_bytes / 1e9:.2f} GB"))
-        stage = each.stage
-        cli.print_table(rows, f"{stage.batch} crops of {stage.crop}x{stage.crop} pixels per step")
+        best = result.best
+        values = {
+            "weights": result.weights,
+            "onnx": result.onnx,
+            "epoch": best["epoch"],
+            "validation_loss": best["validation_loss"],
+            "normal": {"loss": best["normal_loss"], "iou": best["normal_iou"]},
+            "dark": {"loss": best["dark_loss"], "iou": best["dark_iou"]},
+            "images_per_second": round(result.images_per_second, 3),
+        }
+        cli.print_result(as_json, values)
