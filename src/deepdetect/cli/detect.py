@@ -128,6 +128,7 @@ def _check_and_say_what_is_replaced(
             names |= {n for n in both if before["settings"].get(n) != settings.get(n)}
             changed.append(path)
     if changed:
+        names = {"detector"} if "detector" in names else names
         flags = ", ".join("--" + name.replace("_", "-") for name in sorted(names))
         whose = str(changed[0]) if len(changed) == 1 else f"{len(changed)} images"
         cli.note(f"replacing the results of {whose} with other options ({flags})")
