@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy import ndimage
 
 from deepdetect.datasets.degradation import (
     DEGRADATIONS,
-    SensorModel,
     blur_gaussian,
     blur_motion,
-    darken,
     degrade,
     motion_kernel,
     to_linear,
@@ -50,16 +46,6 @@ def test_light_is_divided_and_noise_is_that_of_the_sensor(fraction: float, name:
         assert found.std() == pytest.approx(np.hypot(expected, step[0] / np.sqrt(12)), rel=0.1)
 
 
-def test_more_noise_comes_with_a_smaller_sensor() -> None:
-    linear = np.full((100, 100, 3), 0.5, np.float32)
-    small = SensorModel(full_well=500)
-    few, many = (
-        darken(linear, np.random.default_rng(0), 0.5, sensor).std()
-        for sensor in (SensorModel(), small)
-    )
-    assert many > 3 * few
-
-
 def test_the_gamma_is_undone_and_applied() -> None:
     every = np.arange(256, dtype=np.uint8)
     np.testing.assert_array_equal(to_srgb(to_linear(every)), every)
@@ -93,10 +79,3 @@ def test_the_kernel_is_a_line_of_its_length(angle: float, length: float) -> None
     # Splitting each point among four pixels widens it by less than half a pixel.
     assert length**2 / 12 <= (kernel * along**2).sum() < length**2 / 12 + 0.26
     assert (kernel * across**2).sum() < 0.26
-
-
-def test_names_and_versions_tell_copies_apart() -> None:
-    titles = [one.title for one in DEGRADATIONS.values()]
-    assert len(set(titles)) == len(titles)
-    newer = dataclasses.replace(DEGRADATIONS["dark-8"], version=2)
-    assert newer != DEGRADATIONS["dark-8"]

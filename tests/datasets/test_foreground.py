@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -23,16 +22,6 @@ def test_photographs_with_a_mask_are_listed_in_order(tmp_path: Path) -> None:
         ("a.png", "a_mask.png"),
         ("b.jpg", "b_mask.png"),
     ]
-
-
-def test_the_mask_is_what_is_brighter_than_half(tmp_path: Path) -> None:
-    save(tmp_path / "a.jpg")
-    grey = np.array([[0, 127, 128, 255]], np.uint8)
-    cv2.imwrite(str(tmp_path / "a_mask.png"), grey)
-    (photograph,) = load_foreground(tmp_path)
-    assert photograph.foreground().tolist() == [[False, False, True, True]]
-    cv2.imwrite(str(tmp_path / "a_mask.png"), np.repeat(grey[:, :, None], 3, axis=2))
-    assert photograph.foreground().tolist() == [[False, False, True, True]]
 
 
 def test_what_is_missing_or_wrong_is_named(tmp_path: Path, one_line) -> None:

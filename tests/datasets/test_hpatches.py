@@ -57,11 +57,6 @@ def test_what_is_missing_is_named(folder: Path, one_line) -> None:
     one_line(caught.value)
 
 
-def test_files_beside_the_scenes_are_no_scenes(folder: Path) -> None:
-    (folder / "v_notes.txt").write_text("about the scenes")
-    assert len(load_hpatches(folder)) == 3
-
-
 def test_the_shared_copy_can_be_read(shared: Path) -> None:
     scenes = load_hpatches(shared / "data" / "hpatches")
     assert {is_illumination(scene) for scene in scenes} == {True, False}

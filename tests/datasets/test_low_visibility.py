@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import ImageError
 from deepdetect.datasets.low_visibility import load_low_visibility
 
 
@@ -28,15 +27,6 @@ def test_there_are_two_scenes_of_one_pair(folder: Path) -> None:
     (pair,) = scenes[1].pairs()
     assert (pair.first.name, pair.second.name) == ("img1.bmp", "img2.bmp")
     np.testing.assert_array_equal(pair.homography, [[1, 0, 2], [0, 1, 3], [0, 0, 1]])
-
-
-@pytest.mark.parametrize("missing", ["dusty/img1.png", "smoky/img2.bmp", "smoky/H1to2p"])
-def test_what_is_missing_is_named(folder: Path, missing: str, one_line) -> None:
-    (folder / missing).unlink()
-    with pytest.raises(ImageError) as caught:
-        load_low_visibility(folder)
-    message = one_line(caught.value)
-    assert missing.partition(".")[0].replace("/", " ").split()[1] in message
 
 
 def test_the_shared_copy_does_not_move(shared: Path) -> None:

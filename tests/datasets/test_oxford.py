@@ -68,16 +68,6 @@ def test_the_shared_copy_is_complete(shared: Path) -> None:
     assert sum(len(scene.images) for scene in scenes) == 48
 
 
-def test_some_of_the_scenes_are_enough_and_none_are_not(folder: Path, tmp_path: Path) -> None:
-    for name in SCENES:
-        if name not in ("graf", "ubc"):
-            (folder / name).rename(tmp_path / f"no-{name}")
-    assert [scene.name for scene in load_oxford(folder)] == ["graf", "ubc"]
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(ImageError, match=r"no Oxford scenes in .*empty: the data set has"):
-        load_oxford(tmp_path / "empty")
-
-
 @pytest.mark.parametrize(
     ("count", "numbers"), [(1, [6]), (2, [2, 6]), (3, [2, 4, 6]), (5, [2, 3, 4, 5, 6])]
 )

@@ -223,14 +223,6 @@ def test_damaged_files_are_named_in_one_sentence(case: str, tmp_path: Path, one_
     assert str(tmp_path) in message
 
 
-def test_images_beyond_the_poses_are_refused(tmp_path: Path, one_line) -> None:
-    folder = write_kitti(tmp_path)
-    (folder / "000002.png").rename(folder / "000003.png")
-    with pytest.raises(ImageError, match=r"3 lines and so no pose of 000003\.png") as caught:
-        load(folder)
-    one_line(caught.value)
-
-
 def test_images_that_are_missing_damaged_or_turned_are_refused(tmp_path: Path, one_line) -> None:
     folder = write_strecha(tmp_path)
     turned = Image.new("L", SIZE)

@@ -116,11 +116,6 @@ def test_an_unknown_name_is_told_the_nearest(given: str, nearest: str) -> None:
     assert all(name in str(caught.value) for name in NAMES)
 
 
-def test_no_name() -> None:
-    with pytest.raises(OptionError, match="no label detector was chosen"):
-        select_detectors([])
-
-
 # Quarter pixels hit the halves often; any float finds the rest.
 COORDINATES = st.integers(-12, 60).map(lambda n: n / 4) | st.floats(-1e6, 1e6)
 

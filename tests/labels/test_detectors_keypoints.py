@@ -92,16 +92,6 @@ def test_brisk_settings_are_kept_apart(gray: np.ndarray, naive_mask: Callable) -
         )
 
 
-def test_fast_the_corners_of_a_square(square: np.ndarray) -> None:
-    mask = fast_mask(square)
-    row, column = np.nonzero(mask)
-    for y in (20, 43):
-        for x in (24, 47):
-            assert mask[y, x]
-            near = (abs(column - x) <= 2) & (abs(row - y) <= 2)
-            assert near.sum() == mask.sum() / 4
-
-
 @pytest.mark.parametrize(
     ("contrast", "threshold", "marked"), [(13, 13, False), (14, 13, True), (2, 1, True)]
 )
@@ -209,10 +199,3 @@ def test_shi_tomasi_agrees_with_scipy(image: str, request: pytest.FixtureRequest
     assert mask.dtype == bool
     assert mask.sum() > 200
     assert (mask & expected).sum() > 0.99 * max(mask.sum(), expected.sum())
-
-
-def test_shi_tomasi_a_limit_keeps_the_strongest(gray: np.ndarray) -> None:
-    every, some = (shi_tomasi_mask(gray, corners=n) for n in (0, 50))
-    assert some.sum() == 50
-    assert every.sum() > 200
-    assert not (some & ~every).any()

@@ -5,10 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from deepdetect._shared.errors import OptionError
 from deepdetect.io.image import load_image, luma
 from deepdetect.io.masks import load_mask
 from deepdetect.labels import DETECTOR_NAMES, DETECTORS, Label, LabelOptions, draw_label, fuse
@@ -47,43 +44,6 @@ def test_one_detector_by_itself(name: str, gray: np.ndarray, single: dict) -> No
     np.testing.assert_array_equal(label.mask, single[name, "normal"])
     empty = label.edges if DETECTORS[name].kind == "keypoint" else label.keypoints
     assert not empty.any()
-
-
-@given(
-    gray_seed=st.integers(0, 10_000),
-    names=st.sets(st.sampled_from(DETECTOR_NAMES), min_size=1, max_size=8),
-    more=st.sampled_from(DETECTOR_NAMES),
-    visibility=st.sampled_from(["normal", "low"]),
-)
-def test_adding_a_detector_never_removes_a_pixel(
-    gray_seed: int, names: set[str], more: str, visibility: str
-) -> None:
-    generator = np.random.default_rng(gray_seed)
-    coarse = generator.integers(0, 256, (6, 8), dtype=np.uint8)
-    gray = cv2.resize(coarse, (50, 40), interpolation=cv2.INTER_NEAREST)
-    fewer = fuse(gray, LabelOptions(tuple(names), visibility)).mask
-    both = fuse(gray, LabelOptions((*names, more), visibility)).mask
-    alone = fuse(gray, LabelOptions((more,), visibility)).mask
-    np.testing.assert_array_equal(both, fewer | alone)
-
-
-def test_options() -> None:
-    assert LabelOptions().detectors == DETECTOR_NAMES
-    assert LabelOptions(("sobel", "fast", "sobel")).detectors == ("fast", "sobel")
-    assert LabelOptions(["fast"]).detectors == ("fast",)
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"detectors": ("fsat",)}, "did you mean 'fast'"),
-        ({"detectors": ()}, "no label detector"),
-        ({"visibility": "norm"}, "did you mean 'normal'"),
-    ],
-)
-def test_unknown_options(changes: dict[str, object], words: str) -> None:
-    with pytest.raises(OptionError, match=words):
-        LabelOptions(**changes)
 
 
 def published(shared: Path) -> list[tuple[Path, bool]]:

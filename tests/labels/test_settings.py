@@ -139,22 +139,6 @@ def test_what_opencv_refuses_is_one_sentence(
     assert "OpenCV refuses sobel(kernel_size=4)" in one_line(caught.value)
 
 
-def test_the_order_in_the_file_says_nothing(tmp_path: Path) -> None:
-    first = read_label_settings(
-        write(
-            tmp_path,
-            "[sobel]\nnormal = { relative_threshold = 1 }\n[fast]\nnormal = { threshold = 9 }",
-        )
-    )
-    second = read_label_settings(
-        write(
-            tmp_path,
-            "[fast]\nnormal = { threshold = 9 }\n[sobel]\nnormal = { relative_threshold = 1.0 }",
-        )
-    )
-    assert first == second
-
-
 def test_the_paper_s_are_the_default() -> None:
     assert find_label_settings("paper") == LabelOptions()
 

@@ -10,7 +10,6 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
 
-from safetensors.torch import save_file  # noqa: E402
 
 from deepdetect import WeightsError  # noqa: E402
 from deepdetect.training.checkpoint import (  # noqa: E402
@@ -73,15 +72,6 @@ def test_a_checkpoint_gives_everything_back(tmp_path: Path, optimizer: str) -> N
 def test_a_damaged_checkpoint_is_refused(tmp_path: Path, content: bytes, one_line) -> None:
     path = tmp_path / "checkpoint.safetensors"
     path.write_bytes(content)
-    with pytest.raises(WeightsError, match="delete it") as caught:
-        read_checkpoint(path)
-    one_line(caught.value)
-
-
-@pytest.mark.parametrize("state", ["null", "[]", "{", "[" * 100_000, "3"])
-def test_a_checkpoint_with_a_damaged_state_is_refused(tmp_path: Path, state: str, one_line) -> None:
-    path = tmp_path / "checkpoint.safetensors"
-    save_file({"a": torch.zeros(1)}, path, metadata={"state": state})
     with pytest.raises(WeightsError, match="delete it") as caught:
         read_checkpoint(path)
     one_line(caught.value)

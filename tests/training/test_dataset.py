@@ -105,18 +105,6 @@ def _found(image: np.ndarray, mask: np.ndarray, view: np.ndarray, label: np.ndar
     return False
 
 
-def test_mirrors_come_only_when_asked_for(source: FolderSource) -> None:
-    """Without flips and transpositions each crop is a part of a view as it is."""
-    options = dataclasses.replace(OPTIONS, flips=False, transpositions=False)
-    views = all_views(source)
-    for image in batches(source, options, first=1, last=2)[0][0]:
-        assert any(
-            (view[top : top + 64, left : left + 64] == image).all()
-            for view, _ in views
-            for top, left in np.argwhere((view[:-63, :-63] == image[0, 0]).all(2))
-        )
-
-
 class Corners:
     """One image for all views, with another value at each corner."""
 

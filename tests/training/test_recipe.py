@@ -89,15 +89,6 @@ def test_a_preset_keeps_its_label_settings_unless_others_are_given(tmp_path: Pat
     assert list(chosen.settings) == ["fast"]
 
 
-def test_the_default_is_that_of_the_options() -> None:
-    assert training_preset("default") == TrainingOptions()
-
-
-def test_an_unknown_preset_is_refused() -> None:
-    with pytest.raises(OptionError, match="did you mean 'paper'"):
-        training_preset("papers")
-
-
 @pytest.mark.parametrize(
     ("bad", "hint"),
     [
@@ -113,8 +104,8 @@ def test_bad_device_options_are_refused(bad: dict, hint: str) -> None:
 
 
 def test_a_cpu_that_trains_has_no_other_loading_processes() -> None:
-    assert DeviceOptions("cpu").worker_count() == 0
-    assert DeviceOptions("cpu", num_workers=3).worker_count(2) == 3
+    assert DeviceOptions("cpu").worker_count == 0
+    assert DeviceOptions("cpu", num_workers=3).worker_count == 3
 
 
 @pytest.mark.parametrize(

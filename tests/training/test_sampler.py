@@ -33,14 +33,6 @@ def test_the_warm_up_rises_evenly_into_the_cosine() -> None:
     assert shares == pytest.approx([k / 10 for k in range(1, 11)] + [1, 1])
 
 
-@given(steps=st.integers(1, 40), count=st.integers(1, 60))
-def test_the_last_step_is_a_milestone(steps: int, count: int) -> None:
-    options = TrainingOptions(stages=(Stage(16, 1, 1),), short_sides=(16,))
-    milestones = Schedule(options, steps).milestones(count)
-    assert max(milestones) == steps
-    assert min(milestones) > 0
-
-
 def test_crops_are_counted() -> None:
     schedule = Schedule(OPTIONS, 10)
     assert [schedule.crops_until(step) for step in (0, 1, 5, 6, 10)] == [0, 4, 20, 22, 30]

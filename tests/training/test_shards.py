@@ -80,14 +80,6 @@ def test_views_and_labels_are_those_of_the_images(photographs: Path, source: Sha
             np.testing.assert_array_equal(mask, expected)
 
 
-def test_the_same_photographs_give_the_same_files(
-    photographs: Path, shards: Shards, tmp_path: Path
-) -> None:
-    again = write_shards(photographs, tmp_path, OPTIONS, shard_size=2, workers=1)
-    for (first, _), (second, _) in zip(shards.training, again.training, strict=True):
-        assert first.read_bytes() == second.read_bytes()
-
-
 def test_a_broken_off_call_goes_on(photographs: Path, tmp_path: Path) -> None:
     made = write_shards(photographs, tmp_path, OPTIONS, shard_size=2, workers=1)
     kept, lost = made.training[0][0], made.training[1][0]

@@ -19,7 +19,7 @@ torch = pytest.importorskip("torch", reason="needs torch, which is for training 
 
 from safetensors.torch import load_file, save_file  # noqa: E402
 
-from deepdetect import DeepDetect, DeepDetectError, ImageError, OptionError, WeightsError  # noqa: E402
+from deepdetect import DeepDetect, DeepDetectError, OptionError, WeightsError  # noqa: E402
 from deepdetect.detector.network.espnet import ESPNet  # noqa: E402
 from deepdetect.detector.network.weights import (  # noqa: E402
     average_weights,
@@ -151,7 +151,7 @@ def test_where_weights_come_from_is_written_into_them(run: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("method", "count"), [("training_step", 6), pytest.param("heatmap", 5, marks=pytest.mark.slow)]
+    ("method", "count"), [("training_step", 6), pytest.param("heatmap", 3, marks=pytest.mark.slow)]
 )
 def test_an_interrupted_run_ends_with_the_same_weights(
     method: str, count: int, run: Path, tmp_path: Path, fit, monkeypatch: pytest.MonkeyPatch
@@ -306,14 +306,6 @@ def test_the_caller_keeps_its_random_numbers() -> None:
         assert torch.equal(one, other)
 
 
-def test_missing_weights_to_start_from_are_refused_before_any_work(
-    photographs: Path, tmp_path: Path
-) -> None:
-    with pytest.raises(WeightsError, match="there is no weights file"):
-        train(photographs, tmp_path / "run", init_weights=tmp_path / "none.safetensors")
-    assert not (tmp_path / "run").exists()
-
-
 def test_an_image_that_cannot_be_read_is_named(photographs: Path, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     shutil.copytree(photographs, folder)
@@ -321,13 +313,6 @@ def test_an_image_that_cannot_be_read_is_named(photographs: Path, tmp_path: Path
     with pytest.raises(DeepDetectError, match=r"broken\.jpg"):
         train(folder, tmp_path / "run", TINY, device=PLAIN, workers=1)
     assert len(list((tmp_path / "run" / "labels").rglob("*.png"))) > 10, "the others are kept"
-
-
-@pytest.mark.parametrize("make", [lambda path: None, lambda path: path.mkdir()])
-def test_a_missing_or_empty_folder_is_refused(tmp_path: Path, make) -> None:
-    make(tmp_path / "photos")
-    with pytest.raises(ImageError):
-        train(tmp_path / "photos", tmp_path / "run", device=PLAIN)
 
 
 @pytest.mark.slow

@@ -132,7 +132,7 @@ class DenseTask(Task):
     def _loader(self, dataset: Any, **batches: Any) -> DataLoader[Any]:
         return DataLoader(
             dataset,
-            num_workers=self.device.worker_count(),
+            num_workers=self.device.worker_count,
             pin_memory=self.engine.device.type == "cuda",
             generator=torch.Generator(),  # not torch's own, whose state is the user's
             **batches,

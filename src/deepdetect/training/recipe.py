@@ -226,11 +226,12 @@ class DeviceOptions:
 
         return "cuda" if is_available() else "cpu"
 
-    def worker_count(self, processes: int = 1) -> int:
-        """Return the number of loading processes, given the training processes of this machine."""
+    @property
+    def worker_count(self) -> int:
+        """The number of loading processes, with the default resolved."""
         if self.num_workers is not None:
             return self.num_workers
-        return 0 if self.accelerator == "cpu" else max(1, processor_count() // processes - 1)
+        return 0 if self.accelerator == "cpu" else max(1, processor_count() - 1)
 
 
 @suggest_keywords

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -155,12 +154,19 @@ def _dense_task(
         validation=validation,
         labels=labels,
         workers=workers,
-        processes=fabric.world_size * max(1, device.worker_count()),
+        processes=fabric.world_size * max(1, device.worker_count),
         make_labels=fabric.local_rank == 0,
         quiet=log is None or not fabric.is_global_zero,
     )
     fabric.barrier()
     return DenseTask(network, options, data, device, fabric)
+
+
+TIMED_STEPS = 30
+"""Of each stage, by `profile`."""
+
+WARM_UP_STEPS = 5
+"""Before them: they compile, allocate memory and render the first views."""
 
 
 @dataclass(frozen=True)
@@ -173,8 +179,7 @@ class StageProfile:
         images_per_second: crops per second.
         full_images_per_second: the same in 480x480 images' worth of pixels.
         waiting_fraction: fraction of the time in which the main process waited for data.
-        memory_bytes: peak resident memory of the main process so far, or None where the system
-            does not report it.
+        memory_bytes: peak resident memory of the main process so far, 0 where unknown.
         device_memory_bytes: peak memory of torch on the main process's GPU, or None.
     """
 
@@ -183,7 +188,7 @@ class StageProfile:
     images_per_second: float
     full_images_per_second: float
     waiting_fraction: float
-    memory_bytes: int | None
+    memory_bytes: int
     device_memory_bytes: int | None
 
 
@@ -193,8 +198,6 @@ def profile(
     output: str | Path,
     options: TrainingOptions = TrainingOptions(),
     *,
-    steps: int = 30,
-    warm_up_steps: int = 5,
     validation: str | Path | None = None,
     labels: str | Path | None = None,
     init_weights: InitWeights | None = None,
@@ -205,9 +208,6 @@ def profile(
     """Time some steps of each stage of a run; nothing but the label cache is written.
 
     Args:
-        steps: steps to time in each stage.
-        warm_up_steps: steps before them that are not timed: they compile, allocate memory and
-            render the first views.
         images, output, options, validation, labels, init_weights, device, workers, log: as of
             `train`.
 
@@ -225,28 +225,28 @@ def profile(
         images, output, options, validation, labels, init_weights, device, workers, log
     )
     steps_of_stage = task.schedule.steps_of_stage
-    lengths = [min(n, steps + warm_up_steps) for n in steps_of_stage]
+    lengths = [min(n, TIMED_STEPS + WARM_UP_STEPS) for n in steps_of_stage]
     quiet = log is None or not task.is_main
     if not quiet and log is not None:
         log(f"timing {task.engine.describe()}")
     profiles, first = [], 0
     with progress(sum(lengths), "timing", "step", quiet) as bar:
         for length, whole in zip(lengths, steps_of_stage, strict=True):
-            warm_up = min(warm_up_steps, length - 1)
-            profiles.append(_time_steps(task, first, first + length, warm_up, bar.update))
+            profiles.append(_time_steps(task, first, first + length, bar.update))
             first += whole
     return profiles
 
 
 def _time_steps(
-    task: DenseTask, first: int, last: int, warm_up: int, done: Callable[[int], object]
+    task: DenseTask, first: int, last: int, done: Callable[[int], object]
 ) -> StageProfile:
     import torch
 
+    from ..evaluation.profiling import peak_memory
     from .dataset import loading
     from .trainer import FULL_IMAGE_PIXELS
 
-    stage = task.schedule.position(first).stage
+    stage, warm_up = task.schedule.position(first).stage, min(WARM_UP_STEPS, last - first - 1)
     on_gpu = task.engine.device.type == "cuda"
     if on_gpu:
         torch.cuda.reset_peak_memory_stats()
@@ -271,19 +271,9 @@ def _time_steps(
         images_per_second=rate,
         full_images_per_second=rate * stage.crop**2 / FULL_IMAGE_PIXELS,
         waiting_fraction=waited / seconds,
-        memory_bytes=_peak_memory_bytes(),
+        memory_bytes=peak_memory(),
         device_memory_bytes=torch.cuda.max_memory_allocated() if on_gpu else None,
     )
-
-
-def _peak_memory_bytes() -> int | None:
-    """Return this process's peak resident memory."""
-    if sys.platform == "win32":
-        return None
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024
 
 
 TRAINING_PACKAGES = ("torch", "lightning_fabric", "matplotlib", "safetensors", "onnx")

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from deepdetect._shared.errors import OptionError, WeightsError
+from deepdetect._shared.errors import WeightsError
 from deepdetect.detector.points.ranker import load_ranker, notes_of
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.training import PointsTrainingOptions, TrainingResult, train_points
@@ -107,11 +106,6 @@ def test_an_untrained_ranker_ranks_by_the_first_feature(textures: Path) -> None:
     assert correlation > 0.999
     exported = module.export({"a": 1})
     np.testing.assert_allclose(exported.rank(features.numpy()), logits.detach().numpy(), atol=1e-5)
-
-
-def test_other_options_do_not_resume(whole: TrainingResult, textures: Path) -> None:
-    with pytest.raises(OptionError, match=r"other settings \(`seed`\)"):
-        run(textures, whole.weights.parent, dataclasses.replace(OPTIONS, seed=1))
 
 
 def test_the_measure_of_a_blind_detector(textures: Path) -> None:
