@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ...features.keypoints import nearest_keypoints
-from ...features.matchers import DescriptorMatches
+from ...features.matches import GuidedMatches
 from ...geometry.homography_refinement import refine_homography
 from ...geometry.rescaling import downscale, scaled_homography
 from ...geometry.residuals import transform_points
@@ -35,37 +33,30 @@ MIN_SCALE = 1 / 16
 """Of one image in the other; beyond it a homography shows nothing that could be refined."""
 
 
-@dataclass(frozen=True, eq=False)
-class ImagePair:
-    """Two images and their keypoints.
-
-    Attributes:
-        gray0, gray1: (H0, W0), (H1, W1) uint8 luma.
-        xy0, xy1: (N, 2), (M, 2) keypoints on whole pixels.
-    """
-
-    gray0: np.ndarray
-    gray1: np.ndarray
-    xy0: np.ndarray
-    xy1: np.ndarray
-
-
 def match_by_homography(
-    pair: ImagePair,
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    xy0: np.ndarray,
+    xy1: np.ndarray,
     homography: np.ndarray,
     seed: int = 0,
-) -> tuple[DescriptorMatches, float]:
+) -> tuple[GuidedMatches, float]:
     """Match keypoints by a homography, and keep those whose patches are the same.
 
+    Args:
+        gray0, gray1: (H, W) uint8 luma.
+        xy0, xy1: (N, 2), (M, 2) keypoints on whole pixels.
+        homography: (3, 3) from the first image to the second.
+        seed: of the null pairs.
+
     Returns:
-        The matches, their ratios the `dissimilarity` of their patches, under 1; and the fraction
+        The matches, their scores 1 less the `dissimilarity` of their patches; and the fraction
         with the same patches of the pairs that the homography proposes, or, where keypoints are
         few, of all keypoints of the first image that the second one shows under it. Each keypoint
         of the first image is matched once at most, those of the second image perhaps more often.
     """
-    gray1 = pair.gray1
-    places = transform_points(pair.xy0, homography)
-    indices1, distances = nearest_keypoints(places, pair.xy1, (gray1.shape[1], gray1.shape[0]))
+    places = transform_points(xy0, homography)
+    indices1, distances = nearest_keypoints(places, xy1, (gray1.shape[1], gray1.shape[0]))
     with np.errstate(invalid="ignore"):
         shown = (places > -0.5) & (places < np.array(gray1.shape[::-1]) - 0.5)
     near = distances < MAX_DISTANCE_PX
@@ -74,27 +65,24 @@ def match_by_homography(
     # Where keypoints are few it is chance which of them have another there: all are judged.
     if len(proposed) >= MIN_PROPOSED_FRACTION * len(indices0):
         indices0 = proposed
-    if not len(indices0):
-        return DescriptorMatches(indices0, indices0, np.empty(0, np.float32)), 0.0
-    ratios = _compare(pair, homography, indices0, seed)
+    ratios = _compare(gray0, gray1, xy0[indices0], homography, seed)
     same = ratios < 1
     kept = same & near[indices0]
-    matched = indices0[kept]
-    return DescriptorMatches(matched, indices1[matched], ratios[kept]), float(same.mean())
+    indices0 = indices0[kept]
+    indices1 = indices1[indices0]
+    scores = np.clip(1 - ratios[kept], 0, 1)
+    found = GuidedMatches(indices0, xy1[indices1].astype(np.float64), scores, indices1=indices1)
+    return found, float(same.mean()) if len(same) else 0.0
 
 
 def _compare(
-    pair: ImagePair,
-    homography: np.ndarray,
-    indices0: np.ndarray,
-    seed: int,
+    gray0: np.ndarray, gray1: np.ndarray, pixels: np.ndarray, homography: np.ndarray, seed: int
 ) -> np.ndarray:
     """Return the `dissimilarity` of keypoints, of large images on smaller copies."""
     (gray0, scale0), (gray1, scale1) = (
         downscale(gray, round(max(gray.shape) * min(1, np.sqrt(MAX_VERIFIED_MEGAPIXELS / area))))
-        for gray, area in ((each, each.size / 1e6) for each in (pair.gray0, pair.gray1))
+        for gray, area in ((each, each.size / 1e6) for each in (gray0, gray1))
     )
-    pixels = pair.xy0[indices0]
     if scale0 < 1 or scale1 < 1:
         homography = scaled_homography(homography, scale0, scale1)
         last = np.array(gray0.shape[::-1], np.float32) - 1

@@ -11,10 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from ...features.keypoints import Keypoints, nearest_keypoints
-from ...features.matchers import DescriptorMatches
 from ...features.matches import GuidedMatches, TwoViewGeometry
 from .homography import (
-    ImagePair,
     match_by_homography,
     refine_guiding_homography,
 )
@@ -78,12 +76,11 @@ def guided_matches(
         first = guiding_geometry(gray0, gray1, model, seed, tentative, points)
     if first.matrix is None:
         return first.as_two_view_geometry(), None
-    pair = ImagePair(gray0, gray1, xy0, xy1)
     enough = MIN_MATCHED_FRACTION * min(len(xy0), len(xy1))
     matrix: np.ndarray = first.matrix
     found = None
     if first.model == "homography":
-        matrix, found = _match_plane(pair, first, seed)
+        matrix, found = _match_plane((gray0, gray1, xy0, xy1), first, seed)
         if found is None:
             known = first.tentative if tentative is None else tentative
             depth = guiding_geometry(gray0, gray1, "fundamental", seed, known, points)
@@ -97,7 +94,7 @@ def guided_matches(
         made = match_by_rectification(gray0, gray1, xy0, first.points0, first.points1, first.matrix)
         if made is None or len(made[1]) < enough:
             # Too little around the sparse matches is alike, but they are distinct, and agree.
-            matrix, found = first.matrix, _sparse_matches(pair, first)
+            matrix, found = first.matrix, _sparse_matches(gray0, xy0, first)
         else:
             matrix, found = made
     if len(found) < MIN_MATCHES:
@@ -130,31 +127,25 @@ def guiding_geometry(
 
 
 def _match_plane(
-    pair: ImagePair, first: InitialGeometry, seed: int
+    pair: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], first: InitialGeometry, seed: int
 ) -> tuple[np.ndarray, GuidedMatches | None]:
     """Match by a homography; None where the images show that the scene is no plane."""
     assert first.matrix is not None
-    matrix = refine_guiding_homography(pair.gray0, pair.gray1, first.matrix)
-    matches, verified = match_by_homography(pair, matrix, seed)
+    matrix = refine_guiding_homography(pair[0], pair[1], first.matrix)
+    found, verified = match_by_homography(*pair, matrix, seed)
     parallax = first.parallax
     least = 0.0  # a homography was asked for
     if parallax is not None:
         doubtful = parallax.exceeds(MIN_PARALLAX_FRACTION)
         least = MIN_VERIFIED_FRACTION_OF_DEPTH if doubtful else MIN_VERIFIED_FRACTION
-    return matrix, _at_keypoints(pair, matches) if verified >= least else None
+    return matrix, found if verified >= least else None
 
 
-def _sparse_matches(pair: ImagePair, first: InitialGeometry) -> GuidedMatches:
+def _sparse_matches(gray0: np.ndarray, xy0: np.ndarray, first: InitialGeometry) -> GuidedMatches:
     """Return the sparse matches that agree with the geometry, moved to the keypoints near them."""
-    height, width = pair.gray0.shape
-    rows, distances = nearest_keypoints(first.points0, pair.xy0, (width, height))
+    height, width = gray0.shape
+    rows, distances = nearest_keypoints(first.points0, xy0, (width, height))
     near = np.isfinite(distances)
-    moved = first.points1[near] + pair.xy0[rows[near]] - first.points0[near]
+    moved = first.points1[near] + xy0[rows[near]] - first.points0[near]
     rows, order = np.unique(rows[near].astype(np.int64), return_index=True)
     return GuidedMatches(rows, moved[order], np.full(len(rows), 0.5, np.float32))
-
-
-def _at_keypoints(pair: ImagePair, found: DescriptorMatches) -> GuidedMatches:
-    scores = np.clip(1 - found.ratios, 0, 1)
-    places = pair.xy1[found.indices1].astype(np.float64)
-    return GuidedMatches(found.indices0, places, scores, indices1=found.indices1)
