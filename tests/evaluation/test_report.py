@@ -1,15 +1,12 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
-import math
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from deepdetect import OptionError
 from deepdetect.evaluation.charts import picture
@@ -101,12 +98,6 @@ def test_all_files_are_written_and_named_with_the_report_first(
     }
 
 
-def test_a_report_of_nothing_says_so(tmp_path: Path) -> None:
-    Report("Empty", {}, ()).save(tmp_path)
-    assert "- nothing" in (tmp_path / "report.md").read_text("utf-8")
-    assert json.loads((tmp_path / "report.json").read_text("utf-8"))["skipped"] == []
-
-
 def test_csv_has_every_digit_and_empty_cells(report: Report, folder: Path) -> None:
     with (folder / "tables" / "first.csv").open(newline="", encoding="utf-8") as file:
         head, *rows = csv.reader(file)
@@ -116,13 +107,6 @@ def test_csv_has_every_digit_and_empty_cells(report: Report, folder: Path) -> No
     assert rows[4][0] == "small, with comma"
     assert float(rows[4][1]) == np.nextafter(0.1, 1) != 0.1
     assert len(rows) == 5
-
-
-def test_what_is_not_a_number_is_an_empty_cell_of_csv_too(folder: Path) -> None:
-    """It is what is not known, and a dash in the other formats."""
-    with (folder / "tables" / "first.csv").open(newline="", encoding="utf-8") as file:
-        rows = list(csv.reader(file))
-    assert rows[3] == ["no number", "", "0"]
 
 
 def test_json_has_every_digit_and_no_word_that_json_lacks(folder: Path) -> None:
@@ -140,10 +124,6 @@ def test_json_has_every_digit_and_no_word_that_json_lacks(folder: Path) -> None:
     assert values["skipped"] == [f"left {EVIL}"]
 
 
-def test_the_values_do_not_lose_a_table(report: Report) -> None:
-    assert list(report.values()["tables"]) == [table.key for table in report.tables()]
-
-
 def test_markdown_tables_have_as_many_cells_in_each_line(report: Report) -> None:
     lines = report.tables()[0].to_markdown().splitlines()
     assert len(lines) == 2 + 5
@@ -154,28 +134,6 @@ def test_markdown_tables_have_as_many_cells_in_each_line(report: Report) -> None
     assert lines[1] == "|---|---:|---:|"
     assert lines[3] == "| nothing | – | – |"
     assert "a\\|b <c>" in lines[0]
-
-
-def test_markdown_shows_its_figures_from_files_beside_it(report: Report, folder: Path) -> None:
-    text = (folder / "report.md").read_text("utf-8")
-    for figure in report.figures():
-        assert f"](figures/{figure.key}.png)" in text
-        assert (folder / "figures" / f"{figure.key}.png").read_bytes() == figure.png
-        Image.open(io.BytesIO(figure.png)).verify()
-    assert text.startswith("# Report ")
-    assert "## Skipped\n\n- left " in text
-
-
-def test_a_second_report_takes_the_place_of_the_first(report: Report, tmp_path: Path) -> None:
-    report.save(tmp_path)
-    Report("New", {}, report.sections).save(tmp_path)
-    assert json.loads((tmp_path / "report.json").read_text("utf-8"))["title"] == "New"
-    assert not [path for path in tmp_path.rglob(".*") if path.is_file()]
-
-
-def test_infinity_survives_in_csv(folder: Path) -> None:
-    with (folder / "tables" / "first.csv").open(newline="", encoding="utf-8") as file:
-        assert math.isinf(float(list(csv.reader(file))[4][1]))
 
 
 def test_a_table_out_of_the_text_is_named_there_and_written_as_csv(tmp_path: Path) -> None:

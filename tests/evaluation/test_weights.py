@@ -104,17 +104,6 @@ def test_the_command_prints_weights_side_by_side(run_evaluate, folder: Path) -> 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick_protocol")
-def test_the_labels_join_as_weights_without_error(run_evaluate, folder: Path) -> None:
-    text = run_evaluate("--labels", "--oxford", folder)
-    for word in ("correct: graf 1-6", "density: 0.9", "repeatability: bark"):
-        line = next(line for line in text.splitlines() if word in line)
-        cells = line.split(word)[1].split()
-        assert len(cells) == 2
-        assert cells[0] != cells[1]
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("quick_protocol")
 def test_at_equal_density_weights_have_as_many_keypoints_as_the_labels(
     run_evaluate, folder: Path
 ) -> None:
@@ -151,27 +140,6 @@ def test_the_foreground_is_measured(run_evaluate, tmp_path: Path) -> None:
     assert float(line.split()[-1]) == pytest.approx(0.5)
 
 
-def test_equal_density_without_images_is_refused(tmp_path: Path) -> None:
-    from tests.command_line import run_command
-
-    result = run_command(["evaluate", str(tmp_path), "--equal-density"])
-    assert result.exit_code == 2
-    assert "--equal-density is for the keypoints of --oxford and --foreground" in result.output
-    with pytest.raises(OptionError, match="`equal_density` is for the keypoints of `oxford`"):
-        evaluate(equal_density=True)
-    with pytest.raises(OptionError, match="leave out `equal_density`"):
-        evaluate_oxford(LabelDetector(), [], equal_density=True)
-
-
-def test_a_missing_folder_is_said_before_the_work(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr("deepdetect.evaluation.weights.readable_images", None)
-    for name in ("oxford", "foreground"):
-        with pytest.raises(ImageError, match="there are no"):
-            evaluate(samples=tmp_path, **{name: tmp_path / "none"})
-
-
 def test_other_options_of_the_detector_stay(folder: Path) -> None:
     rgb = np.asarray(Image.open(folder / "graf" / "img1.png"))
     flipping = DeepDetect(tta="flip", resolution="native", tile_megapixels=2)
@@ -181,15 +149,6 @@ def test_other_options_of_the_detector_stay(folder: Path) -> None:
     assert one.score.loss != other.score.loss
     native = flipping.configured(HeatmapOptions("native", tta="flip"))
     assert LabelDensityDetector(native).heatmap(rgb).sum() == LabelDetector().heatmap(rgb).sum()
-
-
-def test_labels_without_oxford_are_refused(tmp_path: Path) -> None:
-    from tests.command_line import run_command
-
-    result = run_command(["evaluate", str(tmp_path), "--labels"])
-    assert result.exit_code == 2
-    assert "--oxford" in result.output
-    assert "Traceback" not in result.output
 
 
 @pytest.mark.parametrize(("correct", "seeds"), [(1000, 3), (999, 64), (0, 64)])
@@ -230,14 +189,6 @@ def test_counts_are_those_of_the_published_matching(
     expected = np.rint(np.mean(counts, axis=0)).astype(int).tolist()
     assert expected[1] > 0
     assert list(mean_correct_matches(Run(folder), feature, pair)) == expected
-
-
-def test_all_weights_see_the_images_alike(run_evaluate, tmp_path: Path) -> None:
-    import json
-
-    found = json.loads(run_evaluate("--compare", "deepdetect.onnx", "--resolution", 160, "--json"))
-    native = json.loads(run_evaluate("--json"))
-    assert found["normal"] == found["compare"][0]["normal"] != native["normal"]
 
 
 def test_samples_and_their_scales(tmp_path: Path, photo: np.ndarray) -> None:
@@ -285,21 +236,6 @@ def test_samples_that_cannot_be_read_are_listed_and_not_scored(
     assert "mask_image_b.png" in second
     (tmp_path / "image_c.png").unlink()
     assert run_command(["evaluate", str(tmp_path)]).exit_code == 2
-
-
-def test_photographs_that_cannot_be_read_are_listed_and_not_scored(
-    tmp_path: Path, photo: np.ndarray
-) -> None:
-    from tests.command_line import run_command
-
-    Image.fromarray(photo[:64, :64]).save(tmp_path / "a.png")
-    (tmp_path / "b.png").write_bytes(b"damaged")
-    result = run_command(["evaluate", str(tmp_path), "--scale", "1", "--scale", "2"])
-    assert result.exit_code == 1
-    assert "x1 normal: score: iou" in result.stdout
-    *_, told, first = result.stderr.splitlines()
-    assert told == "deepdetect: 1 of 2 samples are not in the scores:"
-    assert "b.png" in first
 
 
 def test_damaged_photographs_do_not_end_the_measurement_of_the_others(

@@ -17,19 +17,13 @@ WIDEST = 1600
 """Pixels; wider pictures are shrunk."""
 
 
-def bar_chart(
-    values: Mapping[str, float],
-    label: str,
-    highlighted: Sequence[str] = (),
-    limit: float | None = None,
-) -> bytes:
+def bar_chart(values: Mapping[str, float], label: str, highlighted: Sequence[str] = ()) -> bytes:
     """Draw horizontal bars, with the value beside each.
 
     Args:
         values: by name, from top to bottom.
         label: of the axis.
         highlighted: names that are drawn in another colour.
-        limit: end of the axis.
 
     Returns:
         The PNG file.
@@ -42,7 +36,7 @@ def bar_chart(
     axes.bar_label(bars, fmt="{:.3f}", padding=3)
     axes.invert_yaxis()
     axes.set_xlabel(label)
-    axes.set_xlim(0, limit)
+    axes.set_xlim(left=0)
     axes.margins(x=0.12)
     axes.grid(axis="x", alpha=0.3)
     return _saved(figure)

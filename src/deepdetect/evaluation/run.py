@@ -9,7 +9,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from ..io.image import load_image
 from ..matching.unguided import check_memory
 from .baselines.method import BaselineError, LocalFeature
 from .profiling import Profile, profiled
-from .report import Row, Rows
+from .report import Row, Rows, Titled
 
 Result = TypeVar("Result")
 
@@ -55,17 +55,7 @@ class CacheError(DeepDetectError):
     """A result cannot be kept: the folder cannot be written."""
 
 
-class Method(Protocol):
-    """A row of a table: what is compared."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def title(self) -> str: ...
-
-
-AnyMethod = TypeVar("AnyMethod", bound=Method)
+AnyMethod = TypeVar("AnyMethod", bound=Titled)
 Item = TypeVar("Item")
 
 

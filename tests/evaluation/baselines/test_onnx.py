@@ -124,26 +124,6 @@ def test_keypoints_of_a_shrunk_image_are_the_centres_of_what_became_one_pixel(
     assert found.image_size == (width, height)
 
 
-def test_keypoints_of_an_enlarged_image_lie_around_their_pixel(make: Make) -> None:
-    found = onnx_feature(make((32, 48))).detect(picture(24, 16, (5, 7, 1, 1)))
-    np.testing.assert_allclose(found.xy.mean(0), (5, 7), atol=1e-5)
-    assert np.abs(found.xy - (5, 7)).max() < 0.5
-
-
-def test_only_the_fixed_side_is_stretched(make: Make) -> None:
-    found = onnx_feature(make((32, "width"))).detect(picture(50, 64, (9, 20, 1, 2)))
-    np.testing.assert_allclose(found.xy, [(9, 20.5)], atol=1e-5)
-
-
-@pytest.mark.parametrize("leading", [False, True])
-def test_no_keypoints_are_no_error(make: Make, leading: bool) -> None:
-    method = onnx_feature(make(leading=leading, descriptors=True))
-    rgb = picture(40, 30)
-    found = method.detect(rgb)
-    assert len(found) == 0
-    assert len(method.describe(rgb, found)) == 0
-
-
 @pytest.mark.parametrize("leading", [False, True])
 def test_descriptors_of_the_network_are_kept_and_count_as_learned(
     make: Make, leading: bool
@@ -194,11 +174,4 @@ def test_what_is_no_network_is_said(make: Make, tmp_path: Path, one_line) -> Non
 def test_other_outputs_are_said_when_the_file_is_opened(make: Make, one_line) -> None:
     with pytest.raises(WeightsError, match="keypoints and scores") as caught:
         onnx_feature(make(rename="points"))
-    one_line(caught.value)
-
-
-@pytest.mark.parametrize("change", [{"channels": 1}, {"rank": 3}], ids=["grey", "no batch"])
-def test_another_input_is_said_when_the_file_is_opened(make: Make, change, one_line) -> None:
-    with pytest.raises(WeightsError) as caught:
-        onnx_feature(make(**change))
     one_line(caught.value)

@@ -141,18 +141,6 @@ def test_corners_are_described_by_sift_at_size_3(crop: np.ndarray, name: str) ->
     np.testing.assert_array_equal(CLASSICAL[name].describe(crop, found), expected)
 
 
-@pytest.mark.parametrize("name", [name for name in CLASSICAL if not name.endswith("-low")])
-def test_low_settings_find_more(crop: np.ndarray, name: str) -> None:
-    few, many = (CLASSICAL[n].detect(crop) for n in (name, f"{name}-low"))
-    assert len(many) > 1.5 * len(few)
-
-
-def test_only_orb_and_brisk_have_binary_descriptors() -> None:
-    binary = {name for name, method in CLASSICAL.items() if method.binary}
-    assert binary == {"orb", "orb-low", "brisk", "brisk-low"}
-    assert not any(method.learned for method in CLASSICAL.values())
-
-
 @pytest.mark.parametrize("name", CLASSICAL)
 def test_a_picture_of_one_colour_has_no_keypoints(name: str) -> None:
     flat = np.full((70, 80, 3), 128, np.uint8)
@@ -161,20 +149,6 @@ def test_a_picture_of_one_colour_has_no_keypoints(name: str) -> None:
     described = CLASSICAL[name].describe(flat, found)
     assert described.shape[0] == 0
     assert described.ndim == 2
-
-
-@pytest.mark.parametrize("name", CLASSICAL)
-def test_the_smallest_image_is_no_error(name: str, photo: np.ndarray) -> None:
-    small = np.ascontiguousarray(photo[60:76, 100:116])
-    found = CLASSICAL[name].detect(small)
-    assert len(CLASSICAL[name].describe(small, found)) == len(found)
-
-
-@pytest.mark.parametrize("name", ["sift", "fast", "harris", "shi-tomasi", "orb"])
-def test_detecting_twice_gives_the_same(crop: np.ndarray, name: str) -> None:
-    first, second = (CLASSICAL[name].detect(crop) for _ in range(2))
-    np.testing.assert_array_equal(first.xy, second.xy)
-    np.testing.assert_array_equal(first.scores, second.scores)
 
 
 @pytest.fixture(scope="module")
@@ -207,31 +181,3 @@ def test_each_keypoint_keeps_its_row_also_near_the_border(large: np.ndarray, nam
             kept += 1
             np.testing.assert_array_equal(row, alone[0])
     assert kept == len(xy) if name == "sift" else 0 < kept < len(xy)
-
-
-def test_orb_leaves_out_31_pixels_at_each_border(large: np.ndarray) -> None:
-    xy = grid((140, 120), 1)
-    features = Keypoints(xy, np.ones(len(xy)), (140, 120))
-    described = describe_with(cv2.ORB_create(), large, features).any(1)
-    inside = ((xy >= 31) & (xy < (140 - 31, 120 - 31))).all(1)
-    np.testing.assert_array_equal(described, inside)
-
-
-@pytest.mark.parametrize(
-    ("make", "columns", "dtype"),
-    [
-        (cv2.SIFT_create, 128, np.float32),
-        (cv2.ORB_create, 32, np.uint8),
-        (HOME.BRISK_create, 64, np.uint8),
-    ],
-)
-def test_no_keypoints_have_no_descriptors(large: np.ndarray, make, columns: int, dtype) -> None:
-    rows = describe_with(make(), large, Keypoints.empty((140, 120)))
-    assert (rows.shape, rows.dtype) == ((0, columns), dtype)
-
-
-@pytest.mark.parametrize("make", [cv2.ORB_create, HOME.BRISK_create])
-def test_keypoints_at_the_border_only_get_zeros(large: np.ndarray, make) -> None:
-    rows = describe_with(make(), large, Keypoints([[0, 0], [139, 119]], [1, 1], (140, 120)))
-    assert rows.shape[0] == 2
-    assert not rows.any()

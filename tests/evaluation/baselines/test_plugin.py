@@ -9,13 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import OptionError, WeightsError
+from deepdetect import OptionError
 from deepdetect.evaluation.baselines.method import BaselineError
-from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.evaluation.baselines.plugin import find_feature, plugin_feature
 from deepdetect.evaluation.run import MatchSettings, Run
-from deepdetect.features.sift import root_sift_descriptors
-from deepdetect.io.image import luma
 
 NUMBERS = itertools.count()
 CORNERS = """
@@ -58,15 +55,6 @@ def test_a_function_in_the_current_folder_is_found(write: Write, crop: np.ndarra
     assert found.image_size == (80, 60)
     assert found.best(2).xy.tolist() == [[79, 0], [79, 59]]
     assert find_feature(target).detect(crop).xy.tolist() == found.xy.tolist()
-
-
-def test_points_without_descriptors_get_upright_rootsift_of_size_4(
-    write: Write, crop: np.ndarray
-) -> None:
-    method = plugin_feature(write(CORNERS % "") + ":find")
-    found = method.detect(crop)
-    expected = root_sift_descriptors(luma(crop), found.xy, 4.0, 0.0)
-    np.testing.assert_array_equal(method.describe(crop, found), expected)
 
 
 @pytest.mark.parametrize(
@@ -145,62 +133,12 @@ def test_a_wrong_name_is_an_error_in_one_line(target: str, one_line) -> None:
     assert sys.path == before
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "def find(rgb:\n",
-        "raise ImportError('a package is missing:\\nget it')",
-        "raise RuntimeError('no weights')",
-        "open('weights that are not there')",
-        "1 / 0",
-    ],
-    ids=["syntax", "two lines", "runtime", "file", "arithmetic"],
-)
-def test_a_module_that_fails_is_an_error_in_one_line(write: Write, text: str, one_line) -> None:
-    before = list(sys.path)
-    target = f"{write(text)}:find"
-    with pytest.raises(OptionError) as caught:
-        plugin_feature(target)
-    assert target in one_line(caught.value)
-    assert sys.path == before
-
-
 def test_the_version_follows_the_modules_file(write: Write) -> None:
     name = write(CORNERS % "")
     first = plugin_feature(f"{name}:find").version
     assert plugin_feature(f"{name}:find").version == first
     os.utime(f"{name}.py", ns=(10**18, 10**18))
     assert plugin_feature(f"{name}:find").version != first
-
-
-@pytest.mark.parametrize(
-    "definition",
-    [
-        "class Finder:\n    def __call__(self, rgb):\n        return found(rgb)\nfind = Finder()",
-        "import functools\nfind = functools.partial(found)",
-    ],
-    ids=["object", "partial"],
-)
-def test_the_version_of_any_callable_follows_the_file_it_is_named_in(
-    write: Write, crop: np.ndarray, definition: str
-) -> None:
-    function = (CORNERS % "").replace("def find", "def found")
-    name = write(f"{function}\n{definition}\n")
-    method = plugin_feature(f"{name}:find")
-    assert len(method.detect(crop)) == 4
-    os.utime(f"{name}.py", ns=(10**18, 10**18))
-    assert plugin_feature(f"{name}:find").version != method.version
-
-
-def test_a_function_written_in_c_is_no_crash() -> None:
-    assert plugin_feature("cv2:cornerHarris").version
-
-
-def test_there_are_seven_methods_with_two_settings_each() -> None:
-    kinds = {"sift", "orb", "brisk", "fast", "agast", "harris", "shi-tomasi"}
-    assert set(CLASSICAL) == kinds | {f"{kind}-low" for kind in kinds}
-    assert len({method.title for method in CLASSICAL.values()}) == 14
-    assert all(find_feature(name) is method for name, method in CLASSICAL.items())
 
 
 @pytest.mark.parametrize(
@@ -216,10 +154,3 @@ def test_an_unknown_word_brings_the_nearest_and_the_other_ways(
     assert f"did you mean {nearest!r}" in message
     assert "ONNX" in message
     assert "package.module:function" in message
-
-
-def test_a_word_is_a_file_by_its_ending_and_a_function_by_its_colon() -> None:
-    with pytest.raises(WeightsError, match="cannot be read"):
-        find_feature("folder:of/none.onnx")
-    with pytest.raises(OptionError, match="cannot be imported"):
-        find_feature("no_such_package:function")

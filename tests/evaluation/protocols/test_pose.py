@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import cv2
@@ -98,26 +97,6 @@ def test_all_methods_find_the_pose_and_the_control_does_not(report: Report, fold
     guides = [found["DeepDetect"][k] for k in ("guided by homography", "guided by fundamental")]
     assert sum(guides) + found["DeepDetect"]["unguided"] == 1
     assert found[SIFT]["unguided"] is found["DeepDetect, unguided"]["unguided"] is None
-
-
-@pytest.mark.slow
-def test_the_report_has_the_files_and_says_what_the_control_is(
-    report: Report, folder: Path, tmp_path: Path
-) -> None:
-    report.save(tmp_path)
-    text = (tmp_path / "report.md").read_text()
-    assert "a control that sees no image" in text
-    assert "no test of that choice" in text
-    assert "In `tables/pose_pairs.csv`." in text
-    key = folder.name.replace("-", "_")
-    assert (tmp_path / "figures" / f"pose_{key}.png").is_file()
-    with (tmp_path / "tables" / "pose_pairs.csv").open() as file:
-        pairs = list(csv.DictReader(file))
-    assert len(pairs) == 5
-    assert {row["pair"] for row in pairs} == {f"{folder.name} 000000-000001"}
-    assert {row["frame distance"] for row in pairs} == {"1"}
-    assert f"{folder.name}, by frame distance" in text
-    assert text.count(f"| 1 | {SIFT} |") == 1
 
 
 def image(number: int) -> PosedImage:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -57,18 +57,25 @@ def score_samples(
     Raises:
         ImageError: a mask is missing or of another size.
     """
+
+    def scored() -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+        for path in images:
+            rgb, mask = load_sample(path)
+            yield visibility_of(luma(rgb)), heatmap(rgb), mask
+
+    return _over_images(scored())
+
+
+def _over_images(images: Iterable[tuple[str, np.ndarray, np.ndarray]]) -> dict[str, Scored]:
+    """Score visibilities with heat maps and masks: the means, and all pixels, by visibility."""
     scores: dict[str, list[Scored]] = {"normal": [], "low": []}
-    for path in images:
-        rgb, mask = load_sample(path)
-        found = heatmap(rgb)
-        scores[visibility_of(luma(rgb))].append(
-            (score_heatmap(found, mask), calibration_of(found, mask))
-        )
-    return {name: _over_images(listed) for name, listed in scores.items() if listed}
-
-
-def _over_images(scores: Sequence[Scored]) -> Scored:
-    return mean_score(score for score, _ in scores), pooled(found for _, found in scores)
+    for visibility, heatmap, mask in images:
+        scores[visibility].append((score_heatmap(heatmap, mask), calibration_of(heatmap, mask)))
+    return {
+        name: (mean_score(score for score, _ in listed), pooled(found for _, found in listed))
+        for name, listed in scores.items()
+        if listed
+    }
 
 
 def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -256,17 +263,14 @@ def score_at_scale(
     """
     check_scales([scale])
     native = detector.configured(replace(detector.heatmap_options, resolution="native"))
-    found: dict[str, list[Scored]] = {}
-    for image in images:
-        rgb = _scaled(load_image(image), scale)
-        label = fuse(luma(rgb), options)
-        heatmap = native.heatmap(rgb)
-        scored = score_heatmap(heatmap, label.mask), calibration_of(heatmap, label.mask)
-        found.setdefault(label.visibility, []).append(scored)
-    return [
-        ScaleScore(scale, visibility, *_over_images(found[visibility]))
-        for visibility in sorted(found, reverse=True)
-    ]
+
+    def scored() -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+        for image in images:
+            rgb = _scaled(load_image(image), scale)
+            label = fuse(luma(rgb), options)
+            yield label.visibility, native.heatmap(rgb), label.mask
+
+    return [ScaleScore(scale, name, *found) for name, found in _over_images(scored()).items()]
 
 
 def _scaled(rgb: np.ndarray, scale: float) -> np.ndarray:

@@ -110,29 +110,16 @@ def _oxford_paper(run: Run, options: BenchmarkOptions, scenes: Sequence[PlanarSc
     text = (
         "Tables I and II, the Oxford half of III, Figures 1, 2, 4 and 6. DeepDetect sees images "
         f"squashed to 480x480 as {options.channels.upper()}; the classical detectors see them as "
-        "they are. The paper's numbers are beside ours, and so are those that its authors' public "
-        "notebooks print."
+        "they are. The paper's numbers are beside ours."
     )
     tables = [
         density,
         with_paper_rows(repeatability, OXFORD_REPEATABILITY),
-        _with_notebooks(with_paper_rows(matches, MATCHES), pairs),
+        with_paper_rows(matches, MATCHES),
         figure_6,
     ]
     figures = [_repeatability_figure(repeatability), *figures, *filter(None, [masks])]
     return Section("Oxford, the paper's protocol", (text,), tables, figures)
-
-
-def _with_notebooks(table: Table, pairs: Sequence[PlanarPair]) -> Table:
-    """Add what the authors' notebooks print."""
-    rows = list(table.rows)
-    for method in dict.fromkeys(m for of_pair in NUMBERS["notebooks"].values() for m in of_pair):
-        cells: list[Cell] = [f"{method}, in the authors' notebook"]
-        for pair in pairs:
-            correct, matches = NUMBERS["notebooks"].get(pair.name, {}).get(method, (None, None))
-            cells += [correct, correct / matches if matches else None]
-        rows.append(tuple(cells))
-    return Table(table.key, table.title, table.columns, tuple(rows), table.note)
 
 
 def _repeatability_figure(table: Table) -> Figure:

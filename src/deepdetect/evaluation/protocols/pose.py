@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -331,17 +331,18 @@ SUMMARY: Columns = (
 
 
 def _grouped(
+    key: str,
+    title: str,
     first: Column,
     groups: Sequence[tuple[Cell, Rows]],
     methods: Sequence[PoseMethod],
     columns: Columns,
-    table: Table,
+    note: str = NOTE,
 ) -> Table:
-    """Fill a table with the lines of all methods in each group, whose value comes first."""
-    parts = [(value, tabulate("", "", methods, own, columns)) for value, own in groups]
-    heads = (first, *parts[0][1].columns)
+    """Tabulate all methods in each group, whose value is the first column."""
+    parts = [(value, tabulate(key, title, methods, own, columns, note)) for value, own in groups]
     lines = tuple((value, *line) for value, part in parts for line in part.rows)
-    return Table(table.key, table.title, heads, lines, table.note)
+    return replace(parts[0][1], columns=(first, *parts[0][1].columns), rows=lines)
 
 
 def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], rows: Rows) -> Table:
@@ -376,8 +377,7 @@ def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], row
         "Seconds: median, from the images to the matches, of the run that made them."
     )
     groups = [(scene.name, where(rows, scene=scene.name)) for scene in scenes]
-    table = Table("pose", "Relative poses", (), (), note)
-    return _grouped(Column("scene"), groups, methods, columns, table)
+    return _grouped("pose", "Relative poses", Column("scene"), groups, methods, columns, note)
 
 
 def distance_table(scene: PosedScene, methods: Sequence[PoseMethod], rows: Rows) -> Table:
@@ -387,8 +387,8 @@ def distance_table(scene: PosedScene, methods: Sequence[PoseMethod], rows: Rows)
         (distance, where(rows, scene=scene.name, distance=distance)) for distance in distances
     ]
     title = f"Relative poses in {scene.name}, by frame distance"
-    table = Table(f"pose_{_file_name(scene)}_distances", title, (), (), NOTE)
-    return _grouped(Column("frame distance", "d"), groups, methods, SUMMARY, table)
+    key = f"pose_{_file_name(scene)}_distances"
+    return _grouped(key, title, Column("frame distance", "d"), groups, methods, SUMMARY)
 
 
 PAIR_COLUMNS = {
