@@ -134,6 +134,18 @@ def test_logits_survive_the_round_trip(tmp_path: Path) -> None:
     assert found.best(1).xy.tolist() == [[3.5, 4]]
 
 
+def test_descriptors_are_stored_with_their_type(tmp_path: Path) -> None:
+    described = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    points = keypoints(3)
+    for kind in ("rootsift", None):
+        saved = replace(points, descriptors=described, descriptor_type=kind)
+        save_keypoints(saved, tmp_path / "k.npz")
+        loaded = load_keypoints(tmp_path / "k.npz")
+        assert loaded.descriptor_type == kind
+        assert loaded.descriptors.dtype == np.uint8
+        np.testing.assert_array_equal(loaded.descriptors, described)
+
+
 def zipped(members: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", method) as archive:

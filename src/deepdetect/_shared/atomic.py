@@ -67,7 +67,12 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     final = Path(path)
     temporary: Path | None = None
     try:
-        clear_abandoned(final.parent)
+        folder = final.parent.absolute()
+        if folder not in _cleared:
+            _cleared.add(folder)
+            for entry in _abandoned(folder, _TEMPORARY):
+                with contextlib.suppress(OSError):
+                    os.unlink(entry)
         owner = _owner()
         name = final.with_name(f".{final.stem[:STEM_LENGTH]}.{owner}.part{final.suffix}")
         _make_private(name)
@@ -97,20 +102,6 @@ def _make_private(path: Path) -> None:
         except FileNotFoundError:  # a command that failed has just removed its empty folders
             if not left:
                 raise
-
-
-def clear_abandoned(folder: Path) -> None:
-    """Remove the temporary files of `atomic_path` in a folder whose processes have ended.
-
-    A process looks once in each folder. Whether a process of another machine, or of another
-    container, has ended is not known: its files are removed when they are a day old.
-    """
-    folder = folder.absolute()
-    if folder not in _cleared:
-        _cleared.add(folder)
-        for entry in _abandoned(folder, _TEMPORARY):
-            with contextlib.suppress(OSError):
-                os.unlink(entry)
 
 
 def private_folder(prefix: str) -> Path:
@@ -149,7 +140,11 @@ def private_folder(prefix: str) -> Path:
 
 
 def _abandoned(folder: Path, names: re.Pattern[str]) -> list[os.DirEntry[str]]:
-    """List what processes that have ended have left in a folder, by the names of it."""
+    """List what processes that have ended have left in a folder, by the names of it.
+
+    Whether a process of another machine, or of another container, has ended is not known: its
+    files count as left when they are a day old.
+    """
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
         matches = [(entry, names.fullmatch(entry.name)) for entry in entries]
         return [

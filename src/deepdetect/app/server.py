@@ -209,15 +209,12 @@ class AppServer:
     def _description(self) -> dict[str, Any]:
         """Return what the page is told of this server."""
         options = self.options
+        names = ("title", "note", "options", "folder", "missing")
         tasks = [
             {
                 "kind": kind,
-                "title": task.title,
-                "note": task.note,
                 "files": [task.files[0], task.files[1] or options.max_files],
-                "options": dict(task.options),
-                "folder": task.folder,
-                "missing": task.missing,
+                **{name: getattr(task, name) for name in names},
             }
             for kind, task in TASKS.items()
         ]

@@ -19,6 +19,8 @@ from ..features.keypoints import Keypoints
 from ..features.matches import Matches, TwoViewGeometry
 
 FORMATS = ("npz", "csv")
+OPTIONAL = ("logits", "sizes", "angles", "descriptors", "descriptor_type")
+"""Of keypoints, in npz files where there are any."""
 
 MAX_DEFLATE_RATIO = 1032
 """By how much zip's usual compression can shrink at most (https://zlib.net/zlib_tech.html)."""
@@ -34,20 +36,22 @@ def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
     Args:
         keypoints: the keypoints.
         path: ending in .npz (arrays `keypoints` (N, 2) float32, `scores` (N,) float32,
-            `image_size` (width, height), and `logits`, `sizes` and `angles` (N,) float32 where
-            there are) or .csv (columns x, y, score, and size and angle where there are).
+            `image_size` (width, height), and where there are any `logits`, `sizes` and `angles`
+            (N,) float32, `descriptors` (N, D) and `descriptor_type`) or .csv (columns x, y, score,
+            and size and angle where there are any).
 
     Raises:
         OptionError: the file's ending is another.
         DeepDetectError: the file cannot be written.
     """
     if _format(path) == "npz":
+        optional = {name: getattr(keypoints, name) for name in OPTIONAL}
         _save_npz(
             path,
             keypoints=keypoints.xy,
             scores=keypoints.scores,
             image_size=np.array(keypoints.image_size),
-            **{name: values for name, values in _optional(keypoints) if values is not None},
+            **{name: np.asarray(each) for name, each in optional.items() if each is not None},
         )
     else:
         columns = [("x,y", keypoints.xy), ("score", keypoints.scores)]
@@ -55,10 +59,6 @@ def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
         columns += [(name, values) for name, values in known if values is not None]
         header = ",".join(name for name, _ in columns)
         _save_csv(path, header, [values for _, values in columns])
-
-
-def _optional(keypoints: Keypoints) -> list[tuple[str, np.ndarray | None]]:
-    return [(name, getattr(keypoints, name)) for name in ("logits", "sizes", "angles")]
 
 
 @suggest_keywords
@@ -77,13 +77,13 @@ def load_keypoints(path: str | Path) -> Keypoints:
     """
     arrays = _load_npz(path, "keypoints")
     with _building(path, "keypoints"):
+        kind = arrays.pop("descriptor_type", None)
         return Keypoints(
             arrays["keypoints"],
             arrays["scores"],
             _size(arrays["image_size"]),
-            arrays.get("logits"),
-            arrays.get("sizes"),
-            arrays.get("angles"),
+            **{name: arrays[name] for name in OPTIONAL if name in arrays},
+            descriptor_type=None if kind is None else str(kind),
         )
 
 
