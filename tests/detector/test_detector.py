@@ -164,15 +164,6 @@ def test_detection_is_selection_from_the_map(
     np.testing.assert_array_equal(keypoints.scores, heatmap[y, x])
 
 
-def test_ignored_pixels(detector: DeepDetect, image: np.ndarray) -> None:
-    ignore = np.zeros(image.shape[:2], np.uint8)
-    ignore[:, :70] = 255
-    keypoints = detector.detect(image, density=0.3, ignore=ignore)
-    assert keypoints.xy[:, 0].min() >= 70
-    with pytest.raises(OptionError, match="ignore mask"):
-        detector.detect(image, ignore=ignore.T)
-
-
 # Backends.
 
 
@@ -228,12 +219,6 @@ def test_the_automatic_backend(monkeypatch: pytest.MonkeyPatch) -> None:
     assert DeepDetect().backend == "onnxruntime"
 
 
-@needs["torch"]
-@needs["safetensors"]
-def test_the_automatic_backend_of_safetensors() -> None:
-    assert DeepDetect(TORCH_WEIGHTS).backend == "torch"
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -277,20 +262,6 @@ def test_wrong_options(arguments: dict[str, Any], words: str, one_line: OneLine)
     with pytest.raises(OptionError) as caught:
         DeepDetect(**arguments)
     assert words in one_line(caught.value)
-
-
-def test_a_device_that_is_not_in_this_build(
-    one_line: OneLine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import onnxruntime
-
-    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
-    for name, build in (("cuda", "onnxruntime-gpu"), ("TensorrtExecutionProvider", "the build")):
-        with pytest.raises(OptionError) as caught:
-            DeepDetect(device=name)
-        message = one_line(caught.value)
-        assert f"device {name}: install {build}" in message
-        assert message.endswith("use cpu")
 
 
 # Weights that are wrong.

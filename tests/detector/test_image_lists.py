@@ -3,7 +3,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -110,14 +109,6 @@ def test_sizes_agree_where_the_network_sees_them(photo: np.ndarray) -> None:
         np.testing.assert_allclose(maps[1], detector.heatmap(pieces[1]), atol=1e-5)
 
 
-@pytest.mark.parametrize("size", [0, -1, 1.5, "8"])
-def test_a_batch_size_is_a_number(detector: DeepDetect, size: Any, one_line) -> None:
-    for call in (detector.detect_batch, detector.heatmap_batch):
-        with pytest.raises(OptionError, match="`batch_size` must be") as caught:
-            call([], batch_size=size)
-        one_line(caught.value)
-
-
 @pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
 def test_a_network_for_one_image_names_the_way_out(
     photo: np.ndarray, backend: str, tmp_path: Path, one_line
@@ -183,22 +174,6 @@ def test_masks_of_a_list(detector: DeepDetect, images: list[np.ndarray]) -> None
         detector.detect_batch(images, ignore=masks[:2])
     with pytest.raises(OptionError, match=r"images\[1\]: the ignore mask has shape"):
         detector.detect_batch(images, ignore=masks[0])
-
-
-def test_images_of_opencv(detector: DeepDetect, images: list[np.ndarray]) -> None:
-    rgb = images[0]
-    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-    for own in (detector, PointDetector(30)):
-        same(own.detect(bgr, channels="bgr"), own.detect(rgb))
-        (found,) = own.detect_batch([bgr], channels="bgr")
-        same(found, own.detect(rgb))
-    for one, other in zip(
-        detector.heatmap_and_logits(bgr, channels="bgr"),
-        detector.heatmap_and_logits(rgb),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(one, other)
-    assert (detector.heatmap(bgr) != detector.heatmap(rgb)).any()
 
 
 @pytest.mark.parametrize("resolution", ["auto", "native", 64])

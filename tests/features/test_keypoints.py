@@ -51,15 +51,6 @@ def test_points_that_are_all_alike_get_size_3_and_no_angle() -> None:
     assert (point.size, point.angle) == (7, 90)
 
 
-def test_no_keypoints_of_opencv() -> None:
-    nothing = Keypoints.from_opencv((), SIZE)
-    assert len(nothing) == 0
-    assert nothing.xy.shape == (0, 2)
-    assert nothing.to_opencv() == []
-    assert nothing.density == 0
-    assert len(nothing.best(5)) == 0
-
-
 def test_ties_for_the_best_are_spread_over_the_image() -> None:
     xy = np.stack(np.meshgrid(np.arange(64), np.arange(48)), -1).reshape(-1, 2)
     best = Keypoints(xy, np.ones(len(xy)), (64, 48)).best(12)
@@ -83,13 +74,6 @@ def test_the_best_have_the_highest_scores(scores: list[float], count: int) -> No
     # All columns stay together.
     for column in (best.sizes, best.angles, best.octaves, best.descriptors[:, 3]):
         assert column.tolist() == sorted(chosen)
-
-
-def test_choosing_rows_keeps_what_is_not_there_away() -> None:
-    plain = Keypoints(np.zeros((5, 2)), np.ones(5), (10, 10))[np.array([1, 3])]
-    assert len(plain) == 2
-    assert plain.sizes is plain.angles is plain.octaves is plain.descriptors is None
-    assert plain.image_size == (10, 10)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -142,24 +126,6 @@ def test_no_keypoint(empty: Keypoints) -> None:
     assert len(empty[:]) == 0
 
 
-@pytest.mark.parametrize(
-    ("xy", "scores"),
-    [
-        ([[1, 2]], [0.5, 0.6]),
-        ([[1, 2], [3, 4]], [0.5]),
-        ([[1, 2, 3]], [0.5]),
-        ([1, 2], [0.5]),
-        ([[1, 2]], 0.5),
-        ([[1, 2]], [[0.5]]),
-        ([], [0.5]),
-        ([[1, 2]], []),
-    ],
-)
-def test_shapes_that_do_not_fit(xy: list, scores: list) -> None:
-    with pytest.raises(OptionError, match=r"keypoints need \(N, 2\) positions"):
-        Keypoints(xy, scores, (8, 5))
-
-
 def grid(width: int, height: int) -> np.ndarray:
     return np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 2)
 
@@ -178,11 +144,6 @@ def test_the_first_ones_lie_in_cells_of_their_own(count: int) -> None:
     first = xy[np.argsort(bayer_order(xy, (64, 64)))[:count]]
     side = 64 // int(np.sqrt(count))
     assert len(np.unique(first // side, axis=0)) == count
-
-
-def test_positions_between_pixels_go_with_the_nearest() -> None:
-    whole, between = np.array([[3, 5], [10, 2]]), np.array([[3.4, 4.6], [9.7, 2.2]])
-    np.testing.assert_array_equal(bayer_order(between, (16, 16)), bayer_order(whole, (16, 16)))
 
 
 def test_the_logits_rank_where_there_are_any() -> None:

@@ -159,34 +159,6 @@ def test_a_plateau_leaves_its_first_pixel() -> None:
     assert keypoints.xy.tolist() == [[0, 0]]
 
 
-def test_suppression_goes_before_the_number() -> None:
-    heatmap = np.zeros((16, 16), np.float32)
-    heatmap[4, 4], heatmap[4, 5], heatmap[10, 10] = 0.9, 0.8, 0.7
-    options = SelectionOptions(max_keypoints=2, nms_radius=1, subpixel=False)
-    assert select_keypoints(heatmap, options).xy.tolist() == [[4, 4], [10, 10]]
-
-
-def test_ignored_pixels_suppress_nothing() -> None:
-    heatmap = np.zeros((16, 16), np.float32)
-    heatmap[4, 4], heatmap[4, 5] = 0.9, 0.8
-    ignore = np.zeros((16, 16), bool)
-    ignore[4, 4] = True
-    options = SelectionOptions(nms_radius=3)
-    assert select_keypoints(heatmap, options, ignore=ignore).xy.tolist() == [[5, 4]]
-
-
-@pytest.mark.parametrize("kind", [bool, np.uint8, np.int32, np.float32])
-def test_an_ignore_mask_of_any_number_type(kind: type) -> None:
-    heatmap = np.random.default_rng(2).random((24, 31)).astype(np.float32)
-    ignore = np.zeros((24, 31), kind)
-    ignore[5:15, 10:20] = 1
-    ignore[0, 0] = 1
-    keypoints = select_keypoints(heatmap, SelectionOptions(0.5), ignore=ignore)
-    expected = (heatmap > 0.5) & (ignore == 0)
-    x, y = keypoints.xy.astype(int).T
-    np.testing.assert_array_equal(np.argwhere(expected), np.stack([y, x], 1))
-
-
 @pytest.mark.parametrize("shape", [(31, 24), (24, 30), (24, 31, 1), (24,), ()])
 def test_an_ignore_mask_of_another_size(shape: tuple[int, ...]) -> None:
     heatmap = np.zeros((24, 31), np.float32)

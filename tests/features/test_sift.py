@@ -17,7 +17,6 @@ from deepdetect.features.sift import (
     root_sift_descriptors,
     scaled_sift_descriptors,
     sift_descriptors,
-    to_root_sift,
 )
 from deepdetect.io.image import luma
 
@@ -55,22 +54,6 @@ def test_sift_equals_opencv_with_handmade_keypoints(size: float, angle: float) -
     gray, xy = make_gray(), make_points()
     expected = opencv_sift(gray, xy, size, angle)
     np.testing.assert_array_equal(sift_descriptors(gray, xy, size, angle), expected)
-
-
-def test_sift_follows_the_order_and_repetition_of_the_points() -> None:
-    gray, xy = make_gray(), make_points(count=60)
-    order = np.random.default_rng(2).integers(0, len(xy), 100)  # shuffled, with repeats
-    whole = sift_descriptors(gray, xy)
-    np.testing.assert_array_equal(sift_descriptors(gray, xy[order]), whole[order])
-
-
-@pytest.mark.parametrize("describe", [sift_descriptors, root_sift_descriptors])
-def test_every_point_of_the_image_gets_a_row(describe) -> None:
-    gray = make_gray(width=24, height=20)
-    xy = np.stack(np.meshgrid(np.arange(24), np.arange(20)), -1).reshape(-1, 2)
-    descriptors = describe(gray, xy)
-    assert descriptors.shape == (480, 128)
-    assert np.isfinite(descriptors).all()
 
 
 def test_the_unset_angle_is_a_turn_of_one_degree() -> None:
@@ -147,13 +130,6 @@ def test_root_sift_has_a_length_of_512() -> None:
     np.testing.assert_allclose(lengths, 512, rtol=0.005)
 
 
-def test_root_sift_is_zero_where_sift_is() -> None:
-    flat = np.full((40, 40), 128, np.uint8)
-    xy = np.array([[20, 20], [10, 30]])
-    assert not sift_descriptors(flat, xy).any()
-    assert not root_sift_descriptors(flat, xy).any()
-
-
 def test_root_sift_distances_are_hellinger_distances_of_sift() -> None:
     """|sqrt(p) - sqrt(q)|^2 = 2 - 2 * sum(sqrt(p * q)) for distributions p and q."""
     gray, xy = make_gray(), make_points()
@@ -194,29 +170,6 @@ def test_about_their_own_means_it_is_pearsons_correlation(
     found = correlation_distance(pair[0], rows, pair[1], rows, mean)
     expected = [1 - np.corrcoef(a, b)[0, 1] for a, b in zip(*pair, strict=True)]
     np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
-def test_takes_the_rows_it_is_told(photo: np.ndarray) -> None:
-    gray = luma(photo)
-    generator = np.random.default_rng(0)
-    xy = np.column_stack([generator.integers(0, side, 500) for side in gray.shape[::-1]])
-    first, second = (to_root_sift(dense_sift(gray, xy, size)) for size in (3.0, 8.0))
-    rows0, rows1 = generator.integers(0, 500, (2, 3000))
-    mean = first.mean(axis=0).astype(np.float32)
-    found = correlation_distance(first, rows0, second, rows1, mean)
-    a, b = first[rows0] - mean.astype(float), second[rows1] - mean.astype(float)
-    lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found, 1 - (a * b).sum(axis=1) / lengths, atol=1e-5)
-
-
-def test_equal_descriptors_have_no_distance() -> None:
-    """Null pairs that are all the same differ from ones that are nearly so."""
-    generator = np.random.default_rng(0)
-    first = generator.integers(0, 256, (20_000, 128)).astype(np.uint8)
-    rows = np.arange(len(first))
-    for mean in (np.zeros(128, np.float32), first.mean(axis=0).astype(np.float32)):
-        assert not correlation_distance(first, rows, first.copy(), rows, mean).any()
 
 
 @pytest.mark.parametrize("name", DESCRIPTORS)

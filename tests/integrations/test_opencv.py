@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import OptionError, PointDetector
+from deepdetect import PointDetector
 from deepdetect.features.sift import to_root_sift
 from deepdetect.integrations.opencv import DeepDetectFeature2D
 
@@ -96,19 +96,3 @@ def test_nothing_to_detect_is_as_of_opencv() -> None:
     flat = np.full((64, 64), 90, np.uint8)
     assert DeepDetectFeature2D().detectAndCompute(flat, None) == ((), None)
     assert DeepDetectFeature2D().compute(flat, []) == ((), None)
-
-
-def test_it_is_no_feature2d() -> None:
-    # Derived classes crash the interpreter when it ends (OpenCV 5.0.0).
-    assert not isinstance(DeepDetectFeature2D(), cv2.Feature2D)
-
-
-def test_wrong_use(bgr: np.ndarray) -> None:
-    with pytest.raises(OptionError, match="did you mean 'bgr'"):
-        DeepDetectFeature2D(channels="bgra")  # type: ignore[arg-type]
-    with pytest.raises(OptionError, match="the method compute"):
-        DeepDetectFeature2D().detectAndCompute(bgr, useProvidedKeypoints=True)
-    with pytest.raises(OptionError, match="sizes above 0"):
-        DeepDetectFeature2D().compute(bgr, [cv2.KeyPoint(9, 9, 0)])
-    with pytest.raises(OptionError, match=r"`mask` has the shape \(3, 3\), the image"):
-        DeepDetectFeature2D().detect(bgr, np.ones((3, 3), np.uint8))

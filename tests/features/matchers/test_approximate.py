@@ -49,14 +49,6 @@ def test_the_seed_decides_the_result() -> None:
     assert not np.array_equal(first[0], other[0])
 
 
-def test_distances_are_euclidean_and_ascending() -> None:
-    queries, base = sift_like(1, 100), sift_like(2, 500)
-    rows, distances = flann_neighbours(queries, base, 3, 0)
-    true = np.take_along_axis(cdist(queries, base), rows.astype(int), 1)
-    np.testing.assert_allclose(distances, true, rtol=1e-5)
-    assert (np.diff(distances, axis=1) >= 0).all()
-
-
 def test_recall_is_high_on_clusters() -> None:
     base = clustered(0, 300, 10, 1.0)
     queries = clustered(1, 300, 2, 1.0)
@@ -68,15 +60,6 @@ def test_recall_is_high_on_clusters() -> None:
     assert excess.min() > 1 - 1e-5
     assert np.median(excess) < 1 + 1e-5
     assert np.quantile(excess, 0.95) < 1.5
-
-
-@pytest.mark.parametrize(("size", "count"), [(1, 1), (2, 1), (2, 2), (3, 2)])
-def test_a_tiny_base_is_searched_exactly(size: int, count: int) -> None:
-    queries, base = sift_like(1, 6), sift_like(2, size)
-    rows, distances = flann_neighbours(queries, base, count, 0)
-    expected = exact_neighbours(queries, base, count, 0)
-    np.testing.assert_array_equal(rows, expected[0])
-    np.testing.assert_allclose(distances, expected[1], rtol=1e-6)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.distance import cdist
 
-from deepdetect import OptionError
 from deepdetect.features.matchers import matching as brute_force
 from deepdetect.features.matchers.matching import exact_neighbours, hamming_neighbours
 
@@ -175,12 +174,3 @@ def test_the_base_may_be_as_large_as_that_of_any_matcher() -> None:
     assert (distances[:, 0] == 0).all()
     second = np.sort(bit_distances(base[chosen], base), axis=1)[:, 1]
     np.testing.assert_array_equal(distances[:, 1], second)
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.int32])
-def test_descriptors_that_are_not_binary_are_an_error(dtype, one_line) -> None:
-    binary = random_bytes(0, 5, 32)
-    for pair in ((binary.astype(dtype), binary), (binary, binary.astype(dtype))):
-        with pytest.raises(OptionError, match="use exact or flann") as caught:
-            hamming_neighbours(*pair, 2, 0)
-        one_line(caught.value)

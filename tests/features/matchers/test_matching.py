@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect import OptionError
 from deepdetect.features.matchers import (
     MATCHERS,
     DescriptorMatches,
@@ -139,21 +138,6 @@ def test_mutual_matches_are_the_same_both_ways(seed: int, count0: int, count1: i
     assert pairs(there) == {(row0, row1) for row1, row0 in pairs(back)}
     # The two nearest of all are always each other's nearest.
     assert len(there) > 0
-
-
-@pytest.mark.parametrize(
-    ("name", "hint"),
-    [
-        ("flan", "did you mean 'flann'?"),
-        ("FLANN", "did you mean 'flann'?"),
-        ("exakt", "did you mean 'exact'?"),
-    ],
-)
-def test_an_unknown_name_brings_the_nearest(name: str, hint: str) -> None:
-    with pytest.raises(OptionError) as caught:
-        get_matcher(name)
-    assert repr(name) in str(caught.value)
-    assert hint in str(caught.value)
 
 
 @pytest.mark.parametrize("name", MATCHERS)
