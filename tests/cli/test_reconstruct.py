@@ -214,8 +214,11 @@ def test_results_of_other_photographs_are_not_replaced_silently(run, folder: Pat
 
 
 CASES = {
-    "identical images": ("left left --focal 995", "the same picture"),
-    "identical, said to be rectified": ("left left --focal 995 --rectified", "the same picture"),
+    "identical images": ("left left --focal 995", "both images are the same"),
+    "identical, said to be rectified": (
+        "left left --focal 995 --rectified",
+        "both images are the same",
+    ),
     "pure rotation": ("left only-turned --focal 995", "a rotation of the camera explains all"),
     "pure rotation, said to be rectified": (
         "left only-turned --focal 995 --rectified",
