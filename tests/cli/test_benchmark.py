@@ -153,7 +153,7 @@ def test_a_wrong_name_ends_with_one_line_and_exit_code_2(
     message = result.stderr.strip()
     assert message.startswith("deepdetect: ")
     assert len(message.splitlines()) == 1, message
-    assert hint in message
+    assert hint in message.replace('"', "'")
     assert not Path("out").exists()
 
 

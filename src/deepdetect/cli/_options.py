@@ -272,12 +272,16 @@ def print_columns(values: Sequence[Mapping[str, Any]]) -> None:
         print(f"  {name:<{wide}}", *(f"{column.get(name, '-'):>20}" for column in columns))
 
 
+MAX_DEPTH = 2
+"""Of dictionaries within others, in a table."""
+
+
 def _rows(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
     """Yield the rows of a table; tables and matrices within are left to JSON."""
     for name, value in values.items():
         title = prefix + str(name).replace("_", " ")
         if isinstance(value, Mapping):
-            yield from _rows(value, f"{title}: ")
+            yield from () if prefix.count(":") == MAX_DEPTH else _rows(value, f"{title}: ")
         elif isinstance(value, (list, tuple)):
             if value and not any(isinstance(each, (list, tuple, Mapping)) for each in value):
                 yield title, ", ".join(map(_text, value))
@@ -288,13 +292,9 @@ def _rows(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, st
 def _text(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return (
-        f"{value:,}"
-        if isinstance(value, int)
-        else f"{value:.6g}"
-        if isinstance(value, float)
-        else str(value)
-    )
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def print_table(rows: Iterable[tuple[str, str]], title: str = "") -> None:
