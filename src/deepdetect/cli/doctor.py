@@ -25,7 +25,6 @@ PURPOSES = {
 }
 MAX_BACKEND_DIFFERENCE = 5e-3
 """Between the probabilities of two back ends; five times what is usual."""
-
 MIN_PRECISION = 0.95
 """Of the self-test's matches within 1 px of the truth; all of them where nothing is wrong."""
 
@@ -99,7 +98,7 @@ def opencv() -> Iterator[Finding]:
     module, names = import_opencv(), installed_distributions()
     contrib = hasattr(module, "xfeatures2d") or hasattr(module, "AgastFeatureDetector_create")
     value = f"{module.__version__} ({', '.join(names) or 'of no package'}), "
-    value += f"{'with' if contrib else 'without'} the modules that only labels need"
+    value += "with contrib modules" if contrib else "without contrib modules, as labels need"
     last = max(names, key=lambda name: "contrib" in name, default="")
     installed = importlib.metadata.version(last) if last else module.__version__
     same = _numbers(installed)[:3] == _numbers(module.__version__)[:3]
@@ -119,8 +118,8 @@ def self_test() -> Iterator[Finding]:
     from ..detector.point_detector import PointDetector
     from ..matching.pipeline import match_images
 
-    whole = np.random.default_rng(0).integers(0, 256, (32, 42, 3), np.uint8)
-    whole = whole.repeat(8, 0).repeat(8, 1)
+    blocks = np.random.default_rng(0).integers(0, 256, (32, 42, 3), np.uint8)
+    whole = blocks.repeat(8, 0).repeat(8, 1)
     first, second = whole[:240, :320], whole[4:244, 6:326]
     maps = {
         name: DeepDetect("default", backend=name).heatmap(first)
