@@ -100,18 +100,18 @@ def test_results_within_the_folder_are_no_photographs(
     assert refused.exit_code == 2
     assert one_sentence(refused.stderr)
     words = " ".join(refused.stderr.split())
-    assert "drawn/0004_heatmap.jpg was made by an earlier run and is no photograph" in words
+    assert "was made by an earlier run and is no input" in words
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("a.png",), "give two photographs"),
-        ((".", "a.png"), "one folder, or photographs"),
+        (("a.png",), "give two images"),
+        ((".", "a.png"), "one folder, or images"),
         (("a.png", "b.png", "--no-dense"), "--dense is for more than two"),
         (("a.png", "b.png", "--sequential", "3"), "--sequential is for more than two"),
         (("a.png", "b.png", "--workers", "2"), "--workers is for more than two"),
-        ((".", "--rectified"), "for two photographs"),
+        ((".", "--rectified"), "for two images"),
     ],
 )
 def test_options_of_the_other_kind_are_refused(run, arguments, message: str) -> None:
