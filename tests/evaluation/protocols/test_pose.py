@@ -217,8 +217,8 @@ def test_sift_is_right_on_the_fountain_and_straight_ahead_on_the_clip(
     run = Run(shared)
     options = BenchmarkOptions(edge_detector, classical=("sift",))
     methods = {method.title: method for method in pose_methods(run, options)}
-    fountain, clip = load_posed_scenes(shared / "data")
-    pairs = {pair.name: pair for pair in (*fountain.pairs, *clip.pairs)}
+    scenes = load_posed_scenes(shared / "data")
+    pairs = {pair.name: pair for scene in scenes for pair in scene.pairs}
     near = pose_row(run, methods[SIFT], pairs["fountain 0004-0005"])
     assert near["error"] < 1
     assert near["agreeing"] > 0.9
