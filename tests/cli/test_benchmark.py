@@ -108,17 +108,6 @@ def test_what_fails_is_listed_and_the_rest_is_there(made, folder: Path, run) -> 
     assert json.loads(as_json.stdout)["skipped"] == [failure.strip() for failure in failures]
 
 
-def test_no_classical_method_may_be_wanted(made, folder: Path, run) -> None:
-    _, output = made
-    result = run(
-        *("benchmark", "foreground", "--data", folder, "-o", "out", "--baselines", "none"),
-        *("--cache", output / "cache"),
-    )
-    assert result.exit_code == 0, result.output
-    assert "FAST" not in result.stdout
-    assert "DeepDetect" in result.stdout
-
-
 @pytest.mark.parametrize(
     ("arguments", "hint"),
     [

@@ -46,52 +46,6 @@ def test_points_have_no_dense_picture(run, photos: Path) -> None:
     assert {p.name for p in Path("out").glob("cat*")} == {"cat.npz", "cat_keypoints.jpg"}
 
 
-def test_json_has_the_numbers_and_the_pictures(run, photos: Path) -> None:
-    result = run("detect", photos / "cat.jpg", "--json", "--max-keypoints", 50, "--nms-radius", 2)
-    report = json.loads(result.stdout)
-    (image,) = report["images"]
-    assert image["keypoints"] == 50
-    assert (image["width"], image["height"]) == (200, 150)
-    assert Path(image["pictures"]["heatmap"]).exists()
-    assert report["failures"] == []
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ((), ", density 0."),
-        (("--detector", "points", "--max-keypoints", 1), ": 1 keypoint, "),
-        (("--detector", "points", "--max-keypoints", 50), ": 50 keypoints, "),
-    ],
-)
-def test_the_keypoints_are_counted(options, words: str, run, photos: Path) -> None:
-    """Of a number that was asked for, a density is of no interest, and mostly 0.000."""
-    result = run("detect", photos / "cat.jpg", "--no-pictures", *options)
-    assert words in result.stdout
-    assert ("density" in result.stdout) == (not options)
-
-
-def test_csv_and_no_pictures(run, photos: Path) -> None:
-    result = run(
-        *("detect", photos / "cat.jpg", "-o", "out", "--format", "csv", "--no-pictures"),
-        *("--density", 0.05),
-    )
-    assert result.exit_code == 0
-    assert [p.name for p in Path("out").glob("[!.]*")] == ["cat.csv"]
-    lines = Path("out/cat.csv").read_text().splitlines()
-    assert lines[0] == "x,y,score"
-    assert len(lines) == 1 + round(0.05 * 150 * 200)
-
-
-def test_a_folder_is_searched(run, photos: Path) -> None:
-    report = json.loads(run("detect", photos, "--no-pictures", "--json").stdout)
-    assert {Path(image["image"]).name for image in report["images"]} == {
-        "cat.jpg",
-        "left.png",
-        "right.png",
-    }
-
-
 def test_the_ignore_mask_is_kept_free(run, photos: Path) -> None:
     mask = np.zeros((150, 200), np.uint8)
     mask[:, 100:] = 255
@@ -139,27 +93,6 @@ def test_two_images_of_one_name_are_refused(run, photos: Path, tmp_path: Path) -
     assert "same files" in result.stderr
 
 
-def test_several_images_show_progress_on_stderr_only(run, photos: Path) -> None:
-    result = run("detect", photos, "--no-pictures", "--json")
-    assert "image/s" in result.stderr or "s/image" in result.stderr
-    json.loads(result.stdout)
-
-
-@pytest.mark.parametrize("size", ["auto", "1.5"])
-def test_flips_and_tiles(run, photos: Path, size: str) -> None:
-    options = ["--no-pictures", "--tta", "flip", "--tile-megapixels", size]
-    run("detect", photos / "cat.jpg", "-o", "out", *options)
-    expected = DeepDetect(tta="flip").detect(photos / "cat.jpg")
-    np.testing.assert_array_equal(load_keypoints("out/cat.npz").xy, expected.xy)
-
-
-@pytest.mark.parametrize("size", ["0.2", "many"])
-def test_wrong_tiles(run, photos: Path, size: str) -> None:
-    result = run("detect", photos / "cat.jpg", "--tile-megapixels", size)
-    assert result.exit_code == 2
-    assert "--tile-megapixels" in result.output
-
-
 @pytest.mark.parametrize("short", [MemoryError, DeepDetectError("there is not enough memory")])
 def test_an_image_without_memory_for_it_does_not_end_the_others(
     short: type[BaseException] | BaseException,
@@ -178,14 +111,6 @@ def test_an_image_without_memory_for_it_does_not_end_the_others(
     assert "cat.jpg" in result.output
     assert "not enough memory" in result.output
     assert {path.name for path in Path("out").glob("*.npz")} == {"left.npz", "right.npz"}
-
-
-@pytest.mark.parametrize("resolution", ["native", "240"])
-def test_resolution(run, photos: Path, resolution: str) -> None:
-    run("detect", photos / "cat.jpg", "-o", "out", "--resolution", resolution, "--no-pictures")
-    chosen = resolution if resolution == "native" else int(resolution)
-    expected = DeepDetect(resolution=chosen).detect(photos / "cat.jpg")
-    np.testing.assert_array_equal(load_keypoints("out/cat.npz").xy, expected.xy)
 
 
 def detect(run, images: Path, *more: object) -> list[dict[str, Any]]:
@@ -237,14 +162,6 @@ def test_pictures_and_other_formats_of_the_same_keypoints_are_added(run, photos:
     assert detect(run, photos / "cat.jpg", "--pictures")[0]["skipped"]
 
 
-def test_a_copied_folder_is_still_known(run, photos: Path) -> None:
-    detect(run, photos / "cat.jpg")
-    shutil.copytree("out", "copy", copy_function=shutil.copyfile)  # with new times
-    shutil.rmtree("out")
-    Path("copy").rename("out")
-    assert detect(run, photos / "cat.jpg")[0]["skipped"]
-
-
 def test_an_image_that_has_changed_is_done_again(run, photos: Path) -> None:
     folder = copies(photos, Path("in"))
     detect(run, folder)
@@ -253,17 +170,6 @@ def test_an_image_that_has_changed_is_done_again(run, photos: Path) -> None:
     np.testing.assert_array_equal(
         load_keypoints("out/1.npz").xy, DeepDetect().detect(photos / "left.png").xy
     )
-
-
-def test_outputs_of_a_changed_image_stay_known_when_some_are_made_again(run, photos: Path) -> None:
-    image = copies(photos, Path("in"), 1) / "0.jpg"
-    detect(run, image, "--pictures")
-    shutil.copy(photos / "left.png", image)
-    assert not detect(run, image, "--format", "csv")[0]["skipped"]
-    assert not detect(run, image, "--pictures")[0]["skipped"]
-    expected = DeepDetect().detect(photos / "left.png").xy
-    np.testing.assert_array_equal(load_keypoints("out/0.npz").xy, expected)
-    assert detect(run, image, "--format", "csv")[0]["skipped"]
 
 
 def test_an_edited_output_of_a_changed_image_is_not_replaced(run, photos: Path) -> None:

@@ -147,16 +147,6 @@ def test_a_process_of_its_own_ends_the_same_way(tmp_path: Path) -> None:
     assert done.stdout == ""
 
 
-def test_detecting_imports_no_torch(photos: Path, tmp_path: Path) -> None:
-    code = (
-        "import sys; from deepdetect import DeepDetect;"
-        f"DeepDetect().detect({str(photos / 'cat.jpg')!r});"
-        "print(sorted({'torch', 'skimage', 'matplotlib', 'scipy'} & set(sys.modules)))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 def test_a_full_disk_leaves_no_half_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "k.npz"
     keypoints = Keypoints([[1, 2]], [0.5], (8, 8))

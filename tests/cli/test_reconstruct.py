@@ -332,11 +332,6 @@ def test_one_sentence_and_no_file(
     assert result.stdout == ""
 
 
-def test_an_unknown_ending_ends_before_the_work(run, folder: Path) -> None:
-    result = run("reconstruct", "nothing.png", "nothing.png", "--focal", 995, "-o", "m.stl")
-    assert "unknown ending '.stl'" in result.stderr
-
-
 def test_a_name_without_an_ending_is_a_folder(run, folder: Path) -> None:
     result = run(
         "reconstruct", folder / "left.png", folder / "right.png", "--focal", 995, "-o", "rec"
@@ -388,41 +383,3 @@ def test_exif_gives_the_focal_length(run, folder: Path) -> None:
     assert values["calibration"]["source"] == "EXIF"
     focal = 90 * np.hypot(400, 300) / np.hypot(36, 24)
     assert values["calibration"]["left"]["focal_px"] == pytest.approx([focal, focal])
-
-
-@pytest.mark.slow
-def test_the_progress_counts_every_stage(monkeypatch: pytest.MonkeyPatch, run, folder) -> None:
-    """On a terminal the bar ends full, whichever pipeline ran."""
-    import deepdetect._shared.progress
-
-    bars = []
-
-    class Bar:
-        def __init__(self, total: int, *rest: Any) -> None:
-            self.total, self.n, self.stages = total, 0, []
-            bars.append(self)
-
-        def __enter__(self) -> Bar:
-            return self
-
-        def __exit__(self, *error: object) -> None:
-            pass
-
-        def update(self, count: int = 1) -> None:
-            assert count >= 0
-            self.n += count
-
-        def set_postfix_str(self, text: str) -> None:
-            self.stages.append(text)
-
-    monkeypatch.setattr(deepdetect._shared.progress, "progress", Bar)
-    for pair, more in ((("left", "right"), []), (("turned0", "turned1"), ["--not-rectified"])):
-        paths = [folder / f"{name}.png" for name in pair]
-        assert (
-            run("reconstruct", *paths, "--focal", FOCAL, *more, "-o", f"{pair[0]}.ply").exit_code
-            == 0
-        )
-    assert [bar.n == bar.total for bar in bars] == [True, True]
-    assert bars[0].stages[:3] == ["rectified or not", "keypoints", "matching"]
-    assert bars[1].stages[:3] == ["keypoints and matching", "sub-pixel", "checks"]
-    assert bars[1].stages[-1] == "files"

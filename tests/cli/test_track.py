@@ -60,11 +60,11 @@ def test_a_video_that_is_cut_off_is_said_to_be(run, frames: Path, tmp_path: Path
     content = (tmp_path / "whole.avi").read_bytes()
     (tmp_path / "cut.avi").write_bytes(content[: len(content) * 2 // 3])
     texts = [
-        run("track", name, "-o", f"{name}.csv", "--max-keypoints", 80).stdout
+        run("track", name, "-o", f"{name}.csv", "--max-keypoints", 80).stderr
         for name in ("whole.avi", "cut.avi")
     ]
     assert "the file states" not in texts[0]
-    assert "the file states 12, and may be cut off" in texts[1]
+    assert "the file states 12 frames, and may be cut off" in texts[1]
 
 
 def test_nothing_is_replaced_silently(run, frames: Path, tmp_path: Path) -> None:
