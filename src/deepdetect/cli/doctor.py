@@ -16,6 +16,7 @@ PURPOSES = {
     "app": "app",
     "benchmark": "benchmark, and evaluate with the Oxford scenes",
     "demo": "demo",
+    "heif": "images of iPhones (.heic)",
     "labels": "label and train, with all nine detectors",
     "onnx": "export onnx",
     "openvino": "a faster network on CPUs",
