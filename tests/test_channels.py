@@ -72,8 +72,9 @@ def test_files_say_their_order_themselves(photo: np.ndarray, photo_path: Any) ->
 
 def test_luma_is_taken_as_it_is(photo: np.ndarray) -> None:
     gray = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
-    np.testing.assert_array_equal(deepdetect.labels.fuse(gray).mask, deepdetect.fuse(photo).mask)
-    assert deepdetect.labels.fuse(gray[:10, :12]).mask.shape == (10, 12)
+    fuse = deepdetect.labels.fuse
+    np.testing.assert_array_equal(fuse(gray).mask, fuse(photo).mask)
+    assert fuse(gray[:10, :12]).mask.shape == (10, 12)
 
 
 def test_the_order_for_the_network_is_another_matter(photo: np.ndarray) -> None:

@@ -226,7 +226,6 @@ def test_the_installs_name_extras_that_exist(line: str) -> None:
         "optional-dependencies"
     ]
     named = re.findall(r"\[(.*)\]", line)
-    assert named
     assert all(extra in extras for names in named for extra in names.split(","))
 
 

@@ -86,10 +86,13 @@ OPTIONS = sorted(
 
 @pytest.mark.parametrize("kind", OPTIONS, ids=lambda kind: kind.__name__)
 def test_every_number_among_the_options_is_checked(kind: type) -> None:
-    numbers = [one.name for one in dataclasses.fields(kind) if type(one.default) in (int, float)]
+    fields = dataclasses.fields(kind)
+    numbers = [one.name for one in fields if type(one.default) in (int, float)]
+    missing = dataclasses.MISSING
+    needed = {f.name: None for f in fields if f.default is f.default_factory is missing}
     for name in numbers:
         with pytest.raises(OptionError, match=name):
-            kind(**{name: math.nan})
+            kind(**needed | {name: math.nan})
 
 
 def public_callables() -> dict[str, Any]:

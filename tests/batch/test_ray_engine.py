@@ -26,7 +26,7 @@ def test_the_engines() -> None:
 
 def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingExtraError, match=r"deepdetect\[ray\]"):
+    with pytest.raises(MissingExtraError, match=r"pip install .ray\[data\]"):
         list(map_on_ray(math.sqrt, [1.0]))
 
 

@@ -108,7 +108,7 @@ def test_nothing_is_replaced_silently(run, saved: Path) -> None:
         ("colmap {photos} -o a.db --matches m.h5", "--matches is for saved files"),
         ("hloc f.h5 -o a --pairs pairs.txt", "--pairs is for a folder"),
         ("hloc f.h5 out/cat.npz -o a", "one HDF5 file of features"),
-        ("hloc out/left_right_matches.npz --matches m.h5 -o a", "--matches is for saved files"),
+        ("hloc out/left_right_matches.npz --matches m.h5 -o a", "leave out --matches"),
         ("colmap out/cat.npz -o a", "no SIFT descriptors"),
         ("hloc m.h5 -o a", "holds no features"),
         ("hloc {photos} -o a --pairs none.txt", "no file none.txt"),

@@ -2,17 +2,18 @@ from __future__ import annotations
 
 import weakref
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, Keypoints, SelectionOptions
+from deepdetect import DeepDetect, Keypoints
 from deepdetect._shared.errors import OptionError
 from deepdetect.detector import HeatmapOptions, heatmap, tiling
 from deepdetect.detector import detector as detector_module
 from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.detector.tiling import TiledNetwork, open_tiled
-from deepdetect.features.selection import Maps, select_from_maps
+from deepdetect.features.selection import select_from_maps
 
 
 @pytest.fixture(scope="module")
@@ -180,9 +181,9 @@ def test_nobody_holds_the_image_while_keypoints_are_selected(
         images.append(weakref.ref(rgb))
         return rgb
 
-    def select(maps: Maps, options: SelectionOptions) -> Keypoints:
+    def select(*args: Any) -> Keypoints:
         held.append(images[0]() is not None)
-        return select_from_maps(maps, options)
+        return select_from_maps(*args)
 
     monkeypatch.setattr(heatmap, "MAX_AUTO_PIXELS", 2048)
     monkeypatch.setattr(detector_module, "load_image", load)

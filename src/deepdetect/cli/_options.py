@@ -279,6 +279,8 @@ MAX_DEPTH = 2
 def _rows(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
     """Yield the rows of a table; tables and matrices within are left to JSON."""
     for name, value in values.items():
+        if name == "failures":  # listed at the end
+            continue
         title = prefix + str(name).replace("_", " ")
         if isinstance(value, Mapping):
             yield from () if prefix.count(":") == MAX_DEPTH else _rows(value, f"{title}: ")

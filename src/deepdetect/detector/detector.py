@@ -264,7 +264,7 @@ class DeepDetect:
             OptionError: an option is out of its range, or the mask has another size.
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
-        return self.select(load_image(image, channels=channels), options, ignore)
+        return self._select(load_image(image, channels=channels), options, ignore)
 
     @suggest_keywords
     def detect_batch(
@@ -330,16 +330,12 @@ class DeepDetect:
         """
         rgb = load_image(image, channels=channels)
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
-        return describe_keypoints(luma(rgb), self.select(rgb, options, ignore))
+        return describe_keypoints(luma(rgb), self._select(rgb, options, ignore))
 
-    @suggest_keywords
-    def select(
-        self,
-        rgb: np.ndarray,
-        options: SelectionOptions = SelectionOptions(),
-        ignore: np.ndarray | None = None,
+    def _select(
+        self, rgb: np.ndarray, options: SelectionOptions, ignore: np.ndarray | None
     ) -> Keypoints:
-        """Detect as `detect` does in an image that `load_image` returned, with options at once."""
+        """Detect the keypoints of an image that `load_image` returned."""
         with memory_named(rgb.shape):
             maps = compute_maps(rgb, self._network, self.heatmap_options)
             del rgb  # the keypoints need the room
@@ -404,7 +400,7 @@ def find_keypoints(
         return detector.detect(rgb, ignore=ignore)
     options = SelectionOptions() if selection is None else selection
     if isinstance(detector, DeepDetect):
-        return detector.select(rgb, options, ignore)
+        return detector._select(rgb, options, ignore)
     logits = None
     if hasattr(detector, "heatmap_and_logits"):
         heatmap, logits = detector.heatmap_and_logits(rgb)

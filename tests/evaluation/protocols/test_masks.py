@@ -97,8 +97,8 @@ def test_the_bundled_weights_hold_from_half_to_twice_the_size(
 def test_the_command_prints_a_row_for_each_scale(run_evaluate) -> None:
     text = run_evaluate("--scale", "0.5", "--scale", "2")
     lines = [line.split() for line in text.splitlines()]
-    assert any(line[:2] == ["x0.5", "normal"] for line in lines)
-    assert any(line[:2] == ["x2", "normal"] for line in lines)
+    assert any(line[:2] == ["x0.5", "normal:"] for line in lines)
+    assert any(line[:2] == ["x2", "normal:"] for line in lines)
 
 
 def test_samples_without_a_mask_are_an_error(tmp_path: Path, photo: np.ndarray) -> None:

@@ -117,7 +117,8 @@ def ranking_scores(logits: np.ndarray) -> np.ndarray:
         >>> ranking_scores(np.array([1, 0, 0, -1], np.float32)).round(2).tolist()
         [0.75, 0.5, 0.5, 0.25]
     """
-    scores = (0.5 + 0.5 * logits / (1 + np.abs(logits))).astype(np.float32)
+    tail = 0.5 / (1 + np.abs(logits))
+    scores = np.where(logits < 0, tail, 1 - tail).astype(np.float32)
     # Of positive numbers the bits are in the same order.
     place = np.arange(len(scores), dtype=np.int32)
     return (np.minimum.accumulate(scores.view(np.int32) + place) - place).view(np.float32)
