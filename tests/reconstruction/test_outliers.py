@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from deepdetect import OptionError
 from deepdetect.reconstruction.outliers import (
+    SOR_WINDOW_PX,
     PointFilterOptions,
     disparity_space,
     mean_neighbor_distances,
@@ -68,9 +69,7 @@ def test_what_is_wrong_is_said() -> None:
     for options in (
         {"min_parallax_px": -1},
         {"sor_neighbors": -1},
-        {"sor_window_px": 8},
         {"sor_std_ratio": float("nan")},
-        {"sor_disparity_weight": -1},
     ):
         with pytest.raises(OptionError):
             PointFilterOptions(**options)
@@ -100,12 +99,11 @@ def by_brute_force(
 @given(
     seed=st.integers(0, 2**31),
     share=st.floats(0.02, 1),
-    window=st.sampled_from([3, 5, 9]),
     factor=st.sampled_from([0.5, 1.0, 2.0]),
     middle=st.sampled_from([0.0, 40.0, -300.0]),
 )
 def test_on_a_grid_it_is_what_brute_force_finds(
-    seed: int, share: float, window: int, factor: float, middle: float
+    seed: int, share: float, factor: float, middle: float
 ) -> None:
     size = (31, 17)
     pixels = scattered(seed, share, size)
@@ -113,13 +111,11 @@ def test_on_a_grid_it_is_what_brute_force_finds(
     disparity = (middle + generator.normal(0, 1, len(pixels))).astype(np.float32)
     wild = generator.random(len(pixels)) < 0.05
     disparity[wild] += generator.uniform(-20, 20, wild.sum())
-    kept = sor_inliers_on_grid(
-        pixels, disparity, size, PointFilterOptions(sor_window_px=window, sor_std_ratio=factor)
-    )
-    expected, gap = by_brute_force(pixels, disparity.astype(float), window, factor)
+    kept = sor_inliers_on_grid(pixels, disparity, size, PointFilterOptions(sor_std_ratio=factor))
+    expected, gap = by_brute_force(pixels, disparity.astype(float), SOR_WINDOW_PX, factor)
     assert kept.shape == (len(pixels),)
     near = gap > 1e-4
-    some = (np.abs(pixels[:, None] - pixels) <= window // 2).all(2).sum(1) > 1
+    some = (np.abs(pixels[:, None] - pixels) <= SOR_WINDOW_PX // 2).all(2).sum(1) > 1
     if some.any():
         np.testing.assert_array_equal(kept[near | ~some], expected[near | ~some])
     else:

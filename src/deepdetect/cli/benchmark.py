@@ -79,16 +79,16 @@ def benchmark(
         listed = [word.strip() for word in baselines.split(",")]
         classical = tuple(word for word in listed if word not in ("", "none"))
     options = BenchmarkOptions(
-        DeepDetect(**NETWORK.take(values)),
-        tuple(protocol or DEFAULT_PROTOCOLS),
-        classical,
-        tuple(find_feature(word) for word in method or ()),
-        "bgr" if preset == "published" else "rgb",
-        tuple(geometry_weights or ()) or ("dense",),
-        max_pairs,
-        degraded_images,
-        max_photographs,
-        values.get("ranker"),
+        detector=DeepDetect(**NETWORK.take(values)),
+        protocols=tuple(protocol or DEFAULT_PROTOCOLS),
+        classical=classical,
+        others=tuple(find_feature(word) for word in method or ()),
+        channels="bgr" if preset == "published" else "rgb",
+        geometry_weights=tuple(geometry_weights or ()) or ("dense",),
+        max_pairs=max_pairs,
+        degraded_images=degraded_images,
+        max_images=max_photographs,
+        ranker=values.get("ranker"),
     )
     report = run_benchmarks(names, data, options, cache=cache or output / "cache", quiet=as_json)
     paths = report.save(output)

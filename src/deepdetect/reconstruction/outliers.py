@@ -26,6 +26,12 @@ from ..geometry.windows import window_sums
 FLANN_INDEX_KDTREE_SINGLE = 4
 """FLANN's number of the kd-tree that is exact in few dimensions."""
 
+SOR_WINDOW_PX = 9
+"""Side of the window of pixels that SOR compares with in rectified pairs."""
+
+SOR_DISPARITY_WEIGHT = 2.0
+"""Distance of 1 px of disparity in `disparity_space`, in pixels of the image."""
+
 QUERIES = 200_000
 """Points whose neighbours are looked up at a time, to bound the memory."""
 
@@ -40,9 +46,7 @@ class PointFilterOptions:
             says nothing about the depth. For rectified pairs, the least disparity (with offset).
         sor_neighbors: nearest points that SOR compares with, in `disparity_space`; 0: no SOR, for
             rectified pairs neither.
-        sor_window_px: side of the window of pixels that SOR compares with in rectified pairs.
         sor_std_ratio: standard deviations above the mean distance; fewer remove more.
-        sor_disparity_weight: distance of 1 px of disparity, in pixels of the image.
 
     Raises:
         OptionError: a value is out of its range.
@@ -50,13 +54,11 @@ class PointFilterOptions:
 
     min_parallax_px: float = 2.0
     sor_neighbors: int = 16
-    sor_window_px: int = 9
     sor_std_ratio: float = 2.0
-    sor_disparity_weight: float = 2.0
 
     def __post_init__(self) -> None:
-        limits = "min_parallax_px", "sor_std_ratio", "sor_disparity_weight"
-        check_ranges(self, not_negative=("sor_neighbors", *limits), odd=("sor_window_px",))
+        names = "min_parallax_px", "sor_neighbors", "sor_std_ratio"
+        check_ranges(self, not_negative=names)
 
 
 def sor_inliers(
@@ -100,7 +102,7 @@ def sor_inliers_on_grid(
         pixels: (N, 2) whole pixels of the left image.
         disparity: (N,) in pixels.
         size: (width, height) of the image.
-        point_filter: the window, and how strictly.
+        point_filter: how strictly.
 
     Returns:
         (N,) bool. A keypoint with no other in its window is an outlier only where most have some.
@@ -118,7 +120,7 @@ def sor_inliers_on_grid(
     middle = float(np.median(disparity))  # float32 squares of large numbers lose the differences
     centred = (disparity - middle).astype(np.float64)
     others, total, squares = (
-        window_sums(places, values, size[::-1], point_filter.sor_window_px)
+        window_sums(places, values, size[::-1], SOR_WINDOW_PX)
         for values in (1.0, centred, centred**2)
     )
     others = others - 1
@@ -155,7 +157,7 @@ def disparity_space(
     points: np.ndarray,
     focal_px: float,
     baseline: float = 1.0,
-    disparity_weight: float = PointFilterOptions.sor_disparity_weight,
+    disparity_weight: float = SOR_DISPARITY_WEIGHT,
 ) -> np.ndarray:
     """Return (N, 3) points as (x, y, weight * disparity) in pixels of the first camera."""
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -142,9 +142,7 @@ def reconstruct_two_view(
         kept &= passed
     if point_filter.sor_neighbors:
         with timer.stage("outlier removal"):
-            space = disparity_space(
-                made.points[kept], focal, baseline, point_filter.sor_disparity_weight
-            )
+            space = disparity_space(made.points[kept], focal, baseline)
             inliers = sor_inliers(space, point_filter)
         dropped["statistical outlier"] = int(np.count_nonzero(~inliers))
         kept[kept] = inliers
