@@ -45,7 +45,7 @@ class EdgeDetector(DeepDetect):
     def heatmap(self, image: np.ndarray, *, channels: str = "rgb") -> np.ndarray:
         return self.heatmap_and_logits(image)[0]
 
-    def select(
+    def _select(
         self,
         rgb: np.ndarray,
         options: SelectionOptions = SelectionOptions(),

@@ -60,7 +60,7 @@ def test_the_panorama_is_the_photograph(panorama: Panorama, views) -> None:
 
 
 def test_few_points_put_it_together_without_the_network(views, monkeypatch) -> None:
-    monkeypatch.setattr(DeepDetect, "select", None)
+    monkeypatch.setattr(DeepDetect, "_select", None)
     few = stitch([views.images[2], views.images[0], views.images[1]], PointDetector(1000))
     assert few.reference == 2
     true = [views.homographies[k] for k in (2, 0, 1)]
