@@ -26,9 +26,9 @@ def handle_signals(
         names: of the signals.
 
     Example:
-        >>> with handle_signals(lambda number, frame: print("ended"), ["SIGTERM"]):
-        ...     signal.raise_signal(signal.SIGTERM)
-        ended
+        >>> with handle_signals(lambda number, frame: print("resized"), ["SIGWINCH"]):
+        ...     signal.raise_signal(signal.SIGWINCH)
+        resized
     """
     before = {}
     if threading.current_thread() is threading.main_thread():
