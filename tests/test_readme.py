@@ -190,7 +190,8 @@ def test_the_calls_of_the_table_run(folder: Path, line: str) -> None:
     left = deepdetect.load_image("left.png")
     names = {
         **{name: getattr(deepdetect, name) for name in deepdetect.__all__},
-        **{"detector": deepdetect.DeepDetect(), "image": left, "mask": left[..., 0] > 100},
+        **{"detector": deepdetect.DeepDetect(), "points": deepdetect.PointDetector(500)},
+        **{"image": left, "mask": left[..., 0] > 100},
         **{"a": left, "b": deepdetect.load_image("right.png")},
     }
     assert eval(line, names) is not None
@@ -204,7 +205,7 @@ def test_make_demo_runs(tmp_path: Path) -> None:
         ["make", "demo", f"DEMO_OUTPUT={tmp_path}"], cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    for word in ("keypoints", "density", "matches", "truth", "seconds: guided matching"):
+    for word in ("keypoints", "density", "matches", "true disparity", "seconds: guided matching"):
         assert word in done.stdout
     pictures = {path.name.removeprefix("motorcycle_") for path in tmp_path.glob("*.jpg")}
     assert pictures == {

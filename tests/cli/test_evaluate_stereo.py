@@ -34,7 +34,8 @@ def test_the_command_prints_a_row_for_each(photo: np.ndarray, tmp_path: Path) ->
     rows = json.loads(result.stdout)
     assert len(rows) == 5
     assert rows[0]["precision"] > 0.9
-    result = run_command([*arguments, "--json", str(tmp_path / "gone")])
+    both = [arguments[0], str(tmp_path / "gone"), *arguments[1:]]
+    result = run_command([*both, "--json"])
     assert result.exit_code == 1, result.output
     assert json.loads(result.stdout) == rows
     assert "1 of 2 scenes failed, the others are done" in result.stderr

@@ -31,7 +31,8 @@ def demo(
     detector = DeepDetect(**values)
     folder = cli.output_folder(output)
     numbers = run_demo(load_stereo_pair("motorcycle"), detector, folder)
-    cli.print_result(as_json, {"weights": detector.weights, "backend": detector.runtime, **numbers})
+    values = {"weights": detector.weights, "backend": detector.runtime, **numbers}
+    cli.print_result(as_json, values, "Correct: within 1 px of the true disparity.")
 
 
 def run_demo(pair: StereoPair, detector: HeatmapDetector, folder: Path) -> dict[str, Any]:
