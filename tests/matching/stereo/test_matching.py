@@ -13,7 +13,14 @@ from deepdetect import ImageError, OptionError
 from deepdetect._shared import parallel
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.matching.stereo import DENSE, DisparityOptions, disparity_map
-from deepdetect.matching.stereo.matching import find_disparity_range
+from deepdetect.matching.stereo.matching import (
+    extrapolate_disparity,
+    fill_occlusions,
+    filter_speckles,
+    find_disparity_range,
+    near_discontinuity,
+    on_occluding_edge,
+)
 
 SHAPE = (96, 160)
 ROW, COLUMN = np.indices(SHAPE)
@@ -299,3 +306,166 @@ def smooth_pair(rectified_pair):
         return left, right
 
     return make
+
+
+def test_speckles_are_removed_by_their_size() -> None:
+    disparity = np.full((30, 40), -3.25, np.float32)
+    disparity[5:9, 5:9] = 9  # 16 pixels
+    disparity[20:25, 20:30] = 9  # 50
+    known = np.ones(disparity.shape, bool)
+    known[0] = False
+    kept = filter_speckles(disparity, known, 20)
+    assert not kept[5:9, 5:9].any()
+    assert not kept[0].any()
+    assert kept[20:25, 20:30].all()
+    assert kept.sum() == known.sum() - 16
+    assert disparity[5, 5] == 9
+
+
+def test_a_slope_is_no_speckle_and_no_discontinuity() -> None:
+    row, column = np.indices((30, 40))
+    slope = (0.4 * column - 0.5 * row).astype(np.float32)
+    known = np.ones(slope.shape, bool)
+    assert filter_speckles(slope, known, 100).all()
+    assert not near_discontinuity(slope, known, 4).any()
+
+
+def test_discontinuities_extend_along_rows_and_columns() -> None:
+    disparity = np.zeros((30, 40), np.float32)
+    disparity[10:20, 10:20] = 5
+    near = near_discontinuity(disparity, np.ones(disparity.shape, bool), 2)
+    expected = np.zeros_like(near)
+    expected[7:23, 7:23] = True
+    expected[7, [7, 22]] = expected[22, [7, 22]] = False  # its corners see no jump
+    expected[13:17, 13:17] = False
+    np.testing.assert_array_equal(near, expected)
+
+
+def test_across_a_gap_there_is_a_discontinuity_where_the_depth_jumps() -> None:
+    disparity = np.zeros((5, 30), np.float32)
+    disparity[:, 20:] = 6
+    known = np.ones(disparity.shape, bool)
+    known[:, 14:20] = False
+    near = near_discontinuity(disparity, known, 3)
+    assert near[:, 16:23].all()
+    assert not near[:, :15].any()
+
+
+def test_occlusions_are_filled_from_the_farther_side() -> None:
+    disparity = np.array([[4, 0, 0, 0, 9, 9, 0, 0]], np.float32)
+    known = disparity > 0
+    whole, between = fill_occlusions(disparity, known)
+    np.testing.assert_array_equal(whole, [[4, 4, 4, 4, 9, 9, 9, 9]])
+    np.testing.assert_array_equal(between & ~known, [[0, 1, 1, 1, 0, 0, 0, 0]])
+
+
+def test_a_gap_wider_than_an_occlusion_stays() -> None:
+    disparity = np.zeros((2, 60), np.float32)
+    disparity[1, 40:] = 30
+    known = np.ones(disparity.shape, bool)
+    known[:, 20:40] = False
+    _, between = fill_occlusions(disparity, known)
+    assert not between[0, 20:40].any()  # nothing near hides these twenty
+    assert between[1, 20:40].all()
+
+
+def test_the_edge_of_what_hides_is_its_outermost_pixels() -> None:
+    disparity = np.zeros((30, 40), np.float32)
+    disparity[10:20, 10:20] = 5
+    known = np.ones(disparity.shape, bool)
+    for distance in (1, 2):
+        expected = disparity > 0
+        expected[10 + distance : 20 - distance, 10 + distance : 20 - distance] = False
+        np.testing.assert_array_equal(on_occluding_edge(disparity, known, distance), expected)
+
+
+def test_what_is_not_known_is_no_edge() -> None:
+    disparity = np.full((3, 12), 5, np.float32)
+    known = np.ones(disparity.shape, bool)
+    known[:, 4:7] = False
+    disparity[:, 7:] = 2
+    found = on_occluding_edge(disparity, known, 1)
+    np.testing.assert_array_equal(np.flatnonzero(found[1]), [3])  # the farther one fills the gap
+
+
+LINES = (6, 80)
+LINE = np.arange(LINES[1])
+
+
+def extrapolated(
+    disparity: np.ndarray, known: np.ndarray, carried: np.ndarray | None = None
+) -> np.ndarray:
+    """Extrapolate surfaces that all paths carry on."""
+    if carried is None:
+        ends = (known.argmax(1), known.shape[1] - 1 - known[:, ::-1].argmax(1))
+        first, last = (disparity[np.arange(len(known)), end][:, None] for end in ends)
+        carried = np.where(np.arange(known.shape[1]) < ends[0][:, None], first, last)
+    return extrapolate_disparity(disparity, known, carried.astype(np.float32))
+
+
+def on_rows(values: np.ndarray) -> np.ndarray:
+    return np.tile(np.asarray(values, np.float32), (LINES[0], 1))
+
+
+@pytest.mark.parametrize("slope", [0, 0.1, -0.2])
+@pytest.mark.parametrize("right", [False, True], ids=["left border", "right border"])
+def test_a_plane_is_extrapolated_to_the_border(slope: float, right: bool) -> None:
+    surface = 15 + slope * LINE
+    surface = -surface[::-1] if right else surface
+    place = LINE - surface
+    seen = (place >= 0) & (place <= LINES[1] - 1)
+    found = extrapolated(on_rows(surface), on_rows(seen) > 0)
+    np.testing.assert_array_equal(np.isfinite(found), on_rows(~seen) > 0)
+    np.testing.assert_allclose(found[:, ~seen], on_rows(surface)[:, ~seen], atol=1e-4)
+
+
+def test_what_the_other_view_would_show_stays_open() -> None:
+    """It has no match, so something else is there."""
+    found = extrapolated(on_rows(np.full(80, 4)), on_rows(LINE >= 10) > 0)
+    np.testing.assert_array_equal(np.isfinite(found), on_rows(LINE < 4) > 0)
+    assert np.isnan(extrapolated(on_rows(np.full(80, 4)), on_rows(LINE < 70) > 0)).all()
+
+
+def test_a_surface_is_extrapolated_half_as_far_as_it_is_seen() -> None:
+    surface = np.where(LINE < 50, 40, 20)  # 20 px of it are seen
+    found = extrapolated(on_rows(surface), on_rows(LINE >= 30) > 0)
+    np.testing.assert_array_equal(np.isfinite(found), on_rows((LINE >= 20) & (LINE < 30)) > 0)
+
+
+def test_a_bent_surface_is_extrapolated_less_far() -> None:
+    reach = []
+    for bend in (0, 0.005, 0.02):
+        surface = 30 + bend * (LINE - 30.0) ** 2
+        found = extrapolated(on_rows(surface), on_rows(LINE >= 30) > 0)
+        given = np.isfinite(found[0])
+        reach.append(int(given.sum()))
+        assert (np.abs(found[0] - surface)[given] < 2).all()
+    assert reach[0] > 20
+    assert reach[0] > reach[1] > reach[2] > 0
+
+
+def test_too_little_is_not_extrapolated() -> None:
+    known = on_rows((LINE >= 20) & (LINE < 27)) > 0
+    surface = on_rows(np.full(80, 25))
+    assert np.isnan(extrapolated(surface, known)).all()
+    assert np.isfinite(extrapolated(surface, on_rows((LINE >= 20) & (LINE < 30)) > 0)).any()
+    assert np.isnan(extrapolated(surface, np.zeros(LINES, bool))).all()
+    assert np.isnan(extrapolated(surface, np.ones(LINES, bool))).all()
+
+
+def test_where_other_paths_bring_another_surface_there_is_none() -> None:
+    surface = on_rows(np.full(80, 20))
+    known = on_rows(LINE >= 20) > 0
+    carried = surface.copy()
+    carried[:2] = 28
+    carried[2:, 5:8] = 12
+    found = extrapolated(surface, known, carried)
+    np.testing.assert_array_equal(np.isfinite(found), ~known & (carried == 20))
+
+
+def test_unknown_pixels_do_not_count() -> None:
+    surface = on_rows(15 + 0.1 * LINE)
+    known = (LINE >= 17) & (LINE % 3 > 0)
+    wild = np.where(known, surface, np.float32(1e6))
+    found = extrapolated(wild, on_rows(known) > 0)
+    np.testing.assert_allclose(found[:, :16], surface[:, :16], atol=1e-3)

@@ -12,7 +12,9 @@ from deepdetect.matching.stereo.sgm import (
     CENSUS_RADIUS_Y,
     census,
     is_textured,
+    match_distance,
     matching_cost,
+    refine_disparity,
     semi_global_matching,
 )
 
@@ -75,7 +77,7 @@ def test_the_paths_are_those_of_the_definition() -> None:
     generator = np.random.default_rng(0)
     gray = generator.integers(0, 256, (9, 14), np.uint8)
     left, right = (generator.integers(0, 2**62, gray.shape, np.uint64) for _ in range(2))
-    total = module._aggregate(gray, left, right, -3, 16)
+    total = module.aggregate(gray, left, right, -3, 16)
     height, width = gray.shape
     cost = matching_cost(left, right, -3, 16).astype(int)
     expected = np.zeros_like(cost)
@@ -151,7 +153,7 @@ def test_matches_of_noisy_views_are_more_distant(motorcycle) -> None:
             census(np.clip(view + generator.normal(0, noise, view.shape), 0, 255).astype(np.uint8))
             for view in (left, right)
         ]
-        found = module._match_distance(*words, (0, 63))
+        found = match_distance(*words, (0, 63))
         cost = matching_cost(*words, 0, 64) / module.COST_PER_BIT
         true = cost[row, column, np.rint(truth[row, column]).astype(int)]
         # The matches that are found are the clearer half of the true ones.
@@ -174,3 +176,52 @@ def test_what_is_out_of_sight_takes_no_place_inside(rectified_pair) -> None:
         place = column - found.disparity
         leaves = (place < 0) | (place > shape[1] - 1)
         assert (found.uniqueness_ratio[leaves & ~found.consistent] == 1).mean() > 0.99
+
+
+SHAPE = (60, 120)
+ROW, COLUMN = np.indices(SHAPE)
+INNER = np.s_[4:-4, 30:-4]
+
+
+@pytest.mark.parametrize("off", [-0.4, 0.0, 0.3])
+def test_it_finds_what_is_left_from_nearby(off: float, rectified_pair) -> None:
+    truth = (9.3 + 0.05 * COLUMN - 0.04 * ROW).astype(np.float32)
+    left, right = rectified_pair(truth)
+    known = np.ones(SHAPE, bool)
+    refined = refine_disparity(left, right, truth + np.float32(off), known)
+    errors = np.abs(refined - truth)[INNER]
+    assert np.median(errors) < 0.02
+    assert np.quantile(errors, 0.99) < 0.1
+
+
+def test_gain_and_offset_do_not_matter(rectified_pair) -> None:
+    truth = np.full(SHAPE, 6.4, np.float32)
+    left, right = rectified_pair(truth)
+    dimmed = np.rint(right * 0.6 + 30).astype(np.uint8)
+    refined = refine_disparity(left, dimmed, np.full(SHAPE, 6.0, np.float32), truth > 0)
+    assert np.median(np.abs(refined - truth)[INNER]) < 0.02
+
+
+def test_a_flat_image_keeps_a_plane_as_it_is() -> None:
+    plane = (5 + 0.1 * COLUMN).astype(np.float32)
+    flat = np.full(SHAPE, 100, np.uint8)
+    refined = refine_disparity(flat, flat, plane, np.ones(SHAPE, bool))
+    np.testing.assert_allclose(refined, plane, atol=1e-4)
+
+
+def test_another_surface_does_not_count(rectified_pair) -> None:
+    truth = np.where(COLUMN < 70, 4.3, 9.0).astype(np.float32)
+    left, right = rectified_pair(truth)
+    alone = refine_disparity(left, right, truth, COLUMN < 70)
+    both = refine_disparity(left, right, truth, np.ones(SHAPE, bool))
+    np.testing.assert_array_equal(alone[:, :70], both[:, :70])
+
+
+def test_unknown_pixels_stay_and_do_not_count(rectified_pair) -> None:
+    truth = np.full(SHAPE, 6.4, np.float32)
+    left, right = rectified_pair(truth)
+    known = np.random.default_rng(0).random(SHAPE) < 0.7
+    start = np.where(known, truth, np.float32(77))
+    refined = refine_disparity(left, right, start, known)
+    assert (refined[~known] == 77).all()
+    assert np.median(np.abs(refined - truth)[known]) < 0.02

@@ -1,4 +1,7 @@
-"""Dense disparity maps of rectified pairs, and the matches of keypoints that they give."""
+"""Dense disparity maps of rectified pairs: what can be trusted of them, and how gaps are filled.
+
+Maps are (H, W): `disparity` float32 in pixels, `known` bool.
+"""
 
 from __future__ import annotations
 
@@ -12,23 +15,35 @@ from ..._shared.errors import ImageError, OptionError
 from ..._shared.image_array import Channels
 from ..._shared.opencv import cv2
 from ..._shared.options import check_ranges, suggest_keywords
+from ..._shared.parallel import parallel_for
 from ...features.keypoints import Keypoints
 from ...io.image import load_image, luma
-from .consistency import fill_occlusions, filter_speckles, near_discontinuity, on_occluding_edge
-from .extrapolation import extrapolate_disparity
-from .refinement import refine_disparity
-from .sgm import DisparityRange, is_textured, semi_global_matching
+from .sgm import (
+    MAX_DIFFERENCE_PX,
+    DisparityRange,
+    is_textured,
+    refine_disparity,
+    semi_global_matching,
+)
 
 MAX_SPECKLE_AREA_PX = 100
 """Patches of one surface up to this size are not kept."""
 
+SPECKLE_SUBDIVISIONS = 4
+"""Parts of a pixel in which OpenCV's speckle filter counts."""
+
+OCCLUSION_SLACK_PX = 8
+"""By which a gap may be wider than the step of disparity explains: the windows on both sides."""
+
+MIN_SUPPORT_PX = 5
+"""Fewest known pixels that a line is fitted to."""
+
 # The search for the range of disparities, on a small copy of the pair: the range holds all of the
 # Motorcycle pair and of the Middlebury scenes of the benchmark, without being much wider.
-SEARCH_WIDTH_PX = 160
+SEARCH_WIDTH_PX, SEARCH_MAX_SPECKLE_AREA_PX = 160, 50
 SEARCH_UNIQUENESS_RATIO = 1.3
 """Least ratio of the cost of any other place on the row: what has no match is rarely so clear."""
 
-SEARCH_MAX_SPECKLE_AREA_PX = 50
 SEARCH_TAIL_FRACTION = 0.01
 """Of the disparities at each end, which may be wrong."""
 
@@ -71,14 +86,12 @@ class DisparityOptions:
     occluding_edge_px: int = 0
 
     def __post_init__(self) -> None:
-        if self.disparity_range is not None:
-            if len(self.disparity_range) != 2 or any(int(d) != d for d in self.disparity_range):
-                raise OptionError("disparity_range takes two whole disparities, as (0, 63)")
-            low, high = self.disparity_range
-            if low > high:
-                raise OptionError(
-                    f"the smallest disparity, {low}, is above the largest, {high}: exchange them"
-                )
+        whole = self.disparity_range
+        if whole and (len(whole) != 2 or any(int(d) != d for d in whole) or whole[0] > whole[1]):
+            raise OptionError(
+                "disparity_range takes the smallest and the largest disparity, as (0, 63), not "
+                f"{whole}"
+            )
         check_ranges(
             self,
             between={
@@ -103,8 +116,7 @@ class RectifiedMatches:
         indices: (K,) int64 of the keypoints that have a disparity, rising.
         disparity: (K,) float32 in pixels: the match of the left (x, y) is the right
             (x - disparity, y).
-        matched: (K,) bool: seen in both views; False where the disparity is filled in from the
-            surface beside: hidden in the right view, outside of it, or on the edge of what hides.
+        matched: (K,) bool, as of `DisparityMap`.
     """
 
     indices: np.ndarray
@@ -148,7 +160,16 @@ class DisparityMap:
         Raises:
             OptionError: they are not (N, 2), or not on pixels of the left view.
         """
-        column, row = _whole_pixels(keypoints, self.disparity.shape)
+        xy = np.asarray(keypoints.xy if isinstance(keypoints, Keypoints) else keypoints)
+        if xy.ndim != 2 or xy.shape[1] != 2:
+            raise OptionError(f"keypoints must be an array of shape (N, 2), not {xy.shape}")
+        height, width = self.disparity.shape
+        if (xy != np.rint(xy)).any() or ((xy < 0) | (xy >= (width, height))).any():
+            raise OptionError(
+                "rectified matching takes keypoints on whole pixels of the left view: detect them "
+                "with subpixel=False"
+            )
+        column, row = xy.astype(np.int64).T
         disparity = self.disparity[row, column]
         indices = np.flatnonzero(np.isfinite(disparity))
         matched = self.matched[row[indices], column[indices]]
@@ -204,34 +225,38 @@ def compute_disparity(
     if left.shape != right.shape:
         sizes = " and ".join(f"{view.shape[1]}x{view.shape[0]}" for view in (left, right))
         raise ImageError(f"the views of a rectified pair must have one size, not {sizes}")
-    disparities = _disparity_range(left, right, options)
+    disparities = options.disparity_range or find_disparity_range(left, right)
     if disparities is None:
         nowhere = np.zeros(left.shape, bool)
         return DisparityMap(np.full(left.shape, np.nan, np.float32), nowhere, None)
-    found = semi_global_matching(left, right, disparities)
-    clear = found.uniqueness_ratio >= options.uniqueness_ratio
-    trusted = found.consistent & clear & is_textured(left)
-    known = filter_speckles(found.disparity, trusted, MAX_SPECKLE_AREA_PX)
-    disparity = refine_disparity(left, right, found.disparity, known)
-    known &= _leads_inside(disparity)
-    sure = known
-    if options.occluding_edge_px:
-        sure = _leads_inside(disparity, options.occluding_edge_px) & ~on_occluding_edge(
-            disparity, known, options.occluding_edge_px
+    low, high = (int(disparity) for disparity in disparities)
+    if max(abs(low), abs(high)) >= left.shape[1]:
+        raise OptionError(
+            f"disparities from {low} to {high} do not fit images {left.shape[1]} pixels wide: "
+            "narrow disparity_range"
         )
-        sure &= known
-    kept = known
-    if options.discontinuity_margin_px:
-        kept = known & ~near_discontinuity(disparity, known, options.discontinuity_margin_px)
+    coarse = semi_global_matching(left, right, (low, high))
+    clear = coarse.uniqueness_ratio >= options.uniqueness_ratio
+    trusted = coarse.consistent & clear & is_textured(left)
+    known = filter_speckles(coarse.disparity, trusted, MAX_SPECKLE_AREA_PX)
+    disparity = refine_disparity(left, right, coarse.disparity, known)
+    known &= _leads_inside(disparity)
+    sure = kept = known
+    edge_px, margin_px = options.occluding_edge_px, options.discontinuity_margin_px
+    if edge_px:
+        hiding = on_occluding_edge(disparity, known, edge_px)
+        sure = known & _leads_inside(disparity, edge_px) & ~hiding
+    if margin_px:
+        kept = known & ~near_discontinuity(disparity, known, margin_px)
     matched = kept & sure
     if options.fill_occlusions:
         behind, occluded = fill_occlusions(disparity, sure)
-        beyond = extrapolate_disparity(disparity, sure, found.disparity)
+        beyond = extrapolate_disparity(disparity, sure, coarse.disparity)
         occluded &= ~sure
         extrapolated = ~known & np.isfinite(beyond)
         disparity = np.where(occluded, behind, np.where(extrapolated, beyond, disparity))
         kept = kept | (occluded & ~known) | extrapolated
-    return DisparityMap(np.where(kept, disparity, np.float32(np.nan)), matched, disparities)
+    return DisparityMap(np.where(kept, disparity, np.float32(np.nan)), matched, (low, high))
 
 
 def _leads_inside(disparity: np.ndarray, margin_px: int = 0) -> np.ndarray:
@@ -244,18 +269,8 @@ def _leads_inside(disparity: np.ndarray, margin_px: int = 0) -> np.ndarray:
 def find_disparity_range(left: np.ndarray, right: np.ndarray) -> DisparityRange | None:
     """Find the disparities of a rectified pair, of both signs and up to half its width.
 
-    A small copy of the pair is matched over all of them. What both views agree on, in patches of
-    some size, gives the range.
-
-    Returns:
-        Smallest and largest, or None where the views agree on nothing.
-
-    Example:
-        >>> scene = np.random.default_rng(0).integers(0, 256, (30, 80), np.uint8)
-        >>> scene = cv2.resize(scene, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
-        >>> low, high = find_disparity_range(scene[:, 40:300], scene[:, :260])
-        >>> low <= -40 <= high < 0
-        True
+    A small copy is matched over all of them; what both views agree on, in patches of some size,
+    gives the range. None where they agree on nothing.
     """
     height, width = left.shape
     scale = max(width / SEARCH_WIDTH_PX, 1.0)
@@ -266,49 +281,100 @@ def find_disparity_range(left: np.ndarray, right: np.ndarray) -> DisparityRange 
         )
         scale = width / size[0]
     half = left.shape[1] // 2
-    found = semi_global_matching(left, right, (-half, half))
-    clear = found.consistent & (found.uniqueness_ratio >= SEARCH_UNIQUENESS_RATIO)
-    known = filter_speckles(found.disparity, clear, SEARCH_MAX_SPECKLE_AREA_PX)
+    coarse = semi_global_matching(left, right, (-half, half))
+    clear = coarse.consistent & (coarse.uniqueness_ratio >= SEARCH_UNIQUENESS_RATIO)
+    known = filter_speckles(coarse.disparity, clear, SEARCH_MAX_SPECKLE_AREA_PX)
     if not known.any():
         return None
-    low, high = np.quantile(
-        found.disparity[known], [SEARCH_TAIL_FRACTION, 1 - SEARCH_TAIL_FRACTION]
-    )
+    tails = SEARCH_TAIL_FRACTION, 1 - SEARCH_TAIL_FRACTION
+    low, high = np.quantile(coarse.disparity[known], tails)
     margin = SEARCH_MARGIN_PX + SEARCH_MARGIN_FRACTION * (high - low)
-    smallest = int(np.floor((low - margin) * scale))
-    largest = int(np.ceil((high + margin) * scale))
+    smallest, largest = int(np.floor((low - margin) * scale)), int(np.ceil((high + margin) * scale))
     return max(smallest, 1 - width), min(largest, width - 1)
 
 
-def _disparity_range(
-    left: np.ndarray, right: np.ndarray, options: DisparityOptions
-) -> DisparityRange | None:
-    """Return the range that is given, or the one that is found."""
-    if options.disparity_range is None:
-        return find_disparity_range(left, right)
-    low, high = (int(disparity) for disparity in options.disparity_range)
-    width = left.shape[1]
-    if max(abs(low), abs(high)) >= width:
-        raise OptionError(
-            f"disparities from {low} to {high} do not fit images {width} pixels wide: narrow "
-            "disparity_range"
-        )
-    return low, high
+def filter_speckles(disparity: np.ndarray, known: np.ndarray, max_area_px: int) -> np.ndarray:
+    """Return the known pixels without patches of at most so many pixels: most of these are wrong.
+
+    A patch is connected by steps of at most twice `MAX_DIFFERENCE_PX`.
+    """
+    invalid = np.iinfo(np.int16).min
+    steps = np.where(known, np.rint(disparity * SPECKLE_SUBDIVISIONS), invalid).astype(np.int16)
+    max_step = round(2 * MAX_DIFFERENCE_PX * SPECKLE_SUBDIVISIONS)
+    cv2.filterSpeckles(steps, invalid, max_area_px, max_step)
+    return known & (steps != invalid)
 
 
-def _whole_pixels(
-    keypoints: Keypoints | np.ndarray, shape: tuple[int, ...]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return columns and rows of keypoints that lie on pixels of an image."""
-    xy = np.asarray(keypoints.xy if isinstance(keypoints, Keypoints) else keypoints)
-    if xy.ndim != 2 or xy.shape[1] != 2 or xy.dtype.kind not in "iuf":
-        raise OptionError(f"keypoints must be an array of shape (N, 2), not {xy.shape}")
-    pixels = np.rint(np.where(np.isfinite(xy), xy, -1)).astype(np.int64)
-    height, width = shape
-    inside = (pixels >= 0).all() and (pixels < [width, height]).all()
-    if (pixels != xy).any() or not inside:
-        raise OptionError(
-            "rectified matching takes keypoints on whole pixels of the left view: detect them with "
-            "subpixel=False"
-        )
-    return pixels[:, 0], pixels[:, 1]
+def near_discontinuity(disparity: np.ndarray, known: np.ndarray, distance_px: int) -> np.ndarray:
+    """Find the pixels this near to a disparity discontinuity, along rows, columns or both.
+
+    The window of a match there sees both surfaces, and gives a pixel beside the nearer one its
+    disparity. Where nothing is known, the farther of both sides is assumed to continue.
+    """
+    filled = fill_occlusions(disparity, known)[0]
+    near = np.zeros(disparity.shape, np.uint8)
+    across = np.abs(np.diff(filled, axis=1)) > MAX_DIFFERENCE_PX
+    along = np.abs(np.diff(filled, axis=0)) > MAX_DIFFERENCE_PX
+    near[:, 1:] |= across
+    near[:, :-1] |= across
+    near[1:] |= along
+    near[:-1] |= along
+    return cv2.dilate(near, _square(distance_px)) > 0
+
+
+def on_occluding_edge(disparity: np.ndarray, known: np.ndarray, distance_px: int) -> np.ndarray:
+    """Find the outermost known pixels of surfaces in front of others, as wide as `distance_px`.
+
+    The windows of the match give the nearer disparity also to what lies just beside it, so these
+    are the least sure. Where nothing is known, the farther of both sides is assumed to continue.
+    """
+    filled = fill_occlusions(disparity, known)[0]
+    farthest = cv2.erode(filled, _square(distance_px))
+    return known & (filled - farthest > MAX_DIFFERENCE_PX)
+
+
+def _square(radius_px: int) -> np.ndarray:
+    return np.ones((2 * radius_px + 1, 2 * radius_px + 1), np.uint8)
+
+
+def fill_occlusions(disparity: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fill unknown pixels with the farther of the nearest known ones on both sides of their row.
+
+    What the right view does not see lies behind what occludes it. The disparity is 0 in rows where
+    nothing is known. The second array is true where both sides are known and the gap is no wider
+    than what the nearer surface can occlude.
+    """
+    width = disparity.shape[1]
+    column = np.arange(width)
+    left = np.maximum.accumulate(np.where(known, column, -1), axis=1)
+    right = np.minimum.accumulate(np.where(known, column, width)[:, ::-1], axis=1)[:, ::-1]
+    at_left, at_right = (
+        np.take_along_axis(disparity, np.clip(at, 0, width - 1), axis=1) for at in (left, right)
+    )
+    has_left, has_right = left >= 0, right < width
+    farther = np.where(has_left, at_left, at_right)
+    farther = np.where(has_left & has_right, np.minimum(at_left, at_right), farther)
+    occluded = right - left - 1 <= np.abs(at_left - at_right) + OCCLUSION_SLACK_PX
+    filled = np.where(has_left | has_right, farther, np.float32(0))
+    return filled, has_left & has_right & occluded
+
+
+def extrapolate_disparity(
+    disparity: np.ndarray, known: np.ndarray, carried: np.ndarray
+) -> np.ndarray:
+    """Extrapolate the first and the last known surface of each row to the border; else NaN.
+
+    Only to pixels whose place would lie outside the right image, as a surface in sight has matches
+    of its own; and only where `carried`, what semi-global matching chooses there, suggests it, too.
+    It follows a line, as far as that can be trusted: at a distance of n pixels the line through the
+    n known pixels from the nth on must predict those before, to `MAX_DIFFERENCE_PX`.
+    """
+    from .kernels import extrapolate_rows
+
+    limits = MIN_SUPPORT_PX, np.float32(MAX_DIFFERENCE_PX)
+    from_left, from_right = np.full((2, *disparity.shape), np.nan, np.float32)
+    views = disparity, known, carried
+    mirrored = (np.ascontiguousarray(view[:, ::-1]) for view in views)
+    parallel_for(len(disparity), extrapolate_rows, *views, 1.0, *limits, from_left)
+    parallel_for(len(disparity), extrapolate_rows, *mirrored, -1.0, *limits, from_right)
+    return np.where(np.isfinite(from_left), from_left, from_right[:, ::-1])
