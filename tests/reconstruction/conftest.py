@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
+from deepdetect import DeepDetect, Matches, match_images
 from deepdetect.datasets import load_stereo_pair
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.io.image import luma
@@ -122,14 +122,6 @@ def level() -> Turned:
     return make(np.eye(3), np.eye(3))
 
 
-def matched(pair: Turned, **changes: Any) -> tuple[np.ndarray, np.ndarray]:
-    from deepdetect import DeepDetect, match_images
-
-    found = match_images(pair.left, pair.right, DeepDetect("dense"), **changes)
-    assert found.guided
-    return found.points0, found.points1
-
-
 @pytest.fixture(scope="session")
 def only_turned(level: Turned) -> np.ndarray:
     """The left view of the level pair after a turn of its camera."""
@@ -137,10 +129,8 @@ def only_turned(level: Turned) -> np.ndarray:
 
 
 @pytest.fixture(scope="session")
-def turned_matches(turned: Turned) -> tuple[np.ndarray, np.ndarray]:
-    return matched(turned)
-
-
-@pytest.fixture(scope="session")
-def level_matches(level: Turned) -> tuple[np.ndarray, np.ndarray]:
-    return matched(level)
+def turned_matches(turned: Turned) -> Matches:
+    """Matches of every pixel of the heat map, sub-pixel by rectification."""
+    found = match_images(turned.left, turned.right, DeepDetect("dense"))
+    assert found.subpixel
+    return found

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, MatchingOptions, SelectionOptions, match_images
+from deepdetect import DeepDetect, Matches, MatchingOptions, SelectionOptions, match_images
 from deepdetect._shared.errors import DeepDetectError, ReconstructionError
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift import detect_sift
@@ -21,8 +21,9 @@ from deepdetect.geometry.parallax import TwoViewModel
 from deepdetect.geometry.relative_pose import estimate_relative_pose
 from deepdetect.geometry.two_view import fit_model, has_foreground, is_planar
 from deepdetect.io.image import load_image, luma
-from deepdetect.reconstruction.checks import check_focal, check_images, check_matches, check_pose
+from deepdetect.reconstruction.pipeline import check_images
 from deepdetect.reconstruction.subpixel import refine_matches
+from deepdetect.reconstruction.two_view import check_focal, check_matches, check_pose
 
 SIZE = (370, 250)
 
@@ -59,9 +60,10 @@ def scaled(calibration: Calibration, factor: float) -> Calibration:
 
 
 @pytest.fixture(scope="module")
-def refined(turned: Any, turned_matches: Any) -> tuple[np.ndarray, np.ndarray]:
-    found = refine_matches(*turned.grays, *turned_matches)
-    return turned_matches[0][found.converged].astype(float), found.points1[found.converged]
+def refined(turned: Any, turned_matches: Matches) -> tuple[np.ndarray, np.ndarray]:
+    points0 = turned_matches.points0.astype(float)
+    points1, converged = refine_matches(*turned.grays, points0, turned_matches.points1)
+    return points0[converged], points1[converged]
 
 
 def test_one_picture_twice(photo: np.ndarray, level: Any, one_line) -> None:

@@ -13,7 +13,7 @@ from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.io.image import luma
 from deepdetect.matching.stereo import DENSE, DisparityOptions, disparity_map
-from deepdetect.reconstruction.checks import (
+from deepdetect.reconstruction.rectification import (
     check_cameras,
     check_depths,
     check_disparities,

@@ -5,12 +5,8 @@ and Open3D: a point is removed when its mean distance to its nearest neighbors i
 all by more than some standard deviations.
 
 One threshold for all needs one spacing. Points of a stereo pair have it in the image and in
-disparity, not in space, where their spacing across grows with the depth and along with its square:
-in space the far points are removed first, and the wild ones among the near stay. So the distances
-are measured in `disparity_space`; for a cloud from elsewhere `sor_inliers` takes any space.
-(Motorcycle's true disparities with 0.25 px of noise and 3 % random ones: 0.2 % of the good lost
-and 93 % of the wild found, against 0.4 % and 88 % in space; a street of 2 to 125 baselines: 0 % and
-96 %, against 1.8 % and 10 %.)
+disparity, not in space, where the far ones would be removed first (Motorcycle with 3 % random
+disparities: 0.2 % of the good lost and 93 % of the wild found, against 0.4 % and 88 % in space).
 """
 
 from __future__ import annotations
@@ -57,21 +53,13 @@ class PointFilterOptions:
     sor_std_ratio: float = 2.0
 
     def __post_init__(self) -> None:
-        names = "min_parallax_px", "sor_neighbors", "sor_std_ratio"
-        check_ranges(self, not_negative=names)
+        check_ranges(self, not_negative=("min_parallax_px", "sor_neighbors", "sor_std_ratio"))
 
 
 def sor_inliers(
     points: np.ndarray, point_filter: PointFilterOptions = PointFilterOptions()
 ) -> np.ndarray:
-    """Return which points have others around them.
-
-    Args:
-        points: (N, 3) in a space where the spacing is about the same everywhere.
-        point_filter: how many nearest points are compared with, and how strictly.
-
-    Returns:
-        (N,) bool. Points that are not finite are outliers and count for no other.
+    """Return which points (N, 3) have others around them; those that are not finite have not.
 
     Example:
         >>> row = np.column_stack([np.arange(100.0), np.zeros(100), np.zeros(100)])
@@ -93,19 +81,11 @@ def sor_inliers_on_grid(
     size: tuple[int, int],
     point_filter: PointFilterOptions = PointFilterOptions(),
 ) -> np.ndarray:
-    """Return which keypoints of a rectified pair have about the depth of those around them.
+    """Return which whole pixels (N, 2) of a rectified pair have about the depth of those around.
 
-    As `sor_inliers`, with all keypoints in a window as neighbors and the root mean square of the
-    differences of disparity as distance: three box filters, however many points there are.
-
-    Args:
-        pixels: (N, 2) whole pixels of the left image.
-        disparity: (N,) in pixels.
-        size: (width, height) of the image.
-        point_filter: how strictly.
-
-    Returns:
-        (N,) bool. A keypoint with no other in its window is an outlier only where most have some.
+    As `sor_inliers`, with all in a window as neighbors and the root mean square of the differences
+    of disparity as distance: three box filters. A pixel alone in its window is an outlier only
+    where most are not.
 
     Example:
         >>> pixels = np.argwhere(np.ones((20, 20)))
@@ -153,14 +133,9 @@ def mean_neighbor_distances(points: np.ndarray, neighbors: int) -> np.ndarray:
     return means
 
 
-def disparity_space(
-    points: np.ndarray,
-    focal_px: float,
-    baseline: float = 1.0,
-    disparity_weight: float = SOR_DISPARITY_WEIGHT,
-) -> np.ndarray:
+def disparity_space(points: np.ndarray, focal_px: float, baseline: float = 1.0) -> np.ndarray:
     """Return (N, 3) points as (x, y, weight * disparity) in pixels of the first camera."""
     with np.errstate(divide="ignore", invalid="ignore"):
         across = points[:, :2] / points[:, 2:] * focal_px
         disparity = focal_px * baseline / points[:, 2]
-    return np.column_stack([across, disparity_weight * disparity])
+    return np.column_stack([across, SOR_DISPARITY_WEIGHT * disparity])

@@ -13,33 +13,48 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .._shared.errors import ReconstructionError
+from .._shared.errors import NoDepthError, ReconstructionError
 from .._shared.image_array import Channels
+from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.timing import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, find_keypoints
 from ..detector.image_lists import Images, ignore_masks
 from ..features.keypoints import Keypoints
-from ..features.matches import Matches
 from ..features.selection import SelectionOptions
 from ..geometry.camera import Calibration, calibration_from_focal, read_calibration
 from ..io.exif import calibration_from_exif
+from ..io.image import load_image, luma
 from ..matching.options import MatchingOptions
 from ..matching.pipeline import LoadedPair, match_pair
 from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity
-from .checks import (
+from .outliers import PointFilterOptions, sor_inliers_on_grid
+from .rectification import (
     check_cameras,
     check_depths,
     check_disparities,
-    check_images,
-    check_keypoints,
-    check_matched,
     check_pure_rotation,
+    find_rectification,
 )
-from .outliers import PointFilterOptions, sor_inliers_on_grid
-from .rectification import find_rectification
 from .result import Reconstruction
 from .two_view import reconstruct_two_view
+
+MAX_MEAN_DIFFERENCE_LEVELS = 0.5
+"""Grey levels by which copies of one image differ in the mean."""
+
+MAX_DIFFERENCE_LEVELS, DIFFERENCE_QUANTILE = 8.0, 0.999
+"""Grey levels by which they differ nearly everywhere: at this fraction of the pixels."""
+
+MAX_DIFFERENCE_TO_GRADIENT = 0.5
+"""The same, as a multiple of what the image differs from itself shifted by a pixel: dark views
+differ by few levels."""
+
+MIN_UNIQUE_FRACTION = 0.1
+"""Of the keypoints with a match on their row, where only unique matches count: unrelated images
+gave up to 0.005, rectified pairs at least 0.35."""
+
+MIN_MATCHED_FRACTION = 0.25
+"""The same where all matches count: up to 0.16, and at least 0.64."""
 
 
 @suggest_keywords
@@ -116,8 +131,8 @@ def reconstruct(
         >>> bool(np.median(np.abs(found.disparity - shift)) < 0.1), found.unit
         (True, 'baseline')
     """
-    loaded = LoadedPair.load(left, right, channels)
-    grays = loaded.gray
+    rgb = load_image(left, channels=channels), load_image(right, channels=channels)
+    grays = luma(rgb[0]), luma(rgb[1])
     sizes = grays[0].shape[::-1], grays[1].shape[::-1]
     known = _calibration(calibration, focal_px, (left, right), sizes)
     check_images(*grays)
@@ -139,12 +154,12 @@ def reconstruct(
     whole = None if selection is None else replace(selection, subpixel=False)
     if rectified:
         with timer.stage("keypoints"):
-            keypoints = find_keypoints(detector, loaded.rgb[0], whole, masks[0])
+            keypoints = find_keypoints(detector, rgb[0], whole, masks[0])
         made = _from_disparities(keypoints, grays, known, selection, options, timer)
     else:
         with timer.stage("keypoints and matching"):
             matches = match_pair(
-                loaded,
+                LoadedPair(rgb, grays),
                 detector,
                 selection=whole,
                 ignore=masks,
@@ -154,11 +169,11 @@ def reconstruct(
                 seed=seed,
                 tentative_matches=tentative,
             )
-        made = _from_matches(matches, grays, known, options.point_filter, seed, timer)
+        made = reconstruct_two_view(matches, grays, known, options.point_filter, seed, timer)
     columns, rows = np.rint(made["pixels"]).astype(np.int64).T
     return Reconstruction(
         **made,
-        colors=loaded.rgb[0][rows, columns],
+        colors=rgb[0][rows, columns],
         unit="baseline" if known.baseline_mm is None else "mm",
         size=sizes[0],
         rectified=rectified,
@@ -168,7 +183,17 @@ def reconstruct(
     )
 
 
-Size = tuple[int, int]
+def check_images(gray0: np.ndarray, gray1: np.ndarray) -> None:
+    """Refuse two copies of one image, also when one was saved again without visible loss."""
+    if gray0.shape != gray1.shape:
+        return
+    difference = cv2.absdiff(gray0, gray1)
+    if difference.mean() >= MAX_MEAN_DIFFERENCE_LEVELS:
+        return
+    gradient = cv2.absdiff(gray0[:, 1:], gray0[:, :-1])
+    limit = MAX_DIFFERENCE_TO_GRADIENT * np.quantile(gradient, DIFFERENCE_QUANTILE)
+    if np.quantile(difference, DIFFERENCE_QUANTILE) <= min(MAX_DIFFERENCE_LEVELS, limit):
+        raise NoDepthError("both images are the same: depth needs two images from two places")
 
 
 def _from_disparities(
@@ -187,11 +212,21 @@ def _from_disparities(
     point_filter = options.point_filter
     check_cameras(calibration)
     keypoints = replace(keypoints, xy=np.rint(keypoints.xy))
-    check_keypoints(len(keypoints), selection or SelectionOptions())
+    if not len(keypoints):
+        raise NoDepthError(
+            "the left image has no keypoint: lower `threshold`, or give a larger `density` (an "
+            "image of one grey level shows nothing)"
+        )
     with timer.stage("matching"):
         found = compute_disparity(*grays, how).at(keypoints)
     matched, disparity = found.matched, found.disparity
-    check_matched(int(np.count_nonzero(matched)), len(keypoints), how.uniqueness_ratio > 1)
+    least = MIN_UNIQUE_FRACTION if how.uniqueness_ratio > 1 else MIN_MATCHED_FRACTION
+    if np.count_nonzero(matched) < least * len(keypoints):
+        raise NoDepthError(
+            f"only {np.count_nonzero(matched):,} of {len(keypoints):,} keypoints have a match on "
+            "their row: the images hardly overlap or show different scenes, or the pair is not "
+            "rectified"
+        )
     check_disparities(disparity)
     pixels = keypoints.xy[found.indices]
     check_pure_rotation(pixels[matched], disparity[matched], calibration)
@@ -230,43 +265,11 @@ def _from_disparities(
     }
 
 
-def _from_matches(
-    matches: Matches,
-    grays: tuple[np.ndarray, np.ndarray],
-    calibration: Calibration,
-    point_filter: PointFilterOptions,
-    seed: int,
-    timer: StageTimer,
-) -> dict[str, Any]:
-    """Estimate the pose from matches and triangulate them."""
-    made = reconstruct_two_view(
-        matches.points0,
-        matches.points1,
-        calibration,
-        grays,
-        point_filter,
-        seed,
-        timer,
-        refined=matches.subpixel,
-    )
-    return {
-        "points": made.points,
-        "pixels": matches.points0[made.indices],
-        "disparity": None,
-        "matched": np.ones(len(made.indices), bool),
-        "pose": made.pose,
-        "reprojection_errors": made.reprojection_errors,
-        "keypoints": len(matches.keypoints0),
-        "matches": len(matches),
-        "dropped": made.dropped,
-    }
-
-
 def _calibration(
     given: Calibration | str | Path | None,
     focal_px: float | None,
     images: tuple[Any, Any],
-    sizes: tuple[Size, Size],
+    sizes: tuple[tuple[int, int], tuple[int, int]],
 ) -> Calibration:
     """Return the calibration that is given, or the one the images carry."""
     if given is not None and focal_px is not None:

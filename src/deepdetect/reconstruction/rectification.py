@@ -1,11 +1,7 @@
-"""Whether a pair is rectified: matches lie on the same row of both images.
+"""Rectified pairs: how they are told from others, and what shows that one is none, or has no depth.
 
-The rows are a model without any parameter. A pair is rectified when they explain about as many
-matches as the best models with parameters do: a robust fundamental matrix, and rows that are
-shifted, tilted and scaled. What fraction of all matches that is does not matter: many may be wrong.
-
-Of large images small copies decide in a coarse pass where the answer is the same whatever they are
-too coarse to show; else larger copies do.
+Matches of a rectified pair lie on the same row of both images. These rows, a model without any
+parameter, must explain about as many matches as the best models with parameters do.
 """
 
 from __future__ import annotations
@@ -14,8 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .._shared.errors import NoDepthError, ReconstructionError
+from .._shared.opencv import cv2
 from ..features.selection import grid_subsample
 from ..geometry.acontrario import MAX_LOG10_NFA, log10_nfa
+from ..geometry.camera import Calibration
 from ..geometry.two_view import SCENE_THRESHOLDS_PX, fit_model, is_planar, is_static
 from ..matching.guided import TentativeMatches, find_tentative_matches
 
@@ -39,9 +38,6 @@ GRID_SIZE_PX = 8
 ITERATIONS = 500
 """Samples of three matches, for the rows that are shifted, tilted and scaled."""
 
-SAMPLES_AT_ONCE = 100
-"""Of these, whose rows are computed together, which bounds the memory."""
-
 COARSE_SIDE_PX, COARSE_KEYPOINTS = 480, 1000
 """Longer side of the copies of the coarse pass, and keypoints of each."""
 
@@ -54,6 +50,38 @@ MAX_COARSE_ROW_ERROR_PX = 0.6
 `MIN_INLIER_RATIO` of the matches. In pixels of the images themselves: many matches show together
 what each is too coarse for."""
 
+MAX_FOCAL_DIFFERENCE_FRACTION = 0.01
+"""Of the focal lengths of both views. Rectified views have one; lengths given to three digits pass,
+and at 0.01 a row is off by 2 px at the edge of 400."""
+
+MAX_CY_DIFFERENCE_PX = 2.0
+"""Of cy of both views: twice what a match may be off its row."""
+
+MIN_DEPTH_SPREAD_PX = 0.5
+"""Between the 5th and 95th percentile of the disparities of a scene with depth."""
+
+MIN_DISPARITY_PX = -1.0
+"""With the offset; smaller ones put points behind the cameras."""
+
+MAX_BEHIND_FRACTION = 0.25
+"""Of the points, behind the cameras."""
+
+MAX_ROTATION_ERROR_PX, MIN_ROTATION_FRACTION = 0.3, 0.5
+"""Within which the rotation explains a disparity, and the fraction of them that it must explain:
+of four rotated views at least 0.64."""
+
+MAX_RATIO_TO_PLANE = 0.5
+"""Median error of the rotation over that of the best plane in disparity: of rotated views up to
+0.33, of slanted walls at least 5.3."""
+
+MAX_OFF_ROW_PX = 1.0
+"""Median distance by which the rotation moves matches off their rows: on rows they were found."""
+
+ROBUST_ITERATIONS = 12
+
+ROTATION_GRID_SIZE_PX, MIN_ROTATION_MATCHES, MAX_ROTATION_SAMPLES = 16, 30, 50_000
+"""With fewer disparities, one per cell, nothing is tried; more are not used."""
+
 
 @dataclass(frozen=True)
 class Rectification:
@@ -62,8 +90,7 @@ class Rectification:
     Attributes:
         rectified: whether it is.
         reason: why not; empty when it is.
-        swapped: it is rectified, but the left image was given as the right one: most disparities
-            are negative.
+        swapped: it is rectified, but the left image was given as the right one.
         on_rows: number of matches (one per cell) within a row of each other, of `matches`.
         by_fundamental: number of them that the fundamental matrix explains as closely.
         by_other_rows: the same for the rows that are shifted, tilted and scaled.
@@ -89,28 +116,12 @@ class Rectification:
 
 
 def find_rectification(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    offset_px: float = 0.0,
-    seed: int = 0,
+    gray0: np.ndarray, gray1: np.ndarray, offset_px: float = 0.0, seed: int = 0
 ) -> tuple[Rectification, TentativeMatches | None]:
-    """Decide whether a pair of images is rectified, by the least effort that it takes.
+    """Decide whether two images (H, W) are rectified, large ones by small copies where these can.
 
-    Args:
-        gray0, gray1: (H, W) uint8 luma.
-        offset_px: what is added to a disparity before it gives the depth (calibration).
-        seed: of the random samples.
-
-    Returns:
-        The decision, and the tentative matches of larger copies where they were needed for it.
-
-    Example:
-        >>> import cv2
-        >>> noise = np.random.default_rng(0).integers(0, 256, (150, 200)).astype(np.uint8)
-        >>> x, y = np.meshgrid(np.arange(200, dtype=np.float32), np.arange(150, dtype=np.float32))
-        >>> moved = cv2.remap(noise, x + 4 + y / 5, y, cv2.INTER_LINEAR)
-        >>> find_rectification(noise, moved)[0].rectified
-        True
+    `offset_px` is what is added to a disparity before it gives the depth. The tentative matches of
+    larger copies are returned where they were needed.
     """
     size0, size1 = gray0.shape[::-1], gray1.shape[::-1]
     if size0 != size1:
@@ -157,9 +168,9 @@ def _coarse_pass(
 def _row_error(points0: np.ndarray, points1: np.ndarray, seed: int) -> float:
     """Return by how much the rows of a pair that looks rectified are off at most of its matches.
 
-    Not by the distance of each match from its row, which is as coarse as the matches, but by what
-    all of them have in common: how that distance depends on the place (views that are turned, or
-    bent by a lens) and on the disparity (a camera that moved up or down as well).
+    Not the distance of each match from its row, which is as coarse as the matches, but what they
+    have in common: how that distance depends on the place (views that are turned, or bent by a
+    lens) and on the disparity (a camera that moved up or down as well).
     """
     indices = grid_subsample(points0, GRID_SIZE_PX, seed)
     first, second = points0[indices], points1[indices]
@@ -179,13 +190,7 @@ def detect_rectification(
     offset_px: float = 0.0,
     seed: int = 0,
 ) -> Rectification:
-    """Decide from matches whether a pair is rectified.
-
-    Args:
-        points0, points1: (M, 2) matched positions in the left and the right image.
-        size0, size1: (width, height) of the images.
-        offset_px: what is added to a disparity before it gives the depth (calibration).
-        seed: of the random samples.
+    """Decide from matches (M, 2) whether a pair is rectified; sizes are (width, height).
 
     Example:
         >>> left = np.random.default_rng(0).uniform(0, (640, 480), (900, 2))
@@ -209,23 +214,30 @@ def detect_rectification(
     vertical_offset = np.nan
     if epipolar.inliers.any():
         vertical_offset = float(np.median((second - first)[epipolar.inliers, 1]))
-    counts = tuple(int(np.count_nonzero(part)) for part in (on_rows, epipolar.inliers, other_rows))
-    # Rows are a line in every point; nothing was sampled, so this is on the safe side.
-    alarms = log10_nfa(on_rows, "fundamental", limit, size1)
+    on_rows_count, by_fundamental, by_other_rows = (
+        int(np.count_nonzero(part)) for part in (on_rows, epipolar.inliers, other_rows)
+    )
+    best = max(by_fundamental, by_other_rows)
+    reason = ""
     if size0 != size1:
         reason = "the images differ in size"
-    elif alarms > MAX_LOG10_NFA:
+    # Rows are a line in every point; nothing was sampled, so this is on the safe side.
+    elif log10_nfa(on_rows, "fundamental", limit, size1) > MAX_LOG10_NFA:
         reason = "hardly any match is on the same row in both images"
-    else:
-        reason = _reason(counts, vertical_offset, spread)
-    if not reason and is_static(disparity):
+    elif on_rows_count < MIN_INLIER_RATIO * best:
+        reason = (
+            f"only {on_rows_count:,} of {best:,} matches that agree are on the same row in both "
+            f"images (median offset {vertical_offset:+.1f} px)"
+        )
+    elif spread[2] - spread[0] < MIN_DISPARITY_SPREAD_PX:
+        reason = f"all matches on rows have about the same disparity ({spread[1]:.3g} px)"
+    elif is_static(disparity):
         reason = "nothing moves between the images"
-    if not reason and spread[2] - spread[0] < MIN_PLANAR_SPREAD_PX:
+    elif spread[2] - spread[0] < MIN_PLANAR_SPREAD_PX:
         threshold_px = SCENE_THRESHOLDS_PX["homography"]
         plane = fit_model(first, second, "homography", size1, threshold_px, seed)
         if is_planar(first, second, plane, epipolar, seed):
             reason = "one homography explains all the matches: all move nearly the same"
-    on_rows_count, by_fundamental, by_other_rows = counts
     return Rectification(
         rectified=not reason,
         reason=reason,
@@ -240,29 +252,8 @@ def detect_rectification(
     )
 
 
-def _reason(
-    counts: tuple[int, ...],
-    vertical_offset: float,
-    spread: np.ndarray,
-) -> str:
-    """Return why rows are not the geometry of the pair; empty when they may be."""
-    on_rows, by_fundamental, by_other_rows = counts
-    best = max(by_fundamental, by_other_rows)
-    if on_rows < MIN_INLIER_RATIO * best:
-        return (
-            f"only {on_rows:,} of {best:,} matches that agree are on the same row in both images "
-            f"(median offset {vertical_offset:+.1f} px)"
-        )
-    if spread[2] - spread[0] < MIN_DISPARITY_SPREAD_PX:
-        return f"all matches on rows have about the same disparity ({spread[1]:.3g} px)"
-    return ""
-
-
 def _best_other_rows(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    size: tuple[int, int],
-    seed: int,
+    points0: np.ndarray, points1: np.ndarray, size: tuple[int, int], seed: int
 ) -> np.ndarray:
     """Fit the vertical shift as a plane over the image, robustly; (M,) bool that agree with it.
 
@@ -274,24 +265,17 @@ def _best_other_rows(
     if len(points0) < 3:
         return best
     design = np.column_stack([points0 / max(size), np.ones(len(points0))])
-
-    def agreeing(planes: np.ndarray) -> np.ndarray:
-        agree: np.ndarray = np.abs(planes @ design.T - shift) <= MAX_ROW_DISTANCE_PX
-        return agree
-
     samples = np.random.default_rng(seed).integers(0, len(points0), (ITERATIONS, 3))
     samples = samples[np.abs(np.linalg.det(design[samples])) >= 1e-4]
-    for start in range(0, len(samples), SAMPLES_AT_ONCE):
-        chosen = samples[start : start + SAMPLES_AT_ONCE]
-        planes = np.linalg.solve(design[chosen], shift[chosen][..., None])[..., 0]
-        agree = agreeing(planes)
-        counts = np.count_nonzero(agree, axis=1)
-        if counts.max() > np.count_nonzero(best):
-            best = agree[np.argmax(counts)]
+    planes = np.linalg.solve(design[samples], shift[samples][..., None])[..., 0]
+    agreeing = np.abs(planes @ design.T - shift) <= MAX_ROW_DISTANCE_PX
+    if agreeing.any():
+        best = agreeing[np.argmax(np.count_nonzero(agreeing, axis=1))]
     if np.count_nonzero(best) >= 3:
-        agree = agreeing(np.linalg.lstsq(design[best], shift[best], rcond=None)[0])
-        if np.count_nonzero(agree) > np.count_nonzero(best):
-            best = agree
+        plane = np.linalg.lstsq(design[best], shift[best], rcond=None)[0]
+        refined = np.abs(design @ plane - shift) <= MAX_ROW_DISTANCE_PX
+        if np.count_nonzero(refined) > np.count_nonzero(best):
+            best = refined
     return best
 
 
@@ -303,3 +287,123 @@ def _line_angle(fundamental: np.ndarray | None, size: tuple[int, int]) -> float:
     corners = np.array([[x, y, 1.0] for x in (0, width - 1) for y in (0, height - 1)])
     lines = corners @ fundamental.T
     return float(np.degrees(np.arctan2(np.abs(lines[:, 0]), np.abs(lines[:, 1]))).max())
+
+
+def check_cameras(calibration: Calibration) -> None:
+    """Refuse a calibration that no rectified pair has: focal lengths or cy of both views differ."""
+    camera0, camera1 = calibration.camera0, calibration.camera1
+    advice = f"fix the calibration ({calibration.source}), or pass `rectified=False`"
+    for focal0, focal1 in zip(camera0.focal_px, camera1.focal_px, strict=True):
+        if abs(focal1 - focal0) > MAX_FOCAL_DIFFERENCE_FRACTION * focal0:
+            raise ReconstructionError(
+                f"the focal lengths of the left and the right view are {focal0:g} and {focal1:g} "
+                f"px, those of a rectified pair are one: {advice}"
+            )
+    cy0, cy1 = camera0.centre[1], camera1.centre[1]
+    if abs(cy1 - cy0) > MAX_CY_DIFFERENCE_PX:
+        raise ReconstructionError(
+            f"cy of the left and the right view are {cy0:g} and {cy1:g} px, those of a rectified "
+            f"pair are one: {advice}"
+        )
+
+
+def check_disparities(disparity: np.ndarray) -> None:
+    """Refuse disparities of a rectified pair that are all one value, or of which none is known."""
+    known = np.asarray(disparity)[np.isfinite(disparity)]
+    if not len(known):
+        raise NoDepthError("no disparity was found: the images do not overlap")
+    if is_static(known):
+        raise NoDepthError(
+            "all disparities are 0: both images were taken from one place, without a baseline"
+        )
+    low, middle, high = np.quantile(known, [0.05, 0.5, 0.95])
+    if high - low >= MIN_DEPTH_SPREAD_PX:
+        return
+    raise NoDepthError(
+        f"all disparities are {middle:.3g} px: one image is the other shifted sideways, or both "
+        "show one plane, and there is no depth"
+    )
+
+
+def check_pure_rotation(
+    pixels: np.ndarray, disparity: np.ndarray, calibration: Calibration
+) -> None:
+    """Refuse disparities that a camera which only rotated explains, far better than a plane.
+
+    A rotation by an angle a about the vertical moves pixels along their rows by f a (1 + x^2) at
+    first order, x the slope of the ray: about like a wall, but bent. With a focal length that is
+    far off, a tilt besides, or a bend of less than the noise, it is not noticed.
+    """
+    chosen = np.arange(len(pixels))
+    if len(chosen) > MAX_ROTATION_SAMPLES:
+        chosen = np.random.default_rng(0).choice(len(chosen), MAX_ROTATION_SAMPLES, replace=False)
+    chosen = chosen[grid_subsample(pixels[chosen], ROTATION_GRID_SIZE_PX)]
+    if len(chosen) < MIN_ROTATION_MATCHES:
+        return
+    pixels, disparity = np.asarray(pixels, np.float64)[chosen], np.asarray(disparity)[chosen]
+    by_rotation = _rotation_errors(pixels, disparity, calibration)
+    by_plane = _plane_errors(pixels, disparity)
+    better = np.median(by_rotation) < MAX_RATIO_TO_PLANE * np.median(by_plane)
+    explained = np.mean(by_rotation < MAX_ROTATION_ERROR_PX)
+    if better and explained > MIN_ROTATION_FRACTION:
+        raise NoDepthError(
+            "a rotation of the camera explains most disparities and there is no depth: move it "
+            "sideways between the images"
+        )
+
+
+def check_depths(disparity: np.ndarray, calibration: Calibration) -> None:
+    """Refuse disparities of a rectified pair of which many would lie behind the cameras."""
+    offset = calibration.disparity_offset_px
+    behind = float(np.mean(disparity + offset < MIN_DISPARITY_PX))
+    if behind > MAX_BEHIND_FRACTION:
+        raise ReconstructionError(
+            f"{behind:.0%} of the points would lie behind the cameras: left and right are "
+            f"exchanged, or the disparity offset of {offset:g} px ({calibration.source}) is wrong"
+        )
+
+
+def _rotation_errors(
+    pixels: np.ndarray, disparity: np.ndarray, calibration: Calibration
+) -> np.ndarray:
+    """Fit a rotation to disparities robustly; (N,) what it leaves unexplained, in pixels.
+
+    About the vertical and the line of sight: a tilt hardly changes disparities. Infinite when none
+    leaves the matches on their rows.
+    """
+    camera = calibration.camera1
+    rays = calibration.camera0.rays(pixels)
+    wanted = (pixels[:, 0] - disparity - camera.centre[0]) / camera.focal_px[0]
+    # The rotation about the vertical that most pixels ask for is near enough to begin with.
+    angle = np.median(np.arctan(wanted) - np.arctan(rays[:, 0]))
+    rotation = cv2.Rodrigues(np.array([0, angle, 0]))[0]
+    error = np.empty(0)
+    for iteration in range(ROBUST_ITERATIONS + 1):
+        rotated = rays @ rotation.T
+        if (rotated[:, 2] <= 0).any():  # only with a focal length that cannot be
+            return np.full(len(pixels), np.inf)
+        x, y = (rotated[:, :2] / rotated[:, 2:]).T
+        error = wanted - x
+        if iteration < ROBUST_ITERATIONS:
+            slopes = np.column_stack([1 + x * x, -y])
+            angles = _robust_step(slopes, error, camera.focal_px[0])
+            rotation = cv2.Rodrigues(np.array([0, *angles]))[0] @ rotation
+    off_row = y * camera.focal_px[1] + camera.centre[1] - pixels[:, 1]
+    if np.median(np.abs(off_row)) > MAX_OFF_ROW_PX:
+        return np.full(len(pixels), np.inf)
+    return np.abs(error) * camera.focal_px[0]
+
+
+def _plane_errors(pixels: np.ndarray, disparity: np.ndarray) -> np.ndarray:
+    """Fit disparities linear in x and y robustly; (N,) what they leave unexplained, in pixels."""
+    design = np.column_stack([pixels / max(pixels.max(), 1), np.ones(len(pixels))])
+    plane = np.array([0, 0, np.median(disparity)])
+    for _ in range(ROBUST_ITERATIONS):
+        plane = plane + _robust_step(design, disparity - design @ plane, 1.0)
+    return np.abs(disparity - design @ plane)
+
+
+def _robust_step(design: np.ndarray, error: np.ndarray, pixel: float) -> np.ndarray:
+    """Return the change of parameters that lessens the sum of absolute errors (reweighting)."""
+    weight = 1 / np.sqrt(np.maximum(np.abs(error) * pixel, 0.02))
+    return np.linalg.lstsq(design * weight[:, None], error * weight, rcond=None)[0]

@@ -10,7 +10,7 @@ import numpy as np
 
 from .._shared.errors import ReconstructionError
 from .._shared.options import suggest_keywords
-from ..geometry.camera import Calibration, Camera
+from ..geometry.camera import Calibration
 from ..geometry.point_cloud import PointCloud
 from ..geometry.relative_pose import RelativePose
 from .rectification import Rectification
@@ -147,7 +147,7 @@ class Reconstruction:
             "disparity": None if disparity is None else _percentiles(disparity),
             "median_triangulation_angle_degrees": angle,
             "median_reprojection_error_px": error,
-            "pose": _pose_values(self.pose),
+            "pose": None if self.pose is None else _pose_values(self.pose),
             "calibration": _calibration_values(self.calibration),
             "seconds": {stage: round(value, 4) for stage, value in self.seconds.items()},
         }
@@ -168,9 +168,7 @@ class Reconstruction:
         return result
 
 
-def _pose_values(pose: RelativePose | None) -> dict[str, Any] | None:
-    if pose is None:
-        return None
+def _pose_values(pose: RelativePose) -> dict[str, Any]:
     return {
         "rotation": pose.rotation.tolist(),
         "translation": pose.translation.tolist(),
@@ -180,22 +178,19 @@ def _pose_values(pose: RelativePose | None) -> dict[str, Any] | None:
 
 
 def _calibration_values(calibration: Calibration) -> dict[str, Any]:
+    cameras = {
+        side: {
+            **dict(zip(("width", "height"), camera.size, strict=True)),
+            "focal_px": list(camera.focal_px),
+            **dict(zip(("cx", "cy"), camera.centre, strict=True)),
+        }
+        for side, camera in (("left", calibration.camera0), ("right", calibration.camera1))
+    }
     return {
         "source": calibration.source,
         "baseline_mm": calibration.baseline_mm,
         "disparity_offset_px": round(calibration.disparity_offset_px, 6),
-        "left": _camera_values(calibration.camera0),
-        "right": _camera_values(calibration.camera1),
-    }
-
-
-def _camera_values(camera: Camera) -> dict[str, Any]:
-    return {
-        "width": camera.size[0],
-        "height": camera.size[1],
-        "focal_px": list(camera.focal_px),
-        "cx": camera.centre[0],
-        "cy": camera.centre[1],
+        **cameras,
     }
 
 

@@ -4,16 +4,13 @@ Inverse compositional alignment (Baker and Matthews, "Lucas-Kanade 20 years on",
 and offset of the light taken out. The patch is rotated and sheared as its surroundings are: first
 as all matches together (a similarity), then as the refined matches around it (an affinity).
 
-Chosen by measurement (4679d01:benchmarks/two_view.py) against a parabola through the correlation
-of the same patches, rotated likewise, at the nearest whole pixels. Fraction of the matches of the
-Motorcycle pair within 0.25 / 0.5 px of the truth, of those that converge (88 %): 65 / 83 %
-(parabola 49 / 74 %; before, of all matches, 36 / 63 %); with its views rotated against each other
-by 14 degrees (84 %) 62 / 79 % (parabola 31 / 59 %; before 9 / 29 %).
+Of the matches of the Motorcycle pair that converge (88 %), 65 / 83 % are within 0.25 / 0.5 px of
+the truth (before 36 / 63 %, by a parabola through the correlation 49 / 74 %; its views rotated by
+14 degrees 62 / 79 %, before 9 / 29 %, parabola 31 / 59 %; 4679d01:benchmarks/two_view.py).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -60,52 +57,25 @@ MATCHES_OF_BAND = 500_000
 COARSE_STEP_PX = 2
 """Between the rows and columns of the matches that are aligned before the others."""
 
-
 CORNER_WINDOW_PX = 7
 """Side of the window whose gradients make a corner: about the patch that is aligned."""
 
 
-@dataclass(frozen=True, eq=False)
-class RefinedMatches:
-    """Matches to sub-pixel accuracy.
-
-    Attributes:
-        points1: (N, 2) float64 positions in the second image; as they were where the alignment
-            did not converge.
-        converged: (N,) bool.
-    """
-
-    points1: np.ndarray
-    converged: np.ndarray
-
-
 def refine_matches(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    points0: np.ndarray,
-    points1: np.ndarray,
-) -> RefinedMatches:
-    """Refine the second positions of matches.
+    gray0: np.ndarray, gray1: np.ndarray, points0: np.ndarray, points1: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Refine the second positions (N, 2) of matches of whole pixels, accurate to a pixel or two.
 
-    Args:
-        gray0, gray1: (H, W) uint8 luma.
-        points0: (N, 2) whole pixels of the first image.
-        points1: (N, 2) positions in the second, accurate to a pixel or two.
-
-    Returns:
-        The refined positions. Flat patches, those that extend over the border, those that move
-        too far, and those that remain too different have not converged. The result does not depend
-        on the number of threads.
-
-    Raises:
-        OptionError: a first position is not on a pixel of its image.
+    Returns (N, 2) float64 positions, and (N,) bool which converged: not flat patches, those that
+    extend over the border, move too far, or remain too different; they stay where they are. The
+    result does not depend on the number of threads.
 
     Example:
         >>> image = np.random.default_rng(0).integers(0, 256, (60, 60)).astype(np.uint8)
         >>> image = cv2.GaussianBlur(image, (0, 0), 2)
         >>> moved = cv2.warpAffine(image, np.float32([[1, 0, 0.4], [0, 1, 0]]), (60, 60))
         >>> point = np.array([[30, 30]])
-        >>> refine_matches(image, moved, point, point).points1.round(1).tolist()
+        >>> refine_matches(image, moved, point, point)[0].round(1).tolist()
         [[30.4, 30.0]]
     """
     pixels0 = np.rint(np.asarray(points0, np.float64)).reshape(-1, 2)
@@ -115,19 +85,18 @@ def refine_matches(
             "points0 must be whole pixels of the image: detect keypoints with subpixel=False"
         )
     pixels0 = pixels0.astype(np.int64)
-    start = np.ascontiguousarray(points1, np.float64).reshape(-1, 2)
+    start = np.array(points1, np.float64, order="C").reshape(-1, 2)
     known = np.asarray(np.isfinite(start).all(1))
     known[known] = ((start[known] >= 0) & (start[known] < gray1.shape[::-1])).all(1)
     if not known.all():
         found = refine_matches(gray0, gray1, pixels0[known], start[known])
-        result = RefinedMatches(start.copy(), known.copy())
-        result.points1[known], result.converged[known] = found.points1, found.converged
-        return result
+        start[known], known[known] = found
+        return start, known
     if not len(pixels0):
-        return RefinedMatches(start, known)
+        return start, known
     images = gray0.astype(np.float32), gray1.astype(np.float32)
     overall = similarity(pixels0, start)
-    result = RefinedMatches(start.copy(), np.zeros(len(start), bool))
+    refined, converged = start.copy(), np.zeros(len(start), bool)
     step = COARSE_STEP_PX if len(pixels0) > MIN_MATCHES_OF_LATTICE else 1
     # In bands of rows, for which the memory is small; neighbours beyond their edges are seen, too.
     rows = pixels0[:, 1]
@@ -138,9 +107,8 @@ def refine_matches(
         near = np.flatnonzero((rows >= top - reach) & (rows < bottom + reach))
         own = (rows[near] >= top) & (rows[near] < bottom)
         found = _refine_band(images, pixels0[near], start[near], own, overall, step)
-        result.points1[near[own]] = found.points1
-        result.converged[near[own]] = found.converged
-    return result
+        refined[near[own]], converged[near[own]] = found
+    return refined, converged
 
 
 def _refine_band(
@@ -150,29 +118,24 @@ def _refine_band(
     own: np.ndarray,
     overall: np.ndarray,
     step_px: int,
-) -> RefinedMatches:
+) -> tuple[np.ndarray, np.ndarray]:
     """Refine those of the matches, (N,) bool, that a band of the image owns."""
     # How patches are deformed can be seen on some of them, where they are many.
     some = np.flatnonzero((pixels0 % step_px == 0).all(axis=1))
     affinities = np.broadcast_to(overall, (len(some), 2, 2))
-    found = _align(images, pixels0[some], start[some], affinities, COARSE_CONVERGENCE_PX)
     start, converged = start.copy(), np.zeros(len(start), bool)
-    start[some], converged[some] = found.points1, found.converged
+    start[some], converged[some] = _align(
+        images, pixels0[some], start[some], affinities, COARSE_CONVERGENCE_PX
+    )
     shape = images[0].shape
     affinities = local_affinities(pixels0, start, converged, shape, overall)[own]
     return _align(images, pixels0[own], start[own], affinities, CONVERGENCE_PX)
 
 
 def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
-    """Choose points that can be aligned well, from all parts of an image.
+    """Choose whole pixels (N, 2) that can be aligned well; (M,) int64 rows of them, rising.
 
-    Args:
-        gray: (H, W) uint8 luma.
-        points: (N, 2) whole pixels of the image.
-        count: how many cells the image has; each gives its best corner (Shi and Tomasi, 1994).
-
-    Returns:
-        (M,) int64 rows of the points, rising.
+    Each of `count` cells of the image gives its best corner (Shi and Tomasi, 1994).
 
     Example:
         >>> square = np.zeros((60, 60), np.uint8)
@@ -209,17 +172,9 @@ def local_affinities(
     shape: tuple[int, ...],
     overall: np.ndarray,
 ) -> np.ndarray:
-    """Fit an affinity to the converged matches in the window around each.
+    """Fit an affinity to the converged matches in the window around each; (N, 2, 2) float32.
 
-    Args:
-        pixels0: (N, 2) whole pixels of the first image, each once.
-        points1: (N, 2) their matches.
-        converged: (N,) bool, those that count.
-        shape: (H, W) of the first image.
-        overall: (2, 2), what few or badly spread matches fall back on.
-
-    Returns:
-        (N, 2, 2) float32, derivatives of the second position by the first.
+    Few or badly spread matches fall back on `overall`. `shape` is (H, W) of the first image.
     """
     pixels0 = np.asarray(pixels0, np.int64)
     column, row = pixels0.T
@@ -254,7 +209,7 @@ def _align(
     start: np.ndarray,
     affinities: np.ndarray,
     convergence_px: float,
-) -> RefinedMatches:
+) -> tuple[np.ndarray, np.ndarray]:
     """Align the patches, each warped by its affinity, in threads."""
     from .subpixel_kernel import align
 
@@ -263,11 +218,7 @@ def _align(
     window, affinities = window.astype(np.float32), np.ascontiguousarray(affinities, np.float32)
     refined = np.empty((len(pixels0), 2))
     converged = np.empty(len(pixels0), bool)
-    correlation = np.empty(len(pixels0), np.float32)
-
     limits = MAX_ITERATIONS, convergence_px, MAX_SHIFT_PX, np.float32(MIN_CORRELATION)
-    written = refined, converged, correlation
-    parallel_for(
-        len(pixels0), align, *images, pixels0, start, affinities, window, *limits, *written
-    )
-    return RefinedMatches(refined, converged)
+    given = *images, pixels0, start, affinities, window, *limits
+    parallel_for(len(pixels0), align, *given, refined, converged)
+    return refined, converged

@@ -46,27 +46,12 @@ def align(  # type: ignore[no-untyped-def]
     least,
     refined,
     converged,
-    correlation,
 ):
-    """Refine the matches from `first` to before `last`.
+    """Refine the matches from row `first` to before `last`; `refined`, `converged` are written.
 
     Inverse compositional: the patch of the first image is the template, so that its derivatives
     and the matrix are made once; gain and offset are two more unknowns beside the shift.
-
-    Args:
-        first, last: rows of the matches.
-        image0, image1: (H, W) float32.
-        pixels0: (N, 2) int64 in the first image.
-        points1: (N, 2) float64 starting positions in the second.
-        affinities: (N, 2, 2) float32, the local affinity from the first to the second image.
-        window: (S, S) float32 weights of the patch.
-        iterations: at the most.
-        convergence: a smaller shift ends them, in pixels.
-        max_shift: from the start, in pixels.
-        least: correlation at the end.
-        refined: (N, 2) float64, written; as at the beginning where nothing converges.
-        converged: (N,) bool, written.
-        correlation: (N,) float32 weighted, of both patches at the end, written.
+    Arguments are those of `subpixel._align`; `least` is the correlation at the end.
     """
     side = window.shape[0]
     radius = side // 2
@@ -83,7 +68,7 @@ def align(  # type: ignore[no-untyped-def]
     for k in range(first, last):
         x0, y0 = pixels0[k, 0], pixels0[k, 1]
         refined[k, 0], refined[k, 1] = points1[k, 0], points1[k, 1]
-        converged[k], correlation[k] = False, 0
+        converged[k] = False
         if (
             x0 < radius + 1
             or y0 < radius + 1
@@ -160,7 +145,7 @@ def align(  # type: ignore[no-untyped-def]
                 ex += value * slope[0, j]
                 ey += value * slope[1, j]
             gain = ts / tt
-            correlation[k] = ts / np.sqrt(max(ss * tt, np.float32(1e-12)))
+            correlation = ts / np.sqrt(max(ss * tt, np.float32(1e-12)))
             if gain <= 0:
                 break
             # slope is across the template, so what is left of `seen` is the gain times the shift
@@ -172,7 +157,7 @@ def align(  # type: ignore[no-untyped-def]
             if not gone_x * gone_x + gone_y * gone_y <= max_shift * max_shift:
                 break
             if step_x * step_x + step_y * step_y < convergence * convergence:
-                if correlation[k] >= least:
+                if correlation >= least:
                     converged[k] = True
                     refined[k, 0], refined[k, 1] = x1, y1
                 break

@@ -1,26 +1,27 @@
 """Points from the matches of two calibrated images that need not be rectified.
 
-Sub-pixel matches -> relative pose -> triangulation -> checks -> points.
-
-Matches on whole pixels are all refined. Those of rectified rows are sub-pixel already, and more
-accurate along their epipolar lines than a small patch alone can say; but across them they are as
-the fundamental matrix that rectified the pair, and know no more of the pose. So the pose is that of
-a sample of corners, each refined by itself, and the points are those of the matches as they are.
+Sub-pixel matches -> relative pose -> triangulation -> points, and in between checks that say why
+there is no depth. The pose is that of matches that were refined: all those on whole pixels; of
+matches on rectified rows, which know no more of it than what rectified the pair, a sample of
+corners, while the points are those of the matches as they are.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from .._shared.errors import ReconstructionError
+from .._shared.errors import NoDepthError, ReconstructionError
 from .._shared.timing import StageTimer
+from ..features.matches import Matches
+from ..features.selection import grid_subsample
 from ..geometry import epipolar_errors
-from ..geometry.camera import Calibration
+from ..geometry.camera import Calibration, Camera
 from ..geometry.relative_pose import RelativePose, estimate_relative_pose
 from ..geometry.triangulation import fundamental_matrix, triangulate
-from .checks import check_focal, check_matches, check_pose
+from ..geometry.two_view import SCENE_THRESHOLDS_PX, Scene, classify_scene
 from .outliers import PointFilterOptions, disparity_space, sor_inliers
 from .subpixel import refine_matches, spread_corners
 
@@ -34,87 +35,67 @@ POSE_CELLS = 10_000
 """Of matches that are sub-pixel already, the best corner of each of this many cells is refined, for
 the pose."""
 
+GRID_SIZE_PX = 16
+"""Cells of the first image of this size give one match each: matches side by side are no
+independent evidence."""
 
-@dataclass(frozen=True, eq=False)
-class TwoViewReconstruction:
-    """Triangulated points of a pair.
+MAX_SCENE_DISTANCE_PX = SCENE_THRESHOLDS_PX["fundamental"]
+"""Within which a match agrees with a pose that is compared with the fundamental matrix."""
 
-    Attributes:
-        points: (N, 3) float32 in the frame of the left camera: x right, y down, z forward.
-        indices: (N,) int64, the match that each comes from, rising.
-        points1: (N, 2) float64 positions in the right image that the points were made from.
-        pose: of the right camera; its inliers and errors belong to `pose_indices`.
-        pose_indices: (P,) int64, the matches that the pose was estimated from: those that were
-            refined; or all.
-        reprojection_errors: (N,) float32 in pixels, root mean square of both images.
-        dropped: how many matches each check removed, in order.
-    """
+MIN_POSE_RATIO = 0.75
+"""Matches of the essential matrix per match of the fundamental matrix: with a correct calibration
+the first explains as much."""
 
-    points: np.ndarray
-    indices: np.ndarray
-    points1: np.ndarray
-    pose: RelativePose
-    pose_indices: np.ndarray
-    reprojection_errors: np.ndarray
-    dropped: dict[str, int]
+MIN_IN_FRONT_FRACTION = 0.75
+"""Of the inliers of a pose, in front of both cameras."""
+
+FOCAL_FACTORS = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0)
+"""Other focal lengths that are tried, in units of the given one."""
+
+MAX_FOCAL_ERROR_RATIO = 0.5
+"""Of the median error of another focal length to that of the given one, which is refused below it:
+a focal length that is off by a fifth passes."""
+
+GOOD_ERROR_PX = 0.1
+"""Median error at which no other focal length is tried."""
+
+NO_DEPTH = {
+    "static": "nothing moves between the images: they show the same view, depth needs two images "
+    "from two places",
+    "rotation": "a rotation of the camera explains all the matches and there is no depth: move it "
+    "sideways between the images",
+    "plane": "one homography explains all the matches: the images show a plane, or the camera only "
+    "rotated, and there is no depth",
+}
+"""What is said of the kinds of `Scene` without depth."""
 
 
 def reconstruct_two_view(
-    points0: np.ndarray,
-    points1: np.ndarray,
+    matches: Matches,
+    images: tuple[np.ndarray, np.ndarray],
     calibration: Calibration,
-    images: tuple[np.ndarray, np.ndarray] | None = None,
     point_filter: PointFilterOptions = PointFilterOptions(),
     seed: int = 0,
     timer: StageTimer | None = None,
-    refined: bool = False,
-) -> TwoViewReconstruction:
-    """Reconstruct the points of a pair.
+) -> dict[str, Any]:
+    """Reconstruct the points of a pair; return what `Reconstruction` says of them.
 
-    Args:
-        points0, points1: (M, 2) matched positions in the left and the right image. To be refined,
-            those of the left lie on whole pixels.
-        calibration: of both cameras.
-        images: (H, W) uint8 luma of both, for the refinement; None leaves that out.
-        point_filter: which points are kept.
-        seed: of all random choices.
-        timer: of the stages; None: a new one.
-        refined: whether the positions in the right image are sub-pixel already
-            (`Matches.subpixel`): then some are refined for the pose only.
-
-    Raises:
-        ReconstructionError: the pair gives no depth (`checks` says why), or no point is left.
-
-    Example:
-        >>> from deepdetect.geometry.camera import Camera
-        >>> camera = Camera((640, 480), 500.0)
-        >>> grid = np.stack(np.meshgrid(np.arange(0, 640, 16), np.arange(0, 480, 16)), -1)
-        >>> left = grid.reshape(-1, 2).astype(float)
-        >>> depth = 5 + np.sin(left[:, 0] / 40) + np.cos(left[:, 1] / 50)
-        >>> true = camera.rays(left) * depth[:, None]
-        >>> right = camera.project(true - [1, 0.1, 0])
-        >>> found = reconstruct_two_view(left, right, Calibration(camera, camera))
-        >>> points = found.points * np.hypot(1, 0.1)
-        >>> len(points) > 1000, bool(np.allclose(points, true[found.indices], rtol=1e-2))
-        (True, True)
+    Matches that are not sub-pixel are refined, from whole pixels of the left image; `images` are
+    (H, W) uint8 luma.
     """
     timer = StageTimer() if timer is None else timer
-    points0 = np.asarray(points0, np.float64).reshape(-1, 2)
-    points1 = np.asarray(points1, np.float64).reshape(-1, 2)
+    points0, points1 = matches.points0.astype(np.float64), matches.points1.astype(np.float64)
     indices = pose_indices = np.arange(len(points0))
-    pose_points1 = points1
     dropped: dict[str, int] = {}
-    if images is not None:
-        with timer.stage("sub-pixel"):
-            if refined:
-                pose_indices = spread_corners(images[0], points0, POSE_CELLS)
-            aligned = refine_matches(*images, points0[pose_indices], points1[pose_indices])
-        pose_indices = pose_indices[aligned.converged]
-        pose_points1 = aligned.points1[aligned.converged]
-        if not refined:
-            indices, points1 = pose_indices, aligned.points1
-            dropped["not refined"] = len(points0) - len(indices)
-    evident = points0[pose_indices], pose_points1
+    with timer.stage("sub-pixel"):
+        if matches.subpixel:
+            pose_indices = spread_corners(images[0], points0, POSE_CELLS)
+        aligned, converged = refine_matches(*images, points0[pose_indices], points1[pose_indices])
+    pose_indices = pose_indices[converged]
+    evident = points0[pose_indices], aligned[converged]
+    if not matches.subpixel:
+        indices, points1 = pose_indices, aligned
+        dropped["not refined"] = len(points0) - len(indices)
     with timer.stage("checks"):
         cells, scene = check_matches(*evident, calibration.camera1.size, calibration, seed)
     with timer.stage("pose"):
@@ -152,12 +133,117 @@ def reconstruct_two_view(
             f"none of the {len(points0):,} matches gives a point ({counts}): take "
             "images that overlap more, or check the calibration"
         )
-    return TwoViewReconstruction(
-        points=made.points[kept].astype(np.float32),
-        indices=indices[kept],
-        points1=points1[indices[kept]],
-        pose=pose,
-        pose_indices=pose_indices,
-        reprojection_errors=made.reprojection_errors[kept].astype(np.float32),
-        dropped=dropped,
+    return {
+        "points": made.points[kept].astype(np.float32),
+        "pixels": matches.points0[indices[kept]],
+        "disparity": None,
+        "matched": np.ones(np.count_nonzero(kept), bool),
+        "pose": pose,
+        "reprojection_errors": made.reprojection_errors[kept].astype(np.float32),
+        "keypoints": len(matches.keypoints0),
+        "matches": len(matches),
+        "dropped": dropped,
+    }
+
+
+def check_matches(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    size1: tuple[int, int],
+    calibration: Calibration | None = None,
+    seed: int = 0,
+) -> tuple[np.ndarray, Scene]:
+    """Refuse matches (M, 2) that show no overlap, no motion, or no depth.
+
+    Returns the (K,) rows of those that were used, one per cell, and what these show. A calibration
+    distinguishes a rotating camera from a plane.
+    """
+    indices = grid_subsample(points0, GRID_SIZE_PX, seed)
+    scene = classify_scene(points0[indices], points1[indices], size1, calibration, seed)
+    if not len(points0):
+        raise NoDepthError(
+            "there are no matches: the images do not overlap, or do not show the same scene, "
+            "or no pixel of one is above the threshold (lower `threshold`, or give `density`)"
+        )
+    if scene.kind == "unrelated":
+        raise NoDepthError(
+            f"too few of the {len(points0):,} matches agree with one geometry: the images do not "
+            "overlap, or do not show the same scene"
+        )
+    if scene.kind != "depth":
+        raise NoDepthError(NO_DEPTH[scene.kind])
+    return indices, scene
+
+
+def check_pose(
+    pose: RelativePose | None, indices: np.ndarray, scene: Scene, calibration: Calibration
+) -> RelativePose:
+    """Refuse a pose that explains far less than is possible: the calibration is wrong.
+
+    The pose is that of all matches; `indices` and `scene` are those of `check_matches`.
+    """
+    wrong_focal = _wrong_focal(calibration)
+    if pose is None:
+        raise ReconstructionError(f"no pose of the cameras fits the matches: {wrong_focal}")
+    possible = np.count_nonzero(scene.epipolar.inliers)
+    explained = np.count_nonzero(pose.errors[indices] < MAX_SCENE_DISTANCE_PX)
+    if explained < MIN_POSE_RATIO * possible:
+        raise ReconstructionError(
+            f"with this calibration only {explained:,} of {possible:,} matches fit one pose of "
+            f"the cameras: {wrong_focal}"
+        )
+    if pose.cheirality_ratio < MIN_IN_FRONT_FRACTION:
+        raise ReconstructionError(
+            f"only {pose.cheirality_ratio:.0%} of the points would lie in front of both cameras: "
+            f"{wrong_focal}"
+        )
+    return pose
+
+
+def check_focal(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    errors: np.ndarray,
+    calibration: Calibration,
+    seed: int = 0,
+) -> None:
+    """Refuse a focal length when quite another one fits the matches far better; it is named.
+
+    Where the camera only moved sideways every focal length fits as well, and a wrong one is not
+    noticed: it gives a scene that is stretched in depth. `errors` are (M,) Sampson distances of the
+    pose from matches that a fundamental matrix explains.
+    """
+    given = float(np.median(errors))
+    if given < GOOD_ERROR_PX:
+        return
+    best, best_factor = MAX_FOCAL_ERROR_RATIO * given, 1.0
+    for factor in FOCAL_FACTORS:
+        scaled = replace(
+            calibration,
+            camera0=_with_focal(calibration.camera0, factor),
+            camera1=_with_focal(calibration.camera1, factor),
+        )
+        found = estimate_relative_pose(points0, points1, scaled, MAX_SCENE_DISTANCE_PX, seed)
+        if found is None or found.cheirality_ratio < MIN_IN_FRONT_FRACTION:
+            continue
+        error = float(np.median(found.errors))
+        if error < best:
+            best, best_factor = error, factor
+    if best_factor != 1:
+        focal = calibration.camera0.focal_px[0]
+        raise ReconstructionError(
+            f"{_wrong_focal(calibration)}: one of about {focal * best_factor:.0f} px fits the "
+            f"matches {given / best:.1f} times as well"
+        )
+
+
+def _wrong_focal(calibration: Calibration) -> str:
+    return (
+        f"the focal length of {calibration.camera0.focal_px[0]:.0f} px ({calibration.source}) is "
+        "probably wrong for these images"
     )
+
+
+def _with_focal(camera: Camera, factor: float) -> Camera:
+    fx, fy = camera.focal_px
+    return replace(camera, focal_px=(fx * factor, fy * factor))
