@@ -28,7 +28,7 @@ from deepdetect.evaluation.report import Column, Report, Section, Table
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.geometry import GeometryOptions, estimate_geometry, transform_points
 from deepdetect.geometry.homography_refinement import refine_homography
-from deepdetect.geometry.zncc import (
+from deepdetect.geometry.images import (
     BLUR_SIGMA_PX,
     WINDOW_PX,
     erode_mask,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from deepdetect import Calibration, Camera
-from deepdetect.geometry.triangulation import triangulate
+from deepdetect.geometry.relative_pose import triangulate
 from deepdetect.sfm.colmap import PIXEL_CENTRE, import_pycolmap, quiet_pycolmap
 from deepdetect.tracking import TrackedFrame
 

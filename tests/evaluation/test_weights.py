@@ -22,7 +22,7 @@ from deepdetect.evaluation.protocols.masks import (
 from deepdetect.evaluation.protocols.paper import OXFORD_PAIRS, mean_correct_matches
 from deepdetect.evaluation.run import Run
 from deepdetect.evaluation.weights import _of_paper, evaluate, evaluate_oxford
-from deepdetect.geometry.residuals import transfer_errors
+from deepdetect.geometry.transforms import transfer_errors
 from deepdetect.io.image import luma
 from deepdetect.labels import fuse
 from deepdetect.matching.options import PUBLISHED_MATCHING

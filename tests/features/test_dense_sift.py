@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from deepdetect import OptionError
 from deepdetect._shared import parallel
-from deepdetect.features.dense_sift import dense_sift
-from deepdetect.features.sift import opencv_sift_descriptors, to_root_sift
+from deepdetect.features.sift import dense_sift, opencv_sift_descriptors, to_root_sift
 from deepdetect.io.image import luma
 
 

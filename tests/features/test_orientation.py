@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deepdetect.features.keypoints import Keypoints
-from deepdetect.features.orientation import dominant_angles
+from deepdetect.features.scale_space import dominant_angles
 from deepdetect.io.image import luma
 
 

@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from deepdetect.features.dense_sift import dense_sift
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.features.scale_space import nearest_layers
 from deepdetect.features.sift import (
     DESCRIPTORS,
     correlation_distance,
+    dense_sift,
     opencv_sift_descriptors,
     root_sift_descriptors,
     scaled_sift_descriptors,

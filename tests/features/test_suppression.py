@@ -3,8 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deepdetect.features import suppression
-from deepdetect.features.suppression import suppress_neighbors
+from deepdetect.features.selection import suppress_neighbors
 
 
 @pytest.mark.parametrize("radius", [0.7, 2.0, 5.0])
@@ -32,17 +31,3 @@ def test_of_two_radii_the_smaller_one_counts(seed: int) -> None:
         if (gaps >= np.minimum(radii[kept], radii[row])).all():
             kept.append(int(row))
     assert suppress_neighbors(xy, scores, radii).tolist() == kept
-
-
-@pytest.mark.parametrize("radius", [0.7, 3.0, "own"])
-def test_compiled_and_not_are_the_same(
-    radius: float | str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    generator = np.random.default_rng(0)
-    xy, scores = generator.uniform(-3, 99, (3000, 2)), generator.integers(500, size=3000)
-    radii = generator.choice([2.0, 2.7, 3.7, 9.1], 3000) if radius == "own" else radius
-    found = []
-    for least in (0, 10**9):
-        monkeypatch.setattr(suppression, "MIN_COMPILED_POINTS", least)
-        found.append(suppress_neighbors(xy, scores, radii).tolist())
-    assert found[0] == found[1]

@@ -13,7 +13,7 @@ from deepdetect.geometry import (
     estimate_geometry,
     transfer_errors,
 )
-from deepdetect.geometry.acontrario import MAX_LOG10_NFA, MINIMAL_SAMPLE_SIZE, log10_nfa
+from deepdetect.geometry.estimation import MAX_LOG10_NFA, MINIMAL_SAMPLE_SIZE, log10_nfa
 
 SIZE = (640, 480)
 KINDS = sorted(MINIMAL_SAMPLE_SIZE)

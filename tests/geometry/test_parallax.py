@@ -5,7 +5,7 @@ import pytest
 
 from deepdetect import estimate_geometry
 from deepdetect.geometry import GeometryOptions
-from deepdetect.geometry.parallax import measure_parallax
+from deepdetect.geometry.estimation import measure_parallax
 
 CAMERA = np.array([[600, 0, 320], [0, 600, 240], [0, 0, 1]], float)
 PLANE = np.array([[0.9, 0.12, 20.0], [-0.1, 0.95, 30.0], [1e-4, 5e-5, 1.0]])

@@ -4,12 +4,8 @@ import numpy as np
 import pytest
 
 from deepdetect.geometry import epipolar_errors, transform_points
-from deepdetect.geometry.rescaling import (
-    downscale,
-    scaled_fundamental,
-    scaled_homography,
-    scaled_points,
-)
+from deepdetect.geometry.images import downscale
+from deepdetect.geometry.transforms import scaled_fundamental, scaled_homography, scaled_points
 
 MILD = np.array([[0.9, -0.12, 25.0], [0.15, 0.95, -8.0], [2e-4, -1e-4, 1.0]])
 

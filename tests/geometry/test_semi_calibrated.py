@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from deepdetect.geometry import GeometryOptions, epipolar_errors, estimate_geometry
-from deepdetect.geometry.acontrario import MAX_LOG10_NFA, log10_nfa
-from deepdetect.geometry.camera import Calibration, Camera
+from deepdetect.geometry.camera import Calibration, Camera, fundamental_matrix
+from deepdetect.geometry.estimation import MAX_LOG10_NFA, log10_nfa
 from deepdetect.geometry.semi_calibrated import estimate_semi_calibrated, refine_fundamental
-from deepdetect.geometry.triangulation import fundamental_matrix
 
 SIZE = (1200, 800)
 SIZES = (SIZE, SIZE)

@@ -6,13 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect.geometry import epipolar_errors, triangulation
-from deepdetect.geometry.camera import Calibration, Camera
-from deepdetect.geometry.triangulation import (
-    correct_matches,
-    fundamental_matrix,
-    triangulate,
-)
+from deepdetect.geometry import epipolar_errors, relative_pose
+from deepdetect.geometry.camera import Calibration, Camera, fundamental_matrix
+from deepdetect.geometry.relative_pose import correct_matches, triangulate
 
 CAMERA0 = Camera((640, 480), (600, 610), (310, 250))
 CAMERA1 = Camera((800, 600), (700, 690), (420, 290))
@@ -134,7 +130,7 @@ def test_blocks_give_what_all_at_once_gives(monkeypatch: pytest.MonkeyPatch) -> 
     points0 = np.random.default_rng(0).uniform(0, 480, (100, 2))
     points1 = points0 - [[20, 3]]
     whole = triangulate(points0, points1, calibration, *pose)
-    monkeypatch.setattr(triangulation, "BLOCK", 7)
+    monkeypatch.setattr(relative_pose, "BLOCK", 7)
     parts = triangulate(points0, points1, calibration, *pose)
     for name, values in vars(whole).items():
         np.testing.assert_array_equal(getattr(parts, name), values)

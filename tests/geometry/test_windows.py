@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deepdetect.geometry.windows import gaussian_means, window_sums
+from deepdetect.geometry.images import gaussian_means, window_sums
 
 
 @pytest.mark.parametrize("window", [1, 3, 9])

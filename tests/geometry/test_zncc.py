@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import shift as shifted
 
-from deepdetect.geometry.zncc import (
+from deepdetect.geometry.images import (
     erode_mask,
     gaussian_blur,
     local_zncc,

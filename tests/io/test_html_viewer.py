@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect.geometry.camera import Camera
+from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.geometry.point_cloud import PointCloud
-from deepdetect.geometry.posed_view import PosedView
 from deepdetect.io.html_viewer import (
     page_points,
     write_html_page,

@@ -17,7 +17,7 @@ from deepdetect._shared.errors import DeepDetectError, ReconstructionError
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift import detect_sift
 from deepdetect.geometry.camera import Calibration, calibration_from_focal
-from deepdetect.geometry.parallax import TwoViewModel
+from deepdetect.geometry.estimation import TwoViewModel
 from deepdetect.geometry.relative_pose import estimate_relative_pose
 from deepdetect.geometry.two_view import fit_model, has_foreground, is_planar
 from deepdetect.io.image import load_image, luma

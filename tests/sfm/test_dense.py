@@ -7,8 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from deepdetect.geometry.camera import Camera
-from deepdetect.geometry.posed_view import PosedView
+from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.sfm import dense
 from deepdetect.sfm.dense import find_references, limited_view
 from deepdetect.sfm.intrinsics import CameraIntrinsics

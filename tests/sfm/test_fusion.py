@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deepdetect.geometry.camera import Camera
-from deepdetect.geometry.posed_view import PosedView
+from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.sfm import fusion
 from deepdetect.sfm.fusion import DensePoints, fuse_matches, merge_dense_points
 

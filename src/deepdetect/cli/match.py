@@ -13,7 +13,7 @@ from .._shared.errors import OptionError
 from .._shared.progress import stage_progress
 from .._shared.records import Outputs
 from ..detector.detector import DeepDetect
-from ..features.matchers.matching import MATCHERS
+from ..features.matchers import MATCHERS
 from ..features.matches import Matches
 from ..features.sift import DESCRIPTORS
 from ..geometry import GeometryOptions

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from ..batch.pair_matching import PairMatchingOptions, match_pairs
-from ..features.matchers.matching import MATCHERS
+from ..features.matchers import MATCHERS
 from . import _options as cli
 
 MATCHING = cli.From(

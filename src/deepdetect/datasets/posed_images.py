@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from .._shared.errors import ImageError
-from ..geometry.triangulation import cross_matrix
+from ..geometry.camera import cross_matrix
 from ..io.image import load_image
 from ..io.image_file import open_image
 from .pair_selection import FRAME_DISTANCES, sequence_pairs, unordered_pairs

@@ -12,6 +12,10 @@ from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .keypoints import Keypoints, bayer_order
 
+GRID_CELLS = 24
+"""Along the longer side of the image; each cell gives its strongest keypoints in turn, so that all
+parts of the image have some."""
+
 MAX_OFFSET_PX = 0.499
 """The nearest pixel of a refined keypoint is still the one that it was found at."""
 
@@ -377,3 +381,107 @@ def grid_subsample(xy: np.ndarray, grid_size_px: int, seed: int = 0) -> np.ndarr
     order = np.random.default_rng(seed).permutation(len(cell))
     _, first = np.unique(cell[order], axis=0, return_index=True)
     return np.sort(order[first])
+
+
+DISTANCE_STEP_PX = 0.25
+"""To which the distance of `spread_by_distance` is found."""
+
+
+def spread_over_grid(
+    xy: np.ndarray,
+    scores: np.ndarray,
+    image_size: tuple[int, int],
+    max_keypoints: int,
+    grid_cells: int = GRID_CELLS,
+) -> np.ndarray:
+    """Choose keypoints by score, in turn from all cells of a grid.
+
+    Args:
+        xy: (N, 2) positions.
+        scores: (N,), the higher the better.
+        image_size: (width, height) of the image.
+        max_keypoints: how many to choose.
+        grid_cells: along the longer side.
+
+    Returns:
+        (M,) rows, M <= `max_keypoints`: first the best of each cell, then the second-best, ...
+
+    Example:
+        >>> xy = np.array([[1, 1], [2, 1], [99, 99]])
+        >>> spread_over_grid(xy, np.array([3.0, 2.0, 1.0]), (100, 100), 2).tolist()
+        [0, 2]
+    """
+    side = max(image_size) / grid_cells
+    cell = np.floor(np.maximum(xy, 0) / side).astype(np.int64)
+    cell = cell[:, 1] * (grid_cells + 1) + cell[:, 0]
+    order = np.lexsort((-scores, cell))
+    first = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    begins = np.repeat(first, np.diff(first, append=len(order)))
+    rank = np.arange(len(order)) - begins
+    return order[np.lexsort((-scores[order], rank))][:max_keypoints]
+
+
+def suppress_neighbors(
+    xy: np.ndarray, scores: np.ndarray, radius_px: float | np.ndarray
+) -> np.ndarray:
+    """Go through points from the best to the worst; keep those that are not near a kept one.
+
+    Args:
+        xy: (N, 2) positions.
+        scores: (N,), the higher the better; of equal scores the first row comes first.
+        radius_px: near is strictly closer; (N,) radii: than the smaller one of both points.
+
+    Returns:
+        (K,) rows that are kept, best first.
+
+    Example:
+        >>> xy = np.array([[0.0, 0], [1, 0], [2, 0], [9, 9]])
+        >>> suppress_neighbors(xy, np.array([1.0, 2, 3, 0]), 2).tolist()
+        [2, 0, 3]
+    """
+    from .kernels import keep_distant
+
+    order = np.argsort(-np.asarray(scores), kind="stable")
+    if not len(order):
+        return order
+    places = np.asarray(xy, np.float64).reshape(-1, 2)[order]
+    places = places - places.min(0)
+    radii = np.broadcast_to(np.asarray(radius_px, np.float64), len(order))[order]
+    cell = float(radii.min())
+    columns, rows = (int(side) + 1 for side in places.max(0) / cell)
+    x, y = (np.ascontiguousarray(axis) for axis in places.T)
+    kept: np.ndarray = keep_distant(x, y, radii, cell, columns, rows)
+    return order[kept]
+
+
+def spread_by_distance(xy: np.ndarray, scores: np.ndarray, count: int) -> np.ndarray:
+    """Choose the best points that are as far from each other as their number allows.
+
+    Adaptive non-maximal suppression (Brown, Szeliski and Winder, 2005), by bisection of the
+    distance (Bailo et al., 2018).
+
+    Args:
+        xy: (N, 2) positions.
+        scores: (N,), the higher the better.
+        count: how many to choose.
+
+    Returns:
+        (min(N, count),) rows, best first.
+
+    Example:
+        >>> xy = np.array([[0.0, 0], [1, 0], [9, 0]])
+        >>> spread_by_distance(xy, np.array([3.0, 2, 1]), 2).tolist()
+        [0, 2]
+    """
+    best = np.argsort(-np.asarray(scores), kind="stable")
+    if count >= len(best):
+        return best
+    near, far = 0.0, float(np.linalg.norm(np.ptp(np.asarray(xy, np.float64), axis=0))) + 1
+    while far - near > DISTANCE_STEP_PX:
+        middle = (near + far) / 2
+        kept = suppress_neighbors(xy, scores, middle)
+        if len(kept) >= count:
+            near, best = middle, kept
+        else:
+            far = middle
+    return best[:count]

@@ -15,10 +15,120 @@ from .._shared.errors import OptionError
 from .._shared.opencv import cv2
 from .._shared.parallel import parallel_for
 from .._shared.registry import look_up
-from .dense_sift import MAX_SIZE_PX, MIN_SIZE_PX, dense_sift
 from .keypoints import UNSET_ANGLE, Keypoints, on_pixels
-from .orientation import dominant_angles
-from .scale_space import LAYERS, nearest_layers
+from .scale_space import LAYERS, dominant_angles, nearest_layers
+from .selection import spread_over_grid
+
+MIN_SIZE_PX = 2.0
+MAX_SIZE_PX = 8.0
+"""Diameter of a keypoint."""
+
+SIGMA_PX = 1.6
+CAMERA_SIGMA_PX = 0.5
+"""Blur of SIFT's first image, and the blur that an image is assumed to have already."""
+
+BIN_WIDTH = 1.5
+"""Width of a spatial bin in units of the keypoint's size (3 times its radius)."""
+
+
+def dense_sift(
+    gray: np.ndarray,
+    xy: np.ndarray,
+    size: float = 3.0,
+    step_px: int = 1,
+    gradient: tuple[np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray:
+    """Compute upright SIFT descriptors; they equal OpenCV's at angle 0.
+
+    Args:
+        gray: (H, W) uint8 luma.
+        xy: (N, 2) positions on whole pixels within the image.
+        size: diameter of the keypoints in pixels, in [2, 8].
+        step_px: the positions lie on every so many-th row and column, which saves time.
+        gradient: of the image, where `sift_gradient` has computed it already.
+
+    Returns:
+        (N, 128) uint8: four rows of four columns of eight orientations.
+
+    Raises:
+        MissingExtraError: numba is not installed.
+        OptionError: a position is not on a pixel of the image, or the size is out of its range, or
+            the positions are not so many rows or columns apart.
+
+    Example:
+        >>> gray = np.random.default_rng(0).integers(0, 256, (40, 40)).astype(np.uint8)
+        >>> dense_sift(gray, np.array([[20, 20], [21, 20]])).shape
+        (2, 128)
+    """
+    if not MIN_SIZE_PX <= size <= MAX_SIZE_PX:
+        raise OptionError(
+            f"the keypoint size must lie in [{MIN_SIZE_PX:g}, {MAX_SIZE_PX:g}], not {size}"
+        )
+    if not on_pixels(xy, gray.shape):
+        raise OptionError("dense SIFT needs keypoints on whole pixels within the image")
+    from .kernels import TILE_COLUMNS, TILE_HEIGHT, describe_tiles
+
+    if not len(xy):
+        return np.empty((0, 128), np.uint8)
+    pixels = np.asarray(xy).astype(np.int64)
+    origin = pixels.min(axis=0)
+    if ((pixels - origin) % step_px).any():
+        raise OptionError(f"the keypoints do not lie on every {step_px}th row and column")
+    column, row = ((pixels - origin) // step_px).T
+    rows_of = np.full((row.max() + 1, column.max() + 1), -1, np.int32)
+    rows_of[row, column] = np.arange(len(pixels))
+    out = np.empty((len(pixels), 128), np.uint8)
+    tiles = -(-len(rows_of) // max(1, TILE_HEIGHT // step_px)) * -(
+        -rows_of.shape[1] // TILE_COLUMNS
+    )
+    gradient = sift_gradient(gray) if gradient is None else gradient
+    arguments = (*gradient, rows_of, origin, step_px, *_taps(size))
+    parallel_for(tiles, describe_tiles, *arguments, out)
+    described = rows_of[row, column]
+    return out if (described == np.arange(len(out))).all() else out[described]
+
+
+def sift_gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Compute the gradient of an image that `dense_sift` describes.
+
+    Args:
+        gray: (H, W) uint8 luma.
+
+    Returns:
+        Its magnitude, 0 on the border, and its orientation in units of 45 degrees, both (H, W)
+        float32.
+    """
+    blur = float(np.sqrt(SIGMA_PX**2 - CAMERA_SIGMA_PX**2))
+    smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), blur)
+    across, up = np.zeros_like(smooth), np.zeros_like(smooth)
+    across[:, 1:-1] = smooth[:, 2:] - smooth[:, :-2]
+    up[1:-1] = smooth[:-2] - smooth[2:]
+    magnitude, degrees = cv2.cartToPolar(across, up, angleInDegrees=True)
+    return magnitude, degrees * np.float32(8 / 360)
+
+
+def _taps(size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weights of the pixels around a keypoint, and where they are not 0.
+
+    Returns:
+        (4, T) float32 weights for the four spatial bins, and (4, 3) int64 spans, as of
+        `describe_tiles`.
+    """
+    from .kernels import TAPS_AT_ONCE
+
+    width = BIN_WIDTH * size
+    reach = int(np.ceil(2.5 * width)) - 1  # bins overlap: half of one beyond four
+    offsets = np.arange(-reach, reach + 1) / width
+    bins = np.arange(4)[:, None] - 1.5
+    bilinear = np.maximum(0, 1 - np.abs(offsets - bins))
+    weights = (bilinear * np.exp(-(offsets**2) / 8)).astype(np.float32)
+    spans = []
+    for row in weights:
+        first, last = np.flatnonzero(row)[[0, -1]]
+        groups = -(-(last + 1 - first) // TAPS_AT_ONCE)
+        spans.append([first, first + groups * TAPS_AT_ONCE, len(offsets)])
+    return np.pad(weights, ((0, 0), (0, TAPS_AT_ONCE))), np.array(spans)
+
 
 ROOT_SIFT = "rootsift"
 """`Keypoints.descriptor_type` of RootSIFT."""
@@ -29,10 +139,6 @@ compared after multiplication by the number of layers."""
 
 MIN_KEYPOINTS = 1000
 """With fewer the next lower contrast threshold is tried."""
-
-GRID_CELLS = 24
-"""Along the longer side of the image; each cell gives its strongest keypoints in turn, so that all
-parts of the image have some."""
 
 MIN_DENSE_DENSITY = 0.02
 """Keypoints per pixel from which all at once (`dense_sift`) is faster than one by one."""
@@ -296,37 +402,3 @@ def detect_sift(gray: np.ndarray, max_keypoints: int = 4000) -> Keypoints:
     found = Keypoints.from_opencv(kept, size)
     root = to_root_sift(descriptors.astype(np.uint8))
     return replace(found, descriptors=root, descriptor_type=ROOT_SIFT)
-
-
-def spread_over_grid(
-    xy: np.ndarray,
-    scores: np.ndarray,
-    image_size: tuple[int, int],
-    max_keypoints: int,
-    grid_cells: int = GRID_CELLS,
-) -> np.ndarray:
-    """Choose keypoints by score, in turn from all cells of a grid.
-
-    Args:
-        xy: (N, 2) positions.
-        scores: (N,), the higher the better.
-        image_size: (width, height) of the image.
-        max_keypoints: how many to choose.
-        grid_cells: along the longer side.
-
-    Returns:
-        (M,) rows, M <= `max_keypoints`: first the best of each cell, then the second-best, ...
-
-    Example:
-        >>> xy = np.array([[1, 1], [2, 1], [99, 99]])
-        >>> spread_over_grid(xy, np.array([3.0, 2.0, 1.0]), (100, 100), 2).tolist()
-        [0, 2]
-    """
-    side = max(image_size) / grid_cells
-    cell = np.floor(np.maximum(xy, 0) / side).astype(np.int64)
-    cell = cell[:, 1] * (grid_cells + 1) + cell[:, 0]
-    order = np.lexsort((-scores, cell))
-    first = np.flatnonzero(np.diff(cell[order], prepend=-1))
-    begins = np.repeat(first, np.diff(first, append=len(order)))
-    rank = np.arange(len(order)) - begins
-    return order[np.lexsort((-scores[order], rank))][:max_keypoints]

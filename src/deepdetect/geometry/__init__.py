@@ -1,7 +1,7 @@
 """Geometry of one and two views: models, residuals, cameras, refinement, triangulation."""
 
 from .estimation import Geometry, GeometryOptions, estimate_geometry
-from .residuals import disparity_errors, epipolar_errors, transfer_errors, transform_points
+from .transforms import disparity_errors, epipolar_errors, transfer_errors, transform_points
 
 __all__ = [
     "Geometry",

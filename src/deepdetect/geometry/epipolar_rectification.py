@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .._shared.opencv import cv2
-from .residuals import transform_points
+from .transforms import transform_points
 
 Size = tuple[int, int]
 

@@ -17,18 +17,19 @@ from functools import partial
 import numpy as np
 
 from .._shared.opencv import cv2
-from .optical_flow import equalise, track_round_trip
-from .rescaling import downscale, scaled_homography
-from .residuals import transform_points
-from .zncc import (
+from .images import (
     BLUR_SIGMA_PX,
     WINDOW_PX,
+    downscale,
+    equalise,
     erode_mask,
     gaussian_blur,
     local_zncc,
     normalise_local_contrast,
+    track_round_trip,
     warp_to_reference,
 )
+from .transforms import scaled_homography, transform_points
 
 TRACKING_ROUNDS = ((31, 1500, 3), (15, 3000, 1))
 """Side of the tracked windows in pixels, corners, and levels of the pyramid, for each round. The

@@ -20,12 +20,10 @@ from functools import cached_property
 import numpy as np
 
 from .._shared.opencv import cv2
-from .acontrario import log10_nfa
-from .camera import Calibration, Camera
-from .parallax import TwoViewModel
+from .camera import Calibration, Camera, cross_matrix
+from .estimation import TwoViewModel, log10_nfa
 from .relative_pose import best_of_four, moved_pose
-from .residuals import epipolar_errors, signed_epipolar_errors
-from .triangulation import cross_matrix
+from .transforms import epipolar_errors, signed_epipolar_errors
 
 Size = tuple[int, int]
 

@@ -12,12 +12,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .acontrario import MAX_LOG10_NFA, log10_nfa
 from .camera import Calibration
-from .estimation import GeometryOptions, estimate_geometry
-from .parallax import MIN_FRACTION_OF_PLANE, TwoViewModel, measure_parallax
-from .residuals import transfer_errors
+from .estimation import (
+    MAX_LOG10_NFA,
+    MIN_FRACTION_OF_PLANE,
+    GeometryOptions,
+    TwoViewModel,
+    estimate_geometry,
+    log10_nfa,
+    measure_parallax,
+)
 from .semi_calibrated import estimate_semi_calibrated
+from .transforms import transfer_errors
 
 Size = tuple[int, int]
 

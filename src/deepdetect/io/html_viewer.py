@@ -17,8 +17,8 @@ from pathlib import Path
 
 import numpy as np
 
+from ..geometry.camera import PosedView
 from ..geometry.point_cloud import PointCloud, angular_spacing, robust_box
-from ..geometry.posed_view import PosedView
 
 DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
 """Tangent of half the field of view, and its range."""

@@ -21,7 +21,7 @@ from ..features.matches import Matches, TwoViewGeometry, lazy
 from ..features.selection import SelectionOptions
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
-from ..geometry.residuals import epipolar_errors, transfer_errors
+from ..geometry.transforms import epipolar_errors, transfer_errors
 from ..io.image import load_image, luma
 from .guided import GuidedMatches, TentativeMatches, guided_matches, guiding_geometry
 from .options import MatchingOptions

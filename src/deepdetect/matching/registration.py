@@ -15,8 +15,8 @@ from .._shared.options import suggest_keywords
 from ..detector.detector import AnyDetector
 from ..detector.image_lists import Images
 from ..features.selection import SelectionOptions
-from ..geometry.rescaling import downscale, scaled_homography
-from ..geometry.zncc import median_local_zncc, warp_to_reference
+from ..geometry.images import downscale, median_local_zncc, warp_to_reference
+from ..geometry.transforms import scaled_homography
 from .pipeline import LoadedPair, match_pair
 
 SQUARES = 8

@@ -17,7 +17,7 @@ import numpy as np
 
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
-from ..geometry.windows import window_sums
+from ..geometry.images import window_sums
 
 FLANN_INDEX_KDTREE_SINGLE = 4
 """FLANN's number of the kd-tree that is exact in few dimensions."""

@@ -18,7 +18,7 @@ import numpy as np
 from .._shared.errors import OptionError
 from .._shared.opencv import cv2
 from .._shared.parallel import parallel_for
-from ..geometry.windows import window_sums
+from ..geometry.images import window_sums
 
 PATCH_RADIUS_PX = 4
 """The patch has 2 radius + 1 pixels a side."""

@@ -18,9 +18,8 @@ from .._shared.timing import StageTimer
 from ..features.matches import Matches
 from ..features.selection import grid_subsample
 from ..geometry import epipolar_errors
-from ..geometry.camera import Calibration, Camera
-from ..geometry.relative_pose import RelativePose, estimate_relative_pose
-from ..geometry.triangulation import fundamental_matrix, triangulate
+from ..geometry.camera import Calibration, Camera, fundamental_matrix
+from ..geometry.relative_pose import RelativePose, estimate_relative_pose, triangulate
 from ..geometry.two_view import SCENE_THRESHOLDS_PX, Scene, classify_scene
 from .outliers import PointFilterOptions, disparity_space, sor_inliers
 from .subpixel import refine_matches, spread_corners

@@ -14,8 +14,7 @@ import numpy as np
 
 from .._shared.opencv import cv2
 from .._shared.records import file_state
-from ..geometry.camera import Camera
-from ..geometry.posed_view import PosedView, relative_fundamental
+from ..geometry.camera import Camera, PosedView, relative_fundamental
 from ..io.image import load_image, luma
 from ..matching.guided.rectified import match_by_rectification
 from .fusion import MIN_VIEWS, DensePoints, angles_between, fuse_matches

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..geometry.posed_view import PosedView
+from ..geometry.camera import PosedView
 
 BLOCK = 50_000
 """Pixels that are triangulated at once, which bounds the memory."""

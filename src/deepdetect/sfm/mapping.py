@@ -16,7 +16,7 @@ import numpy as np
 
 from .._shared.errors import NoDepthError
 from ..batch.pair_list import Pair
-from ..geometry.posed_view import PosedView
+from ..geometry.camera import PosedView
 from .colmap import PIXEL_CENTRE, quiet_pycolmap
 from .intrinsics import CameraIntrinsics
 from .pair_selection import largest_component

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from .._shared.options import suggest_keywords
+from ..geometry.camera import PosedView
 from ..geometry.point_cloud import PointCloud
-from ..geometry.posed_view import PosedView
 from .intrinsics import CameraIntrinsics
 
 SCALE = "lengths are in spacings, the median distance from a camera to the nearest other one: the \

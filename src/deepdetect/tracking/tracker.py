@@ -18,7 +18,7 @@ from .._shared.image_array import Channels
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from ..features.keypoints import Keypoints
-from ..geometry.optical_flow import track_round_trip
+from ..geometry.images import track_round_trip
 from ..io.image import load_image, luma
 from .tracks import TrackedFrame
 

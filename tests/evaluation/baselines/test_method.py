@@ -19,7 +19,7 @@ from deepdetect.evaluation.baselines.method import (
 )
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.features.keypoints import Keypoints
-from deepdetect.features.orientation import dominant_angles
+from deepdetect.features.scale_space import dominant_angles
 from deepdetect.features.sift import (
     root_sift_descriptors,
     scaled_sift_descriptors,

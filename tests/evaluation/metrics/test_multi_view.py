@@ -8,8 +8,7 @@ from deepdetect.evaluation.metrics.multi_view import (
     camera_errors,
     relative_pose_errors,
 )
-from deepdetect.geometry.camera import Camera
-from deepdetect.geometry.posed_view import PosedView
+from deepdetect.geometry.camera import Camera, PosedView
 
 CAMERA = Camera((400, 300), 600.0)
 

@@ -25,7 +25,7 @@ from deepdetect.evaluation.protocols.sfm import (
 from deepdetect.evaluation.protocols.sfm_methods import SfmMethod
 from deepdetect.evaluation.report import Table
 from deepdetect.evaluation.run import Run
-from deepdetect.geometry.posed_view import PosedView
+from deepdetect.geometry.camera import PosedView
 
 POINTS, SIFT, RANDOM = (
     "DeepDetect, points",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from deepdetect.geometry import epipolar_errors, transfer_errors, transform_points
-from deepdetect.geometry.acontrario import MAX_LOG10_NFA
+from deepdetect.geometry.estimation import MAX_LOG10_NFA
 from deepdetect.geometry.two_view import GUIDING_THRESHOLDS_PX
 from deepdetect.io.image import load_image, luma
 from deepdetect.matching.guided import initial_geometry as module

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.features.dense_sift import dense_sift
+from deepdetect.features.sift import dense_sift
 from deepdetect.io.image import load_image, luma
 from deepdetect.matching.guided import verification
 from deepdetect.matching.guided.verification import (

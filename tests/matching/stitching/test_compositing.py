@@ -6,7 +6,7 @@ import pytest
 
 from deepdetect import DeepDetectError, OptionError
 from deepdetect._shared import memory
-from deepdetect.geometry.rescaling import downscale
+from deepdetect.geometry.images import downscale
 from deepdetect.matching.stitching.bundle_adjustment import RotatingCamera
 from deepdetect.matching.stitching.canvas import (
     Canvas,

@@ -7,10 +7,13 @@ from typing import Literal
 import numpy as np
 
 from ...features.keypoints import Keypoints
-from ...features.orientation import dominant_angles
-from ...features.selection import check_ignore
-from ...features.sift import spread_over_grid
-from ...features.suppression import spread_by_distance, suppress_neighbors
+from ...features.scale_space import dominant_angles
+from ...features.selection import (
+    check_ignore,
+    spread_by_distance,
+    spread_over_grid,
+    suppress_neighbors,
+)
 from .candidate_features import describe_candidates
 from .hessian_scales import build_scale_space, check_memory, find_candidates
 from .ranker import Ranker, load_ranker

@@ -14,7 +14,7 @@ from ..._shared.errors import DeepDetectError, OptionError
 from ...detector.detector import DeepDetect, find_keypoints
 from ...detector.point_detector import PointDetector
 from ...features.keypoints import Keypoints
-from ...features.orientation import dominant_angles
+from ...features.scale_space import dominant_angles
 from ...features.selection import SelectionOptions
 from ...features.sift import get_descriptor, scaled_sift_descriptors, to_root_sift
 from ...io.image import luma

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ...geometry.residuals import transform_points
+from ...geometry.transforms import transform_points
 
 CORNER_THRESHOLDS_PX = (1.0, 3.0, 5.0)
 

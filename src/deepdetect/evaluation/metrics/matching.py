@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...geometry.residuals import transfer_errors
+from ...geometry.transforms import transfer_errors
 from .homography import Sizes, project_visible
 
 THRESHOLDS_PX = tuple(range(1, 11))

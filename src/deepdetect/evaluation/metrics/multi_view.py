@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...geometry.posed_view import PosedView
+from ...geometry.camera import PosedView
 from .pose import rotation_error, translation_error
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...geometry.relative_pose import rotation_angle
-from ...geometry.residuals import epipolar_errors
+from ...geometry.transforms import epipolar_errors
 
 POSE_THRESHOLDS_DEG = (5.0, 10.0, 20.0)
 """Of the AUC."""

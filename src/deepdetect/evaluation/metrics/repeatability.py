@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import MissingExtraError
-from ...geometry.residuals import transform_points
+from ...geometry.transforms import transform_points
 from .homography import Sizes, project_visible
 
 CHANCE_POINTS = 20_000

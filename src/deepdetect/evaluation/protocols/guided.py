@@ -15,7 +15,7 @@ from ..._shared.records import Arrays
 from ...datasets.types import PlanarPair
 from ...features.keypoints import nearest_keypoints
 from ...geometry import transform_points
-from ...geometry.residuals import transfer_errors
+from ...geometry.transforms import transfer_errors
 from ...io.image import load_image, luma
 from ...matching.guided import guided_matches
 from ..baselines.method import LocalFeature

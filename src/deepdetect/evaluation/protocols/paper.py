@@ -13,7 +13,7 @@ from ...datasets.foreground import MaskedPhotograph, load_foreground
 from ...datasets.types import PlanarPair, PlanarScene
 from ...features.display import draw_matches
 from ...features.keypoints import Keypoints
-from ...geometry.residuals import transfer_errors
+from ...geometry.transforms import transfer_errors
 from ...io.image import load_image, luma
 from ...viz.draw import add_caption, hstack
 from ..baselines.method import LocalFeature

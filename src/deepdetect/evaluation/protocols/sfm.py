@@ -11,8 +11,7 @@ import numpy as np
 from ..._shared.records import Arrays
 from ...datasets.pair_selection import evenly_spaced
 from ...datasets.posed_images import PosedImage, PosedScene, load_posed_scenes
-from ...geometry.camera import Camera
-from ...geometry.posed_view import PosedView
+from ...geometry.camera import Camera, PosedView
 from ...io.image import load_image
 from ...sfm.colmap import import_pycolmap
 from ..charts import line_chart

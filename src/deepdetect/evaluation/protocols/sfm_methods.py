@@ -21,7 +21,7 @@ from ...batch.extraction import feature_group
 from ...batch.hdf5 import Group, import_h5py, open_hdf5, write_groups
 from ...detector.point_detector import PointDetector
 from ...features.keypoints import Keypoints
-from ...features.orientation import dominant_angles
+from ...features.scale_space import dominant_angles
 from ...features.sift import describe_keypoints
 from ...geometry.camera import Camera
 from ...io.image import load_image, luma

@@ -17,8 +17,7 @@ from ..._shared.records import file_digest
 from ...datasets.types import CalibratedStereoPair
 from ...detector.detector import AnyDetector, DeepDetect
 from ...detector.heatmap import HeatmapOptions
-from ...features.matchers import match_descriptors
-from ...features.matchers.approximate import flann_neighbours
+from ...features.matchers import flann_neighbours, match_descriptors
 from ...features.selection import SelectionOptions
 from ...matching.stereo.matching import find_disparity_range
 from ...matching.unguided import check_memory

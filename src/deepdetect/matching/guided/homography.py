@@ -7,9 +7,8 @@ import numpy as np
 from ...features.keypoints import nearest_keypoints
 from ...features.matches import GuidedMatches
 from ...geometry.homography_refinement import refine_homography
-from ...geometry.rescaling import downscale, scaled_homography
-from ...geometry.residuals import transform_points
-from ...geometry.zncc import warp_to_reference
+from ...geometry.images import downscale, warp_to_reference
+from ...geometry.transforms import scaled_homography, transform_points
 from .verification import dissimilarity
 
 MAX_DISTANCE_PX = 1.0

@@ -15,11 +15,14 @@ import numpy as np
 
 from ..._shared.errors import OptionError, unknown_name
 from ...features.matches import TwoViewGeometry
-from ...geometry.acontrario import MAX_LOG10_NFA
-from ...geometry.parallax import Parallax, TwoViewModel
-from ...geometry.rescaling import scaled_fundamental, scaled_homography, scaled_points
-from ...geometry.residuals import epipolar_errors
+from ...geometry.estimation import MAX_LOG10_NFA, Parallax, TwoViewModel
 from ...geometry.semi_calibrated import MATCH_SIGMA_PX, refine_fundamental
+from ...geometry.transforms import (
+    epipolar_errors,
+    scaled_fundamental,
+    scaled_homography,
+    scaled_points,
+)
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, choose_model
 from .asift import TILTS, simulated_views
 from .epipolar_search import epipolar_search, log10_p_value

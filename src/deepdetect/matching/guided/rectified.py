@@ -19,10 +19,9 @@ import numpy as np
 
 from ..._shared.opencv import cv2
 from ...features.matches import GuidedMatches
-from ...geometry.optical_flow import equalise, track_round_trip
-from ...geometry.rescaling import scaled_points
-from ...geometry.residuals import epipolar_errors
+from ...geometry.images import equalise, track_round_trip
 from ...geometry.semi_calibrated import refine_fundamental
+from ...geometry.transforms import epipolar_errors, scaled_points
 from .rectified_view import RectifiedView, range_with_margin, rectified_view
 
 MAX_ROW_ERROR_PX, ROW_QUANTILE = 0.5, 0.9

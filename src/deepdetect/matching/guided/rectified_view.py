@@ -13,8 +13,8 @@ import numpy as np
 
 from ..._shared.opencv import cv2
 from ...geometry.epipolar_rectification import PolarFrame, RectifiedFrame, rectified_frame
-from ...geometry.rescaling import downscale, scaled_fundamental, scaled_points
-from ...geometry.zncc import gaussian_blur, local_zncc
+from ...geometry.images import downscale, gaussian_blur, local_zncc
+from ...geometry.transforms import scaled_fundamental, scaled_points
 from ..stereo.matching import (
     DisparityMap,
     DisparityOptions,

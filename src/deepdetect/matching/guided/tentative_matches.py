@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...features.keypoints import Keypoints
-from ...features.matchers import match_descriptors
-from ...features.matchers.matching import exact_neighbours
+from ...features.matchers import exact_neighbours, match_descriptors
 from ...features.sift import describe_keypoints, detect_sift
-from ...geometry.rescaling import downscale, scaled_points
+from ...geometry.images import downscale
+from ...geometry.transforms import scaled_points
 
 Points = tuple[np.ndarray, np.ndarray]
 

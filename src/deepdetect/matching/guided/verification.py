@@ -19,9 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...features.dense_sift import dense_sift, sift_gradient
-from ...features.sift import correlation_distance, to_root_sift
-from ...geometry.windows import gaussian_means, window_sums
+from ...features.sift import correlation_distance, dense_sift, sift_gradient, to_root_sift
+from ...geometry.images import gaussian_means, window_sums
 
 DESCRIPTOR_REACH = 36
 """Pixels that the largest descriptors see, with their gradient and blur. Further from all edges the

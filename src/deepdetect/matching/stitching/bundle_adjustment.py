@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..._shared.opencv import cv2
-from ...geometry.residuals import transform_points
+from ...geometry.transforms import transform_points
 
 MAX_ITERATIONS = 20
 MIN_STEP = 1e-7

@@ -15,8 +15,8 @@ import numpy as np
 from ..._shared.errors import OptionError, RegistrationError
 from ..._shared.memory import require_memory
 from ..._shared.opencv import cv2
-from ...geometry.rescaling import downscale, scaled_homography
-from ...geometry.residuals import transform_points
+from ...geometry.images import downscale
+from ...geometry.transforms import scaled_homography, transform_points
 from .bundle_adjustment import RotatingCamera
 
 Box = tuple[int, int, int, int]

@@ -13,7 +13,8 @@ from ..._shared.image_array import Channels
 from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.timing import StageTimer
 from ...detector.detector import AnyDetector, DeepDetect
-from ...geometry.rescaling import downscale, scaled_homography
+from ...geometry.images import downscale
+from ...geometry.transforms import scaled_homography
 from ...io.image import load_image
 from ..guided.tentative_matches import MAX_SIDE_PX
 from .bundle_adjustment import RotatingCamera, level_cameras

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ...detector.points.detection import least_distances
-from ...features.suppression import suppress_neighbors
+from ...features.selection import suppress_neighbors
 from .pairs import CandidatePair, Correspondences, Side
 
 CLOSE_PX, NEAR_PX = 1.0, 3.0

@@ -1,5 +1,5 @@
 // The dominant orientation of the gradients around keypoints (Lowe, 2004, Section 5), as
-// `deepdetect.features.orientation` assigns it.
+// `deepdetect.features.scale_space` assigns it.
 import { SIZE_PER_SIGMA, layersOf } from "./scale_space.js";
 import { roundHalfEven } from "./selection.js";
 

@@ -1,4 +1,4 @@
-// Greedy suppression of points, as `deepdetect.features.suppression` does it.
+// Greedy suppression of points, as `deepdetect.features.selection` does it.
 
 const DISTANCE_STEP_PX = 0.25; // to which the distance of `spreadByDistance` is found
 

@@ -1,11 +1,18 @@
-"""Photometric agreement of two images under a homography: local ZNCC, insensitive to lighting."""
+"""Images compared: warped, correlated, tracked."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.opencv import cv2
+from .transforms import scaling_matrix
+
+ANTIALIASING_SIGMA = 0.5
+"""Of the blur before an image is downscaled, in units of sqrt(1 / scale^2 - 1) pixels."""
 
 WINDOW_PX = 15
 """Side of the square windows."""
@@ -18,6 +25,23 @@ NOISE_STD = 2.0
 
 MIN_VARIANCE = 1.0
 """Of a window's grey levels: flatter windows are not compared."""
+
+
+def downscale(gray: np.ndarray, max_side: int) -> tuple[np.ndarray, float]:
+    """Downscale an image whose longer side has more than `max_side` pixels to this size.
+
+    Returns:
+        The image, and its scale: at most 1.
+    """
+    scale = min(1.0, max_side / max(gray.shape))
+    if scale == 1:
+        return gray, 1.0
+    # The sides are seldom whole numbers of pixels: blur and sample by the scale itself, so that
+    # one number holds for both.
+    size = (max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale)))
+    smooth = cv2.GaussianBlur(gray, (0, 0), ANTIALIASING_SIGMA * np.sqrt(1 / scale**2 - 1))
+    affine = scaling_matrix(scale)[:2]
+    return cv2.warpAffine(smooth, affine, size, borderMode=cv2.BORDER_REPLICATE), scale
 
 
 def warp_to_reference(
@@ -149,3 +173,122 @@ def normalise_local_contrast(gray: np.ndarray, window_px: int = WINDOW_PX) -> np
 def _erode(mask: np.ndarray, side: int) -> np.ndarray:
     kernel = np.ones((side, side), np.uint8)
     return cv2.erode(mask.astype(np.uint8), kernel, borderValue=0) > 0
+
+
+def window_sums(
+    pixels: np.ndarray,
+    values: np.ndarray | np.generic | float,
+    shape: Sequence[int],
+    window_px: int,
+    *,
+    at: np.ndarray | None = None,
+    dtype: type[np.floating[Any]] | None = None,
+) -> np.ndarray:
+    """Sum the values of the pixels in the square window around each pixel.
+
+    Args:
+        pixels: (N, 2) int64 pixels (x, y), each once.
+        values: (N,) a value for each, or one for all.
+        shape: (H, W, ...) of the image.
+        window_px: side of the window, odd.
+        at: (M, 2) int64 centres of the windows; None: the pixels themselves.
+        dtype: of the sums; None: that of the values.
+
+    Returns:
+        (M,) sums, 0 where there is no pixel in the window.
+
+    Example:
+        >>> pixels = np.array([[0, 0], [2, 1], [9, 9]])
+        >>> window_sums(pixels, np.array([1.0, 2, 3]), (10, 10), 5).tolist()
+        [3.0, 3.0, 3.0]
+    """
+    image = _scatter(pixels, values, shape, dtype)
+    window = (window_px, window_px)
+    sums = cv2.boxFilter(image, -1, window, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    x, y = (pixels if at is None else at).T
+    return sums[y, x]
+
+
+def gaussian_means(
+    pixels: np.ndarray, values: np.ndarray, shape: Sequence[int], sigma_px: float, at: np.ndarray
+) -> np.ndarray:
+    """Average the values of nearby pixels, weighted by a Gaussian; arguments as `window_sums`.
+
+    Returns:
+        (M,) float32 means.
+    """
+    count, total = (_scatter(pixels, part, shape, np.float32) for part in (1, values))
+    count, total = (cv2.GaussianBlur(image, (0, 0), sigma_px) for image in (count, total))
+    x, y = at.T
+    return (total / np.maximum(count, 1e-6))[y, x]
+
+
+def _scatter(
+    pixels: np.ndarray,
+    values: np.ndarray | np.generic | float,
+    shape: Sequence[int],
+    dtype: type[np.floating[Any]] | None,
+) -> np.ndarray:
+    """Return an image with the values at their pixels, 0 elsewhere."""
+    image = np.zeros(tuple(shape[:2]), dtype or np.asarray(values).dtype)
+    image[pixels[:, 1], pixels[:, 0]] = values
+    return image
+
+
+def track_round_trip(
+    first: np.ndarray,
+    second: np.ndarray,
+    points: np.ndarray,
+    window_px: int,
+    *,
+    levels: int,
+    iterations: int = 30,
+    step_px: float = 0.01,
+    min_eigenvalue: float = 1e-4,
+    expected: np.ndarray | None = None,
+    back_to_start: bool = False,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Track points forth and back.
+
+    Args:
+        first, second: (H, W) uint8 images.
+        points: (N, 2) float32 positions in the first.
+        window_px: side of the tracked windows.
+        levels: of the pyramid above the image; each doubles how far a track can move.
+        iterations: of each track and level, at most.
+        step_px: a track that moves by less than this has arrived.
+        min_eigenvalue: of the gradients in a window, per pixel, below which a track is lost.
+        expected: (N, 2) float32 positions in the second, where the search begins; None: in the
+            same place.
+        back_to_start: whether the way back begins at the start itself.
+
+    Returns:
+        (N, 2) float32 positions in the second, and (N,) distances from the start after the way
+        back, infinite where a track was lost.
+    """
+    how = {
+        "winSize": (window_px, window_px),
+        "maxLevel": levels,
+        "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, iterations, step_px),
+        "minEigThreshold": min_eigenvalue,
+    }
+    guided = {**how, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+    start = np.ascontiguousarray(points, np.float32).reshape(-1, 1, 2)
+    if expected is not None:
+        guess = np.ascontiguousarray(expected, np.float32).reshape(-1, 1, 2)
+        there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, guess.copy(), **guided)
+        back_guess = there + start - guess
+    else:
+        there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, None, **how)
+        back_guess = start.copy() if back_to_start else None
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
+        second, first, there, back_guess, **(how if back_guess is None else guided)
+    )
+    gaps = np.linalg.norm((back - start).reshape(-1, 2), axis=1)
+    lost = (found.ravel() == 0) | (found_back.ravel() == 0)
+    return there.reshape(-1, 2), np.where(lost, np.inf, gaps)
+
+
+def equalise(gray: np.ndarray) -> np.ndarray:
+    """Equalise an image locally, so that changes of light are not taken for motion."""
+    return cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply(gray)

@@ -1,21 +1,192 @@
-"""Matching of descriptors: nearest neighbours, the ratio test, and the matchers.
-
-To add a matcher, write a function of the signature of `Matcher` and add it to `MATCHERS`.
-"""
+"""Matchers."""
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
-from ..._shared.errors import OptionError
-from ..._shared.opencv import cv2
-from ..._shared.registry import look_up
-from ..keypoints import on_pixels
-from .approximate import faiss_neighbours, flann_neighbours
-from .patchmatch import patchmatch_neighbours
+from .._shared.errors import MissingExtraError, OptionError
+from .._shared.opencv import cv2
+from .._shared.parallel import parallel_for
+from .._shared.registry import look_up
+from .keypoints import on_pixels
+
+FLANN_INDEX_KDTREE = 1
+
+TREES, CHECKS = 5, 50
+"""Of FLANN, as in the paper's code."""
+
+LISTS_PER_ROOT, PROBES, TRAINING_PER_LIST = 4, 16, 40
+"""Of faiss: lists of the inverted file, in units of the square root of the descriptors; lists that
+are searched for each query; descriptors that the centre of each list is trained on."""
+
+MIN_INDEXED = 4096
+"""With fewer descriptors faiss compares all: an inverted file would save nothing."""
+
+
+def flann_neighbours(
+    queries: np.ndarray,
+    base: np.ndarray,
+    count: int,
+    seed: int,
+    positions: object = None,
+    trees: int = TREES,
+    checks: int = CHECKS,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find approximate nearest neighbours in random kd-trees; otherwise as `Matcher`.
+
+    Args:
+        trees: number of trees.
+        checks: leaves that are visited for each query.
+    """
+    queries, base = (np.asarray(part, np.float32) for part in (queries, base))
+
+    def search() -> tuple[np.ndarray, np.ndarray]:
+        cv2.setRNGSeed(seed)
+        index = cv2.flann_Index(base, {"algorithm": FLANN_INDEX_KDTREE, "trees": trees})
+        return index.knnSearch(queries, count, params={"checks": checks})
+
+    # OpenCV has one random number generator per thread: that of the caller is left alone.
+    with ThreadPoolExecutor(1) as thread:
+        rows, squared = thread.submit(search).result()
+    return rows, np.sqrt(squared)
+
+
+def faiss_neighbours(
+    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find approximate nearest neighbours in an inverted file; otherwise as `Matcher`.
+
+    About one neighbour in fifty is missed.
+
+    Raises:
+        MissingExtraError: faiss is not installed.
+    """
+    try:
+        import faiss
+    except ImportError:
+        raise MissingExtraError(
+            "the matcher faiss needs faiss: run pip install faiss-cpu, or use flann"
+        ) from None
+    quantizer = faiss.ScalarQuantizer
+    kind = quantizer.QT_8bit_direct if base.dtype == np.uint8 else quantizer.QT_8bit
+    queries, base = (np.ascontiguousarray(part, np.float32) for part in (queries, base))
+    width = base.shape[1]
+    centres = faiss.IndexFlatL2(width)
+    index: Any = centres
+    if len(base) >= MIN_INDEXED:
+        lists = min(int(LISTS_PER_ROOT * np.sqrt(len(base))), len(base) // TRAINING_PER_LIST)
+        index = faiss.IndexIVFScalarQuantizer(centres, width, lists, kind, faiss.METRIC_L2, False)
+        index.cp.seed = seed
+        index.cp.niter = 5
+        index.nprobe = PROBES
+        order = np.random.default_rng(seed).permutation(len(base))
+        index.train(base[np.sort(order[: lists * TRAINING_PER_LIST])])
+    index.add(base)
+    squared, rows = index.search(queries, count)
+    missing = rows < 0  # the lists that were searched held too few
+    rows, squared = np.where(missing, 0, rows), np.where(missing, np.inf, squared)
+    return rows.astype(np.int32), np.sqrt(np.maximum(squared, 0)).astype(np.float32)
+
+
+SWEEPS = 4
+"""Over all queries, down and up in turn."""
+
+OFFSETS_PX = (1, 4, 12)
+"""Distances to the queries whose neighbours are tried; one pixel where keypoints are dense."""
+
+BAND_HEIGHT_PX = 96
+"""Of a part that one thread works on; the result depends on it."""
+
+SEARCH_SHRINK = 3
+"""Random tries begin in the whole image around the best neighbour; each next one is so many times
+nearer."""
+
+
+def patchmatch_neighbours(
+    queries: np.ndarray,
+    base: np.ndarray,
+    count: int,
+    seed: int,
+    positions: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find two approximate nearest neighbours of each query by spreading good ones.
+
+    A `Matcher` of bytes on whole pixels; the result is the same for any number of threads.
+
+    Raises:
+        OptionError: the descriptors are not bytes, or the keypoints are not on whole pixels or have
+            scales of their own.
+    """
+    if queries.dtype != np.uint8 or base.dtype != np.uint8:
+        raise OptionError(
+            "the matcher patchmatch needs descriptors of bytes, such as sift and rootsift: use "
+            "flann, faiss or exact"
+        )
+    if positions is None:
+        raise OptionError(
+            "the matcher patchmatch needs dense keypoints of one scale and angle, not points with "
+            "their own: use auto, flann, faiss or exact"
+        )
+    if count > 2 or len(base) < 2:
+        raise OptionError("the matcher patchmatch finds one or two neighbours, of two or more")
+    from . import kernels
+
+    xy0, xy1 = (_pixels(xy) for xy in positions)
+    # In row-major order: a sweep builds on what it has just found.
+    order = _row_major_order(xy0)
+    if order is not None:
+        queries, xy0 = queries[order], xy0[order]
+    at0, at1 = _grid(xy0), _grid(xy1)
+    edges = np.arange(0, at0.shape[0] + BAND_HEIGHT_PX, BAND_HEIGHT_PX)
+    bands = np.searchsorted(xy0[:, 1], edges)
+    rows = np.empty((len(queries), 2), np.int32)
+    distances = np.empty((len(queries), 2), np.int32)
+    offsets, radii = np.array(OFFSETS_PX), _radii(max(at1.shape))
+    parallel_for(len(queries), kernels.patchmatch_start, queries, base, seed, rows, distances)
+    images = queries, base, xy0, xy1, at0, at1
+    for turn in range(SWEEPS):
+        tries = offsets, turn, seed, radii
+        found = rows.copy(), rows, distances
+        parallel_for(len(bands) - 1, kernels.patchmatch_sweep, bands, *images, *tries, *found)
+    gaps = np.sqrt(distances.astype(np.float32))
+    if order is not None:
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        rows, gaps = rows[back], gaps[back]
+    return rows[:, :count], gaps[:, :count]
+
+
+def _row_major_order(pixels: np.ndarray) -> np.ndarray | None:
+    """Return the rows by lines and columns; None when they are sorted, as of most detectors."""
+    number = pixels[:, 1].astype(np.int64) * (int(pixels[:, 0].max()) + 1) + pixels[:, 0]
+    return None if (number[1:] >= number[:-1]).all() else np.argsort(number, kind="stable")
+
+
+def _pixels(xy: np.ndarray) -> np.ndarray:
+    if not on_pixels(xy):
+        raise OptionError(
+            "the matcher patchmatch needs keypoints on whole pixels: use flann, faiss or exact"
+        )
+    return np.asarray(xy).astype(np.int32)
+
+
+def _grid(xy: np.ndarray) -> np.ndarray:
+    """Return the row at each pixel of the smallest image that holds all, -1 where there is none."""
+    width, height = xy.max(axis=0) + 1
+    grid = np.full((height, width), -1, np.int32)
+    grid[xy[:, 1], xy[:, 0]] = np.arange(len(xy))
+    return grid
+
+
+def _radii(longest_side: int) -> np.ndarray:
+    radii = [longest_side // 2]
+    while radii[-1] > SEARCH_SHRINK:
+        radii.append(radii[-1] // SEARCH_SHRINK)
+    return np.maximum(radii, 1)
 
 
 class Matcher(Protocol):

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from deepdetect.features.matchers import match_descriptors
-from deepdetect.features.matchers.approximate import faiss_neighbours, flann_neighbours
-from deepdetect.features.matchers.matching import exact_neighbours
+from deepdetect.features.matchers import (
+    exact_neighbours,
+    faiss_neighbours,
+    flann_neighbours,
+    match_descriptors,
+)
 
 
 def sift_like(seed: int, count: int) -> np.ndarray:

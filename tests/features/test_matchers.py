@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from deepdetect.features import matchers
 from deepdetect.features.matchers import (
     MATCHERS,
     DescriptorMatches,
+    exact_neighbours,
     get_matcher,
     match_descriptors,
-    matching,
 )
-from deepdetect.features.matchers.matching import exact_neighbours
 
 
 def fixed_matcher(
@@ -175,7 +175,7 @@ def test_auto_takes_the_matcher_that_fits(
     called = []
     for name in ("exact", "patchmatch", "flann"):
         monkeypatch.setattr(
-            matching, f"{name}_neighbours", lambda *_, name=name: called.append(name)
+            matchers, f"{name}_neighbours", lambda *_, name=name: called.append(name)
         )
     some = np.zeros((count, 8), np.uint8)
     places = np.zeros((count, 2))
@@ -188,14 +188,14 @@ def test_auto_takes_patchmatch_only_where_it_suits(monkeypatch: pytest.MonkeyPat
     base = generator.integers(0, 256, (400, 16)).astype(np.uint8)
     order = generator.permutation(400)
     pixels = np.stack(np.divmod(np.arange(400), 20), 1).astype(np.float32)
-    monkeypatch.setattr(matching, "MAX_EXACT_PRODUCT", 0)
+    monkeypatch.setattr(matchers, "MAX_EXACT_PRODUCT", 0)
     taken = []
 
     def spy(*arguments):
         taken.append("patchmatch")
         return exact_neighbours(*arguments)
 
-    monkeypatch.setattr(matching, "patchmatch_neighbours", spy)
+    monkeypatch.setattr(matchers, "patchmatch_neighbours", spy)
     both, floats = (pixels, pixels[order]), base.astype(np.float32)
     automatic = get_matcher("auto")
     for queries, positions in ((base, (pixels + 0.25, pixels)), (base, None), (floats, both)):

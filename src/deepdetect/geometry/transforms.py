@@ -1,4 +1,4 @@
-"""Distances between matched points and a model, in pixels."""
+"""Points under homographies and fundamental matrices, and their distances from them in pixels."""
 
 from __future__ import annotations
 
@@ -113,3 +113,30 @@ def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.nda
     true = np.where(np.isfinite(disparity), disparity, np.nan)[row, column]
     expected = np.column_stack([points0[:, 0] - true, points0[:, 1]])
     return np.linalg.norm(expected - points1, axis=1)
+
+
+def scaled_points(points: np.ndarray, scale: float) -> np.ndarray:
+    """Return positions in an image of another scale; pixel centres are whole numbers.
+
+    Example:
+        >>> scaled_points(np.array([[0.0, 1.0]]), 2).tolist()
+        [[0.5, 2.5]]
+    """
+    return (np.asarray(points, np.float64) + 0.5) * scale - 0.5
+
+
+def scaled_homography(homography: np.ndarray, scale0: float, scale1: float) -> np.ndarray:
+    """Return the homography between both images at other scales, its last element 1."""
+    matrix = scaling_matrix(scale1) @ homography @ scaling_matrix(1 / scale0)
+    return matrix / matrix[2, 2]
+
+
+def scaled_fundamental(fundamental: np.ndarray, scale0: float, scale1: float) -> np.ndarray:
+    """Return the fundamental matrix between both images at other scales."""
+    return scaling_matrix(1 / scale1).T @ fundamental @ scaling_matrix(1 / scale0)
+
+
+def scaling_matrix(scale: float) -> np.ndarray:
+    """Return the (3, 3) map from an image to the same image at another scale."""
+    shift = 0.5 * scale - 0.5
+    return np.array([[scale, 0, shift], [0, scale, shift], [0, 0, 1]])

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.distance import cdist
 
-from deepdetect.features.matchers import matching as brute_force
-from deepdetect.features.matchers.matching import exact_neighbours, hamming_neighbours
+from deepdetect.features import matchers
+from deepdetect.features.matchers import exact_neighbours, hamming_neighbours
 
 
 def naive_neighbours(
@@ -50,7 +50,7 @@ def test_blocks_do_not_change_the_result(block: int, monkeypatch: pytest.MonkeyP
     rng = np.random.default_rng(0)
     queries, base = sift_like(rng, 70), sift_like(rng, 90)
     expected = exact_neighbours(queries, base, 2, 0)
-    monkeypatch.setattr(brute_force, "BLOCK_SIZE", block)
+    monkeypatch.setattr(matchers, "BLOCK_SIZE", block)
     rows, distances = exact_neighbours(queries, base, 2, 0)
     np.testing.assert_array_equal(rows, expected[0])
     np.testing.assert_array_equal(distances, expected[1])
@@ -110,7 +110,7 @@ def test_memory_is_bounded_by_the_block(
     queries: int, base: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Working memory is a few times BLOCK numbers, however few descriptors the base holds."""
-    monkeypatch.setattr(brute_force, "BLOCK_SIZE", 200_000)
+    monkeypatch.setattr(matchers, "BLOCK_SIZE", 200_000)
     rng = np.random.default_rng(0)
     first = rng.random((queries, 128), np.float32)
     second = rng.random((base, 128), np.float32)
@@ -161,7 +161,7 @@ def test_neighbours_are_right_among_ties(data: st.DataObject, count: int) -> Non
 def test_blocks_do_not_change_the_hamming_result(
     block: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(brute_force, "HAMMING_QUERIES", block)
+    monkeypatch.setattr(matchers, "HAMMING_QUERIES", block)
     assert_nearest(random_bytes(0, 60, 32), random_bytes(1, 80, 32), 2)
 
 

@@ -9,10 +9,8 @@ from hypothesis import strategies as st
 
 from deepdetect import OptionError
 from deepdetect._shared import parallel
-from deepdetect.features.dense_sift import dense_sift
-from deepdetect.features.matchers import match_descriptors
-from deepdetect.features.matchers.matching import exact_neighbours
-from deepdetect.features.matchers.patchmatch import patchmatch_neighbours
+from deepdetect.features.matchers import exact_neighbours, match_descriptors, patchmatch_neighbours
+from deepdetect.features.sift import dense_sift
 from deepdetect.io.image import luma
 
 SHIFT = np.array([11, 7])
