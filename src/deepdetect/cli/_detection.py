@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from .._shared.errors import OptionError
-from ..detector.backends.options import BACKENDS
+from ..detector.backends import BACKENDS
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.selection import SelectionOptions

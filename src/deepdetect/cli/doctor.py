@@ -114,7 +114,7 @@ def self_test() -> Iterator[Finding]:
     """Detect by each back end, and match, two images whose shift is known."""
     import numpy as np
 
-    from ..detector.backends.options import BACKENDS
+    from ..detector.backends import BACKENDS
     from ..detector.detector import DeepDetect
     from ..detector.point_detector import PointDetector
     from ..matching.pipeline import match_images

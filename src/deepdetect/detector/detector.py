@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -18,22 +19,8 @@ from ..features.selection import Maps, SelectionOptions, select_from_maps, selec
 from ..features.sift import describe_keypoints
 from ..io.image import load_image, luma
 from .backends import RuntimeOptions, open_network
-from .heatmap import (
-    HeatmapOptions,
-    compute_maps,
-    compute_maps_of_batch,
-    memory_named,
-    seen_size,
-)
-from .image_lists import (
-    Images,
-    batches,
-    check_batch_size,
-    ignore_masks,
-    image_list,
-    image_named,
-    load_each,
-)
+from .heatmap import HeatmapOptions, compute_maps, compute_maps_of_batch, memory_named
+from .image_lists import Images, ignore_masks, image_named, load_each
 from .pretrained import PRETRAINED, resolve_weights
 
 CHANNELS_OF_IMAGES = (
@@ -131,8 +118,11 @@ class DeepDetect:
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Another process opens the network itself; names of weights are the same on all machines.
-        keywords = {**vars(self._runtime), **vars(self.heatmap_options)}
-        return functools.partial(DeepDetect, self._portable, **keywords), ()
+        return functools.partial(DeepDetect, self._portable, **self._keywords), ()
+
+    @property
+    def _keywords(self) -> dict[str, Any]:
+        return {**vars(self._runtime), **vars(self.heatmap_options)}
 
     @property
     def runtime(self) -> str:
@@ -160,8 +150,7 @@ class DeepDetect:
     @suggest_keywords
     def with_weights(self, weights: str | Path) -> DeepDetect:
         """Return a detector with other weights, and all other options as they are."""
-        keywords = {**vars(self._runtime), **vars(self.heatmap_options)}
-        return DeepDetect(weights, **keywords)
+        return DeepDetect(weights, **self._keywords)
 
     @suggest_keywords
     def heatmap(self, image: Any, *, channels: Channels = "rgb") -> np.ndarray:
@@ -353,19 +342,21 @@ class DeepDetect:
         self, images: Images, channels: Channels, batch_size: int
     ) -> Iterator[tuple[int, tuple[int, ...], Maps]]:
         """Load images and run the network; yield the place of each, its shape and its maps."""
-        check_batch_size(batch_size)
-        options = self.heatmap_options
+        if not isinstance(batch_size, (int, np.integer)) or batch_size < 1:
+            raise OptionError(f"`batch_size` must be a whole number from 1 on, not {batch_size!r}")
 
-        def size(loaded: tuple[int, np.ndarray]) -> tuple[int, int]:
-            return seen_size(loaded[1].shape, options)
+        def seen_size(loaded: tuple[int, np.ndarray]) -> tuple[int, int]:
+            return self.heatmap_options.seen_size(loaded[1].shape)
 
-        for batch in batches(load_each(image_list(images), channels), size, batch_size):
-            places = [(number, rgb.shape) for number, rgb in batch]
-            with image_named(places[0][0]), memory_named(places[0][1], len(batch)):
-                maps = compute_maps_of_batch([rgb for _, rgb in batch], self._network, options)
-            del batch[:]  # the keypoints need the room
-            for place in places:
-                yield (*place, maps.pop(0))
+        for _, group in itertools.groupby(load_each(images, channels), seen_size):
+            while batch := list(itertools.islice(group, batch_size)):
+                places = [(number, rgb.shape) for number, rgb in batch]
+                loaded = [rgb for _, rgb in batch]
+                with image_named(places[0][0]), memory_named(places[0][1], len(batch)):
+                    maps = compute_maps_of_batch(loaded, self._network, self.heatmap_options)
+                del batch, loaded  # the keypoints need the room
+                for place in places:
+                    yield (*place, maps.pop(0))
 
 
 def check_selection(detector: AnyDetector, selection: SelectionOptions | None) -> None:
@@ -382,23 +373,15 @@ def find_keypoints(
     selection: SelectionOptions | None = None,
     ignore: np.ndarray | None = None,
 ) -> Keypoints:
-    """Find the keypoints of a loaded image, ranked by logits where the detector gives them.
+    """Find the keypoints of a (H, W, 3) uint8 image, ranked by logits where there are any.
 
-    Args:
-        detector: a `DeepDetect` or a `PointDetector`, or anything with a method `heatmap` or
-            `detect`, as these have.
-        rgb: (H, W, 3) uint8.
-        selection: which pixels of a heat map; None: those over 0.5.
-        ignore: (H, W), true where no keypoint is wanted.
-
-    Raises:
-        OptionError: the detector has no heat map to select from; or its map has another size than
-            the image, or is not finite.
+    The detector may be anything with a method `heatmap` or `detect`, as those of this package have.
+    The selection is of pixels of a heat map; None takes those over 0.5.
     """
     check_selection(detector, selection)
     if not hasattr(detector, "heatmap"):
         return detector.detect(rgb, ignore=ignore)
-    options = SelectionOptions() if selection is None else selection
+    options = selection or SelectionOptions()
     if isinstance(detector, DeepDetect):
         return detector._select(rgb, options, ignore)
     logits = None

@@ -7,8 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -19,9 +18,6 @@ from .._shared.opencv import cv2, is_lack_of_memory
 from .._shared.options import check_ranges, suggest_keywords
 from ..features.selection import Maps, Rows, bands, sigmoid
 from .backends import Network
-
-if TYPE_CHECKING:
-    from .tiling import TiledNetwork
 
 STRIDE = 8
 """The network halves an image three times, so its sides must be multiples of 8."""
@@ -34,6 +30,9 @@ RELEASE_PIXELS = 20_000_000
 
 MIN_TILE_MEGAPIXELS = 1.5
 """Of smaller tiles most would be overlap."""
+
+Run = Callable[[list[np.ndarray]], list[np.ndarray]]
+"""Maps images of one size, (H, W, 3) uint8, to their (H, W) logits."""
 
 
 @suggest_keywords
@@ -87,68 +86,66 @@ class HeatmapOptions:
             raise unknown_name("tta", self.tta, ["none", "flip"])
         if self.tile_megapixels != "auto":
             check_ranges(self, between={"tile_megapixels": (MIN_TILE_MEGAPIXELS, math.inf)})
+            if self.resolution != "native":
+                raise OptionError("`tile_megapixels` needs `resolution='native'`: give both")
+
+    def is_native(self, shape: tuple[int, ...]) -> bool:
+        """Return whether the network sees an image of a shape (H, W, ...) at its own size."""
+        small = shape[0] * shape[1] <= MAX_AUTO_PIXELS
+        return self.resolution == "native" or (self.resolution == "auto" and small)
+
+    def seen_size(self, shape: tuple[int, ...]) -> tuple[int, int]:
+        """Return the width and height at which the network sees an image of a shape (H, W, ...)."""
+        height, width = shape[:2]
+        if self.is_native(shape):
+            return width, height
+        if self.resolution != "auto":
+            return int(self.resolution), int(self.resolution)
+        scale = (MAX_AUTO_PIXELS / (height * width)) ** 0.5
+        width, height = (max(1, round(side * scale / STRIDE)) for side in (width, height))
+        return STRIDE * width, STRIDE * height
 
 
 def compute_maps(
     rgb: np.ndarray, network: Network, options: HeatmapOptions = HeatmapOptions()
 ) -> Maps:
-    """Run the network on an image.
-
-    Args:
-        rgb: (H, W, 3) uint8 RGB.
-        network: the loaded network.
-        options: the resolution and the order of the channels.
-
-    Returns:
-        The heat map and its logits, at the image's own pixels. Where the network sees a smaller
-        image, only what it says of that is kept, and enlarged when a map is asked for. A constant
-        image holds nothing to detect: its map is 0 throughout.
-    """
+    """Run the network on a (H, W, 3) uint8 RGB image, as `compute_maps_of_batch` does."""
     return compute_maps_of_batch([rgb], network, options)[0]
 
 
 def compute_maps_of_batch(
     images: Sequence[np.ndarray], network: Network, options: HeatmapOptions = HeatmapOptions()
 ) -> list[Maps]:
-    """Run the network once on several images.
+    """Run the network once on (H, W, 3) uint8 RGB images that it sees at one size.
 
-    Args:
-        images: (H, W, 3) uint8 RGB each, of which `seen_size` is the same.
-        network, options: as of `compute_maps`.
-
-    Returns:
-        As `compute_maps`, of each image. Of images run together the last bits may be others.
+    The maps are at the images' own pixels: scaled ones are enlarged when a map is asked for. A
+    constant image holds nothing to detect: its map is 0. The last bits of images that are run
+    together may be others.
     """
-    maps: list[Maps | None] = [None] * len(images)
+    logits: dict[int, np.ndarray] = {}
     together = []
     for number, rgb in enumerate(images):
-        native = _is_native(rgb.shape, options)
-        if not native and options.tile_megapixels != "auto":
-            raise OptionError(
-                "`tile_megapixels` needs `resolution='native'`: scaled images are small"
-            )
         if _is_constant(rgb):
-            maps[number] = Maps.of_logits(np.full(rgb.shape[:2], -np.inf, np.float32))
-            continue
-        seen = _seen(rgb, options)
-        tiled = _tiled(network, rgb.shape[0] * rgb.shape[1], options) if native else None
-        if tiled is None:
-            together.append((number, seen))
-            continue
-        (logits,) = _mean_of_flips(partial(_run_tiled, tiled, options), [seen], options)
-        maps[number] = Maps.of_logits(logits)
+            logits[number] = np.full(rgb.shape[:2], -np.inf, np.float32)
+        elif tiled := _tiled(network, rgb.shape, options):
+            (logits[number],) = _mean_of_flips(tiled, [_seen(rgb, options)], options)
+        else:
+            together.append(number)
     if together:
-        found = _mean_of_flips(partial(_run, network), [seen for _, seen in together], options)
-        largest = max(images[number].shape[0] * images[number].shape[1] for number, _ in together)
-        scaled = not _is_native(images[together[0][0]].shape, options)
-        if scaled and largest > RELEASE_PIXELS and hasattr(network, "release_memory"):
+        seen = [_seen(images[number], options) for number in together]
+        found = _mean_of_flips(partial(_run, network), seen, options)
+        logits.update(zip(together, found, strict=True))
+        shapes = [images[number].shape for number in together]
+        large = max(height * width for height, width, _ in shapes) > RELEASE_PIXELS
+        if large and not options.is_native(shapes[0]) and hasattr(network, "release_memory"):
             network.release_memory()
             release_freed_memory()
-        for (number, _), logits in zip(together, found, strict=True):
-            shape = images[number].shape[:2]
-            native = _is_native(shape, options)
-            maps[number] = Maps.of_logits(logits) if native else _enlarged(logits, shape)
-    return [one for one in maps if one is not None]
+    return [
+        Maps.of_logits(logits[number])
+        if logits[number].shape == rgb.shape[:2]
+        else _enlarged(logits[number], rgb.shape[:2])
+        for number, rgb in enumerate(images)
+    ]
 
 
 @contextmanager
@@ -156,49 +153,26 @@ def memory_named(shape: tuple[int, ...], images: int = 1) -> Iterator[None]:
     """Make lack of memory, in work on images of this shape, an error of one sentence."""
     try:
         yield
-        return
-    except MemoryError:
-        pass
     except Exception as error:
-        if not is_lack_of_memory(error):
+        if not (isinstance(error, MemoryError) or is_lack_of_memory(error)):
             raise
-    height, width = shape[:2]
-    if images > 1:
+        size = f"{shape[1]}x{shape[0]} pixels"
         raise DeepDetectError(
-            f"there is not enough memory for {images} images of {width}x{height} pixels at once: "
+            f"there is not enough memory for {images} images of {size} at once: "
             "use a smaller `batch_size`"
-        )
-    raise DeepDetectError(
-        f"there is not enough memory for an image of {width}x{height} pixels: "
-        "use `resolution='auto'`, fewer keypoints, or a smaller image"
-    )
-
-
-def seen_size(shape: tuple[int, ...], options: HeatmapOptions) -> tuple[int, int]:
-    """Return the width and height at which the network sees an image of a shape (H, W, ...)."""
-    height, width = shape[:2]
-    if _is_native(shape, options):
-        return width, height
-    if options.resolution != "auto":
-        return int(options.resolution), int(options.resolution)
-    scale = (MAX_AUTO_PIXELS / (height * width)) ** 0.5
-    width, height = (max(STRIDE, round(side * scale / STRIDE) * STRIDE) for side in (width, height))
-    return width, height
-
-
-def _is_native(shape: tuple[int, ...], options: HeatmapOptions) -> bool:
-    """Return whether the network sees an image at its own size."""
-    whole = shape[0] * shape[1] <= MAX_AUTO_PIXELS
-    return options.resolution == "native" or (options.resolution == "auto" and whole)
+            if images > 1
+            else f"there is not enough memory for an image of {size}: "
+            "use `resolution='auto'`, fewer keypoints, or a smaller image"
+        ) from None
 
 
 def _seen(rgb: np.ndarray, options: HeatmapOptions) -> np.ndarray:
     """Return an image with the size and the order of channels that the network sees."""
     seen = rgb if options.network_channels == "rgb" else rgb[:, :, ::-1]
-    if _is_native(rgb.shape, options):
+    if options.is_native(rgb.shape):
         return seen
     kind = cv2.INTER_AREA if options.resolution == "auto" else cv2.INTER_CUBIC
-    size = seen_size(rgb.shape, options)
+    size = options.seen_size(rgb.shape)
     scaled: np.ndarray = cv2.resize(np.ascontiguousarray(seen), size, interpolation=kind)
     return scaled
 
@@ -216,65 +190,47 @@ def _enlarged(logits: np.ndarray, shape: tuple[int, ...]) -> Maps:
     return Maps(shape, heatmap, lambda: enlarged(logits))
 
 
-def _tiled(network: Network, pixels: int, options: HeatmapOptions) -> TiledNetwork | None:
-    """Return the network for tiles, or None for an image that is run whole."""
+def _tiled(network: Network, shape: tuple[int, ...], options: HeatmapOptions) -> Run | None:
+    """Return what runs the network in tiles, or None for an image that is run whole."""
     path = getattr(network, "onnx_path", None)  # torch, bfloat16 and others run whole
-    if options.tile_megapixels == "auto":
-        if path is None or pixels * network.bytes_per_pixel <= available_memory():  # type: ignore[attr-defined]
-            return None
-        return _open_tiled(path, network)
-    if pixels <= options.tile_megapixels * 1e6:
+    area = None if options.tile_megapixels == "auto" else float(options.tile_megapixels)
+    if not options.is_native(shape) or (area is None and path is None):
         return None
-    tiled = None if path is None else _open_tiled(path, network)
-    if tiled is None:
-        raise OptionError(
-            "this network cannot be run in tiles: leave `tile_megapixels` out, or use ONNX weights "
-            "that deepdetect has trained, in float32"
-        )
-    return tiled
-
-
-def _open_tiled(path: Path, network: Network) -> TiledNetwork | None:
+    most = available_memory() / network.bytes_per_pixel if area is None else area * 1e6  # type: ignore[attr-defined]
+    if shape[0] * shape[1] <= most:
+        return None
     from .tiling import open_tiled
 
-    return open_tiled(path, network.threads)  # type: ignore[attr-defined]
+    tiled = None if path is None else open_tiled(path, network.threads)  # type: ignore[attr-defined]
+    if tiled is not None:
+        return lambda images: [tiled(rgb, area) for rgb in images]
+    if area is None:
+        return None
+    raise OptionError(
+        "this network cannot be run in tiles: leave `tile_megapixels` out, or use ONNX weights "
+        "that deepdetect has trained, in float32"
+    )
 
 
 def _is_constant(rgb: np.ndarray) -> bool:
     return all((rgb[rows] == rgb[0, 0]).all() for rows in bands(rgb.shape))
 
 
-def _pad(rgb: np.ndarray) -> np.ndarray:
-    """Repeat the last row and column until both sides are multiples of 8."""
-    below, right = -rgb.shape[0] % STRIDE, -rgb.shape[1] % STRIDE
-    if not below and not right:
-        return rgb
-    return np.pad(rgb, ((0, below), (0, right), (0, 0)), mode="edge")
-
-
 def _run(network: Network, images: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return the (H, W) logits of images of one size, each flip of which is padded by itself."""
+    """Return the (H, W) logits of images of one size.
+
+    The last row and column of each are repeated until both sides are multiples of 8.
+    """
     height, width = images[0].shape[:2]
-    padded = [_pad(rgb) for rgb in images]
-    planes = np.empty((len(images), 3, *padded[0].shape[:2]), np.float32)
-    for rgb, into in zip(padded, planes, strict=True):
-        np.multiply(rgb.transpose(2, 0, 1), np.float32(1 / 255), out=into)
+    below, right = -height % STRIDE, -width % STRIDE
+    planes = np.empty((len(images), 3, height + below, width + right), np.float32)
+    for rgb, into in zip(images, planes, strict=True):
+        padded = np.pad(rgb, ((0, below), (0, right), (0, 0)), "edge") if below or right else rgb
+        np.multiply(padded.transpose(2, 0, 1), np.float32(1 / 255), out=into)
     return [np.ascontiguousarray(logits[0, :height, :width]) for logits in network(planes)]
 
 
-def _run_tiled(
-    tiled: TiledNetwork, options: HeatmapOptions, images: Sequence[np.ndarray]
-) -> list[np.ndarray]:
-    """Return the (H, W) logits of images, each run in tiles."""
-    area = None if options.tile_megapixels == "auto" else float(options.tile_megapixels)
-    return [tiled(rgb, area) for rgb in images]
-
-
-def _mean_of_flips(
-    run: Callable[[list[np.ndarray]], list[np.ndarray]],
-    images: list[np.ndarray],
-    options: HeatmapOptions,
-) -> list[np.ndarray]:
+def _mean_of_flips(run: Run, images: list[np.ndarray], options: HeatmapOptions) -> list[np.ndarray]:
     """Return the logits of images, with `tta` the mean of those of their flips and turns."""
     if options.tta == "none":
         return run(images)
@@ -285,6 +241,4 @@ def _mean_of_flips(
             found = run([each[:, ::step] for each in turned])
             for mean, logits in zip(means, found, strict=True):
                 mean += np.rot90(logits[:, ::step], -turns)
-    for mean in means:
-        mean /= 8
-    return means
+    return [mean / np.float32(8) for mean in means]

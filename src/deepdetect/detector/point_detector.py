@@ -18,7 +18,7 @@ from ..features.selection import check_ignore, check_max_keypoints
 from ..features.sift import describe_keypoints
 from ..io.image import load_image, luma
 from .heatmap import MAX_AUTO_PIXELS, memory_named
-from .image_lists import Images, ignore_masks, image_list, image_named, load_each
+from .image_lists import Images, ignore_masks, image_named, load_each
 from .points.detection import SPREADS, Spread, detect_points
 from .points.ranker import load_ranker
 from .pretrained import RANKER
@@ -127,7 +127,7 @@ class PointDetector:
             OptionError: a mask has another size than its image.
         """
         masks, found = ignore_masks(ignore, len(images)), []
-        for number, rgb in load_each(image_list(images), channels):
+        for number, rgb in load_each(images, channels):
             with image_named(number):
                 found.append(self._find(rgb, masks[number]))
         return found

@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from .._shared.errors import DeepDetectError
 from .._shared.memory import release_freed_memory
 from .._shared.progress import progress
 from .backends.onnx_parts import cut_onnx
-from .backends.without_telemetry import import_onnxruntime
+from .backends.onnxruntime_backend import start_session
 
 STRIDE = 8
 
@@ -57,7 +56,8 @@ END_MARGIN_PX = 80
 DEFAULT_TILE_MEGAPIXELS = 2.7
 
 Part = Callable[..., list[np.ndarray]]
-Span = tuple[slice, slice, slice]
+Reader = Callable[[slice, slice], np.ndarray]
+"""Gives the tile of an input at rows and columns, which are counted in strides."""
 
 
 @dataclass(frozen=True)
@@ -77,88 +77,31 @@ class TiledNetwork:
     end: Part
 
     def __call__(self, rgb: np.ndarray, tile_megapixels: float | None = None) -> np.ndarray:
-        """Compute the logits.
-
-        Args:
-            rgb: (H, W, 3) uint8, of any size; it is padded as `compute_maps` does.
-            tile_megapixels: how much of the image is run at a time; None: 2.7.
-
-        Returns:
-            (H, W) float32.
-        """
+        """Compute the (H, W) float32 logits of (H, W, 3) uint8, so much of it at a time."""
         side = int((1e6 * (tile_megapixels or DEFAULT_TILE_MEGAPIXELS)) ** 0.5)
-        height, width = (-(-length // STRIDE) for length in rgb.shape[:2])
-        starts = list(_tiles(height, width, side // STRIDE, START_MARGIN_PX // STRIDE))
-        middles = list(_tiles(height, width, side // 2, BLOCK_MARGIN * (BLOCKS + 1)))
+        height, width = rgb.shape[:2]
+        size = (-(-height // STRIDE), -(-width // STRIDE))
+        image: Reader = functools.partial(_planes, rgb)
+        margin = START_MARGIN_PX // STRIDE
+        reduced, quarter = _in_tiles(self.start, [image], (1, 2), size, side // STRIDE, margin)
+        margin = BLOCK_MARGIN * (BLOCKS + 1)
+        (eighth,) = _in_tiles(self._blocks, [_reader(reduced)], (1,), size, side // 2, margin)
+        del reduced
+        inputs = [image, _reader(quarter, 2), _reader(eighth)]
         # Beside the logits there is less room, and these overlap little.
-        ends = list(_tiles(height, width, side // (2 * STRIDE), END_MARGIN_PX // STRIDE))
-        total = len(starts) + len(middles) * len(self.blocks) + len(ends)
+        margin = END_MARGIN_PX // STRIDE
+        (logits,) = _in_tiles(self.end, inputs, (STRIDE,), size, side // (2 * STRIDE), margin)
+        del quarter, eighth, inputs
         release_freed_memory()
-        with progress(total, "network", "tile", quiet=not sys.stderr.isatty()) as bar:
-            reduced, quarter = self._run_start(rgb, height, width, starts, bar)
-            release_freed_memory()
-            eighth = self._run_middle(reduced, middles, bar)
-            del reduced
-            release_freed_memory()
-            logits = self._run_end(rgb, quarter, eighth, ends, bar)
-        del quarter, eighth
+        return np.ascontiguousarray(logits[0, 0, :height, :width])
+
+    def _blocks(self, reduced: np.ndarray) -> list[np.ndarray]:
+        """Run the blocks and the middle on a tile of the reduced features."""
+        features = _in_bands(self.blocks[0], reduced)
+        for block in self.blocks[1:]:
+            _in_bands(block, features, into=features)
         release_freed_memory()
-        return logits
-
-    def _run_start(
-        self, rgb: np.ndarray, height: int, width: int, tiles: list[tuple[Span, Span]], bar: Any
-    ) -> tuple[np.ndarray, np.ndarray]:
-        reduced, quarter = np.empty(0), np.empty(0)
-        for row, column in tiles:
-            found = self.start(_planes(rgb, row[0], column[0]))
-            if not reduced.size:
-                reduced = np.empty((1, found[0].shape[1], height, width), np.float32)
-                quarter = np.empty((1, found[1].shape[1], 2 * height, 2 * width), np.float32)
-            for whole, part, scale in ((reduced, found[0], 1), (quarter, found[1], 2)):
-                _place(whole, part, row, column, scale)
-            bar.update(1)
-        return reduced, quarter
-
-    def _run_middle(
-        self, reduced: np.ndarray, tiles: list[tuple[Span, Span]], bar: Any
-    ) -> np.ndarray:
-        eighth = np.empty(0)
-        for row, column in tiles:
-            given = reduced[:, :, row[0], column[0]]
-            features = _in_bands(self.blocks[0], given)
-            for block in self.blocks[1:]:
-                bar.update(1)
-                _in_bands(block, features, into=features)
-            release_freed_memory()
-            found = _in_bands(self.middle, given, features)
-            if not eighth.size:
-                eighth = np.empty((1, found.shape[1], *reduced.shape[2:]), np.float32)
-            _place(eighth, found, row, column, 1)
-            bar.update(1)
-            del features, found  # before those of the next tile are made
-            release_freed_memory()
-        return eighth
-
-    def _run_end(
-        self,
-        rgb: np.ndarray,
-        quarter: np.ndarray,
-        eighth: np.ndarray,
-        tiles: list[tuple[Span, Span]],
-        bar: Any,
-    ) -> np.ndarray:
-        logits = np.empty(rgb.shape[:2], np.float32)
-        for row, column in tiles:
-            (found,) = self.end(
-                _planes(rgb, row[0], column[0]),
-                np.ascontiguousarray(quarter[:, :, _times(row[0], 2), _times(column[0], 2)]),
-                np.ascontiguousarray(eighth[:, :, row[0], column[0]]),
-            )
-            into = logits[_times(row[1], STRIDE), _times(column[1], STRIDE)]
-            inner = found[0, 0, _times(row[2], STRIDE), _times(column[2], STRIDE)]
-            into[...] = inner[: into.shape[0], : into.shape[1]]
-            bar.update(1)
-        return logits
+        return [_in_bands(self.middle, reduced, features)]
 
 
 def open_tiled(path: Path, threads: int | None = None) -> TiledNetwork | None:
@@ -170,19 +113,10 @@ def open_tiled(path: Path, threads: int | None = None) -> TiledNetwork | None:
 @functools.lru_cache(maxsize=2)
 def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwork | None:
     model = path.read_bytes()
-    onnxruntime = import_onnxruntime()
-    settings = onnxruntime.SessionOptions()
-    settings.log_severity_level = 4
-    # Kept memory would add up over the parts.
-    settings.enable_cpu_mem_arena = False
-    settings.enable_mem_pattern = False
-    if threads is not None:
-        settings.intra_op_num_threads = threads
 
     def part(inputs: tuple[str, ...], outputs: tuple[str, ...]) -> Part:
-        session = onnxruntime.InferenceSession(
-            cut_onnx(model, inputs, outputs), settings, providers=["CPUExecutionProvider"]
-        )
+        # Kept memory would add up over the parts.
+        session = start_session(cut_onnx(model, inputs, outputs), threads, keep_memory=False)
 
         def run(*given: np.ndarray) -> list[np.ndarray]:
             try:
@@ -206,6 +140,38 @@ def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwo
         )
     except Exception:  # parts that are not there or not alone in the file: it is run whole
         return None
+
+
+def _in_tiles(
+    part: Part,
+    inputs: Sequence[Reader],
+    scales: tuple[int, ...],
+    size: tuple[int, int],
+    side: int,
+    margin: int,
+) -> list[np.ndarray]:
+    """Run a part on tiles of its inputs, and join its outputs.
+
+    Size, side and margin are counted in strides, in which an output is so many times as large.
+    """
+    outputs: list[np.ndarray] = []
+    tiles = list(product(*(_spans(length, side, margin) for length in size)))
+    release_freed_memory()
+    with progress(len(tiles), "network", "tile", quiet=not sys.stderr.isatty()) as bar:
+        for (seen_rows, rows, inner_rows), (seen_columns, columns, inner_columns) in tiles:
+            found = part(*(read(seen_rows, seen_columns) for read in inputs))
+            if not outputs:
+                outputs = [
+                    np.empty((1, tile.shape[1], *(scale * length for length in size)), np.float32)
+                    for tile, scale in zip(found, scales, strict=True)
+                ]
+            for output, tile, scale in zip(outputs, found, scales, strict=True):
+                inner = tile[:, :, _times(inner_rows, scale), _times(inner_columns, scale)]
+                output[:, :, _times(rows, scale), _times(columns, scale)] = inner
+            del found, tile, inner  # before those of the next tile are made
+            release_freed_memory()
+            bar.update(1)
+    return outputs
 
 
 def _in_bands(part: Part, *given: np.ndarray, into: np.ndarray | None = None) -> np.ndarray:
@@ -233,13 +199,11 @@ def _in_bands(part: Part, *given: np.ndarray, into: np.ndarray | None = None) ->
     return into
 
 
-def _tiles(height: int, width: int, side: int, margin: int) -> Iterator[tuple[Span, Span]]:
-    """Yield rows and columns of tiles: what is seen, what is written, and where that lies in it."""
-    return product(_spans(height, side, margin), _spans(width, side, margin))
+def _spans(length: int, side: int, margin: int) -> list[tuple[slice, slice, slice]]:
+    """Divide a length into as few equal parts as are, with their margins, at most a side long.
 
-
-def _spans(length: int, side: int, margin: int) -> list[Span]:
-    """Divide a length into as few equal parts as are, with their margins, at most a side long."""
+    Of each: what is seen, what is written, and where that lies in what is seen.
+    """
     count = 1
     while (core := -(-length // count)) + margin * min(count - 1, 2) > side and core > margin:
         count += 1
@@ -255,19 +219,18 @@ def _times(span: slice, scale: int) -> slice:
     return slice(span.start * scale, span.stop * scale)
 
 
-def _place(whole: np.ndarray, part: np.ndarray, row: Span, column: Span, scale: int) -> None:
-    """Copy the inner pixels of a tile to their places."""
-    inner = part[:, :, _times(row[2], scale), _times(column[2], scale)]
-    whole[:, :, _times(row[1], scale), _times(column[1], scale)] = inner
+def _reader(features: np.ndarray, scale: int = 1) -> Reader:
+    return lambda rows, columns: np.ascontiguousarray(
+        features[:, :, _times(rows, scale), _times(columns, scale)]
+    )
 
 
 def _planes(rgb: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
     """Return (1, 3, H, W) float32 of a tile; beyond the image its last row and column go on."""
     height, width = STRIDE * (rows.stop - rows.start), STRIDE * (columns.stop - columns.start)
     tile = rgb[_times(rows, STRIDE), _times(columns, STRIDE)]
-    missing = (height - tile.shape[0], width - tile.shape[1])
-    if any(missing):
-        tile = np.pad(tile, ((0, missing[0]), (0, missing[1]), (0, 0)), mode="edge")
+    below, right = height - tile.shape[0], width - tile.shape[1]
+    tile = np.pad(tile, ((0, below), (0, right), (0, 0)), mode="edge")
     planes = np.empty((1, 3, height, width), np.float32)
     np.multiply(tile.transpose(2, 0, 1), np.float32(1 / 255), out=planes[0])
     return planes

@@ -9,8 +9,8 @@ import pytest
 
 from deepdetect import DeepDetect
 from deepdetect._shared.errors import OptionError
+from deepdetect.detector.backends.interface import RuntimeOptions
 from deepdetect.detector.backends.onnxruntime_backend import open_onnxruntime
-from deepdetect.detector.backends.options import RuntimeOptions
 from deepdetect.detector.pretrained import pretrained_weights
 
 CUDA = RuntimeOptions("onnxruntime", "cuda")

@@ -7,12 +7,14 @@ the format (onnx.proto3) are read: nodes and weights are copied as they are.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 MODEL_GRAPH = 7
 GRAPH_NODE, GRAPH_NAME, GRAPH_INITIALIZER, GRAPH_INPUT, GRAPH_OUTPUT = 1, 2, 5, 11, 12
 NODE_INPUT, NODE_OUTPUT = 1, 2
-INITIALIZER_NAME, VALUE_NAME = 8, 1
+NAME = {GRAPH_INITIALIZER: 8, GRAPH_INPUT: 1, GRAPH_OUTPUT: 1}
+"""Where the name is in what has one."""
+
 FLOAT = 1
 
 Bytes = bytes | memoryview
@@ -20,18 +22,9 @@ Bytes = bytes | memoryview
 
 
 def cut_onnx(model: bytes, inputs: Sequence[str], outputs: Sequence[str]) -> bytes:
-    """Cut out of an ONNX file what computes some tensors from others.
+    """Cut out of an ONNX file what computes some tensors, (1, C, H, W) float32, from others.
 
-    Args:
-        model: the file's content.
-        inputs: names of the tensors to be given, (1, C, H, W) float32 of any size.
-        outputs: names of the tensors to be computed, of the same kind.
-
-    Returns:
-        The content of a smaller file.
-
-    Raises:
-        KeyError: a tensor is not there, or needs more than the inputs.
+    A KeyError says which tensor is not there, or needs more than the inputs.
     """
     return _cut(
         _read(model),
@@ -41,30 +34,16 @@ def cut_onnx(model: bytes, inputs: Sequence[str], outputs: Sequence[str]) -> byt
 
 
 def leave_out_outputs(model: bytes, names: Collection[str]) -> bytes:
-    """Cut off an ONNX file what computes some of its outputs only.
+    """Cut off an ONNX file what computes these outputs only; without them it stays the same.
 
     ONNX Runtime computes all outputs of a file, asked for or not.
-
-    Args:
-        model: the file's content.
-        names: of the outputs.
-
-    Returns:
-        The content of a smaller file; the same where it has none of these outputs.
-
-    Raises:
-        KeyError: it is no ONNX file.
     """
-    try:
-        graph = _read(model)
-        kept = {name: raw for name, raw in graph.outputs.items() if name not in names}
-        return model if len(kept) == len(graph.outputs) else _cut(graph, graph.inputs, kept)
-    except (IndexError, StopIteration, UnicodeDecodeError) as error:
-        raise KeyError(str(error)) from None
+    graph = _read(model)
+    kept = {name: raw for name, raw in graph.outputs.items() if name not in names}
+    return model if len(kept) == len(graph.outputs) else _cut(graph, graph.inputs, kept)
 
 
-@dataclass(frozen=True)
-class _Graph:
+class _Graph(NamedTuple):
     """What an ONNX file holds, each part as it is written there."""
 
     model: list[Bytes]  # all but the graph
@@ -95,19 +74,18 @@ def _cut(graph: _Graph, inputs: Mapping[str, Bytes], outputs: Mapping[str, Bytes
 
 def _read(model: bytes) -> _Graph:
     """Take an ONNX file apart."""
-    rest: list[Bytes] = []
+    parts = _Graph([], [], {}, {}, {})
+    named = {
+        GRAPH_INITIALIZER: parts.weights,
+        GRAPH_INPUT: parts.inputs,
+        GRAPH_OUTPUT: parts.outputs,
+    }
     graph: Bytes = b""
     for number, payload, raw in _fields(model):
         if number == MODEL_GRAPH:
             graph = payload
         else:
-            rest.append(raw)
-    parts = _Graph(rest, [], {}, {}, {})
-    named = {
-        GRAPH_INITIALIZER: (parts.weights, INITIALIZER_NAME),
-        GRAPH_INPUT: (parts.inputs, VALUE_NAME),
-        GRAPH_OUTPUT: (parts.outputs, VALUE_NAME),
-    }
+            parts.model.append(raw)
     for number, payload, raw in _fields(graph):
         if number == GRAPH_NODE:
             names = [(kind, str(name, "utf-8")) for kind, name, _ in _fields(payload) if kind <= 2]
@@ -115,9 +93,8 @@ def _read(model: bytes) -> _Graph:
             written = [name for kind, name in names if kind == NODE_OUTPUT]
             parts.nodes.append((raw, read, written))
         elif number in named:
-            into, field = named[number]
-            name = next(text for kind, text, _ in _fields(payload) if kind == field)
-            into[str(name, "utf-8")] = raw
+            name = next(text for kind, text, _ in _fields(payload) if kind == NAME[number])
+            named[number][str(name, "utf-8")] = raw
     return parts
 
 
@@ -133,12 +110,10 @@ def _fields(data: Bytes) -> Iterator[tuple[int, memoryview, memoryview]]:
         elif kind == 2:
             length, first = _varint(data, place)
             place = first + length
-        elif kind in (1, 5):
-            place += 8 if kind == 1 else 4
         else:
-            raise KeyError(f"field of kind {kind}")
+            place += {1: 8, 5: 4}[kind]
         if place > len(data):
-            raise KeyError("the end of the file")
+            raise EOFError("the file ends within a message")
         yield tag >> 3, data[first:place], data[start:place]
 
 

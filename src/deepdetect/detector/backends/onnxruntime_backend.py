@@ -8,18 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from ..._shared.errors import OptionError, WeightsError, unknown_name
-from .onnx_parts import leave_out_outputs
-from .options import RuntimeOptions
-from .shapes import (
+from ..._shared.errors import OptionError, unknown_name
+from .interface import (
     KEYPOINT_OUTPUTS,
     PROBE_SHAPE,
+    RuntimeOptions,
     as_logits,
-    check_network,
     failed_run,
-    lack_of_memory,
     output_to_read,
+    unreadable,
 )
+from .onnx_parts import leave_out_outputs
 from .without_telemetry import import_onnxruntime
 
 CPU = "CPUExecutionProvider"
@@ -32,12 +31,10 @@ class OnnxRuntimeNetwork:
     bytes_per_pixel = 150
     """Of memory that a run takes, about."""
 
-    def __init__(
-        self, session: Any, input_name: str, output_name: str, path: Path, threads: int | None
-    ) -> None:
+    def __init__(self, session: Any, path: Path, threads: int | None) -> None:
         self._session = session
-        self._input_name = input_name
-        self._output_name = output_name
+        self._input_name = session.get_inputs()[0].name
+        self._output_name = output_to_read([value.name for value in session.get_outputs()])
         self.onnx_path = path
         self.threads = threads
 
@@ -45,10 +42,7 @@ class OnnxRuntimeNetwork:
         try:
             output = self._session.run([self._output_name], {self._input_name: image})[0]
         except Exception as error:  # its exceptions share no base class
-            if any(words in str(error) for words in ("allocate memory", "bad_alloc")):
-                raise lack_of_memory(image.shape) from None
-            reason = str(error).splitlines()[0]
-            raise failed_run(image.shape, reason, "another device") from None
+            raise failed_run(error, image.shape) from None
         return as_logits(output, self._output_name, image.shape, self.onnx_path)
 
     def release_memory(self) -> None:
@@ -62,12 +56,7 @@ class OnnxRuntimeNetwork:
 
 
 def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
-    """Load an ONNX file.
-
-    Raises:
-        WeightsError: the file is damaged or is another network.
-        OptionError: the device is unknown or not available.
-    """
+    """Load an ONNX file; a device that is not there is an OptionError."""
     onnxruntime = import_onnxruntime()
     device = options.device
     provider = PROVIDERS.get(device, device)
@@ -80,52 +69,43 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
             f"the installed onnxruntime does not have the device {device}: install {build}, or use "
             f"{' or '.join(['cpu', *(name for name in available if name != CPU)])}"
         )
+    try:
+        session = start_session(_maps_only(path), options.threads, provider)
+    except Exception as error:  # its exceptions share no base class
+        raise unreadable(path, error) if provider == CPU else _not_started(device, error) from None
+    # It goes on with the CPU when a provider cannot start, and says so in a log only.
+    if provider not in session.get_providers():
+        raise _not_started(device, "no reason given")
+    return OnnxRuntimeNetwork(session, path, options.threads)
+
+
+def start_session(
+    model: str | bytes, threads: int | None, provider: str = CPU, keep_memory: bool = True
+) -> Any:
+    """Start a session that prints nothing, for a file or its content."""
+    onnxruntime = import_onnxruntime()
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = 4  # what fails is said by the exception, and by us
-    if options.threads is not None:
-        settings.intra_op_num_threads = options.threads
-
-    try:
-        # Falling back to the CPU after a failure, it would print blocks of text.
-        session = onnxruntime.InferenceSession(
-            _maps_only(path), settings, providers=[provider], enable_fallback=0
-        )
-    except Exception as error:  # its exceptions share no base class
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        if provider != CPU:
-            raise OptionError(
-                f"the device {device} could not start with {path} ({reason}): check its driver and "
-                "libraries, or leave it out"
-            ) from None
-        raise WeightsError(
-            f"{path} is not an ONNX file that can be read ({reason}): download it again"
-        ) from None
-    # It goes on with the CPU when a provider cannot start, and says so in a log only.
+    settings.enable_cpu_mem_arena = settings.enable_mem_pattern = keep_memory
+    if threads is not None:
+        settings.intra_op_num_threads = threads
+    # Falling back to the CPU after a failure, it would print blocks of text.
+    session = onnxruntime.InferenceSession(model, settings, providers=[provider], enable_fallback=0)
     session.disable_fallback()
     session._model_bytes = None  # the content of the file, which it keeps for falling back
-    if provider not in session.get_providers():
-        raise OptionError(
-            f"the device {device} could not start: check its driver and libraries, or leave it out"
-        )
-    inputs = session.get_inputs()
-    outputs = session.get_outputs()
-    check_network(
-        path,
-        [value.shape for value in inputs],
-        [value.shape for value in outputs],
-        # It says "tensor(float)" for float32.
-        {
-            "float32" if value.type == "tensor(float)" else value.type
-            for value in [*inputs, *outputs]
-        },
+    return session
+
+
+def _not_started(device: str, reason: object) -> OptionError:
+    return OptionError(
+        f"the device {device} could not start ({str(reason).splitlines()[0]}): check its driver "
+        "and libraries, or leave it out"
     )
-    output = output_to_read([value.name for value in outputs])
-    return OnnxRuntimeNetwork(session, inputs[0].name, output, path, options.threads)
 
 
 def _maps_only(path: Path) -> str | bytes:
     """Return the content of a file that gives keypoints, too, without them; else its path."""
-    with contextlib.suppress(OSError, KeyError):  # ONNX Runtime says what is wrong
+    with contextlib.suppress(Exception):  # of a damaged file: ONNX Runtime says what is wrong
         model = path.read_bytes()
         without = leave_out_outputs(model, KEYPOINT_OUTPUTS)
         if without is not model:

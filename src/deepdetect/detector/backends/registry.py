@@ -1,7 +1,7 @@
 """The backends that can run the network: one line each.
 
 To add a backend, write its module beside this one with a function
-`open_NAME(path, options) -> Network`, add its line, and its name to `options.BACKENDS`.
+`open_NAME(path, options) -> Network`, add its line, and its name to `interface.BACKENDS`.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ from __future__ import annotations
 import functools
 import importlib.util
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from ..._shared.errors import (
     MissingExtraError,
@@ -19,72 +19,57 @@ from ..._shared.errors import (
     WeightsError,
     install_command,
 )
+from .interface import Network, RuntimeOptions, check_answer
 from .onnxruntime_backend import open_onnxruntime
 from .openvino_backend import open_openvino
-from .options import Network, RuntimeOptions
-from .shapes import sanity_check
 from .torch_backend import open_torch
 
 
-@dataclass(frozen=True)
-class Backend:
-    """A backend: its packages, the weights it reads, and the function that loads them."""
-
+class _Backend(NamedTuple):
     packages: tuple[str, ...]
-    suffixes: tuple[str, ...]
+    suffix: str
     open: Callable[[Path, RuntimeOptions], Network]
 
 
-_BACKENDS: dict[str, Backend] = {
-    "onnxruntime": Backend(("onnxruntime",), (".onnx",), open_onnxruntime),
-    "openvino": Backend(("openvino",), (".onnx",), open_openvino),
-    "torch": Backend(("torch", "safetensors"), (".safetensors",), open_torch),
+_BACKENDS = {
+    "onnxruntime": _Backend(("onnxruntime",), ".onnx", open_onnxruntime),
+    "openvino": _Backend(("openvino",), ".onnx", open_openvino),
+    "torch": _Backend(("torch", "safetensors"), ".safetensors", open_torch),
 }
 
 
 def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
-    """Load weights with the backend that fits; the last few networks are kept.
-
-    Args:
-        path: an ONNX or safetensors file.
-        options: the backend and its settings.
-
-    Returns:
-        The network, and the backend's name.
-
-    Raises:
-        WeightsError: the file is missing, damaged, or does not fit.
-        MissingExtraError: the backend is not installed.
-        OptionError: the backend does not read such files.
-    """
+    """Load weights with the backend that fits, and return its name; a few networks are kept."""
     if not path.is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")
-    name = options.backend
-    if name == "auto":
-        name = _choose(path, options)
+    name = _choose(path, options) if options.backend == "auto" else options.backend
     backend = _BACKENDS[name]
-    if path.suffix.lower() not in backend.suffixes:
+    if path.suffix.lower() != backend.suffix:
         raise OptionError(
-            f"the backend {name} reads {' or '.join(backend.suffixes)} files, not {path.name}: "
+            f"the backend {name} reads {backend.suffix} files, not {path.name}: "
             "leave the backend out, or give other weights"
         )
     options.check_backend(name)
-    for package in backend.packages:
+    require_packages(f"reading {path.name} with the backend {name}", *backend.packages)
+    file = path.stat()
+    return _open(name, path, options, (path.absolute(), file.st_mtime_ns, file.st_size)), name
+
+
+def require_packages(what: str, *packages: str) -> None:
+    """Raise a MissingExtraError where a package is not installed that something needs."""
+    for package in packages:
         if importlib.util.find_spec(package) is None:
             raise MissingExtraError(
-                f"reading {path.name} with the backend {name} needs the package {package}, "
-                f"which is not installed: run {install_command(package)}"
+                f"{what} needs the package {package}, which is not installed: "
+                f"run {install_command(package)}"
             )
-    file = path.stat()
-    state = path.absolute(), file.st_mtime_ns, file.st_size
-    return _open(name, path, options, state), name
 
 
 @functools.lru_cache(maxsize=4)
 def _open(backend: str, path: Path, options: RuntimeOptions, state: tuple[object, ...]) -> Network:
     """Load a file; one whose state has changed since is loaded again."""
     network = _BACKENDS[backend].open(path, options)
-    sanity_check(network, path)
+    check_answer(network, path)
     return network
 
 

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .options import RuntimeOptions
-from .shapes import LOGITS, as_logits
+from .interface import LOGITS, RuntimeOptions, as_logits
 
 
 class TorchNetwork:
@@ -32,11 +31,7 @@ class TorchNetwork:
 
 
 def open_torch(path: Path, options: RuntimeOptions) -> TorchNetwork:
-    """Load a safetensors file.
-
-    Raises:
-        WeightsError: the file is damaged or does not fit the network.
-    """
+    """Load a safetensors file."""
     import torch
 
     from ..network.weights import load_network

@@ -37,12 +37,12 @@ def _import_with(
     with _lock:
         if package in sys.modules:
             return importlib.import_module(package)
-        was_there, before = key in entries, entries.get(key)
+        before = dict(entries)
         entries[key] = value
         try:
             return importlib.import_module(package)
         finally:
-            if was_there:
-                entries[key] = before
+            if key in before:
+                entries[key] = before[key]
             else:
                 entries.pop(key, None)

@@ -1,0 +1,146 @@
+"""What the backends share: how a network is run, and what it must answer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+
+from ..._shared.errors import DeepDetectError, OptionError, WeightsError, unknown_name
+
+BACKENDS = ("onnxruntime", "openvino", "torch")
+PRECISIONS = ("float32", "bfloat16")
+
+LOGITS = "logits"
+"""Name of the output that holds logits; an output of another name holds probabilities."""
+
+KEYPOINT_OUTPUTS = frozenset({"keypoints", "keypoint_logits"})
+"""Outputs of files that give keypoints, too: these are not read."""
+
+PROBE_SHAPE = (24, 32)
+"""Height and width of the image that a network is tried on."""
+
+
+class Network(Protocol):
+    """A loaded network."""
+
+    def __call__(self, image: np.ndarray) -> np.ndarray:
+        """Map (N, 3, H, W) float32 in [0, 1] to (N, 1, H, W) float32 logits, all finite.
+
+        H and W are multiples of 8. Lack of memory is a MemoryError, wrong answers WeightsErrors.
+        """
+
+
+@dataclass(frozen=True)
+class RuntimeOptions:
+    """How the network is run: the options of `DeepDetect` of these names."""
+
+    backend: str = "auto"
+    device: str = "cpu"
+    threads: int | None = None
+    precision: Literal["float32", "bfloat16"] = "float32"
+
+    def __post_init__(self) -> None:
+        if self.backend not in ("auto", *BACKENDS):
+            raise unknown_name("backend", self.backend, ("auto", *BACKENDS))
+        if self.threads is not None and self.threads < 1:
+            raise OptionError(f"threads must be at least 1, not {self.threads}")
+        if self.precision not in PRECISIONS:
+            raise unknown_name("precision", self.precision, PRECISIONS)
+
+    def check_backend(self, backend: str) -> None:
+        """Raise an OptionError if a backend has not what is asked of it."""
+        wanted = {
+            f'`precision="{self.precision}"`': "openvino" if self.precision != "float32" else None,
+            f'`device="{self.device}"`': "onnxruntime" if self.device != "cpu" else None,
+        }
+        for option, needed in wanted.items():
+            if needed not in (None, backend):
+                raise OptionError(
+                    f"{option} needs the backend {needed}, not {backend}: leave one of them out"
+                )
+
+
+def output_to_read(names: Sequence[str]) -> str:
+    """Choose the output to read: the logits, or the first where there are none."""
+    return LOGITS if LOGITS in names else names[0]
+
+
+def as_logits(
+    output: np.ndarray, name: str, image_shape: tuple[int, ...], path: Path
+) -> np.ndarray:
+    """Check the output of this name, and turn it into (N, 1, H, W) float32 logits.
+
+    Probabilities that float32 rounds to 0 or 1 become the logits of the nearest number it holds.
+    """
+    wanted = (image_shape[0], 1, *image_shape[2:])
+    if output.shape != wanted or output.dtype != np.float32:
+        raise WeightsError(
+            f"{path} does not fit: it gives a {output.dtype} map of shape {output.shape} for an "
+            f"image that needs float32 {wanted}; use other weights"
+        )
+    low, high = float(output.min()), float(output.max())  # NaN where there is one
+    if not (np.isfinite(low) and np.isfinite(high)):
+        raise WeightsError(
+            f"{path} gives values that are not finite: it is damaged, or its training diverged; "
+            "use other weights"
+        )
+    if name == LOGITS:
+        return output
+    if low < 0 or high > 1:
+        raise WeightsError(
+            f"{path} gives values from {low:g} to {high:g}, which are no "
+            f"probabilities: name the output {LOGITS!r} if it holds logits, or use other weights"
+        )
+    probability = np.clip(output.astype(np.float64), 1e-38, 1 - 2.0**-25)
+    return np.log(probability / (1 - probability)).astype(np.float32)
+
+
+def check_answer(network: Network, path: Path) -> None:
+    """Run a network on a small image of noise, so that a wrong one is refused when it is loaded."""
+    # Noise enough for this; importing NumPy's generators takes 6 MB.
+    numbers = np.arange(3 * math.prod(PROBE_SHAPE), dtype=np.uint16) * np.uint16(40503)
+    noise = numbers.reshape(1, 3, *PROBE_SHAPE).astype(np.float32) * np.float32(2**-16)
+    try:
+        logits = network(noise)
+    except WeightsError:
+        raise
+    except DeepDetectError as error:
+        raise WeightsError(
+            f"{path} does not fit: it must map one image (1, 3, height, width) of any size to one "
+            f"map (1, 1, height, width), but {error}"
+        ) from None
+    if logits.min() == logits.max():
+        raise WeightsError(
+            f"{path} gives the same value at every pixel of an image of noise: it is damaged, or "
+            "was never trained; use other weights"
+        )
+
+
+def unreadable(path: Path, error: Exception) -> WeightsError:
+    """Return the error for a file that a runtime refuses."""
+    return WeightsError(
+        f"{path} is not an ONNX file that can be read ({_reason(error)}): download it again"
+    )
+
+
+def failed_run(error: Exception, image_shape: tuple[int, ...]) -> Exception:
+    """Return the error of a run on (N, 3, H, W) that failed, a MemoryError for lack of memory."""
+    if any(word in f"{type(error).__name__} {error}" for word in ("MemoryError", "alloc")):
+        return MemoryError(str(error))
+    number, _, height, width = image_shape
+    images = "an image" if number == 1 else f"{number} images"
+    remedy = "use another backend or device" if number == 1 else "use `batch_size=1`"
+    return DeepDetectError(
+        f"the network failed on {images} of {width}x{height} pixels ({_reason(error)}): {remedy}"
+    )
+
+
+def _reason(error: Exception) -> str:
+    """Return the line of a runtime's message that says most: OpenVINO's begin with places."""
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    return lines[-1] if lines[0].startswith("Exception from") else lines[0]
