@@ -8,15 +8,12 @@ from deepdetect._shared.errors import ImageError, OptionError
 from deepdetect._shared.image_array import array_to_rgb, check_channels
 
 
-@pytest.mark.parametrize("side", [(20, 30), (16, 16), (3, 5)])
 @pytest.mark.parametrize("count", [1, 3, 4])
-def test_channels_may_come_first(side: tuple[int, int], count: int) -> None:
-    rng = np.random.default_rng(0)
-    last = rng.integers(0, 256, (*side, count), np.uint8)
-    if side == (3, 5):  # 3x5 pixels as channels last, so channels first are not tried
-        np.testing.assert_array_equal(array_to_rgb(last).shape, (3, 5, 3))
-        return
+def test_channels_may_come_first(count: int) -> None:
+    last = np.random.default_rng(0).integers(0, 256, (20, 30, count), np.uint8)
     np.testing.assert_array_equal(array_to_rgb(np.moveaxis(last, 2, 0)), array_to_rgb(last))
+    # 3x5 pixels with the channels last are no channels first.
+    assert array_to_rgb(np.zeros((3, 5, count), np.uint8)).shape == (3, 5, 3)
 
 
 def test_bgr_is_what_opencv_calls_it(photo: np.ndarray) -> None:

@@ -46,23 +46,11 @@ def test_one_worker_or_one_task_stays_in_this_process(
     assert [pid for pid, _ in map_in_processes(eval, tasks, workers)] == [os.getpid()] * len(tasks)
 
 
-@pytest.mark.parametrize(
-    ("function", "tasks", "workers", "error"),
-    [
-        (math.sqrt, [1.0, -1.0, 4.0], 1, ValueError),
-        (load_image, ["none.png", "nothing.png", "nil.png"], 2, ImageError),
-    ],
-)
-def test_errors_reach_the_caller(
-    function: Callable, tasks: list, workers: int, error: type[Exception], tmp_path: Path
-) -> None:
-    if function is load_image:
-        tasks = [tmp_path / name for name in tasks]
-    with pytest.raises(error) as caught:
-        list(map_in_processes(function, tasks, workers))
-    if error is ImageError:
-        assert "there is no file" in str(caught.value)
-        assert str(tmp_path) in str(caught.value)
+def test_errors_reach_the_caller(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="math domain"):
+        list(map_in_processes(math.sqrt, [1.0, -1.0, 4.0], 1))
+    with pytest.raises(ImageError, match="there is no file"):
+        list(map_in_processes(load_image, [tmp_path / f"{k}.png" for k in range(3)], 2))
 
 
 def test_a_dead_worker_is_one_sentence() -> None:

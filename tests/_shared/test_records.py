@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
 import os
 import shutil
 from dataclasses import dataclass
@@ -150,7 +149,7 @@ def test_what_is_not_replaced_belongs_to_what_it_did(tmp_path: Path, source: Pat
     assert Outputs([replaced], [other]).find() is None, "it may not be whole"
 
 
-@pytest.mark.parametrize("content", [b"", b"[1]", b"{}", b"\xff", b"[" * 100_000])
+@pytest.mark.parametrize("content", [b"", b"[1]", b"{}", b"\xff"])
 def test_a_damaged_record_is_none(tmp_path: Path, source: Path, content: bytes) -> None:
     outputs = Outputs([tmp_path / "points.npz"], [source])
     make(outputs)
@@ -177,15 +176,13 @@ def test_settings_that_differ_are_named(tmp_path: Path) -> None:
         check_same(tmp_path, before, {"ratio": 0.8, "seed": 1, "new": None})
     with pytest.raises(OptionError, match="something else"):
         check_same(tmp_path, None, {})
-    assert plain(Options()) == {"class": "Options", "ratio": 0.8, "sizes": [1, 2]}
 
 
-@pytest.mark.parametrize("compress", [True, False])
-def test_arrays_come_back_whole_or_not_at_all(tmp_path: Path, compress: bool) -> None:
+def test_arrays_come_back_whole_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "arrays.npz"
     assert load_arrays(path) is None
     arrays = {"points": np.arange(6.0).reshape(2, 3), "none": np.zeros((0, 2), np.uint8)}
-    save_arrays(path, arrays, compress=compress)
+    save_arrays(path, arrays)
     loaded = load_arrays(path)
     assert loaded is not None
     assert loaded.keys() == arrays.keys()
@@ -198,18 +195,13 @@ def test_arrays_come_back_whole_or_not_at_all(tmp_path: Path, compress: bool) ->
         assert load_arrays(path) is None
 
 
-def _is_locked(path: Path) -> bool:
-    try:
-        with lock(path, path):
-            return False
-    except OptionError:
-        return True
-
-
 @pytest.mark.skipif(os.name != "posix", reason="Windows has no flock")
-def test_one_process_at_a_time_holds_a_lock(tmp_path: Path) -> None:
+def test_one_at_a_time_holds_a_lock(tmp_path: Path) -> None:
     path = tmp_path / "lock"
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        with lock(path, tmp_path):
-            assert pool.apply(_is_locked, [path])
-        assert not pool.apply(_is_locked, [path])
+    for _ in range(2):
+        with (
+            lock(path, tmp_path),
+            pytest.raises(OptionError, match="another process"),
+            lock(path, tmp_path),
+        ):
+            pass

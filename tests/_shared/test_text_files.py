@@ -23,15 +23,13 @@ def test_files_with_and_without_a_byte_order_mark(kind: str, mark: bytes, tmp_pa
     assert read(path, 20) == {"a": [1, "ä"]}
 
 
-@pytest.mark.parametrize(
-    "content", ["a.b = [" * 900_000, "{" * 100_000, "\n" * 101, "a = " + "[" * 90, b"\xff", "{"]
-)
+@pytest.mark.parametrize("content", [b"\n" * 101, b"a = " + b"[" * 90, b"\xff", b"{"])
 @pytest.mark.parametrize("read", [read_json, read_toml])
 def test_other_files_are_a_value_error(
-    read: Callable[[Path, int], Any], content: str | bytes, tmp_path: Path
+    read: Callable[[Path, int], Any], content: bytes, tmp_path: Path
 ) -> None:
     path = tmp_path / "file"
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    path.write_bytes(content)
     with pytest.raises(ValueError):  # noqa: PT011 - of several kinds
         read(path, 100)
 

@@ -93,14 +93,6 @@ class BatchError(DeepDetectError):
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
     """Return the error for an unknown name, which suggests the nearest known one.
 
-    Args:
-        kind: what the name stands for, such as "detector".
-        name: the name that was given.
-        known: the names that exist.
-
-    Returns:
-        The error, for the caller to raise.
-
     Example:
         >>> print(unknown_name("detector", "siift", ["sift", "orb"]))
         unknown detector 'siift': did you mean 'sift'? (known: sift, orb)
@@ -120,7 +112,6 @@ WITHOUT_GPU = (
 )
 """How pip takes the build of torch for processors; on Linux it takes that for CUDA otherwise."""
 
-
 DISTRIBUTIONS = {
     "cv2": "opencv-python-headless",
     "faiss": "faiss-cpu",
@@ -137,9 +128,6 @@ def install_command(*packages: str) -> str:
     Example:
         >>> install_command("h5py", "faiss")
         'pip install h5py faiss-cpu'
-        >>> install_command("torch", "onnx")
-        'pip install torch onnx, without a GPU with the option --extra-index-url \
-https://download.pytorch.org/whl/cpu, which spares 6 GB'
     """
     names = " ".join(DISTRIBUTIONS.get(package, package) for package in packages)
     command = f"pip install {names}"

@@ -12,15 +12,9 @@ Channels = Literal["rgb", "bgr"]
 CHANNEL_ORDERS = ("rgb", "bgr")
 CHANNEL_COUNTS = (1, 3, 4)
 
-LAYOUTS = "(height, width), (height, width, channels) or (channels, height, width)"
-
 
 def check_channels(channels: str) -> None:
-    """Check the order of the colours of an image in an array.
-
-    Raises:
-        OptionError: it is unknown.
-    """
+    """Refuse an unknown order of the colours of an image in an array."""
     if channels not in CHANNEL_ORDERS:
         raise unknown_name("channel order", channels, CHANNEL_ORDERS)
 
@@ -46,20 +40,11 @@ def as_array(image: Any) -> np.ndarray:
 
 
 def array_to_rgb(image: Any, channels: Channels = "rgb", name: str = "the image") -> np.ndarray:
-    """Convert an image in an array or a PyTorch tensor to 8-bit RGB.
-
-    Args:
-        image: (H, W), (H, W, C) or (C, H, W), C 1, 3 or 4: bool, uint8, uint16 or float in [0, 1].
-            The fourth channel, alpha, is dropped.
-        channels: the order of the first three channels.
-        name: what errors call it.
-
-    Returns:
-        (H, W, 3) uint8.
+    """Convert an image in an array or a PyTorch tensor, as of `load_image`, to (H, W, 3) uint8 RGB.
 
     Raises:
-        ImageError: it has another shape, type or range, or holds NaN.
-        OptionError: the order is unknown.
+        ImageError: it has another shape, type or range, or holds NaN; `name` is what it is called.
+        OptionError: the order of the channels is unknown.
 
     Example:
         >>> red = np.zeros((3, 20, 30), np.float32)
@@ -89,7 +74,8 @@ def _channels_last(array: np.ndarray) -> np.ndarray:
     if array.ndim == 2 or (array.ndim == 3 and array.shape[2] in CHANNEL_COUNTS):
         return array
     raise ImageError(
-        f"an image array has shape {shape}: it must be {LAYOUTS}, with 1, 3 or 4 channels"
+        f"an image array has shape {shape}: it must be (height, width), (height, width, channels) "
+        "or (channels, height, width), with 1, 3 or 4 channels"
         + ("; give several grey images as a list" if array.ndim == 3 else "")
     )
 

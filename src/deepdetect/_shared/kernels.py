@@ -1,8 +1,7 @@
 """Compilation of the kernels by numba, at the first call of each.
 
-The compiled code is cached where numba does so: in NUMBA_CACHE_DIR, in `__pycache__` beside the
-module, or in the user's cache folder. Where none of them can be written, as in a read-only
-container, it is cached in a folder of this user in the temporary directory, or else not at all.
+Where numba can write to none of the places of its cache, as in a read-only container, the cache is
+in a folder of this user in the temporary directory, or else there is none.
 """
 
 from __future__ import annotations
@@ -11,14 +10,13 @@ import functools
 import os
 import stat
 import tempfile
-import threading
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from .errors import MissingExtraError
 
-_lock = threading.Lock()
 _announcement: list[Callable[[], object]] = []
 
 
@@ -44,10 +42,7 @@ def _listen() -> None:
 
 
 def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator that compiles a function with numba at its first call, and caches it.
-
-    Args:
-        flags: of `numba.njit`, all but `cache`.
+    """Return a decorator that compiles a function by `numba.njit` at its first call, and caches it.
 
     Raises:
         MissingExtraError: numba cannot be imported: it takes some versions of NumPy only.
@@ -64,38 +59,32 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
     config: Any = numba.config  # its names are made at run time
 
     def decorate(function: Callable[..., Any]) -> Any:
-        try:
+        with suppress(RuntimeError):  # numba found no writable folder
             return numba.njit(cache=True, **flags)(function)
-        except RuntimeError:  # numba found no writable folder
-            folder = _temporary_folder()
-        if folder is None:
-            return numba.njit(**flags)(function)
-        with _lock:
-            before = config.CACHE_DIR
+        before = config.CACHE_DIR
+        try:
             # Read while a function is decorated, not when it is called.
-            config.CACHE_DIR = str(folder)
-            try:
-                return numba.njit(cache=True, **flags)(function)
-            except RuntimeError:  # no space left there, or numba is set to look elsewhere only
-                return numba.njit(**flags)(function)
-            finally:
-                config.CACHE_DIR = before
+            config.CACHE_DIR = str(_temporary_folder())
+            return numba.njit(cache=True, **flags)(function)
+        except (OSError, RuntimeError):
+            return numba.njit(**flags)(function)
+        finally:
+            config.CACHE_DIR = before
 
     return decorate
 
 
-def _temporary_folder() -> Path | None:
-    """Return a folder in the temporary directory that only this user can write, if possible.
+def _temporary_folder() -> Path:
+    """Return a folder in the temporary directory that only this user can write.
 
     Whoever can write there can make us run any code.
+
+    Raises:
+        OSError: there is none.
     """
-    if not hasattr(os, "getuid"):
-        return None
-    try:
-        folder = Path(tempfile.gettempdir()) / f"deepdetect-numba-{os.getuid()}"
-        folder.mkdir(mode=0o700, exist_ok=True)
-        found = folder.lstat()
-    except OSError:
-        return None
-    private = stat.S_ISDIR(found.st_mode) and not found.st_mode & 0o077
-    return folder if private and found.st_uid == os.getuid() else None
+    folder = Path(tempfile.gettempdir()) / f"deepdetect-numba-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_mode & 0o077 or found.st_uid != os.getuid():
+        raise PermissionError(f"{folder} is not this user's alone")
+    return folder

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+from contextlib import suppress
 from pathlib import Path
 
 from .errors import OptionError
@@ -31,32 +32,17 @@ _MMAP_THRESHOLD = (-3, 2**20)  # M_MMAP_THRESHOLD
 
 
 def available_memory() -> int:
-    """Return the memory in bytes that is available without swapping, within the container's limit.
-
-    Example:
-        >>> available_memory() > 0
-        True
-    """
+    """Return the bytes that are available without swapping, within the container's limit."""
     return min(_system_memory(), _container_memory())
 
 
 def needed_memory(**counts: float) -> float:
-    """Return the bytes that a step takes; `counts` by the names of `BYTES_PER`.
-
-    Example:
-        >>> needed_memory(canvas_pixel=1000, blended_pixel=10)
-        22250
-    """
+    """Return the bytes that a step takes; `counts` by the names of `BYTES_PER`."""
     return sum(BYTES_PER[name] * count for name, count in counts.items())
 
 
 def require_memory(what: str, advice: str, **counts: float) -> None:
-    """Stop before a step fills the memory.
-
-    Args:
-        what: needs it, as "3 keypoints".
-        advice: how to need less.
-        counts: as for `needed_memory`.
+    """Refuse a step that would fill the memory; `counts` as of `needed_memory`.
 
     Raises:
         OptionError: more is needed than is available.
@@ -68,57 +54,43 @@ def require_memory(what: str, advice: str, **counts: float) -> None:
         )
 
 
-def disable_malloc_trim() -> bool:
+def disable_malloc_trim() -> None:
     """Let this process keep the memory that it frees, where the C library is glibc.
 
     By default glibc returns large blocks to the system at once, and each page of the next ones is
     cleared again: a fifth of the time of a training step on the CPU, a sixth of that of labelling.
-    The memory of the process then stays at its peak.
-
-    Returns:
-        Whether it has an effect.
     """
-    if platform.libc_ver()[0] != "glibc":
-        return False
-    mallopt = ctypes.CDLL(None).mallopt
-    return all(mallopt(option, value) for option, value in _MALLOPT)
+    if platform.libc_ver()[0] == "glibc":
+        for option, value in _MALLOPT:
+            ctypes.CDLL(None).mallopt(option, value)
 
 
-def release_freed_memory() -> bool:
+def release_freed_memory() -> None:
     """Return freed memory to the system, now and, in blocks of a megabyte, from now on.
 
     The C library glibc keeps blocks of up to 32 MB otherwise, of which a network leaves hundreds of
     megabytes. It is a setting of the whole process.
-
-    Returns:
-        Whether it has an effect.
     """
-    if platform.libc_ver()[0] != "glibc":
-        return False
-    library = ctypes.CDLL(None)
-    library.malloc_trim(0)
-    return bool(library.mallopt(*_MMAP_THRESHOLD))
+    if platform.libc_ver()[0] == "glibc":
+        library = ctypes.CDLL(None)
+        library.malloc_trim(0)
+        library.mallopt(*_MMAP_THRESHOLD)
 
 
 def _system_memory() -> int:
-    try:
-        # MemAvailable includes caches that the system can drop.
+    # MemAvailable includes caches that the system can drop.
+    with suppress(OSError, StopIteration):  # macOS lacks the file
         lines = Path("/proc/meminfo").read_text().splitlines()
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvail"))
-    except (OSError, StopIteration):  # macOS lacks the file, old kernels the line
-        pass
-    try:
+    with suppress(AttributeError, ValueError):  # Windows
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
-    except (AttributeError, ValueError):  # Windows
-        return DEFAULT_MEMORY
+    return DEFAULT_MEMORY
 
 
 def _container_memory() -> int:
     """Return what the control group (version 2) of a container leaves to this process."""
     group = Path("/sys/fs/cgroup")
-    try:
-        limit = (group / "memory.max").read_text().strip()
-        used = int((group / "memory.current").read_text())
-        return 2**62 if limit == "max" else max(int(limit) - used, 0)
-    except OSError:
-        return 2**62
+    with suppress(OSError, ValueError):  # there is none, or its limit is "max"
+        limit, used = ((group / f"memory.{name}").read_text() for name in ("max", "current"))
+        return max(int(limit) - int(used), 0)
+    return 2**62

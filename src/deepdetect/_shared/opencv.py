@@ -28,10 +28,6 @@ DISTRIBUTIONS = (
 """The packages on PyPI that bring `cv2`."""
 
 
-NO_MEMORY_TO_LOAD = ("failed to map segment from shared object", "Cannot allocate memory")
-"""How glibc's words end where a library does not fit into the memory; it adds other reasons."""
-
-
 class _OpenCV(ModuleType):
     """Stands for `cv2`, and imports it when it is asked for anything."""
 
@@ -51,14 +47,11 @@ def import_opencv() -> ModuleType:
 
     Raises:
         MissingExtraError: there is none, it cannot be imported, or it is too old.
-        MemoryError: it does not fit into the memory.
     """
     try:
         found = importlib.import_module("cv2")
     except ImportError as error:
         reason = str(error).partition("\n")[0]
-        if reason.endswith(NO_MEMORY_TO_LOAD):
-            raise MemoryError(reason) from None
         raise MissingExtraError(
             f"OpenCV cannot be imported ({reason}): run pip install opencv-python-headless, which "
             f"needs no libraries of a screen, or any other package of OpenCV {LOWEST_VERSION} or "
@@ -110,14 +103,8 @@ def installed_distributions() -> list[str]:
     """Return which of the packages that bring `cv2` are installed."""
     import importlib.metadata  # takes longer than all of this package
 
-    found = []
-    for name in DISTRIBUTIONS:
-        try:
-            importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-        found.append(name)
-    return found
+    installed = {each.name for each in importlib.metadata.distributions()}
+    return [name for name in DISTRIBUTIONS if name in installed]
 
 
 def _numbers(version: str) -> list[int]:

@@ -20,15 +20,8 @@ def suggest_keywords(
 ) -> Callable[Parameters, Result]:
     """Decorate a function so that an unknown keyword is an error with the nearest right one.
 
-    It keeps its signature, so that editors and type checkers see it. A class is decorated above
-    `dataclass`; it stays the same class.
-
-    Args:
-        function: to be decorated.
-        elsewhere: what to do instead, by keywords that belong to other functions.
-
-    Raises:
-        OptionError: from the function, when called with an unknown keyword.
+    It keeps its signature, and a class, decorated above `dataclass`, stays the same class.
+    `elsewhere` says what to do instead, by keywords that belong to other functions.
 
     Example:
         >>> @suggest_keywords
@@ -68,13 +61,10 @@ def check_ranges(
     odd: Sequence[str] = (),
     between: Mapping[str, tuple[float, float]] = {},
 ) -> None:
-    """Check the numbers in the fields of options: in tuples each of them, None always passes.
+    """Check the numbers in fields of options, in tuples each of them; None always passes.
 
-    Args:
-        options: of any class.
-        positive, not_negative, fractions, odd: names of fields above 0, from 0, in [0, 1], and odd
-            from 1.
-        between: smallest and largest allowed value by the name of a field.
+    The names of fields above 0, from 0, in [0, 1], and odd from 1; and the smallest and largest
+    allowed value by the name of a field.
 
     Raises:
         OptionError: a value is not a number, or out of its range.
@@ -101,6 +91,4 @@ def _numbers(value: object) -> list[Any]:
     """Return a number, or those of nested tuples; NaN for anything else."""
     if isinstance(value, tuple):
         return [number for one in value for number in _numbers(one)]
-    if not isinstance(value, Real):
-        return [math.nan]
-    return [value]
+    return [value if isinstance(value, Real) else math.nan]

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 from .errors import DeepDetectError, OptionError
 from .memory import disable_malloc_trim
 from .opencv import cv2
-from .signals import signals_held
+from .signals import release_interrupt, signals_held
 
 if TYPE_CHECKING:
     from concurrent.futures import Future, ProcessPoolExecutor
@@ -31,10 +31,7 @@ PARTS_PER_THREAD = 4
 """More than one, so that a thread with easy parts takes more of them."""
 
 UNWANTED_TASK_S = 20.0
-"""How long a task may go on after the work was interrupted or has failed."""
-
-MAX_PROCESSES = 61
-"""Windows waits for 63 at most."""
+"""How long a task may take to end after the work was interrupted or has failed."""
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """What libraries take the number of their threads from when they are loaded."""
@@ -66,24 +63,15 @@ def processor_count() -> int:
 def map_in_processes(
     function: Callable[[Task], Outcome], tasks: Sequence[Task], workers: int | None = None
 ) -> Iterator[Outcome]:
-    """Apply a function to every task in several processes.
-
-    Args:
-        function: a module-level function; it runs on one thread.
-        tasks: its arguments, which are pickled for the workers.
-        workers: number of processes; default one per processor. With 1 the work is done in this
-            process.
-
-    Yields:
-        The outcomes, in the order in which they are ready.
+    """Apply a function of a module to every task, one in each of several processes at a time.
 
     Raises:
-        OptionError: `workers` is below 1.
+        OptionError: `workers` is below 1; with 1 the work is done in this process.
         DeepDetectError: a worker process died.
     """
     if workers is not None and workers < 1:
         raise OptionError(f"workers must be at least 1, not {workers}")
-    count = min(workers or processor_count(), len(tasks), MAX_PROCESSES)
+    count = min(workers or processor_count(), len(tasks))
     if count <= 1:
         with _one_opencv_thread():
             yield from map(function, tasks)
@@ -94,14 +82,11 @@ def map_in_processes(
 
     # Spawned, not forked: a fork copies the locks of the parent's threads.
     context = multiprocessing.get_context("spawn")
-    ended = context.Event()
-    pool = ProcessPoolExecutor(
-        count, mp_context=context, initializer=_start_worker, initargs=(ended,)
-    )
+    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
     remaining = iter(tasks)
 
     def submit(places: Iterable[object]) -> set[Future[Outcome]]:
-        # By the processes that are started, until `_start_worker`.
+        # By the processes that are started, until their first task.
         with signals_held(), _one_thread_inherited():
             return {
                 pool.submit(_run_task, function, task)
@@ -122,24 +107,20 @@ def map_in_processes(
             "use fewer `workers`, or smaller images"
         ) from None
     finally:
-        ended.set()  # some are queued where they cannot be cancelled
         if pending:
-            _end_soon(pool)
+            _end_workers(pool)
         pool.shutdown(cancel_futures=True)
 
 
-def _end_soon(pool: ProcessPoolExecutor) -> None:
-    """Wait a while for tasks that nobody wants any more, then kill the processes.
-
-    A signal to this process alone does not reach them. What they write is under temporary names
-    until it is whole.
-    """
+def _end_workers(pool: ProcessPoolExecutor) -> None:
+    """End tasks that nobody wants any more: they clean up, or are killed after a while."""
     workers = list((pool._processes or {}).values())
     pool.shutdown(wait=False, cancel_futures=True)
-    deadline = time.monotonic() + UNWANTED_TASK_S
-    while any(worker.is_alive() for worker in workers) and time.monotonic() < deadline:
-        time.sleep(0.05)
     for worker in workers:
+        worker.terminate()
+    deadline = time.monotonic() + UNWANTED_TASK_S
+    for worker in workers:
+        worker.join(max(0.0, deadline - time.monotonic()))
         worker.kill()
 
 
@@ -155,55 +136,31 @@ def _one_thread_inherited() -> Iterator[None]:
             del os.environ[name]
 
 
-class _Worker:
-    """What Ctrl-C, which all processes of a terminal get, does to a worker: it ends its task."""
-
-    ended: Any = None  # the event that no further task is wanted
-    at_work = False
-    stopped = False
-
-    def interrupt(self, number: int, frame: FrameType | None) -> None:
-        """Remember the signal; where a task is done, end it."""
-        self.stopped = True
-        if self.at_work:
-            raise KeyboardInterrupt
-
-    def run(self, function: Callable[[Task], Outcome], task: Task) -> Outcome:
-        """Do a task, unless the work has been stopped."""
-        if self.stopped or self.ended.is_set():
-            from concurrent.futures import CancelledError
-
-            raise CancelledError
-        self.at_work = True
-        try:
-            return function(task)
-        finally:
-            self.at_work = False
-
-
-_worker = _Worker()
-
-
 def _run_task(function: Callable[[Task], Outcome], task: Task) -> Outcome:
-    return _worker.run(function, task)
+    try:
+        for name in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(name, _exit_worker)
+        release_interrupt()
+        return function(task)
+    except SystemExit:  # the pool would go on with the next task
+        os._exit(1)
 
 
-def _start_worker(ended: Any) -> None:
-    """Prepare a worker: one thread, freed memory is kept, and it ends with the parent."""
-    _worker.ended = ended
-    start_child(_worker.interrupt)
+def _exit_worker(number: int, frame: FrameType | None) -> None:
+    """End a worker, which cleans up what its task holds open."""
+    for name in (signal.SIGINT, signal.SIGTERM):  # both may come
+        signal.signal(name, signal.SIG_IGN)
+    raise SystemExit
+
+
+def _start_worker() -> None:
+    start_child()
     disable_malloc_trim()
 
 
-def start_child(on_interrupt: Any = signal.SIG_DFL) -> None:
-    """Prepare a process that has been started: one thread, and it ends with its parent.
-
-    Args:
-        on_interrupt: what Ctrl-C does, as for `signal.signal`.
-    """
-    signal.signal(signal.SIGINT, on_interrupt)
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+def start_child() -> None:
+    """Prepare a process that has been started: one thread, and it ends with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
     use_one_thread()
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -235,21 +192,10 @@ def _one_opencv_thread() -> Iterator[None]:
 
 
 def parallel_for(count: int, work: Callable[..., object], *arguments: Any) -> None:
-    """Call a function for parts of a range, in as many threads as there are processors.
+    """Call `work(start, stop, *arguments)` for parts of a range, in as many threads as processors.
 
-    In a worker of `map_in_processes` it is one thread.
-
-    Args:
-        count: length of the range.
-        work: called with (start, stop, *arguments) for each part. It should release the GIL, and
-            its result must not depend on how the range is divided.
-        arguments: the same for all parts.
-
-    Example:
-        >>> done = []
-        >>> parallel_for(10, lambda start, stop: done.extend(range(start, stop)))
-        >>> sorted(done) == list(range(10))
-        True
+    It should release the GIL, and its result must not depend on how the range is divided. In a
+    worker of `map_in_processes` it is one thread.
     """
     threads = min(_max_threads or processor_count(), count)
     if threads <= 1:

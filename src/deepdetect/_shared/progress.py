@@ -9,18 +9,7 @@ from typing import Any
 
 
 def progress(total: int | None, title: str, unit: str, quiet: bool = False, done: int = 0) -> Any:
-    """Return a progress bar on standard error.
-
-    Args:
-        total: number of units; None where it is not known.
-        title: the word before the bar.
-        unit: name of one unit, such as "image".
-        quiet: show nothing.
-        done: units that were done earlier.
-
-    Returns:
-        A tqdm bar: a context manager with `update(n)` and `set_postfix_str(text)`.
-    """
+    """Return a tqdm bar on standard error; with `done` units at its beginning."""
     from tqdm import tqdm
 
     return tqdm(
@@ -37,15 +26,7 @@ def progress(total: int | None, title: str, unit: str, quiet: bool = False, done
 
 @contextmanager
 def stage_progress(title: str, stages: Sequence[str]) -> Iterator[Callable[[str], None]]:
-    """Show a bar of the stages of a task on a terminal, with the name of the one under way.
-
-    Args:
-        title: the word before the bar.
-        stages: in their order.
-
-    Yields:
-        A function to be called with the name of each stage when it ends.
-    """
+    """Show a bar of stages; yield a function to be called with the name of each when it ends."""
     # On a terminal only: what is logged stays readable.
     with progress(len(stages), title, "stage", quiet=not sys.stderr.isatty()) as bar:
         bar.set_postfix_str(stages[0])

@@ -1,8 +1,6 @@
 """What was made from what: is it of the same input and options, is it whole, may it be replaced?
 
-`key` is a digest of values, arrays and files, to name what depends on them. A record beside each
-output, `.deepdetect/NAME.json` in its folder, says from what it was made. `lock` lets one process
-at a time write a file. All files appear whole or not at all (`atomic`).
+A record beside each output, `.deepdetect/NAME.json` in its folder, says from what it was made.
 """
 
 from __future__ import annotations
@@ -22,15 +20,11 @@ import numpy as np
 
 from .atomic import atomic_path
 from .errors import DeepDetectError, MissingFileError, OptionError
-from .text_files import read_json
 
 FOLDER = ".deepdetect"
 """Of the records, in the folder of the outputs."""
 
 ADVICE = "choose another place with -o, or replace it with --overwrite"
-
-MAX_RECORD_BYTES = 1 << 26
-"""Longer records are damaged: one of a thousand inputs has 100 kB."""
 
 NAMES = "names of the arrays"
 """Key of the list of all others in a file of arrays: one that lost some is damaged."""
@@ -39,19 +33,14 @@ Arrays = Mapping[str, np.ndarray]
 
 
 def key(*values: Any) -> str:
-    """Return a digest of values, the same in every process and on every machine.
+    """Return 32 hexadecimal digits of values, the same in every process and on every machine.
 
-    Args:
-        values: None, booleans, numbers, text, bytes, arrays (by type, shape and content), paths
-            (by the content of their files), dataclasses (by name and fields), and lists, sets and
-            dictionaries of these. A tuple is a list.
-
-    Returns:
-        32 hexadecimal digits.
+    Values are None, booleans, numbers, text, bytes, arrays (by type, shape and content), paths (by
+    the content of their files), dataclasses (by name and fields), and lists, sets and dictionaries
+    of these. A tuple is a list.
 
     Raises:
         MissingFileError: a file is missing.
-        TypeError: a value is of another type.
 
     Example:
         >>> key({"a": 1, "b": np.eye(2)}) == key({"b": np.eye(2), "a": 1})
@@ -123,16 +112,10 @@ def file_state(path: Path) -> tuple[int, int]:
 
 
 def check_same(place: Path, before: object, now: Mapping[str, Any], advice: str = ADVICE) -> None:
-    """Refuse what was made with other settings.
-
-    Args:
-        place: what was made.
-        before: the settings that are noted in it, None where there are none.
-        now: those of this run, as `plain` returns them; others that were noted do not matter.
-        advice: what to do.
+    """Refuse what was made with other settings than those of this run, as `plain` returns them.
 
     Raises:
-        OptionError: they differ; the names of those that do are in the message.
+        OptionError: some differ, which are named, or there are none.
     """
     if not isinstance(before, Mapping):
         raise OptionError(f"{place} exists, written by something else: {advice}")
@@ -149,8 +132,7 @@ class Outputs:
     Attributes:
         paths: files or folders that are made.
         inputs: files or folders that they are made from.
-        settings: what else they depend on, as for `key`; outputs of others are not replaced. The
-            name of the command is one of them where commands may write files of one name.
+        settings: what else they depend on, as for `key`; outputs of others are not replaced.
         overwrite: replace whatever there is.
         growing: outputs of a part of the inputs are replaced, too.
 
@@ -178,18 +160,9 @@ class Outputs:
             OptionError: an output was made from other files, with other settings, or by something
                 else.
         """
-        names = [str(path.resolve()) for path in self.inputs]
-        for path in () if self.overwrite else self.paths:
-            if not path.exists():
-                continue
-            record = _read(path)
-            if record is None:
-                origin = " and ".join(names)
-                raise OptionError(f"{path} exists, and is not known to be of {origin}: {ADVICE}")
-            before = record["inputs"]
-            if before != names and not (self.growing and {*before} <= {*names}):
-                raise OptionError(f"{path} exists, made from {' and '.join(before)}: {ADVICE}")
-            check_same(path, record["settings"], plain(self.settings))
+        if not self.overwrite:
+            for path in self.paths:
+                self._known(path)
 
     def find(self) -> dict[str, Any] | None:
         """Return the values noted with outputs that are done, None where work is left.
@@ -199,8 +172,7 @@ class Outputs:
         """
         if self.overwrite:
             return None
-        self.check()
-        records = [_read(path) if path.exists() else None for path in self.paths]
+        records = [self._known(path) for path in self.paths]
         for path, record in zip(self.paths, records, strict=True):
             if record and record["digest"] and not _is_unchanged(path, record):
                 raise OptionError(f"{path} exists, and has been changed: {ADVICE}")
@@ -210,13 +182,10 @@ class Outputs:
 
     @contextmanager
     def writing(self) -> Iterator[dict[str, Any]]:
-        """Note what the outputs are made from, before the work and, with their digests, after it.
+        """Note what outputs are made from, before and after the work; yield values to note, too.
 
         Work that fails leaves no trace: what it has not replaced is known as what it was before.
         What work that is killed has written is known as its own.
-
-        Yields:
-            An empty dictionary of values to note, which `find` gives back.
 
         Raises:
             OptionError: as `check`.
@@ -225,38 +194,52 @@ class Outputs:
         self.check()
         records = [_record(path) for path in self.paths]
         missing = {each for path in records for each in path.parents if not each.exists()}
-        before = [
-            (file_state(path), record.read_bytes() if record.is_file() else None)
-            for path, record in zip(self.paths, records, strict=True)
-        ]
+        states = [file_state(path) for path in self.paths]
+        contents = [path.read_bytes() if path.is_file() else None for path in records]
         values: dict[str, Any] = {}
         try:
-            for path in self.paths:
-                self._note(path, False, values)
+            self._note(False, values)
             yield values
-            for path in self.paths:
-                self._note(path, path.exists(), values)
+            self._note(True, values)
         except BaseException:
-            for path, record, (state, content) in zip(self.paths, records, before, strict=True):
+            for path, record, state, content in zip(
+                self.paths, records, states, contents, strict=True
+            ):
                 if file_state(path) == state:
                     _restore(record, content)
-            for folder in sorted(missing, key=lambda path: -len(path.parts)):
+            for folder in sorted(missing, reverse=True):  # from the innermost
                 with contextlib.suppress(OSError):  # it is not empty
                     folder.rmdir()
             raise
 
-    def _note(self, path: Path, whole: bool, values: Mapping[str, Any]) -> None:
+    def _known(self, path: Path) -> dict[str, Any] | None:
+        """Return the record of an output, None where there is no output; refuse another's."""
+        if not path.exists():
+            return None
+        names = [str(each.resolve()) for each in self.inputs]
+        record = _read(path)
+        if record is None:
+            origin = " and ".join(names)
+            raise OptionError(f"{path} exists, and is not known to be of {origin}: {ADVICE}")
+        before = record["inputs"]
+        if before != names and not (self.growing and {*before} <= {*names}):
+            raise OptionError(f"{path} exists, made from {' and '.join(before)}: {ADVICE}")
+        check_same(path, record["settings"], plain(self.settings))
+        return record
+
+    def _note(self, done: bool, values: Mapping[str, Any]) -> None:
         note = {
             "inputs": [str(each.resolve()) for each in self.inputs],
             "states": [file_state(each) for each in self.inputs],
             "settings": plain(self.settings),
-            "whole": whole,
-            "state": file_state(path),
-            "digest": file_digest(path) if whole and path.is_file() else None,
             "values": plain(values),
         }
-        with atomic_path(_record(path)) as temporary:
-            temporary.write_text(json.dumps(note), encoding="utf-8")
+        for path in self.paths:
+            whole = done and path.exists()
+            digest = file_digest(path) if whole and path.is_file() else None
+            state = {"whole": whole, "state": file_state(path), "digest": digest}
+            with atomic_path(_record(path)) as temporary:
+                temporary.write_text(json.dumps(note | state), encoding="utf-8")
 
 
 def _record(output: Path) -> Path:
@@ -266,10 +249,10 @@ def _record(output: Path) -> Path:
 def _read(output: Path) -> dict[str, Any] | None:
     """Read the record of an output, None where there is none or it is damaged."""
     try:
-        record = read_json(_record(output), MAX_RECORD_BYTES)
+        record = json.loads(_record(output).read_bytes())
     except (OSError, ValueError):
         return None
-    fields = {"inputs", "states", "settings", "whole", "state", "digest", "values"}
+    fields = {"inputs", "states", "settings", "values", "whole", "state", "digest"}
     return record if isinstance(record, dict) and fields <= {*record} else None
 
 
@@ -309,11 +292,7 @@ def check_not_made(folder: Path, images: Iterable[Path]) -> None:
 
 
 def save_arrays(path: Path, arrays: Arrays, *, compress: bool = True) -> None:
-    """Write arrays by name to an NPZ file, whole or not at all.
-
-    Raises:
-        DeepDetectError: it cannot be written.
-    """
+    """Write arrays by name to an NPZ file, whole or not at all."""
     contents: dict[str, Any] = {**arrays, NAMES: np.array(sorted(arrays))}
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         (np.savez_compressed if compress else np.savez)(file, **contents)
@@ -332,11 +311,7 @@ def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
 
 @contextmanager
 def lock(path: Path, final: Path) -> Iterator[None]:
-    """Let one process at a time write a file; the system unlocks it when that ends.
-
-    Args:
-        path: a file for the lock, in a folder that exists. On Windows nothing is locked.
-        final: what is written, for the message.
+    """Let one process at a time write a file, by a file for the lock; on Windows nothing is locked.
 
     Raises:
         OptionError: another process holds the lock.

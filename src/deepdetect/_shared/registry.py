@@ -13,19 +13,10 @@ Entry = TypeVar("Entry")
 
 
 def look_up(kind: str, name: str, registry: Mapping[str, Entry]) -> Entry:
-    """Find an entry of a registry by its name.
-
-    Args:
-        kind: what the entries are, as "matcher".
-        name: the name.
-        registry: the entries by name.
+    """Return the entry of this name; `kind` says what the entries are, as "matcher".
 
     Raises:
         OptionError: the name is unknown (the nearest right one is named).
-
-    Example:
-        >>> look_up("answer", "yes", {"yes": True, "no": False})
-        True
     """
     if name not in registry:
         raise unknown_name(kind, name, registry)
@@ -39,12 +30,6 @@ def resolve_name_or_path(
 
     Raises:
         OptionError: it is neither a path nor a known name (the nearest right one is named).
-
-    Example:
-        >>> resolve_name_or_path("weights", "dense", {"dense": 1})
-        1
-        >>> resolve_name_or_path("weights", "mine.onnx", {"dense": 1}).name
-        'mine.onnx'
     """
     if is_path(value):
         return Path(value)

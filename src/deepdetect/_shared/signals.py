@@ -16,19 +16,10 @@ ENDING = ("SIGTERM", "SIGHUP")
 def handle_signals(
     handler: Callable[[int, FrameType | None], object], names: Sequence[str] = ENDING
 ) -> Iterator[None]:
-    """Have a function called for signals while the block runs.
+    """Have a function called for signals while the block runs, in the main thread.
 
     A signal that is ignored, as by `nohup`, is left alone, and one that has a handler already,
-    but for Ctrl+C. Outside the main thread, where Python allows no handlers, nothing is done.
-
-    Args:
-        handler: called with the number of the signal, and the frame.
-        names: of the signals.
-
-    Example:
-        >>> with handle_signals(lambda number, frame: print("resized"), ["SIGWINCH"]):
-        ...     signal.raise_signal(signal.SIGWINCH)
-        resized
+    but for Ctrl+C.
     """
     before = {}
     if threading.current_thread() is threading.main_thread():
@@ -50,7 +41,7 @@ def exit_by_signal(number: int, frame: FrameType | None) -> None:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Let Ctrl-C wait while the block starts processes, and in these until they unblock it."""
+    """Let Ctrl-C wait while the block starts processes, and in these until `release_interrupt`."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -63,3 +54,9 @@ def signals_held() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def release_interrupt() -> None:
+    """Let Ctrl-C come that `signals_held` holds in a process that has been started."""
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])

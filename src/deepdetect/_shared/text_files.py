@@ -12,31 +12,15 @@ from typing import Any
 def read_json(path: str | Path, max_bytes: int) -> Any:
     """Read a JSON file in UTF-8, with or without a byte order mark.
 
-    Args:
-        path: the file.
-        max_bytes: longer files are refused.
-
     Raises:
         OSError: it cannot be read.
-        ValueError: it is longer, no UTF-8, no JSON, or nested too deep.
-
-    Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "calib.json"
-        >>> _ = path.write_text('{"focal_px": 1250}')
-        >>> read_json(path, 1000)
-        {'focal_px': 1250}
+        ValueError: it is longer than `max_bytes`, no UTF-8, no JSON, or nested too deep.
     """
     return _read(path, max_bytes, json.loads)
 
 
 def read_toml(path: str | Path, max_bytes: int) -> dict[str, Any]:
-    """Read a TOML file as `read_json` reads JSON; the time may grow with the square of its length.
-
-    Raises:
-        OSError: it cannot be read.
-        ValueError: it is longer, no UTF-8, no TOML, or nested too deep.
-    """
+    """Read a TOML file as `read_json` does; the time may grow with the square of its length."""
     return _read(path, max_bytes, tomllib.loads)
 
 

@@ -8,13 +8,7 @@ from contextlib import contextmanager
 
 
 class StageTimer:
-    """Measures the stages of a computation, and reports each one as it ends.
-
-    Args:
-        progress: called with the name of each stage when it ends; None: nothing is reported.
-
-    Attributes:
-        seconds: time of each stage, by name.
+    """Measures the stages of a computation in seconds, and reports each one as it ends.
 
     Example:
         >>> timer = StageTimer(progress=print)
