@@ -21,9 +21,8 @@ from deepdetect.evaluation.metrics.calibration import Calibration, calibration_o
 from deepdetect.evaluation.metrics.masks import MaskScore, score_heatmap
 from deepdetect.io.image import load_image
 from deepdetect.labels import LabelOptions
-from deepdetect.training.labels import label_view
 from deepdetect.training.recipe import Stage, TrainingOptions
-from deepdetect.training.views import SourceImage, list_images, render
+from deepdetect.training.views import SourceImage, label_view, list_images, render
 
 Scored = tuple[MaskScore, Calibration]
 

@@ -113,7 +113,7 @@ def checkpoints(generator: np.random.Generator, folder: Path) -> None:
     import torch
     from safetensors.numpy import save
 
-    from deepdetect.training.checkpoint import TrainingState, read_checkpoint, restore
+    from deepdetect.training.checkpoint import read_checkpoint
 
     tensors, state = checkpoint_parts()
     tensors, state = dict(tensors), copy.deepcopy(state)
@@ -144,11 +144,8 @@ def checkpoints(generator: np.random.Generator, folder: Path) -> None:
     path.write_bytes(content)
     network, optimizers = small_training()
     found = read_checkpoint(path)
-    try:
-        resumed = TrainingState.from_json(found.metadata, 100, ("step", "loss"))
-    except ValueError as error:
-        raise found.unfit(error) from None
-    restore(found, network, optimizers)
+    resumed = found.state(100, ("step", "loss"))
+    found.restore(network, optimizers)
     network(torch.ones(2, 3)).sum().backward()
     for optimizer in optimizers:
         optimizer.step()

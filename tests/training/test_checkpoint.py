@@ -1,8 +1,8 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from deepdetect.training.checkpoint import (  # noqa: E402
     Checkpoint,
     TrainingState,
     read_checkpoint,
-    restore,
     save_checkpoint,
 )
 from deepdetect.training.optim import make_optimizers  # noqa: E402
@@ -54,7 +53,7 @@ def test_a_checkpoint_gives_everything_back(tmp_path: Path, optimizer: str) -> N
     other, other_optimizers = trained(optimizer, steps=0)
     found = read_checkpoint(path)
     assert found.metadata == {"step": 1}
-    restore(found, other, other_optimizers)
+    found.restore(other, other_optimizers)
     for name, value in network.state_dict().items():
         assert torch.equal(value, other.state_dict()[name])
     for ours, theirs in zip(optimizers, other_optimizers, strict=True):
@@ -97,25 +96,14 @@ def _negative(tensors: dict[str, torch.Tensor], name: str) -> None:
     tensors[name] = torch.full_like(tensors[name], -1)
 
 
-@pytest.mark.parametrize("name", ["optimizer.step.0.weight", "optimizer.exp_avg_sq.0.weight"])
-def test_a_negative_count_or_square_is_refused(tmp_path: Path, name: str, one_line) -> None:
-    network, optimizers = trained()
-    save_checkpoint(tmp_path / "c.safetensors", network, optimizers, {})
-    tensors = dict(read_checkpoint(tmp_path / "c.safetensors").tensors)
-    _negative(tensors, name)
-    with pytest.raises(WeightsError, match=f"{name} is negative.*delete it") as caught:
-        restore(Checkpoint(tmp_path / "c.safetensors", {}, tensors), *trained(steps=0))
-    one_line(caught.value)
-
-
-@pytest.mark.parametrize("change", [_shorter, _doubled, _missing, _not_finite])
 @pytest.mark.parametrize(
-    ("optimizer", "name"),
+    ("optimizer", "name", "change"),
     [
-        ("adam", "optimizer.exp_avg.0.weight"),
-        ("adam", "optimizer.step.0.weight"),
-        ("soap", "optimizer.right_basis.0.weight"),
-        ("adam", "network.0.weight"),
+        ("adam", "optimizer.exp_avg.0.weight", _shorter),
+        ("adam", "optimizer.step.0.weight", _doubled),
+        ("adam", "optimizer.step.0.weight", _negative),
+        ("soap", "optimizer.right_basis.0.weight", _missing),
+        ("adam", "network.0.weight", _not_finite),
     ],
 )
 def test_a_tensor_that_does_not_fit_is_refused_before_an_optimizer_sees_it(
@@ -130,40 +118,38 @@ def test_a_tensor_that_does_not_fit_is_refused_before_an_optimizer_sees_it(
     other, other_optimizers = trained(optimizer, steps=0)
     before = {key: value.clone() for key, value in other.state_dict().items()}
     with pytest.raises(WeightsError, match=name) as caught:
-        restore(Checkpoint(path, {}, tensors), other, other_optimizers)
+        Checkpoint(path, {}, tensors).restore(other, other_optimizers)
     one_line(caught.value)
     assert all(torch.equal(value, before[key]) for key, value in other.state_dict().items())
     assert not any(each.state for each in other_optimizers)
 
 
+def state_of(**changes: Any) -> TrainingState:
+    metadata = json.loads(json.dumps({**dataclasses.asdict(STATE), **changes}))
+    return Checkpoint(Path("c.safetensors"), metadata, {}).state(12, COLUMNS)
+
+
 def test_the_state_of_a_run_is_given_back() -> None:
-    stored = json.loads(json.dumps(asdict(STATE)))
-    assert TrainingState.from_json(stored, 12, COLUMNS) == STATE
+    assert state_of() == STATE
 
 
 @pytest.mark.parametrize(
     "change",
     [
         {"step": -1},
-        {"step": 10**9},
+        {"step": 13},
         {"step": 1.5},
-        {"step": True},
         {"loss_sum": 10**400},
-        {"loss_count": 0},
-        {"points": [POINT, POINT]},
-        {"points": [{**POINT, "step": 13}]},
         {"loss_sum": float("nan")},
         {"loss_sum": "0.7"},
-        {"loss_count": "2"},
+        {"loss_count": None},
         {"points": None},
         {"points": [None]},
         {"points": [{"step": 1}]},
         {"points": [{**POINT, "score": "1"}]},
     ],
 )
-def test_an_impossible_state_is_refused(change: dict[str, Any]) -> None:
-    with pytest.raises(ValueError, match=r"step|loss|point|score"):
-        TrainingState.from_json({**asdict(STATE), **change}, 12, COLUMNS)
-    missing = {name: value for name, value in asdict(STATE).items() if name not in change}
-    with pytest.raises(ValueError, match=next(iter(change))):
-        TrainingState.from_json(missing, 12, COLUMNS)
+def test_an_impossible_state_is_refused(change: dict[str, Any], one_line) -> None:
+    with pytest.raises(WeightsError, match="delete it") as caught:
+        state_of(**change)
+    one_line(caught.value)

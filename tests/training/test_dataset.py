@@ -15,9 +15,10 @@ import cv2  # noqa: E402
 from torch import Tensor  # noqa: E402
 from torch.utils.data import DataLoader  # noqa: E402
 
-from deepdetect import ImageError  # noqa: E402
+from deepdetect import DeepDetectError, ImageError  # noqa: E402
 from deepdetect.io.image import luma  # noqa: E402
-from deepdetect.labels import LabelOptions  # noqa: E402
+from deepdetect.io.masks import load_mask, save_mask  # noqa: E402
+from deepdetect.labels import LabelOptions, fuse  # noqa: E402
 from deepdetect.training.dataset import (  # noqa: E402
     CropDataset,
     FolderSource,
@@ -25,10 +26,16 @@ from deepdetect.training.dataset import (  # noqa: E402
     loading,
     prepare_data,
 )
-from deepdetect.training.labels import LabelCache  # noqa: E402
 from deepdetect.training.recipe import Stage, TrainingOptions  # noqa: E402
 from deepdetect.training.sampler import CropSampler, Schedule  # noqa: E402
-from deepdetect.training.views import SourceImage, View, list_images, render  # noqa: E402
+from deepdetect.training.views import (  # noqa: E402
+    SourceImage,
+    View,
+    label_key,
+    label_view,
+    list_images,
+    render,
+)
 
 OPTIONS = TrainingOptions(
     stages=(Stage(64, 4, 6), Stage(96, 2, 1)),
@@ -43,10 +50,53 @@ Batch = tuple[np.ndarray, np.ndarray]
 
 @pytest.fixture(scope="module")
 def source(photographs: Path, tmp_path_factory: pytest.TempPathFactory) -> FolderSource:
-    cache = LabelCache(tmp_path_factory.mktemp("labels"), OPTIONS.labels)
-    made = FolderSource(list_images(photographs, OPTIONS), cache, 2**30)
-    made.make_labels([image.normal + image.dark for image in made.images], workers=1)
+    folder, images = tmp_path_factory.mktemp("labels"), list_images(photographs, OPTIONS)
+    for count, expected in ((3, 3 * 6), (12, 9 * 6)):
+        made = FolderSource(images[:count], folder, OPTIONS.labels, 2**30)
+        views = [image.normal + image.dark for image in made.images]
+        assert made.make_labels(views, workers=1) == expected, "labels are made once"
     return made
+
+
+def label(source: FolderSource, image: SourceImage, view: View) -> np.ndarray:
+    return load_mask(source.label_path(image, view))
+
+
+def test_labels_are_those_of_the_views(source: FolderSource) -> None:
+    image = source.images[0]
+    for view in image.normal + image.dark:
+        rgb = render(image.path, view)
+        visibility = "normal" if view.darkening is None else "low"
+        expected = fuse(luma(rgb), LabelOptions(OPTIONS.labels.detectors, visibility)).mask
+        np.testing.assert_array_equal(label(source, image, view), expected)
+        np.testing.assert_array_equal(label_view(rgb, view, OPTIONS.labels), expected)
+
+
+def test_other_settings_have_another_folder() -> None:
+    keys = {label_key(LabelOptions(names)) for names in (("fast",), ("fast", "sobel"))}
+    assert len(keys) == 2
+    assert label_key(LabelOptions(("fast",), "low")) in keys, "views decide that"
+
+
+def test_an_image_that_cannot_be_read_is_named(photographs: Path, tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        (tmp_path / name).write_bytes((photographs / "photo00.png").read_bytes())
+    (tmp_path / "broken.png").write_bytes(b"no image")
+    made = FolderSource(list_images(tmp_path, OPTIONS), tmp_path / "labels", OPTIONS.labels)
+    with pytest.raises(DeepDetectError, match=r"1 of 3 images cannot be read.*broken\.png"):
+        made.make_labels([image.normal[:2] for image in made.images], workers=1)
+    assert len(list(made.label_folder.glob("*.png"))) == 2 * 2, "the others are kept"
+
+
+def test_photographs_of_one_name_have_their_own_labels(photographs: Path, tmp_path: Path) -> None:
+    """Training and validation folders often number their photographs in the same way."""
+    paths = []
+    for part, name in (("train", "photo00.png"), ("val", "photo05.png")):
+        (tmp_path / part).mkdir()
+        (tmp_path / part / "0001.png").write_bytes((photographs / name).read_bytes())
+        made = FolderSource(list_images(tmp_path / part, OPTIONS), tmp_path, OPTIONS.labels)
+        paths.append(made.label_path(made[0], made[0].normal[0]))
+    assert paths[0] != paths[1]
 
 
 def loader(source, options: TrainingOptions = OPTIONS, workers: int = 0, **steps) -> DataLoader:
@@ -65,9 +115,15 @@ def same(found: Iterable[Batch], expected: Iterable[Batch]) -> None:
         np.testing.assert_array_equal(ours[1], theirs[1])
 
 
+def again(source: FolderSource, memory_bytes: int = 0) -> FolderSource:
+    """The same images and labels, with nothing in memory."""
+    folder = source.label_folder.parent
+    return FolderSource(source.images, folder, OPTIONS.labels, memory_bytes)
+
+
 def all_views(source: FolderSource) -> list[Batch]:
     return [
-        (render(image.path, view), source.labels.load(image, view))
+        (render(image.path, view), label(source, image, view))
         for image in source.images
         for view in image.normal + image.dark
     ]
@@ -76,7 +132,7 @@ def all_views(source: FolderSource) -> list[Batch]:
 def test_a_batch_is_a_pure_function_of_the_step(source: FolderSource) -> None:
     whole = batches(source)
     assert len(whole) == 12 * 6 // 4 + 12 // 2
-    fresh = FolderSource(source.images, source.labels)
+    fresh = again(source)
     for first, last in ((7, 8), (0, 1), (5, None)):
         same(batches(fresh, first=first, last=last), whole[first:last])
     assert not np.array_equal(whole[0][0], whole[1][0])
@@ -165,7 +221,7 @@ def test_colors_change_and_labels_do_not(source: FolderSource) -> None:
 
 
 def test_a_limit_of_the_memory_changes_nothing_but_the_time(source: FolderSource) -> None:
-    frugal = FolderSource(source.images, source.labels, memory_bytes=20_000)
+    frugal = again(source, memory_bytes=20_000)
     same(batches(frugal, last=4), batches(source, last=4))
     assert 0 < len(frugal._kept) < 3
     assert frugal.memory_bytes >= 0
@@ -190,7 +246,7 @@ def test_worker_processes_give_the_same_batches(source: FolderSource) -> None:
 def test_an_error_of_a_worker_is_one_sentence(
     source: FolderSource, tmp_path: Path, workers: int, one_line
 ) -> None:
-    lost = FolderSource(source.images, LabelCache(tmp_path, OPTIONS.labels))
+    lost = FolderSource(source.images, tmp_path, OPTIONS.labels)
     with pytest.raises(ImageError) as caught, loading(loader(lost, workers=workers)) as made:
         next(made)
     assert one_line(caught.value).startswith("there is no file")
@@ -198,13 +254,11 @@ def test_an_error_of_a_worker_is_one_sentence(
 
 
 def test_a_label_of_another_size_is_refused(photographs: Path, tmp_path: Path) -> None:
-    from deepdetect.io.masks import save_mask
-
-    image = list_images(photographs, OPTIONS)[0]
-    cache = LabelCache(tmp_path, OPTIONS.labels)
-    save_mask(np.zeros((8, 8), bool), cache.path(image, image.normal[0]))
+    made = FolderSource(list_images(photographs, OPTIONS), tmp_path, OPTIONS.labels)
+    view = made[0].normal[0]
+    save_mask(np.zeros((8, 8), bool), made.label_path(made[0], view))
     with pytest.raises(ImageError, match="another size"):
-        FolderSource([image], cache).load(0, image.normal[0])
+        made.load(0, view)
 
 
 def test_validation_is_whole_images_first_normal_then_dark(source: FolderSource) -> None:
@@ -215,7 +269,7 @@ def test_validation_is_whole_images_first_normal_then_dark(source: FolderSource)
         view = image.dark[0] if index >= 12 else image.normal[0]
         rgb, mask = whole[index]
         np.testing.assert_array_equal(rgb, render(image.path, view))
-        np.testing.assert_array_equal(mask, source.labels.load(image, view))
+        np.testing.assert_array_equal(mask, label(source, image, view))
     parts = [ValidationDataset(source, rank, 5) for rank in range(5)]
     assert [len(part) for part in parts] == [6, 6, 4, 4, 4]
     assert torch.equal(parts[3][2][0], whole[15][0])
@@ -226,8 +280,8 @@ def test_a_view_is_rendered_once(
     source: FolderSource, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What was rendered to be labelled is what crops are taken from."""
-    made = FolderSource(source.images[:2], LabelCache(tmp_path, OPTIONS.labels), 2**30)
-    assert made.make_labels([image.normal for image in made.images], workers=2) == 6
+    made = FolderSource(source.images[:2], tmp_path, OPTIONS.labels, 2**30)
+    assert made.make_labels([image.normal for image in made.images], workers=1) == 6
     monkeypatch.setattr("deepdetect.training.dataset.render", None)
     for index, image in enumerate(made.images):
         for view in image.normal:

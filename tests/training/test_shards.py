@@ -211,7 +211,7 @@ def test_an_index_cannot_name_files_elsewhere(shards: Shards, tmp_path: Path) ->
         Shards.open(tmp_path / "copy", OPTIONS)
 
 
-@pytest.mark.parametrize("content", ["[" * 100_000, '{"training": ', '{"training": 1}', "[1]"])
+@pytest.mark.parametrize("content", ["[" * 100_000, '{"training": ', "[1]"])
 def test_an_index_that_is_none_is_one_sentence(
     content: str, shards: Shards, tmp_path: Path, one_line: Callable[[BaseException], str]
 ) -> None:

@@ -57,13 +57,9 @@ def draw_darkening(generator: np.random.Generator) -> Darkening:
 
 
 def darken(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:
-    """Reduce the brightness, then the contrast (paper, Section III-B).
+    """Reduce the brightness, then the contrast (paper, Section III-B), of (H, W, 3) uint8.
 
-    Both images are (H, W, 3) uint8; the result is what Pillow's `ImageEnhance` gives.
-
-    Example:
-        >>> int(darken(np.full((16, 16, 3), 200, np.uint8), Darkening(0.3, 0.4))[0, 0, 0])
-        60
+    The result is what Pillow's `ImageEnhance` gives.
     """
     # One value depends on itself and the mean only, so two tables of 256 entries do it all.
     # Pillow blends in float32 and truncates.
@@ -87,13 +83,10 @@ def transpose(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def jitter_color(rgb: np.ndarray, generator: np.random.Generator, exact: bool) -> np.ndarray:
-    """Remove the colours or rotate the hue, both with the same luma.
+    """Remove the colours or rotate the hue, both with the same luma, of (H, W, 3) uint8 RGB.
 
-    Args:
-        rgb: (H, W, 3) uint8 RGB.
-        generator: draws which, the angle, and the factor of the saturation.
-        exact: only remove colours: rotating them can change the luma by one level, which
-            matters for the keypoints of dark images.
+    Where it must be exact, colours are removed: rotating them can change the luma by one level,
+    which matters for the keypoints of dark images.
     """
     if exact or generator.random() < 0.5:
         return to_gray(rgb)
@@ -107,16 +100,10 @@ def to_gray(rgb: np.ndarray) -> np.ndarray:
 
 
 def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
-    """Rotate the colours around the luma, which changes by rounding only.
+    """Rotate the colours of (H, W, 3) uint8 RGB by an angle in the plane of Cb and Cr.
 
-    Args:
-        rgb: (H, W, 3) uint8 RGB.
-        angle: in radians, in the plane of Cb and Cr.
-        saturation: factor of the colours; those that would leave the range of uint8 are
-            desaturated until they fit.
-
-    Returns:
-        (H, W, 3) uint8 RGB, whose luma differs by at most one level.
+    The luma changes by rounding only, by at most one level. Colours that would leave the range of
+    uint8 are desaturated until they fit.
     """
     red, green, blue = cv2.split(rgb.astype(np.float32))
     gray = RED * red + GREEN * green + BLUE * blue
@@ -135,22 +122,10 @@ def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
 
 
 def augment(rgb: np.ndarray, side: int, seed: int) -> np.ndarray:
-    """Make an augmented view: a part of an image, rotated, relit, blurred, noisy, compressed.
+    """Make a (side, side, 3) view of a part of an image: rotated, relit, blurred, compressed.
 
     Its label is made from the view itself. Other versions of NumPy and OpenCV may give slightly
     different views for the same seed.
-
-    Args:
-        rgb: (H, W, 3) uint8 RGB.
-        side: of the view, in pixels.
-        seed: of all random choices.
-
-    Returns:
-        (side, side, 3) uint8 RGB, all of it from inside the image.
-
-    Example:
-        >>> augment(np.full((64, 96, 3), 90, np.uint8), 32, seed=1).shape
-        (32, 32, 3)
     """
     generator = np.random.default_rng([AUGMENTATION_VERSION, seed])
     view = _rotated_crop(rgb, side, generator)

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -18,14 +18,23 @@ from .._shared.memory import available_memory
 from .._shared.opencv import cv2
 from .._shared.parallel import map_in_processes
 from .._shared.progress import progress
+from .._shared.records import key
 from ..io.image import load_image
-from ..io.masks import save_mask
+from ..io.masks import load_mask, save_mask
+from ..labels import LabelOptions
 from .augmentation import flip, jitter_color, transpose
-from .labels import LabelCache, label_view
 from .recipe import Stage, TrainingOptions
 from .sampler import CropIndex
 from .shards import Shards, ShardSource, has_shards
-from .views import SourceImage, View, digest_images, list_images, render, train_val_split
+from .views import (
+    SourceImage,
+    View,
+    label_key,
+    label_view,
+    list_images,
+    render,
+    train_val_split,
+)
 
 
 class ImageSource(Protocol):
@@ -43,15 +52,21 @@ class ImageSource(Protocol):
 
 
 class FolderSource:
-    """Images in files, with labels in a cache.
+    """Images in files, and their labels as 1-bit PNG files, in a subfolder for the label settings.
 
-    Up to `memory_bytes` of views are kept in memory; those beyond are rendered each time.
+    A label is named by the content of its image: a replaced image gets a new label. Up to
+    `memory_bytes` of views are kept in memory; those beyond are rendered each time.
     """
 
     def __init__(
-        self, images: Sequence[SourceImage], labels: LabelCache, memory_bytes: int = 0
+        self,
+        images: Sequence[SourceImage],
+        labels: Path,
+        options: LabelOptions,
+        memory_bytes: int = 0,
     ) -> None:
-        self.images, self.labels, self.memory_bytes = images, labels, memory_bytes
+        self.images, self.label_options, self.memory_bytes = images, options, memory_bytes
+        self.label_folder = labels / label_key(options)[:12]
         self._kept: dict[tuple[int, View], tuple[np.ndarray, np.ndarray]] = {}
 
     def __len__(self) -> int:
@@ -63,16 +78,20 @@ class FolderSource:
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_kept": {}}  # a process that is not forked has its own
 
+    def label_path(self, image: SourceImage, view: View) -> Path:
+        """Return the file of a label."""
+        return self.label_folder / f"{image.path.stem}_{image.digest}_{view.name}.png"
+
     def load(self, index: int, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Return a view as (H, W, 3) uint8 RGB, and its label as (H, W) bool."""
         if (index, view) in self._kept:
             return self._kept[index, view]
         source = self.images[index]
-        image, mask = render(source.path, view), self.labels.load(source, view)
+        image, mask = render(source.path, view), load_mask(self.label_path(source, view))
         if mask.shape != image.shape[:2]:
             raise ImageError(
                 f"the label of {source.path} has another size than the image: "
-                f"delete {self.labels.folder} and start again"
+                f"delete {self.label_folder} and start again"
             )
         self._keep(index, view, image, mask)
         return image, mask
@@ -85,32 +104,27 @@ class FolderSource:
     def make_labels(
         self, views: Sequence[tuple[View, ...]], workers: int | None = None, quiet: bool = True
     ) -> int:
-        """Make the labels that do not exist yet, in parallel; return how many were made.
+        """Make the missing labels of some views of each image in processes; return their number.
 
         The views that are rendered for it are kept.
 
-        Args:
-            views: of each image, those that are needed.
-            workers: number of processes; default one per processor.
-            quiet: show no progress bar.
-
         Raises:
             BatchError: images cannot be read; the other labels are made all the same.
-            DeepDetectError: a label cannot be written.
         """
         tasks, memory = [], self.memory_bytes
         for index, (image, needed) in enumerate(zip(self.images, views, strict=True)):
-            if missing := self.labels.missing(image, needed):
+            files = {view: self.label_path(image, view) for view in needed}
+            if missing := {view: path for view, path in files.items() if not path.exists()}:
                 memory -= sum(4 * view.short_side**2 for view in missing)  # at least
-                tasks.append(_LabelTask(index, image, missing, self.labels, memory > 0))
-        total = sum(len(task.views) for task in tasks)
+                tasks.append(_LabelTask(index, image.path, missing, self.label_options, memory > 0))
+        total = sum(len(task.labels) for task in tasks)
         failures = []
         with progress(total, "labels", "label", quiet) as bar:
             for task, made, error in map_in_processes(_make_labels, tasks, workers):
-                for view, pair in zip(task.views, made, strict=False):
-                    self._keep(task.index, view, *pair)
+                for view, pair in made.items():
+                    self._keep(task.number, view, *pair)
                 failures += [error] if error else []
-                bar.update(len(task.views))
+                bar.update(len(task.labels))
         if failures:
             raise BatchError(
                 f"{len(failures)} of {len(self.images)} images cannot be read, the labels of the "
@@ -120,30 +134,32 @@ class FolderSource:
         return total
 
 
-@dataclass(frozen=True)
-class _LabelTask:
-    index: int
-    image: SourceImage
-    views: tuple[View, ...]
-    labels: LabelCache
+class _LabelTask(NamedTuple):
+    """An image whose labels are written, and whether its views are sent back."""
+
+    number: int
+    image: Path
+    labels: dict[View, Path]
+    options: LabelOptions
     keep: bool
 
 
 def _make_labels(
     task: _LabelTask,
-) -> tuple[_LabelTask, list[tuple[np.ndarray, np.ndarray]], str | None]:
-    """Write the labels of an image; return the views with their labels, or what is wrong."""
-    made = []
+) -> tuple[_LabelTask, dict[View, tuple[np.ndarray, np.ndarray]], str]:
+    """Write the labels of an image; return the views with their labels, and what is wrong."""
+    made = {}
     try:
-        image = load_image(task.image.path)
-        for view in task.views:
+        image = load_image(task.image)
+        for view, path in task.labels.items():
             rgb = render(image, view)
-            mask = label_view(rgb, view, task.labels.options)
-            save_mask(mask, task.labels.path(task.image, view))
-            made += [(rgb, mask)] if task.keep else []
+            mask = label_view(rgb, view, task.options)
+            save_mask(mask, path)
+            if task.keep:
+                made[view] = rgb, mask
     except ImageError as error:
         return task, made, str(error)
-    return task, made, None
+    return task, made, ""
 
 
 class CropDataset(Dataset[tuple[Tensor, Tensor]]):
@@ -213,13 +229,7 @@ class ValidationDataset(Dataset[tuple[Tensor, Tensor]]):
 
 @dataclass(frozen=True)
 class TrainingData:
-    """The images of a run.
-
-    Attributes:
-        training, validation: the images to train on and to validate with.
-        digest: a digest of which images there are.
-        shard_sizes: number of training images in each shard, None for images in a folder.
-    """
+    """The images of a run, a digest of them, and the number of images in each shard."""
 
     training: ImageSource
     validation: ImageSource
@@ -239,42 +249,37 @@ def prepare_data(
     make_labels: bool = True,
     quiet: bool = True,
 ) -> TrainingData:
-    """List the images of a run and make the labels of all their views; arguments of `train`.
+    """List the images of a run and make the missing labels of their views; arguments of `train`.
 
-    Args:
-        images, options, output, validation, labels, workers: as of `train`.
-        processes: of this machine that load images, each with views of its own in memory.
-        make_labels: whether missing labels are made.
-        quiet: show no progress bar.
-
-    Raises:
-        ImageError: a folder is missing or empty.
-        BatchError: images cannot be read.
+    `processes` of this machine load images, each with views of its own in memory.
     """
     images, output = Path(images), Path(output)
-    label_folder = output / "labels" if labels is None else Path(labels)
-    cache = LabelCache(label_folder, options.labels)
-    exclude = (output, label_folder)
+    folder = output / "labels" if labels is None else Path(labels)
     shards = Shards.open(images, options) if has_shards(images) else None
-    listed = [] if shards else list_images(images, options, exclude, options.max_images)
-    held_out: list[SourceImage] = []
+    listed, held_out = [], []
+    if shards is None:
+        listed = list_images(images, options, (output, folder), options.max_images)
     if validation is not None:
-        held_out = list_images(Path(validation), options, exclude)
-    elif not shards:
+        held_out = list_images(Path(validation), options, (output, folder))
+    elif shards is None:
         listed, held_out = train_val_split(listed, options.val_fraction)
     memory = available_memory() // 2 // processes
-    source, held = FolderSource(listed, cache, memory), FolderSource(held_out, cache, memory // 8)
+    training = FolderSource(listed, folder, options.labels, memory)
+    held = FolderSource(held_out, folder, options.labels, memory // 8)
     if make_labels:
         views = [i.normal + i.dark if options.dark_fraction > 0 else i.normal for i in listed]
-        source.make_labels(views, workers, quiet)
+        training.make_labels(views, workers, quiet)
         held.make_labels([image.validation_views for image in held_out], workers, quiet)
-    if not shards:
-        return TrainingData(source, held, digest_images(listed, held_out))
-    packed, sizes = ShardSource(shards.training, options), tuple(n for _, n in shards.training)
-    if validation is None:
-        own = ShardSource(shards.validation, options)
-        return TrainingData(packed, own, shards.digest, sizes)
-    return TrainingData(packed, held, f"{shards.digest} {digest_images([], held_out)}", sizes)
+    digests = [[image.digest for image in part] for part in (listed, held_out)]
+    if shards is None:
+        return TrainingData(training, held, key(digests)[:16])
+    names = [path.name for path, _ in shards.training + shards.validation]
+    return TrainingData(
+        ShardSource(shards.training, options),
+        ShardSource(shards.validation, options) if validation is None else held,
+        key(names, digests)[:16],
+        tuple(count for _, count in shards.training),
+    )
 
 
 @contextlib.contextmanager

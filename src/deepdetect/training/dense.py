@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +14,6 @@ from torch.nn.functional import binary_cross_entropy_with_logits, pad
 from torch.utils.data import DataLoader
 
 from .._shared.errors import OptionError, WeightsError
-from .._shared.records import plain
 from .._shared.registry import look_up
 from ..detector.network.espnet import ESPNet
 from ..detector.network.onnx_export import export_onnx
@@ -36,7 +33,7 @@ from .dataset import CropDataset, TrainingData, ValidationDataset, loading
 from .engine import Engine, freeze_batch_norm
 from .optim import make_optimizers
 from .recipe import DeviceOptions, InitWeights, TrainingOptions
-from .sampler import CropSampler, Schedule
+from .sampler import CropSampler, Schedule, milestones
 from .trainer import Task
 
 NETWORKS: dict[str, Callable[[], nn.Module]] = {"espnet": ESPNet}
@@ -48,12 +45,7 @@ ONNX = "deepdetect.onnx"
 def initial_network(
     options: TrainingOptions, init_weights: InitWeights | None
 ) -> tuple[TrainingOptions, nn.Module]:
-    """Make the network with its initial weights, and resolve the options that depend on them.
-
-    Raises:
-        OptionError: parts of random weights are to be kept, or the network is unknown.
-        WeightsError: the weights are missing or do not fit.
-    """
+    """Make the network with its initial weights, and resolve the options that depend on them."""
     make = look_up("network", options.network, NETWORKS)
     if init_weights is not None:
         if options.frozen_batch_norm is None:
@@ -73,15 +65,7 @@ def initial_network(
 
 
 class DenseTask(Task):
-    """A network that maps images to heat maps, and its labelled images.
-
-    Args:
-        network: with its initial weights.
-        options: the recipe.
-        data: the images with labels.
-        device: how the network is run.
-        fabric: of `engine.launch`.
-    """
+    """A network that maps images to heat maps, with its initial weights, and labelled images."""
 
     columns = (
         *("epoch", "images", "learning_rate", "validation_loss"),
@@ -112,15 +96,9 @@ class DenseTask(Task):
         self.optimizers = make_optimizers(options.optimizer, network)
         self.schedule = Schedule(options, len(data.training))
         self.steps = self.schedule.steps
-        self.milestones = self.schedule.milestones(options.val_count)
-        origin = {"images_digest": data.digest, "initial_weights": initial_weights}
-        self.inputs = {**plain(options), **origin}
-        self.notes = {
-            "options": json.dumps(dataclasses.asdict(options), sort_keys=True),
-            "images": str(len(data.training)),
-            **origin,
-            "run_on": self.engine.describe(),
-        }
+        self.milestones = milestones(self.steps, options.val_count)
+        self.origin = {"images_digest": data.digest, "initial_weights": initial_weights}
+        self.notes = {"images": str(len(data.training)), "run_on": self.engine.describe()}
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
         """Return the loader of the batches of some steps: (images, masks), see `CropDataset`."""
@@ -142,46 +120,30 @@ class DenseTask(Task):
         """Return the number of pixels in a batch, over all processes."""
         return batch[1].numel() * self.fabric.world_size
 
-    def training_step(self, batch: tuple[Tensor, Tensor], step: int) -> float:
-        """Make one optimiser step, and return the loss over the whole batch.
+    def learning_rate(self, step: int) -> float:
+        """Return the learning rate of a step."""
+        return self.schedule.learning_rate(step)
 
-        Args:
-            batch: (B, crop, crop, 3) uint8 RGB images, this process's part of the batch, and
-                (B, crop, crop) bool labels.
-            step: steps done before.
-
-        Raises:
-            OptionError: the loss or its gradients are not finite.
-        """
+    def loss(self, batch: tuple[Tensor, Tensor]) -> Tensor:
+        """Return the loss of (B, crop, crop, 3) uint8 RGB with (B, crop, crop) bool labels."""
         images, masks = batch
         self.network.train()
         if self.options.frozen_batch_norm:
             freeze_batch_norm(self.network)
         elif self.options.freeze_encoder:
             freeze_batch_norm(self.network.get_submodule("encoder"))
-        for optimizer in self.optimizers:
-            optimizer.zero_grad(set_to_none=True)
-            for group in optimizer.param_groups:
-                group["lr"] = self.schedule.learning_rate(step)
         truth = self.engine.to_device(masks)[:, None].float()
         logits = self.engine.logits(self.engine.to_float(images))
         weight = self._pos_weight(images)
         if self.options.pos_weight_uncertain and weight is not None:
             probability = logits.detach().sigmoid()
             weight = 1 + (weight - 1) * 4 * probability * (1 - probability)
-        loss = binary_cross_entropy_with_logits(logits, truth, pos_weight=weight)
+        return binary_cross_entropy_with_logits(logits, truth, pos_weight=weight)
+
+    def backward(self, loss: Tensor) -> float:
+        """Compute the gradients, and return the mean loss over all processes."""
         self.fabric.backward(loss)
-        gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
-        value = self.fabric.all_reduce(loss.detach(), reduce_op="mean").item()
-        # A finite loss can have gradients that are not, in bfloat16.
-        if not (math.isfinite(value) and torch.nn.utils.get_total_norm(gradients).isfinite()):
-            raise OptionError(
-                f"the loss or its gradients are not finite at step {step}: start again with "
-                "`precision=float32`, or with a lower `learning_rate`"
-            )
-        for optimizer in self.optimizers:
-            optimizer.step()
-        return float(value)
+        return float(self.fabric.all_reduce(loss.detach(), reduce_op="mean").item())
 
     def _pos_weight(self, images: Tensor) -> Tensor | None:
         """Return the weights of the images' marked pixels, (B, 1, 1, 1) or (1,); None: all 1."""
@@ -207,16 +169,10 @@ class DenseTask(Task):
         sums = self.fabric.all_reduce(sums, reduce_op="sum")
         (normal_loss, normal_iou), (dark_loss, dark_iou) = (sums[:, :2] / sums[:, 2:]).tolist()
         fraction, crops = self.options.dark_fraction, self.schedule.crops_until(step)
-        return {
-            "epoch": crops / self.schedule.images,
-            "images": crops,
-            "learning_rate": self.schedule.learning_rate(step - 1),
-            "validation_loss": (1 - fraction) * normal_loss + fraction * dark_loss,
-            "normal_loss": normal_loss,
-            "normal_iou": normal_iou,
-            "dark_loss": dark_loss,
-            "dark_iou": dark_iou,
-        }
+        loss = (1 - fraction) * normal_loss + fraction * dark_loss
+        progress = crops / self.schedule.images, crops, self.learning_rate(step - 1)
+        values = *progress, loss, normal_loss, normal_iou, dark_loss, dark_iou
+        return dict(zip(self.columns, values, strict=True))
 
     @torch.inference_mode()
     def heatmap(self, image: Tensor) -> np.ndarray:

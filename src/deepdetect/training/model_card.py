@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from .._shared.atomic import atomic_path
+from .._shared.records import file_digest
 from .checkpoint import Point
 
 
 def save_curves(points: Sequence[Point], columns: Sequence[str], folder: Path) -> None:
-    """Write curves.csv, and curves.png (paper, Figure 5) where matplotlib is installed."""
+    """Write curves.csv, and curves.png (paper, Figure 5)."""
     with atomic_path(folder / "curves.csv") as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows([_cell(point[name]) for name in columns] for point in points)
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        return
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
     steps = [point["step"] for point in points]
@@ -43,14 +41,9 @@ def write_model_card(
     notes: Mapping[str, Any],
     points: Sequence[Point],
 ) -> None:
-    """Write a model card as Markdown.
+    """Write a model card of a file of weights, with its notes and the curves, as Markdown.
 
-    Args:
-        path: of the card.
-        weights: the file that it describes.
-        describe: says of the point of these weights what the network is and how good it is.
-        notes: of the weights' file.
-        points: the curves of the run.
+    `describe` says of the point of these weights what the network is, and how good it is.
     """
     network, quality = describe(json.loads(notes["point"]))
     options = json.loads(notes["options"])
@@ -58,7 +51,7 @@ def write_model_card(
     lines = [
         "# Model card",
         "",
-        f"`{weights.name}`, SHA-256 `{hashlib.sha256(weights.read_bytes()).hexdigest()}`:",
+        f"`{weights.name}`, SHA-256 `{file_digest(weights)}`:",
         network,
         "",
         "## How good the weights are",

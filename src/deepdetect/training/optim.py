@@ -8,11 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from .._shared.errors import unknown_name
-from .recipe import OPTIMIZERS
-
-# Of `Soap`; a decay of 0.95 for all three means is that of the paper.
 BETA = 0.95
+"""Decay of all three means of `Soap`, as in its paper."""
+
 EPS = 1e-8
 """Keeps the division finite."""
 
@@ -27,22 +25,13 @@ def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:
     """Make the optimisers that together train a network's parameters, except frozen ones.
 
     They are "adam", or "soap": SOAP for the kernels, Adam for biases and the like.
-
-    Raises:
-        OptionError: the name is unknown (the nearest right one is named).
-
-    Example:
-        >>> len(make_optimizers("adam", nn.Linear(2, 1)))
-        1
     """
     trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
     if name == "adam":
         return [torch.optim.Adam(trained, fused=True)]
-    if name == "soap":
-        kernels = [parameter for parameter in trained if parameter.ndim > 1]
-        vectors = [parameter for parameter in trained if parameter.ndim <= 1]
-        return [Soap(kernels), torch.optim.Adam(vectors, fused=True)]
-    raise unknown_name("optimizer", name, OPTIMIZERS)
+    kernels = [parameter for parameter in trained if parameter.ndim > 1]
+    vectors = [parameter for parameter in trained if parameter.ndim <= 1]
+    return [Soap(kernels), torch.optim.Adam(vectors, fused=True)]
 
 
 def state_shapes(optimizer: Optimizer, parameter: Tensor) -> dict[str, tuple[int, ...]]:
@@ -67,20 +56,6 @@ class Soap(Optimizer):
     All of the state are tensors, per parameter, so that safetensors can store them and a run
     resumes bit by bit. (pytorch-optimizer's keeps one basis for each axis of a kernel, in lists,
     beside numbers.) The first step only computes the first basis.
-
-    Args:
-        parameters: tensors of two or more axes.
-        lr: learning rate.
-
-    Example:
-        >>> weight = nn.Parameter(torch.ones(3, 2))
-        >>> optimizer = Soap([weight], lr=0.1)
-        >>> for _ in range(20):
-        ...     optimizer.zero_grad()
-        ...     weight.square().sum().backward()
-        ...     optimizer.step()
-        >>> bool(weight.square().sum() < 1)
-        True
     """
 
     def __init__(self, parameters: Iterable[nn.Parameter], lr: float = 1e-3) -> None:

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .._shared.errors import MissingExtraError, install_command
 from .._shared.options import suggest_keywords
@@ -74,9 +74,8 @@ def train(
         >>> result = train("photos", "run", options, init_weights="default")  # doctest: +SKIP
         >>> detector = DeepDetect(result.onnx)  # doctest: +SKIP
     """
-    task = _dense_task(
-        images, output, options, validation, labels, init_weights, device, workers, log
-    )
+    data = {"validation": validation, "labels": labels, "workers": workers}
+    task = _dense_task(images, output, options, init_weights, device, log is None, **data)
     from .trainer import Trainer
 
     trainer = Trainer(task, Path(output), log)
@@ -132,14 +131,12 @@ def _dense_task(
     images: str | Path,
     output: str | Path,
     options: TrainingOptions,
-    validation: str | Path | None,
-    labels: str | Path | None,
     init_weights: InitWeights | None,
     device: DeviceOptions,
-    workers: int | None,
-    log: Log | None,
+    quiet: bool,
+    **data: Any,
 ) -> DenseTask:
-    """Make the labels, and what is trained on them; arguments of `train`."""
+    """Make the labels, and what is trained on them; arguments of `train` and `prepare_data`."""
     require_packages()
     from .dataset import prepare_data
     from .dense import DenseTask, initial_network
@@ -147,19 +144,17 @@ def _dense_task(
 
     options, network = initial_network(options, init_weights)  # before the labels, for its errors
     fabric = launch(device)
-    data = prepare_data(
+    prepared = prepare_data(
         images,
         options,
         output,
-        validation=validation,
-        labels=labels,
-        workers=workers,
         processes=fabric.world_size * max(1, device.worker_count),
         make_labels=fabric.local_rank == 0,
-        quiet=log is None or not fabric.is_global_zero,
+        quiet=quiet or not fabric.is_global_zero,
+        **data,
     )
     fabric.barrier()
-    return DenseTask(network, options, data, device, fabric)
+    return DenseTask(network, options, prepared, device, fabric)
 
 
 TIMED_STEPS = 30
@@ -221,9 +216,8 @@ def profile(
         >>> profile("photos", "run")[0].images_per_second  # doctest: +SKIP
     """
     options = dataclasses.replace(options, interleave=False)  # each stage by itself
-    task = _dense_task(
-        images, output, options, validation, labels, init_weights, device, workers, log
-    )
+    data = {"validation": validation, "labels": labels, "workers": workers}
+    task = _dense_task(images, output, options, init_weights, device, log is None, **data)
     steps_of_stage = task.schedule.steps_of_stage
     lengths = [min(n, TIMED_STEPS + WARM_UP_STEPS) for n in steps_of_stage]
     quiet = log is None or not task.is_main

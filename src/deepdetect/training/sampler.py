@@ -25,13 +25,7 @@ SHUFFLED_SHARDS = 4
 
 
 class CropIndex(NamedTuple):
-    """What a dataset needs to make one crop, the same on every call.
-
-    Attributes:
-        image: number of the image.
-        epoch, position: the epoch, and the image's position in its order.
-        stage: crop size and views.
-    """
+    """An image's number, the epoch and the image's position in its order, and the stage."""
 
     image: int
     epoch: int
@@ -69,11 +63,7 @@ class Schedule:
         self._crops = np.concatenate([[0], np.cumsum(batches[self._stages])])
 
     def position(self, step: int) -> Position:
-        """Find the stage of a step, and its place in it.
-
-        Raises:
-            IndexError: the step lies behind the last one.
-        """
+        """Find the stage of a step, and its place in it."""
         number = int(self._stages[step])
         stage = self.options.stages[number]
         first_epoch = sum(each.epochs for each in self.options.stages[:number])
@@ -90,9 +80,10 @@ class Schedule:
         """Return how many crops the steps before this one have."""
         return int(self._crops[step])
 
-    def milestones(self, count: int) -> set[int]:
-        """Return the numbers of steps done at `count` evenly spaced points, the end among them."""
-        return {round(self.steps * part / count) for part in range(1, count + 1)} - {0}
+
+def milestones(steps: int, count: int) -> set[int]:
+    """Return the numbers of steps done at `count` evenly spaced points, the end among them."""
+    return {round(steps * part / count) for part in range(1, count + 1)} - {0}
 
 
 class CropSampler(Sampler[list[CropIndex]]):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import bisect
 import contextlib
-import dataclasses
 import functools
 import hashlib
 import io
@@ -19,7 +18,7 @@ import tarfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,9 +32,17 @@ from .._shared.text_files import read_json
 from ..io.image import load_image
 from ..io.masks import encode_mask, load_mask
 from ..labels import LabelOptions
-from .labels import label_view, settings_digest
 from .recipe import TrainingOptions
-from .views import SourceImage, View, list_images, render, train_val_split, views_of
+from .views import (
+    SourceImage,
+    View,
+    label_key,
+    label_view,
+    list_images,
+    render,
+    train_val_split,
+    views_of,
+)
 
 INDEX = "shards.json"
 
@@ -61,7 +68,7 @@ class Shards:
             OptionError: the shards were made with other options.
             ImageError: the index is damaged, or a shard is missing.
         """
-        index = _read_index(folder)
+        index = _read_index(folder, options)
         try:
             training, validation = (
                 tuple((folder / Path(row["file"]).name, int(row["images"])) for row in index[kind])
@@ -69,16 +76,10 @@ class Shards:
             )
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise _damaged(folder / INDEX, error) from None
-        _check_options(folder, index, options)
         for path, _ in training + validation:
             if not path.is_file():
                 raise ImageError(f"the shard {path} is missing: write the shards again")
         return cls(folder, training, validation)
-
-    @property
-    def digest(self) -> str:
-        """A digest of which images there are, and how they are packed."""
-        return key([[path.name, count] for path, count in self.training + self.validation])[:16]
 
 
 class ShardSource:
@@ -98,11 +99,7 @@ class ShardSource:
         return SourceImage(Path(name), key.rpartition("_")[2], *views_of(name, self.options))
 
     def load(self, index: int, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """Return a view as (H, W, 3) uint8 RGB, and its label as (H, W) bool.
-
-        Raises:
-            ImageError: the image or its label is damaged or missing.
-        """
+        """Return a view as (H, W, 3) uint8 RGB, and its label as (H, W) bool."""
         shard, _, sample = self._sample(index)
         try:
             (place,) = (place for name, place in sample.items() if name.startswith("image."))
@@ -174,7 +171,7 @@ def write_shards(
     if images.resolve() == output.resolve():
         raise OptionError(f"{output} holds the images: choose another `output`")
     if (output / INDEX).exists():
-        _check_options(output, _read_index(output), options)
+        _read_index(output, options)
     listed = list_images(images, options, (output,), options.max_images)
     files: dict[str, list[tuple[Path, int]]] = {"training": [], "validation": []}
     tasks = []
@@ -182,11 +179,19 @@ def write_shards(
         for number, chosen in enumerate(_deal(part, images, shard_size)):
             if not chosen:
                 continue
-            task = _ShardTask(output, chosen, kind == "validation", options.labels)
-            path = output / f"{kind}-{number:06d}-{task.digest}.tar"
+            views = [
+                image.validation_views if kind == "validation" else image.normal + image.dark
+                for image in chosen.values()
+            ]
+            made_from = [
+                (name, image.digest, *(view.name for view in needed))
+                for (name, image), needed in zip(chosen.items(), views, strict=True)
+            ]
+            digest = key(label_key(options.labels), made_from)[:12]
+            path = output / f"{kind}-{number:06d}-{digest}.tar"
             files[kind].append((path, len(chosen)))
             if not path.exists():
-                tasks.append(dataclasses.replace(task, path=path))
+                tasks.append(_ShardTask(path, chosen, views, options.labels))
     failures: list[str] = []
     total = sum(len(task.images) for task in tasks)
     with progress(total, "shards", "image", quiet) as bar:
@@ -207,27 +212,13 @@ def write_shards(
     return Shards(output, tuple(files["training"]), tuple(files["validation"]))
 
 
-@dataclass(frozen=True)
-class _ShardTask:
-    """A shard to be written: its path, and its images by their names in the folder."""
+class _ShardTask(NamedTuple):
+    """A shard to be written: its path, its images by their names in the folder, and their views."""
 
     path: Path
     images: Mapping[str, SourceImage]
-    for_validation: bool
+    views: Sequence[tuple[View, ...]]
     labels: LabelOptions
-
-    def views(self, image: SourceImage) -> tuple[View, ...]:
-        """The views whose labels are needed."""
-        return image.validation_views if self.for_validation else image.normal + image.dark
-
-    @property
-    def digest(self) -> str:
-        """A digest of everything the shard's content depends on."""
-        rows = [
-            (name, image.digest, *(view.name for view in self.views(image)))
-            for name, image in self.images.items()
-        ]
-        return key(settings_digest(self.labels), rows)[:12]
 
 
 def _deal(
@@ -245,11 +236,12 @@ def _deal(
 def _write_shard(task: _ShardTask) -> tuple[int, list[str]]:
     """Write one shard, if all of its images can be read; return their number, and what fails."""
     failures: list[str] = []
-    with contextlib.suppress(_UnreadError), atomic_path(task.path) as temporary:
+    rows = zip(task.images.items(), task.views, strict=True)
+    with contextlib.suppress(BatchError), atomic_path(task.path) as temporary:
         with tarfile.open(temporary, "w") as tar:
-            for k, (name, image) in enumerate(task.images.items()):
+            for k, ((name, image), views) in enumerate(rows):
                 try:
-                    files = _files_of(name, image, task)
+                    files = _files_of(name, image.path, views, task.labels)
                 except ImageError as error:
                     failures.append(str(error))
                     continue
@@ -259,27 +251,18 @@ def _write_shard(task: _ShardTask) -> tuple[int, list[str]]:
                     member.size = len(content)
                     tar.addfile(member, io.BytesIO(content))
         if failures:
-            raise _UnreadError
+            raise BatchError("the shard is not complete", failures)
     return len(task.images), failures
 
 
-class _UnreadError(Exception):
-    """A shard is not complete."""
-
-
-def _files_of(name: str, image: SourceImage, task: _ShardTask) -> dict[str, bytes]:
+def _files_of(
+    name: str, path: Path, views: Sequence[View], labels: LabelOptions
+) -> dict[str, bytes]:
     """Return the files of an image by their endings."""
-    path = image.path
-    try:
-        content = path.read_bytes()
-        rgb = load_image(content)
-    except OSError as error:
-        raise ImageError(f"{path} cannot be read ({error.strerror}): check its rights") from None
-    except ImageError as error:
-        raise ImageError(str(error).replace("the image", str(path), 1)) from None
-    files = {"name.txt": name.encode(), f"image{path.suffix.lower()}": content}
-    for view in task.views(image):
-        mask = label_view(render(rgb, view), view, task.labels)
+    rgb = load_image(path)
+    files = {"name.txt": name.encode(), f"image{path.suffix.lower()}": path.read_bytes()}
+    for view in views:
+        mask = label_view(render(rgb, view), view, labels)
         files[f"label.{view.name}.png"] = encode_mask(mask)
     return files
 
@@ -308,11 +291,15 @@ def _read(path: Path, place: tuple[int, int]) -> bytes:
         raise _damaged(path, error) from None
 
 
-def _read_index(folder: Path) -> dict[str, Any]:
+def _read_index(folder: Path, options: TrainingOptions) -> dict[str, Any]:
+    """Read the index of shards; an OptionError where they were made with other options."""
     try:
-        return dict(read_json(folder / INDEX, MAX_INDEX_BYTES))
+        index = dict(read_json(folder / INDEX, MAX_INDEX_BYTES))
     except (OSError, ValueError, TypeError) as error:
         raise _damaged(folder / INDEX, error) from None
+    advice = "make the shards and train with the same, or write to another folder"
+    check_same(folder / INDEX, index.get("options"), _fixed_options(options), advice)
+    return index
 
 
 def _damaged(path: Path, reason: object) -> ImageError:
@@ -323,9 +310,4 @@ def _fixed_options(options: TrainingOptions) -> dict[str, Any]:
     """Return what of a recipe is fixed once the labels are made, as JSON would give it back."""
     names = ("short_sides", "square", "max_images", "val_fraction", "augmentations")
     fixed = {name: plain(getattr(options, name)) for name in names}
-    return {**fixed, "labels": settings_digest(options.labels)}
-
-
-def _check_options(folder: Path, index: dict[str, Any], options: TrainingOptions) -> None:
-    advice = "make the shards and train with the same, or write to another folder"
-    check_same(folder / INDEX, index.get("options"), _fixed_options(options), advice)
+    return {**fixed, "labels": label_key(options.labels)}

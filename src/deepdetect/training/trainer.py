@@ -5,28 +5,23 @@ from __future__ import annotations
 import abc
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torch import nn
+from torch import Tensor, nn
+from torch.nn.utils import clip_grad_norm_
 from torch.optim import Optimizer
 from torch.utils.data import DataLoader
 
-from .._shared.errors import WeightsError
+from .._shared.errors import OptionError, WeightsError
 from .._shared.progress import progress
 from .._shared.provenance import provenance
-from .._shared.records import check_same, key
-from .checkpoint import (
-    Point,
-    TrainingState,
-    read_checkpoint,
-    read_point,
-    restore,
-    save_checkpoint,
-)
+from .._shared.records import check_same, key, plain
+from .checkpoint import Point, TrainingState, read_checkpoint, save_checkpoint
 from .dataset import loading
 from .model_card import save_curves, write_model_card
 
@@ -39,26 +34,29 @@ CHECKPOINT_INTERVAL_S = 60.0
 
 
 class Task(abc.ABC):
-    """What is trained, how a step is made and how it is measured.
+    """What is trained, its loss and how it is measured.
 
     Attributes:
         network: all of the state that is trained.
         optimizers: what trains it.
-        inputs: the recipe, the images and the initial weights, as `plain` returns them: a run is
-            resumed with the same only.
-        notes: where the weights come from, which is written into them.
+        options: the recipe.
+        origin: digests of the images and of the initial weights: a run is resumed with the same
+            recipe and origin only.
+        notes: what else is written into the weights.
         steps: of the whole run.
         milestones: numbers of steps done after which it is validated.
         columns: of a point of the curves, besides "step" and "training_loss".
         objective: the column that the best weights are chosen by.
         sign: 1 if the lowest value is the best, -1 if the highest.
         weights_file: name of the file of the best weights.
+        max_gradient_norm: larger gradients are scaled down to it.
         is_main: whether this process writes the files.
     """
 
     network: nn.Module
     optimizers: list[Optimizer]
-    inputs: dict[str, Any]
+    options: Any
+    origin: dict[str, str]
     notes: dict[str, str]
     steps: int
     milestones: set[int]
@@ -66,6 +64,7 @@ class Task(abc.ABC):
     objective: str
     sign: int
     weights_file: str
+    max_gradient_norm = math.inf
     is_main: bool = True
 
     @abc.abstractmethod
@@ -73,16 +72,16 @@ class Task(abc.ABC):
         """Return the loader of the batches of some steps."""
 
     @abc.abstractmethod
-    def training_step(self, batch: Any, step: int) -> float:
-        """Make one optimiser step, and return the loss.
-
-        Raises:
-            OptionError: the loss or its gradients are not finite.
-        """
-
-    @abc.abstractmethod
     def pixels(self, batch: Any) -> int:
         """Return the number of pixels in a batch, over all processes."""
+
+    @abc.abstractmethod
+    def learning_rate(self, step: int) -> float:
+        """Return the learning rate of a step."""
+
+    @abc.abstractmethod
+    def loss(self, batch: Any) -> Tensor:
+        """Return the loss of a batch, or of this process's part of it."""
 
     @abc.abstractmethod
     def validate(self, step: int) -> dict[str, float]:
@@ -100,9 +99,36 @@ class Task(abc.ABC):
     def card(self, best: Point) -> tuple[str, list[str]]:
         """Say in the model card what the network is, and how good it is."""
 
+    def backward(self, loss: Tensor) -> float:
+        """Compute the gradients, and return the loss over all processes."""
+        loss.backward()
+        return loss.item()
+
     def export(self, folder: Path) -> Path | None:
         """Write the best weights in another form; return the file."""
         return None
+
+    def training_step(self, batch: Any, step: int) -> float:
+        """Make one optimiser step after `step` others, and return the loss over the whole batch.
+
+        Raises:
+            OptionError: the loss or its gradients are not finite.
+        """
+        for optimizer in self.optimizers:
+            optimizer.zero_grad(set_to_none=True)
+            for group in optimizer.param_groups:
+                group["lr"] = self.learning_rate(step)
+        value = self.backward(self.loss(batch))
+        norm = clip_grad_norm_(self.network.parameters(), self.max_gradient_norm)
+        # A finite loss can have gradients that are not, in bfloat16.
+        if not (math.isfinite(value) and norm.isfinite()):
+            raise OptionError(
+                f"the loss or its gradients are not finite at step {step}: start again with a "
+                "lower `learning_rate`, or in float32"
+            )
+        for optimizer in self.optimizers:
+            optimizer.step()
+        return value
 
 
 @dataclass(frozen=True)
@@ -136,6 +162,10 @@ class Trainer:
         self.task, self.folder = task, folder
         self.log = log if task.is_main else None
         self.columns = ("step", "training_loss", *task.columns)
+        self.inputs = {**plain(task.options), **task.origin}
+        recipe = json.dumps(dataclasses.asdict(task.options), sort_keys=True)
+        self.notes = {"options": recipe, **task.origin, **task.notes}
+        self.weights = folder / task.weights_file
         self.state = TrainingState()
         self.best: Point | None = None
         if (folder / CHECKPOINT).exists():
@@ -147,8 +177,13 @@ class Trainer:
         measured = {point["step"] for point in state.points}
         if state.step in task.milestones and state.step not in measured:
             self._validate()  # a run of no steps, or one that was interrupted while it validated
-        if state.step == task.steps and self.best is None:
-            self._keep(state.points[-1])  # they were damaged, and no further validation comes
+        if self.best is None and state.points:
+            at_end = state.step == task.steps
+            when = "with the last weights" if at_end else "at the next validation"
+            if self.log is not None:
+                self.log(f"{self.weights} is missing or damaged: it is written again {when}")
+            if at_end:
+                self._keep(state.points[-1])
         started, pixels = time.monotonic(), 0
         saved = started
         bar = progress(task.steps, "training", "step", self.log is None, state.step)
@@ -170,18 +205,13 @@ class Trainer:
                     self._save()
                     saved = time.monotonic()
         speed = pixels / FULL_IMAGE_PIXELS / max(time.monotonic() - started, 1e-9)
-        if self.best is None:
-            raise WeightsError(f"{self._weights} is missing or damaged: train into another folder")
+        assert self.best is not None  # the last step is a milestone
         onnx = None
         if task.is_main:
             onnx = task.export(self.folder)
-            notes = task.read_notes(self._weights)
-            write_model_card(self.folder / CARD, self._weights, task.card, notes, state.points)
-        return TrainingResult(self._weights, onnx, state.points, self.best, speed)
-
-    @property
-    def _weights(self) -> Path:
-        return self.folder / self.task.weights_file
+            notes = task.read_notes(self.weights)
+            write_model_card(self.folder / CARD, self.weights, task.card, notes, state.points)
+        return TrainingResult(self.weights, onnx, state.points, self.best, speed)
 
     def _validate(self) -> None:
         """Measure the weights, keep them if they are the best so far, and save the state."""
@@ -201,37 +231,27 @@ class Trainer:
         """Write the weights as the best so far."""
         self.best = point
         if self.task.is_main:
-            notes = {**self.task.notes, **provenance(), "run": key(self.task.inputs)}
-            self.task.save(self._weights, notes | {"point": json.dumps(point)})
+            notes = {**self.notes, **provenance(), "run": key(self.inputs)}
+            self.task.save(self.weights, notes | {"point": json.dumps(point)})
 
     def _save(self) -> None:
         if self.task.is_main:
-            metadata = {**dataclasses.asdict(self.state), "inputs": self.task.inputs}
-            metadata |= self.task.notes | provenance()
+            metadata = {**dataclasses.asdict(self.state), "inputs": self.inputs}
+            metadata |= self.notes | provenance()
             path = self.folder / CHECKPOINT
             save_checkpoint(path, self.task.network, self.task.optimizers, metadata)
 
     def _resume(self) -> None:
-        task = self.task
         found = read_checkpoint(self.folder / CHECKPOINT)
         advice = "use the same to resume the run, or another `output`"
-        check_same(self.folder, found.metadata.get("inputs"), task.inputs, advice)
+        check_same(self.folder, found.metadata.get("inputs"), self.inputs, advice)
+        self.state = found.state(self.task.steps, self.columns)
+        if self.state.step:  # before the first step optimisers have no moments
+            found.restore(self.task.network, self.task.optimizers)
         try:
-            state = TrainingState.from_json(found.metadata, task.steps, self.columns)
-        except ValueError as error:
-            raise found.unfit(error) from None
-        if state.step:  # before the first step optimisers have no moments
-            restore(found, task.network, task.optimizers)
-        self.state = state
-        try:
-            notes = task.read_notes(self._weights)
-            if notes["run"] == key(task.inputs):
-                self.best = read_point(json.loads(notes["point"]), self.columns)
-        except (WeightsError, KeyError, TypeError, ValueError, RecursionError):
-            pass  # as if there were none
-        if self.best is None and state.points and self.log is not None:
-            at_end = state.step == task.steps
-            self.log(
-                f"{self._weights} is missing or damaged: it is written again "
-                f"{'with the last weights' if at_end else 'at the next validation'}"
-            )
+            notes = self.task.read_notes(self.weights)
+        except (WeightsError, ValueError):  # they are written again
+            return
+        if notes.get("run") == key(self.inputs):
+            of_weights = (p for p in self.state.points if json.dumps(p) == notes.get("point"))
+            self.best = next(of_weights, None)

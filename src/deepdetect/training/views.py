@@ -1,23 +1,22 @@
-"""The source images of a run, and their views: sizes, light, augmentation."""
+"""The source images of a run, their views (sizes, light, augmentation), and labels of these."""
 
 from __future__ import annotations
 
-import hashlib
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from .._shared.errors import ImageError
 from .._shared.opencv import cv2
-from ..io.image import find_images, load_image, scale_short_side
+from .._shared.records import file_digest, key
+from ..io.image import find_images, load_image, luma, scale_short_side
+from ..labels import LabelOptions, fuse
+from ..labels.visibility import Visibility
 from .augmentation import AUGMENTATION_VERSION, Darkening, augment, darken, draw_darkening
 from .recipe import TrainingOptions
-
-DIGEST_BYTES = 65536
-"""The digest of an image depends on its size and this many bytes from its start."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class SourceImage:
 
     Attributes:
         path: its file.
-        digest: eight hexadecimal digits that depend on the content.
+        digest: hexadecimal digits that depend on the content.
         normal, dark: its views.
     """
 
@@ -101,25 +100,33 @@ def render(image: object, view: View) -> np.ndarray:
     return rgb if view.darkening is None else darken(rgb, view.darkening)
 
 
-def list_images(
-    root: Path,
-    options: TrainingOptions,
-    exclude: Sequence[Path] = (),
-    limit: int | None = None,
-) -> list[SourceImage]:
-    """List the images below a folder with their views.
+def label_view(rgb: np.ndarray, view: View, options: LabelOptions) -> np.ndarray:
+    """Make the label, (H, W) bool, of a rendered view, (H, W, 3) uint8 RGB.
 
-    Above the limit they are chosen by the checksums of their names.
-
-    Raises:
-        ImageError: the folder is missing or empty.
+    A dark view gets the low-visibility settings, a normal one the normal settings.
     """
+    visibility: Visibility = "normal" if view.darkening is None else "low"
+    return fuse(luma(rgb), replace(options, visibility=visibility)).mask
+
+
+def label_key(options: LabelOptions) -> str:
+    """Return a digest of everything a label depends on besides the image and the view."""
+    names = options.detectors
+    return key({n: [options.parameters(n, "normal"), options.parameters(n, "low")] for n in names})
+
+
+def list_images(
+    root: Path, options: TrainingOptions, exclude: Sequence[Path] = (), limit: int | None = None
+) -> list[SourceImage]:
+    """List the images below a folder; above the limit some, by the checksums of their names."""
     paths = find_images(root, exclude)
     if limit is not None and len(paths) > limit:
         chosen = sorted(paths, key=lambda path: (zlib.crc32(path.name.encode()), path))[:limit]
         paths = sorted(chosen)
     return [
-        SourceImage(path, _digest_file(path), *views_of(path.relative_to(root).as_posix(), options))
+        SourceImage(
+            path, file_digest(path)[:16], *views_of(path.relative_to(root).as_posix(), options)
+        )
         for path in paths
     ]
 
@@ -130,9 +137,6 @@ def train_val_split(
     """Split images into those to train on and about a fraction for validation.
 
     By the checksums of their names, so that an image stays on its side when others are added.
-
-    Raises:
-        ImageError: there are too few images to split.
     """
     training: list[SourceImage] = []
     validation: list[SourceImage] = []
@@ -147,19 +151,3 @@ def train_val_split(
             "one image is too few to train on: add more, or give a folder for `validation`"
         )
     return training, validation
-
-
-def digest_images(training: Sequence[SourceImage], validation: Sequence[SourceImage]) -> str:
-    """Return a digest of the images that a run trains on and validates with."""
-    digests = [image.digest for image in training] + ["|"]
-    digests += [image.digest for image in validation]
-    return hashlib.sha256(" ".join(digests).encode()).hexdigest()[:16]
-
-
-def _digest_file(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            start = file.read(DIGEST_BYTES)
-        return f"{zlib.crc32(start, path.stat().st_size & 0xFFFFFFFF):08x}"
-    except OSError as error:
-        raise ImageError(f"{path} cannot be read ({error.strerror}): check its rights") from None

@@ -9,12 +9,7 @@ import torch
 from deepdetect.detector.points.candidate_features import FEATURES
 from deepdetect.training.points import losses, pairs
 from deepdetect.training.points.losses import mutual_pairs, pair_loss, soft_top_k
-from deepdetect.training.points.pairs import (
-    CandidatePair,
-    Correspondences,
-    Side,
-    candidate_pair,
-)
+from deepdetect.training.points.pairs import CandidatePair, Candidates, candidate_pair
 from deepdetect.training.points.views import ViewPair
 
 
@@ -23,7 +18,7 @@ def soft(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(losses, "TEMPERATURE", 3.0)
 
 
-COUNT, REPEATED, AREA = 60, 30, 10_000
+COUNT, REPEATED, BUDGET = 60, 30, 20
 
 
 class FirstFeature(torch.nn.Module):
@@ -44,15 +39,21 @@ def known_pair(distance_px: float = 0.3) -> CandidatePair:
     features = np.zeros((COUNT, FEATURES), np.float32)
     features[:, 0] = np.arange(COUNT)
     rows = np.arange(REPEATED)
-    way = Correspondences(
-        rows, rows, np.full(REPEATED, distance_px), np.ones(COUNT, bool), np.ones(REPEATED, bool)
+    view = Candidates(
+        xy=grid,
+        sigma_px=np.ones(COUNT),
+        features=features,
+        visible=np.ones(COUNT, bool),
+        first=rows,
+        second=rows,
+        distance_px=np.full(REPEATED, distance_px),
+        matchable=np.ones(REPEATED, bool),
     )
-    side = Side(grid, np.ones(COUNT), features)
-    return CandidatePair((side, side), (way, way), AREA)
+    return CandidatePair((view, view), BUDGET)
 
 
-def value(ranker, pair, density=0.002, match_weight=0.0) -> float:
-    return pair_loss(ranker, pair, density, match_weight).item()
+def value(ranker, pair, match_weight=0.0) -> float:
+    return pair_loss(ranker, pair, match_weight).item()
 
 
 def test_the_soft_choice_sums_to_the_budget() -> None:
@@ -64,17 +65,16 @@ def test_the_soft_choice_sums_to_the_budget() -> None:
 
 def test_training_brings_repeated_candidates_to_the_top() -> None:
     ranker, pair = FirstFeature(), known_pair()
-    optimizer = torch.optim.Adam(ranker.parameters(), 0.05)
-    density = 20 / AREA
-    before = value(ranker, pair, density)
-    for _ in range(300):
+    optimizer = torch.optim.Adam(ranker.parameters(), 0.1)
+    before = value(ranker, pair)
+    for _ in range(100):
         optimizer.zero_grad()
-        loss = pair_loss(ranker, pair, density, 0.0)
+        loss = pair_loss(ranker, pair, 0.0)
         loss.backward()
         optimizer.step()
     assert before > -0.6
     assert loss.item() < -0.7
-    best = torch.argsort(ranker.logits, descending=True)[:20]
+    best = torch.argsort(ranker.logits, descending=True)[:BUDGET]
     assert (best < REPEATED).float().mean() >= 0.7  # .5 by chance
 
 
@@ -94,25 +94,24 @@ def test_close_partners_are_worth_more() -> None:
 
 def test_matchable_partners_are_worth_more() -> None:
     ranker, pair = FirstFeature(), known_pair()
-    way = dataclasses.replace(pair.ways[0], matchable=np.zeros(REPEATED, bool))
-    other = dataclasses.replace(pair, ways=(way, way))
+    view = dataclasses.replace(pair.views[0], matchable=np.zeros(REPEATED, bool))
+    other = dataclasses.replace(pair, views=(view, view))
     first, second = (value(ranker, p, match_weight=1.0) for p in (pair, other))
     assert second == pytest.approx(first / 2, rel=0.01)
 
 
 def test_mutual_pairs_are_each_others_nearest() -> None:
-    way = Correspondences(
-        np.array([0, 0, 1, 2]),
-        np.array([5, 6, 6, 7]),
-        np.array([1.0, 0.5, 0.2, 2.5]),
-        np.ones(3, bool),
-        np.ones(4, bool),
+    view = dataclasses.replace(
+        known_pair().views[0],
+        first=np.array([0, 0, 1, 2]),
+        second=np.array([5, 6, 6, 7]),
+        distance_px=np.array([1.0, 0.5, 0.2, 2.5]),
     )
     everyone = np.ones(3, bool), np.ones(8, bool)
-    assert mutual_pairs(way, 3.0, *everyone).tolist() == [2, 3]
-    assert mutual_pairs(way, 2.0, *everyone).tolist() == [2]
+    assert mutual_pairs(view, 3.0, *everyone).tolist() == [2, 3]
+    assert mutual_pairs(view, 2.0, *everyone).tolist() == [2]
     without = np.array([True, False, True]), everyone[1]
-    assert sorted(mutual_pairs(way, 3.0, *without).tolist()) == [1, 3]
+    assert sorted(mutual_pairs(view, 3.0, *without).tolist()) == [1, 3]
 
 
 @pytest.mark.parametrize("with_descriptors", [False, True])
@@ -123,18 +122,25 @@ def test_candidates_of_the_same_view_see_each_other(
     side = 128
     image, valid = photo[:side, :side], np.ones((side, side), bool)
     valid[:, :20] = False
-    pair = candidate_pair(
-        ViewPair((image, image), (valid, valid), np.eye(3), "light"), with_descriptors
-    )
-    assert len(pair.sides[0].xy) == 300
-    assert pair.sides[0].xy[:, 0].min() > 19
-    for way in pair.ways:
-        assert way.visible.all()
-        itself = way.first == way.second
+    images = ViewPair((image, image), (valid, valid), np.eye(3), "light")
+    pair = candidate_pair(images, 0.01, with_descriptors)
+    assert pair.budget == pytest.approx(0.01 * side**2)
+    assert len(pair.views[0].xy) == 300
+    assert pair.views[0].xy[:, 0].min() > 19
+    for view in pair.views:
+        assert view.visible.all()
+        itself = view.first == view.second
         assert itself.sum() == 300
-        assert (way.distance_px[itself] == 0).all()
-        assert way.distance_px[~itself].min() > 0
-        assert way.matchable[itself].mean() > 0.9
+        assert (view.distance_px[itself] == 0).all()
+        assert view.distance_px[~itself].min() > 0
+        assert view.matchable[itself].mean() > 0.9
+
+
+def test_views_of_nothing_have_no_candidates() -> None:
+    empty, valid = np.zeros((64, 64), np.uint8), np.ones((64, 64), bool)
+    pair = candidate_pair(ViewPair((empty, empty), (valid, valid), np.eye(3), "blur"), 0.01, True)
+    for view in pair.views:
+        assert len(view.xy) == len(view.visible) == len(view.first) == len(view.matchable) == 0
 
 
 def test_a_shift_is_followed(photo) -> None:
@@ -142,9 +148,8 @@ def test_a_shift_is_followed(photo) -> None:
     images = photo[:side, :side], photo[5 : side + 5, 9 : side + 9]
     valid = np.ones((side, side), bool)
     shift = np.array([[1, 0, -9], [0, 1, -5], [0, 0, 1.0]])
-    pair = candidate_pair(ViewPair(images, (valid, valid), shift, "light"), False)
-    way = pair.ways[0]
-    seen = pair.sides[0].xy - (9, 5)
+    view = candidate_pair(ViewPair(images, (valid, valid), shift, "light"), 0.01, False).views[0]
+    seen = view.xy - (9, 5)
     inside = ((seen > -0.5) & (seen < side - 0.5)).all(1)
-    np.testing.assert_array_equal(way.visible, inside)
-    assert len(np.unique(way.first[way.distance_px < 0.05])) > 0.5 * inside.sum()
+    np.testing.assert_array_equal(view.visible, inside)
+    assert len(np.unique(view.first[view.distance_px < 0.05])) > 0.5 * inside.sum()

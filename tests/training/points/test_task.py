@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from deepdetect._shared.errors import WeightsError
+from deepdetect.detector.points.detection import detect_points
 from deepdetect.detector.points.ranker import load_ranker, notes_of
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.training import PointsTrainingOptions, TrainingResult, train_points
 from deepdetect.training.checkpoint import read_checkpoint
-from deepdetect.training.points.measure import measure, points_detector, validation_pairs
+from deepdetect.training.points.measure import MEASURES, measure, validation_pairs
 from deepdetect.training.points.task import RankerTask
 from deepdetect.training.trainer import CHECKPOINT
 
@@ -24,9 +26,10 @@ OPTIONS = PointsTrainingOptions(steps=4, pairs=1, side=96, val_count=2, val_pair
 
 
 @pytest.fixture(scope="module", autouse=True)
-def few_statistics() -> Iterator[None]:
-    """Take mean and deviation of the features from a few pairs, which is faster."""
+def few_and_small() -> Iterator[None]:
+    """Measure few pairs, and small ones, which is faster."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("deepdetect.training.points.measure.SIDE_PX", 96)
         patch.setattr("deepdetect.training.points.task.STATISTICS_PAIRS", 4)
         patch.setattr("deepdetect.training.trainer.CHECKPOINT_INTERVAL_S", 0)
         yield
@@ -89,8 +92,8 @@ def test_the_best_weights_are_those_of_the_best_measure(
     whole: TrainingResult, textures: Path
 ) -> None:
     ranker = load_ranker(whole.weights)
-    found = measure(points_detector(ranker), validation_pairs(textures, 1))
-    assert found.score == pytest.approx(whole.best["score"], abs=1e-6)
+    found = measure(partial(detect_points, ranker=ranker), validation_pairs(textures, 1))
+    assert found["score"] == pytest.approx(whole.best["score"], abs=1e-6)
     notes = notes_of(ranker)
     assert notes["images"] == "4"
     assert json.loads(notes["point"]) == whole.best
@@ -109,7 +112,7 @@ def test_an_untrained_ranker_ranks_by_the_first_feature(textures: Path) -> None:
 
 
 def test_the_measure_of_a_blind_detector(textures: Path) -> None:
-    pairs = validation_pairs(textures, 2, side=96)
+    pairs = validation_pairs(textures, 2)
     assert {pair.kind for pair in pairs} == {"zoom", "blur", "viewpoint", "light"}
     generator = np.random.default_rng(0)
 
@@ -117,10 +120,10 @@ def test_the_measure_of_a_blind_detector(textures: Path) -> None:
         return Keypoints(generator.uniform(0, 95, (500, 2)), generator.random(500), (96, 96))
 
     found = measure(blind, pairs)
-    assert found.mean.shape == (3, 2)
-    assert found.score < 0.3
-    assert found.mean_correct < 0.05
-    assert (found.mean[:, 1] >= found.mean[:, 0]).all()
+    assert len(found) == 1 + 4 * len(MEASURES)
+    assert found["score"] < 0.3
+    assert max(found[name] for name in found if name.endswith("correct")) < 0.1
+    assert found["blur @3 px 2048"] >= found["blur @1 px 2048"]
 
 
 def test_an_altered_checkpoint_is_one_sentence(
@@ -130,7 +133,6 @@ def test_an_altered_checkpoint_is_one_sentence(
     moment = "optimizer.exp_avg_sq.ranker.first.weight"
     for state, tensors, told in (
         ({"step": None}, {}, "step"),
-        ({"points": [{"step": 0}]}, {}, "columns"),
         ({}, {moment: torch.zeros(3)}, moment),
     ):
         save_file(

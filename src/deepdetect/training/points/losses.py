@@ -6,15 +6,13 @@ standard deviation, so the loss does not fall when the ranker only makes its log
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from ...detector.points.detection import least_distances
 from ...features.selection import suppress_neighbors
-from .pairs import CandidatePair, Correspondences, Side
+from .pairs import CandidatePair, Candidates
 
 CLOSE_PX, NEAR_PX = 1.0, 3.0
 
@@ -35,61 +33,37 @@ MIN_SPREAD = 1e-3
 BISECTIONS = 40
 
 
-@dataclass(frozen=True)
-class Chosen:
-    """The keypoints of a view at a budget.
-
-    Attributes:
-        share: (N,) of all candidates: how surely each is among the best, differentiable; 0 for
-            those that a better one is near.
-        visible: (N,) bool: those that the other view shows.
-    """
-
-    share: Tensor
-    visible: Tensor
-
-
-def pair_loss(
-    ranker: torch.nn.Module, pair: CandidatePair, density: float, match_weight: float
-) -> Tensor:
+def pair_loss(ranker: torch.nn.Module, pair: CandidatePair, match_weight: float) -> Tensor:
     """Return the loss of a pair of views, seen in both directions.
 
     Its value is what is expected to be found again; its gradient is that at a fixed budget: a
     candidate that becomes more likely drives out others at the border of the budget, so its reward
     counts less theirs.
-
-    Args:
-        ranker: from (N, F) features to (N,) logits.
-        pair: the candidates of both views, and which see the same place.
-        density: keypoints per pixel.
-        match_weight: as of `PointsTrainingOptions`.
     """
-    chosen = [
-        _choose(ranker, side, way, density * pair.area)
-        for side, way in zip(pair.sides, pair.ways, strict=True)
-    ]
-    mass = min(float(each.share.detach()[each.visible].sum()) for each in chosen)
-    total = chosen[0].share.sum() * 0
-    for way, here, there in zip(pair.ways, chosen, chosen[::-1], strict=True):
-        share = here.share.detach()
-        reward = _rewards(way, share, there.share.detach(), match_weight)
-        border = share * (1 - share) * here.visible
+    shares = [_choose(ranker, view, pair.budget) for view in pair.views]
+    visible = [torch.from_numpy(view.visible) for view in pair.views]
+    mass = min(float(shares[k].detach()[visible[k]].sum()) for k in range(2))
+    total = shares[0].sum() * 0
+    for k, view in enumerate(pair.views):
+        share = shares[k].detach()
+        reward = _rewards(view, share, shares[1 - k].detach(), match_weight)
+        border = share * (1 - share) * visible[k]
         level = (reward * border).sum() / border.sum().clamp(min=1e-6)
-        value = (share * reward * here.visible).sum() / max(mass, 1.0)
-        gain = (here.share * (reward - level) * here.visible).sum() / max(mass, 1.0)
+        value = (share * reward * visible[k]).sum() / max(mass, 1.0)
+        gain = (shares[k] * (reward - level) * visible[k]).sum() / max(mass, 1.0)
         total = total - value - (gain - gain.detach())
     return total / 2
 
 
-def _choose(ranker: torch.nn.Module, side: Side, way: Correspondences, budget: float) -> Chosen:
-    logits = ranker(torch.from_numpy(side.features))
-    radii = least_distances(side.sigma_px)  # as at run time
-    kept = torch.from_numpy(suppress_neighbors(side.xy, logits.detach().numpy(), radii))
+def _choose(ranker: torch.nn.Module, view: Candidates, budget: float) -> Tensor:
+    """Return (N,) how surely each candidate is among the best; 0 where a better one is near."""
+    logits = ranker(torch.from_numpy(view.features))
+    radii = least_distances(view.sigma_px)  # as at run time
+    kept = torch.from_numpy(suppress_neighbors(view.xy, logits.detach().numpy(), radii))
     fixed = logits[kept].detach()
     spread = fixed.std() if len(fixed) > 1 else fixed.new_ones(())
     scaled = (logits[kept] - fixed.mean()) * (SHARPNESS / spread.clamp(min=MIN_SPREAD))
-    share = torch.zeros(len(logits)).index_put((kept,), soft_top_k(scaled, budget, TEMPERATURE))
-    return Chosen(share, torch.from_numpy(way.visible))
+    return torch.zeros(len(logits)).index_put((kept,), soft_top_k(scaled, budget, TEMPERATURE))
 
 
 def soft_top_k(logits: Tensor, budget: float, temperature: float) -> Tensor:
@@ -107,41 +81,31 @@ def soft_top_k(logits: Tensor, budget: float, temperature: float) -> Tensor:
     return torch.sigmoid((logits - low.float()) / temperature)
 
 
-def _rewards(way: Correspondences, here: Tensor, there: Tensor, match_weight: float) -> Tensor:
+def _rewards(view: Candidates, here: Tensor, there: Tensor, match_weight: float) -> Tensor:
     """Return what a candidate is worth: its partner's choice, by the distances of the measure.
 
     One to one, as it is measured, and among those that may be chosen: with a sum over all near
     candidates, crowds of points are rewarded, and fewer points are found again within 1 px.
     """
-    possible = [each.numpy() > MIN_CHOICE for each in (here, there)]
-    pairs = mutual_pairs(way, NEAR_PX, possible[0], possible[1])
-    close = way.distance_px[pairs] <= CLOSE_PX
+    pairs = mutual_pairs(view, NEAR_PX, here.numpy() > MIN_CHOICE, there.numpy() > MIN_CHOICE)
+    close = view.distance_px[pairs] <= CLOSE_PX
     worth = 1 - CLOSE_SHARE + CLOSE_SHARE * close
-    worth *= (1 + match_weight * way.matchable[pairs]) / (1 + match_weight)
+    worth *= (1 + match_weight * view.matchable[pairs]) / (1 + match_weight)
     reward = torch.zeros(len(here))
-    partner = torch.from_numpy(way.second[pairs])
-    reward[torch.from_numpy(way.first[pairs])] = torch.from_numpy(worth).float() * there[partner]
+    partner = torch.from_numpy(view.second[pairs])
+    reward[torch.from_numpy(view.first[pairs])] = torch.from_numpy(worth).float() * there[partner]
     return reward
 
 
 def mutual_pairs(
-    way: Correspondences,
-    radius_px: float,
-    possible_here: np.ndarray,
-    possible_there: np.ndarray,
+    view: Candidates, radius_px: float, possible_here: np.ndarray, possible_there: np.ndarray
 ) -> np.ndarray:
-    """Return which correspondences join mutual nearest neighbours.
-
-    Args:
-        way: from one view to the other.
-        radius_px: the largest distance.
-        possible_here, possible_there: (N,), (M,) bool: which candidates count.
-    """
-    close = way.distance_px <= radius_px
-    rows = np.flatnonzero(close & possible_here[way.first] & possible_there[way.second])
-    rows = rows[np.argsort(way.distance_px[rows], kind="stable")]
+    """Return which (P,) join mutual nearest neighbours among the possible candidates (N,), (M,)."""
+    close = view.distance_px <= radius_px
+    rows = np.flatnonzero(close & possible_here[view.first] & possible_there[view.second])
+    rows = rows[np.argsort(view.distance_px[rows], kind="stable")]
     # The first of each candidate is its nearest.
-    _, best_first = np.unique(way.first[rows], return_index=True)
-    _, best_second = np.unique(way.second[rows], return_index=True)
+    _, best_first = np.unique(view.first[rows], return_index=True)
+    _, best_second = np.unique(view.second[rows], return_index=True)
     found: np.ndarray = rows[np.intersect1d(best_first, best_second)]
     return found
