@@ -1,17 +1,21 @@
-"""Which images are matched for dense points; their points are tested with the pipeline."""
+"""Dense points with synthetic cameras, whose points are known; the pipeline tests the matching."""
 
 from __future__ import annotations
-
-import dataclasses
 
 import numpy as np
 import pytest
 
 from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.sfm import dense
-from deepdetect.sfm.dense import find_references, limited_view
+from deepdetect.sfm.dense import (
+    DensePoints,
+    find_references,
+    fuse_matches,
+    limited_view,
+    merge_dense_points,
+)
 from deepdetect.sfm.intrinsics import CameraIntrinsics
-from deepdetect.sfm.mapping import Observations, SparseModel
+from deepdetect.sfm.mapping import RegisteredImage, SparseModel
 
 SIZE = (320, 240)
 
@@ -25,27 +29,125 @@ def view(x: float, name: str = "") -> PosedView:
     return PosedView(name, Camera(SIZE, 300.0), rotation, -rotation @ [x, 0, 0])
 
 
+@pytest.fixture
+def scene() -> tuple[PosedView, list[PosedView], np.ndarray, np.ndarray]:
+    """A reference, four neighbours, pixels of the reference and the points that they show."""
+    rng = np.random.default_rng(0)
+    xy = rng.uniform((20, 20), (300, 220), (500, 2))
+    reference = view(0)
+    points = reference.camera.rays(xy) * rng.uniform(5, 7, (500, 1))
+    return reference, [view(x) for x in (-1.0, -0.5, 0.5, 1.0)], xy, points
+
+
+def test_exact_matches_give_the_points(scene) -> None:
+    reference, others, xy, points = scene
+    matches = [other.project(points)[0] for other in others]
+    found, errors, counts = fuse_matches(reference, xy, others, matches)
+    np.testing.assert_allclose(found, points, atol=1e-6)
+    assert errors.max() < 1e-6
+    assert (counts == 5).all()
+
+
+def test_noise_is_averaged_over_the_views(scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    reference, others, xy, points = scene
+    rng = np.random.default_rng(1)
+    matches = [other.project(points)[0] + rng.normal(0, 0.1, xy.shape) for other in others]
+    several, errors, counts = fuse_matches(reference, xy, others, matches)
+    monkeypatch.setattr(dense, "MIN_VIEWS", 2)
+    single, _, _ = fuse_matches(reference, xy, others[2:3], matches[2:3])
+    good = counts > 0
+    assert good.mean() > 0.95
+    assert 0.05 < np.median(errors[good]) < 0.15
+    depth_errors = [
+        np.median(np.abs(each[good, 2] - points[good, 2])) for each in (several, single)
+    ]
+    assert depth_errors[0] < 0.6 * depth_errors[1]
+
+
+def test_a_wrong_match_is_outvoted(scene) -> None:
+    reference, others, xy, points = scene
+    matches = [other.project(points)[0] for other in others]
+    matches[1] = matches[1] + (40, 0)
+    matches[3] = matches[3] - (25, 0)
+    found, errors, counts = fuse_matches(reference, xy, others, matches)
+    np.testing.assert_allclose(found, points, atol=1e-6)
+    assert (counts == 3).all()
+    assert errors.max() < 1e-6
+
+
+def test_two_views_are_not_enough(scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    reference, others, xy, points = scene
+    matches = [other.project(points)[0] for other in others[:2]]
+    matches[1][:250] = np.nan  # there is no match
+    matches[1][250:] += (30, 0)  # a match that contradicts
+    _, _, counts = fuse_matches(reference, xy, others[:2], matches)
+    assert not counts.any()
+    monkeypatch.setattr(dense, "MIN_VIEWS", 2)
+    _, _, counts = fuse_matches(reference, xy, others[:2], matches)
+    assert (counts >= 2).all()
+
+
+def test_points_without_parallax_or_behind_the_cameras_are_left_out(scene) -> None:
+    reference, _, xy, _ = scene
+    near = [view(x) for x in (0.01, 0.02, 0.03)]
+    far = reference.camera.rays(xy) * 6
+    matches = [other.project(far)[0] for other in near]
+    assert not fuse_matches(reference, xy, near, matches)[2].any()
+    wide = [view(x) for x in (-1.0, 1.0, 0.5)]
+    behind = [other.project(-far)[0] for other in wide]
+    assert np.isfinite(behind[0]).all()
+    assert not fuse_matches(reference, xy, wide, behind)[2].any()
+
+
+def surface(reference: PosedView, depth: float = 6.0, stride: int = 2) -> DensePoints:
+    """Return the points of a plane in the world that a view shows, one at each second pixel."""
+    y, x = np.mgrid[0 : SIZE[1] : stride, 0 : SIZE[0] : stride]
+    rays = reference.camera.rays(np.column_stack([x.ravel(), y.ravel()])) @ reference.rotation
+    points = reference.centre + rays * ((depth - reference.centre[2]) / rays[:, 2:])
+    count = len(points)
+    ones = np.ones(count, np.float32)
+    return DensePoints(
+        points.astype(np.float32), np.zeros((count, 3), np.uint8), ones, ones.astype(np.uint8)
+    )
+
+
+def test_what_two_references_show_is_kept_once() -> None:
+    first, second = view(0), view(0.5)
+    parts = [(first, surface(first)), (second, surface(second))]
+    merged = merge_dense_points(parts, 2)
+    new = len(merged) - len(parts[0][1])
+    projected, _ = first.project(parts[1][1].points)
+    outside = (~((projected > -1) & (projected < SIZE)).all(axis=1)).sum()
+    assert outside > 300
+    assert outside <= new < 1.3 * outside + 600
+    assert len(merge_dense_points(parts[:1], 2)) == len(parts[0][1])
+
+
+def test_another_surface_is_no_duplicate() -> None:
+    first, second = view(0), view(0.01)
+    parts = [(first, surface(first, 6.0)), (second, surface(second, 5.0))]
+    assert len(merge_dense_points(parts, 2)) == len(parts[0][1]) + len(parts[1][1])
+
+
 def test_neighbours_share_points_at_a_good_angle(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dense, "NEIGHBOURS", 2)
-    views = {k: view(x, str(k)) for k, x in enumerate((0.0, 0.02, 0.6, 1.2, 9.0))}
-    rng = np.random.default_rng(0)
-    points = rng.uniform((-1, -1, 5.5), (1, 1, 6.5), (200, 3))
-    rows, numbers, xy = [], [], []
-    for row, point in enumerate(points):
-        for number, own in views.items():
-            rows.append(row)
-            numbers.append(number)
-            xy.append(own.project(point[None])[0][0])
-    seen = Observations(np.array(rows), np.array(numbers), np.array(xy), np.array(rows))
-    intrinsics = {number: CameraIntrinsics.of_camera(own.camera) for number, own in views.items()}
-    sparse = SparseModel(views, intrinsics, points, np.zeros(200), seen)
-    found = {each.view.name: each for each in find_references(sparse)}
-    assert {each.view.name for each in found["0"].neighbours} == {"2", "3"}
-    first = found["0"].neighbours[0]
-    np.testing.assert_allclose(first.points0, views[0].project(points)[0])
-    np.testing.assert_allclose(first.points1, views[int(first.view.name)].project(points)[0])
-    lonely = dataclasses.replace(sparse, seen=Observations(*(a[::5] for a in vars(seen).values())))
-    assert find_references(lonely) == []
+    points = np.random.default_rng(0).uniform((-1, -1, 5.5), (1, 1, 6.5), (200, 3))
+
+    def model(step: int) -> SparseModel:
+        """Cameras that see every so many of the points."""
+        rows = np.arange(0, 200, step)
+        images = {}
+        for x in (0.0, 0.02, 0.6, 1.2, 9.0):
+            own = view(x, str(x))
+            intrinsics = CameraIntrinsics.of_camera(own.camera)
+            images[own.name] = RegisteredImage(
+                own, intrinsics, rows, own.project(points[rows])[0], rows
+            )
+        return SparseModel(images, points, np.zeros(200), np.full(200, 5))
+
+    found = {first.view.name: others for first, *others in find_references(model(1))}
+    assert {each.view.name for each in found["0.0"]} == {"0.6", "1.2"}
+    assert find_references(model(10)) == []
 
 
 def test_a_smaller_view_sees_the_same_directions(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 import threading
@@ -49,32 +48,11 @@ def _restore_sigterm() -> None:
 
 @contextmanager
 def quiet_pycolmap() -> Iterator[Any]:
-    """Give pycolmap, and keep what it logs off standard error: its own settings do not.
-
-    What Python writes there is still seen.
-    """
+    """Give pycolmap, and let it log nothing while the block runs."""
     pycolmap = import_pycolmap()
-    stream = sys.stderr
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     try:
-        own = stream.fileno() == 2
-    except (AttributeError, OSError, ValueError):
-        own = False
-    try:
-        stream.flush()
-        saved = os.dup(2)
-    except (AttributeError, OSError):  # without a standard error
-        yield pycolmap
-        return
-    null = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(null, 2)
-        if own:
-            sys.stderr = os.fdopen(os.dup(saved), "w", buffering=1, errors="backslashreplace")
         yield pycolmap
     finally:
-        if own:
-            sys.stderr.close()
-            sys.stderr = stream
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(null)
+        pycolmap.logging.minloglevel = before

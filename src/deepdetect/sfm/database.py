@@ -25,19 +25,16 @@ def write_database(
     images: Mapping[str, tuple[Keypoints, CameraIntrinsics]],
     matches: Mapping[Pair, np.ndarray],
 ) -> None:
-    """Write a new database of COLMAP.
+    """Write a new database of COLMAP to a file that does not exist, or is empty.
 
-    Each image is a frame of its own, of a rig with its camera alone. Keypoints with sizes have four
-    columns (x, y, scale, orientation), others two. Descriptors are written where they are SIFT's.
+    Keypoints with sizes have four columns (x, y, scale, orientation), others two. Descriptors are
+    written where they are SIFT's.
 
     Args:
-        path: the file, which must not exist or be empty.
+        path: the file.
         images: by their path below their folder; those with the same object of intrinsics share a
             camera.
         matches: (K, 2) rows of keypoints by the names of the two images.
-
-    Raises:
-        MissingExtraError: pycolmap is not installed.
     """
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(path) as database:
         cameras: dict[int, tuple[int, int]] = {}  # camera and rig by the object
@@ -82,7 +79,7 @@ def orientations_of(points: Keypoints) -> np.ndarray:
 def sift_bytes(keypoints: Keypoints) -> np.ndarray | None:
     """Return descriptors as SIFT's (N, 128) uint8, or None where they are of another kind.
 
-    Descriptors of length 1 are multiplied by 512, as SIFT does it.
+    Those of length 1 are multiplied by 512, as SIFT does it.
     """
     found = keypoints.descriptors
     if found is None or found.shape[1] != SIFT_NUMBERS:

@@ -1,11 +1,13 @@
 """Dense points from images with known cameras.
 
 Each image in turn is the reference. It is rectified with its best neighbours, and matched with
-them row by row (`matching.guided.rectified`); `fusion` makes points of the matches.
+them row by row (`matching.guided.rectified`). A pixel becomes a point where enough views agree with
+one position in space; it is the position that projects nearest to all of their matches.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,11 +17,11 @@ import numpy as np
 from .._shared.opencv import cv2
 from .._shared.records import file_state
 from ..geometry.camera import Camera, PosedView, relative_fundamental
+from ..geometry.transforms import scaled_points
 from ..io.image import load_image, luma
 from ..matching.guided.rectified import match_by_rectification
-from .fusion import MIN_VIEWS, DensePoints, angles_between, fuse_matches
 from .intrinsics import CameraIntrinsics
-from .mapping import SparseModel
+from .mapping import RegisteredImage, SparseModel
 
 NEIGHBOURS = 4
 """Images that each one is matched with."""
@@ -39,101 +41,104 @@ MAX_SIDE_PX = 2000
 CACHED_IMAGES = 16
 """Prepared images that a process keeps: following references share neighbours."""
 
+BLOCK = 50_000
+"""Pixels that are triangulated at once, which bounds the memory."""
+
+REWEIGHTINGS = 2
+"""Of the linear triangulation, after which it minimises distances in pixels."""
+
+MIN_VIEWS = 3
+"""Images that must agree on a point, the reference among them."""
+
+MAX_ERROR_PX = 1.0
+"""Between a match and the projection of the point that it agrees with."""
+
+MIN_TRIANGULATION_DEG = 1.0
+"""Smallest angle between two of the lines of sight."""
+
+DUPLICATE_DEPTH = 0.01
+"""Of a point that another reference has given already, the relative difference of the depths."""
+
 
 @dataclass(frozen=True, eq=False)
-class Neighbour:
-    """An image that a reference is matched with.
+class DensePoints:
+    """Points that several images agree on.
 
     Attributes:
-        view: its camera.
-        intrinsics: the same with its distortion.
-        points0, points1: (K, 2) sparse matches, in pixels of the pinhole cameras of the reference
-            and of this one.
+        points: (N, 3) float32.
+        colors: (N, 3) uint8 sRGB.
+        errors: (N,) float32 distance of the projections from the matches in pixels, the root mean
+            square of all images that agree.
+        views: (N,) uint8, how many these are.
     """
 
-    view: PosedView
-    intrinsics: CameraIntrinsics
-    points0: np.ndarray
-    points1: np.ndarray
+    points: np.ndarray
+    colors: np.ndarray
+    errors: np.ndarray
+    views: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, index: np.ndarray) -> DensePoints:
+        return DensePoints(*(values[index] for values in vars(self).values()))
+
+    @classmethod
+    def joined(cls, parts: Sequence[DensePoints]) -> DensePoints:
+        """Return all points of several."""
+        if not parts:
+            empty = np.empty((0, 3), np.float32)
+            return cls(empty, empty.astype(np.uint8), empty[:, 0], empty[:, 0].astype(np.uint8))
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        return cls(*(np.concatenate(values) for values in columns))
 
 
-@dataclass(frozen=True, eq=False)
-class Reference:
-    """An image whose pixels become points, and those that it is matched with."""
-
-    view: PosedView
-    intrinsics: CameraIntrinsics
-    neighbours: tuple[Neighbour, ...]
-
-
-def find_references(sparse: SparseModel) -> list[Reference]:
+def find_references(sparse: SparseModel) -> list[list[RegisteredImage]]:
     """Choose the neighbours of each image: those that share many points at a good angle.
 
-    Returns:
-        The images that have enough neighbours, those that see most points first.
+    Returns each image that has enough neighbours with these behind it, the best first; images that
+    see most points come first.
     """
-    rows = {number: np.flatnonzero(sparse.seen.views == number) for number in sparse.views}
     found = []
-    for number in sorted(rows, key=lambda number: -len(rows[number])):
-        scored = []
-        for other in rows:
-            if other == number:
+    for image in sorted(sparse.images.values(), key=lambda image: -len(image.points)):
+        scored: list[tuple[float, RegisteredImage]] = []
+        for other in sparse.images.values():
+            common = np.intersect1d(image.points, other.points)
+            if other is image or len(common) < MIN_COMMON_POINTS:
                 continue
-            common, own, its = np.intersect1d(
-                sparse.seen.points[rows[number]],
-                sparse.seen.points[rows[other]],
-                return_indices=True,
-            )
-            if len(common) < MIN_COMMON_POINTS:
-                continue
-            lines = [sparse.points[common] - sparse.views[k].centre for k in (number, other)]
+            lines = [sparse.points[common] - each.view.centre for each in (image, other)]
             angle = np.degrees(angles_between(*lines))
             weights = np.minimum(angle / IDEAL_ANGLE_DEG, 1) ** 1.5
             weights = weights * np.minimum(MAX_ANGLE_DEG / np.maximum(angle, 1e-9), 1) ** 2
-            neighbour = Neighbour(
-                sparse.views[other],
-                sparse.intrinsics[other],
-                sparse.seen.xy[rows[number][own]],
-                sparse.seen.xy[rows[other][its]],
-            )
-            scored.append((float(weights.sum()), neighbour))
+            scored.append((float(weights.sum()), other))
         scored.sort(key=lambda each: -each[0])
-        best = tuple(neighbour for _, neighbour in scored[:NEIGHBOURS])
-        if len(best) + 1 >= MIN_VIEWS:
-            found.append(Reference(sparse.views[number], sparse.intrinsics[number], best))
+        images = [image, *(other for _, other in scored[:NEIGHBOURS])]
+        if len(images) >= MIN_VIEWS:
+            found.append(images)
     return found
 
 
-def dense_points(folder: Path, reference: Reference, stride_px: int) -> DensePoints:
-    """Match a reference with its neighbours, and return the points that enough of them agree on.
+def dense_points(folder: Path, images: Sequence[RegisteredImage], stride_px: int) -> DensePoints:
+    """Match the first image with the others, and return the points that enough of them agree on.
 
-    Args:
-        folder: of the images.
-        reference: with its neighbours.
-        stride_px: a point is sought at every so many pixels of a row and of a column.
-
-    Raises:
-        ImageError: an image cannot be read any more.
+    A point is sought at every `stride_px` pixels of a row and of a column.
     """
-    path = folder / reference.view.name
-    rgb = _prepared_image(path, file_state(path), reference.intrinsics)
-    gray, view = luma(rgb), limited_view(reference.view)
-    scale = view.camera.size[0] / reference.view.camera.size[0]
+    reference, *neighbours = images
+    rgb, view, scale = _prepared(folder, reference)
+    gray = luma(rgb)
     height, width = gray.shape
     y, x = np.mgrid[0:height:stride_px, 0:width:stride_px]
     xy = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
     views, matches = [], []
-    for neighbour in reference.neighbours:
-        path = folder / neighbour.view.name
-        other = _prepared_image(path, file_state(path), neighbour.intrinsics)
-        its_view = limited_view(neighbour.view)
-        its_scale = its_view.camera.size[0] / neighbour.view.camera.size[0]
+    for neighbour in neighbours:
+        other, its_view, its_scale = _prepared(folder, neighbour)
+        _, own, its = np.intersect1d(reference.points, neighbour.points, return_indices=True)
         found = match_by_rectification(
             gray,
             luma(other),
             xy,
-            _scaled(neighbour.points0, scale),
-            _scaled(neighbour.points1, its_scale),
+            scaled_points(reference.xy[own], scale),
+            scaled_points(neighbour.xy[its], its_scale),
             relative_fundamental(view, its_view),
             exact=True,
         )
@@ -151,6 +156,13 @@ def dense_points(folder: Path, reference: Reference, stride_px: int) -> DensePoi
         errors[kept].astype(np.float32),
         counts[kept].astype(np.uint8),
     )
+
+
+def _prepared(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, PosedView, float]:
+    """Return an image without its distortion at most `MAX_SIDE_PX` long, its view, its scale."""
+    path, view = folder / image.view.name, limited_view(image.view)
+    rgb = _prepared_image(path, file_state(path), image.intrinsics)
+    return rgb, view, view.camera.size[0] / image.view.camera.size[0]
 
 
 @lru_cache(maxsize=CACHED_IMAGES)
@@ -180,6 +192,148 @@ def limited_view(view: PosedView) -> PosedView:
     return replace(view, camera=Camera(size, (fx * across, fy * down), centre))
 
 
-def _scaled(xy: np.ndarray, scale: float) -> np.ndarray:
-    """Return positions in an image that has been scaled."""
-    return np.asarray((xy + 0.5) * scale - 0.5)
+def angles_between(rays0: np.ndarray, rays1: np.ndarray) -> np.ndarray:
+    """Return the angles between vectors (N, 3) in radians."""
+    across = np.linalg.norm(np.cross(rays0, rays1), axis=1)
+    return np.asarray(np.arctan2(across, np.einsum("ij,ij->i", rays0, rays1)))
+
+
+def fuse_matches(
+    reference: PosedView,
+    xy: np.ndarray,
+    views: Sequence[PosedView],
+    matches: Sequence[np.ndarray],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find the points that the matches (N, 2) of several views agree on; NaN where there is none.
+
+    The match of each view in turn gives a point, with which those of other views agree or not. The
+    point with most agreement is triangulated again from all that agree.
+
+    Returns:
+        (N, 3) points, (N,) errors as of `DensePoints`, and (N,) number of views that agree, the
+        reference among them; 0 where too few do, and there is no point.
+    """
+    points = np.full((len(xy), 3), np.nan)
+    errors = np.full(len(xy), np.nan)
+    counts = np.zeros(len(xy), np.int64)
+    for start in range(0, len(xy) if views else 0, BLOCK):
+        part = slice(start, start + BLOCK)
+        points[part], errors[part], counts[part] = _fuse_block(
+            reference, xy[part], views, [places[part] for places in matches]
+        )
+    return points, errors, counts
+
+
+def _fuse_block(
+    reference: PosedView,
+    xy: np.ndarray,
+    views: Sequence[PosedView],
+    matches: Sequence[np.ndarray],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    all_views = [reference, *views]
+    places = np.stack([xy, *matches])
+    known = np.isfinite(places).all(axis=2)
+    agreeing = np.zeros(known.shape, bool)
+    most = np.zeros(len(xy), np.int64)
+    for k in range(1, len(all_views)):
+        if not known[k].any():
+            continue
+        alone = np.zeros(known.shape, bool)
+        alone[0] = alone[k] = known[k]
+        points = _triangulate(all_views, places, alone)
+        distance, _ = _distances(all_views, places, points)
+        agree = known & known[k] & (distance < MAX_ERROR_PX)
+        number = agree.sum(axis=0)
+        better = agree[0] & agree[k] & (number > most)
+        agreeing[:, better], most[better] = agree[:, better], number[better]
+    points = _triangulate(all_views, places, agreeing)
+    distance, depth = _distances(all_views, places, points)
+    number = agreeing.sum(axis=0)
+    squares = np.where(agreeing, distance**2, 0).sum(axis=0)
+    errors = np.sqrt(squares / np.maximum(number, 1))
+    ahead = np.where(agreeing, depth > 0, True).all(axis=0)
+    angle = np.zeros(len(xy))
+    for k, view in enumerate(views, 1):
+        between = np.degrees(angles_between(points - reference.centre, points - view.centre))
+        angle = np.maximum(angle, np.where(agreeing[k], between, 0))
+    good = (
+        (number >= MIN_VIEWS)
+        & np.isfinite(points).all(axis=1)
+        & ahead
+        & (errors < MAX_ERROR_PX)
+        & (angle >= MIN_TRIANGULATION_DEG)
+    )
+    return points, errors, np.where(good, number, 0)
+
+
+def _triangulate(views: Sequence[PosedView], places: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Triangulate (N, 3) points from positions (V, N, 2) in the views that are used (V, N).
+
+    Linear, weighted by depths: after some rounds the least squares of distances in pixels.
+    """
+    count = places.shape[1]
+    points = np.full((count, 3), np.nan)
+    depth = np.ones(places.shape[:2])
+    for _ in range(1 + REWEIGHTINGS):
+        normal = np.zeros((count, 3, 3))
+        right = np.zeros((count, 3))
+        for k, view in enumerate(views):
+            weight = np.where(used[k], 1 / depth[k], 0)
+            projection = view.projection
+            for axis in (0, 1):
+                where = np.where(used[k], places[k, :, axis], 0)
+                row = (where[:, None] * projection[2] - projection[axis]) * weight[:, None]
+                normal += row[:, :3, None] * row[:, None, :3]
+                right -= row[:, :3] * row[:, 3:]
+        solvable = (used.sum(axis=0) >= 2) & (np.linalg.det(normal) > 0)
+        points[solvable] = np.linalg.solve(normal[solvable], right[solvable, :, None])[:, :, 0]
+        for k, view in enumerate(views):
+            seen = np.abs(points @ view.rotation[2] + view.translation[2])
+            depth[k] = np.where(np.isfinite(seen) & (seen > 1e-9), seen, 1)
+    return points
+
+
+def _distances(
+    views: Sequence[PosedView], places: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (V, N) distances of projections from positions, infinite behind a view; depths."""
+    distances, depths = np.full(places.shape[:2], np.inf), np.full(places.shape[:2], -1.0)
+    for k, view in enumerate(views):
+        projected, depth = view.project(points)
+        distance = np.linalg.norm(projected - places[k], axis=1)
+        fine = np.isfinite(distance) & (depth > 0)
+        distances[k, fine], depths[k, fine] = distance[fine], depth[fine]
+    return distances, depths
+
+
+def merge_dense_points(
+    parts: Sequence[tuple[PosedView, DensePoints]], stride_px: int
+) -> DensePoints:
+    """Join the points of all references, without those that an earlier one has given already."""
+    kept: list[DensePoints] = []
+    for view, own in parts:
+        seen = _nearest_depths(view, kept, stride_px)
+        projected, depth = view.project(own.points)
+        cells = np.rint(projected / stride_px).astype(np.int64)
+        cells = cells.clip(0, np.array(seen.shape[::-1]) - 1)
+        before = seen[cells[:, 1], cells[:, 0]]
+        again = np.abs(before - depth) <= DUPLICATE_DEPTH * depth
+        kept.append(own[np.flatnonzero(~again)])
+    return DensePoints.joined(kept)
+
+
+def _nearest_depths(view: PosedView, parts: Sequence[DensePoints], stride: int) -> np.ndarray:
+    """Return the depth of the nearest point in each cell of a view, infinite without any."""
+    columns, rows = (-(-side // stride) for side in view.camera.size)
+    nearest = np.full(columns * rows, np.inf)
+    for part in parts:
+        projected, depth = view.project(part.points)
+        cells = np.rint(np.where(depth[:, None] > 0, projected, -1e6) / stride)
+        inside = ((cells >= 0) & (cells < (columns, rows))).all(axis=1)
+        column, row = cells[inside].astype(np.int64).T
+        order = np.argsort(-depth[inside], kind="stable")  # the last that is written stays
+        cell = (row * columns + column)[order]
+        there = np.full(columns * rows, np.inf)
+        there[cell] = depth[inside][order]
+        nearest = np.minimum(nearest, there)
+    return nearest.reshape(rows, columns)

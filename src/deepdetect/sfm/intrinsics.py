@@ -37,12 +37,7 @@ class CameraIntrinsics:
 
     @classmethod
     def of_camera(cls, camera: Camera) -> CameraIntrinsics:
-        """Return the intrinsics of a known pinhole camera.
-
-        Example:
-            >>> CameraIntrinsics.of_camera(Camera((640, 480), 500.0)).params
-            (500.0, 500.0, 320.0, 240.0)
-        """
+        """Return the intrinsics of a known pinhole camera."""
         centre = (camera.centre[0] + PIXEL_CENTRE, camera.centre[1] + PIXEL_CENTRE)
         return cls("PINHOLE", camera.size, (*camera.focal_px, *centre))
 
@@ -52,14 +47,7 @@ class CameraIntrinsics:
     ) -> CameraIntrinsics:
         """Return intrinsics to be estimated, with one parameter of radial distortion.
 
-        Args:
-            size: (width, height) in pixels.
-            focal_px: where the estimation begins; None where nothing is known.
-            source: of the focal length.
-
-        Example:
-            >>> CameraIntrinsics.initial((1000, 500)).params
-            (1200.0, 500.0, 250.0, 0.0)
+        The estimation begins with `focal_px`, or a guess; `source` is that of the focal length.
         """
         if focal_px is None:
             focal_px, source = ESTIMATED_FOCAL_FACTOR * max(size), "estimated"
@@ -126,27 +114,16 @@ def known_cameras(
 
     Raises:
         ReconstructionError: it is wrong, or for none of them.
-
-    Example:
-        >>> camera = Camera((640, 480), 500.0)
-        >>> list(known_cameras(camera, {"a.jpg": (640, 480), "b.jpg": (320, 240)}))
-        ['a.jpg']
     """
     known: dict[str, Camera] = {}
     problem: ReconstructionError | None = None
     for name, size in sizes.items():
         try:
-            if isinstance(calibration, Calibration):
-                camera = calibration.camera0
-            elif isinstance(calibration, Camera):
-                camera = calibration
-            else:
+            if isinstance(calibration, (str, Path)):
                 camera = read_calibration(calibration, size, size).camera0
-            if camera.size != size:
-                raise ReconstructionError(
-                    f"the calibration is for images of {camera.size[0]}x{camera.size[1]} pixels, "
-                    f"{name} has {size[0]}x{size[1]}: give the calibration of this size"
-                )
+            else:
+                camera = calibration if isinstance(calibration, Camera) else calibration.camera0
+                Calibration(camera, camera).check_sizes(size, size)
             known[name] = camera
         except ReconstructionError as error:
             problem = error
@@ -169,10 +146,7 @@ def initial_intrinsics(
         sizes: (width, height) by the name of the image.
         known: cameras that are known, by name.
         focal_px: of the others; None: of their EXIF, or a guess.
-        single_camera: as of `MultiViewOptions`.
-
-    Returns:
-        By name, the same object for images that share a camera.
+        single_camera: as of `MultiViewOptions`; images that share a camera get the same object.
     """
     shared: dict[Any, CameraIntrinsics] = {}
     intrinsics = {}

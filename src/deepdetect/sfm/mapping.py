@@ -5,7 +5,6 @@ Schönberger and Frahm, "Structure-from-Motion Revisited", 2016.
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -50,18 +49,20 @@ it is in the middle."""
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
-    """Where points are seen: one row for each point in each image that sees it.
+class RegisteredImage:
+    """An image whose pose is known, and the points that it sees.
 
     Attributes:
-        points: (K,) int64 rows of the points, ascending.
-        views: (K,) int64 COLMAP's numbers of the images.
-        xy: (K, 2) float64 positions in pixels of pinhole cameras.
-        keypoints: (K,) int64 rows of the keypoints of the image.
+        view: its pose and pinhole camera.
+        intrinsics: of the same camera, with its distortion.
+        points: (K,) int64 rows of the points, rising.
+        xy: (K, 2) float64 where it sees them, in pixels of the pinhole camera.
+        keypoints: (K,) int64 rows of its keypoints.
     """
 
+    view: PosedView
+    intrinsics: CameraIntrinsics
     points: np.ndarray
-    views: np.ndarray
     xy: np.ndarray
     keypoints: np.ndarray
 
@@ -71,35 +72,27 @@ class SparseModel:
     """Cameras and sparse points, in the frame and unit of the model.
 
     Attributes:
-        views: by COLMAP's number of the image; their cameras are pinhole cameras.
-        intrinsics: of the images, by the same number, with their distortion.
+        images: by name, in COLMAP's order.
         points: (P, 3) float64.
         errors: (P,) float64 mean reprojection error in pixels.
-        seen: where they are seen.
+        tracks: (P,) number of images that each point is seen in.
     """
 
-    views: Mapping[int, PosedView]
-    intrinsics: Mapping[int, CameraIntrinsics]
+    images: Mapping[str, RegisteredImage]
     points: np.ndarray
     errors: np.ndarray
-    seen: Observations
+    tracks: np.ndarray
 
     @property
-    def tracks(self) -> np.ndarray:
-        """(P,) number of images that each point is seen in."""
-        return np.bincount(self.seen.points, minlength=len(self.points))
+    def views(self) -> dict[str, PosedView]:
+        """Cameras by the names of the images."""
+        return {name: image.view for name, image in self.images.items()}
 
 
 def verify_pairs(database: Path, seed: int = 0, workers: int | None = None) -> dict[Pair, int]:
     """Estimate the two-view geometries of matched pairs, and store them in the database.
 
-    Args:
-        database: with matches.
-        seed: of the random samples.
-        workers: number of threads; None: one per processor.
-
-    Returns:
-        The number of matches that agree with its geometry, of each pair where enough do.
+    Returns the number of matches that agree with its geometry, of each pair where enough do.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_VERIFIED)
@@ -137,9 +130,6 @@ def map_images(
 
     Returns:
         The largest model of pycolmap, and the names of the images in each other component.
-
-    Raises:
-        NoDepthError: no images hang together.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.IncrementalPipelineOptions()
@@ -194,52 +184,36 @@ def _names(model: Any) -> frozenset[str]:
 def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseModel:
     """Return the cameras and points of a model of pycolmap.
 
-    Args:
-        model: a `pycolmap.Reconstruction`.
-        sources: where the intrinsics of each image began.
+    `sources` says where the intrinsics of each image began.
     """
-    views, intrinsics = {}, {}
-    for number in model.reg_image_ids():
+    seen: dict[int, list[tuple[int, int]]] = {number: [] for number in model.reg_image_ids()}
+    points = np.empty((len(model.points3D), 3))
+    for row, number in enumerate(sorted(model.points3D)):
+        points[row] = model.points3D[number].xyz
+        for element in model.points3D[number].track.elements:
+            seen[element.image_id].append((row, element.point2D_idx))
+    images = {}
+    sums, tracks = np.zeros(len(points)), np.zeros(len(points), np.int64)
+    for number, pairs in seen.items():
         image = model.images[number]
         pose = image.cam_from_world()
         own = CameraIntrinsics.of_colmap(image.camera, sources.get(image.name, "given"))
-        intrinsics[number] = own
-        views[number] = PosedView(
-            image.name, own.pinhole, pose.rotation.matrix(), np.array(pose.translation)
-        )
-    numbers = sorted(model.points3D)
-    rows = [
-        (
-            *(k, element.image_id, element.point2D_idx),
-            *model.images[element.image_id].points2D[element.point2D_idx].xy,
-        )
-        for k, number in enumerate(numbers)
-        for element in model.points3D[number].track.elements
-    ]
-    table = np.array(rows, np.float64).reshape(-1, 5)
-    seen_points, seen_in, keypoints = table[:, :3].astype(np.int64).T
-    xy = table[:, 3:] - PIXEL_CENTRE
-    for number, own in intrinsics.items():
-        rows_in = seen_in == number
-        xy[rows_in] = own.to_pinhole(xy[rows_in])
-    points = np.array([model.points3D[number].xyz for number in numbers]).reshape(-1, 3)
-    seen = Observations(seen_points, seen_in, xy, keypoints)
-    distances = np.empty(len(xy))
-    for number, view in views.items():
-        rows_in = seen_in == number
-        projected = view.project(points[seen_points[rows_in]])[0]
-        distances[rows_in] = np.linalg.norm(projected - xy[rows_in], axis=1)
-    counts = np.bincount(seen_points, minlength=len(points))
-    errors = np.bincount(seen_points, distances, minlength=len(points)) / np.maximum(counts, 1)
-    return SparseModel(views, intrinsics, points, errors, seen)
+        rotation, translation = pose.rotation.matrix(), np.array(pose.translation)
+        view = PosedView(image.name, own.pinhole, rotation, translation)
+        rows, keypoints = np.array(pairs, np.int64).reshape(-1, 2).T
+        places = np.array([image.points2D[keypoint].xy for keypoint in keypoints])
+        xy = own.to_pinhole(places.reshape(-1, 2) - PIXEL_CENTRE)
+        images[image.name] = RegisteredImage(view, own, rows, xy, keypoints)
+        distances = np.linalg.norm(view.project(points[rows])[0] - xy, axis=1)
+        sums += np.bincount(rows, distances, len(points))
+        tracks += np.bincount(rows, minlength=len(points))
+    return SparseModel(images, points, sums / np.maximum(tracks, 1), tracks)
 
 
 def adjust(model: Any, known_cameras: bool) -> None:
-    """Adjust all cameras and points (bundle adjustment) with a robust loss.
+    """Adjust all cameras and points of a model (bundle adjustment) with a robust loss.
 
-    Args:
-        model: a `pycolmap.Reconstruction`, which is changed.
-        known_cameras: whether the intrinsics stay as they are.
+    As `pycolmap.bundle_adjustment`, which cannot be kept from logging.
     """
     taken = Counter(model.images[number].camera_id for number in model.reg_image_ids())
     enough = min(taken.values()) >= MIN_VIEWS_OF_PRINCIPAL_POINT
@@ -250,7 +224,12 @@ def adjust(model: Any, known_cameras: bool) -> None:
         how.print_summary = False
         how.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         how.ceres.loss_function_scale = ROBUST_SCALE_PX
-        pycolmap.bundle_adjustment(model, how)
+        pycolmap.ObservationManager(model).filter_observations_with_negative_depth()
+        config = pycolmap.BundleAdjustmentConfig()
+        for number in model.reg_image_ids():
+            config.add_image(number)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        pycolmap.create_default_bundle_adjuster(how, config, model).solve()
         model.update_point_3d_errors()
 
 
@@ -260,9 +239,7 @@ def normalise_model(model: Any) -> None:
     1 is the spacing of its cameras.
     """
     sparse = read_sparse_model(model)
-    seen = np.bincount(sparse.seen.views)
-    number = max(sparse.views, key=lambda number: seen[number])
-    view = sparse.views[number]
+    view = max(sparse.images.values(), key=lambda image: len(image.points)).view
     scale = 1 / (camera_spacing(list(sparse.views.values())) or 1.0)
     with quiet_pycolmap() as pycolmap:
         model.transform(
@@ -278,17 +255,3 @@ def camera_spacing(views: Sequence[PosedView]) -> float:
     distances = np.linalg.norm(centres[:, None] - centres, axis=2)
     np.fill_diagonal(distances, np.inf)
     return float(np.median(distances.min(axis=1)))
-
-
-def write_sparse_model(model: Any, folder: Path) -> None:
-    """Write COLMAP's files of a model into a folder, all of them or none."""
-    made = folder.with_name(f".{folder.name}.new")
-    before = folder.with_name(f".{folder.name}.old")
-    for leftover in (made, before):
-        shutil.rmtree(leftover, ignore_errors=True)
-    made.mkdir(parents=True)
-    model.write(made)
-    if folder.exists():
-        folder.rename(before)
-    made.rename(folder)
-    shutil.rmtree(before, ignore_errors=True)

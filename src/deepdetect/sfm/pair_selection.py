@@ -39,12 +39,7 @@ def sequential_pairs(names: Sequence[str], following: int) -> list[Pair]:
 
 
 def similar_pairs(names: Sequence[str], vectors: np.ndarray, count: int) -> list[Pair]:
-    """Return each name with those whose vectors are most alike, every pair once.
-
-    Args:
-        names: of the images.
-        vectors: (N, D) of length 1, one each.
-        count: partners of each; it may also be a partner of others.
+    """Return each name with the `count` whose vectors (N, D) are most alike, every pair once.
 
     Example:
         >>> angles = np.radians([0, 10, 90, 95])
@@ -80,13 +75,8 @@ def vlad_vectors(
 ) -> np.ndarray:
     """Describe each image by one vector: VLAD with the square roots of what each word sums.
 
-    Args:
-        descriptors: (N_i, D) float32 of each image, of length 1.
-        words: of the vocabulary.
-        seed: of the vocabulary.
-
-    Returns:
-        (images, words * D) float32 of length 1; 0 for an image without keypoints.
+    Descriptors are (N_i, D) float32 of length 1; so are the vectors (images, words * D), or 0 for
+    an image without keypoints.
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -113,11 +103,9 @@ def _vocabulary(descriptors: np.ndarray, words: int, seed: int) -> np.ndarray:
     """Return the centres of k-means."""
     rng = np.random.default_rng(seed)
     if len(descriptors) > MAX_TRAINING_DESCRIPTORS:
-        descriptors = descriptors[
-            rng.choice(len(descriptors), MAX_TRAINING_DESCRIPTORS, replace=False)
-        ]
+        descriptors = rng.choice(descriptors, MAX_TRAINING_DESCRIPTORS, replace=False)
     count = min(words, len(descriptors))
-    centres = descriptors[rng.choice(len(descriptors), count, replace=False)].copy()
+    centres = rng.choice(descriptors, count, replace=False)
     for _ in range(KMEANS_ITERATIONS):
         nearest = _nearest(descriptors, centres)
         sizes = np.bincount(nearest, minlength=count)

@@ -27,7 +27,7 @@ from ..geometry.point_cloud import PointCloud
 from ..io.html_viewer import write_html_page
 from ..io.point_cloud import save_point_cloud
 from .colmap import import_pycolmap
-from .fusion import DensePoints
+from .dense import DensePoints
 from .intrinsics import initial_intrinsics, known_cameras
 from .mapping import MIN_VIEWS, SparseModel, read_sparse_model
 from .options import MultiViewOptions
@@ -110,9 +110,10 @@ def reconstruct_many(
             )
             del sizes[name]
     if len(sizes) < MIN_VIEWS:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in [*unregistered.items()][:3])
         raise ReconstructionError(
             f"{len(sizes)} of {len(sizes) + len(unregistered)} images can be used, "
-            f"{MIN_VIEWS} are needed: " + _listed(unregistered)
+            f"{MIN_VIEWS} are needed: {reasons or 'take more images'}"
         )
     known: Mapping[str, Camera] = {}
     if calibration is not None:
@@ -130,28 +131,25 @@ def reconstruct_many(
     with timer.stage("mapping"):
         model, verified, components = stages.map(folder, intrinsics, matches, bool(known))
     sparse = read_sparse_model(model, {name: own.source for name, own in intrinsics.items()})
-    registered = {view.name for view in sparse.views.values()}
     for name in sizes:
-        if name not in registered:
+        if name not in sparse.images:
             unregistered[name] = _why_unregistered(name, verified, components)
     with timer.stage("dense points"):
         dense = stages.dense(folder, sparse) if options.dense else DensePoints.joined([])
     with timer.stage("files"):
-        order = sorted(sparse.views, key=lambda number: sparse.views[number].name)
-        views = {sparse.views[number].name: sparse.views[number] for number in order}
+        views = dict(sorted(sparse.views.items()))
         reference = min(views, key=lambda name: float(np.linalg.norm(views[name].centre)))
-        frame = f"camera of {reference}"
-        colors = _sparse_colors(stages.features, sparse)
+        unit = "spacing", f"camera of {reference}"
         found = MultiViewReconstruction(
             views=views,
-            intrinsics={sparse.views[number].name: sparse.intrinsics[number] for number in order},
+            intrinsics={name: sparse.images[name].intrinsics for name in views},
             unregistered=dict(sorted(unregistered.items())),
             components=_without_registered(components, unregistered),
             reference=reference,
-            sparse=PointCloud(sparse.points, colors, "spacing", frame),
+            sparse=PointCloud(sparse.points, _sparse_colors(stages.features, sparse), *unit),
             sparse_errors=sparse.errors.astype(np.float32),
             sparse_views=sparse.tracks.astype(np.int32),
-            dense=PointCloud(dense.points, dense.colors, "spacing", frame),
+            dense=PointCloud(dense.points, dense.colors, *unit),
             dense_errors=dense.errors,
             dense_views=dense.views,
             keypoints=keypoints,
@@ -203,13 +201,12 @@ def _why_unregistered(
                 f"it hangs together with {len(names) - 1} others only, which show something else, "
                 "or too little of the same"
             )
-    partners = sum(name in pair for pair in verified)
-    if not partners:
-        return "it matches none of the others: it shows something else, or from too far away"
-    return (
-        f"it matches {partners} of the others, but its pose cannot be told from them: take more "
-        "images between"
-    )
+    if partners := sum(name in pair for pair in verified):
+        return (
+            f"it matches {partners} of the others, but its pose cannot be told from them: take "
+            "more images between"
+        )
+    return "it matches none of the others: it shows something else, or from too far away"
 
 
 def _without_registered(
@@ -224,13 +221,6 @@ def _sparse_colors(features: Path, sparse: SparseModel) -> np.ndarray:
     """Return the (P, 3) uint8 mean colours of the points in the images that see them."""
     sums = np.zeros((len(sparse.points), 3))
     with open_hdf5(features) as file:
-        for number, view in sparse.views.items():
-            own = sparse.seen.views == number
-            colors = file[view.name]["colors"][()]
-            np.add.at(sums, sparse.seen.points[own], colors[sparse.seen.keypoints[own]])
+        for name, image in sparse.images.items():
+            np.add.at(sums, image.points, file[name]["colors"][()][image.keypoints])
     return np.rint(sums / np.maximum(sparse.tracks, 1)[:, None]).astype(np.uint8)
-
-
-def _listed(reasons: Mapping[str, str]) -> str:
-    shown = [f"{name}: {reason}" for name, reason in list(reasons.items())[:3]]
-    return "; ".join(shown) or "take more images"

@@ -23,7 +23,6 @@ from .._shared.memory import available_memory, needed_memory
 from .._shared.parallel import map_in_processes, processor_count
 from .._shared.progress import progress
 from .._shared.records import file_state, key, load_arrays, save_arrays
-from .._shared.text_files import read_json
 from ..batch.extraction import extract_features
 from ..batch.hdf5 import open_hdf5
 from ..batch.pair_list import Pair, pair_name
@@ -35,17 +34,15 @@ from ..features.selection import SelectionOptions
 from ..io.image import find_images
 from .colmap import import_pycolmap
 from .database import write_database
-from .dense import Reference, dense_points, find_references, limited_view
-from .fusion import DensePoints, merge_dense_points
-from .intrinsics import CameraIntrinsics
-from .mapping import (
-    SparseModel,
-    adjust,
-    map_images,
-    normalise_model,
-    verify_pairs,
-    write_sparse_model,
+from .dense import (
+    DensePoints,
+    dense_points,
+    find_references,
+    limited_view,
+    merge_dense_points,
 )
+from .intrinsics import CameraIntrinsics
+from .mapping import RegisteredImage, SparseModel, adjust, map_images, normalise_model, verify_pairs
 from .options import MultiViewOptions
 from .pair_selection import (
     COMPARED_KEYPOINTS,
@@ -62,17 +59,9 @@ LINKS = ".images"
 """Folder of links to listed images, within `WORK`. It is hidden, so that they are no further images
 of a folder that holds the results."""
 
-MAX_RECORD_BYTES = 1 << 28
-"""A longer record of a mapping is damaged: a verified pair has some 50 bytes."""
-
 
 def check_images(images: str | Path | Sequence[str | Path]) -> dict[str, Path]:
-    """Return the images below a folder, or of a list, by name.
-
-    Raises:
-        ImageError: the folder is missing or holds no image, or a file is missing.
-        OptionError: two files of a list have one name.
-    """
+    """Return the images below a folder, or of a list without two of one name, by name."""
     if isinstance(images, (str, Path)):
         folder = Path(images)
         return {path.relative_to(folder).as_posix(): path for path in find_images(folder)}
@@ -86,15 +75,7 @@ def check_images(images: str | Path | Sequence[str | Path]) -> dict[str, Path]:
 
 
 class Stages:
-    """The stages of a reconstruction; what each makes is kept in a folder.
-
-    Args:
-        output: folder of the results.
-        options: of all stages.
-        workers: number of processes; None: one per processor.
-        quiet: show no progress bars.
-        seed: of all random choices.
-    """
+    """The stages of a reconstruction; what each makes is kept in the folder of the results."""
 
     def __init__(
         self,
@@ -133,9 +114,8 @@ class Stages:
     ) -> tuple[dict[str, tuple[int, int]], dict[str, int], dict[str, str]]:
         """Find and describe the keypoints of all images below a folder.
 
-        Returns:
-            (width, height) in pixels and number of keypoints of those that could be read, by name;
-            and a sentence on each of the others.
+        Returns (width, height) in pixels and number of keypoints of those that could be read, by
+        name; and a sentence on each of the others.
         """
         report = extract_features(
             folder,
@@ -150,16 +130,16 @@ class Stages:
         sizes, keypoints, failures = {}, {}, {}
         with open_hdf5(self.features) as file:
             for name in check_images(folder):
-                # 1.jpg is in the sentence on 11.jpg, too.
-                begins = (f"{folder.absolute() / name} ", f"{name}: ")
-                sentences = [text for text in report.failures if text.startswith(begins)]
-                if name in file and not sentences:
+                if name in file:
                     width, height = file[name]["image_size"][()]
                     sizes[name] = int(width), int(height)
                     keypoints[name] = len(file[name]["keypoints"])
-                else:
-                    sentences += [text for text in report.failures if name in text]
-                    failures[name] = (sentences or ["it could not be read"])[0]
+                    continue
+                # 1.jpg is in the sentence on 11.jpg, too.
+                begins = (f"{folder.absolute() / name} ", f"{name}: ")
+                sentences = [text for text in report.failures if name in text]
+                sentences.sort(key=lambda text: not text.startswith(begins))
+                failures[name] = [*sentences, "it could not be read"][0]
         return sizes, keypoints, failures
 
     def choose_pairs(self, names: Sequence[str]) -> list[Pair]:
@@ -186,12 +166,9 @@ class Stages:
         found = {}
         with open_hdf5(path) as file:
             for pair in pairs:
-                turned = pair_name(*pair) not in file
-                group = file[pair_name(*(pair[::-1] if turned else pair))]
-                matches = group["matches0"][()]
+                matches = file[pair_name(*pair)]["matches0"][()]
                 rows = np.flatnonzero(matches >= 0)
-                both = np.column_stack([rows, matches[rows]])
-                found[pair] = both[:, ::-1] if turned else both
+                found[pair] = np.column_stack([rows, matches[rows]])
         return found
 
     def map(
@@ -211,7 +188,7 @@ class Stages:
 
         Returns:
             The model of pycolmap; the number of matches of each pair that agree with its geometry;
-            and the names of the images in each component that is no part of it.
+            and the names of the images in each other component.
         """
         pycolmap = import_pycolmap()
         images = {}
@@ -226,16 +203,16 @@ class Stages:
             list(matches.items()),
             (known, self.seed, pycolmap.__version__, __version__),
         )
-        record, sparse = self.work / "mapping.json", self.output / "sparse"
-        try:
-            noted = read_json(record, MAX_RECORD_BYTES)
-            if noted["key"] == made_of and (sparse / "points3D.bin").exists():
-                verified = {(a, b): count for a, b, count in noted["verified"]}
-                components = [frozenset(names) for names in noted["components"]]
-                return pycolmap.Reconstruction(sparse), verified, components
-        except (OSError, ValueError, KeyError, TypeError):
-            pass  # none, of another version, or damaged
-        with atomic_path(self.output / "database.db") as path:
+        record = self.work / f"mapping-{made_of}.json"
+        database, sparse = self.output / "database.db", self.output / "sparse"
+        if record.exists() and (sparse / "points3D.bin").exists():
+            noted = json.loads(record.read_text(encoding="utf-8"))
+            verified = {(a, b): count for a, b, count in noted["verified"]}
+            components = [frozenset(names) for names in noted["components"]]
+            return pycolmap.Reconstruction(sparse), verified, components
+        for old in self.work.glob("mapping-*.json"):
+            old.unlink()
+        with atomic_path(database) as path:
             path.unlink()
             write_database(path, images, matches)
             verified = verify_pairs(path, self.seed, self.workers)
@@ -244,7 +221,7 @@ class Stages:
         space.mkdir()
         with progress(len(images), "mapping", "image", self.quiet) as bar:
             model, components = map_images(
-                self.output / "database.db",
+                database,
                 folder,
                 space,
                 verified,
@@ -256,48 +233,44 @@ class Stages:
         shutil.rmtree(space, ignore_errors=True)
         adjust(model, known)
         normalise_model(model)
-        record.unlink(missing_ok=True)
-        write_sparse_model(model, sparse)
-        values = {
-            "key": made_of,
+        sparse.mkdir(exist_ok=True)
+        model.write(sparse)
+        noted = {
             "verified": [[*pair, count] for pair, count in verified.items()],
             "components": [sorted(names) for names in components],
         }
         with atomic_path(record) as path:
-            path.write_text(json.dumps(values), encoding="utf-8")
+            path.write_text(json.dumps(noted), encoding="utf-8")
         return model, verified, components
 
     def dense(self, folder: Path, sparse: SparseModel) -> DensePoints:
         """Make the dense points that earlier runs have not made, and join all."""
         store, stride = self.work / "dense", self.options.stride_px
-        paths: dict[Path, Reference] = {}
-        for reference in find_references(sparse):
-            names = [reference.view.name, *(each.view.name for each in reference.neighbours)]
-            states = [file_state(folder / name) for name in names]
-            paths[store / f"{key(reference, states, stride, __version__)}.npz"] = reference
+        paths: dict[Path, list[RegisteredImage]] = {}
+        for images in find_references(sparse):
+            states = [file_state(folder / image.view.name) for image in images]
+            paths[store / f"{key(images, states, stride, __version__)}.npz"] = images
         for old in store.glob("*.npz"):
             if old not in paths:
                 old.unlink()
-        tasks = [(path, reference) for path, reference in paths.items() if not path.exists()]
+        tasks = [(path, images) for path, images in paths.items() if not path.exists()]
         work = partial(_dense_task, folder=folder.absolute(), stride_px=stride)
         done = len(paths) - len(tasks)
         with progress(len(paths), "dense points", "image", self.quiet, done) as bar:
             for _ in map_in_processes(work, tasks, self._dense_workers(sparse)):
                 bar.update()
-        parts = [
-            (limited_view(reference.view), DensePoints(**(load_arrays(path) or {})))
-            for path, reference in paths.items()
-        ]
-        return merge_dense_points(parts, stride)
+        parts = [DensePoints(**(load_arrays(path) or {})) for path in paths]
+        views = [limited_view(images[0].view) for images in paths.values()]
+        return merge_dense_points(list(zip(views, parts, strict=True)), stride)
 
     def _dense_workers(self, sparse: SparseModel) -> int:
-        sizes = [limited_view(view).camera.size for view in sparse.views.values()]
+        sizes = [limited_view(image.view).camera.size for image in sparse.images.values()]
         pixels = max(width * height for width, height in sizes)
         fitting = max(1, int(available_memory() // needed_memory(dense_pixel=pixels)))
         return min(self.workers or processor_count(), fitting)
 
 
-def _dense_task(task: tuple[Path, Reference], folder: Path, stride_px: int) -> None:
+def _dense_task(task: tuple[Path, list[RegisteredImage]], folder: Path, stride_px: int) -> None:
     """Write the dense points of one image."""
-    path, reference = task
-    save_arrays(path, vars(dense_points(folder, reference, stride_px)), compress=False)
+    path, images = task
+    save_arrays(path, vars(dense_points(folder, images, stride_px)), compress=False)
