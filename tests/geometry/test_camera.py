@@ -9,8 +9,8 @@ import pytest
 
 from deepdetect._shared.errors import ReconstructionError
 from deepdetect.geometry.camera import (
+    Calibration,
     Camera,
-    calibration_from_focal,
     read_calibration,
 )
 
@@ -117,15 +117,12 @@ def test_a_missing_file_is_said(tmp_path: Path, one_line) -> None:
         one_line(error.value)
 
 
-def test_a_focal_length_is_enough() -> None:
-    found = calibration_from_focal(700, SIZE, (320, 240))
-    np.testing.assert_array_equal(
-        found.camera0.matrix, [[700, 0, 319.5], [0, 700, 239.5], [0, 0, 1]]
-    )
-    assert found.camera1.centre == (159.5, 119.5)
+def test_the_principal_point_is_the_middle_where_none_is_given() -> None:
+    camera = Camera(SIZE, 700)
+    np.testing.assert_array_equal(camera.matrix, [[700, 0, 319.5], [0, 700, 239.5], [0, 0, 1]])
     for focal in (0, -1, float("nan"), float("inf")):
         with pytest.raises(ReconstructionError, match="focal length"):
-            calibration_from_focal(focal, SIZE, SIZE)
+            Camera(SIZE, focal)
 
 
 def test_rays_and_projection_undo_each_other() -> None:
@@ -135,7 +132,7 @@ def test_rays_and_projection_undo_each_other() -> None:
 
 
 def test_the_size_of_the_images_is_checked() -> None:
-    calibration = calibration_from_focal(700, SIZE, SIZE)
+    calibration = Calibration(Camera(SIZE, 700), Camera(SIZE, 700))
     calibration.check_sizes(SIZE, SIZE)
     with pytest.raises(ReconstructionError, match="right image has 320x240"):
         calibration.check_sizes(SIZE, (320, 240))

@@ -16,7 +16,7 @@ from deepdetect import DeepDetect, Matches, MatchingOptions, SelectionOptions, m
 from deepdetect._shared.errors import DeepDetectError, ReconstructionError
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift import detect_sift
-from deepdetect.geometry.camera import Calibration, calibration_from_focal
+from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.geometry.estimation import TwoViewModel
 from deepdetect.geometry.relative_pose import estimate_relative_pose
 from deepdetect.geometry.two_view import fit_model, has_foreground, is_planar
@@ -108,7 +108,7 @@ def test_a_camera_that_only_rotated(
 def test_a_plane(photo: np.ndarray, one_line) -> None:
     warp = np.array([[0.9, 0.12, 20.0], [-0.1, 0.95, 18.0], [4e-4, 1e-4, 1.0]])
     seen = cv2.warpPerspective(photo, warp, (256, 256), flags=cv2.INTER_CUBIC)
-    calibration = calibration_from_focal(300, (256, 256), (256, 256))
+    calibration = Calibration(*[Camera((256, 256), 300)] * 2)
     message = refusal(sparse(photo, seen), one_line, calibration=calibration)
     assert "one homography explains all the matches" in message
 

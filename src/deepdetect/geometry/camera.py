@@ -1,8 +1,6 @@
-"""Calibration of two cameras: focal lengths, principal points and, where known, the baseline.
+"""Pinhole cameras, calibrations of two, and cameras with a pose.
 
-A calibration comes from a calib.json, from a focal length in pixels, or from EXIF (`io.exif`).
-
-The file is one JSON object. Only `focal_px` is required; lengths are in pixels of images of
+A calib.json is one JSON object. Only `focal_px` is required; lengths are in pixels of images of
 `width` x `height`, with the centre of the first pixel at (0, 0)::
 
     {"focal_px": 1246.7,            one number, or [fx, fy]
@@ -12,8 +10,8 @@ The file is one JSON object. Only `focal_px` is required; lengths are in pixels 
      "disparity_offset_px": 66.7,   cx of the right camera minus cx of the left; default: 0
      "left": {...}, "right": {...}} what differs in one view: focal_px, cx, cy, width, height
 
-Other keys are ignored. The names follow the calib.txt of Middlebury 2014 (Scharstein et al.,
-"High-resolution stereo datasets with subpixel-accurate ground truth"), where the offset is `doffs`.
+Other keys are ignored. The names follow the calib.txt of Middlebury 2014, where the offset is
+`doffs`.
 """
 
 from __future__ import annotations
@@ -95,24 +93,13 @@ class Camera:
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
     def rays(self, points: np.ndarray) -> np.ndarray:
-        """Return the viewing directions (x, y, 1) of pixels in the camera's frame.
-
-        Args:
-            points: (N, 2) positions in its image.
-
-        Returns:
-            (N, 3) float64.
-        """
+        """Return (N, 3) float64 viewing directions (x, y, 1) of (N, 2) pixels, in its frame."""
         directions = np.ones((len(points), 3))
         directions[:, :2] = (np.asarray(points, np.float64) - self.centre) / self.focal_px
         return directions
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Project points from the camera's frame to the image, (N, 2) float64 in pixels.
-
-        Args:
-            points: (N, 3), x right, y down, z forward.
-        """
+        """Project (N, 3) points of its frame (x right, y down, z forward) to (N, 2) pixels."""
         points = np.asarray(points, np.float64)
         with np.errstate(divide="ignore", invalid="ignore"):
             return points[:, :2] / points[:, 2:] * self.focal_px + self.centre
@@ -187,22 +174,6 @@ class Calibration:
                 )
 
 
-def calibration_from_focal(
-    focal_px: float | Sequence[float], size0: Size, size1: Size, source: str = "focal_px"
-) -> Calibration:
-    """Return the calibration of two images of one camera with its principal point in the middle.
-
-    Args:
-        focal_px: focal length in pixels, or (fx, fy).
-        size0, size1: (width, height) of the images.
-        source: where it comes from.
-
-    Raises:
-        ReconstructionError: the focal length is not a number above 0.
-    """
-    return Calibration(Camera(size0, focal_px), Camera(size1, focal_px), source=source)
-
-
 def read_calibration(path: str | Path, size0: Size, size1: Size) -> Calibration:
     """Read a calib.json, in the format at the top of this module.
 
@@ -217,61 +188,58 @@ def read_calibration(path: str | Path, size0: Size, size1: Size) -> Calibration:
     try:
         values = read_json(path, MAX_FILE_BYTES)
     except OSError as error:
-        reason = error.strerror or type(error).__name__
         missing = isinstance(error, FileNotFoundError)
         kind = MissingCalibrationError if missing else ReconstructionError
-        raise kind(f"{path} cannot be read ({reason}): check the path") from None
+        raise kind(f"{path} cannot be read ({error.strerror}): check the path") from None
     except ValueError as error:
         raise ReconstructionError(
             f"{path} is not valid JSON ({str(error).splitlines()[0]}): "
             "correct it, or give the focal length"
         ) from None
     try:
-        return _from_values(values, size0, size1, str(path))
+        return _calibration(values, size0, size1, str(path))
     except ReconstructionError as error:
         raise ReconstructionError(f"{path}: {error}") from None
 
 
-def _from_values(values: Any, size0: Size, size1: Size, source: str) -> Calibration:
+def _calibration(values: Any, size0: Size, size1: Size, source: str) -> Calibration:
     if not isinstance(values, dict):
         raise ReconstructionError('it must hold one object, as {"focal_px": 1000}')
     views = []
     for name in ("left", "right"):
-        own = values.get(name, {})
-        if not isinstance(own, dict):
+        of_view = values.get(name, {})
+        if not isinstance(of_view, dict):
             raise ReconstructionError(f'"{name}" must be an object, as {{"cx": 320}}')
-        views.append({**values, **own})
-    if any(view.get("focal_px") is None for view in views):
-        raise ReconstructionError('it has no "focal_px": add the focal length in pixels')
-    offset = values.get("disparity_offset_px")
-    offset = None if offset is None else _number("disparity_offset_px", offset)
+        views.append({**values, **of_view})
     left, right = views
     camera0 = _camera(left, size0)
-    if offset is not None and "cx" not in values.get("right", {}):
-        right = {**right, "cx": camera0.centre[0] + offset}
-    camera1 = _camera(right, size1)
-    baseline = values.get("baseline_mm")
-    found = Calibration(camera0, camera1, baseline, source)
-    if offset is not None and abs(found.disparity_offset_px - offset) > MAX_OFFSET_ERROR_PX:
+    offset = values.get("disparity_offset_px")
+    if offset is not None:
+        offset = _number("disparity_offset_px", offset)
+        if "cx" not in values.get("right", {}):
+            right["cx"] = camera0.centre[0] + offset
+    calibration = Calibration(camera0, _camera(right, size1), values.get("baseline_mm"), source)
+    measured = calibration.disparity_offset_px
+    if offset is not None and abs(measured - offset) > MAX_OFFSET_ERROR_PX:
         raise ReconstructionError(
             f"disparity_offset_px is {offset:g}, but cx of the right view minus cx of the left "
-            f"is {found.disparity_offset_px:g}: leave one of them out"
+            f"is {measured:g}: leave one of them out"
         )
-    found.check_sizes(size0, size1)
-    return found
+    calibration.check_sizes(size0, size1)
+    return calibration
 
 
 def _camera(view: dict[str, Any], size: Size) -> Camera:
     """Return one view's camera; defaults come from the image."""
-    width, height = (
-        side if view.get(name) is None else _number(name, view[name])
-        for name, side in zip(("width", "height"), size, strict=True)
-    )
-    cx, cy = (
-        (side - 1) / 2 if view.get(name) is None else _number(name, view[name])
-        for name, side in (("cx", width), ("cy", height))
-    )
-    return Camera((width, height), view["focal_px"], (cx, cy))
+    if view.get("focal_px") is None:
+        raise ReconstructionError('it has no "focal_px": add the focal length in pixels')
+
+    def number(name: str, default: float) -> float:
+        return default if view.get(name) is None else _number(name, view[name])
+
+    width, height = number("width", size[0]), number("height", size[1])
+    centre = number("cx", (width - 1) / 2), number("cy", (height - 1) / 2)
+    return Camera((width, height), view["focal_px"], centre)
 
 
 def _pair(name: str, value: Any) -> tuple[float, float]:
@@ -295,8 +263,8 @@ def _number(name: str, value: Any) -> float:
     return number
 
 
-def _text(size: Sequence[float]) -> str:
-    return "x".join(f"{side:g}" for side in size)
+def _text(size: Size) -> str:
+    return f"{size[0]}x{size[1]}"
 
 
 def fundamental_matrix(
@@ -323,11 +291,6 @@ class PosedView:
         camera: its pinhole camera, centre of the first pixel (0, 0).
         rotation, translation: (3, 3) and (3,) float64: a point X of the world is
             rotation @ X + translation in the camera's frame, x right, y down, z forward.
-
-    Example:
-        >>> view = PosedView("a.jpg", Camera((640, 480), 500.0), np.eye(3), np.array([1.0, 0, 0]))
-        >>> view.centre.tolist(), view.project(np.array([[0.0, 0.0, 10.0]]))[0].tolist()
-        ([-1.0, 0.0, 0.0], [[369.5, 239.5]])
     """
 
     name: str
@@ -359,17 +322,7 @@ class PosedView:
 
 
 def relative_fundamental(first: PosedView, second: PosedView) -> np.ndarray:
-    """Return the fundamental matrix of two views, (3, 3) with x1^T F x0 = 0.
-
-    Example:
-        >>> camera = Camera((640, 480), 500.0)
-        >>> views = [PosedView("", camera, np.eye(3), np.array([x, 0.0, 0])) for x in (0, -1)]
-        >>> matrix = relative_fundamental(*views)
-        >>> (matrix / matrix[2, 1]).round(9) + 0.0  # matches lie on the same row
-        array([[ 0.,  0.,  0.],
-               [ 0.,  0., -1.],
-               [ 0.,  1.,  0.]])
-    """
+    """Return the fundamental matrix of two views, (3, 3) with x1^T F x0 = 0."""
     rotation = second.rotation @ first.rotation.T
     translation = second.translation - rotation @ first.translation
     inverses = [np.linalg.inv(view.camera.matrix) for view in (first, second)]

@@ -21,7 +21,6 @@ from .transforms import transform_points
 
 Size = tuple[int, int]
 
-
 MAX_STRETCH = 2.0
 """A planar frame may stretch or shrink a part of a view by this factor, relative to its middle;
 beyond it the epipole is too near, and the frame is polar."""
@@ -34,8 +33,7 @@ RESOLVED_QUANTILE = 0.6
 first view: it is finer nearer to the epipole, and coarser farther away."""
 
 MIN_RADIUS_PX = 8.0
-"""Nearer to the epipole nothing is rectified: nothing moves there, and few pixels fill many
-rows."""
+"""Nearer to the epipole nothing is rectified: nothing moves there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,15 +160,6 @@ def rectified_frame(
     Returns:
         A planar frame where one distorts the views little, else a polar one; None where neither is
         possible.
-
-    Example:
-        >>> grid = np.stack(np.meshgrid(np.arange(5), np.arange(5)), -1).reshape(-1, 2) * 20.0
-        >>> forward = 1.1 * (grid - 40) + 40  # everything grows about the middle
-        >>> about_the_middle = np.array([[0, 1, -40], [-1, 0, 40], [40, -40, 0.0]])
-        >>> frame = rectified_frame(grid, forward, about_the_middle, (81, 81), (81, 81))
-        >>> first, second = frame.to_frame(grid[:4], 0), frame.to_frame(forward[:4], 1)
-        >>> type(frame).__name__, bool(np.allclose(first[:, 1], second[:, 1]))
-        ('PolarFrame', True)
     """
     points0, points1 = (np.asarray(points, np.float64) for points in (points0, points1))
     if len(points0) < 8:
@@ -187,10 +176,10 @@ def _planar_frame(
     size1: Size,
 ) -> PlanarFrame | None:
     """Rectify by homographies, or return None where they distort too much."""
-    found, *matrices = cv2.stereoRectifyUncalibrated(
+    success, *matrices = cv2.stereoRectifyUncalibrated(
         points0, points1, fundamental, size0, threshold=0
     )
-    if not found or not all(np.isfinite(matrix).all() for matrix in matrices):
+    if not success or not all(np.isfinite(matrix).all() for matrix in matrices):
         return None
     corners = _corners(size0), _corners(size1)
     middles = np.median(points0, axis=0), np.median(points1, axis=0)
@@ -208,14 +197,11 @@ def _planar_frame(
     first, second = (np.diag([scale, scale, 1]) @ matrix for matrix in matrices)
     moved = transform_points(points0, first) - transform_points(points1, second)
     second = _translation(np.round(np.median(moved[:, 0])), 0) @ second
-    frames = transform_points(corners[0], first), transform_points(corners[1], second)
-    top = max(frame[:, 1].min() for frame in frames)
-    bottom = min(frame[:, 1].max() for frame in frames)
-    left = min(frame[:, 0].min() for frame in frames)
-    right = max(frame[:, 0].max() for frame in frames)
+    borders = np.stack([transform_points(corners[0], first), transform_points(corners[1], second)])
+    (left, _), (right, _) = borders.min(axis=(0, 1)), borders.max(axis=(0, 1))
+    top, bottom = borders[..., 1].min(axis=1).max(), borders[..., 1].max(axis=1).min()
     width, height = int(np.ceil(right - left)) + 1, int(np.ceil(bottom - top)) + 1
-    largest = max(np.prod(size0), np.prod(size1))
-    if height < 2 or width * height > MAX_AREA * largest:
+    if height < 2 or width * height > MAX_AREA * max(np.prod(size0), np.prod(size1)):
         return None
     shift = _translation(-np.floor(left), -np.floor(top))
     return PlanarFrame((shift @ first, shift @ second), (width, height))
@@ -230,13 +216,9 @@ def _polar_frame(
 ) -> PolarFrame | None:
     """Rectify about the epipoles, or return None where one lies at infinity."""
     left, _, right = np.linalg.svd(fundamental)
-    homogeneous = right[2], left[:, 2]
-    if any(abs(epipole[2]) < 1e-12 for epipole in homogeneous):
+    if min(abs(right[2, 2]), abs(left[2, 2])) < 1e-12:
         return None
-    epipoles = (
-        homogeneous[0][:2] / homogeneous[0][2],
-        homogeneous[1][:2] / homogeneous[1][2],
-    )
+    epipoles = right[2, :2] / right[2, 2], left[:2, 2] / left[2, 2]
     border = _corners(size0) - epipoles[0]
     wrapped = bool(((epipoles[0] > 0) & (epipoles[0] < np.array(size0) - 1)).all())
     middle, first_angle, last_angle = 0.0, -np.pi, np.pi
@@ -275,5 +257,5 @@ def _translation(x: float, y: float) -> np.ndarray:
 def _jacobian(homography: np.ndarray, point: np.ndarray) -> np.ndarray:
     """Return the (2, 2) derivative of a homography at a point."""
     mapped = homography @ np.append(point, 1)
-    place = mapped[:2] / mapped[2]
-    return (homography[:2, :2] - np.outer(place, homography[2, :2])) / mapped[2]
+    position = mapped[:2] / mapped[2]
+    return (homography[:2, :2] - np.outer(position, homography[2, :2])) / mapped[2]

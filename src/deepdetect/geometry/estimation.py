@@ -1,10 +1,14 @@
-"""Robust estimation of the geometry between two images, and the evidence for it."""
+"""Robust estimation of the geometry between two images, and how far chance explains it.
+
+Moisan and Stival, "A probabilistic criterion to detect rigid point matches between two images and
+estimate the fundamental matrix", 2004. The number of false alarms (NFA) of a geometry is how many
+models with as many inliers at this threshold are expected among random matches.
+"""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
-from math import lgamma, log, pi
+from math import inf, lgamma, log, pi
 from typing import Any
 
 import numpy as np
@@ -14,56 +18,17 @@ from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from .transforms import epipolar_errors, transfer_errors, transform_points
 
+ESTIMATORS = ("magsac", "ransac")
+MODEL_NAMES = ("auto", "homography", "fundamental", "essential", "none")
+
+MIN_MATCHES = {"homography": 4, "fundamental": 15, "essential": 6}
+"""With fewer than 15 matches OpenCV's RANSAC ignores the threshold of a fundamental matrix."""
+
 MAX_LOG10_NFA = -6.0
 """A geometry is accepted below this decimal logarithm of its number of false alarms."""
 
 MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7, "essential": 5}
 """Matches that determine a model."""
-
-
-def log10_nfa(
-    inliers: np.ndarray,
-    model: str,
-    inlier_threshold: float,
-    image_size: tuple[int, int],
-    models_per_sample: int = 1,
-) -> float:
-    """Return the decimal logarithm of the number of false alarms.
-
-    Args:
-        inliers: (M,) bool, which of all matches are near the model.
-        model: "homography", "fundamental" or "essential".
-        inlier_threshold: that they are nearer than, in pixels of the second image.
-        image_size: (width, height) of the second image.
-        models_per_sample: that were tried for each minimal sample.
-
-    Returns:
-        Below 0 for what chance does not explain; infinite when there are too few inliers.
-
-    Example:
-        >>> log10_nfa(np.arange(100) < 30, "homography", 3, (640, 480)) < -50
-        True
-        >>> log10_nfa(np.arange(76) < 6, "homography", 3, (640, 480)) > -6
-        True
-    """
-    sample = MINIMAL_SAMPLE_SIZE[model]
-    count, agreeing = len(inliers), int(np.count_nonzero(inliers))
-    if agreeing <= sample:
-        return float("inf")
-    width, height = image_size
-    if model == "homography":
-        chance = pi * inlier_threshold**2 / (width * height)
-    else:  # a band along a line through the image
-        chance = 2 * inlier_threshold * float(np.hypot(width, height)) / (width * height)
-    tests = log(models_per_sample * (count - sample))
-    tests += log_binomial(count, agreeing) + log_binomial(agreeing, sample)
-    return (tests + (agreeing - sample) * log(min(chance, 1.0))) / log(10)
-
-
-def log_binomial(count: int, chosen: int) -> float:
-    """Return the natural logarithm of a binomial coefficient."""
-    return lgamma(count + 1) - lgamma(chosen + 1) - lgamma(count - chosen + 1)
-
 
 MIN_PARALLAX_PX = 3.0
 """Matches whose transfer error is at least this are off the plane."""
@@ -83,152 +48,6 @@ MAX_MATCHES = 2000
 
 SAMPLES = 1000
 """Pairs of matches whose lines are intersected."""
-
-
-@dataclass(frozen=True, eq=False)
-class Parallax:
-    """The matches off a plane, and how many of them agree on an epipole.
-
-    Attributes:
-        on_plane: number of matches that the homography explains.
-        off_plane: number of those that it does not.
-        agreeing: number of the latter that move along lines through the epipole.
-        epipole: (3,) homogeneous, in the second image; None without any.
-        log10_nfa: decimal logarithm of the number of false alarms of that agreement.
-    """
-
-    on_plane: int
-    off_plane: int
-    agreeing: int
-    epipole: np.ndarray | None
-    log10_nfa: float
-
-    def exceeds(self, fraction_of_plane: float) -> bool:
-        """Whether more agree than chance explains, and as many relative to those on the plane."""
-        significant = self.log10_nfa < MAX_LOG10_NFA
-        return significant and self.agreeing >= fraction_of_plane * self.on_plane
-
-    @property
-    def shows_depth(self) -> bool:
-        """Whether these matches alone show that the scene has depth."""
-        most = self.agreeing >= MIN_FRACTION_OF_REST * self.off_plane
-        return most and self.exceeds(MIN_FRACTION_OF_PLANE)
-
-
-@dataclass(frozen=True, eq=False)
-class TwoViewModel:
-    """The model of a pair, and the evidence for it.
-
-    Attributes:
-        model: "homography", "fundamental", or "none" where nothing could be estimated.
-        matrix: (3, 3) float64, or None.
-        inliers: (M,) bool, the matches that agree with it.
-        log10_nfa: decimal logarithm of its number of false alarms.
-        parallax: of a homography that was chosen, not asked for: what it leaves.
-    """
-
-    model: str
-    matrix: np.ndarray | None
-    inliers: np.ndarray
-    log10_nfa: float
-    parallax: Parallax | None = None
-
-    @property
-    def trusted(self) -> bool:
-        """Whether chance does not explain it."""
-        return self.log10_nfa < MAX_LOG10_NFA
-
-
-def measure_parallax(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    homography: np.ndarray,
-    seed: int = 0,
-) -> Parallax:
-    """Look for an epipole among the matches that a homography leaves.
-
-    Args:
-        points0, points1: (M, 2) matches, some of them wrong.
-        homography: (3, 3) from the first image to the second.
-        seed: of the random pairs of matches.
-
-    Example:
-        >>> points = np.random.default_rng(0).uniform(0, 500, (300, 2))
-        >>> depth = np.repeat([0, 1.0], 150) * np.linspace(8, 40, 300)  # half of it before a wall
-        >>> moved = points + np.column_stack([depth, np.zeros(300)])
-        >>> measure_parallax(points, moved, np.eye(3)).shows_depth
-        True
-        >>> wrong = np.random.default_rng(1).uniform(0, 500, (150, 2))
-        >>> moved = np.concatenate([points[:150], wrong])
-        >>> measure_parallax(points, moved, np.eye(3)).shows_depth
-        False
-    """
-    points0, points1 = (np.asarray(points, np.float64) for points in (points0, points1))
-    off = transfer_errors(points0, points1, homography) >= MIN_PARALLAX_PX
-    on_plane = len(off) - int(np.count_nonzero(off))
-    predicted, found = transform_points(points0[off], homography), points1[off]
-    finite = np.isfinite(predicted).all(axis=1)
-    predicted, found = predicted[finite], found[finite]
-    off_plane = len(found)
-    nothing = Parallax(on_plane, off_plane, 0, None, math.inf)
-    if off_plane < 3:
-        return nothing
-    random = np.random.default_rng(seed)
-    if off_plane > MAX_MATCHES:
-        drawn = random.choice(off_plane, MAX_MATCHES, replace=False)
-        predicted, found = predicted[drawn], found[drawn]
-    low, size = points1.min(axis=0), np.ptp(points1, axis=0)
-    if not size.all():  # all on one row or column
-        return nothing
-    scale = float(size.max())
-    first, second = (
-        np.column_stack([(points - low) / scale - 0.5, np.ones(len(points))])
-        for points in (predicted, found)
-    )
-    lines = np.cross(first, second)
-    chosen = random.integers(0, len(lines), (SAMPLES, 2))
-    epipoles = np.cross(lines[chosen[:, 0]], lines[chosen[:, 1]])
-    length = np.linalg.norm(epipoles, axis=1)
-    epipoles = epipoles[length > 1e-12] / length[length > 1e-12, None]
-    if not len(epipoles):
-        return nothing
-    limit = MAX_EPIPOLE_DISTANCE_PX / scale
-    counts = np.count_nonzero(_misses(epipoles, first, second) < limit, axis=1)
-    best = int(np.argmax(counts))
-    to_pixels = np.array(
-        [[scale, 0, low[0] + scale / 2], [0, scale, low[1] + scale / 2], [0, 0, 1]]
-    )
-    band = 2 * MAX_EPIPOLE_DISTANCE_PX * float(np.hypot(*size)) / max(float(size.prod()), 1)
-    agreeing = int(counts[best])
-    return Parallax(
-        on_plane,
-        off_plane,
-        round(agreeing * off_plane / len(found)),
-        to_pixels @ epipoles[best],
-        _log10_nfa(len(found), agreeing, band),
-    )
-
-
-def _misses(epipoles: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the distances of points from the lines through epipoles and predictions, (E, N)."""
-    x, y, scale = epipoles.T[:, :, None]
-    normal = np.hypot(y - scale * first[:, 1], scale * first[:, 0] - x)
-    return np.abs(epipoles @ np.cross(first, second).T) / np.maximum(normal, 1e-12)
-
-
-def _log10_nfa(count: int, agreeing: int, chance: float) -> float:
-    """Return the logarithm of the number of false alarms of an epipole, which two matches give."""
-    if agreeing <= 2:
-        return math.inf
-    tests = math.log(count - 2) + log_binomial(count, agreeing) + log_binomial(agreeing, 2)
-    return (tests + (agreeing - 2) * math.log(min(chance, 1.0))) / math.log(10)
-
-
-ESTIMATORS = ("magsac", "ransac")
-MODEL_NAMES = ("auto", "homography", "fundamental", "essential", "none")
-
-MIN_MATCHES = {"homography": 4, "fundamental": 15, "essential": 6}
-"""With fewer than 15 matches OpenCV's RANSAC ignores the threshold of a fundamental matrix."""
 
 
 @suggest_keywords
@@ -264,10 +83,7 @@ class GeometryOptions:
             raise unknown_name("estimator", self.estimator, ESTIMATORS)
         if not 0 < self.confidence < 1:
             raise OptionError(f"the confidence must lie between 0 and 1, not {self.confidence}")
-        check_ranges(
-            self,
-            positive=("inlier_threshold", "iterations"),
-        )
+        check_ranges(self, positive=("inlier_threshold", "iterations"))
         for name in ("homography", "camera0", "camera1"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _matrix(name, getattr(self, name)))
@@ -306,8 +122,8 @@ class Geometry:
     inliers: np.ndarray
 
     def __repr__(self) -> str:
-        found = np.count_nonzero(self.inliers)
-        return f"Geometry(model={self.model!r}, {found} inliers of {len(self.inliers)} matches)"
+        inliers = np.count_nonzero(self.inliers)
+        return f"Geometry(model={self.model!r}, {inliers} inliers of {len(self.inliers)} matches)"
 
 
 @suggest_keywords
@@ -433,3 +249,160 @@ def _cameras(options: GeometryOptions) -> tuple[np.ndarray, np.ndarray]:
             "or choose the fundamental matrix"
         )
     return options.camera0, options.camera1
+
+
+def log10_nfa(
+    inliers: np.ndarray,
+    model: str,
+    inlier_threshold: float,
+    image_size: tuple[int, int],
+    models_per_sample: int = 1,
+) -> float:
+    """Return the decimal logarithm of the number of false alarms, infinite with too few inliers.
+
+    Args:
+        inliers: (M,) bool, which of all matches are near the model.
+        model: "homography", "fundamental" or "essential".
+        inlier_threshold: that they are nearer than, in pixels of the second image.
+        image_size: (width, height) of the second image.
+        models_per_sample: that were tried for each minimal sample.
+
+    Example:
+        >>> log10_nfa(np.arange(100) < 30, "homography", 3, (640, 480)) < -50
+        True
+    """
+    width, height = image_size
+    if model == "homography":
+        chance = pi * inlier_threshold**2 / (width * height)
+    else:  # a band along a line through the image
+        chance = 2 * inlier_threshold * float(np.hypot(width, height)) / (width * height)
+    agreeing = int(np.count_nonzero(inliers))
+    sample_size = MINIMAL_SAMPLE_SIZE[model]
+    return _log10_nfa(len(inliers), agreeing, sample_size, chance, models_per_sample)
+
+
+def _log10_nfa(
+    count: int, agreeing: int, sample_size: int, chance: float, models_per_sample: int = 1
+) -> float:
+    if agreeing <= sample_size:
+        return inf
+    tests = log(models_per_sample * (count - sample_size))
+    tests += _log_binomial(count, agreeing) + _log_binomial(agreeing, sample_size)
+    return (tests + (agreeing - sample_size) * log(min(chance, 1.0))) / log(10)
+
+
+def _log_binomial(count: int, chosen: int) -> float:
+    """Return the natural logarithm of a binomial coefficient."""
+    return lgamma(count + 1) - lgamma(chosen + 1) - lgamma(count - chosen + 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Parallax:
+    """The matches off a plane, and how many of them agree on an epipole.
+
+    What a homography leaves of the matches of a static scene moves along lines through the epipole
+    (Chum, Werner and Matas, "Two-view geometry estimation unaffected by a dominant plane", 2005).
+    Wrong matches move anywhere, and those of a repeated pattern in one direction, but they are few
+    beside what lies on the plane.
+
+    Attributes:
+        on_plane: number of matches that the homography explains.
+        off_plane: number of those that it does not.
+        agreeing: number of the latter that move along lines through the epipole.
+        log10_nfa: decimal logarithm of the number of false alarms of that agreement.
+    """
+
+    on_plane: int
+    off_plane: int
+    agreeing: int
+    log10_nfa: float
+
+    def exceeds(self, fraction_of_plane: float) -> bool:
+        """Whether more agree than chance explains, and as many relative to those on the plane."""
+        significant = self.log10_nfa < MAX_LOG10_NFA
+        return significant and self.agreeing >= fraction_of_plane * self.on_plane
+
+    @property
+    def shows_depth(self) -> bool:
+        """Whether these matches alone show that the scene has depth."""
+        most = self.agreeing >= MIN_FRACTION_OF_REST * self.off_plane
+        return most and self.exceeds(MIN_FRACTION_OF_PLANE)
+
+
+@dataclass(frozen=True, eq=False)
+class TwoViewModel:
+    """The model of a pair, and the evidence for it.
+
+    Attributes:
+        model: "homography", "fundamental", or "none" where nothing could be estimated.
+        matrix: (3, 3) float64, or None.
+        inliers: (M,) bool, the matches that agree with it.
+        log10_nfa: decimal logarithm of its number of false alarms.
+        parallax: of a homography that was chosen, not asked for: what it leaves.
+    """
+
+    model: str
+    matrix: np.ndarray | None
+    inliers: np.ndarray
+    log10_nfa: float
+    parallax: Parallax | None = None
+
+    @property
+    def trusted(self) -> bool:
+        """Whether chance does not explain it."""
+        return self.log10_nfa < MAX_LOG10_NFA
+
+
+def measure_parallax(
+    points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, seed: int = 0
+) -> Parallax:
+    """Look for an epipole among the (M, 2) matches that a homography leaves, some of them wrong.
+
+    Example:
+        >>> points = np.random.default_rng(0).uniform(0, 500, (300, 2))
+        >>> depth = np.repeat([0, 1.0], 150) * np.linspace(8, 40, 300)  # half of it before a wall
+        >>> moved = points + np.column_stack([depth, np.zeros(300)])
+        >>> measure_parallax(points, moved, np.eye(3)).shows_depth
+        True
+    """
+    points0, points1 = (np.asarray(points, np.float64) for points in (points0, points1))
+    off = transfer_errors(points0, points1, homography) >= MIN_PARALLAX_PX
+    on_plane = len(off) - int(np.count_nonzero(off))
+    predicted, actual = transform_points(points0[off], homography), points1[off]
+    finite = np.isfinite(predicted).all(axis=1)
+    predicted, actual = predicted[finite], actual[finite]
+    off_plane = len(actual)
+    nothing = Parallax(on_plane, off_plane, 0, inf)
+    if off_plane < 3:
+        return nothing
+    random = np.random.default_rng(seed)
+    if off_plane > MAX_MATCHES:
+        drawn = random.choice(off_plane, MAX_MATCHES, replace=False)
+        predicted, actual = predicted[drawn], actual[drawn]
+    low, size = points1.min(axis=0), np.ptp(points1, axis=0)
+    if not size.all():  # all on one row or column
+        return nothing
+    scale = float(size.max())
+    first, second = (
+        np.column_stack([(points - low) / scale - 0.5, np.ones(len(points))])
+        for points in (predicted, actual)
+    )
+    lines = np.cross(first, second)
+    chosen = random.integers(0, len(lines), (SAMPLES, 2))
+    epipoles = np.cross(lines[chosen[:, 0]], lines[chosen[:, 1]])
+    length = np.linalg.norm(epipoles, axis=1)
+    epipoles = epipoles[length > 1e-12] / length[length > 1e-12, None]
+    if not len(epipoles):
+        return nothing
+    near = _misses(epipoles, first, second) < MAX_EPIPOLE_DISTANCE_PX / scale
+    agreeing = int(np.count_nonzero(near, axis=1).max())
+    band = 2 * MAX_EPIPOLE_DISTANCE_PX * float(np.hypot(*size)) / max(float(size.prod()), 1)
+    alarms = _log10_nfa(len(actual), agreeing, 2, band)
+    return Parallax(on_plane, off_plane, round(agreeing * off_plane / len(actual)), alarms)
+
+
+def _misses(epipoles: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Return the distances of points from the lines through epipoles and predictions, (E, N)."""
+    x, y, scale = epipoles.T[:, :, None]
+    normal = np.hypot(y - scale * first[:, 1], scale * first[:, 0] - x)
+    return np.abs(epipoles @ np.cross(first, second).T) / np.maximum(normal, 1e-12)

@@ -1,12 +1,10 @@
 """Refinement of a homography on the images in a fraction of a second, each step cross-validated.
 
-Corners are tracked over the pixels that are left between the first image and the warped second one,
-forth and back, and a homography is fitted to them; then all pixels of a smaller copy are aligned,
-by the correlation after local contrast normalisation (Evangelidis and Psarakis, "Parametric image
-alignment using enhanced correlation coefficient maximization", 2008; OpenCV's). The image is
-divided into squares, in turn of two halves. A step is kept only if, on each half, what it finds
-*without* that half correlates the images better than the homography before: where it holds on what
-it was not fitted to.
+Corners are tracked between the first image and the warped second one, forth and back, and a
+homography is fitted to them; then all pixels of a smaller copy are aligned (Evangelidis and
+Psarakis, "Parametric image alignment using enhanced correlation coefficient maximization", 2008).
+The image is divided into squares, in turn of two halves. A step is kept only if, on each half, what
+it finds *without* that half correlates the images better than the homography before.
 """
 
 from __future__ import annotations
@@ -77,14 +75,6 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
 
     Returns:
         (3, 3), its last element 1; the initial one where nothing better was found.
-
-    Example:
-        >>> scene = np.random.default_rng(0).integers(0, 256, (40, 40)).astype(np.uint8)
-        >>> scene = cv2.resize(scene, (240, 240), interpolation=cv2.INTER_CUBIC)
-        >>> start = np.array([[1, 0, -12], [0, 1, 1], [0, 0, 1.0]])
-        >>> found = refine_homography(scene[:, :200], scene[:, 10:210], start)
-        >>> bool(np.abs(found[:2, 2] - (-10, 0)).max() < 0.1)
-        True
     """
     size = (gray0.shape[1], gray0.shape[0])
     blurred = gaussian_blur(gray0, BLUR_SIGMA_PX)
@@ -103,9 +93,11 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
     for step in steps:
         warped, valid_mask = warp_to_reference(gray1, current, size)
         fit = step(warped, valid_mask)
-        halves = [fit(half), fit(~half)] if fit is not None else [None]
-        views = [warp_to_reference(gray1, current @ one, size) for one in halves if one is not None]
-        if fit is None or len(views) < 2:
+        if fit is None:
+            continue
+        corrections = fit(half), fit(~half)
+        views = [warp_to_reference(gray1, current @ m, size) for m in corrections if m is not None]
+        if len(views) < 2:
             continue
         (mixed, mixed_mask), (other, other_mask) = views
         np.copyto(mixed, other, where=half)
@@ -130,8 +122,8 @@ def _fit_to_corners(
 ) -> Fit | None:
     """Track corners, and return the fit to those in a part of the image.
 
-    Least squares with weights: right on most of an image that no single homography fits (a lens
-    that bends lines, a wall that is not quite flat), where a consensus is another one each time.
+    Weighted least squares: right on most of an image that no single homography fits (a lens that
+    bends lines, a wall that is not quite flat), where a consensus is another one each time.
     """
     margin = np.ones((window_px, window_px), np.uint8)
     inside = cv2.erode(valid_mask.astype(np.uint8), margin, borderValue=0)
@@ -177,12 +169,12 @@ def _fit_to_pixels(gray0: np.ndarray, warped: np.ndarray, valid_mask: np.ndarray
         mask = cv2.resize(mask, first.shape[::-1], interpolation=cv2.INTER_NEAREST)
         start = np.eye(3, dtype=np.float32)
         try:
-            found = cv2.findTransformECC(
+            correction = cv2.findTransformECC(
                 *normalised, start, cv2.MOTION_HOMOGRAPHY, criteria, mask, 1
             )[1]
         except cv2.error:  # it does not converge, or there is nothing to correlate
             return None
-        return scaled_homography(found.astype(np.float64), 1 / scale, 1 / scale)
+        return scaled_homography(correction.astype(np.float64), 1 / scale, 1 / scale)
 
     return align
 
@@ -190,13 +182,7 @@ def _fit_to_pixels(gray0: np.ndarray, warped: np.ndarray, valid_mask: np.ndarray
 def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray | None:
     """Fit a homography by iteratively reweighted least squares with Cauchy weights.
 
-    Returns:
-        (3, 3), its last element 1; None when the points do not determine it.
-
-    Example:
-        >>> points = np.array([[0, 0], [9, 0], [9, 9], [0, 9], [4, 5.0]])
-        >>> fit_homography_irls(points, points + (2, -1)).round(6)[:2, 2].tolist()
-        [2.0, -1.0]
+    Its last element is 1; None when the points do not determine it.
     """
     if len(points0) < 4:
         return None
@@ -212,10 +198,10 @@ def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray 
         mapped = transform_points(first, homography)
         gaps = second - mapped
         weight = 1 / (1 + (gaps**2).sum(axis=1) * (spread / CAUCHY_SCALE_PX) ** 2)
-        place = np.column_stack([first, np.ones(len(first))]) / depth[:, None]
-        none = np.zeros_like(place)
-        across = np.column_stack([place, none, -mapped[:, :1] * place[:, :2]])
-        down = np.column_stack([none, place, -mapped[:, 1:] * place[:, :2]])
+        position = np.column_stack([first, np.ones(len(first))]) / depth[:, None]
+        zeros = np.zeros_like(position)
+        across = np.column_stack([position, zeros, -mapped[:, :1] * position[:, :2]])
+        down = np.column_stack([zeros, position, -mapped[:, 1:] * position[:, :2]])
         normal = (across.T * weight) @ across + (down.T * weight) @ down
         right = (across.T * weight) @ gaps[:, 0] + (down.T * weight) @ gaps[:, 1]
         try:
@@ -227,16 +213,15 @@ def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray 
         homography = homography + np.append(step, 0).reshape(3, 3)
         if np.abs(step).max() < 1e-9:
             break
-    found = np.linalg.inv(inwards) @ homography @ inwards
-    return found / found[2, 2]
+    homography = np.linalg.inv(inwards) @ homography @ inwards
+    return homography / homography[2, 2]
 
 
 def _halves(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Divide an image into squares, as those of a chessboard.
+    """Divide an image of (width, height) into squares, as those of a chessboard.
 
-    Returns:
-        Which pixels lie on squares of the second colour, (H, W) bool, and whether the blurred
-        windows of `local_zncc` lie within their squares, (H // STEP_PX, W // STEP_PX) bool.
+    Returns which pixels lie on squares of the second colour, (H, W) bool, and whether the blurred
+    windows of `local_zncc` lie within their squares, (H // STEP_PX, W // STEP_PX) bool.
     """
     margin = WINDOW_PX // 2 + int(np.ceil(3 * BLUR_SIGMA_PX))
     side = max(max(size) / SQUARES, 4 * margin)

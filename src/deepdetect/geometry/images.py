@@ -1,4 +1,4 @@
-"""Images compared: warped, correlated, tracked."""
+"""Images scaled, warped, correlated and tracked, and sums over windows of them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import OptionError
 from .._shared.opencv import cv2
 from .transforms import scaling_matrix
 
@@ -28,11 +27,7 @@ MIN_VARIANCE = 1.0
 
 
 def downscale(gray: np.ndarray, max_side: int) -> tuple[np.ndarray, float]:
-    """Downscale an image whose longer side has more than `max_side` pixels to this size.
-
-    Returns:
-        The image, and its scale: at most 1.
-    """
+    """Return an image whose longer side has at most `max_side` pixels, and its scale."""
     scale = min(1.0, max_side / max(gray.shape))
     if scale == 1:
         return gray, 1.0
@@ -49,8 +44,7 @@ def warp_to_reference(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Warp the second image by the homography from the first to it, into the frame of the first.
 
-    Returns:
-        (H, W) or (H, W, 3) uint8 warped image, and its (H, W) bool mask of valid pixels.
+    Returns the (H, W) or (H, W, 3) uint8 image, and the (H, W) bool mask of its valid pixels.
     """
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     warped = cv2.warpPerspective(image1, homography, size, flags=flags)
@@ -71,28 +65,14 @@ def local_zncc(
     Args:
         first, second: (H, W) images in the same frame, any dtype.
         valid_mask: (H, W) bool; windows must lie within it.
-        window_px: side of the square windows in pixels, odd.
-        step_px: between the centres of the windows; the side is an odd multiple of it. The image is
-            divided into squares of this side from the first pixel on, and the windows are centred
-            on them.
+        window_px: side of the square windows, an odd multiple of `step_px`.
+        step_px: between the centres of the windows, which are those of the squares of this side
+            from the first pixel on.
 
     Returns:
         (H // step_px, W // step_px) float32 in [-1, 1], NaN where a window is not valid or is flat.
-
-    Raises:
-        OptionError: the side of the windows is no odd multiple of the step.
-
-    Example:
-        >>> image = np.random.default_rng(0).integers(0, 256, (32, 32)).astype(np.uint8)
-        >>> valid = np.ones((32, 32), bool)
-        >>> float(np.nanmedian(local_zncc(image, 255 - image, valid)).round(3))
-        -1.0
-        >>> local_zncc(image, image, valid, step_px=5).shape
-        (6, 6)
     """
-    side, rest = divmod(window_px, step_px)
-    if rest or side % 2 == 0:
-        raise OptionError(f"{window_px} is no odd multiple of {step_px}: choose another window_px")
+    side = window_px // step_px
     shape = (first.shape[0] // step_px, first.shape[1] // step_px)
     if 0 in shape:
         return np.full(shape, np.nan, np.float32)
@@ -101,18 +81,18 @@ def local_zncc(
     )
     a, b = a.astype(np.float64), b.astype(np.float64)
 
+    def at_steps(values: np.ndarray) -> np.ndarray:
+        if step_px == 1:
+            return values
+        return cv2.resize(values, shape[::-1], interpolation=cv2.INTER_AREA)
+
     def mean(values: np.ndarray) -> np.ndarray:
-        if step_px > 1:
-            values = cv2.resize(values, shape[::-1], interpolation=cv2.INTER_AREA)
-        return cv2.boxFilter(values, cv2.CV_64F, (side, side))
+        return cv2.boxFilter(at_steps(values), cv2.CV_64F, (side, side))
 
     mean_a, mean_b = mean(a), mean(b)
     variance_a = mean(a * a) - mean_a**2
     variance_b = mean(b * b) - mean_b**2
-    whole = mask.astype(np.float32)
-    if step_px > 1:
-        whole = cv2.resize(whole, shape[::-1], interpolation=cv2.INTER_AREA)
-    inside = _erode(whole > 1 - 0.5 / step_px**2, side)
+    inside = _erode(at_steps(mask.astype(np.float32)) > 1 - 0.5 / step_px**2, side)
     known = inside & (variance_a > MIN_VARIANCE) & (variance_b > MIN_VARIANCE)
     covariance = mean(a * b) - mean_a * mean_b
     result = np.full(shape, np.nan, np.float32)
@@ -121,26 +101,12 @@ def local_zncc(
     return result
 
 
-def median_local_zncc(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    homography: np.ndarray,
-    blur_sigma_px: float = BLUR_SIGMA_PX,
-) -> float:
-    """Return the median local ZNCC of two images over their overlap, in [-1, 1].
-
-    Args:
-        gray0, gray1: (H, W) uint8 images.
-        homography: (3, 3) from the first to the second.
-        blur_sigma_px: of a blur of both before, in pixels of the first image.
-
-    Returns:
-        The median over the valid windows; -1 when there are none.
-    """
+def median_local_zncc(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> float:
+    """Return the median local ZNCC of two images over their overlap, -1 without any."""
     size = (gray0.shape[1], gray0.shape[0])
     warped, valid_mask = warp_to_reference(gray1, homography, size)
-    first, second = (gaussian_blur(gray, blur_sigma_px) for gray in (gray0, warped))
-    values = local_zncc(first, second, erode_mask(valid_mask, blur_sigma_px))
+    first, second = (gaussian_blur(gray, BLUR_SIGMA_PX) for gray in (gray0, warped))
+    values = local_zncc(first, second, erode_mask(valid_mask, BLUR_SIGMA_PX))
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else -1.0
 
@@ -155,15 +121,12 @@ def erode_mask(mask: np.ndarray, blur_sigma_px: float) -> np.ndarray:
     return _erode(mask, 2 * int(np.ceil(3 * blur_sigma_px)) + 1)
 
 
-def normalise_local_contrast(gray: np.ndarray, window_px: int = WINDOW_PX) -> np.ndarray:
+def normalise_local_contrast(gray: np.ndarray) -> np.ndarray:
     """Subtract the mean of the window around each pixel and divide by its standard deviation.
 
-    The correlation of two images normalised like this is that of all their windows at once.
-
-    Returns:
-        (H, W) float32; near 0 where a window is flat.
+    Of two images like this, (H, W) float32, the correlation is that of all their windows at once.
     """
-    window = (window_px, window_px)
+    window = (WINDOW_PX, WINDOW_PX)
     values = gray.astype(np.float32)
     mean = cv2.boxFilter(values, cv2.CV_32F, window)
     variance = cv2.boxFilter(values * values, cv2.CV_32F, window) - mean * mean
@@ -196,11 +159,6 @@ def window_sums(
 
     Returns:
         (M,) sums, 0 where there is no pixel in the window.
-
-    Example:
-        >>> pixels = np.array([[0, 0], [2, 1], [9, 9]])
-        >>> window_sums(pixels, np.array([1.0, 2, 3]), (10, 10), 5).tolist()
-        [3.0, 3.0, 3.0]
     """
     image = _scatter(pixels, values, shape, dtype)
     window = (window_px, window_px)
@@ -212,11 +170,7 @@ def window_sums(
 def gaussian_means(
     pixels: np.ndarray, values: np.ndarray, shape: Sequence[int], sigma_px: float, at: np.ndarray
 ) -> np.ndarray:
-    """Average the values of nearby pixels, weighted by a Gaussian; arguments as `window_sums`.
-
-    Returns:
-        (M,) float32 means.
-    """
+    """Average nearby values, weighted by a Gaussian, (M,) float32; otherwise as `window_sums`."""
     count, total = (_scatter(pixels, part, shape, np.float32) for part in (1, values))
     count, total = (cv2.GaussianBlur(image, (0, 0), sigma_px) for image in (count, total))
     x, y = at.T
@@ -248,45 +202,44 @@ def track_round_trip(
     expected: np.ndarray | None = None,
     back_to_start: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Track points forth and back.
+    """Track points forth and back (Lucas-Kanade).
 
     Args:
         first, second: (H, W) uint8 images.
-        points: (N, 2) float32 positions in the first.
+        points: (N, 2) positions in the first.
         window_px: side of the tracked windows.
         levels: of the pyramid above the image; each doubles how far a track can move.
         iterations: of each track and level, at most.
         step_px: a track that moves by less than this has arrived.
         min_eigenvalue: of the gradients in a window, per pixel, below which a track is lost.
-        expected: (N, 2) float32 positions in the second, where the search begins; None: in the
-            same place.
+        expected: (N, 2) positions in the second, where the search begins; None: in the same place.
         back_to_start: whether the way back begins at the start itself.
 
     Returns:
         (N, 2) float32 positions in the second, and (N,) distances from the start after the way
         back, infinite where a track was lost.
     """
-    how = {
+    settings = {
         "winSize": (window_px, window_px),
         "maxLevel": levels,
         "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, iterations, step_px),
         "minEigThreshold": min_eigenvalue,
     }
-    guided = {**how, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+    guided = {**settings, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
     start = np.ascontiguousarray(points, np.float32).reshape(-1, 1, 2)
     if expected is not None:
         guess = np.ascontiguousarray(expected, np.float32).reshape(-1, 1, 2)
-        there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, guess.copy(), **guided)
-        back_guess = there + start - guess
+        end, forth, _ = cv2.calcOpticalFlowPyrLK(first, second, start, guess.copy(), **guided)
+        back_guess = end + start - guess
     else:
-        there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, None, **how)
+        end, forth, _ = cv2.calcOpticalFlowPyrLK(first, second, start, None, **settings)
         back_guess = start.copy() if back_to_start else None
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-        second, first, there, back_guess, **(how if back_guess is None else guided)
+    returned, back, _ = cv2.calcOpticalFlowPyrLK(
+        second, first, end, back_guess, **(settings if back_guess is None else guided)
     )
-    gaps = np.linalg.norm((back - start).reshape(-1, 2), axis=1)
-    lost = (found.ravel() == 0) | (found_back.ravel() == 0)
-    return there.reshape(-1, 2), np.where(lost, np.inf, gaps)
+    gaps = np.linalg.norm((returned - start).reshape(-1, 2), axis=1)
+    lost = (forth.ravel() == 0) | (back.ravel() == 0)
+    return end.reshape(-1, 2), np.where(lost, np.inf, gaps)
 
 
 def equalise(gray: np.ndarray) -> np.ndarray:

@@ -112,17 +112,7 @@ class RobustBox:
 def robust_box(cloud: PointCloud) -> RobustBox:
     """Find the box from the 1st to the 99th percentile of each coordinate.
 
-    A few outliers very far away do not change it much.
-
-    Raises:
-        OptionError: the cloud is empty.
-
-    Example:
-        >>> line = np.linspace(0, 100, 101)
-        >>> points = np.column_stack([line, 2 * line, 0 * line])
-        >>> box = robust_box(PointCloud(points, np.zeros((101, 3), np.uint8), "mm"))
-        >>> box.low.tolist(), box.high.tolist(), box.centre.tolist()
-        ([1.0, 2.0, 0.0], [99.0, 198.0, 0.0], [50.0, 100.0, 0.0])
+    A few outliers very far away do not change it much. An empty cloud is an OptionError.
     """
     require_points(cloud)
     low, high = np.percentile(
@@ -134,19 +124,8 @@ def robust_box(cloud: PointCloud) -> RobustBox:
 def angular_spacing(cloud: PointCloud) -> float:
     """Return the angle between neighbouring points as the left camera sees them, in radians.
 
-    Points drawn at this size make a closed surface of a dense cloud.
-
-    Returns:
-        Width of a point over its depth, at most 0.02, as if all points were spread evenly.
-
-    Raises:
-        OptionError: the cloud is empty.
-
-    Example:
-        >>> y, x = np.indices((100, 100)).reshape(2, -1)
-        >>> points = np.column_stack([x, y, np.full(10_000, 500.0)])
-        >>> round(angular_spacing(PointCloud(points, np.zeros((10_000, 3), np.uint8), "mm")), 5)
-        0.00198
+    It is the width of a point over its depth, as if all points were spread evenly; points drawn at
+    this size make a closed surface of a dense cloud. An empty cloud is an OptionError.
     """
     require_points(cloud)
     ahead = cloud.points[cloud.points[:, 2] > 0]
@@ -156,17 +135,12 @@ def angular_spacing(cloud: PointCloud) -> float:
         ahead[:, :2] / ahead[:, 2:], (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0
     )
     width, height = ((seen[1] - seen[0]) / (1 - 2 * BOX_PERCENTILE / 100)).tolist()
-    return (
-        min(MAX_ANGULAR_SPACING, float(np.sqrt(width * height / len(ahead)))) or MAX_ANGULAR_SPACING
-    )
+    spacing = min(MAX_ANGULAR_SPACING, float(np.sqrt(width * height / len(ahead))))
+    return spacing or MAX_ANGULAR_SPACING
 
 
 def require_points(cloud: PointCloud) -> None:
-    """Raise an error for an empty cloud.
-
-    Raises:
-        OptionError: it is empty.
-    """
+    """Raise an OptionError for an empty cloud."""
     if not len(cloud):
         raise OptionError("the point cloud has no points: there is nothing to show or to write")
 

@@ -41,36 +41,27 @@ def triangulate(
     rotation: np.ndarray,
     translation: np.ndarray,
 ) -> Triangulation:
-    """Triangulate matches.
+    """Triangulate (N, 2) matches in pixels: a point X is rotation @ X + translation in the second.
 
-    Args:
-        points0, points1: (N, 2) matched positions in pixels.
-        calibration: of both cameras.
-        rotation, translation: (3, 3) and (3,): a point X of the first camera's frame is
-            rotation @ X + translation in the second's.
+    Both positions are first moved onto a pair of epipolar lines (`correct_matches`): this is the
+    maximum likelihood for errors of the same size in both images. The rays then meet, and the depth
+    is a quotient, accurate at small angles too.
 
     Example:
         >>> from .camera import Camera
-        >>> camera = Camera((640, 480), 500.0)
+        >>> cameras = Calibration(*[Camera((640, 480), 500.0)] * 2)
         >>> pose = np.eye(3), np.array([-1.0, 0, 0])
-        >>> found = triangulate([[319.5, 239.5]], [[269.5, 239.5]], Calibration(camera, camera),
-        ...                     *pose)
-        >>> found.points.round(6).tolist()
+        >>> points = triangulate([[319.5, 239.5]], [[269.5, 239.5]], cameras, *pose).points
+        >>> points.round(6).tolist()
         [[0.0, 0.0, 10.0]]
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    rotation = np.asarray(rotation, np.float64)
-    translation = np.asarray(translation, np.float64).reshape(3)
+    pose = np.asarray(rotation, np.float64), np.asarray(translation, np.float64).reshape(3)
+    starts = range(0, max(len(points0), 1), BLOCK)
+    parts = (slice(start, start + BLOCK) for start in starts)
     blocks = [
-        _triangulate_block(
-            points0[start : start + BLOCK],
-            points1[start : start + BLOCK],
-            calibration,
-            rotation,
-            translation,
-        )
-        for start in range(0, max(len(points0), 1), BLOCK)
+        _triangulate_block(points0[part], points1[part], calibration, *pose) for part in parts
     ]
     return Triangulation(*(np.concatenate(values) for values in zip(*blocks, strict=True)))
 
@@ -105,14 +96,9 @@ def _triangulate_block(
 def correct_matches(
     points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Move matches as little as possible so that x1^T F x0 = 0 holds (Lindstrom 2010, niter2).
+    """Move (N, 2) matches as little as possible so that x1^T F x0 = 0 holds.
 
-    Args:
-        points0, points1: (N, 2) matched positions.
-        fundamental: (3, 3) with x1^T F x0 = 0.
-
-    Returns:
-        (N, 2) and (N, 2) moved positions.
+    Lindstrom, "Triangulation made easy", 2010, algorithm niter2.
     """
     first = np.column_stack([points0, np.ones(len(points0))])
     second = np.column_stack([points1, np.ones(len(points1))])
@@ -178,12 +164,7 @@ class RelativePose:
 
 
 def rotation_angle(rotation: np.ndarray) -> float:
-    """Return the angle of a rotation in degrees, accurate for small angles, too.
-
-    Example:
-        >>> round(rotation_angle(np.eye(3)), 6)
-        0.0
-    """
+    """Return the angle of a rotation in degrees, accurate for small angles, too."""
     skew = (rotation - rotation.T)[[2, 0, 1], [1, 2, 0]]
     return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(rotation) - 1)))
 
@@ -195,19 +176,9 @@ def estimate_relative_pose(
     inlier_threshold: float = 1.0,
     seed: int = 0,
 ) -> RelativePose | None:
-    """Estimate the pose: essential matrix by MAGSAC, the best of its four poses, refined.
+    """Estimate the pose from (M, 2) matches in pixels: essential matrix by MAGSAC, then refined.
 
-    Args:
-        points0, points1: (M, 2) matched positions in pixels.
-        calibration: of both cameras.
-        inlier_threshold: Sampson distance in pixels.
-        seed: of the random samples.
-
-    Returns:
-        The pose, or None when there are too few matches or it cannot be estimated.
-
-    Raises:
-        OptionError: the threshold or the seed is out of its range.
+    Returns None when there are too few matches or it cannot be estimated.
     """
     essential = GeometryOptions(
         inlier_threshold=inlier_threshold,
@@ -216,30 +187,26 @@ def estimate_relative_pose(
     )
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    every = -(-len(points0) // MAX_MATCHES) if len(points0) else 1
+    sample = _evenly(np.arange(len(points0)))
     geometry = estimate_geometry(
-        points0[::every], points1[::every], "essential", seed=seed, options=essential
+        points0[sample], points1[sample], "essential", seed=seed, options=essential
     )
     if geometry.matrix is None or not geometry.inliers.any():
         return None
     kept = np.zeros(len(points0), bool)
-    kept[::every] = geometry.inliers
-    inliers = points0[kept], points1[kept]
-    pose = best_of_four(geometry.matrix, *inliers, calibration)
+    kept[sample] = geometry.inliers
+    pose = best_of_four(geometry.matrix, points0[kept], points1[kept], calibration)
     for _ in range(MAX_REFITS):
+        before = np.count_nonzero(kept)
         inliers = points0[kept], points1[kept]
         pose = refine_pose(*inliers, calibration, *pose, scale_px=inlier_threshold)
-        before = np.count_nonzero(kept)
         errors = epipolar_errors(points0, points1, fundamental_matrix(calibration, *pose))
         kept = errors < inlier_threshold
         if np.count_nonzero(kept) <= before * (1 + MIN_INLIER_GAIN):
             break
-    errors = epipolar_errors(points0, points1, fundamental_matrix(calibration, *pose))
-    kept = errors < inlier_threshold
     if not kept.any():
         return None
-    sample = np.flatnonzero(kept)
-    sample = sample[:: -(-len(sample) // MAX_MATCHES)]
+    sample = _evenly(np.flatnonzero(kept))
     ratio = _cheirality_ratio(points0[sample], points1[sample], calibration, *pose)
     return RelativePose(*pose, inliers=kept, errors=errors, cheirality_ratio=ratio)
 
@@ -252,21 +219,12 @@ def refine_pose(
     translation: np.ndarray,
     scale_px: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit a pose to matches: Sampson distances with a Cauchy loss, by Gauss-Newton.
+    """Fit a pose to (M, 2) matches, mostly right: Sampson distances with a Cauchy loss.
 
-    The parameters are three angles of the rotation and two of the direction of the translation.
-
-    Args:
-        points0, points1: (M, 2) matched positions in pixels, mostly right.
-        calibration: of both cameras.
-        rotation, translation: initial pose.
-        scale_px: a match with half this error has half the weight of an exact one.
-
-    Returns:
-        (3, 3) rotation and (3,) translation of length 1; never worse than the initial pose.
+    By Gauss-Newton, over three angles of the rotation and two of the translation's direction; never
+    worse than the initial pose. Half of `scale_px` gives a match half the weight of an exact one.
     """
-    every = -(-len(points0) // MAX_MATCHES)
-    points0, points1 = points0[::every], points1[::every]
+    points0, points1 = _evenly(points0), _evenly(points1)
 
     def residuals(pose: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
         return signed_epipolar_errors(points0, points1, fundamental_matrix(calibration, *pose))
@@ -275,23 +233,23 @@ def refine_pose(
         return float(np.log1p((values / (scale_px / 2)) ** 2).sum())
 
     pose = rotation, translation / np.linalg.norm(translation)
-    here = residuals(pose)
-    best = cost(here)
+    errors = residuals(pose)
+    lowest = cost(errors)
     for _ in range(MAX_ITERATIONS):
         varied = (residuals(moved_pose(pose, axis)) for axis in np.eye(5) * DERIVATIVE_STEP)
-        slopes = np.column_stack([(there - here) / DERIVATIVE_STEP for there in varied])
-        weights = 1 / (1 + (here / (scale_px / 2)) ** 2)
+        slopes = np.column_stack([(other - errors) / DERIVATIVE_STEP for other in varied])
+        weights = 1 / (1 + (errors / (scale_px / 2)) ** 2)
         normal = slopes.T @ (slopes * weights[:, None])
-        change = -np.linalg.lstsq(normal, slopes.T @ (weights * here), rcond=None)[0]
+        change = -np.linalg.lstsq(normal, slopes.T @ (weights * errors), rcond=None)[0]
         while np.abs(change).max() > MIN_CHANGE:
-            there = moved_pose(pose, change)
-            values = residuals(there)
-            if cost(values) < best:
+            moved = moved_pose(pose, change)
+            moved_errors = residuals(moved)
+            if cost(moved_errors) < lowest:
                 break
             change = change / 4
         else:
             break
-        pose, here, best = there, values, cost(values)
+        pose, errors, lowest = moved, moved_errors, cost(moved_errors)
     return pose
 
 
@@ -318,24 +276,14 @@ def _cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def best_of_four(
-    essential: np.ndarray,
-    points0: np.ndarray,
-    points1: np.ndarray,
-    calibration: Calibration,
+    essential: np.ndarray, points0: np.ndarray, points1: np.ndarray, calibration: Calibration
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose of an essential matrix with most points in front of both cameras.
+    """Return the rotation and translation with most points in front of both cameras.
 
-    Args:
-        essential: (3, 3), in normalised coordinates.
-        points0, points1: (M, 2) matched positions in pixels.
-        calibration: of both cameras.
-
-    Returns:
-        (3, 3) rotation and (3,) translation of length 1.
+    The essential matrix is in normalised coordinates, the (M, 2) matches are in pixels.
     """
     rotation0, rotation1, translation = cv2.decomposeEssentialMat(essential)
-    every = -(-len(points0) // MAX_MATCHES)
-    points0, points1 = points0[::every], points1[::every]
+    points0, points1 = _evenly(points0), _evenly(points1)
     poses = [
         (rotation, sign * translation.ravel())
         for rotation in (rotation0, rotation1)
@@ -351,6 +299,10 @@ def _cheirality_ratio(
     rotation: np.ndarray,
     translation: np.ndarray,
 ) -> float:
-    return float(
-        triangulate(points0, points1, calibration, rotation, translation).cheirality.mean()
-    )
+    in_front = triangulate(points0, points1, calibration, rotation, translation).cheirality
+    return float(in_front.mean())
+
+
+def _evenly(rows: np.ndarray) -> np.ndarray:
+    """Return at most `MAX_MATCHES` of the rows."""
+    return rows[:: max(1, -(-len(rows) // MAX_MATCHES))]

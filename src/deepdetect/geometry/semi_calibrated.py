@@ -5,10 +5,6 @@ with about the same focal length. Five matches then give a relative pose for eac
 is tried, where a fundamental matrix needs seven: the share of samples without a wrong match is far
 larger, and so few matches leave fewer degrees of freedom to chance. Which focal length is nearest
 is decided by how many matches agree; then pose and cameras are fitted to them together.
-
-Nister, "An efficient solution to the five-point relative pose problem", 2004; for an unknown focal
-length see Kukelova, Bujnak and Pajdla, "Polynomial eigenvalue solutions to minimal problems in
-computer vision", 2012.
 """
 
 from __future__ import annotations
@@ -35,7 +31,6 @@ START_FOCAL_LENGTHS = np.geomspace(0.4, 2.5, 12)
 
 MIN_MATCHES = 6
 """One more than give an essential matrix."""
-
 
 FOCAL_LENGTHS = (0.7, 1.4)
 """That are tried, in units of the longer side of the image: as good as all from a wide angle of 90
@@ -83,16 +78,6 @@ def estimate_semi_calibrated(
 
     Returns:
         The geometry; None with too few matches, or where nothing could be estimated.
-
-    Example:
-        >>> rng = np.random.default_rng(0)
-        >>> points = rng.uniform((-4, -3, 8), (4, 3, 16), (60, 3))
-        >>> camera = Camera((640, 480), 500.0)
-        >>> first, second = camera.project(points), camera.project(points - [1, 0, 0.5])
-        >>> second[:30] = rng.uniform(0, 480, (30, 2))
-        >>> found = estimate_semi_calibrated(first, second, ((640, 480), (640, 480)))
-        >>> bool(found.inliers[30:].all()), bool(found.log10_nfa < -30)
-        (True, True)
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -103,25 +88,27 @@ def estimate_semi_calibrated(
     best = start = None
     for focal in FOCAL_LENGTHS:
         cameras = _Cameras.guess(sizes, focal)
-        matrix = _fit_essential(points0[order], points1[order], cameras, inlier_threshold)
-        if matrix is None:
+        essential = _fit_essential(points0[order], points1[order], cameras, inlier_threshold)
+        if essential is None:
             continue
-        found = _judge(_fundamental(matrix, cameras), sizes, points0, points1, inlier_threshold)
-        if best is None or found.log10_nfa < best.log10_nfa:
-            best, start = found, (matrix, cameras)
+        fundamental = cameras.fundamental(essential)
+        fundamental = fundamental / np.linalg.norm(fundamental)
+        model = _judge(fundamental, sizes, points0, points1, inlier_threshold)
+        if best is None or model.log10_nfa < best.log10_nfa:
+            best, start = model, (essential, cameras)
     if best is None or start is None or np.count_nonzero(best.inliers) < MIN_MATCHES:
         return best
     essential, cameras = start
     inliers = points0[best.inliers], points1[best.inliers]
-    here = _View(best_of_four(essential, *inliers, cameras.calibration), cameras)
+    views = _Views(best_of_four(essential, *inliers, cameras.calibration), cameras)
     for _ in range(MAX_FITS):
         inliers = points0[best.inliers], points1[best.inliers]
-        here = _fit(here, *inliers, np.full(len(inliers[0]), MATCH_SIGMA_PX))
-        found = _judge(here.fundamental, sizes, points0, points1, inlier_threshold)
-        if found.log10_nfa > best.log10_nfa:
+        views = _fit(views, *inliers, np.full(len(inliers[0]), MATCH_SIGMA_PX))
+        model = _judge(views.fundamental, sizes, points0, points1, inlier_threshold)
+        if model.log10_nfa > best.log10_nfa:
             break
-        hopeless = best.log10_nfa == found.log10_nfa > 0
-        best = found
+        hopeless = best.log10_nfa == model.log10_nfa > 0
+        best = model
         if hopeless:  # further fits sharpen what nobody will trust
             break
     return best
@@ -139,20 +126,19 @@ def refine_fundamental(
     Where the matches say little, as about the focal length or at the borders, the usual decides.
 
     Args:
-        points0, points1: (M, 2) matched positions, M at least 6.
+        points0, points1: (M, 2) matched positions.
         fundamental: (3, 3) with x1^T F x0 = 0, to begin with.
         sizes: (width, height) of both images.
         match_sigmas_px: (M,) standard deviations of the matches from their epipolar lines.
 
     Returns:
-        (3, 3) fundamental matrix of norm 1; the given one with too few matches.
+        (3, 3) fundamental matrix of norm 1; that at the beginning with fewer than 6 matches.
     """
     if len(points0) < MIN_MATCHES:
         return fundamental
     cameras, essential = _nearest_cameras(fundamental, sizes)
-    pose = best_of_four(essential, points0, points1, cameras.calibration)
-    start = _View(pose, cameras)
-    matrix = _fit(start, points0, points1, match_sigmas_px).fundamental
+    views = _Views(best_of_four(essential, points0, points1, cameras.calibration), cameras)
+    matrix = _fit(views, points0, points1, match_sigmas_px).fundamental
     return np.asarray(matrix / np.linalg.norm(matrix))
 
 
@@ -201,9 +187,14 @@ class _Cameras:
         calibration = self.calibration
         return np.linalg.inv(calibration.camera0.matrix), np.linalg.inv(calibration.camera1.matrix)
 
+    def fundamental(self, essential: np.ndarray) -> np.ndarray:
+        """Return the fundamental matrix of an essential one."""
+        inverse0, inverse1 = self.inverses
+        return np.asarray(inverse1.T @ essential @ inverse0)
+
     def moved(self, change: np.ndarray) -> _Cameras:
         """Return cameras near these: a change of 6 parameters."""
-        if not change.any():
+        if not change.any():  # with their inverses
             return self
         offsets = self.offsets + change[2:].reshape(2, 2)
         return _Cameras(self.sizes, self.log_focal + change[:2], offsets)
@@ -216,8 +207,8 @@ class _Cameras:
 
 
 @dataclass(frozen=True, eq=False)
-class _View:
-    """A pose and both cameras: 11 parameters."""
+class _Views:
+    """A relative pose and both cameras: 11 parameters."""
 
     pose: tuple[np.ndarray, np.ndarray]
     cameras: _Cameras
@@ -225,18 +216,14 @@ class _View:
     @property
     def fundamental(self) -> np.ndarray:
         rotation, translation = self.pose
-        inverse0, inverse1 = self.cameras.inverses
-        return np.asarray(inverse1.T @ (cross_matrix(translation) @ rotation) @ inverse0)
+        return self.cameras.fundamental(cross_matrix(translation) @ rotation)
 
-    def moved(self, change: np.ndarray) -> _View:
-        return _View(moved_pose(self.pose, change[:5]), self.cameras.moved(change[5:]))
+    def moved(self, change: np.ndarray) -> _Views:
+        return _Views(moved_pose(self.pose, change[:5]), self.cameras.moved(change[5:]))
 
 
 def _fit_essential(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    cameras: _Cameras,
-    inlier_threshold: float,
+    points0: np.ndarray, points1: np.ndarray, cameras: _Cameras, inlier_threshold: float
 ) -> np.ndarray | None:
     """Return an essential matrix by MAGSAC."""
     calibration = cameras.calibration
@@ -263,12 +250,6 @@ def _fit_essential(
     return np.asarray(matrix)
 
 
-def _fundamental(essential: np.ndarray, cameras: _Cameras) -> np.ndarray:
-    inverse0, inverse1 = cameras.inverses
-    matrix = inverse1.T @ essential @ inverse0
-    return np.asarray(matrix / np.linalg.norm(matrix))
-
-
 def _judge(
     fundamental: np.ndarray,
     sizes: tuple[Size, Size],
@@ -283,42 +264,37 @@ def _judge(
     return TwoViewModel("fundamental", fundamental, inliers, alarms)
 
 
-def _fit(
-    view: _View,
-    points0: np.ndarray,
-    points1: np.ndarray,
-    sigmas: np.ndarray,
-) -> _View:
+def _fit(views: _Views, points0: np.ndarray, points1: np.ndarray, sigmas: np.ndarray) -> _Views:
     """Fit pose and cameras to matches, with a Cauchy loss, and to what is usual (MAP estimate)."""
+    count = len(points0)
 
-    def residuals(view: _View) -> np.ndarray:
-        errors = signed_epipolar_errors(points0, points1, view.fundamental)
-        return np.append(errors / sigmas, view.cameras.deviations())
+    def residuals(views: _Views) -> np.ndarray:
+        errors = signed_epipolar_errors(points0, points1, views.fundamental)
+        return np.append(errors / sigmas, views.cameras.deviations())
 
-    def cost(values: np.ndarray) -> float:
-        matches, usual = values[: len(points0)], values[len(points0) :]
+    def cost(errors: np.ndarray) -> float:
+        matches, usual = errors[:count], errors[count:]
         return float(2 * np.log1p((matches / 2) ** 2).sum() + (usual**2).sum() / 2)
 
     step, damping = 1e-6, 1e-3
-    here = residuals(view)
-    best = cost(here)
+    errors = residuals(views)
+    lowest = cost(errors)
     for _ in range(MAX_ITERATIONS):
-        varied = (residuals(view.moved(axis)) for axis in np.eye(11) * step)
-        slopes = np.column_stack([(there - here) / step for there in varied])
-        weights = np.ones(len(here))
-        weights[: len(points0)] = 1 / (1 + (here[: len(points0)] / 2) ** 2)
-        normal, gradient = slopes.T @ (slopes * weights[:, None]), slopes.T @ (weights * here)
-        before = best
+        varied = (residuals(views.moved(axis)) for axis in np.eye(11) * step)
+        slopes = np.column_stack([(other - errors) / step for other in varied])
+        weights = np.ones(len(errors))
+        weights[:count] = 1 / (1 + (errors[:count] / 2) ** 2)
+        normal, gradient = slopes.T @ (slopes * weights[:, None]), slopes.T @ (weights * errors)
+        before = lowest
         while damping < 1e6:
             damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
-            change = -np.linalg.solve(damped, gradient)
-            moved = view.moved(change)
-            there = residuals(moved)
-            if cost(there) < best:
-                view, here, best = moved, there, cost(there)
+            moved = views.moved(-np.linalg.solve(damped, gradient))
+            moved_errors = residuals(moved)
+            if cost(moved_errors) < lowest:
+                views, errors, lowest = moved, moved_errors, cost(moved_errors)
                 damping /= 5
                 break
             damping *= 5
-        if before - best < 1e-4:
+        if before - lowest < 1e-4:
             break
-    return view
+    return views

@@ -1,4 +1,4 @@
-"""Points under homographies and fundamental matrices, and their distances from them in pixels."""
+"""Points under homographies and fundamental matrices, and their errors in pixels."""
 
 from __future__ import annotations
 
@@ -62,10 +62,7 @@ def epipolar_errors(
 def signed_epipolar_errors(
     points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
 ) -> np.ndarray:
-    """Return the Sampson distances with a sign that says on which side a match lies.
-
-    Arguments and result as of `epipolar_errors`.
-    """
+    """Return `epipolar_errors` with a sign that says on which side a match lies."""
     points0, points1 = np.asarray(points0, np.float64), np.asarray(points1, np.float64)
     across1, down1, algebraic = _apply(fundamental, points0)
     across0, down0 = _apply(fundamental.T[:2], points1)
@@ -85,13 +82,13 @@ def _apply(matrix: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     One after the other: with so few columns a product of matrices takes several times as long.
     """
     x, y = points[:, 0], points[:, 1]
-    result = []
+    coordinates = []
     for row in matrix:
         values = row[0] * x
         values += row[1] * y
         values += row[2]
-        result.append(values)
-    return result
+        coordinates.append(values)
+    return coordinates
 
 
 @suggest_keywords
@@ -115,13 +112,14 @@ def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.nda
     return np.linalg.norm(expected - points1, axis=1)
 
 
-def scaled_points(points: np.ndarray, scale: float) -> np.ndarray:
-    """Return positions in an image of another scale; pixel centres are whole numbers.
+def scaling_matrix(scale: float) -> np.ndarray:
+    """Return the (3, 3) map from an image to the same image at another scale."""
+    shift = 0.5 * scale - 0.5
+    return np.array([[scale, 0, shift], [0, scale, shift], [0, 0, 1]])
 
-    Example:
-        >>> scaled_points(np.array([[0.0, 1.0]]), 2).tolist()
-        [[0.5, 2.5]]
-    """
+
+def scaled_points(points: np.ndarray, scale: float) -> np.ndarray:
+    """Return positions in an image of another scale; pixel centres are whole numbers."""
     return (np.asarray(points, np.float64) + 0.5) * scale - 0.5
 
 
@@ -134,9 +132,3 @@ def scaled_homography(homography: np.ndarray, scale0: float, scale1: float) -> n
 def scaled_fundamental(fundamental: np.ndarray, scale0: float, scale1: float) -> np.ndarray:
     """Return the fundamental matrix between both images at other scales."""
     return scaling_matrix(1 / scale1).T @ fundamental @ scaling_matrix(1 / scale0)
-
-
-def scaling_matrix(scale: float) -> np.ndarray:
-    """Return the (3, 3) map from an image to the same image at another scale."""
-    shift = 0.5 * scale - 0.5
-    return np.array([[scale, 0, shift], [0, scale, shift], [0, 0, 1]])

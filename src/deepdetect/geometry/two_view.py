@@ -1,9 +1,7 @@
 """What two images show: a plane, a rotation, depth, the same view, or nothing in common.
 
 The one decision of matching, reconstruction and stitching. It rests on a homography and a
-fundamental matrix of the same matches, how many agree with each and how likely that is by chance
-(`acontrario`), and on what the homography leaves (`parallax`). Pairs whose matches lie on rows are
-told apart from others in `reconstruction.rectification`, by the same evidence.
+fundamental matrix of the same matches, and on the parallax that the homography leaves.
 """
 
 from __future__ import annotations
@@ -82,21 +80,13 @@ def fit_model(
     threshold_px: float,
     seed: int = 0,
 ) -> TwoViewModel:
-    """Fit a homography or a fundamental matrix to matches, trusted or not.
-
-    Args:
-        points0, points1: (M, 2) matched positions.
-        model: "homography" or "fundamental".
-        size1: (width, height) of the second image.
-        threshold_px: within which a match agrees.
-        seed: of the random samples.
-    """
+    """Fit a homography or a fundamental matrix to (M, 2) matches, trusted or not."""
     options = GeometryOptions(inlier_threshold=threshold_px)
-    found = estimate_geometry(points0, points1, model, seed=seed, options=options)
-    if found.matrix is None:
-        return TwoViewModel("none", None, found.inliers, float("inf"))
-    alarms = log10_nfa(found.inliers, model, threshold_px, size1)
-    return TwoViewModel(model, found.matrix, found.inliers, alarms)
+    geometry = estimate_geometry(points0, points1, model, seed=seed, options=options)
+    if geometry.matrix is None:
+        return TwoViewModel("none", None, geometry.inliers, float("inf"))
+    alarms = log10_nfa(geometry.inliers, model, threshold_px, size1)
+    return TwoViewModel(model, geometry.matrix, geometry.inliers, alarms)
 
 
 def choose_model(
@@ -113,7 +103,7 @@ def choose_model(
         points0, points1: (M, 2) matched positions, many of which may be wrong.
         sizes: (width, height) of both images.
         model: "homography", "fundamental", or "auto": the homography, but the fundamental matrix
-            where the matches alone show depth (`Parallax.shows_depth`).
+            where the matches alone show depth.
         seed: of the random samples.
         semi_calibrated: whether a fundamental matrix may be one of cameras as most are
             (`semi_calibrated`), which few matches show but which takes longer.
@@ -146,14 +136,10 @@ def classify_scene(
     calibration: Calibration | None = None,
     seed: int = 0,
 ) -> Scene:
-    """Say what a pair shows.
+    """Say what a pair shows, by (M, 2) matches that are spread out.
 
-    Args:
-        points0, points1: (M, 2) float64 matched positions, spread out: matches side by side are no
-            independent evidence.
-        size1: (width, height) of the second image.
-        calibration: tells a rotating camera from a plane, where it is known.
-        seed: of the random samples.
+    Matches side by side are no independent evidence. A calibration, where it is known, tells a
+    rotating camera from a plane.
 
     Example:
         >>> points = np.random.default_rng(0).uniform(0, 500, (300, 2))
@@ -186,13 +172,7 @@ def is_planar(
     epipolar: TwoViewModel,
     seed: int = 0,
 ) -> bool:
-    """Return whether a homography explains all that can be explained, though many may be wrong.
-
-    Args:
-        points0, points1: (M, 2) matches, some of them wrong.
-        plane, epipolar: the homography and the fundamental matrix that were estimated from them.
-        seed: of the search for an epipole among the others.
-    """
+    """Return whether a homography explains all that can be explained, though many may be wrong."""
     least = MIN_PLANAR_RATIO * np.count_nonzero(epipolar.inliers)
     if plane.matrix is None or np.count_nonzero(plane.inliers) < least:
         return False
@@ -204,9 +184,7 @@ def is_planar(
 def has_foreground(off_plane_px: np.ndarray, by_fundamental: np.ndarray) -> bool:
     """Return whether something stands in front of the plane, small as it may be.
 
-    Args:
-        off_plane_px: (M,) transfer errors of the plane's homography.
-        by_fundamental: (M,) bool, the matches that the fundamental matrix explains.
+    By the (M,) transfer errors of its homography, and the matches the fundamental matrix explains.
     """
     clear = off_plane_px > FOREGROUND_DISTANCE_PX
     foreground = np.count_nonzero(clear & by_fundamental)
@@ -218,12 +196,7 @@ def has_foreground(off_plane_px: np.ndarray, by_fundamental: np.ndarray) -> bool
 
 
 def is_static(motion_px: np.ndarray) -> bool:
-    """Return whether matches that move this far show the same view in both images.
-
-    Example:
-        >>> is_static(np.array([0.1, 0.0, 0.3])), is_static(np.array([0.1, 0.2, 7.0]))
-        (True, False)
-    """
+    """Return whether matches that move this far show the same view in both images."""
     motion = np.abs(motion_px)
     return bool(
         np.median(motion) < MAX_MEDIAN_MOTION_PX
@@ -231,11 +204,7 @@ def is_static(motion_px: np.ndarray) -> bool:
     )
 
 
-def is_pure_rotation(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    calibration: Calibration,
-) -> bool:
+def is_pure_rotation(points0: np.ndarray, points1: np.ndarray, calibration: Calibration) -> bool:
     """Return whether one rotation maps the rays of matches onto each other (Kabsch's method)."""
     rays0, rays1 = (
         rays / np.linalg.norm(rays, axis=1, keepdims=True)

@@ -22,7 +22,7 @@ from ..detector.detector import AnyDetector, DeepDetect, find_keypoints
 from ..detector.image_lists import Images, ignore_masks
 from ..features.keypoints import Keypoints
 from ..features.selection import SelectionOptions
-from ..geometry.camera import Calibration, calibration_from_focal, read_calibration
+from ..geometry.camera import Calibration, Camera, read_calibration
 from ..io.exif import calibration_from_exif
 from ..io.image import load_image, luma
 from ..matching.options import MatchingOptions
@@ -280,5 +280,6 @@ def _calibration(
     if given is not None:
         return read_calibration(given, *sizes)
     if focal_px is not None:
-        return calibration_from_focal(focal_px, *sizes)
+        camera0, camera1 = (Camera(size, focal_px) for size in sizes)
+        return Calibration(camera0, camera1, source="focal_px")
     return calibration_from_exif(*images, *sizes)
