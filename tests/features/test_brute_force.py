@@ -74,14 +74,6 @@ def test_equals_a_naive_search_among_ties(
     assert_exact(queries, base, count)
 
 
-@pytest.mark.parametrize("size", [5, 50, 700])
-def test_the_lower_row_comes_first_among_many_equals(size: int) -> None:
-    rng = np.random.default_rng(size)
-    base = rng.integers(0, 2, (size, 3)).astype(np.float32)
-    queries = rng.integers(0, 2, (40, 3)).astype(np.float32)
-    assert_exact(queries, base, 2)
-
-
 @pytest.mark.parametrize("offset", [1.0, 30.0, 1000.0])
 def test_neighbours_stay_true_far_from_the_origin(offset: float) -> None:
     """|b|^2 - 2 q.b in single precision drowns small distances in a common offset."""
@@ -148,13 +140,6 @@ def random_bytes(seed: int, *shape: int) -> np.ndarray:
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_neighbours_equal_those_of_counting_all_bits(width: int, count: int) -> None:
     assert_nearest(random_bytes(count, 60, width), random_bytes(9, 80, width), count)
-
-
-@given(data=st.data(), count=st.integers(1, 2))
-def test_neighbours_are_right_among_ties(data: st.DataObject, count: int) -> None:
-    values = st.lists(st.integers(0, 3), min_size=2, max_size=12)
-    parts = [np.array(data.draw(values), np.uint8)[:, None] for _ in range(2)]
-    assert_nearest(*parts, count)
 
 
 @pytest.mark.parametrize("block", [1, 7, 59, 60, 61])

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deepdetect import OptionError
 from deepdetect._shared import parallel
 from deepdetect.features.sift import dense_sift, opencv_sift_descriptors, to_root_sift
 from deepdetect.io.image import luma
@@ -68,22 +66,3 @@ def test_does_not_depend_on_the_number_of_threads(
         found.append(to_root_sift(dense_sift(gray, xy)))
     np.testing.assert_array_equal(found[0], found[1])
     np.testing.assert_array_equal(found[0], found[2])
-
-
-@pytest.mark.parametrize(
-    ("xy", "size"),
-    [([[3.5, 2]], 3), ([[-1, 2]], 3), ([[2, 9]], 3), ([[2, 2]], 1.9), ([[2, 2]], 8.1)],
-)
-def test_what_it_cannot_describe_is_refused(xy: list, size: float) -> None:
-    with pytest.raises(OptionError):
-        dense_sift(np.zeros((9, 9), np.uint8), np.array(xy), size)
-
-
-def test_root_is_the_root_of_each_share(photo: np.ndarray) -> None:
-    gray = luma(photo)[:60, :60]
-    sift = dense_sift(gray, every_pixel(gray))
-    shares = sift / np.maximum(sift.sum(1, keepdims=True), 1)
-    np.testing.assert_allclose(
-        to_root_sift(sift), np.minimum(512 * np.sqrt(shares), 255), atol=0.501
-    )
-    assert cv2.norm(to_root_sift(sift)[1000].astype(np.float32)) == pytest.approx(512, rel=0.005)

@@ -138,14 +138,6 @@ def test_each_pixel_has_a_rank_of_its_own(width: int, height: int) -> None:
     assert 0 <= order.min() <= order.max() < 1
 
 
-@pytest.mark.parametrize("count", [4, 16, 64, 256])
-def test_the_first_ones_lie_in_cells_of_their_own(count: int) -> None:
-    xy = grid(64, 64)
-    first = xy[np.argsort(bayer_order(xy, (64, 64)))[:count]]
-    side = 64 // int(np.sqrt(count))
-    assert len(np.unique(first // side, axis=0)) == count
-
-
 def test_the_logits_rank_where_there_are_any() -> None:
     points = Keypoints(np.zeros((3, 2)), [1, 1, 1], (8, 8), logits=[20, 30, 25])
     assert points.best(2).logits.tolist() == [30, 25]

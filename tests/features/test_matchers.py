@@ -83,14 +83,6 @@ def test_known_answer(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["flann", "exact"])
-def test_two_copies_of_the_nearest_are_no_match(name: str) -> None:
-    first = points((1, 2), (8, 8))
-    second = points((1, 2), (1, 2), (8, 8))
-    matches = match_descriptors(first, second, get_matcher(name), ratio=1.0)
-    assert pairs(matches) == {(1, 2)}
-
-
-@pytest.mark.parametrize("name", ["flann", "exact"])
 @pytest.mark.parametrize("mutual", [False, True])
 @pytest.mark.parametrize(("count0", "count1"), [(0, 0), (0, 5), (5, 0), (5, 1), (1, 1), (0, 1)])
 def test_without_a_second_best_nothing_matches(
@@ -163,24 +155,6 @@ def test_every_matcher_keeps_the_contract(name: str, count: int) -> None:
     assert (np.diff(distances, axis=1) >= 0).all()
     np.testing.assert_array_equal(queries, before[0])
     np.testing.assert_array_equal(base, before[1])
-
-
-@pytest.mark.parametrize(
-    ("count", "positions", "expected"),
-    [(100, True, "exact"), (30_000, True, "patchmatch"), (30_000, False, "flann")],
-)
-def test_auto_takes_the_matcher_that_fits(
-    count: int, positions: bool, expected: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    called = []
-    for name in ("exact", "patchmatch", "flann"):
-        monkeypatch.setattr(
-            matchers, f"{name}_neighbours", lambda *_, name=name: called.append(name)
-        )
-    some = np.zeros((count, 8), np.uint8)
-    places = np.zeros((count, 2))
-    get_matcher("auto")(some, some, 1, 0, (places, places) if positions else None)
-    assert called == [expected]
 
 
 def test_auto_takes_patchmatch_only_where_it_suits(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,9 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from deepdetect import DeepDetect
 from deepdetect._shared.errors import OptionError
-from deepdetect.features.selection import SelectionOptions, grid_subsample, select_keypoints
+from deepdetect.features.selection import (
+    SelectionOptions,
+    grid_subsample,
+    select_keypoints,
+    suppress_neighbors,
+)
 
 
 def bayer(bits: int) -> np.ndarray:
@@ -80,21 +84,6 @@ def test_equals_plain_loops(data: st.DataObject, shape: tuple[int, int]) -> None
     assert keypoints.scores.tolist() == [float(heatmap[y, x]) for x, y in found]
 
 
-@given(
-    heatmap=arrays(np.float32, st.tuples(st.integers(1, 20), st.integers(1, 20)), elements=LEVELS),
-    radius=st.integers(1, 25),
-)
-def test_suppressed_keypoints_keep_their_distance(heatmap: np.ndarray, radius: int) -> None:
-    keypoints = select_keypoints(heatmap, SelectionOptions(0.25, nms_radius=radius))
-    xy = keypoints.xy
-    distance = np.abs(xy[:, None] - xy[None]).max(2)
-    np.fill_diagonal(distance, np.inf)
-    assert len(xy) == 0 or distance.min() > radius
-    # The most probable pixel is always kept.
-    if (heatmap > 0.25).any():
-        assert keypoints.scores.max() == heatmap.max()
-
-
 def test_the_threshold_is_strict() -> None:
     heatmap = np.zeros((16, 20), np.float32)
     heatmap[3, 4] = 0.5
@@ -120,14 +109,6 @@ def test_a_density_takes_no_impossible_pixel() -> None:
     assert len(select_keypoints(heatmap, SelectionOptions(density=0.5))) == 1
 
 
-@pytest.mark.parametrize("count", [1, 7, 100, 10_000])
-def test_the_most_probable_are_kept(count: int) -> None:
-    heatmap = np.random.default_rng(1).random((30, 40)).astype(np.float32)
-    keypoints = select_keypoints(heatmap, SelectionOptions(0.5, max_keypoints=count, nms_radius=0))
-    best = np.sort(heatmap[heatmap > 0.5])[::-1][:count]
-    np.testing.assert_array_equal(np.sort(keypoints.scores)[::-1], best)
-
-
 @pytest.mark.parametrize(
     "options", [SelectionOptions(max_keypoints=3), SelectionOptions(density=3 / 400)]
 )
@@ -151,12 +132,6 @@ def test_ties_are_spread_over_the_image(radius: int, count: int) -> None:
     cells = (xy // (50, 60)).astype(int)
     share = np.bincount(cells[:, 1] * 4 + cells[:, 0], minlength=8) / count
     np.testing.assert_allclose(share, 1 / 8, atol=1.1 / count + 0.03)
-
-
-def test_a_plateau_leaves_its_first_pixel() -> None:
-    heatmap = np.full((9, 9), 0.8, np.float32)
-    keypoints = select_keypoints(heatmap, SelectionOptions(nms_radius=20))
-    assert keypoints.xy.tolist() == [[0, 0]]
 
 
 @pytest.mark.parametrize("shape", [(31, 24), (24, 30), (24, 31, 1), (24,), ()])
@@ -208,25 +183,6 @@ def test_logits_rank_what_float32_rounds_to_one() -> None:
         assert found.best(1).xy.tolist() == [[5, 15]]
 
 
-def test_the_best_keypoints_of_a_photograph_are_no_lattice(photo: np.ndarray) -> None:
-    """Ranked by probabilities, many of which are 1, they lay on a grid of powers of two."""
-    detector = DeepDetect()
-    keypoints = detector.detect(photo, max_keypoints=100, nms_radius=1)
-    assert len(keypoints) == 100
-    xy = np.rint(keypoints.xy).astype(int)
-    offsets = np.bincount((xy[:, 1] % 4) * 4 + xy[:, 0] % 4, minlength=16) / len(xy)
-    ours = offsets.max()
-    heatmap, logits = detector.heatmap_and_logits(photo)
-    old = select_keypoints(heatmap, SelectionOptions(max_keypoints=100))
-    saturated = (heatmap == 1).sum()
-    assert saturated > 200  # else this photograph shows nothing
-    assert np.sort(logits[heatmap == 1])[-1] > np.sort(logits[heatmap == 1])[0]
-    xy = old.xy.astype(int)
-    offsets = np.bincount((xy[:, 1] % 4) * 4 + xy[:, 0] % 4, minlength=16) / len(xy)
-    # The network itself, which halves the image twice, prefers every other pixel a little.
-    assert ours < 0.4 < offsets.max() - 0.15
-
-
 @pytest.mark.parametrize(("x", "y"), [(12.0, 9.0), (12.3, 9.0), (11.6, 9.45), (12.25, 8.75)])
 def test_the_peak_of_a_paraboloid_is_found(x: float, y: float) -> None:
     row, column = np.indices((20, 24))
@@ -257,3 +213,30 @@ def test_grid_subsample_takes_one_of_each_cell() -> None:
     assert (np.diff(rows) > 0).all()
     np.testing.assert_array_equal(rows, grid_subsample(points, 10))
     assert (rows != grid_subsample(points, 10, seed=1)).any()
+
+
+@pytest.mark.parametrize("radius", [0.7, 2.0, 5.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_as_a_search_among_all_kept_ones(radius: float, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    xy = generator.uniform(-3, 30, (300, 2)).astype(np.float32)
+    scores = generator.integers(20, size=300)
+    kept: list[int] = []
+    for row in np.argsort(-scores, kind="stable"):
+        gaps = np.linalg.norm(xy[kept].astype(float) - xy[row].astype(float), axis=1)
+        if not len(kept) or gaps.min() >= radius:
+            kept.append(int(row))
+    assert suppress_neighbors(xy, scores, radius).tolist() == kept
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_of_two_radii_the_smaller_one_counts(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    xy = generator.uniform(-3, 30, (300, 2))
+    scores, radii = generator.uniform(size=300), generator.uniform(0.5, 6, 300)
+    kept: list[int] = []
+    for row in np.argsort(-scores):
+        gaps = np.linalg.norm(xy[kept] - xy[row], axis=1)
+        if (gaps >= np.minimum(radii[kept], radii[row])).all():
+            kept.append(int(row))
+    assert suppress_neighbors(xy, scores, radii).tolist() == kept

@@ -123,13 +123,6 @@ def test_at_their_own_scale_any_sizes_are_described_in_order() -> None:
     assert none.shape == (0, 128)
 
 
-def test_root_sift_has_a_length_of_512() -> None:
-    descriptors = root_sift_descriptors(make_gray(), make_points())
-    assert descriptors.dtype == np.uint8
-    lengths = np.linalg.norm(descriptors.astype(int), axis=1)
-    np.testing.assert_allclose(lengths, 512, rtol=0.005)
-
-
 def test_root_sift_distances_are_hellinger_distances_of_sift() -> None:
     """|sqrt(p) - sqrt(q)|^2 = 2 - 2 * sum(sqrt(p * q)) for distributions p and q."""
     gray, xy = make_gray(), make_points()

@@ -80,13 +80,6 @@ def test_a_flat_image_has_no_keypoints(shape: tuple[int, int]) -> None:
     assert found.descriptors.dtype == np.uint8
 
 
-def test_spread_takes_the_strongest_of_each_cell_before_any_second() -> None:
-    xy = np.array([[1, 1], [2, 2], [3, 1], [50, 50], [51, 50], [95, 5]], float)
-    strength = np.array([9.0, 8, 7, 2, 3, 1])
-    assert spread_over_grid(xy, strength, (100, 100), 6).tolist() == [0, 4, 5, 1, 3, 2]
-    assert spread_over_grid(xy, strength, (100, 100), 3).tolist() == [0, 4, 5]
-
-
 @given(
     count=st.integers(0, 80),
     most=st.integers(0, 90),

@@ -73,13 +73,10 @@ def draw_matches(
         rgb0, rgb1: the images, (H, W, 3) uint8 RGB.
         points0, points1: (M, 2) matched positions.
         good: (M,) bool: green lines, the others red.
-        lines: number of lines; the sample is random with a fixed seed, so green and red
-            have the proportions of all matches.
+        lines: number of lines; the sample is random, so green and red have the proportions of all
+            matches.
         by_position: colour good matches by where they are in the first image, and draw more of
-            them as dots than as lines, so that one sees what was found where.
-
-    Returns:
-        (H, W, 3) uint8 RGB, H that of the taller image, W that of both at this height.
+            them as dots than as lines, so that one sees what was matched where.
     """
     height = max(rgb0.shape[0], rgb1.shape[0])
     width = sum(rgb.shape[1] * height / len(rgb) for rgb in (rgb0, rgb1))
@@ -95,8 +92,8 @@ def draw_matches(
     order = np.random.default_rng(0).permutation(len(points0))[: DOTS if by_position else lines]
     colors = np.where(good[order, None], GREEN, RED)
     if by_position:
-        where = points0[order] / (shown[0].shape[1], height)
-        colors[good[order]] = _colors_of_positions(where[good[order]])
+        relative = points0[order] / (shown[0].shape[1], height)
+        colors[good[order]] = _colors_of_positions(relative[good[order]])
     with_line = np.arange(len(order)) < (LINES if by_position else lines)
     unit = line_scale(canvas)
     for k in np.argsort(good[order], kind="stable"):  # the good ones on top
@@ -105,17 +102,17 @@ def draw_matches(
         end = tuple(int(v) for v in np.rint(points1[row] + [shown[0].shape[1], 0]))
         if with_line[k]:
             cv2.line(canvas, start, end, color, round(unit), cv2.LINE_AA)
-        for place in (start, end):
-            cv2.circle(canvas, place, round(2 * unit), color, -1, cv2.LINE_AA)
+        for point in (start, end):
+            cv2.circle(canvas, point, round(2 * unit), color, -1, cv2.LINE_AA)
     return canvas
 
 
-def _colors_of_positions(where: np.ndarray) -> np.ndarray:
+def _colors_of_positions(positions: np.ndarray) -> np.ndarray:
     """Return (N, 3) RGB colours of positions in [0, 1]: hue from left to right, dark downwards.
 
     None is red, which matches that are not good have.
     """
-    x, y = np.clip(where, 0, 1).T
+    x, y = np.clip(positions, 0, 1).T
     hsv = np.stack([20 + 120 * x, np.full(len(x), 230), 255 - 110 * y], 1)  # of 180, 255, 255
     hsv = np.rint(hsv).astype(np.uint8)[None]
     return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0] if len(x) else np.empty((0, 3), np.uint8)
@@ -123,11 +120,9 @@ def _colors_of_positions(where: np.ndarray) -> np.ndarray:
 
 def _of_height(rgb: np.ndarray, height: int) -> np.ndarray:
     """Scale an image to a height."""
-    if len(rgb) == height:
-        return rgb
     width = max(1, round(rgb.shape[1] * height / len(rgb)))
-    how = cv2.INTER_LINEAR if height > len(rgb) else cv2.INTER_AREA
-    return cv2.resize(rgb, (width, height), interpolation=how)
+    interpolation = cv2.INTER_LINEAR if height > len(rgb) else cv2.INTER_AREA
+    return cv2.resize(rgb, (width, height), interpolation=interpolation)
 
 
 def line_scale(picture: np.ndarray) -> float:
@@ -144,11 +139,7 @@ def draw_circle(
 
 
 def checked_image(image: Any, size: tuple[int, int], channels: Channels) -> np.ndarray:
-    """Return the image of keypoints, of any kind, as (H, W, 3) uint8 RGB.
-
-    Raises:
-        ImageError: it is a path, or has another (width, height) than `size`.
-    """
+    """Return the image of keypoints of a (width, height), of any kind, as (H, W, 3) uint8 RGB."""
     if isinstance(image, (str, bytes)) or hasattr(image, "__fspath__"):
         raise ImageError("a picture needs the image itself, not a path: give load_image(path)")
     if hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
@@ -170,12 +161,8 @@ def html_summary(
 ) -> str:
     """Return a small table in HTML, and a picture of positions, about ten kB.
 
-    Args:
-        title: the caption.
-        rows: text by name.
-        points: positions and (width, height) of one image or two, side by side.
-        lines: (M, 2) positions in the first and then in the second image, (M, 4) in all, some of
-            which are joined by lines.
+    The positions are of one image or two, side by side; some of the (M, 4) `lines`, positions in
+    the first and in the second, are drawn.
     """
     cells = "".join(
         f"<tr><td>{html.escape(name)}</td><td>{html.escape(text)}</td></tr>"
@@ -205,12 +192,8 @@ def _position_picture(points: Sequence[Points], lines: np.ndarray | None) -> np.
     picture = np.repeat(joined[:, :, None] // 2, 3, axis=2)
     picture[..., 1] = joined
     if lines is not None:
-        for x0, y0, x1, y1 in lines[_sample(len(lines), MAX_LINES)] * scale:
+        chosen = np.sort(np.random.default_rng(0).permutation(len(lines))[:MAX_LINES])
+        for x0, y0, x1, y1 in lines[chosen] * scale:
             start, end = (round(x0), round(y0)), (round(x1) + panels[0].shape[1], round(y1))
             cv2.line(picture, start, end, (90, 220, 255))  # smooth ones take five times the bytes
     return picture
-
-
-def _sample(count: int, size: int) -> np.ndarray:
-    """Choose rows at random, the same ones each time; all where they are few."""
-    return np.sort(np.random.default_rng(0).permutation(count)[:size])

@@ -20,6 +20,9 @@ SIZES_PER_SCALE = {"diameter": 1.0, "sigma": 2.0}
 MAX_COORDINATE_BITS = 12
 """Of a position in `bayer_order`: float32 holds the order exactly up to this many."""
 
+UNSET_ANGLE = -1
+"""OpenCV's angle of a keypoint that has none."""
+
 _OPTIONAL: dict[str, Any] = {
     "logits": np.float32,
     "sizes": np.float32,
@@ -82,19 +85,15 @@ class Keypoints:
             )
         if not (np.isfinite(xy).all() and np.isfinite(scores).all()):
             raise OptionError("keypoints need finite positions and scores")
-        object.__setattr__(self, "xy", xy)
-        object.__setattr__(self, "scores", scores)
-        object.__setattr__(self, "image_size", (int(self.image_size[0]), int(self.image_size[1])))
+        fields = {"xy": xy, "scores": scores}
         for name, dtype in _OPTIONAL.items():
-            if getattr(self, name) is None:
-                continue
-            values = np.asarray(getattr(self, name), dtype)
-            if values.shape != scores.shape:
-                raise OptionError(
-                    f"keypoints need as many {name} as scores, not {values.shape} and "
-                    f"{scores.shape}"
-                )
-            object.__setattr__(self, name, values)
+            if getattr(self, name) is not None:
+                fields[name] = values = np.asarray(getattr(self, name), dtype)
+                if values.shape != scores.shape:
+                    raise OptionError(
+                        f"keypoints need as many {name} as scores, not {values.shape} and "
+                        f"{scores.shape}"
+                    )
         if self.descriptors is not None:
             descriptors = np.asarray(self.descriptors)
             if descriptors.dtype != np.uint8:
@@ -104,7 +103,10 @@ class Keypoints:
                     f"{len(scores)} keypoints need ({len(scores)}, D) descriptors, "
                     f"not {descriptors.shape}"
                 )
-            object.__setattr__(self, "descriptors", descriptors)
+            fields["descriptors"] = descriptors
+        for name, values in fields.items():
+            object.__setattr__(self, name, values)
+        object.__setattr__(self, "image_size", (int(self.image_size[0]), int(self.image_size[1])))
 
     @classmethod
     @suggest_keywords
@@ -266,9 +268,10 @@ class Keypoints:
 
     def __getitem__(self, index: slice | np.ndarray | list[int] | int) -> Keypoints:
         rows = [int(index)] if isinstance(index, (int, np.integer)) else index
-        names = ("xy", "scores", *_OPTIONAL, "descriptors")
-        parts = {name: getattr(self, name) for name in names}
-        return replace(self, **{k: v[rows] for k, v in parts.items() if v is not None})
+        columns = {
+            name: getattr(self, name) for name in ("xy", "scores", *_OPTIONAL, "descriptors")
+        }
+        return replace(self, **{k: v[rows] for k, v in columns.items() if v is not None})
 
     def __iter__(self) -> Iterator[np.ndarray]:
         return iter(self.xy)
@@ -298,12 +301,7 @@ class Keypoints:
 
 
 def unit_length(descriptors: np.ndarray) -> np.ndarray:
-    """Return (N, D) descriptors as float32 of length 1.
-
-    Example:
-        >>> unit_length(np.array([[3, 4]], np.uint8)).round(3).tolist()
-        [[0.6000000238418579, 0.800000011920929]]
-    """
+    """Return (N, D) descriptors as float32 of length 1."""
     values = descriptors.astype(np.float32)
     lengths = np.linalg.norm(values, axis=1, keepdims=True)
     unit: np.ndarray = values / np.maximum(lengths, np.finfo(np.float32).tiny)
@@ -311,16 +309,10 @@ def unit_length(descriptors: np.ndarray) -> np.ndarray:
 
 
 def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Rank positions as an ordered dither does: the first N are spread evenly, for any N.
+    """Rank (N, 2) positions as an ordered dither does: the first N are spread evenly, for any N.
 
-    It is Bayer's matrix, of the image's own size: neighbours come far apart in the order.
-
-    Args:
-        xy: (N, 2) positions; their nearest pixels count.
-        size: (width, height) of the image.
-
-    Returns:
-        (N,) float32 in [0, 1), the first the lowest.
+    It is Bayer's matrix, of the image's own (width, height): neighbours come far apart. Nearest
+    pixels count. The ranks are (N,) float32 in [0, 1).
 
     Example:
         >>> bayer_order(np.array([[0, 0], [1, 0], [0, 1], [1, 1]]), (2, 2)).tolist()
@@ -335,28 +327,18 @@ def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     return (order / 4**bits).astype(np.float32)
 
 
-UNSET_ANGLE = -1
-"""OpenCV's angle of a keypoint that has none."""
-
-
 def nearest_keypoints(
-    places: np.ndarray, xy: np.ndarray, image_size: tuple[int, int]
+    positions: np.ndarray, xy: np.ndarray, image_size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the keypoint nearest to each position, of those in the 3x3 pixels around it.
 
     Args:
-        places: (N, 2) positions.
+        positions: (N, 2).
         xy: (M, 2) keypoints of the same image. Of several on one pixel the first counts.
         image_size: (width, height) of the image.
 
     Returns:
         (N,) int32 rows of `xy`, and (N,) distances in pixels: -1 and infinite where none is near.
-
-    Example:
-        >>> points = np.array([[2, 3], [4, 3]])
-        >>> places = np.array([[3.9, 3], [2, 3], [6, 6]])
-        >>> [values.round(1).tolist() for values in nearest_keypoints(places, points, (8, 8))]
-        [[1, 0, -1], [0.1, 0.0, inf]]
     """
     from .kernels import nearest_of_nine
 
@@ -365,11 +347,10 @@ def nearest_keypoints(
     rows = np.flatnonzero(((pixels >= 0) & (pixels < image_size)).all(axis=1))[::-1]
     grid = np.full((height, width), -1, np.int32)
     grid[pixels[rows, 1], pixels[rows, 0]] = rows  # the first of several is written last
-    places = np.ascontiguousarray(places, np.float64)
-    nearest = np.full(len(places), -1, np.int32)
-    distances = np.full(len(places), np.inf)
-    keypoints = np.ascontiguousarray(xy, np.float64)
-    parallel_for(len(places), nearest_of_nine, places, keypoints, grid, nearest, distances)
+    positions, xy = (np.ascontiguousarray(points, np.float64) for points in (positions, xy))
+    nearest = np.full(len(positions), -1, np.int32)
+    distances = np.full(len(positions), np.inf)
+    parallel_for(len(positions), nearest_of_nine, positions, xy, grid, nearest, distances)
     return nearest, distances
 
 

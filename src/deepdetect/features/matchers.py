@@ -1,4 +1,7 @@
-"""Matchers."""
+"""Matching of descriptors: nearest neighbours by several matchers, and the ratio test.
+
+To add a matcher, write a function of the signature of `Matcher` and add it to `MATCHERS`.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +17,22 @@ from .._shared.parallel import parallel_for
 from .._shared.registry import look_up
 from .keypoints import on_pixels
 
-FLANN_INDEX_KDTREE = 1
+BLOCK_SIZE = 4_000_000
+"""Numbers of four bytes that exact search holds at a time: 16 MB, most of which caches hold."""
 
-TREES, CHECKS = 5, 50
+MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
+"""Length of descriptors of bytes up to which single precision computes distances exactly."""
+
+MAX_EXACT_PRODUCT = 4e8
+"""Keypoints of both images, multiplied, up to which all distances are computed in a moment."""
+
+HAMMING_QUERIES = 20_000
+"""At a time: OpenCV keeps an object for each of their neighbours."""
+
+HAMMING_BASE = 200_000
+"""At a time: OpenCV's search takes fewer than 2^18."""
+
+FLANN_INDEX_KDTREE, TREES, CHECKS = 1, 5, 50
 """Of FLANN, as in the paper's code."""
 
 LISTS_PER_ROOT, PROBES, TRAINING_PER_LIST = 4, 16, 40
@@ -26,74 +42,8 @@ are searched for each query; descriptors that the centre of each list is trained
 MIN_INDEXED = 4096
 """With fewer descriptors faiss compares all: an inverted file would save nothing."""
 
-
-def flann_neighbours(
-    queries: np.ndarray,
-    base: np.ndarray,
-    count: int,
-    seed: int,
-    positions: object = None,
-    trees: int = TREES,
-    checks: int = CHECKS,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find approximate nearest neighbours in random kd-trees; otherwise as `Matcher`.
-
-    Args:
-        trees: number of trees.
-        checks: leaves that are visited for each query.
-    """
-    queries, base = (np.asarray(part, np.float32) for part in (queries, base))
-
-    def search() -> tuple[np.ndarray, np.ndarray]:
-        cv2.setRNGSeed(seed)
-        index = cv2.flann_Index(base, {"algorithm": FLANN_INDEX_KDTREE, "trees": trees})
-        return index.knnSearch(queries, count, params={"checks": checks})
-
-    # OpenCV has one random number generator per thread: that of the caller is left alone.
-    with ThreadPoolExecutor(1) as thread:
-        rows, squared = thread.submit(search).result()
-    return rows, np.sqrt(squared)
-
-
-def faiss_neighbours(
-    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find approximate nearest neighbours in an inverted file; otherwise as `Matcher`.
-
-    About one neighbour in fifty is missed.
-
-    Raises:
-        MissingExtraError: faiss is not installed.
-    """
-    try:
-        import faiss
-    except ImportError:
-        raise MissingExtraError(
-            "the matcher faiss needs faiss: run pip install faiss-cpu, or use flann"
-        ) from None
-    quantizer = faiss.ScalarQuantizer
-    kind = quantizer.QT_8bit_direct if base.dtype == np.uint8 else quantizer.QT_8bit
-    queries, base = (np.ascontiguousarray(part, np.float32) for part in (queries, base))
-    width = base.shape[1]
-    centres = faiss.IndexFlatL2(width)
-    index: Any = centres
-    if len(base) >= MIN_INDEXED:
-        lists = min(int(LISTS_PER_ROOT * np.sqrt(len(base))), len(base) // TRAINING_PER_LIST)
-        index = faiss.IndexIVFScalarQuantizer(centres, width, lists, kind, faiss.METRIC_L2, False)
-        index.cp.seed = seed
-        index.cp.niter = 5
-        index.nprobe = PROBES
-        order = np.random.default_rng(seed).permutation(len(base))
-        index.train(base[np.sort(order[: lists * TRAINING_PER_LIST])])
-    index.add(base)
-    squared, rows = index.search(queries, count)
-    missing = rows < 0  # the lists that were searched held too few
-    rows, squared = np.where(missing, 0, rows), np.where(missing, np.inf, squared)
-    return rows.astype(np.int32), np.sqrt(np.maximum(squared, 0)).astype(np.float32)
-
-
 SWEEPS = 4
-"""Over all queries, down and up in turn."""
+"""Of PatchMatch over all queries, down and up in turn."""
 
 OFFSETS_PX = (1, 4, 12)
 """Distances to the queries whose neighbours are tried; one pixel where keypoints are dense."""
@@ -104,89 +54,6 @@ BAND_HEIGHT_PX = 96
 SEARCH_SHRINK = 3
 """Random tries begin in the whole image around the best neighbour; each next one is so many times
 nearer."""
-
-
-def patchmatch_neighbours(
-    queries: np.ndarray,
-    base: np.ndarray,
-    count: int,
-    seed: int,
-    positions: tuple[np.ndarray, np.ndarray] | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find two approximate nearest neighbours of each query by spreading good ones.
-
-    A `Matcher` of bytes on whole pixels; the result is the same for any number of threads.
-
-    Raises:
-        OptionError: the descriptors are not bytes, or the keypoints are not on whole pixels or have
-            scales of their own.
-    """
-    if queries.dtype != np.uint8 or base.dtype != np.uint8:
-        raise OptionError(
-            "the matcher patchmatch needs descriptors of bytes, such as sift and rootsift: use "
-            "flann, faiss or exact"
-        )
-    if positions is None:
-        raise OptionError(
-            "the matcher patchmatch needs dense keypoints of one scale and angle, not points with "
-            "their own: use auto, flann, faiss or exact"
-        )
-    if count > 2 or len(base) < 2:
-        raise OptionError("the matcher patchmatch finds one or two neighbours, of two or more")
-    from . import kernels
-
-    xy0, xy1 = (_pixels(xy) for xy in positions)
-    # In row-major order: a sweep builds on what it has just found.
-    order = _row_major_order(xy0)
-    if order is not None:
-        queries, xy0 = queries[order], xy0[order]
-    at0, at1 = _grid(xy0), _grid(xy1)
-    edges = np.arange(0, at0.shape[0] + BAND_HEIGHT_PX, BAND_HEIGHT_PX)
-    bands = np.searchsorted(xy0[:, 1], edges)
-    rows = np.empty((len(queries), 2), np.int32)
-    distances = np.empty((len(queries), 2), np.int32)
-    offsets, radii = np.array(OFFSETS_PX), _radii(max(at1.shape))
-    parallel_for(len(queries), kernels.patchmatch_start, queries, base, seed, rows, distances)
-    images = queries, base, xy0, xy1, at0, at1
-    for turn in range(SWEEPS):
-        tries = offsets, turn, seed, radii
-        found = rows.copy(), rows, distances
-        parallel_for(len(bands) - 1, kernels.patchmatch_sweep, bands, *images, *tries, *found)
-    gaps = np.sqrt(distances.astype(np.float32))
-    if order is not None:
-        back = np.empty_like(order)
-        back[order] = np.arange(len(order))
-        rows, gaps = rows[back], gaps[back]
-    return rows[:, :count], gaps[:, :count]
-
-
-def _row_major_order(pixels: np.ndarray) -> np.ndarray | None:
-    """Return the rows by lines and columns; None when they are sorted, as of most detectors."""
-    number = pixels[:, 1].astype(np.int64) * (int(pixels[:, 0].max()) + 1) + pixels[:, 0]
-    return None if (number[1:] >= number[:-1]).all() else np.argsort(number, kind="stable")
-
-
-def _pixels(xy: np.ndarray) -> np.ndarray:
-    if not on_pixels(xy):
-        raise OptionError(
-            "the matcher patchmatch needs keypoints on whole pixels: use flann, faiss or exact"
-        )
-    return np.asarray(xy).astype(np.int32)
-
-
-def _grid(xy: np.ndarray) -> np.ndarray:
-    """Return the row at each pixel of the smallest image that holds all, -1 where there is none."""
-    width, height = xy.max(axis=0) + 1
-    grid = np.full((height, width), -1, np.int32)
-    grid[xy[:, 1], xy[:, 0]] = np.arange(len(xy))
-    return grid
-
-
-def _radii(longest_side: int) -> np.ndarray:
-    radii = [longest_side // 2]
-    while radii[-1] > SEARCH_SHRINK:
-        radii.append(radii[-1] // SEARCH_SHRINK)
-    return np.maximum(radii, 1)
 
 
 class Matcher(Protocol):
@@ -215,19 +82,6 @@ class Matcher(Protocol):
         ...
 
 
-BLOCK_SIZE = 4_000_000
-"""Numbers of four bytes that exact search holds at a time: 16 MB, most of which caches hold."""
-
-MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
-"""Length of descriptors of bytes up to which single precision computes distances exactly."""
-
-HAMMING_QUERIES = 20_000
-"""At a time: OpenCV keeps an object for each of their neighbours."""
-
-HAMMING_BASE = 200_000
-"""At a time: OpenCV's search takes fewer than 2^18."""
-
-
 def exact_neighbours(
     queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -253,16 +107,15 @@ def exact_neighbours(
         factors = np.ones((len(block), length + 1), precision)
         np.multiply(block, -2, out=factors[:, :length])
         partial = factors @ wide
-        found = np.empty((len(block), count), np.intp)
-        every = np.arange(len(block))
+        nearest = np.empty((len(block), count), np.intp)
         for rank in range(count):  # argmin takes the lower row of equals
-            found[:, rank] = partial.argmin(1)
-            partial[every, found[:, rank]] = np.inf
-        found.sort(axis=1)
+            nearest[:, rank] = partial.argmin(1)
+            partial[np.arange(len(block)), nearest[:, rank]] = np.inf
+        nearest.sort(axis=1)
         # From the differences themselves, so that distances are exact near 0.
-        gaps = np.linalg.norm(block[:, None] - base[found], axis=2)
+        gaps = np.linalg.norm(block[:, None] - base[nearest], axis=2)
         order = np.argsort(gaps, axis=1, kind="stable")
-        rows[start : start + step] = np.take_along_axis(found, order, 1)
+        rows[start : start + step] = np.take_along_axis(nearest, order, 1)
         distances[start : start + step] = np.take_along_axis(gaps, order, 1)
     return rows, distances
 
@@ -270,11 +123,7 @@ def exact_neighbours(
 def hamming_neighbours(
     queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find nearest neighbours of binary descriptors (ORB, BRISK) by Hamming, as a `Matcher`.
-
-    Raises:
-        OptionError: the descriptors are not binary.
-    """
+    """Find nearest neighbours of binary descriptors (ORB, BRISK) by Hamming, as a `Matcher`."""
     if queries.dtype != np.uint8 or base.dtype != np.uint8:
         raise OptionError(
             "the matcher hamming compares binary descriptors, such as ORB's: use exact or flann"
@@ -298,13 +147,128 @@ def _search_part(
     queries: np.ndarray, base: np.ndarray, count: int, first: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Search a part of the base, whose first row has the number `first`."""
-    found = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(queries, base, min(count, len(base)))
-    rows = np.array([[one.trainIdx for one in some] for some in found], np.int32)
-    return rows + first, np.array([[one.distance for one in some] for some in found], np.float32)
+    matches = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(queries, base, min(count, len(base)))
+    rows = np.array([[match.trainIdx for match in some] for some in matches], np.int32)
+    distances = np.array([[match.distance for match in some] for some in matches], np.float32)
+    return rows + first, distances
 
 
-MAX_EXACT_PRODUCT = 4e8
-"""Keypoints of both images, multiplied, up to which all distances are computed in a moment."""
+def flann_neighbours(
+    queries: np.ndarray,
+    base: np.ndarray,
+    count: int,
+    seed: int,
+    positions: object = None,
+    trees: int = TREES,
+    checks: int = CHECKS,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find approximate nearest neighbours in random kd-trees; otherwise as `Matcher`.
+
+    `checks` leaves are visited for each query.
+    """
+    queries, base = (np.asarray(part, np.float32) for part in (queries, base))
+
+    def search() -> tuple[np.ndarray, np.ndarray]:
+        cv2.setRNGSeed(seed)
+        index = cv2.flann_Index(base, {"algorithm": FLANN_INDEX_KDTREE, "trees": trees})
+        return index.knnSearch(queries, count, params={"checks": checks})
+
+    # OpenCV has one random number generator per thread: that of the caller is left alone.
+    with ThreadPoolExecutor(1) as thread:
+        rows, squared = thread.submit(search).result()
+    return rows, np.sqrt(squared)
+
+
+def faiss_neighbours(
+    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find approximate nearest neighbours in an inverted file; otherwise as `Matcher`.
+
+    The file holds quantised descriptors (Johnson, Douze and Jégou, "Billion-scale similarity search
+    with GPUs", 2017); bytes lose nothing. About one neighbour in fifty is missed.
+    """
+    try:
+        import faiss
+    except ImportError:
+        raise MissingExtraError(
+            "the matcher faiss needs faiss: run pip install faiss-cpu, or use flann"
+        ) from None
+    quantizer = faiss.ScalarQuantizer
+    kind = quantizer.QT_8bit_direct if base.dtype == np.uint8 else quantizer.QT_8bit
+    queries, base = (np.ascontiguousarray(part, np.float32) for part in (queries, base))
+    width = base.shape[1]
+    centres = faiss.IndexFlatL2(width)
+    index: Any = centres
+    if len(base) >= MIN_INDEXED:
+        lists = min(int(LISTS_PER_ROOT * np.sqrt(len(base))), len(base) // TRAINING_PER_LIST)
+        index = faiss.IndexIVFScalarQuantizer(centres, width, lists, kind, faiss.METRIC_L2, False)
+        index.cp.seed = seed
+        index.cp.niter = 5
+        index.nprobe = PROBES
+        order = np.random.default_rng(seed).permutation(len(base))
+        index.train(base[np.sort(order[: lists * TRAINING_PER_LIST])])
+    index.add(base)
+    squared, rows = index.search(queries, count)
+    missing = rows < 0  # the lists that were searched held too few
+    rows, squared = np.where(missing, 0, rows), np.where(missing, np.inf, squared)
+    return rows.astype(np.int32), np.sqrt(np.maximum(squared, 0)).astype(np.float32)
+
+
+def patchmatch_neighbours(
+    queries: np.ndarray,
+    base: np.ndarray,
+    count: int,
+    seed: int,
+    positions: tuple[np.ndarray, np.ndarray] | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find one or two approximate nearest neighbours of each query by spreading good ones.
+
+    A neighbour's match, moved along, is probably a good one (Barnes et al., "PatchMatch", 2009). On
+    hundreds of thousands of dense keypoints it takes a twentieth of FLANN's time and finds more
+    correct matches; it does not suit few or scattered ones. A `Matcher` of bytes on whole pixels;
+    the result is the same for any number of threads.
+    """
+    if queries.dtype != np.uint8 or base.dtype != np.uint8:
+        raise OptionError(
+            "the matcher patchmatch needs descriptors of bytes, such as sift and rootsift: use "
+            "flann, faiss or exact"
+        )
+    if positions is None or not all(on_pixels(xy) for xy in positions):
+        raise OptionError(
+            "the matcher patchmatch needs dense keypoints of one scale and angle, on whole pixels: "
+            "use auto, flann, faiss or exact"
+        )
+    from . import kernels
+
+    xy0, xy1 = (np.asarray(xy).astype(np.int32) for xy in positions)
+    # In row-major order, as of most detectors: a sweep builds on the queries before.
+    order = np.lexsort((xy0[:, 0], xy0[:, 1]))
+    queries, xy0 = queries[order], xy0[order]
+    at0, at1 = _grid(xy0), _grid(xy1)
+    edges = np.arange(0, at0.shape[0] + BAND_HEIGHT_PX, BAND_HEIGHT_PX)
+    bands = np.searchsorted(xy0[:, 1], edges)
+    radii = [max(at1.shape) // 2]
+    while radii[-1] > SEARCH_SHRINK:
+        radii.append(radii[-1] // SEARCH_SHRINK)
+    rows = np.empty((len(queries), 2), np.int32)
+    distances = np.empty((len(queries), 2), np.int32)
+    parallel_for(len(queries), kernels.patchmatch_start, queries, base, seed, rows, distances)
+    images = queries, base, xy0, xy1, at0, at1
+    for turn in range(SWEEPS):
+        tries = np.array(OFFSETS_PX), turn, seed, np.maximum(radii, 1)
+        results = rows.copy(), rows, distances
+        parallel_for(len(bands) - 1, kernels.patchmatch_sweep, bands, *images, *tries, *results)
+    back = np.empty_like(order)
+    back[order] = np.arange(len(order))
+    return rows[back, :count], np.sqrt(distances[back, :count].astype(np.float32))
+
+
+def _grid(xy: np.ndarray) -> np.ndarray:
+    """Return the row at each pixel of the smallest image that holds all, -1 where there is none."""
+    width, height = xy.max(axis=0) + 1
+    grid = np.full((height, width), -1, np.int32)
+    grid[xy[:, 1], xy[:, 0]] = np.arange(len(xy))
+    return grid
 
 
 def automatic_neighbours(
@@ -316,9 +280,7 @@ def automatic_neighbours(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find neighbours exactly where keypoints are few, else by PatchMatch, else by FLANN.
 
-    PatchMatch spreads good matches over dense keypoints: it needs bytes, and keypoints on whole
-    pixels of one scale and angle; FLANN does not.
-    Arguments and result as of `Matcher`.
+    PatchMatch needs bytes, and keypoints on whole pixels of one scale and angle.
     """
     if len(queries) * len(base) <= MAX_EXACT_PRODUCT:
         return exact_neighbours(queries, base, count, seed, positions)
@@ -339,11 +301,7 @@ MATCHERS: dict[str, Matcher] = {
 
 
 def get_matcher(name: str) -> Matcher:
-    """Return the matcher of this name.
-
-    Raises:
-        OptionError: the name is unknown.
-    """
+    """Return the matcher of this name; an unknown one is an OptionError."""
     return look_up("matcher", name, MATCHERS)
 
 
@@ -388,11 +346,6 @@ def match_descriptors(
     Returns:
         The matches, by ascending row of the first set. There are none when the second set has
         fewer than two descriptors, as there is no second-best neighbour.
-
-    Example:
-        >>> a = np.eye(3, 128, dtype=np.float32)
-        >>> match_descriptors(a, a[::-1].copy(), get_matcher("exact")).indices1.tolist()
-        [2, 1, 0]
     """
     if len(descriptors0) == 0 or len(descriptors1) < 2:
         none = np.empty(0, np.int32)

@@ -85,12 +85,12 @@ class GuidedMatches:
         best_first = np.lexsort((self.indices0, -self.scores))
         _, first = np.unique(pixels[best_first], axis=0, return_index=True)
         kept = np.sort(best_first[first])
-        return replace(
-            self,
-            indices0=self.indices0[kept],
-            points1=self.points1[kept],
-            scores=self.scores[kept],
-            indices1=None if self.indices1 is None else self.indices1[kept],
+        return GuidedMatches(
+            self.indices0[kept],
+            self.points1[kept],
+            self.scores[kept],
+            self.subpixel,
+            None if self.indices1 is None else self.indices1[kept],
         )
 
 
@@ -103,10 +103,10 @@ class _Lazy:
     def __get__(self, instance: Any, owner: type | None = None) -> Keypoints:
         if instance is None:
             raise AttributeError(self.name)  # so that the field has no default
-        held = instance.__dict__[self.name]
-        if not isinstance(held, Keypoints):
-            held = instance.__dict__[self.name] = held()
-        return held
+        keypoints = instance.__dict__[self.name]
+        if not isinstance(keypoints, Keypoints):
+            keypoints = instance.__dict__[self.name] = keypoints()
+        return keypoints
 
     def __set__(self, instance: Any, value: Any) -> None:
         instance.__dict__[self.name] = value
@@ -203,8 +203,8 @@ class Matches:
                     getattr(self, f"points{side}"), keypoints.xy, keypoints.image_size
                 )
                 indices[distances > MAX_KEYPOINT_DISTANCE_PX] = -1
-            found = np.zeros(0, np.int32) if indices is None else np.asarray(indices)
-            object.__setattr__(self, name, self._checked_indices(found, side))
+            indices = np.zeros(0, np.int32) if indices is None else np.asarray(indices)
+            object.__setattr__(self, name, self._checked_indices(indices, side))
 
     def __getstate__(self) -> dict[str, Any]:
         """Return what is pickled: keypoints, not a function that would find them."""
@@ -312,13 +312,12 @@ class Matches:
         """Return what a notebook shows: a small table, and where some of the matches are."""
         from .display import html_summary
 
-        inliers, guide = np.count_nonzero(self.inliers), self.two_view_geometry
+        inliers, geometry = np.count_nonzero(self.inliers), self.two_view_geometry
+        guide = "nothing" if geometry is None else geometry.model
         rows = {
             "inliers": f"{inliers:,} ({self.model})",
-            "guided by": "nothing" if guide is None else guide.model,
+            "guided by": guide if self.success else "no geometry that could be trusted",
         }
-        if not self.success:
-            rows["guided by"] = "no geometry that could be trusted"
         for side, keypoints in enumerate((self.keypoints0, self.keypoints1)):
             width, height = keypoints.image_size
             rows[f"image {side}"] = f"{width}x{height}, {len(keypoints):,} keypoints"
@@ -342,29 +341,24 @@ class Matches:
         )
 
     def _checked_indices(self, indices: np.ndarray, side: int) -> np.ndarray:
-        """Return indices of an image's keypoints as int32.
-
-        Raises:
-            OptionError: they are not one whole number for each match, or of no keypoint.
-        """
+        """Return indices of an image's keypoints as int32, checked."""
         if indices.shape != (len(self),) or (indices.size and indices.dtype.kind not in "iu"):
             raise OptionError(
                 f"matches need one whole number each as indices{side}, not {indices.dtype} "
                 f"numbers of shape {indices.shape}"
             )
-        if not indices.size:
-            return indices.astype(np.int32)
-        count = len(self.keypoints1 if side else self.keypoints0)
-        if not (indices.min() >= -1 and indices.max() < count):
-            raise OptionError(
-                f"indices{side} must lie in [-1, {count - 1}], as there are {count} keypoints, "
-                f"not in [{indices.min()}, {indices.max()}]"
-            )
+        if indices.size:
+            count = len(self.keypoints1 if side else self.keypoints0)
+            if not (indices.min() >= -1 and indices.max() < count):
+                raise OptionError(
+                    f"indices{side} must lie in [-1, {count - 1}], as there are {count} keypoints, "
+                    f"not in [{indices.min()}, {indices.max()}]"
+                )
         return indices.astype(np.int32)
 
 
 def _ends(points: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Number what matches end at: keypoints from 0 on, pixels without one below 0."""
+    """Number the ends of matches: keypoints from 0 on, pixels without one below 0."""
     ends = indices.astype(np.int64)
     without = np.flatnonzero(indices < 0)
     if len(without):

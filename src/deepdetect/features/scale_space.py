@@ -24,28 +24,16 @@ MIN_SIDE_PX = 8
 """Octaves with a shorter side are not used."""
 
 
-def nearest_layers(
-    sizes: np.ndarray, shape: tuple[int, ...], first_octave: int = -1
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the octave and the layer whose sigma is nearest to that of keypoints.
+def nearest_layers(sizes: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the octave and the layer, from 1 to 3, whose sigma is nearest to that of keypoints.
 
-    Args:
-        sizes: (N,) diameters in pixels: twice sigma, as OpenCV's SIFT has them.
-        shape: of the image, height and width first.
-        first_octave: the lowest; -1 is that of the image at twice its size.
-
-    Returns:
-        (N,) int64 octaves, and (N,) int64 layers from 1 to 3.
-
-    Example:
-        >>> octaves, layers = nearest_layers(np.array([1.0, 4.0, 8.0]), (480, 640))
-        >>> octaves.tolist(), layers.tolist()
-        ([-1, 0, 1], [1, 1, 1])
+    By their (N,) sizes, twice sigma, as OpenCV's SIFT has them, in an image of a (height, width).
+    Octave -1 is that of the image at twice its size.
     """
     sigma = np.maximum(np.asarray(sizes, np.float64) / SIZE_PER_SIGMA, 1e-6)
     step = np.rint(LAYERS * np.log2(sigma / BASE_SIGMA_PX)).astype(np.int64)
     last_octave = max(0, int(np.floor(np.log2(max(min(shape[:2]), 1) / MIN_SIDE_PX))))
-    step = np.clip(step, LAYERS * first_octave + 1, LAYERS * (last_octave + 1))
+    step = np.clip(step, 1 - LAYERS, LAYERS * (last_octave + 1))
     octaves = (step - 1) // LAYERS
     return octaves, step - LAYERS * octaves
 
@@ -104,13 +92,6 @@ def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.n
     Returns:
         (N,) float32 in [0, 360): degrees from x towards y, which points down, as
         `cv2.KeyPoint.angle`. 0 where the image is flat.
-
-    Example:
-        >>> gray = np.tile(np.arange(64, dtype=np.uint8), (64, 1))  # brighter to the right
-        >>> dominant_angles(gray, np.array([[32, 32]]), np.array([6])).tolist()
-        [0.0]
-        >>> dominant_angles(gray.T, np.array([[32, 32]]), np.array([6])).tolist()
-        [90.0]
     """
     xy = np.asarray(xy, np.float64).reshape(-1, 2)
     sizes = np.broadcast_to(np.asarray(sizes, np.float64), len(xy))
@@ -120,7 +101,7 @@ def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.n
     octaves, layers = nearest_layers(sizes, gray.shape)
     for octave, layer, image in gaussian_layers(gray, int(octaves.min()), int(octaves.max())):
         rows = np.flatnonzero((octaves == octave) & (layers == layer))
-        places = np.rint(xy[rows] / 2.0**octave).astype(np.int64)
+        pixels = np.rint(xy[rows] / 2.0**octave).astype(np.int64)
         windows = WINDOW_PER_SIGMA * sizes[rows] / SIZE_PER_SIGMA / 2.0**octave
         radii = np.rint(RADIUS_PER_WINDOW * windows).astype(np.int64)
         for radius in np.unique(radii).tolist():
@@ -128,38 +109,34 @@ def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.n
             step = max(1, SAMPLES_AT_ONCE // (2 * radius + 1) ** 2)
             for first in range(0, len(alike), step):
                 some = alike[first : first + step]
-                votes = _votes(image, places[some], windows[some], radius)
+                votes = _votes(image, pixels[some], windows[some], radius)
                 angles[rows[some]] = _highest(votes)
     return angles
 
 
-def _votes(image: np.ndarray, places: np.ndarray, windows: np.ndarray, radius: int) -> np.ndarray:
-    """Return (N, 36) histograms of the gradients around pixels of an image.
+def _votes(image: np.ndarray, pixels: np.ndarray, windows: np.ndarray, radius: int) -> np.ndarray:
+    """Return (N, 36) histograms of the gradients around (N, 2) pixels of an image.
 
-    Args:
-        image: (H, W) float32.
-        places: (N, 2) pixels.
-        windows: (N,) sigmas of the Gaussian windows in pixels.
-        radius: half the side of the windows in pixels.
+    The Gaussian windows have (N,) sigmas, and sides of twice the radius.
     """
     height, width = image.shape
     offsets = np.arange(-radius, radius + 1)
     weights = np.exp(-0.5 * (offsets / windows[:, None]) ** 2)
-    x, y = (places[:, axis, None] + offsets for axis in (0, 1))
+    x, y = (pixels[:, axis, None] + offsets for axis in (0, 1))
     # The outermost pixels have no gradient.
     across = np.where((x >= 1) & (x < width - 1), weights, 0)
     down = np.where((y >= 1) & (y < height - 1), weights, 0)
     x, y = np.clip(x, 1, width - 2), np.clip(y, 1, height - 2)
-    pixels = (y * width)[:, :, None] + x[:, None]
+    samples = (y * width)[:, :, None] + x[:, None]
     flat = image.reshape(-1)
-    dx = (flat.take(pixels + 1) - flat.take(pixels - 1)).reshape(len(places), -1)
-    dy = (flat.take(pixels + width) - flat.take(pixels - width)).reshape(len(places), -1)
+    dx = (flat.take(samples + 1) - flat.take(samples - 1)).reshape(len(pixels), -1)
+    dy = (flat.take(samples + width) - flat.take(samples - width)).reshape(len(pixels), -1)
     magnitude, angle = cv2.cartToPolar(dx, dy, angleInDegrees=True)
     bins = np.rint(angle * np.float32(BINS / 360)).astype(np.intp) % BINS
-    bins += BINS * np.arange(len(places))[:, None]
+    bins += BINS * np.arange(len(pixels))[:, None]
     values = (down[:, :, None] * across[:, None]).reshape(magnitude.shape) * magnitude
-    votes = np.bincount(bins.reshape(-1), values.reshape(-1), BINS * len(places))
-    return votes.reshape(len(places), BINS)
+    votes = np.bincount(bins.reshape(-1), values.reshape(-1), BINS * len(pixels))
+    return votes.reshape(len(pixels), BINS)
 
 
 def _highest(votes: np.ndarray) -> np.ndarray:

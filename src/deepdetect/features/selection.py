@@ -155,8 +155,8 @@ def select_keypoints(
             "they must be equal"
         )
     maps = Maps(ranking.shape, lambda: heatmap.__getitem__, lambda: ranking)
-    found = select_from_maps(maps, options, ignore)
-    return found if logits is not None else replace(found, logits=None)
+    keypoints = select_from_maps(maps, options, ignore)
+    return keypoints if logits is not None else replace(keypoints, logits=None)
 
 
 def select_from_maps(
@@ -169,12 +169,11 @@ def select_from_maps(
     chosen = _choose(passing, ranking, options)
     del passing
     counts = [int(np.bitwise_count(chosen[rows]).sum()) for rows in bands(maps.shape)]
-    xy = np.empty((sum(counts), 2), np.float32)
+    xy = np.zeros((sum(counts), 2), np.float32)
     scores, logits = np.empty(len(xy), np.float32), np.empty(len(xy), np.float32)
-    ends = np.cumsum(counts).tolist()
     parts = [
         (rows, slice(end - count, end))
-        for rows, end, count in zip(bands(maps.shape), ends, counts, strict=True)
+        for rows, end, count in zip(bands(maps.shape), np.cumsum(counts), counts, strict=True)
     ]
     # One map at a time, and what is not written yet takes no memory.
     for rows, part in parts:
@@ -191,10 +190,8 @@ def select_from_maps(
     del heatmap
     for rows, part in parts:
         row, column = np.divmod(_unpack(chosen[rows], width), width)
-        for k, whole in ((0, column), (1, row + rows.start)):
-            found = whole.astype(np.float32)
-            xy[part, k] = found + xy[part, k] if options.subpixel else found
-    del chosen
+        xy[part, 0] += column.astype(np.float32)
+        xy[part, 1] += (row + rows.start).astype(np.float32)
     return Keypoints(xy, scores, (width, height), logits)
 
 
@@ -236,10 +233,8 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
         pixels = _unpack(passing[seen], width)
         if radius and len(pixels):
             near = ranking[seen]
-            found = _highest_in_window(
-                pixels, near.ravel()[pixels], near.shape, radius, seen.start, height
-            )
-            pixels = pixels[found]
+            scores = near.ravel()[pixels]
+            pixels = pixels[_is_highest(pixels, scores, near.shape, radius, seen.start, height)]
         pixels += seen.start * width
         return pixels[(pixels >= rows.start * width) & (pixels < rows.stop * width)]
 
@@ -251,13 +246,13 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
         lowest = _least_of_the_best(parts, count, ranking.dtype)
     chosen, kept, tied = np.zeros_like(passing), 0, []
     for rows in in_bands:
-        found = wanted(rows) if only is None else only
+        pixels = wanted(rows) if only is None else only
         if count is not None:
-            found = found[ranks[found] >= lowest]
-            tied.append(found[ranks[found] == lowest])
-        kept += len(found)
+            pixels = pixels[ranks[pixels] >= lowest]
+            tied.append(pixels[ranks[pixels] == lowest])
+        kept += len(pixels)
         mask = np.zeros(ranking[rows].shape, bool)
-        mask.ravel()[found - rows.start * width] = True
+        mask.ravel()[pixels - rows.start * width] = True
         chosen[rows] = np.packbits(mask, axis=1)
     if count is not None and kept > count:
         last = np.concatenate(tied)
@@ -281,7 +276,7 @@ def _least_of_the_best(parts: Iterable[np.ndarray], count: int, kind: np.dtype) 
     return best.min() if len(best) >= count else kind.type(-np.inf)
 
 
-def _highest_in_window(
+def _is_highest(
     pixels: np.ndarray,
     scores: np.ndarray,
     shape: tuple[int, ...],
@@ -289,12 +284,10 @@ def _highest_in_window(
     first_row: int,
     height: int,
 ) -> np.ndarray:
-    """Return which pixels of a band rank highest in the window around them.
+    """Return which pixels of a band of this shape rank highest in the window around them.
 
-    The band has this shape, and begins with this row of an image of this height.
-
-    Of equal scores the one that comes first in `bayer_order` ranks higher: one pixel of a plateau
-    is kept.
+    It begins with a row of an image of this height. Of equal scores the one that comes first in
+    `bayer_order` ranks higher: one pixel of a plateau is kept.
     """
     kind = np.float32 if scores.dtype == np.float32 else np.float64
     image = np.full(shape, -np.inf, kind)
@@ -305,10 +298,10 @@ def _highest_in_window(
     rows = np.flatnonzero(kept)
     row, column = np.divmod(pixels[rows], shape[1])
     padded = np.pad(image, radius, constant_values=-np.inf)
-    own = image[row, column]
+    middle = image[row, column]
     for y, x in np.ndindex(window.shape):
         down, across = y - radius, x - radius
-        tied = np.flatnonzero(padded[row + y, column + x] == own)
+        tied = np.flatnonzero(padded[row + y, column + x] == middle)
         if not len(tied) or (down, across) == (0, 0):
             continue
         here = np.column_stack([column[tied], row[tied] + first_row])
@@ -342,11 +335,7 @@ def _peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis:
 
 
 def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an ignore mask as (H, W) bool.
-
-    Raises:
-        OptionError: it differs from the image in size.
-    """
+    """Return an ignore mask as (H, W) bool; an OptionError where it differs from the image."""
     mask = np.asarray(ignore)
     if mask.shape != shape:
         raise OptionError(
@@ -362,21 +351,11 @@ def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:
         counts.append(round(options.density * pixels))
     if options.max_keypoints is not None:
         counts.append(int(options.max_keypoints))
-    return min(counts) if counts else None
+    return min(counts, default=None)
 
 
 def grid_subsample(xy: np.ndarray, grid_size_px: int, seed: int = 0) -> np.ndarray:
-    """Choose one random position of each cell of a grid; (K,) rows in rising order.
-
-    Args:
-        xy: (N, 2) positions.
-        grid_size_px: side of the square cells in pixels.
-        seed: of the choice.
-
-    Example:
-        >>> len(grid_subsample(np.array([[0, 0], [5, 5], [40, 5]]), 16))
-        2
-    """
+    """Choose one random of (N, 2) positions of each cell of a grid; (K,) rows in rising order."""
     cell = np.floor(np.asarray(xy, np.float64) / grid_size_px).astype(np.int64)
     order = np.random.default_rng(seed).permutation(len(cell))
     _, first = np.unique(cell[order], axis=0, return_index=True)
@@ -396,15 +375,8 @@ def spread_over_grid(
 ) -> np.ndarray:
     """Choose keypoints by score, in turn from all cells of a grid.
 
-    Args:
-        xy: (N, 2) positions.
-        scores: (N,), the higher the better.
-        image_size: (width, height) of the image.
-        max_keypoints: how many to choose.
-        grid_cells: along the longer side.
-
-    Returns:
-        (M,) rows, M <= `max_keypoints`: first the best of each cell, then the second-best, ...
+    Returns at most `max_keypoints` rows: first the best of each cell, then the second-best, ...
+    `grid_cells` are along the longer side of the image.
 
     Example:
         >>> xy = np.array([[1, 1], [2, 1], [99, 99]])
@@ -444,34 +416,21 @@ def suppress_neighbors(
     order = np.argsort(-np.asarray(scores), kind="stable")
     if not len(order):
         return order
-    places = np.asarray(xy, np.float64).reshape(-1, 2)[order]
-    places = places - places.min(0)
+    positions = np.asarray(xy, np.float64).reshape(-1, 2)[order]
+    positions = positions - positions.min(0)
     radii = np.broadcast_to(np.asarray(radius_px, np.float64), len(order))[order]
     cell = float(radii.min())
-    columns, rows = (int(side) + 1 for side in places.max(0) / cell)
-    x, y = (np.ascontiguousarray(axis) for axis in places.T)
+    columns, rows = (int(side) + 1 for side in positions.max(0) / cell)
+    x, y = (np.ascontiguousarray(axis) for axis in positions.T)
     kept: np.ndarray = keep_distant(x, y, radii, cell, columns, rows)
     return order[kept]
 
 
 def spread_by_distance(xy: np.ndarray, scores: np.ndarray, count: int) -> np.ndarray:
-    """Choose the best points that are as far from each other as their number allows.
+    """Choose the best points that are as far from each other as their number allows, best first.
 
     Adaptive non-maximal suppression (Brown, Szeliski and Winder, 2005), by bisection of the
     distance (Bailo et al., 2018).
-
-    Args:
-        xy: (N, 2) positions.
-        scores: (N,), the higher the better.
-        count: how many to choose.
-
-    Returns:
-        (min(N, count),) rows, best first.
-
-    Example:
-        >>> xy = np.array([[0.0, 0], [1, 0], [9, 0]])
-        >>> spread_by_distance(xy, np.array([3.0, 2, 1]), 2).tolist()
-        [0, 2]
     """
     best = np.argsort(-np.asarray(scores), kind="stable")
     if count >= len(best):

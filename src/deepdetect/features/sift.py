@@ -16,19 +16,55 @@ from .._shared.opencv import cv2
 from .._shared.parallel import parallel_for
 from .._shared.registry import look_up
 from .keypoints import UNSET_ANGLE, Keypoints, on_pixels
-from .scale_space import LAYERS, dominant_angles, nearest_layers
+from .scale_space import BASE_SIGMA_PX, CAMERA_SIGMA_PX, LAYERS, dominant_angles, nearest_layers
 from .selection import spread_over_grid
 
-MIN_SIZE_PX = 2.0
-MAX_SIZE_PX = 8.0
-"""Diameter of a keypoint."""
+ROOT_SIFT = "rootsift"
+"""`Keypoints.descriptor_type` of RootSIFT."""
 
-SIGMA_PX = 1.6
-CAMERA_SIGMA_PX = 0.5
-"""Blur of SIFT's first image, and the blur that an image is assumed to have already."""
+DENSE_SIZES_PX = (2.0, 8.0)
+"""Diameters of keypoints that can be described all at once."""
+
+MIN_DENSE_DENSITY = 0.02
+"""Keypoints per pixel from which that is faster than one by one."""
 
 BIN_WIDTH = 1.5
 """Width of a spatial bin in units of the keypoint's size (3 times its radius)."""
+
+CONTRAST_THRESHOLDS = (0.04, 0.01, 0.0025)
+"""Of SIFT (Lowe: 0.04), in the order in which they are tried; the contrast of a keypoint is
+compared after multiplication by the number of layers."""
+
+MIN_KEYPOINTS = 1000
+"""With fewer the next lower contrast threshold is tried."""
+
+ROWS_AT_ONCE = 1024
+"""Descriptors that are converted together, so that they stay in the processor's cache."""
+
+
+def sift_descriptors(
+    gray: np.ndarray, xy: np.ndarray, size: float = 3.0, angle: float = 0.0
+) -> np.ndarray:
+    """Compute SIFT descriptors, by the fastest implementation for these keypoints.
+
+    Many upright keypoints on whole pixels are described all at once, which differs from OpenCV's
+    result by 1 in one of ten thousand numbers; others by OpenCV.
+
+    Args:
+        gray: (H, W) uint8 luma.
+        xy: (N, 2) positions, centre of the first pixel (0, 0).
+        size: diameter of the keypoint in pixels.
+        angle: its orientation in degrees; 0 is upright. -1 is OpenCV's "unset", which its SIFT
+            takes for a rotation by one degree; the published code does the same.
+
+    Returns:
+        (N, 128) uint8.
+    """
+    dense = len(xy) > MIN_DENSE_DENSITY * gray.size
+    upright = angle == 0 and DENSE_SIZES_PX[0] <= size <= DENSE_SIZES_PX[1]
+    if dense and upright and on_pixels(xy, gray.shape):
+        return dense_sift(gray, xy, size)
+    return opencv_sift_descriptors(gray, xy, size, angle)
 
 
 def dense_sift(
@@ -38,67 +74,44 @@ def dense_sift(
     step_px: int = 1,
     gradient: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> np.ndarray:
-    """Compute upright SIFT descriptors; they equal OpenCV's at angle 0.
+    """Compute upright SIFT descriptors all at once, (N, 128) uint8; they equal OpenCV's.
+
+    OpenCV sums the gradients around each keypoint separately. Where all keypoints are upright and
+    of one size, the sums are a filter: bilinear times Gaussian, along rows and then along columns.
 
     Args:
         gray: (H, W) uint8 luma.
         xy: (N, 2) positions on whole pixels within the image.
-        size: diameter of the keypoints in pixels, in [2, 8].
+        size: diameter of the keypoints in pixels, within `DENSE_SIZES_PX`.
         step_px: the positions lie on every so many-th row and column, which saves time.
         gradient: of the image, where `sift_gradient` has computed it already.
-
-    Returns:
-        (N, 128) uint8: four rows of four columns of eight orientations.
-
-    Raises:
-        MissingExtraError: numba is not installed.
-        OptionError: a position is not on a pixel of the image, or the size is out of its range, or
-            the positions are not so many rows or columns apart.
-
-    Example:
-        >>> gray = np.random.default_rng(0).integers(0, 256, (40, 40)).astype(np.uint8)
-        >>> dense_sift(gray, np.array([[20, 20], [21, 20]])).shape
-        (2, 128)
     """
-    if not MIN_SIZE_PX <= size <= MAX_SIZE_PX:
-        raise OptionError(
-            f"the keypoint size must lie in [{MIN_SIZE_PX:g}, {MAX_SIZE_PX:g}], not {size}"
-        )
-    if not on_pixels(xy, gray.shape):
-        raise OptionError("dense SIFT needs keypoints on whole pixels within the image")
     from .kernels import TILE_COLUMNS, TILE_HEIGHT, describe_tiles
 
     if not len(xy):
         return np.empty((0, 128), np.uint8)
     pixels = np.asarray(xy).astype(np.int64)
     origin = pixels.min(axis=0)
-    if ((pixels - origin) % step_px).any():
-        raise OptionError(f"the keypoints do not lie on every {step_px}th row and column")
     column, row = ((pixels - origin) // step_px).T
     rows_of = np.full((row.max() + 1, column.max() + 1), -1, np.int32)
     rows_of[row, column] = np.arange(len(pixels))
     out = np.empty((len(pixels), 128), np.uint8)
-    tiles = -(-len(rows_of) // max(1, TILE_HEIGHT // step_px)) * -(
-        -rows_of.shape[1] // TILE_COLUMNS
-    )
+    tiles_down = -(-len(rows_of) // max(1, TILE_HEIGHT // step_px))
+    tiles_across = -(-rows_of.shape[1] // TILE_COLUMNS)
     gradient = sift_gradient(gray) if gradient is None else gradient
     arguments = (*gradient, rows_of, origin, step_px, *_taps(size))
-    parallel_for(tiles, describe_tiles, *arguments, out)
+    parallel_for(tiles_down * tiles_across, describe_tiles, *arguments, out)
     described = rows_of[row, column]
     return out if (described == np.arange(len(out))).all() else out[described]
 
 
 def sift_gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the gradient of an image that `dense_sift` describes.
+    """Compute the gradient of a (H, W) uint8 image that `dense_sift` describes.
 
-    Args:
-        gray: (H, W) uint8 luma.
-
-    Returns:
-        Its magnitude, 0 on the border, and its orientation in units of 45 degrees, both (H, W)
-        float32.
+    Returns its magnitude, 0 on the border, and its orientation in units of 45 degrees, both (H, W)
+    float32.
     """
-    blur = float(np.sqrt(SIGMA_PX**2 - CAMERA_SIGMA_PX**2))
+    blur = float(np.sqrt(BASE_SIGMA_PX**2 - CAMERA_SIGMA_PX**2))
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), blur)
     across, up = np.zeros_like(smooth), np.zeros_like(smooth)
     across[:, 1:-1] = smooth[:, 2:] - smooth[:, :-2]
@@ -110,9 +123,8 @@ def sift_gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _taps(size: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights of the pixels around a keypoint, and where they are not 0.
 
-    Returns:
-        (4, T) float32 weights for the four spatial bins, and (4, 3) int64 spans, as of
-        `describe_tiles`.
+    (4, T) float32 weights for the four spatial bins, and (4, 3) int64 spans, as of
+    `describe_tiles`.
     """
     from .kernels import TAPS_AT_ONCE
 
@@ -128,49 +140,6 @@ def _taps(size: float) -> tuple[np.ndarray, np.ndarray]:
         groups = -(-(last + 1 - first) // TAPS_AT_ONCE)
         spans.append([first, first + groups * TAPS_AT_ONCE, len(offsets)])
     return np.pad(weights, ((0, 0), (0, TAPS_AT_ONCE))), np.array(spans)
-
-
-ROOT_SIFT = "rootsift"
-"""`Keypoints.descriptor_type` of RootSIFT."""
-
-CONTRAST_THRESHOLDS = (0.04, 0.01, 0.0025)
-"""Of SIFT (Lowe: 0.04), in the order in which they are tried; the contrast of a keypoint is
-compared after multiplication by the number of layers."""
-
-MIN_KEYPOINTS = 1000
-"""With fewer the next lower contrast threshold is tried."""
-
-MIN_DENSE_DENSITY = 0.02
-"""Keypoints per pixel from which all at once (`dense_sift`) is faster than one by one."""
-
-
-def sift_descriptors(
-    gray: np.ndarray, xy: np.ndarray, size: float = 3.0, angle: float = 0.0
-) -> np.ndarray:
-    """Compute SIFT descriptors, by the fastest implementation for these keypoints.
-
-    Many upright keypoints on whole pixels are described all at once, which differs from OpenCV's
-    result by 1 in one of ten thousand numbers; others, and all of them without numba, by OpenCV.
-
-    Args:
-        gray: (H, W) uint8 luma.
-        xy: (N, 2) positions, centre of the first pixel (0, 0).
-        size: diameter of the keypoint in pixels.
-        angle: its orientation in degrees; 0 is upright. -1 is OpenCV's "unset", which its SIFT
-            takes for a rotation by one degree; the published code does the same.
-
-    Returns:
-        (N, 128) uint8.
-
-    Example:
-        >>> sift_descriptors(np.zeros((32, 32), np.uint8), np.array([[8, 8]])).shape
-        (1, 128)
-    """
-    dense = len(xy) > MIN_DENSE_DENSITY * gray.size
-    upright = angle == 0 and MIN_SIZE_PX <= size <= MAX_SIZE_PX
-    if dense and upright and on_pixels(xy, gray.shape):
-        return dense_sift(gray, xy, size)
-    return opencv_sift_descriptors(gray, xy, size, angle)
 
 
 def opencv_sift_descriptors(
@@ -203,11 +172,6 @@ def scaled_sift_descriptors(
 
     Returns:
         (N, 128) uint8.
-
-    Example:
-        >>> gray = np.zeros((64, 64), np.uint8)
-        >>> scaled_sift_descriptors(gray, np.array([[30, 30]]), [5], [90]).shape
-        (1, 128)
     """
     if not len(xy):
         return np.empty((0, 128), np.uint8)
@@ -221,6 +185,13 @@ def scaled_sift_descriptors(
     # Without precise upscaling octave -1 is a quarter of a pixel off.
     sift = cv2.SIFT_create(nOctaveLayers=LAYERS, enable_precise_upscale=True)
     return _compute(sift, gray, keypoints)
+
+
+def _compute(sift: cv2.SIFT, gray: np.ndarray, keypoints: list[cv2.KeyPoint]) -> np.ndarray:
+    described, descriptors = sift.compute(gray, keypoints)
+    if len(described) != len(keypoints):  # it would silently break the order of rows
+        raise AssertionError("cv2.SIFT left out keypoints that were given to it")
+    return descriptors.astype(np.uint8)  # they are whole numbers from 0 to 255
 
 
 def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
@@ -242,32 +213,18 @@ def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
         >>> describe_keypoints(gray, points).descriptors.shape
         (1, 128)
     """
-    if keypoints.sizes is None:
-        found = sift_descriptors(gray, keypoints.xy)
-        return replace(
-            keypoints, descriptors=to_root_sift(found, overwrite=True), descriptor_type=ROOT_SIFT
-        )
-    if not (keypoints.sizes > 0).all():
-        raise OptionError("keypoints need sizes above 0 to be described: give them some")
-    angles = np.full(len(keypoints), UNSET_ANGLE, np.float32)
-    if keypoints.angles is not None:
-        angles = keypoints.angles.copy()
-    unset = np.flatnonzero(angles < 0)
-    angles[unset] = dominant_angles(gray, keypoints.xy[unset], keypoints.sizes[unset])
-    found = scaled_sift_descriptors(gray, keypoints.xy, keypoints.sizes, angles)
-    return replace(
-        keypoints,
-        angles=angles,
-        descriptors=to_root_sift(found, overwrite=True),
-        descriptor_type=ROOT_SIFT,
-    )
-
-
-def _compute(sift: cv2.SIFT, gray: np.ndarray, keypoints: list[cv2.KeyPoint]) -> np.ndarray:
-    described, descriptors = sift.compute(gray, keypoints)
-    if len(described) != len(keypoints):  # it would silently break the order of rows
-        raise AssertionError("cv2.SIFT left out keypoints that were given to it")
-    return descriptors.astype(np.uint8)  # they are whole numbers from 0 to 255
+    xy, sizes, angles = keypoints.xy, keypoints.sizes, keypoints.angles
+    if sizes is None:
+        descriptors = sift_descriptors(gray, xy)
+    else:
+        if not (sizes > 0).all():
+            raise OptionError("keypoints need sizes above 0 to be described: give them some")
+        angles = np.full(len(xy), UNSET_ANGLE, np.float32) if angles is None else angles.copy()
+        unset = np.flatnonzero(angles < 0)
+        angles[unset] = dominant_angles(gray, xy[unset], sizes[unset])
+        descriptors = scaled_sift_descriptors(gray, xy, sizes, angles)
+    root = to_root_sift(descriptors, overwrite=True)
+    return replace(keypoints, angles=angles, descriptors=root, descriptor_type=ROOT_SIFT)
 
 
 def root_sift_descriptors(
@@ -278,20 +235,14 @@ def root_sift_descriptors(
 
 
 def to_root_sift(descriptors: np.ndarray, overwrite: bool = False) -> np.ndarray:
-    """Convert SIFT descriptors to RootSIFT (Arandjelovic and Zisserman, 2012).
+    """Convert (N, 128) uint8 SIFT descriptors to RootSIFT (Arandjelovic and Zisserman, 2012).
 
-    Its Euclidean distance is the Hellinger distance of SIFT.
-
-    Args:
-        descriptors: (N, 128) uint8.
-        overwrite: convert in place, which saves a copy.
-
-    Returns:
-        (N, 128) uint8: the square roots of the L1-normalised ones times 512, at most 255.
+    They are the square roots of the L1-normalised ones times 512, at most 255: their Euclidean
+    distance is the Hellinger distance of SIFT. To overwrite them saves a copy.
     """
-    result = descriptors if overwrite else descriptors.copy()
-    parallel_for(len(result), _square_root, result)
-    return result
+    converted = descriptors if overwrite else descriptors.copy()
+    parallel_for(len(converted), _square_root, converted)
+    return converted
 
 
 def _square_root(start: int, stop: int, descriptors: np.ndarray) -> None:
@@ -323,12 +274,6 @@ def correlation_distance(
     Returns:
         (K,) float32: 1 - correlation, from 0 to 2: 0 where both are equal, 0 but for rounding
         where they differ by a factor; 1 where one of them is the mean.
-
-    Example:
-        >>> a = np.array([[10, 20, 30], [30, 20, 10]], np.uint8)
-        >>> mean = np.full(3, 20, np.float32)
-        >>> correlation_distance(a, np.array([0, 0]), a, np.array([0, 1]), mean).round(3)
-        array([0., 2.], dtype=float32)
     """
     from .kernels import correlation_distances
 
@@ -338,9 +283,6 @@ def correlation_distance(
     parallel_for(len(out), correlation_distances, first, rows0, second, rows1, mean, out)
     return out
 
-
-ROWS_AT_ONCE = 1024
-"""Descriptors that are converted together, so that they stay in the processor's cache."""
 
 Descriptor = Callable[[np.ndarray, np.ndarray, float, float], np.ndarray]
 
@@ -352,24 +294,14 @@ DESCRIPTORS: dict[str, Descriptor] = {
 
 
 def get_descriptor(name: str) -> Descriptor:
-    """Return the descriptor of this name.
-
-    Raises:
-        OptionError: the name is unknown.
-    """
+    """Return the descriptor of this name; an unknown one is an OptionError."""
     return look_up("descriptor", name, DESCRIPTORS)
 
 
 def detect_sift(gray: np.ndarray, max_keypoints: int = 4000) -> Keypoints:
-    """Detect SIFT keypoints, spread over the image, and describe them by RootSIFT.
+    """Detect SIFT keypoints, spread over a (H, W) uint8 image, and describe them by RootSIFT.
 
-    Args:
-        gray: (H, W) uint8 luma.
-        max_keypoints: at most this many.
-
-    Returns:
-        Keypoints with sizes, angles, octaves and (N, 128) uint8 descriptors, which are rotated to
-        the keypoints' angles.
+    They have sizes, angles and octaves; the descriptors are rotated to the keypoints' angles.
 
     Example:
         >>> gray = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
@@ -377,28 +309,27 @@ def detect_sift(gray: np.ndarray, max_keypoints: int = 4000) -> Keypoints:
         Keypoints(20 keypoints in 99x99 pixels, scores 0.0135 to 0.0788, 128-D uint8 descriptors)
     """
     size = (gray.shape[1], gray.shape[0])
-    # Found once: nearly all of the time goes into the pyramid, whatever the threshold.
+    # Detected once: nearly all of the time goes into the pyramid, whatever the threshold.
     # Without precise upscaling OpenCV's positions are a quarter of a pixel off, right and down.
     sift = cv2.SIFT_create(
         nOctaveLayers=LAYERS,
         contrastThreshold=min(CONTRAST_THRESHOLDS),
         enable_precise_upscale=True,
     )
-    every = sift.detect(gray, None)
-    contrasts = LAYERS * np.array([keypoint.response for keypoint in every])
-    enough = min(MIN_KEYPOINTS, max_keypoints)
-    keypoints = every
+    keypoints = sift.detect(gray, None)
+    strength = np.array([keypoint.response for keypoint in keypoints])
     for threshold in CONTRAST_THRESHOLDS:
-        if np.count_nonzero(contrasts >= threshold) >= enough:
-            keypoints = [every[k] for k in np.flatnonzero(contrasts >= threshold)]
+        strong = np.flatnonzero(LAYERS * strength >= threshold)
+        if len(strong) >= min(MIN_KEYPOINTS, max_keypoints):
+            keypoints, strength = [keypoints[k] for k in strong], strength[strong]
             break
     if not len(keypoints) or max_keypoints < 1:
         none = np.empty((0, 128), np.uint8)
         return replace(Keypoints.empty(size), descriptors=none, descriptor_type=ROOT_SIFT)
-    strength = np.array([keypoint.response for keypoint in keypoints])
     xy = cv2.KeyPoint_convert(keypoints)
     chosen = spread_over_grid(xy, strength, size, max_keypoints)
-    kept, descriptors = sift.compute(gray, [keypoints[k] for k in chosen])
-    found = Keypoints.from_opencv(kept, size)
+    described, descriptors = sift.compute(gray, [keypoints[k] for k in chosen])
     root = to_root_sift(descriptors.astype(np.uint8))
-    return replace(found, descriptors=root, descriptor_type=ROOT_SIFT)
+    return replace(
+        Keypoints.from_opencv(described, size), descriptors=root, descriptor_type=ROOT_SIFT
+    )
