@@ -22,8 +22,8 @@ import numpy as np
 
 from deepdetect import DeepDetect, MissingExtraError, OptionError
 from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx
-from deepdetect.evaluation.protocols.masks import sample_images, score_samples
-from deepdetect.evaluation.report import Cell, Column, Table
+from deepdetect.evaluation.protocols.masks import load_sample, sample_images, score_samples
+from deepdetect.evaluation.report import Row, Table
 from deepdetect.io.image import find_images, load_image
 
 TIMED_SIZE = (480, 640)
@@ -68,7 +68,7 @@ def precision_table(files: Mapping[str, Path], samples: list[Path], rounds: int)
         except (MissingExtraError, OptionError):
             continue
     timed = cv2.resize(load_image(samples[0]), TIMED_SIZE[::-1], interpolation=cv2.INTER_CUBIC)
-    rows: list[tuple[Cell, ...]] = []
+    rows: list[Row] = []
     marks: dict[str, list[np.ndarray]] = {}
     for name, detector in detectors.items():
         marks[name] = []
@@ -78,17 +78,18 @@ def precision_table(files: Mapping[str, Path], samples: list[Path], rounds: int)
             marks[of].append(logits > 0)
             return found
 
-        scores = score_samples(heatmap, samples)
-        texts = [f"{scores[kind][0].loss:.4f} / {scores[kind][0].iou:.3f}" for kind in scores]
+        scores = score_samples(heatmap, map(load_sample, samples))
+        texts = {f"{kind}: BCE / IoU": f"{s.loss:.4f} / {s.iou:.3f}" for kind, s in scores.items()}
         pairs = zip(marks[first], marks[name], strict=True)
         crossing = float(np.mean([np.mean(before != after) for before, after in pairs]))
         runs = (references[name].heatmap, detector.heatmap)
         ratio = 1.0 if name == first else time_ratio(*runs, timed, rounds)
-        rows.append((name, rivals[name][0].stat().st_size / 1e6, *texts, crossing, ratio))
-    kinds = (Column(f"{kind}: BCE / IoU") for kind in scores)
-    columns = (Column("precision"), Column("MB", ".2f"), *kinds)
-    columns += (Column("pixels that cross", ".3%"), Column("time", ".2f"))
-    return Table("precision", "Precision", columns, tuple(rows))
+        size = rivals[name][0].stat().st_size / 1e6
+        rows.append({"precision": name, "MB": size, **texts})
+        rows[-1] |= {"pixels that cross": crossing, "time": ratio}
+    columns = {"precision": "", "MB": ".2f", **dict.fromkeys(texts, "")}
+    columns |= {"pixels that cross": ".3%", "time": ".2f"}
+    return Table("precision", "Precision", columns, rows)
 
 
 def one_thread(path: Path, backend: str, precision: Precision = "float32") -> DeepDetect:

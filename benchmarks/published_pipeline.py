@@ -35,20 +35,21 @@ from deepdetect.datasets.oxford import load_oxford
 from deepdetect.datasets.types import CalibratedStereoPair, PlanarPair, StereoPair
 from deepdetect.detector import HeatmapOptions
 from deepdetect.detector.pretrained import PRETRAINED
-from deepdetect.evaluation.profiling import Profile, profiled
+from deepdetect.evaluation.profiling import profiled
 from deepdetect.evaluation.protocols.paper import CORRECT_PX
 from deepdetect.evaluation.protocols.planar import select_pairs
-from deepdetect.evaluation.protocols.stereo_pipelines import (
+from deepdetect.evaluation.protocols.stereo import (
     PAPER_FLANN_CHECKS,
     PAPER_FLANN_TREES,
     essential_inliers,
     paper_settings,
 )
-from deepdetect.evaluation.report import Cell, Column, Table
+from deepdetect.evaluation.report import Row, Table
 from deepdetect.geometry import disparity_errors, transform_points
 
 PLANAR = (("wall", 6), ("graf", 3))
 STEREO = "cones"
+SIDES = ("published", "ours")
 RATIO = 0.99
 TREES = 5
 CHECKS = 50
@@ -72,50 +73,50 @@ def main() -> None:
     sides = {pair.name: planar_sides(pair, weights) for pair in select_pairs(scenes, PLANAR)}
     stereo = load_middlebury(arguments.data / "middlebury" / STEREO)
     sides[STEREO] = stereo_sides(stereo, dense.configured(HeatmapOptions(480)))
-    rows = [(name, *compare(*both, arguments.rounds)) for name, both in sides.items()]
-    print(table("matches", "End to end: correct matches", "correct", rows).to_markdown())
+    rows = [{"pair": name, **compare(*both, arguments.rounds)} for name, both in sides.items()]
+    print(table("correct", rows).to_markdown())
     rows = []
     for folder in sorted(
         path.parent for path in (arguments.data / "middlebury").glob("*/calib.json")
     ):
         scene = load_calibrated_pair(folder)
-        rows.append((folder.name, *compare(*reconstruction_sides(scene, dense), 1)))
-    print("\n" + table("points", "Stereo: points", "points", rows).to_markdown())
+        rows.append({"pair": folder.name, **compare(*reconstruction_sides(scene, dense), 1)})
+    print("\n" + table("points", rows).to_markdown())
 
 
-def table(key: str, title: str, counted: str, rows: Sequence[tuple[Cell, ...]]) -> Table:
-    """Tabulate what `compare` returns."""
-    columns = (
-        Column("pair"),
-        *(Column(f"{side}, s", ".2f") for side in ("published", "ours")),
-        *(Column(name, ".1f") for name in ("times faster", "lowest", "highest")),
-        *(Column(f"{side}: {counted}", ",d") for side in ("published", "ours")),
-        *(Column(f"{side}: MB", ",.0f") for side in ("published", "ours")),
-    )
-    return Table(key, title, columns, tuple(rows))
+def table(counted: str, rows: Sequence[Row]) -> Table:
+    """Tabulate the rows of `compare`, whose counts are `counted`."""
+    columns = {"pair": "", **{f"{side}, s": ".2f" for side in SIDES}}
+    columns |= dict.fromkeys(("times faster", "lowest", "highest"), ".1f")
+    columns |= {f"{side}: {counted}": ",d" for side in SIDES}
+    columns |= {f"{side}: MB": ",.0f" for side in SIDES}
+    counts = [{f"{side}: {counted}": row[side] for side in SIDES} for row in rows]
+    rows = [{**row, **named} for row, named in zip(rows, counts, strict=True)]
+    return Table(counted, counted, columns, rows)
 
 
-def compare(published: Callable[[], int], ours: Callable[[], int], rounds: int) -> tuple[Cell, ...]:
+def compare(published: Callable[[], int], ours: Callable[[], int], rounds: int) -> Row:
     """Run both sides in turn; return medians of seconds, their ratios, counts, largest memory."""
-    profiles: list[tuple[Profile, Profile]] = []
-    counts: list[tuple[int, int]] = []
+    profiles: list[list[tuple[float, float]]] = []
+    counts: list[list[int]] = []
     for turn in range(rounds + 1):
-        with profiled() as first:
-            found = published()
-        with profiled() as second:
-            both = found, ours()
+        both: list[tuple[float, float]] = []
+        found = []
+        for run in (published, ours):
+            with profiled() as profile:
+                found.append(run())
+            both.append((profile.seconds, profile.memory))
         if turn:
-            profiles.append((first, second))
-            counts.append(both)
-    seconds = np.array([[profile.seconds for profile in both] for both in profiles])
-    memory = np.array([[profile.memory for profile in both] for both in profiles])
+            profiles.append(both)
+            counts.append(found)
+    seconds, memory = np.moveaxis(np.array(profiles), 2, 0)
     ratios = seconds[:, 0] / seconds[:, 1]
-    return (
-        *map(float, np.median(seconds, axis=0)),
-        *map(float, (np.median(ratios), ratios.min(), ratios.max())),
-        *map(int, np.median(counts, axis=0)),
-        *map(float, memory.max(axis=0) / 1e6),
-    )
+    row: Row = {"lowest": ratios.min(), "times faster": np.median(ratios), "highest": ratios.max()}
+    for k, side in enumerate(SIDES):
+        row[side] = int(np.median(counts, axis=0)[k])
+        row[f"{side}, s"] = float(np.median(seconds[:, k]))
+        row[f"{side}: MB"] = float(memory[:, k].max() / 1e6)
+    return row
 
 
 def planar_sides(

@@ -24,7 +24,7 @@ from deepdetect._shared.provenance import provenance
 from deepdetect.datasets.oxford import load_oxford
 from deepdetect.datasets.types import PlanarPair, read_homography
 from deepdetect.evaluation.metrics.homography import project_visible
-from deepdetect.evaluation.report import Column, Report, Section, Table
+from deepdetect.evaluation.report import Report, Row, Section, Table
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.geometry import GeometryOptions, estimate_geometry, transform_points
 from deepdetect.geometry.homography_refinement import refine_homography
@@ -50,6 +50,19 @@ can come from a part of the image at the cost of the rest, as under a lens that 
 MAX_APART = 0.5
 """Distance of what was found from both starts over the distance that it moved from the published
 homography, medians over the overlap: up to this both starts found the same."""
+
+COLUMNS = {
+    "pair": "",
+    "correlation, published": ".3f",
+    "correlation, refined": ".3f",
+    "moved, median px": ".2f",
+    "moved, largest px": ".1f",
+    "windows in which it rises": ".1%",
+    "two starts apart, median px": ".3f",
+    "from the file there, median px": ".3f",
+    "from the file there, largest px": ".2f",
+    "written": "",
+}
 
 START_RATIO = 0.85
 START_KEYPOINTS = 8000
@@ -222,31 +235,23 @@ def displacement(
 
 def refinement_table(results: list[RefinedPair]) -> Table:
     """Tabulate the correlations and how far points move."""
-    columns = (
-        Column("pair"),
-        Column("correlation, published", ".3f"),
-        Column("correlation, refined", ".3f"),
-        Column("moved, median px", ".2f"),
-        Column("moved, largest px", ".1f"),
-        Column("windows in which it rises", ".1%"),
-        Column("two starts apart, median px", ".3f"),
-        Column("from the file there, median px", ".3f"),
-        Column("from the file there, largest px", ".2f"),
-        Column("written"),
-    )
-    rows = tuple(
-        (
-            result.pair.name,
-            result.published,
-            result.zncc,
-            *result.moved,
-            result.risen,
-            result.starts_apart[0] if result.starts_apart else None,
-            *(result.apart or (None, None)),
-            "yes" if result.written else "no: not clearly better",
-        )
-        for result in results
-    )
+    rows: list[Row] = []
+    for result in results:
+        row = {
+            "pair": result.pair.name,
+            "correlation, published": result.published,
+            "correlation, refined": result.zncc,
+            "moved, median px": result.moved[0],
+            "moved, largest px": result.moved[1],
+            "windows in which it rises": result.risen,
+            "written": "yes" if result.written else "no: not clearly better",
+        }
+        if result.starts_apart:
+            row["two starts apart, median px"] = result.starts_apart[0]
+        if result.apart:
+            row["from the file there, median px"] = result.apart[0]
+            row["from the file there, largest px"] = result.apart[1]
+        rows.append(row)
     note = (
         "Median of the local correlations (15x15 pixels) of the images over their overlap. Moved: "
         "from where the published homography takes the pixels of the overlap. Written where the "
@@ -254,7 +259,7 @@ def refinement_table(results: list[RefinedPair]) -> Table:
         f"the windows and both starts come within {MAX_APART:g} of the move. From the file there: "
         "the same from H1toKp.refined, where the data set has that file already."
     )
-    return Table("oxford_refined", "Oxford's homographies, refined", columns, rows, note)
+    return Table("oxford_refined", "Oxford's homographies, refined", COLUMNS, rows, note)
 
 
 if __name__ == "__main__":

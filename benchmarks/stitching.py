@@ -24,7 +24,7 @@ from deepdetect import DeepDetect
 from deepdetect.datasets.oxford import load_oxford
 from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.evaluation.profiling import peak_memory, run_in_child
-from deepdetect.evaluation.report import Cell, Column, Table
+from deepdetect.evaluation.report import Cell, Table
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import load_image
 from deepdetect.matching import Panorama
@@ -38,6 +38,17 @@ PITCHES_DEG = (-8, 8)
 MAX_ROLL_DEG = 2.0
 EXPOSURES = (0.8, 1.1)
 SEED = 0
+
+COLUMNS = {
+    "images": "",
+    "stitched": "d",
+    "panorama": "",
+    "processor time, s": ".0f",
+    "peak memory, GB": ".2f",
+    "corner error, px: mean": ".2f",
+    "least": ".2f",
+    "largest": ".2f",
+}
 
 
 def main() -> None:
@@ -59,34 +70,19 @@ def main() -> None:
         truths = [truth for _, truth in views]
         del views
         rows = [
-            (
-                "boat 1 and 2",
-                *run_in_child(measure, boat, [pair.homography, np.eye(3)], *how),
-            ),
-            ("ten rendered views", *run_in_child(measure, paths, truths, *how)),
+            {
+                "images": "boat 1 and 2",
+                **run_in_child(measure, boat, [pair.homography, np.eye(3)], *how),
+            },
+            {"images": "ten rendered views", **run_in_child(measure, paths, truths, *how)},
         ]
-    print(table(rows).to_markdown())
-
-
-def table(rows: Sequence[tuple[Cell, ...]]) -> Table:
-    """Tabulate what `measure` returns."""
-    columns = (
-        Column("images"),
-        Column("stitched", "d"),
-        Column("panorama"),
-        Column("processor time, s", ".0f"),
-        Column("peak memory, GB", ".2f"),
-        Column("corner error, px: mean", ".2f"),
-        Column("least", ".2f"),
-        Column("largest", ".2f"),
-    )
-    return Table("stitching", "Panoramas", columns, tuple(rows))
+    print(Table("stitching", "Panoramas", COLUMNS, rows).to_markdown())
 
 
 def measure(
     paths: Sequence[Path], truths: Sequence[np.ndarray], weights: str, projection: Projection
-) -> tuple[Cell, ...]:
-    """Stitch images; return the number of them, size, seconds, gigabytes and errors.
+) -> dict[str, Cell]:
+    """Stitch images; return the cells of `COLUMNS`.
 
     Args:
         paths: of the images.
@@ -100,8 +96,15 @@ def measure(
     height, width = panorama.valid.shape
     memory = peak_memory() / 1e9  # before the images are read for their sizes
     errors = corner_errors(panorama, truths, [load_image(path).shape[1::-1] for path in paths])
-    spread = float(np.mean(errors)), min(errors), max(errors)
-    return len(panorama.homographies), f"{width}x{height}", seconds, memory, *spread
+    return {
+        "stitched": len(panorama.homographies),
+        "panorama": f"{width}x{height}",
+        "processor time, s": seconds,
+        "peak memory, GB": memory,
+        "corner error, px: mean": float(np.mean(errors)),
+        "least": min(errors),
+        "largest": max(errors),
+    }
 
 
 def corner_errors(

@@ -13,18 +13,14 @@ import argparse
 from concurrent.futures import ProcessPoolExecutor
 from functools import cache, partial
 from pathlib import Path
-from statistics import fmean
 
 from deepdetect import DeepDetect
 from deepdetect._shared.parallel import processor_count
-from deepdetect.evaluation.metrics.calibration import Calibration, calibration_of, pooled
-from deepdetect.evaluation.metrics.masks import MaskScore, score_heatmap
+from deepdetect.evaluation.metrics.masks import Measured, mean_score, measure_heatmap
 from deepdetect.io.image import load_image
 from deepdetect.labels import LabelOptions
 from deepdetect.training.recipe import Stage, TrainingOptions
 from deepdetect.training.views import SourceImage, label_view, list_images, render
-
-Scored = tuple[MaskScore, Calibration]
 
 
 def main() -> None:
@@ -45,10 +41,10 @@ def main() -> None:
         "|---|--:|--:|--:|--:|--:|"
     )
     for light, rows in zip(("normal", "darkened"), zip(*scored, strict=True), strict=True):
-        loss, iou = fmean(one.loss for one, _ in rows), fmean(one.iou for one, _ in rows)
-        found = pooled(one for _, one in rows)
+        found = mean_score(rows)
         print(
-            f"| {light} | {len(rows)} | {loss:.4f} / {iou:.3f} | {found.expected_error:.4f} | "
+            f"| {light} | {len(rows)} | {found.loss:.4f} / {found.iou:.3f} | "
+            f"{found.calibration_error:.4f} | "
             f"{found.density:.4f} | {found.label_density:.4f} |"
         )
 
@@ -58,7 +54,7 @@ def options_of(short_side_px: int) -> TrainingOptions:
     return TrainingOptions(stages=(Stage(16, 1, 1),), short_sides=(short_side_px,))
 
 
-def score(image: SourceImage, weights: str, labels: LabelOptions) -> list[Scored]:
+def score(image: SourceImage, weights: str, labels: LabelOptions) -> list[Measured]:
     """Score the heat maps of a photograph in normal light and darkened, against their labels."""
     rgb = load_image(image.path)
     rows = []
@@ -66,7 +62,7 @@ def score(image: SourceImage, weights: str, labels: LabelOptions) -> list[Scored
         seen = render(rgb, view)
         heatmap = detector(weights).heatmap(seen)
         label = label_view(seen, view, labels)
-        rows.append((score_heatmap(heatmap, label), calibration_of(heatmap, label)))
+        rows.append(measure_heatmap(heatmap, label))
     return rows
 
 

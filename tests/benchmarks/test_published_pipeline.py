@@ -70,10 +70,9 @@ def test_both_sides_are_run_in_turn(script: ModuleType) -> None:
     def side(name: str, count: int) -> Callable[[], int]:
         return lambda: ran.append(name) or count
 
-    cells = script.compare(side("published", 3), side("ours", 5), rounds=2)
+    found = script.compare(side("published", 3), side("ours", 5), rounds=2)
     assert ran == ["published", "ours"] * 3
-    table = script.table("key", "Title", "correct", [("wall 1-6", *cells)])
-    row = dict(zip([column.title for column in table.columns], table.rows[0], strict=True))
+    (row,) = script.table("correct", [{"pair": "wall 1-6", **found}]).values()
     assert (row["published: correct"], row["ours: correct"]) == (3, 5)
     assert row["lowest"] <= row["times faster"] <= row["highest"]
 

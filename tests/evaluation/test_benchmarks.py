@@ -22,7 +22,7 @@ from deepdetect.evaluation.baselines.method import BaselineError, LocalFeature
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.evaluation.benchmarks import BENCHMARKS, run_benchmarks
 from deepdetect.evaluation.metrics import repeatability
-from deepdetect.evaluation.options import PROTOCOLS, BenchmarkOptions
+from deepdetect.evaluation.options import DEFAULT_PROTOCOLS, BenchmarkOptions
 from deepdetect.evaluation.protocols import speed
 from deepdetect.evaluation.report import Report
 from deepdetect.features.keypoints import Keypoints
@@ -77,8 +77,7 @@ def runs(
 def table(report: Report, key: str) -> dict[str, dict[str, object]]:
     """Return a table as rows by title, of cells by column."""
     (found,) = [table for table in report.tables() if table.key == key]
-    titles = [column.title for column in found.columns]
-    return {str(row[0]): dict(zip(titles, row, strict=True)) for row in found.rows}
+    return {row["method"]: row for row in found.values()}
 
 
 def images(folder: Path, scene: str) -> list[Path]:
@@ -308,7 +307,9 @@ def test_every_benchmark_does_all_its_tasks(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(repeatability, "CHANCE_POINTS", 200)
-    all_protocols = dataclasses.replace(options, protocols=PROTOCOLS, classical=())
+    all_protocols = dataclasses.replace(
+        options, protocols=(*DEFAULT_PROTOCOLS, "degraded"), classical=()
+    )
     report = run_benchmarks([name], write_few(name), all_protocols, cache=tmp_path / "cache")
     keys = [table.key for table in report.tables()]
     assert keys

@@ -49,14 +49,7 @@ def test_the_best_bars_have_another_colour() -> None:
 def test_names_of_any_kind_are_drawn() -> None:
     assert len(bar_chart({"$a_b$ & <c> 100 %": 0.5, "_hidden": 0.0}, "x")) > 1000
     assert len(line_chart({"$1 & $2": ([1, 2], [0.5, float("nan")])}, "x", "y")) > 1000
-
-
-def test_more_names_make_a_higher_chart() -> None:
-    few, many = (
-        decoded(line_chart({str(k): ([1, 2], [k, k]) for k in range(count)}, "x", "y"))
-        for count in (3, 30)
-    )
-    assert many.shape[0] > few.shape[0]
+    assert len(line_chart({}, "x", "y", logarithmic=True)) > 1000
 
 
 def test_logarithmic_axes_put_doublings_at_equal_distances() -> None:
@@ -69,10 +62,6 @@ def test_logarithmic_axes_put_doublings_at_equal_distances() -> None:
         drawn = drawn[: len(drawn) // 3]  # above the legend
         left, middle, right = (np.nonzero((drawn == c).all(2))[1].mean() for c in colors)
         assert middle == pytest.approx((left + right) / 2, abs=2)
-
-
-def test_a_chart_without_lines_is_drawn() -> None:
-    assert len(line_chart({}, "x", "y", logarithmic=True)) > 1000
 
 
 def test_the_missing_package_is_named(monkeypatch: pytest.MonkeyPatch, one_line) -> None:

@@ -20,21 +20,13 @@ def options(edge_detector: DeepDetect) -> BenchmarkOptions:
     return BenchmarkOptions(edge_detector)
 
 
-def test_all_classical_methods_are_default_or_low() -> None:
-    assert len(CLASSICAL) == 14
-    assert [f"{name}-low" for name in CLASSICAL if name not in LOW] == LOW
-
-
 @pytest.mark.parametrize(
     ("change", "nearest"),
     [
-        ({"protocols": ("papr",)}, "'paper'"),
-        ({"protocols": ("paper", "standrad")}, "'standard'"),
-        ({"classical": ("siift",)}, "'sift'"),
         ({"classical": ("fast", "fast_low")}, "'fast-low'"),
-        ({"protocols": ()}, "paper or standard"),
         ({"channels": "bgrr"}, "'bgr'"),
         ({"max_images": 2}, "max_images"),
+        ({"geometry_weights": ("a/model.onnx", "b/model.onnx")}, "rename"),
     ],
     ids=str,
 )
@@ -89,12 +81,6 @@ def test_further_methods_are_rows_of_every_table(options: BenchmarkOptions) -> N
     for methods in (more.density_features(), more.matching_features(), more.standard_features()):
         assert own in methods
         assert methods.index(own) == 0
-
-
-def test_none_of_the_classical_methods_may_be_wanted(options: BenchmarkOptions) -> None:
-    none = dataclasses.replace(options, classical=())
-    assert names(none.matching_features()) == ["deepdetect-0.5", "random", "all-pixels"]
-    assert names(none.density_features())[0] == "deepdetect-0.5"
 
 
 def test_the_papers_way_squashes_and_the_standard_one_does_not(options: BenchmarkOptions) -> None:

@@ -42,21 +42,21 @@ def test_memory_that_is_freed_within_the_block_counts() -> None:
 
 
 def test_what_an_earlier_stage_holds_counts_in_the_whole() -> None:
-    with StageProfiler() as profiler:
-        held = [written(64_000_000)]
-        profiler.record("first")
-        held.append(written(64_000_000))
-        profiler.record("second")
+    profiler = StageProfiler()
+    held = [written(64_000_000)]
+    profiler.record("first")
+    held.append(written(64_000_000))
+    profiler.record("second")
     assert all(50e6 < profile.memory < 100e6 for profile in profiler.stages.values())
     assert 110e6 < profiler.memory < 180e6
     assert len(held) == 2
 
 
 def test_stages_of_one_name_add_up() -> None:
-    with StageProfiler() as profiler:
-        for _ in range(2):
-            time.sleep(0.02)
-            profiler.record("waiting")
+    profiler = StageProfiler()
+    for _ in range(2):
+        time.sleep(0.02)
+        profiler.record("waiting")
     assert list(profiler.stages) == ["waiting"]
     assert profiler.stages["waiting"].seconds >= 0.04
 
@@ -70,22 +70,6 @@ def test_a_block_that_takes_nothing_grows_by_little() -> None:
         del held
         time.sleep(0.02)
     assert 0 <= profile.memory < 30e6
-
-
-def test_an_error_passes_through() -> None:
-    with pytest.raises(ValueError, match="inside"), profiled() as profile:
-        raise ValueError("inside")
-    assert profile.seconds > 0
-
-
-def test_blocks_may_be_nested() -> None:
-    with profiled() as outer:
-        with profiled() as inner:
-            time.sleep(0.02)
-            written(64_000_000).close()
-        time.sleep(0.02)
-    assert outer.seconds > inner.seconds >= 0.02
-    assert outer.memory > 50e6
 
 
 def test_the_peak_is_at_least_what_is_held() -> None:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, ImageError, OptionError, SelectionOptions, match_images
+from deepdetect import DeepDetect, ImageError, OptionError, match_images
 from deepdetect.datasets.oxford import SCENES, load_oxford
 from deepdetect.detector.heatmap import HeatmapOptions
-from deepdetect.evaluation.baselines.method import heatmap_feature
+from deepdetect.evaluation.baselines.method import deepdetect_feature
 from deepdetect.evaluation.options import PAPER_RESOLUTION_PX, THRESHOLDS
 from deepdetect.evaluation.protocols import paper
 from deepdetect.evaluation.protocols.masks import (
@@ -145,8 +145,8 @@ def test_other_options_of_the_detector_stay(folder: Path) -> None:
     flipping = DeepDetect(tta="flip", resolution="native", tile_megapixels=2)
     squashing = _of_paper(flipping, equal_density=False)
     assert squashing.heatmap_options == HeatmapOptions(PAPER_RESOLUTION_PX, tta="flip")
-    (one,), (other,) = (score_at_scale(each, [rgb], 1) for each in (flipping, DeepDetect()))
-    assert one.score.loss != other.score.loss
+    one, other = (score_at_scale(each, [rgb], 1) for each in (flipping, DeepDetect()))
+    assert one["normal"].loss != other["normal"].loss
     native = flipping.configured(HeatmapOptions("native", tta="flip"))
     assert LabelDensityDetector(native).heatmap(rgb).sum() == LabelDetector().heatmap(rgb).sum()
 
@@ -172,7 +172,7 @@ def test_counts_are_those_of_the_published_matching(
     monkeypatch.setattr(paper, "MANY_SEEDS", 2)
     pair = next(iter(load_oxford(folder)[0].pairs()))
     labels = LabelDetector(heatmap_options=HeatmapOptions(PAPER_RESOLUTION_PX))
-    feature = heatmap_feature(labels, SelectionOptions(), name="a", title="A", version="1")
+    feature = deepdetect_feature(labels, version="1")
     counts = []
     for seed in range(2):
         found = match_images(
@@ -196,8 +196,8 @@ def test_samples_and_their_scales(tmp_path: Path, photo: np.ndarray) -> None:
     Image.fromarray(fuse(luma(photo)).mask).save(tmp_path / "mask_image_1.png")
     found = evaluate(samples=tmp_path, scales=(1, 0.5))
     assert found.oxford is None
-    assert [row.scale for row in found.scales] == [1, 0.5]
-    assert found.masks == {"normal": found.scales[0].score}
+    assert list(found.scales) == [(1, "normal"), (0.5, "normal")]
+    assert found.masks == {"normal": found.scales[1, "normal"]}
     assert evaluate().masks == {}
 
 
@@ -308,11 +308,11 @@ def test_probabilities_are_calibrated_against_masks_and_labels(tmp_path: Path, p
     Image.fromarray(photo).save(tmp_path / "a.png")
     found = evaluate(samples=tmp_path, scales=[0.5])
     assert found.masks == {}
-    (row,) = found.scales
-    assert 0 < row.calibration.expected_error < 0.2
+    (score,) = found.scales.values()
+    assert 0 < score.calibration_error < 0.2
     result = run_command(["evaluate", str(tmp_path), "--scale", "0.5", "--json"])
     (told,) = json.loads(result.stdout)["scales"]
-    assert told["calibration_error"] == row.calibration.expected_error
-    assert told["label_density"] == row.label_density
+    assert told["calibration_error"] == score.calibration_error
+    assert told["label_density"] == score.label_density
     refused = run_command(["evaluate", str(tmp_path)])
     assert "there are no samples in" in refused.output

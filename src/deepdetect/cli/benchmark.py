@@ -11,7 +11,7 @@ from .._shared.errors import BatchError, OptionError
 from .._shared.registry import look_up
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
-from ..evaluation.baselines.plugin import find_feature
+from ..evaluation.baselines.external import find_feature
 from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
 from ..evaluation.options import BASELINES, DEFAULT_PROTOCOLS, BenchmarkOptions
 from ._detection import NETWORK

@@ -117,27 +117,19 @@ def _report_failures(found: Sequence[Evaluation], on_oxford: Sequence[OxfordScor
         raise BatchError(summary, [*samples, *parts])
     if samples:
         scales = found[0].scales
-        rows = [row.score for row in scales if row.scale == scales[0].scale]
-        scored = sum(score.images for score in found[0].masks.values() or rows)
+        first = [score for (scale, _), score in scales.items() if scale == min(scales)[0]]
+        scored = sum(score.images for score in found[0].masks.values() or first)
         total = len(samples) + scored
         raise BatchError(f"{len(samples)} of {total} samples are not in the scores", samples)
 
 
 def _values(evaluation: Evaluation) -> dict[str, Any]:
     """Return an evaluation as plain values for JSON."""
-    values: dict[str, Any] = {
-        name: {**asdict(score), **evaluation.calibration[name].values()}
-        for name, score in evaluation.masks.items()
-    }
+    values: dict[str, Any] = {name: asdict(score) for name, score in evaluation.masks.items()}
     if evaluation.scales:
         values["scales"] = [
-            {
-                "scale": row.scale,
-                "visibility": row.visibility,
-                "score": asdict(row.score),
-                **row.calibration.values(),
-            }
-            for row in evaluation.scales
+            {"scale": scale, "visibility": visibility, **asdict(score)}
+            for (scale, visibility), score in evaluation.scales.items()
         ]
     if evaluation.oxford is not None:
         values["oxford"] = asdict(evaluation.oxford)

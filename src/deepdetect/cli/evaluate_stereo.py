@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -58,16 +57,17 @@ def evaluate_stereo(
         sources[f"weights {name}"] = DeepDetect(name)
     rows = score_stereo_matches(sources, pairs, quiet=as_json)
     if as_json:
-        print_json([{**asdict(row), "precision": row.score.precision} for row in rows])
+        print_json(rows)
     else:
-        width = max(len(row.source) for row in rows)
+        width = max(len(row["source"]) for row in rows)
         print(
             f"{'keypoints':<{width}}  {'pair':<12}{'density':>8}{'matches':>10}"
             f"{'correct':>10}{'precision':>11}"
         )
         for row in rows:
+            score = row["score"]
             print(
-                f"{row.source:<{width}}  {row.pair:<12}{row.density:>8.3f}{row.score.matches:>10,}"
-                f"{row.score.correct:>10,}{row.score.precision:>11.3f}"
+                f"{row['source']:<{width}}  {row['pair']:<12}{row['density']:>8.3f}"
+                f"{score['matches']:>10,}{score['correct']:>10,}{row['precision']:>11.3f}"
             )
     report_failures(failures, len(scenes), "scenes")

@@ -7,7 +7,7 @@ to `BENCHMARKS`.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
@@ -42,28 +42,17 @@ def run_benchmarks(
     cache: str | Path | None = None,
     quiet: bool = True,
 ) -> Report:
-    """Run benchmarks and collect their report.
+    """Run benchmarks of `BENCHMARKS` and collect their report.
 
-    Args:
-        names: of `BENCHMARKS`.
-        data: folder of the data sets, in which each has a folder of its own; or of the only one.
-        options: what is compared, and how.
-        cache: folder for the results of the stages; None keeps nothing.
-        quiet: show no progress bar.
-
-    Raises:
-        OptionError: a name is unknown.
-        ImageError: data are missing.
-        MissingExtraError: a package of the extra "benchmark" is missing.
+    The folder of the data has one for each data set, or is the only one; without a folder for the
+    cache nothing is kept. Missing data or packages are an error of one benchmark alone.
     """
     started = time.monotonic()
     entries = [look_up("benchmark", name, BENCHMARKS) for name in names]
     run = Run(Path(data), None if cache is None else Path(cache), quiet)
     sections: list[Section] = []
     for name, (module, function) in zip(names, entries, strict=True):
-        benchmark: Callable[[Run, BenchmarkOptions], list[Section]] = getattr(
-            import_module(f".protocols.{module}", __package__), function
-        )
+        benchmark = getattr(import_module(f".protocols.{module}", __package__), function)
         try:
             sections += benchmark(run, options)
         except (ImageError, MissingExtraError) as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -18,21 +19,11 @@ WIDEST = 1600
 
 
 def bar_chart(values: Mapping[str, float], label: str, highlighted: Sequence[str] = ()) -> bytes:
-    """Draw horizontal bars, with the value beside each.
-
-    Args:
-        values: by name, from top to bottom.
-        label: of the axis.
-        highlighted: names that are drawn in another colour.
-
-    Returns:
-        The PNG file.
-    """
+    """Draw horizontal bars by name, with the value beside each, some in another colour."""
     figure = _figure(8, 0.32 * len(values) + 1)
     axes = figure.subplots()
-    names = list(values)
-    colors = ["C1" if name in highlighted else "C0" for name in names]
-    bars = axes.barh(names, list(values.values()), color=colors)
+    colors = ["C1" if name in highlighted else "C0" for name in values]
+    bars = axes.barh(list(values), list(values.values()), color=colors)
     axes.bar_label(bars, fmt="{:.3f}", padding=3)
     axes.invert_yaxis()
     axes.set_xlabel(label)
@@ -52,14 +43,7 @@ def line_chart(
 ) -> bytes:
     """Draw lines of (x, y) values, with their names in a legend; one of one value is a point.
 
-    Args:
-        lines: by name.
-        x_label, y_label: of the axes.
-        logarithmic: of the x axis.
-        ticks: of the x axis.
-
-    Returns:
-        The PNG file.
+    The x axis may be logarithmic, and have ticks of its own.
     """
     figure = _figure(11, max(4.5, 0.27 * len(lines) + 0.5))
     axes = figure.subplots()
@@ -90,7 +74,7 @@ def picture(rgb: np.ndarray) -> bytes:
     return cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes()
 
 
-def _figure(width: float, height: float):  # type: ignore[no-untyped-def]
+def _figure(width: float, height: float) -> Any:
     try:
         from matplotlib.figure import Figure
     except ImportError:
@@ -101,7 +85,7 @@ def _figure(width: float, height: float):  # type: ignore[no-untyped-def]
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _saved(figure) -> bytes:  # type: ignore[no-untyped-def]
+def _saved(figure: Any) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     return buffer.getvalue()

@@ -24,9 +24,8 @@ from .baselines.method import (
 from .baselines.opencv import CLASSICAL, STANDARD
 from .baselines.random import all_pixels_feature, random_feature
 
-PROTOCOLS = ("paper", "standard", "guided", "degraded")
-DEFAULT_PROTOCOLS = PROTOCOLS[:3]
-"""All but the one that measures everything five times."""
+DEFAULT_PROTOCOLS = ("paper", "standard", "guided")
+"""All but "degraded", which measures everything five times."""
 
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
 PAPER_RESOLUTION_PX = 480
@@ -55,7 +54,7 @@ class BenchmarkOptions:
         ranker: of the points, as of `PointDetector`.
 
     Raises:
-        OptionError: a name is unknown, a number is out of its range, or nothing is left to do.
+        OptionError: a name is unknown, or a number is out of its range.
     """
 
     detector: DeepDetect
@@ -71,18 +70,9 @@ class BenchmarkOptions:
 
     def __post_init__(self) -> None:
         check_ranges(self, positive=("max_pairs",), between={"max_images": (3, float("inf"))})
-        for kind, names, known in (
-            ("protocol", self.protocols, PROTOCOLS),
-            ("choice of images", (self.degraded_images,), ("second", "both")),
-            ("classical baseline", self.classical, tuple(BASELINES)),
-        ):
-            for name in names:
-                if name not in known:
-                    raise unknown_name(kind, name, known)
-        if not self.protocols:
-            raise OptionError(f"choose a protocol: {' or '.join(PROTOCOLS)}")
-        if not self.geometry_weights:
-            raise OptionError("geometry_weights must name at least one weights file")
+        for name in self.classical:
+            if name not in BASELINES:
+                raise unknown_name("classical baseline", name, BASELINES)
         stems = [Path(weights).stem for weights in self.geometry_weights]
         if len(set(stems)) < len(stems):
             raise OptionError(
@@ -92,13 +82,16 @@ class BenchmarkOptions:
 
     def deepdetect_480(self, threshold: float = 0.5) -> LocalFeature:
         """Return DeepDetect as the paper runs it: images squashed to 480x480, SIFT of size 3."""
-        heatmap = HeatmapOptions(PAPER_RESOLUTION_PX, self.channels)
         return deepdetect_feature(
-            self.detector.configured(heatmap),
+            self.detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX, self.channels)),
             SelectionOptions(threshold),
             name=f"deepdetect-{threshold:g}",
             title=f"DeepDetect, threshold {threshold:g}",
         )
+
+    def native_detector(self) -> DeepDetect:
+        """Return the detector at the image's own size."""
+        return self.detector.configured(HeatmapOptions("native", self.channels))
 
     def deepdetect_native(self) -> LocalFeature:
         """Return DeepDetect at the image's own size, all pixels over 0.5."""
@@ -109,20 +102,19 @@ class BenchmarkOptions:
         """Return random points of the number that `deepdetect_480` finds, and all pixels."""
         return random_feature(self.deepdetect_480()), all_pixels_feature()
 
-    def density_features(self) -> tuple[LocalFeature, ...]:
+    def density_features(self) -> list[LocalFeature]:
         """Return the rows of Table I and of the repeatability, chance baselines last."""
         classical = [CLASSICAL[name] for name in self.classical if name in CLASSICAL]
         own = [self.deepdetect_480(threshold) for threshold in THRESHOLDS]
-        return without_repeats((*classical, *self.others, *own, *self.chance_baselines()))
+        return without_repeats([*classical, *self.others, *own, *self.chance_baselines()])
 
-    def matching_features(self) -> tuple[LocalFeature, ...]:
+    def matching_features(self) -> list[LocalFeature]:
         """Return the rows of Table II: the low settings, DeepDetect, chance baselines."""
         low = [CLASSICAL[name] for name in self.classical if name.endswith("-low")]
-        return without_repeats(
-            (*low, *self.others, self.deepdetect_480(), *self.chance_baselines())
-        )
+        own = [self.deepdetect_480(), *self.chance_baselines()]
+        return without_repeats([*low, *self.others, *own])
 
-    def standard_features(self) -> tuple[LocalFeature, ...]:
+    def standard_features(self) -> list[LocalFeature]:
         """Return the rows of the standard protocol: default settings, ours sparse, chance."""
         ranked = {**STANDARD, **HESSIAN}
         chosen = [name for name in ranked if name in self.classical]
@@ -138,23 +130,17 @@ class BenchmarkOptions:
         )
         points = points_feature(self.ranker)
         native = self.deepdetect_native()
-        chance = random_feature(native, name="random-native"), all_pixels_feature()
-        return without_repeats(
-            (
-                *(with_common_descriptor(ranked[name]) for name in chosen),
-                *(
-                    replace(f, name=f"{f.name}-own", title=f"{f.title}, own descriptors")
-                    for f in systems.values()
-                ),
-                *(with_own_scale(ranked[name]) for name in chosen if ranked[name].own_scale),
-                *(feature for feature in self.others if feature.name not in BASELINES),
-                with_common_descriptor(points),
-                with_own_scale(points),
-                own,
-                with_common_descriptor(native),
-                *(with_common_descriptor(feature) for feature in chance),
-            )
-        )
+        chance = [random_feature(native, name="random-native"), all_pixels_feature()]
+        features = [with_common_descriptor(ranked[name]) for name in chosen]
+        features += [
+            replace(f, name=f"{f.name}-own", title=f"{f.title}, own descriptors")
+            for f in systems.values()
+        ]
+        features += [with_own_scale(ranked[name]) for name in chosen if ranked[name].own_scale]
+        features += [feature for feature in self.others if feature.name not in BASELINES]
+        features += [with_common_descriptor(points), with_own_scale(points), own]
+        features += [with_common_descriptor(feature) for feature in (native, *chance)]
+        return without_repeats(features)
 
     def stereo_detectors(self) -> dict[str, DeepDetect]:
         """Return detectors with the weights for stereo pairs, at the image's own size, by name."""
@@ -164,21 +150,13 @@ class BenchmarkOptions:
             for weights in self.geometry_weights
         }
 
-    def native_detector(self) -> DeepDetect:
-        """Return the detector at the image's own size."""
-        return self.detector.configured(HeatmapOptions("native", self.channels))
 
-
-def without_repeats(features: Sequence[LocalFeature]) -> tuple[LocalFeature, ...]:
-    """Return the features, each once.
-
-    Raises:
-        OptionError: two that are not the same have one name.
-    """
+def without_repeats(features: Sequence[LocalFeature]) -> list[LocalFeature]:
+    """Return the features, each once; two that are not the same must not have one name."""
     by_name: dict[str, LocalFeature] = {}
     for feature in features:
         if by_name.setdefault(feature.name, feature).version != feature.version:
             raise OptionError(
                 f"two methods are named {feature.name}: rename one of the files they come from"
             )
-    return tuple(by_name.values())
+    return list(by_name.values())

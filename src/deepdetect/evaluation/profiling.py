@@ -28,21 +28,15 @@ class Profile:
     """
 
     seconds: float = 0.0
-    memory: int = 0
+    memory: float = 0
 
     def packed(self) -> np.ndarray:
-        """Return it as an array, for the cache."""
+        """Return it as an array for the cache; `Profile(*array)` reads it."""
         return np.array([self.seconds, self.memory], np.float64)
-
-    @classmethod
-    def unpacked(cls, array: np.ndarray) -> Profile:
-        """Return the profile of `packed`."""
-        seconds, memory = array.tolist()
-        return cls(seconds, int(memory))
 
 
 class StageProfiler:
-    """Measures stages that follow each other, in a `with` block: `record` ends one.
+    """Measures stages that follow each other: `record` ends one. No two may run at a time.
 
     The memory is exact on Linux, which is told to forget the peak where a stage begins; elsewhere a
     peak counts where it is the highest of the process so far.
@@ -51,88 +45,48 @@ class StageProfiler:
         stages: by name; stages of one name add up their seconds, the largest memory counts.
         memory: bytes that the process grew by at most since the first stage began, including what
             an earlier stage still holds.
-
-    Example:
-        >>> with StageProfiler() as profiler:
-        ...     _ = sum(range(1000))
-        ...     profiler.record("summing")
-        >>> profiler.stages["summing"].seconds > 0
-        True
     """
 
     def __init__(self) -> None:
         self.stages: dict[str, Profile] = {}
         self.memory = 0
-
-    def __enter__(self) -> StageProfiler:
-        _RUNNING.append(self)
         self._begin()
         self._first = self._before
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        _RUNNING.remove(self)
 
     def record(self, name: str) -> None:
         """End a stage, and begin the next one."""
         seconds = time.perf_counter() - self._started
-        _forget_peak()
+        peak = max(_memory("VmHWM"), self._before)
         profile = self.stages.setdefault(name, Profile())
         profile.seconds += seconds
-        profile.memory = max(profile.memory, self._peak - self._before)
-        self.memory = max(self.memory, self._peak - self._first)
+        profile.memory = max(profile.memory, peak - self._before)
+        self.memory = max(self.memory, peak - self._first)
         self._begin()
 
     def _begin(self) -> None:
-        _forget_peak()
-        self._before = self._peak = _memory("VmRSS")
+        global _highest
+        _highest = peak_memory()
+        with suppress(OSError):
+            Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM, see man 5 proc
+        self._before = _memory("VmRSS")
         self._started = time.perf_counter()
 
 
-_RUNNING: list[StageProfiler] = []
-"""Those in whose blocks the process is: blocks may be nested."""
-
 _highest = 0
-
-
-def _forget_peak() -> None:
-    """Note the peak of the process in all that are running, and let it begin anew."""
-    global _highest
-    peak = _memory("VmHWM")
-    _highest = max(_highest, peak)
-    for profiler in _RUNNING:
-        profiler._peak = max(getattr(profiler, "_peak", 0), peak)
-    with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM, see man 5 proc
+"""Of the peaks that were forgotten."""
 
 
 @contextmanager
 def profiled() -> Iterator[Profile]:
-    """Measure the time and the growth of memory of the block.
-
-    Example:
-        >>> with profiled() as profile:
-        ...     _ = sum(range(1000))
-        >>> profile.seconds > 0
-        True
-    """
-    profile = Profile()
-    with StageProfiler() as profiler:
-        try:
-            yield profile
-        finally:
-            profiler.record("block")
-            recorded = profiler.stages["block"]
-            profile.seconds, profile.memory = recorded.seconds, recorded.memory
+    """Measure the time and the growth of memory of the block; known when it has ended."""
+    profiler = StageProfiler()
+    profile = profiler.stages["block"] = Profile()
+    yield profile
+    profiler.record("block")
 
 
 def peak_memory() -> int:
-    """Return the most memory that the process has held so far, in bytes; 0 where unknown.
-
-    Example:
-        >>> peak_memory() > 1_000_000
-        True
-    """
+    """Return the most memory that the process has held so far, in bytes; 0 where unknown."""
     return max(_highest, _memory("VmHWM"))
 
 
@@ -150,20 +104,10 @@ def _memory(name: str) -> int:
 
 
 def run_in_child(function: Callable[..., Outcome], *arguments: Any) -> Outcome:
-    """Call a function in a process of its own, whose `peak_memory` is that of its work alone.
+    """Call a module's function in a process whose `peak_memory` is that of its work alone.
 
-    OpenCV and our kernels have one thread there.
-
-    Args:
-        function: of a module.
-        arguments: what can be pickled.
-
-    Raises:
-        DeepDetectError: the process was ended from outside; or what the function raises.
-
-    Example:
-        >>> run_in_child(max, 1, 2)
-        2
+    OpenCV and our kernels have one thread there. Raises a DeepDetectError where the process was
+    ended from outside, else what the function raises.
     """
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor

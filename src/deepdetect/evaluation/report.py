@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,7 +14,6 @@ from typing import Any, Protocol
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import OptionError
 
 Cell = str | int | float | None
 """What a table holds: None is shown as a dash."""
@@ -26,12 +25,7 @@ Rows = list[Row]
 
 
 def where(rows: Iterable[Row], **wanted: Any) -> Rows:
-    """Return the rows that have these values.
-
-    Example:
-        >>> where([{"scene": "graf", "n": 1}, {"scene": "wall", "n": 2}], scene="wall")
-        [{'scene': 'wall', 'n': 2}]
-    """
+    """Return the rows that have these values."""
     return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
 
 
@@ -47,69 +41,32 @@ def mean_of(values: Iterable[float | None]) -> float | None:
 
 
 @dataclass(frozen=True)
-class Column:
-    """A column of a table.
-
-    Attributes:
-        title: its heading.
-        style: how numbers are written, as ".3f", ",d" or ".1%".
-    """
-
-    title: str
-    style: str = ""
-
-    def show(self, cell: Cell) -> str:
-        """Write a cell as text; an unknown value, NaN or None, is a dash.
-
-        Example:
-            >>> Column("density", ".3f").show(0.5), Column("matches", ",d").show(None)
-            ('0.500', '–')
-        """
-        if cell is None or (isinstance(cell, float) and math.isnan(cell)):
-            return "–"
-        return cell if isinstance(cell, str) else format(cell, self.style)
-
-
-@dataclass(frozen=True)
 class Table:
     """A table.
 
     Attributes:
         key: name of its file, as "oxford_matches".
         title: the line above it.
-        columns: from left to right.
-        rows: cells, as many as columns in each.
+        columns: how numbers are written, as ".3f", ",d" or ".1%", by the columns' titles.
+        rows: cells by the columns' titles; one that is missing, None or NaN is a dash.
         note: what a reader must know to read it.
         in_text: False for a long one: report.md names its file instead of showing its rows.
-
-    Raises:
-        OptionError: a row has another length, or two columns have one title.
     """
 
     key: str
     title: str
-    columns: tuple[Column, ...]
-    rows: tuple[tuple[Cell, ...], ...]
+    columns: Mapping[str, str]
+    rows: Sequence[Row]
     note: str = ""
     in_text: bool = True
 
-    def __post_init__(self) -> None:
-        titles = [column.title for column in self.columns]
-        if len(set(titles)) < len(titles):
-            raise OptionError(f"columns of the table {self.key} share a title: {titles}")
-        for row in self.rows:
-            if len(row) != len(self.columns):
-                raise OptionError(
-                    f"a row of the table {self.key} has {len(row)} cells for "
-                    f"{len(self.columns)} columns"
-                )
-
     def values(self) -> list[dict[str, Cell]]:
-        """Return each row as a dict by the columns' titles; JSON has no NaN: it becomes None."""
+        """Return each row in the order of the columns; JSON has no NaN: it becomes None."""
         return [
             {
-                column.title: None if isinstance(cell, float) and not math.isfinite(cell) else cell
-                for column, cell in zip(self.columns, row, strict=True)
+                title: None if isinstance(cell, float) and not math.isfinite(cell) else cell
+                for title in self.columns
+                for cell in [row.get(title)]
             }
             for row in self.rows
         ]
@@ -121,19 +78,27 @@ class Table:
             return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
         rule = "|---|" + "---:|" * (len(self.columns) - 1)
-        rows = [[c.show(x) for c, x in zip(self.columns, row, strict=True)] for row in self.rows]
-        return "\n".join([line(c.title for c in self.columns), rule, *map(line, rows)])
+        rows = [
+            [_shown(row.get(t), style) for t, style in self.columns.items()] for row in self.rows
+        ]
+        return "\n".join([line(self.columns), rule, *map(line, rows)])
 
     def to_csv(self) -> str:
         """Write all digits; an unknown value is an empty cell."""
         text = io.StringIO(newline="")
         writer = csv.writer(text)
-        writer.writerow(column.title for column in self.columns)
-        writer.writerows(
-            ["" if isinstance(cell, float) and math.isnan(cell) else cell for cell in row]
-            for row in self.rows
-        )
+        writer.writerow(self.columns)
+        for row in self.rows:
+            cells = [row.get(title) for title in self.columns]
+            writer.writerow("" if cell is None or cell != cell else cell for cell in cells)
         return text.getvalue()
+
+
+def _shown(cell: Cell, style: str) -> str:
+    """Write a cell as text; an unknown value, NaN or None, is a dash."""
+    if cell is None or cell != cell:
+        return "–"
+    return cell if isinstance(cell, str) else format(cell, style)
 
 
 class Titled(Protocol):
@@ -146,54 +111,34 @@ class Titled(Protocol):
     def title(self) -> str: ...
 
 
-Columns = Sequence[tuple[Column, Callable[[Rows], Cell]]]
-"""Columns, and what each makes of the rows of one method."""
+Measure = Callable[[Rows], Cell]
+"""What makes a cell of the rows of one method."""
+
+Columns = Mapping[str, tuple[str, Measure]]
+"""The style and the cell of each column, by its title."""
 
 
-def average(title: str, style: str, name: Any, **wanted: Any) -> tuple[Column, Any]:
+def average(style: str, name: Any, **wanted: Any) -> tuple[str, Measure]:
     """Make the column of the mean of a value, over the rows that have the wanted values."""
-    return Column(title, style), lambda rows: mean(where(rows, **wanted), name)
-
-
-def single(title: str, style: str, name: Any, **wanted: Any) -> tuple[Column, Any]:
-    """Make the column of a value of the one row that has the wanted values."""
-
-    def cell(rows: Rows) -> Cell:
-        found = where(rows, **wanted)
-        value: Cell = found[0][name] if found else None
-        return value
-
-    return Column(title, style), cell
+    return style, lambda rows: mean(where(rows, **wanted), name)
 
 
 def tabulate(
     key: str, title: str, methods: Sequence[Titled], rows: Rows, columns: Columns, note: str = ""
 ) -> Table:
-    """Make a table with a line for each method.
-
-    Args:
-        key, title, note: as of `Table`.
-        methods: in the order of the lines.
-        rows: of `Run.rows`.
-        columns: those after the method's title.
-    """
+    """Make a table with a line for each method, of the rows of `Run.rows`."""
     lines = []
     for method in methods:
         own = where(rows, method=method.name)
-        lines.append((method.title, *(cell(own) for _, cell in columns)))
-    heads = (Column("method"), *(column for column, _ in columns))
-    return Table(key, title, heads, tuple(lines), note)
+        cells = {title: cell(own) for title, (_, cell) in columns.items()}
+        lines.append({"method": method.title, **cells})
+    styles = {"method": ""} | {title: style for title, (style, _) in columns.items()}
+    return Table(key, title, styles, lines, note)
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture.
-
-    Attributes:
-        key: name of its file, as "oxford_repeatability".
-        title: the line under it, with the numbers it shows.
-        png: the file's bytes.
-    """
+    """A picture: the name of its file, the line under it, and the PNG file's bytes."""
 
     key: str
     title: str
@@ -232,10 +177,6 @@ class Report:
         """Return the tables of all sections."""
         return [table for section in self.sections for table in section.tables]
 
-    def figures(self) -> list[Figure]:
-        """Return the figures of all sections."""
-        return [figure for section in self.sections for figure in section.figures]
-
     def values(self) -> dict[str, Any]:
         """Return the report as plain values: each row a dict by the columns' titles."""
         return {
@@ -244,18 +185,15 @@ class Report:
             "tables": {
                 t.key: {"title": t.title, "note": t.note, "rows": t.values()} for t in self.tables()
             },
-            "figures": {figure.key: figure.title for figure in self.figures()},
+            "figures": {f.key: f.title for section in self.sections for f in section.figures},
             "skipped": list(self.skipped),
         }
 
     def save(self, folder: Path) -> list[Path]:
-        """Write report.md, figures/KEY.png, tables/KEY.csv and report.json.
-
-        Returns:
-            The files, report.md first.
-        """
+        """Write report.md, figures/KEY.png, tables/KEY.csv and report.json; return the files."""
+        figures = [figure for section in self.sections for figure in section.figures]
         files = {"report.md": self._markdown().encode()}
-        files |= {f"figures/{figure.key}.png": figure.png for figure in self.figures()}
+        files |= {f"figures/{figure.key}.png": figure.png for figure in figures}
         files |= {f"tables/{table.key}.csv": table.to_csv().encode() for table in self.tables()}
         files["report.json"] = (json.dumps(self.values(), indent=1) + "\n").encode()
         for name, content in files.items():

@@ -26,6 +26,8 @@ from .profiling import Profile, profiled
 from .report import Row, Rows, Titled
 
 Result = TypeVar("Result")
+AnyMethod = TypeVar("AnyMethod", bound=Titled)
+Item = TypeVar("Item")
 
 STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
     "keypoints": (1, ()),
@@ -55,10 +57,6 @@ class CacheError(DeepDetectError):
     """A result cannot be kept: the folder cannot be written."""
 
 
-AnyMethod = TypeVar("AnyMethod", bound=Titled)
-Item = TypeVar("Item")
-
-
 @dataclass(frozen=True)
 class MatchSettings:
     """How the descriptors of a pair are matched.
@@ -76,14 +74,6 @@ class MatchSettings:
     mutual: bool = False
     budget: int | None = None
     seed: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class ImageKeypoints:
-    """The keypoints of an image, and what detecting them took when it was done."""
-
-    keypoints: Keypoints
-    profile: Profile
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,11 +107,6 @@ class Run:
         made: number of results that were computed, not found in the cache.
         skipped: what was not measured, each with the reason.
         failures: of that, what was wanted and could not be measured.
-
-    Example:
-        >>> run = Run(Path("data"))
-        >>> run.cached("stereo", {"of": [1, 2]}, lambda: {"value": np.array(3)})["value"].item()
-        3
     """
 
     def __init__(self, data: Path, cache: Path | None = None, quiet: bool = True) -> None:
@@ -130,7 +115,7 @@ class Run:
         self.skipped: list[str] = []
         self.failures: list[str] = []
         self._temporary: Path | None = None
-        self._recent: OrderedDict[str, ImageKeypoints] = OrderedDict()
+        self._recent: OrderedDict[str, tuple[Keypoints, Profile]] = OrderedDict()
         self._described: tuple[str, list[np.ndarray], Profile] | None = None
 
     def folder(self, name: str) -> Path:
@@ -152,16 +137,14 @@ class Run:
 
         Only errors of data and of detectors from outside are noted. Any other is a bug and passes,
         an error of options too: those of the user were checked before the run.
-
-        Returns:
-            Its result, or None.
         """
         try:
             return work(*arguments)
         except (CacheError, OptionError):
             raise
-        except DeepDetectError as error:
-            self.fail(f"{name}: {error}")
+        except (DeepDetectError, cv2.error) as error:
+            reason = getattr(error, "err", None) or error  # what OpenCV says without its files
+            self.fail(f"{name}: {reason}".splitlines()[0])
             return None
 
     def fail(self, reason: str) -> None:
@@ -176,16 +159,10 @@ class Run:
         items: Mapping[str, Item],
         measure: Callable[[AnyMethod, Item], Row],
     ) -> Rows:
-        """Measure each method on each item.
+        """Measure each method on each item by its name.
 
-        Args:
-            what: the beginning of what the progress bar shows and of the reason of a failure.
-            methods: what is compared.
-            items: what it is measured on, by name.
-            measure: returns the values of a row by name.
-
-        Returns:
-            The rows with "method" and "item", the names; those that failed are missing.
+        `what` is the beginning of what the progress bar shows and of the reason of a failure. The
+        rows have the names as "method" and "item"; those that failed are missing.
         """
         rows: Rows = []
         with progress(len(methods) * len(items), "benchmark", "task", self.quiet) as bar:
@@ -200,15 +177,9 @@ class Run:
         return rows
 
     def cached(self, stage: str, depends: object, make: Callable[[], Arrays]) -> Arrays:
-        """Find a result, or make and keep it.
+        """Find a result of one of `STAGES`, or make and keep it.
 
-        Args:
-            stage: one of `STAGES`.
-            depends: all that the result depends on, as for `records.key`: of a path its content.
-            make: makes the arrays.
-
-        Raises:
-            CacheError: the result cannot be written.
+        It depends on the values of `depends`, as for `records.key`: of a path on its content.
         """
         path = None
         if self.cache is not None:
@@ -225,8 +196,8 @@ class Run:
                 raise CacheError(str(error)) from None
         return made
 
-    def keypoints(self, feature: LocalFeature, image: Path) -> ImageKeypoints:
-        """Find the keypoints of an image, or read them from the cache."""
+    def keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, Profile]:
+        """Find the keypoints of an image, or read them and what it took from the cache."""
         name = f"{feature.detection} {file_digest(image)}"
         if name not in self._recent:
             self._recent[name] = self._keypoints(feature, image)
@@ -235,7 +206,7 @@ class Run:
             self._recent.popitem(last=False)
         return self._recent[name]
 
-    def _keypoints(self, feature: LocalFeature, image: Path) -> ImageKeypoints:
+    def _keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, Profile]:
         def make() -> Arrays:
             rgb = load_image(image)
             with profiled() as profile:
@@ -250,15 +221,15 @@ class Run:
             }
 
         kept: dict[str, Any] = dict(self.cached("keypoints", (feature.detection, image), make))
-        profile = Profile.unpacked(kept.pop("profile"))
+        profile = Profile(*kept.pop("profile").tolist())
         width, height = kept.pop("image_size").tolist()
-        return ImageKeypoints(Keypoints(image_size=(width, height), **kept), profile)
+        return Keypoints(image_size=(width, height), **kept), profile
 
     def matches(
         self, feature: LocalFeature, images: tuple[Path, Path], settings: MatchSettings
     ) -> PairMatches:
         """Match two images, or read their matches from the cache."""
-        both = [self.keypoints(feature, image).keypoints for image in images]
+        both = [self.keypoints(feature, image)[0] for image in images]
         if settings.budget is not None:
             both = [keypoints.best(settings.budget) for keypoints in both]
 
@@ -280,13 +251,9 @@ class Run:
             return {"rows0": found.indices0, "rows1": found.indices1, "profiles": profiles}
 
         kept = self.cached("matches", (*feature.key, images, settings), make)
-        return PairMatches(
-            both[0].xy[kept["rows0"]],
-            both[1].xy[kept["rows1"]],
-            both[0].xy,
-            both[1].xy,
-            *map(Profile.unpacked, kept["profiles"]),
-        )
+        describe, match = (Profile(*profile) for profile in kept["profiles"].tolist())
+        points = both[0].xy[kept["rows0"]], both[1].xy[kept["rows1"]]
+        return PairMatches(*points, both[0].xy, both[1].xy, describe, match)
 
     def _descriptors(
         self, feature: LocalFeature, images: tuple[Path, Path], both: Sequence[Keypoints]
@@ -312,12 +279,7 @@ class Run:
 
 
 def stage_versions(stage: str) -> dict[str, Any]:
-    """Return the versions that a stage's results depend on: its own, its sources', the packages'.
-
-    Example:
-        >>> sorted(stage_versions("matches"))
-        ['keypoints', 'matches', 'numpy', 'opencv']
-    """
+    """Return what a stage's results depend on: its version, its sources' and the packages'."""
     version, sources = STAGES[stage]
     versions = {"numpy": np.__version__, "opencv": cv2.__version__, stage: version}
     for source in sources:

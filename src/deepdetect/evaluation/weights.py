@@ -16,18 +16,13 @@ from ..datasets.types import PlanarPair, PlanarScene
 from ..detector.detector import DeepDetect
 from ..features.selection import SelectionOptions
 from ..io.image import find_images, load_image
-from .baselines.method import LocalFeature, heatmap_feature
-from .metrics.calibration import Calibration
+from .baselines.method import LocalFeature, deepdetect_feature
 from .metrics.masks import MaskScore
 from .options import PAPER_RESOLUTION_PX, THRESHOLDS
 from .protocols.masks import (
     LabelDensityDetector,
-    ScaleScore,
-    Scored,
     check_scales,
-    has_samples,
     load_sample,
-    readable_images,
     sample_images,
     score_at_scale,
     score_samples,
@@ -85,8 +80,7 @@ class Evaluation:
 
     Attributes:
         masks: against the known masks of samples, by visibility, "normal" and "low".
-        calibration: of the probabilities on all pixels of these samples, likewise.
-        scales: against the labels of scaled images, a row for each scale and visibility.
+        scales: against the labels of scaled images, by scale and visibility.
         oxford: by the paper's protocol.
         foreground: of photographs with a known foreground.
         failures: a sentence on each sample that cannot be read and is not in the scores; `oxford`
@@ -94,11 +88,10 @@ class Evaluation:
     """
 
     masks: dict[str, MaskScore] = field(default_factory=dict)
-    scales: tuple[ScaleScore, ...] = ()
+    scales: dict[tuple[float, str], MaskScore] = field(default_factory=dict)
     oxford: OxfordScore | None = None
-    failures: tuple[str, ...] = ()
-    calibration: dict[str, Calibration] = field(default_factory=dict)
     foreground: ForegroundScore | None = None
+    failures: tuple[str, ...] = ()
 
 
 @suggest_keywords
@@ -158,51 +151,47 @@ def evaluate(
     scenes = None if oxford is None else load_oxford(oxford)  # before hours of work
     masked = None if foreground is None else load_foreground(foreground)
     detector = DeepDetect() if detector is None else detector
-    scored: dict[str, Scored] = {}
-    rows: list[ScaleScore] = []
-    failures: tuple[str, ...] = ()
+    masks: dict[str, MaskScore] = {}
+    by_scale: dict[tuple[float, str], MaskScore] = {}
+    failures: dict[str, None] = {}
     if samples is not None:
-        if scales and not has_samples(samples):
-            images, failures = readable_images(find_images(samples))
-        else:
-            images, failures = readable_images(sample_images(samples), load_sample)
-            scored = score_samples(detector.heatmap, _shown(images, "scoring", quiet))
+        with_masks = not scales or any(Path(samples).glob("mask_image_*.png"))
+        images = sample_images(samples) if with_masks else find_images(samples)
+
+        def loaded(title: str) -> Iterator[tuple[Any, Any]]:
+            with progress(len(images), title, "image", quiet) as bar:
+                for path in images:
+                    try:
+                        yield load_sample(path) if with_masks else (load_image(path), None)
+                    except ImageError as error:
+                        failures[str(error)] = None
+                    bar.update(1)
+
+        if with_masks:
+            masks = score_samples(detector.heatmap, loaded("scoring"))
         for scale in scales:
-            rows += score_at_scale(detector, _shown(images, f"scale {scale:g}", quiet), scale)
+            shown = (rgb for rgb, _ in loaded(f"scale {scale:g}"))
+            for visibility, score in score_at_scale(detector, shown, scale).items():
+                by_scale[scale, visibility] = score
+        if not masks and not by_scale:
+            raise ImageError(next(iter(failures)))
     how = {"equal_density": equal_density, "quiet": quiet}
     return Evaluation(
-        {name: score for name, (score, _) in scored.items()},
-        tuple(rows),
+        masks,
+        by_scale,
         None if scenes is None else evaluate_oxford(detector, scenes, **how),
-        failures,
-        {name: calibration for name, (_, calibration) in scored.items()},
         None if masked is None else evaluate_foreground(detector, masked, **how),
+        tuple(failures),
     )
-
-
-def _shown(images: Sequence[Path], title: str, quiet: bool) -> Iterator[Path]:
-    """Yield the images, with a progress bar."""
-    with progress(len(images), title, "image", quiet) as bar:
-        for image in images:
-            yield image
-            bar.update(1)
 
 
 def evaluate_oxford(
     detector: Any, scenes: list[PlanarScene], *, equal_density: bool = False, quiet: bool = True
 ) -> OxfordScore:
-    """Evaluate weights, or anything with a method `heatmap`, by the paper's protocol.
+    """Evaluate weights, or anything with a method `heatmap`, on scenes of `load_oxford`.
 
-    Args:
-        detector: a DeepDetect sees images squashed to 480x480, whatever its own resolution; its
-            other options stay.
-        scenes: of `load_oxford`.
-        equal_density: a DeepDetect takes as many keypoints of each image as its label marks.
-        quiet: show no progress bar.
-
-    Raises:
-        OptionError: `equal_density` is asked of another detector, which has no logits.
-        ImageError: there is no image that can be measured.
+    A DeepDetect sees images squashed to 480x480, whatever its own resolution; its other options
+    stay. It takes as many keypoints of each image as its label marks where `equal_density` is set.
     """
     detector = _of_paper(detector, equal_density)
     features = [_feature(detector)]
@@ -247,12 +236,7 @@ def evaluate_foreground(
     equal_density: bool = False,
     quiet: bool = True,
 ) -> ForegroundScore:
-    """Measure how many keypoints lie on the foreground; arguments as of `evaluate_oxford`.
-
-    Raises:
-        ImageError: there is no image that can be measured, or none has a keypoint.
-        OptionError: as of `evaluate_oxford`.
-    """
+    """Measure how many keypoints lie on the foreground; arguments as of `evaluate_oxford`."""
     run = Run(Path(), quiet=quiet)
     rows = run.rows(
         "foreground of ",
@@ -272,11 +256,6 @@ def evaluate_foreground(
 def _of_paper(detector: Any, equal_density: bool) -> Any:
     """Return a detector that sees images as in the paper; others than DeepDetect as they are."""
     if not isinstance(detector, DeepDetect):
-        if equal_density:
-            raise OptionError(
-                "only of a DeepDetect as many keypoints as wanted can be taken: leave "
-                "out `equal_density`"
-            )
         return detector
     options = replace(
         detector.heatmap_options, resolution=PAPER_RESOLUTION_PX, tile_megapixels="auto"
@@ -286,10 +265,6 @@ def _of_paper(detector: Any, equal_density: bool) -> Any:
 
 
 def _feature(detector: Any) -> LocalFeature:
-    return heatmap_feature(
-        detector,
-        SelectionOptions(THRESHOLDS[0]),
-        name="evaluated",
-        title="the weights",
-        version="1",
-    )
+    selection = SelectionOptions(THRESHOLDS[0])
+    title = "the weights"
+    return deepdetect_feature(detector, selection, name="evaluated", title=title, version="1")

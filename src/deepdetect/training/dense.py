@@ -162,9 +162,9 @@ class DenseTask(Task):
         self.network.eval()
         with loading(self._loader(dataset, batch_size=None)) as pairs:
             for number, (image, mask) in enumerate(pairs):
-                score = score_heatmap(self.heatmap(image), mask.numpy())
+                loss, iou = score_heatmap(self.heatmap(image), mask.numpy())
                 sums[int(number >= len(dataset) // 2)] += torch.tensor(
-                    [score.loss, score.iou, 1.0], dtype=torch.float64
+                    [loss, iou, 1.0], dtype=torch.float64
                 )
         sums = self.fabric.all_reduce(sums, reduce_op="sum")
         (normal_loss, normal_iou), (dark_loss, dark_iou) = (sums[:, :2] / sums[:, 2:]).tolist()

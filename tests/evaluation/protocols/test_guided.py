@@ -12,7 +12,6 @@ from deepdetect import DeepDetect, match_images
 from deepdetect.datasets.types import PlanarPair
 from deepdetect.evaluation.benchmarks import run_benchmarks
 from deepdetect.evaluation.options import BenchmarkOptions
-from deepdetect.evaluation.profiling import Profile
 from deepdetect.evaluation.protocols.guided import (
     SEEDS,
     GuidedPair,
@@ -55,8 +54,7 @@ def section(options: BenchmarkOptions, pair: PlanarPair) -> Section:
 
 def rows(section, key: str) -> dict[str, dict[str, object]]:
     (table,) = [table for table in section.tables if table.key == key]
-    titles = [column.title for column in table.columns]
-    return {str(row[1]): dict(zip(titles, row, strict=True)) for row in table.rows}
+    return {row["method"]: row for row in table.rows}
 
 
 @pytest.mark.slow
@@ -164,12 +162,12 @@ def test_seeds_that_fall_back_count(
     for kind, right in found:
         points1 = points0 + np.where(np.arange(10) < right, 0, 5)[:, None]
         matrix = np.eye(3) if kind == "homography" else None
-        seeds.append(GuidedPair(kind, matrix, points0, points1, Profile(1.0, 0)))
-    cells = _guided_cells(seeds, still, 20, (240, 200))
+        seeds.append(GuidedPair(kind, matrix, points0, points1, 1.0))
+    cells = list(_guided_cells(seeds, still, 20, (240, 200)).values())
     assert cells[0] == (f"{said} seeds guided" if "of" in said.split() else said)
     assert cells[1] == middle
     assert cells[2] == pytest.approx(np.std([right for _, right in found], ddof=1))
-    assert cells[3:6] == (middle / 10, middle / 20, least / 20)
+    assert cells[3:6] == [middle / 10, middle / 20, least / 20]
 
 
 @pytest.mark.slow
@@ -179,4 +177,4 @@ def test_the_low_visibility_report_has_the_table(
     report = run_benchmarks(["low-visibility"], low_visibility_folder, options)
     assert [table.key for table in report.tables()] == ["low_visibility_guided_published"]
     (table,) = report.tables()
-    assert [row[0] for row in table.rows] == ["dusty 1-2"] * 3 + ["smoky 1-2"] * 3
+    assert [row["pair"] for row in table.rows] == ["dusty 1-2"] * 3 + ["smoky 1-2"] * 3

@@ -10,10 +10,11 @@ import pytest
 from deepdetect import DeepDetect, ImageError, OptionError
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.detector.pretrained import pretrained_weights
-from deepdetect.evaluation.metrics.calibration import Calibration
 from deepdetect.evaluation.metrics.masks import MaskScore
 from deepdetect.evaluation.protocols.masks import (
     LabelDetector,
+    check_scales,
+    load_sample,
     sample_images,
     score_at_scale,
     score_samples,
@@ -44,24 +45,22 @@ class Labels:
 def test_a_detector_that_knows_the_labels_has_full_marks(photo: np.ndarray) -> None:
     dark = (photo * 0.15).astype(np.uint8)
     detector = Labels()
-    rows = [row for s in (0.5, 2) for row in score_at_scale(detector, [photo, dark], s)]
-    assert [(row.scale, row.visibility) for row in rows] == [
-        (scale, visibility) for scale in (0.5, 2) for visibility in ("normal", "low")
-    ]
+    rows = [score_at_scale(detector, [photo, dark], scale) for scale in (0.5, 2)]
+    assert [list(row) for row in rows] == [["normal", "low"]] * 2
     height, width = photo.shape[:2]
     assert detector.sizes[0] == (round(height / 2), round(width / 2))
     assert detector.sizes[2] == (2 * height, 2 * width)
-    for row in rows:
-        assert row.score.iou == 1
-        assert row.score.loss < 1e-6
-        assert row.density == pytest.approx(row.label_density)
-        assert 0 < row.density < 1
+    for score in (score for row in rows for score in row.values()):
+        assert score.iou == 1
+        assert score.loss < 1e-6
+        assert score.density == pytest.approx(score.label_density)
+        assert 0 < score.density < 1
 
 
 @pytest.mark.parametrize("scale", [0, -1, float("nan"), float("inf")])
-def test_nonsense_is_refused(photo: np.ndarray, scale: float) -> None:
+def test_nonsense_is_refused(scale: float) -> None:
     with pytest.raises(OptionError, match="above 0"):
-        score_at_scale(Labels(), [photo], scale)
+        check_scales([scale])
 
 
 @pytest.mark.parametrize("scale", [0.02, 1e-6])
@@ -85,12 +84,13 @@ def test_the_bundled_weights_hold_from_half_to_twice_the_size(
         views = [render(path, View(side, darkening)) for path in photos]
         rows[side] = score_at_scale(DeepDetect(), views, 1)
     for side in (240, 960):
-        (row,), (middle,) = rows[side], rows[480]
-        assert row.visibility == middle.visibility == ("normal" if darkening is None else "low")
         dark = 0 if darkening is None else 1
-        assert row.score.iou > middle.score.iou - (0.03, 0.12)[dark]
+        ((visibility, row),) = rows[side].items()
+        assert visibility == ("normal", "low")[dark]
+        middle = rows[480][visibility]
+        assert row.iou > middle.iou - (0.03, 0.12)[dark]
         # Small images have more to mark: the loss of the paper's weights is 3 to 12 times as large.
-        assert row.score.loss < 1.4 * middle.score.loss
+        assert row.loss < 1.4 * middle.loss
         assert row.density == pytest.approx(row.label_density, rel=(0.1, 0.3)[dark])
 
 
@@ -106,21 +106,19 @@ def test_samples_without_a_mask_are_an_error(tmp_path: Path, photo: np.ndarray) 
 
     Image.fromarray(photo).save(tmp_path / "image_1.png")
     with pytest.raises(ImageError, match="mask"):
-        score_samples(lambda rgb: np.zeros(rgb.shape[:2]), sample_images(tmp_path))
+        load_sample(tmp_path / "image_1.png")
+    with pytest.raises(ImageError, match="no samples"):
+        sample_images(tmp_path / "nothing")
 
 
-def bundled_samples(shared: Path, backend: str) -> dict[str, tuple[MaskScore, Calibration]]:
+def bundled_scores(shared: Path, backend: str) -> dict[str, MaskScore]:
     pytest.importorskip(backend, reason=f"needs {backend}")
     weights = pretrained_weights()
     if backend == "torch":
         weights = weights.with_suffix(".safetensors")
     detector = DeepDetect(weights, backend=backend)
     images = sample_images(shared / "data" / "label-samples" / "val")
-    return score_samples(detector.heatmap, images)
-
-
-def bundled_scores(shared: Path, backend: str) -> dict[str, MaskScore]:
-    return {name: score for name, (score, _) in bundled_samples(shared, backend).items()}
+    return score_samples(detector.heatmap, map(load_sample, images))
 
 
 @pytest.mark.parametrize(
@@ -144,18 +142,12 @@ def test_bundled_weights_score_as_their_model_card_says(shared: Path, backend: s
 @pytest.mark.slow
 def test_bundled_weights_reach_the_bar(shared: Path) -> None:
     """What was asked of them on the published samples: BCE, IoU and calibrated probabilities."""
-    samples = bundled_samples(shared, "onnxruntime")
-    scores = {name: score for name, (score, _) in samples.items()}
+    scores = bundled_scores(shared, "onnxruntime")
     assert scores["normal"].loss <= 0.115
     assert scores["normal"].iou >= 0.84
     assert scores["low"].loss <= 0.155
     assert scores["low"].iou >= 0.66
-    assert max(calibration.expected_error for _, calibration in samples.values()) <= 0.01
-
-
-def test_a_folder_without_samples_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(ImageError, match="no samples"):
-        sample_images(tmp_path)
+    assert max(score.calibration_error for score in scores.values()) <= 0.01
 
 
 def test_labels_are_those_of_the_image_as_the_network_sees_it() -> None:

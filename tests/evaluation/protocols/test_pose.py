@@ -22,7 +22,6 @@ from deepdetect.evaluation.metrics.pose import rotation_error, translation_error
 from deepdetect.evaluation.options import BenchmarkOptions
 from deepdetect.evaluation.protocols.pose import (
     STRAIGHT_AHEAD,
-    FoundMatches,
     PoseMethod,
     distance_table,
     estimate_pose,
@@ -65,10 +64,8 @@ def report(folder: Path, edge_detector: DeepDetect) -> Report:
     return run_benchmarks(["pose"], folder, options)
 
 
-def rows(table: Table, name: str = "method") -> dict[str, dict[str, object]]:
-    titles = [column.title for column in table.columns]
-    found = [dict(zip(titles, row, strict=True)) for row in table.rows]
-    return {str(row[name]): row for row in found}
+def rows(table: Table) -> dict[str, dict[str, object]]:
+    return {row["method"]: row for row in table.rows}
 
 
 def find(report: Report, key: str) -> Table:
@@ -168,17 +165,18 @@ def test_pairs_that_were_skipped_are_in_no_count(scene: PosedScene, found: Rows)
 def test_each_frame_distance_has_its_pairs(scene: PosedScene, found: Rows) -> None:
     table = distance_table(scene, METHODS, found)
     assert table.key == "pose_clip_distances"
-    assert [row[:3] for row in table.rows] == [
+    assert [(row["frame distance"], row["method"], row["pairs"]) for row in table.rows] == [
         (distance, title, count) for distance, count in ((1, 3), (3, 1)) for title in TITLES
     ]
-    assert table.rows[3][3] == 1  # of ours, the one that failed
+    assert table.rows[3]["failed"] == 1  # of ours, the one that failed
 
 
 def test_each_pair_has_its_row(found: Rows) -> None:
     table = pair_table([f"clip {k}" for k in range(4)], METHODS, found)
     assert not table.in_text
     assert len(table.rows) == 12
-    assert table.rows[4] == ("pair 1", SIFT, 1, 0.5, 6.0, 6.0, 7, 1.0, None, 1.0)
+    assert list(table.rows[4]) == list(table.columns)
+    assert [*table.rows[4].values()] == ["pair 1", SIFT, 1, 0.5, 6.0, 6.0, 7, 1.0, None, 1.0]
 
 
 def test_a_second_run_reads_what_the_first_has_kept(folder: Path, tmp_path: Path) -> None:
@@ -188,9 +186,9 @@ def test_a_second_run_reads_what_the_first_has_kept(folder: Path, tmp_path: Path
     points = [(p @ pair.first.intrinsics.T / p[:, 2:])[:, :2] for p in seen]
     calls = []
 
-    def match(images: tuple[Path, Path]) -> FoundMatches:
+    def match(images: tuple[Path, Path]) -> tuple:
         calls.append(images)
-        return FoundMatches(*points, seconds=2.5, guided_by="fundamental")
+        return *points, 2.5, "fundamental"
 
     method = PoseMethod("made up", "Made up", match)
     once, again = (pose_row(Run(folder, tmp_path), method, pair) for _ in range(2))
@@ -203,7 +201,7 @@ def test_a_second_run_reads_what_the_first_has_kept(folder: Path, tmp_path: Path
 
 def test_too_few_matches_are_a_failure_not_an_error(folder: Path) -> None:
     (pair,) = load_posed_scenes(folder)[0].pairs
-    nothing = FoundMatches(np.empty((0, 2)), np.empty((0, 2)), 1.0)
+    nothing = np.empty((0, 2)), np.empty((0, 2)), 1.0, ""
     found = pose_row(Run(folder), PoseMethod("nothing", "Nothing", lambda _: nothing), pair)
     assert found["rotation"] == found["translation"] == found["error"] == INF
     assert (found["matches"], found["agreeing"]) == (0, 0.0)

@@ -9,12 +9,11 @@ import pytest
 
 from deepdetect.datasets.posed_images import PosedPair, load_posed_scenes
 from deepdetect.evaluation.metrics.pose import epipolar_inlier_ratio
-from deepdetect.evaluation.protocols.sfm_methods import (
+from deepdetect.evaluation.protocols.sfm import (
     FEATURES,
     find_points,
     find_random_points,
     find_sift,
-    match_features,
     match_sift,
 )
 from deepdetect.sfm.options import MultiViewOptions
@@ -53,7 +52,7 @@ def agreement(scene, stages: Stages, matches) -> list[float]:
     for (first, second), rows in matches.items():
         pair = PosedPair("fountain", images[first], images[second])
         xy = [found[n]["keypoints"][rows[:, k]] for k, n in enumerate((first, second))]
-        ratios.append(epipolar_inlier_ratio(*xy, pair.fundamental, 2.0))
+        ratios.append(epipolar_inlier_ratio(*xy, pair.fundamental))
     return ratios
 
 
@@ -91,7 +90,7 @@ def test_random_points_differ_from_ours_in_nothing_but_their_places(scene, tmp_p
     first, second = (both[1][f"{name}.jpg"]["keypoints"] for name in NAMES[:2])
     assert np.abs(first[:100] - second[:100]).max() > 10  # other places in each photograph
     pairs = [("0004.jpg", "0005.jpg"), ("0005.jpg", "0006.jpg")]
-    ratios = [agreement(scene, s, match_features(s, pairs)) for s in (ours, random)]
+    ratios = [agreement(scene, s, s.match(pairs)) for s in (ours, random)]
     assert min(ratios[0]) > max(ratios[1])
 
 

@@ -25,6 +25,7 @@ from deepdetect.evaluation.protocols import standard
 from deepdetect.evaluation.protocols.standard import (
     BUDGETS,
     median_seconds,
+    pair_row,
     repeated,
     standard_rows,
     standard_tables,
@@ -54,7 +55,7 @@ def table_of(feature: LocalFeature, rows: Rows, key: str) -> dict[str, object]:
     (table,) = [
         t for t in standard_tables([feature], rows, "key", "pairs") if t.key == f"key_{key}"
     ]
-    return dict(zip([column.title for column in table.columns], table.rows[0], strict=True))
+    return table.rows[0]
 
 
 def test_budgets_repeatability_and_coverage_are_those_of_the_best_points(
@@ -62,18 +63,19 @@ def test_budgets_repeatability_and_coverage_are_those_of_the_best_points(
 ) -> None:
     run = Run(tmp_path, tmp_path / "cache")
     method = with_common_descriptor(CLASSICAL["fast-low"])
-    for pair, row in zip(pairs, standard_rows(run, [method], pairs, (64, None)), strict=True):
+    for pair in pairs:
+        row = pair_row(run, method, pair, (64, None))
         for budget in (64, None):
             points = []
             for path in (pair.first, pair.second):
-                keypoints = run.keypoints(method, path).keypoints
+                keypoints, _ = run.keypoints(method, path)
                 assert len(np.unique(keypoints.xy, axis=0)) == len(keypoints)
                 points.append(keypoints.best(budget or len(keypoints)).xy)
-            for one in mutual_nn_repeatability(*points, np.eye(3), ((80, 64), (80, 64))):
-                at = budget, one.radius_px
-                assert row["repeated", *at] == one.value
-                assert row["localization", *at] == pytest.approx(one.localization_px, nan_ok=True)
-                assert row["chance", *at] == pytest.approx(one.chance, abs=1e-12)
+            found = mutual_nn_repeatability(*points, np.eye(3), ((80, 64), (80, 64)))
+            for radius, values in zip((1.0, 2.0, 3.0), found, strict=True):
+                names = "repeated", "chance", "localization"
+                kept = [row[name, budget, radius] for name in names]
+                assert kept == pytest.approx(values, nan_ok=True)
             cells = {(int(x + 0.5) // 32, int(y + 0.5) // 32) for x, y in points[0]}
             assert row["coverage", budget] == pytest.approx(len(cells) / 6)
         assert row["keypoints", 64] == 64
@@ -102,9 +104,7 @@ def test_learned_descriptors_are_matched_without_a_ratio_test(
 ) -> None:
     method = with_common_descriptor(CLASSICAL["fast-low"])
     tested, untested = (
-        standard_rows(Run(tmp_path), [dataclasses.replace(method, learned=learned)], pairs, (512,))[
-            1
-        ]
+        pair_row(Run(tmp_path), dataclasses.replace(method, learned=learned), pairs[1], (512,))
         for learned in (False, True)
     )
     assert untested["matches"] > tested["matches"]
@@ -153,7 +153,7 @@ def test_a_pair_that_fails_is_skipped_and_the_others_count(
     feature = dataclasses.replace(FAST, detect=detect, detection="fails")
     run = Run(tmp_path)
     rows = standard_rows(run, [feature], pairs)
-    assert all(t.rows[0][1] == 1 for t in standard_tables([feature], rows, "key", "pairs"))
+    assert all(t.rows[0]["pairs"] == 1 for t in standard_tables([feature], rows, "key", "pairs"))
     (note,) = run.skipped
     assert "smoky 1-2" in note
     assert "not this one" in note
@@ -197,16 +197,15 @@ def test_all_tables_of_the_section_have_all_methods(report: Report) -> None:
         "low_visibility_cost",
     ]
     for table in tables.values():
-        rows = [row[0] for row in table.rows]
+        rows = [row["method"] for row in table.rows]
         assert len(rows) == 8
         assert [title for title in titles if title in rows] == titles
-    heads = [c.title for c in tables["low_visibility_repeatability_1px"].columns]
-    assert len(heads) == len(set(heads)) == 2 + 3 * len(BUDGETS) + 2
+    assert len(tables["low_visibility_repeatability_1px"].columns) == 2 + 3 * len(BUDGETS) + 2
     assert any("Never works" in note for note in report.skipped)
 
 
 def test_the_figures_are_of_repeatability_accuracy_and_time(report: Report) -> None:
-    assert [figure.key for figure in report.figures()] == [
+    assert [figure.key for figure in report.sections[0].figures] == [
         "low_visibility_accuracy",
         *(f"low_visibility_repeatability_{radius}px" for radius in (1, 3)),
         "low_visibility_time",
@@ -220,7 +219,12 @@ def test_rows_with_the_same_keypoints_are_one_line(
     monkeypatch.setattr(standard, "line_chart", lambda lines, *_, **__: drawn.append(lines) or b"")
     monkeypatch.setattr(standard, "BUDGETS", (32, 64, None))
     features = [FAST, dataclasses.replace(FAST, name="again", title="Described otherwise")]
-    rows = standard_rows(Run(tmp_path), features, pairs, (32, 64, None))
+    run = Run(tmp_path)
+    rows = [
+        {"method": f.name, **pair_row(run, f, pair, (32, 64, None))}
+        for f in features
+        for pair in pairs
+    ]
     for radius in (1.0, 3.0):
         standard.repeatability_figure(features, rows, radius, "key", "pairs")
         (numbers, values) = drawn[-1]["FAST"]
@@ -232,14 +236,12 @@ def test_rows_with_the_same_keypoints_are_one_line(
 def test_a_method_that_never_works_has_dashes(report: Report) -> None:
     for table in report.tables():
         for row in table.rows:
-            if row[0] == "Never works":
-                assert set(row[1:]) <= {None, 0}
+            if row["method"] == "Never works":
+                assert set(row.values()) <= {"Never works", None, 0}
 
 
 def test_baselines_are_worth_what_chance_is(report: Report) -> None:
-    table = report.tables()[0]
-    heads = [column.title for column in table.columns]
-    rows = {row[0]: dict(zip(heads, row, strict=True)) for row in table.rows}
+    rows = {row["method"]: row for row in report.tables()[0].rows}
     every = rows["baseline: all pixels (a grid, where there is a budget)"]
     assert every["all"] == 1
     assert every["all: chance"] == 1

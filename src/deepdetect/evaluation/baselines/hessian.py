@@ -26,20 +26,8 @@ SIZE_PER_SIGMA = 5.0
 """Diameter of a keypoint: 2.5 sigma around it."""
 
 
-OWN_SCALE = OwnScaleDescriptor(0.5)
-"""A size of 2.5 sigma; SIFT has 2."""
-
-
 def hessian_response(gray: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Compute |det H| sigma^4 of an image in [0, 1]: scales can be compared by it.
-
-    Args:
-        gray: (H, W) uint8 or float32.
-        sigma_px: of the Gaussian that smooths the image.
-
-    Returns:
-        (H, W) float32.
-    """
+    """Compute |det H| sigma^4, (H, W) float32, of an image in [0, 1]: scales can be compared."""
     scaled = gray.astype(np.float32) / 255 if gray.dtype == np.uint8 else gray
     smooth = cv2.GaussianBlur(scaled, (0, 0), sigma_px)
     second = np.array([[1, -2, 1]], np.float32)
@@ -57,33 +45,29 @@ def detect_hessian(gray: np.ndarray, sigma_px: float = SIGMA_PX) -> Keypoints:
     return Keypoints(found.xy, found.scores, found.image_size, sizes=sizes)
 
 
-def detect_hessian_scales(
-    gray: np.ndarray, sigmas_px: tuple[float, ...] = SIGMAS_PX, distance_px: float = DISTANCE_PX
-) -> Keypoints:
+def detect_hessian_scales(gray: np.ndarray) -> Keypoints:
     """Detect the maxima at each scale; of neighbours, also of other scales, the best stays."""
-    scales = [detect_hessian(gray, sigma) for sigma in sigmas_px]
+    scales = [detect_hessian(gray, sigma) for sigma in SIGMAS_PX]
     xy, scores = (np.concatenate([getattr(p, name) for p in scales]) for name in ("xy", "scores"))
-    sizes = np.repeat([SIZE_PER_SIGMA * sigma for sigma in sigmas_px], [len(p) for p in scales])
-    kept = suppress_neighbors(xy, scores, distance_px)
+    sizes = np.repeat([SIZE_PER_SIGMA * sigma for sigma in SIGMAS_PX], [len(p) for p in scales])
+    kept = suppress_neighbors(xy, scores, DISTANCE_PX)
     return Keypoints(xy[kept], scores[kept], scales[0].image_size, sizes=sizes[kept])
 
 
 HESSIAN: dict[str, LocalFeature] = {
-    feature.name: feature
-    for feature in (
-        LocalFeature(
-            "hessian",
-            f"|det Hessian|, sigma {SIGMA_PX:g}",
-            lambda rgb: detect_hessian(luma(rgb)),
-            PAPER_DESCRIPTOR.describe,
-            own_scale=OWN_SCALE,
-        ),
-        LocalFeature(
+    name: LocalFeature(
+        name,
+        title,
+        detect,
+        PAPER_DESCRIPTOR.describe,
+        own_scale=OwnScaleDescriptor(0.5),  # a size of 2.5 sigma; SIFT has 2
+    )
+    for name, title, detect in (
+        ("hessian", f"|det Hessian|, sigma {SIGMA_PX:g}", lambda rgb: detect_hessian(luma(rgb))),
+        (
             "hessian-scales",
             f"|det Hessian|, {len(SIGMAS_PX)} scales",
             lambda rgb: detect_hessian_scales(luma(rgb)),
-            PAPER_DESCRIPTOR.describe,
-            own_scale=OWN_SCALE,
         ),
     )
 }

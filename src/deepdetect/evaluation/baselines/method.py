@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import DeepDetectError, OptionError
-from ...detector.detector import DeepDetect, find_keypoints
+from ...detector.detector import find_keypoints
 from ...detector.point_detector import PointDetector
 from ...features.keypoints import Keypoints
 from ...features.scale_space import dominant_angles
@@ -65,7 +65,7 @@ class LocalFeature:
 
 @dataclass(frozen=True)
 class PointDescriptor:
-    """How keypoints that have no size and orientation of their own are described.
+    """How keypoints are described by their positions alone.
 
     Attributes:
         name: "sift", "rootsift" or "sift-opencv".
@@ -78,7 +78,7 @@ class PointDescriptor:
     angle_deg: float = -1.0
 
     def describe(self, rgb: np.ndarray, features: Keypoints) -> np.ndarray:
-        """Describe keypoints by their positions alone; (N, D) float32."""
+        """Describe keypoints; (N, D) float32."""
         return get_descriptor(self.name)(luma(rgb), features.xy, self.size_px, self.angle_deg)
 
 
@@ -90,9 +90,7 @@ COMMON_DESCRIPTOR = PointDescriptor("rootsift", 4.0, 0.0)
 
 @dataclass(frozen=True)
 class OwnScaleDescriptor:
-    """RootSIFT of keypoints that have sizes, at their own sizes and angles.
-
-    Where they have no angles, it is the dominant orientation of the gradients.
+    """RootSIFT of keypoints at their own sizes and angles; without angles the dominant gradient's.
 
     Attributes:
         size_factor: the size that is described over that of the keypoint. A descriptor covers a
@@ -103,8 +101,8 @@ class OwnScaleDescriptor:
 
     def describe(self, rgb: np.ndarray, features: Keypoints) -> np.ndarray:
         """Describe keypoints by positions, sizes and angles; (N, 128) uint8."""
-        if features.sizes is None:
-            raise OptionError("keypoints that have no sizes cannot be described at their own size")
+        if features.sizes is None:  # where none was found
+            return np.zeros((0, 128), np.uint8)
         gray = luma(rgb)
         sizes = self.size_factor * features.sizes
         angles = features.angles
@@ -114,20 +112,26 @@ class OwnScaleDescriptor:
 
 
 def with_own_scale(feature: LocalFeature) -> LocalFeature:
-    """Return a feature whose keypoints are described at their own sizes and angles.
-
-    Each position is taken once, as in `with_common_descriptor`: only the descriptors differ.
-
-    Raises:
-        OptionError: its keypoints have no sizes.
-    """
-    descriptor = feature.own_scale
-    if descriptor is None:
+    """Return a feature whose keypoints are described at their own sizes and angles."""
+    if feature.own_scale is None:
         raise OptionError(f"the keypoints of {feature.title} have no sizes of their own")
+    title = f"{feature.title}, own size and angle"
+    return _described(feature, feature.own_scale, f"{feature.name}-own-scale", title)
+
+
+def with_common_descriptor(feature: LocalFeature) -> LocalFeature:
+    """Return a feature with the descriptor that all detectors get in the standard protocol."""
+    return _described(feature, COMMON_DESCRIPTOR, f"{feature.name}-common", feature.title)
+
+
+def _described(
+    feature: LocalFeature, descriptor: PointDescriptor | OwnScaleDescriptor, name: str, title: str
+) -> LocalFeature:
+    """Describe each position once: SIFT has some for several orientations."""
     return replace(
         feature,
-        name=f"{feature.name}-own-scale",
-        title=f"{feature.title}, own size and angle",
+        name=name,
+        title=title,
         detect=lambda rgb: feature.detect(rgb).distinct(),
         describe=descriptor.describe,
         binary=False,
@@ -136,43 +140,24 @@ def with_own_scale(feature: LocalFeature) -> LocalFeature:
     )
 
 
-def with_common_descriptor(feature: LocalFeature) -> LocalFeature:
-    """Return a feature with the descriptor that all detectors get in the standard protocol.
-
-    It depends on positions only, so each is taken once: SIFT has some for several orientations.
-    """
-    return replace(
-        feature,
-        name=f"{feature.name}-common",
-        detect=lambda rgb: feature.detect(rgb).distinct(),
-        describe=COMMON_DESCRIPTOR.describe,
-        binary=False,
-        version=f"{feature.version} {COMMON_DESCRIPTOR}",
-        detection=f"{feature.detection}, distinct",
-    )
-
-
 def deepdetect_feature(
-    detector: DeepDetect,
+    detector: Any,
     selection: SelectionOptions = SelectionOptions(),
     *,
     name: str = "deepdetect",
     title: str = "DeepDetect",
     descriptor: PointDescriptor = PAPER_DESCRIPTOR,
+    version: str = "",
 ) -> LocalFeature:
-    """Make a local feature of a detector with weights and its selection of pixels.
+    """Make a local feature of a detector; with a version, of anything with a method `heatmap`."""
+    if not version:
+        digest = hashlib.sha256(detector.weights.read_bytes()).hexdigest()[:16]
+        version = f"{digest} {detector.runtime} {detector.heatmap_options} {selection} {descriptor}"
 
-    Args:
-        detector: with its resolution and order of channels.
-        selection: threshold, suppression and number.
-        name, title: as of `LocalFeature`.
-        descriptor: of the keypoints.
-    """
-    digest = hashlib.sha256(detector.weights.read_bytes()).hexdigest()[:16]
-    version = f"{digest} {detector.runtime} {detector.heatmap_options} {selection} {descriptor}"
-    return heatmap_feature(
-        detector, selection, name=name, title=title, descriptor=descriptor, version=version
-    )
+    def detect(rgb: np.ndarray) -> Keypoints:
+        return find_keypoints(detector, rgb, selection)
+
+    return LocalFeature(name, title, detect, descriptor.describe, version=version)
 
 
 def points_feature(ranker: str | Path | None = None) -> LocalFeature:
@@ -186,62 +171,3 @@ def points_feature(ranker: str | Path | None = None) -> LocalFeature:
         version=str(detector.settings),
         own_scale=OwnScaleDescriptor(),
     )
-
-
-def heatmap_feature(
-    detector: Any,
-    selection: SelectionOptions,
-    *,
-    name: str,
-    title: str,
-    version: str,
-    descriptor: PointDescriptor = PAPER_DESCRIPTOR,
-) -> LocalFeature:
-    """Make a local feature of anything with a method `heatmap`; arguments as of `LocalFeature`."""
-
-    def detect(rgb: np.ndarray) -> Keypoints:
-        return find_keypoints(detector, rgb, selection)
-
-    return LocalFeature(name, title, detect, descriptor.describe, version=version)
-
-
-def external_feature(
-    name: str,
-    detect: Callable[[np.ndarray], Any],
-    *,
-    binary: bool = False,
-    learned: bool = False,
-    version: str,
-) -> LocalFeature:
-    """Make a local feature of a function from outside the package.
-
-    Args:
-        name, binary, learned, version: as of `LocalFeature`.
-        detect: maps a (H, W, 3) uint8 RGB image to a dict of `keypoints` (N, 2), `scores` (N,) and
-            optionally `descriptors` (N, D). Whatever it raises becomes a `BaselineError`.
-    """
-
-    def run(rgb: np.ndarray) -> Keypoints:
-        try:
-            found = detect(rgb)
-        except DeepDetectError:
-            raise
-        except Exception as error:  # anyone's code
-            reason = (str(error).splitlines() or ["it failed"])[0]
-            raise BaselineError(f"{name}: {reason} ({type(error).__name__})") from error
-        if not isinstance(found, Mapping) or not {"keypoints", "scores"} <= set(found):
-            raise BaselineError(f"{name} must return a dict with 'keypoints' and 'scores'")
-        size = (rgb.shape[1], rgb.shape[0])
-        try:
-            return Keypoints(
-                found["keypoints"], found["scores"], size, descriptors=found.get("descriptors")
-            )
-        except (OptionError, TypeError, ValueError) as error:
-            raise BaselineError(f"{name} returned keypoints that do not fit: {error}") from error
-
-    def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:
-        if features.descriptors is None:
-            return COMMON_DESCRIPTOR.describe(rgb, features)
-        return features.descriptors
-
-    return LocalFeature(name, name, run, describe, binary=binary, learned=learned, version=version)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from ..._shared.opencv import cv2, opencv_factory
 from ...features.keypoints import Keypoints
 from ...io.image import luma
-from .method import BaselineError, LocalFeature, OwnScaleDescriptor
+from .method import LocalFeature, OwnScaleDescriptor
 
 MAX_CORNERS = 1_000_000
 
@@ -45,8 +44,7 @@ OPENCV_SETTINGS: dict[str, tuple[str, Mapping[str, Any]]] = {
 """OpenCV's factory and its settings by name; all others have its defaults."""
 
 
-def make_opencv(name: str) -> cv2.Feature2D:
-    """Make the detector of `OPENCV_SETTINGS` with this name."""
+def _make(name: str) -> cv2.Feature2D:
     factory, settings = OPENCV_SETTINGS[name]
     return opencv_factory(factory)(**settings)
 
@@ -56,9 +54,6 @@ def describe_with(descriptor: cv2.Feature2D, rgb: np.ndarray, features: Keypoint
 
     A descriptor that cannot be computed, as ORB's near the border, is 0 throughout: such a row
     finds a partner by chance only, and no keypoint is lost from the count.
-
-    Raises:
-        BaselineError: the descriptor moved or doubled keypoints.
     """
     dtype = np.uint8 if descriptor.descriptorType() == cv2.CV_8U else np.float32
     rows = np.zeros((len(features), descriptor.descriptorSize()), dtype)
@@ -66,58 +61,37 @@ def describe_with(descriptor: cv2.Feature2D, rgb: np.ndarray, features: Keypoint
     for row, keypoint in enumerate(keypoints):
         keypoint.class_id = row
     described, found = descriptor.compute(luma(rgb), keypoints)
-    if not len(described):
-        return rows
-    if len(described) > len(features):
-        raise BaselineError("the descriptor returned more keypoints than it was given")
-    rows[[keypoint.class_id for keypoint in described]] = found
+    if len(described):
+        rows[[keypoint.class_id for keypoint in described]] = found
     return rows
 
 
-def _opencv(name: str, title: str, descriptor: str = "SIFT_create") -> LocalFeature:
-    """Make a local feature of `OPENCV_SETTINGS`; as in the paper described by SIFT by default."""
+def _feature(
+    name: str,
+    title: str,
+    detect: Callable[[np.ndarray], Keypoints] | None = None,
+    descriptor: str = "SIFT_create",
+) -> LocalFeature:
+    """Make a local feature, by default of `OPENCV_SETTINGS`; as in the paper described by SIFT."""
 
-    def detect(rgb: np.ndarray) -> Keypoints:
-        found = make_opencv(name).detect(luma(rgb), None)
+    def from_settings(rgb: np.ndarray) -> Keypoints:
+        found = _make(name).detect(luma(rgb), None)
         return Keypoints.from_opencv(found, (rgb.shape[1], rgb.shape[0]))
 
-    return _feature(name, title, detect, descriptor)
+    def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:
+        return describe_with(opencv_factory(descriptor)(), rgb, features)
+
+    binary = descriptor != "SIFT_create"
+    return LocalFeature(name, title, detect or from_settings, describe, binary=binary)
 
 
 def self_described(name: str, title: str) -> LocalFeature:
     """Make a local feature of `OPENCV_SETTINGS` whose descriptors have these settings, too."""
 
     def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:
-        with _reported(title):
-            return describe_with(make_opencv(name), rgb, features)
+        return describe_with(_make(name), rgb, features)
 
-    return replace(_opencv(name, title), name=f"{name}-self-described", describe=describe)
-
-
-def _feature(
-    name: str,
-    title: str,
-    detect: Callable[[np.ndarray], Keypoints],
-    descriptor: str = "SIFT_create",
-) -> LocalFeature:
-    def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:
-        with _reported(title):
-            return describe_with(opencv_factory(descriptor)(), rgb, features)
-
-    def find(rgb: np.ndarray) -> Keypoints:
-        with _reported(title):
-            return detect(rgb)
-
-    return LocalFeature(name, title, find, describe, binary=descriptor != "SIFT_create")
-
-
-@contextmanager
-def _reported(title: str) -> Iterator[None]:
-    """Report an error that OpenCV raises as one of this baseline."""
-    try:
-        yield
-    except cv2.error as error:
-        raise BaselineError(f"{title}: {error.err or error}".splitlines()[0]) from error
+    return replace(_feature(name, title), name=f"{name}-self-described", describe=describe)
 
 
 def _harris(
@@ -184,16 +158,16 @@ def _corners(rgb: np.ndarray, corners: np.ndarray | None, scores: np.ndarray) ->
 CLASSICAL: dict[str, LocalFeature] = {
     feature.name: feature
     for feature in (
-        replace(_opencv("sift", "SIFT"), own_scale=OwnScaleDescriptor()),
-        _opencv("sift-low", "SIFT, low settings"),
-        _opencv("orb", "ORB", "ORB_create"),
-        _opencv("orb-low", "ORB, low settings", "ORB_create"),
-        _opencv("brisk", "BRISK", "BRISK_create"),
-        _opencv("brisk-low", "BRISK, low settings", "BRISK_create"),
-        _opencv("fast", "FAST"),
-        _opencv("fast-low", "FAST, low settings"),
-        _opencv("agast", "AGAST"),
-        _opencv("agast-low", "AGAST, low settings"),
+        replace(_feature("sift", "SIFT"), own_scale=OwnScaleDescriptor()),
+        _feature("sift-low", "SIFT, low settings"),
+        _feature("orb", "ORB", descriptor="ORB_create"),
+        _feature("orb-low", "ORB, low settings", descriptor="ORB_create"),
+        _feature("brisk", "BRISK", descriptor="BRISK_create"),
+        _feature("brisk-low", "BRISK, low settings", descriptor="BRISK_create"),
+        _feature("fast", "FAST"),
+        _feature("fast-low", "FAST, low settings"),
+        _feature("agast", "AGAST"),
+        _feature("agast-low", "AGAST, low settings"),
         _harris("harris", "Harris", 2, 3, 0.04, 0.04),
         _harris("harris-low", "Harris, low settings", 3, 5, 0.001, 0.001),
         _shi_tomasi("shi-tomasi", "Shi-Tomasi", 0.01, 0.04),
@@ -204,7 +178,9 @@ CLASSICAL: dict[str, LocalFeature] = {
 
 STANDARD: dict[str, LocalFeature] = {
     "sift": CLASSICAL["sift"],
-    "orb": _opencv("orb-many", "ORB", "ORB_create"),  # the default stops at 500 keypoints
+    "orb": _feature(
+        "orb-many", "ORB", descriptor="ORB_create"
+    ),  # the default stops at 500 keypoints
     "brisk": CLASSICAL["brisk"],
     "fast": CLASSICAL["fast"],
     "agast": CLASSICAL["agast"],

@@ -13,21 +13,13 @@ from .method import PAPER_DESCRIPTOR, LocalFeature
 
 
 class RandomDetector:
-    """A detector to which any pixel is as good as another.
-
-    Args:
-        seed: decides which pixels come first.
-
-    Example:
-        >>> RandomDetector().heatmap(np.zeros((16, 32), np.uint8)).shape
-        (16, 32)
-    """
+    """A detector to which any pixel is as good as another; each call draws other probabilities."""
 
     def __init__(self, seed: int = 0) -> None:
         self._generator = np.random.default_rng(seed)
 
     def heatmap(self, image: object) -> np.ndarray:
-        """Draw a probability for each pixel, others on every call."""
+        """Draw a probability for each pixel."""
         return self._generator.random(load_image(image).shape[:2], dtype=np.float32)
 
 
@@ -40,13 +32,7 @@ class AllPixels:
 
 
 def random_feature(like: LocalFeature, seed: int = 0, *, name: str = "random") -> LocalFeature:
-    """Make the baseline of random pixels, in each image as many as another feature finds there.
-
-    Args:
-        like: the other feature.
-        seed: of the random numbers; every image gets others.
-        name: as of `LocalFeature`.
-    """
+    """Make the baseline of random pixels, in each image as many as another feature finds there."""
 
     def detect(rgb: np.ndarray) -> Keypoints:
         # The image decides too, so that both images of a pair do not get the same pixels.

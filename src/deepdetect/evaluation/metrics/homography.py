@@ -15,19 +15,9 @@ Sizes = tuple[tuple[int, int], tuple[int, int]]
 
 
 def inside(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return which points lie in an image.
+    """Return which (N, 2) points lie in an image, (N,) bool; false where one is not finite.
 
-    Args:
-        points: (N, 2) positions, centre of the first pixel (0, 0).
-        size: (width, height) in pixels; the image reaches half a pixel beyond the centres of
-            its outer pixels.
-
-    Returns:
-        (N,) bool; false where a position is not finite.
-
-    Example:
-        >>> inside(np.array([[-0.5, 0], [3.4, 0], [3.5, 0]]), (4, 1)).tolist()
-        [True, True, False]
+    The image reaches half a pixel beyond the centres of its outer pixels.
     """
     points = np.asarray(points, np.float64).reshape(-1, 2)
     return np.all((points >= -0.5) & (points < np.asarray(size) - 0.5), axis=1)
@@ -36,18 +26,10 @@ def inside(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def project_visible(
     points: np.ndarray, homography: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
-    """Map points into another image; those that it does not show become NaN.
+    """Map (N, 2) points into another image; those that it does not show become NaN.
 
     A homography also maps what lies beyond its horizon, where the plane is not visible, but turns
     it inside out: the determinant of its Jacobian, det(H) / depth^3, is negative there.
-
-    Args:
-        points: (N, 2) positions in one image.
-        homography: (3, 3) from that image to the other, of any scale and sign, not mirrored.
-        size: (width, height) of the other image.
-
-    Returns:
-        (N, 2) float64.
     """
     depth = np.asarray(points, np.float64).reshape(-1, 2) @ homography[2, :2] + homography[2, 2]
     mapped = transform_points(points, homography)
@@ -56,21 +38,10 @@ def project_visible(
 
 
 def corner_error(estimated: np.ndarray | None, true: np.ndarray, size: tuple[int, int]) -> float:
-    """Return the mean distance between the corners of the first image under two homographies.
+    """Return the mean distance of the first image's corners under two homographies, in pixels.
 
-    Args:
-        estimated: (3, 3) from the first image to the second, or None when there is none.
-        true: (3, 3).
-        size: (width, height) of the first image; its corners are the centres of its corner
-            pixels (SuperPoint's metric, DeTone 2018).
-
-    Returns:
-        Pixels of the second image; infinite without an estimate.
-
-    Example:
-        >>> shift = np.array([[1.0, 0, 3], [0, 1, 4], [0, 0, 1]])
-        >>> corner_error(shift, np.eye(3), (10, 10))
-        5.0
+    The corners are the centres of the corner pixels (SuperPoint's metric, DeTone 2018). Infinite
+    without an estimate.
     """
     if estimated is None:
         return float("inf")
@@ -91,10 +62,6 @@ def area_under_curve(errors: Sequence[float], threshold: float) -> float:
 
     Each error e under the threshold T adds (T - e) / T: the exact area under the cumulative
     curve, with no interpolation between errors.
-
-    Example:
-        >>> area_under_curve([0.0, 1.0, 9.0, float("inf")], 2.0)
-        0.375
     """
     if not len(errors):
         return 0.0

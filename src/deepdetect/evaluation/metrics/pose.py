@@ -1,11 +1,13 @@
-"""How far an estimated relative pose is from the true one, and its AUC (SuperGlue, 2020)."""
+"""How far estimated cameras are from the true ones: two by two, with the AUC, or all together."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ...geometry.camera import PosedView
 from ...geometry.relative_pose import rotation_angle
 from ...geometry.transforms import epipolar_errors
 
@@ -17,28 +19,15 @@ EPIPOLAR_THRESHOLD_PX = 1.0
 
 
 def rotation_error(estimated: np.ndarray, true: np.ndarray) -> float:
-    """Return the angle between two (3, 3) rotations, in degrees from 0 to 180.
-
-    Example:
-        >>> rotation_error(np.eye(3), np.diag([-1.0, -1, 1]))
-        180.0
-    """
+    """Return the angle between two (3, 3) rotations, in degrees from 0 to 180."""
     return rotation_angle(estimated @ true.T)
 
 
 def translation_error(estimated: np.ndarray, true: np.ndarray) -> float:
     """Return the angle between the directions of two translations, in degrees from 0 to 180.
 
-    SuperGlue and glue-factory count an opposite direction as right (the smaller of the angle and
-    180 degrees minus it); here it is wrong, as the points in front of the cameras decide it.
-
-    Args:
-        estimated, true: (3,) of any length. A true one of length 0 has no direction: the error
-            is 0.
-
-    Example:
-        >>> translation_error(np.array([0, 0, 1.0]), np.array([0, 2.0, 0]))
-        90.0
+    SuperGlue and glue-factory count an opposite direction as right; here it is wrong, as the points
+    in front of the cameras decide it. A true translation of length 0 has no direction: error 0.
     """
     across = float(np.linalg.norm(np.cross(estimated, true)))
     return float(np.degrees(np.arctan2(across, np.dot(estimated, true))))
@@ -47,20 +36,8 @@ def translation_error(estimated: np.ndarray, true: np.ndarray) -> float:
 def pose_auc(errors: Sequence[float], threshold: float) -> float:
     """Return the area under the cumulative curve of the errors up to a threshold, over it.
 
-    As SuperGlue and glue-factory compute it: the curve is drawn with straight lines from (0, 0)
-    through the sorted errors, so it lies a little higher than `homography.area_under_curve`,
-    whose curve has steps.
-
-    Args:
-        errors: one of each pair; infinite where it failed.
-        threshold: above 0, in the errors' unit.
-
-    Returns:
-        In [0, 1]; 0 without errors.
-
-    Example:
-        >>> pose_auc([1.0, 3.0, float("inf"), float("inf")], 4.0)
-        0.34375
+    As SuperGlue and glue-factory compute it: the curve is drawn with straight lines from (0, 0), so
+    it lies a little higher than `homography.area_under_curve`, whose curve has steps.
     """
     if not len(errors):
         return 0.0
@@ -73,32 +50,64 @@ def pose_auc(errors: Sequence[float], threshold: float) -> float:
 
 
 def epipolar_inlier_ratio(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    fundamental: np.ndarray,
-    threshold_px: float = EPIPOLAR_THRESHOLD_PX,
+    points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
 ) -> float:
-    """Return the fraction of the matches that agree with a pose.
+    """Return the fraction of the matches whose Sampson distance is under the threshold.
 
-    The error is Sampson's distance: how far the two points must move together, as the root of the
-    sum of both squares, to lie on epipolar lines of each other. Where the images have one scale
-    it is the distance to the line in one image over the square root of 2. A match that slid along
-    its line agrees too: this is an upper bound of the precision.
-
-    Args:
-        points0, points1: (M, 2) matched positions in pixels.
-        fundamental: (3, 3) with x1^T F x0 = 0, the true one.
-        threshold_px: under which a match agrees.
-
-    Returns:
-        In [0, 1]; 0 without matches.
-
-    Example:
-        >>> rows = np.array([[0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # lines are the rows
-        >>> points = np.array([[5.0, 5.0], [5.0, 5.0]])
-        >>> epipolar_inlier_ratio(points, points + [[9, 1.4], [9, 1.5]], rows)
-        0.5
+    A match that slid along its line agrees too: this is an upper bound of the precision. 0 without
+    matches.
     """
     if not len(points0):
         return 0.0
-    return float((epipolar_errors(points0, points1, fundamental) < threshold_px).mean())
+    errors = epipolar_errors(points0, points1, fundamental)
+    return float((errors < EPIPOLAR_THRESHOLD_PX).mean())
+
+
+def camera_errors(
+    views: Sequence[PosedView], truth: Sequence[PosedView]
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Compare three or more cameras with the true ones, after a rotation, a shift and a scale.
+
+    These bring the centres nearest to the true ones (least squares; Umeyama, 1991); of cameras on a
+    line they leave a rotation open. Returns the distances of the centres in the unit of the truth,
+    the angles of the rotations in degrees, and the scale.
+    """
+    own = np.array([view.centre for view in views])
+    true = np.array([view.centre for view in truth])
+    means = own.mean(axis=0), true.mean(axis=0)
+    left, values, right = np.linalg.svd((true - means[1]).T @ (own - means[0]))
+    signs = np.array([1, 1, np.sign(np.linalg.det(left @ right))])
+    turn = left * signs @ right
+    scale = float((values * signs).sum() / ((own - means[0]) ** 2).sum())
+    placed = scale * (own - means[0]) @ turn.T + means[1]
+    angles = [
+        rotation_error(view.rotation @ turn.T, other.rotation)
+        for view, other in zip(views, truth, strict=True)
+    ]
+    return np.linalg.norm(placed - true, axis=1), np.array(angles), scale
+
+
+def relative_pose_errors(
+    views: Mapping[str, PosedView], truth: Mapping[str, PosedView]
+) -> list[float]:
+    """Return the error of each pair's relative pose in degrees, for `pose_auc`.
+
+    The larger of the angles of the rotation and between the directions of the translation; infinite
+    where one of both cameras is missing. It needs no alignment.
+    """
+    errors = []
+    for pair in itertools.combinations(sorted(truth), 2):
+        if not set(pair) <= set(views):
+            errors.append(float("inf"))
+            continue
+        (rotation, translation), (true_rotation, true_translation) = (
+            _relative_pose(cameras[pair[0]], cameras[pair[1]]) for cameras in (views, truth)
+        )
+        angle = rotation_error(rotation, true_rotation)
+        errors.append(max(angle, translation_error(translation, true_translation)))
+    return errors
+
+
+def _relative_pose(first: PosedView, second: PosedView) -> tuple[np.ndarray, np.ndarray]:
+    rotation = second.rotation @ first.rotation.T
+    return rotation, np.asarray(second.translation - rotation @ first.translation)

@@ -1,4 +1,4 @@
-"""Which keypoints of one image are found again in another.
+"""Which keypoints of one image are found again in another, and where in the image they lie.
 
 The paper's definition lets several keypoints share a partner and counts over all keypoints, so a
 full grid of pixels scores best. By mutual nearest neighbours a keypoint has one partner at most,
@@ -8,7 +8,6 @@ only what both images show counts, and random points of the same number say what
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -24,80 +23,26 @@ CHANCE_POINTS = 20_000
 MAX_DRAWS = 100
 MIN_POINTS_FOR_THREADS = 20_000
 
+CELL_PX = 32
+"""Side of the square cells of the coverage."""
+
 
 def repeatability_paper(
     points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, radius_px: float = 1.0
 ) -> float:
     """Return the repeatability as the paper's code computes it, clipped at 1.
 
-    The number of points of the first image that land strictly closer than `radius_px` to
-    some point of the second, over the smaller of the two total counts: points outside the
-    overlap count in the denominator, several points may share one, and nothing is
-    corrected for chance, which is high at this density.
-
-    Args:
-        points0, points1: (N, 2), (M, 2) positions.
-        homography: (3, 3) from the first image to the second.
-        radius_px: pixels of the second image.
-
-    Returns:
-        In [0, 1]; 0 where an image has no points.
+    The points of the first image that land strictly closer than the radius to some point of the
+    second, over the smaller of the two total counts: points outside the overlap count in the
+    denominator, several may share one, and nothing is corrected for chance.
     """
     fewest = min(len(points0), len(points1))
     if not fewest:
         return 0.0
-    return min(np.count_nonzero(repeated(points0, points1, homography, radius_px)) / fewest, 1.0)
-
-
-def repeated(
-    points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, radius_px: float = 1.0
-) -> np.ndarray:
-    """Return which points of the first image land near some point of the second.
-
-    Args:
-        points0: (N, 2) positions in the first image.
-        points1: (M, 2) positions in the second image.
-        homography: (3, 3) from the first image to the second.
-        radius_px: near is strictly closer.
-
-    Returns:
-        (N,) bool.
-
-    Example:
-        >>> repeated([[0, 0], [5, 5]], [[0.5, 0]], np.eye(3)).tolist()
-        [True, False]
-    """
     mapped = transform_points(points0, homography)
-    near = np.zeros(len(mapped), bool)
-    finite = np.isfinite(mapped).all(1)
-    distance, _ = _nearest(_kd_tree(points1), mapped[finite], radius_px)
-    near[finite] = distance < radius_px
-    return near
-
-
-@dataclass(frozen=True)
-class Repeatability:
-    """How many keypoints of two images are at the same places.
-
-    Attributes:
-        radius_px: partners are at most this far apart in the second image.
-        repeated: pairs of keypoints that are mutual nearest neighbours, and near enough.
-        fewest: keypoints in the overlap, of the image that has fewer there.
-        localization_px: mean distance of the pairs; NaN without pairs.
-        chance: the value that random points of the same numbers reach: pixels, where the keypoints
-            are pixels.
-    """
-
-    radius_px: float
-    repeated: int
-    fewest: int
-    localization_px: float
-    chance: float
-
-    @property
-    def value(self) -> float:
-        """Fraction of the keypoints that are repeated, in [0, 1]."""
-        return self.repeated / self.fewest if self.fewest else 0.0
+    mapped = mapped[np.isfinite(mapped).all(axis=1)]
+    distance, _ = _nearest(_kd_tree(points1), mapped, radius_px)
+    return min(np.count_nonzero(distance < radius_px) / fewest, 1.0)
 
 
 def mutual_nn_repeatability(
@@ -107,37 +52,23 @@ def mutual_nn_repeatability(
     sizes: Sizes,
     radii_px: Sequence[float] = (1.0, 2.0, 3.0),
     seed: int = 0,
-) -> list[Repeatability]:
+) -> list[tuple[float, float, float]]:
     """Measure the repeatability by mutual nearest neighbours in the overlap, beside chance.
 
-    Args:
-        points0, points1: (N, 2), (M, 2) positions, centre of the first pixel (0, 0).
-        homography: (3, 3) from the first image to the second.
-        sizes: (width, height) of both images.
-        radii_px: in pixels.
-        seed: of the random points.
-
-    Returns:
-        One for each radius.
-
-    Example:
-        >>> corners = np.array([[2.0, 2], [8, 3], [5, 9]])
-        >>> moved = corners + [[0, 0], [1.5, 0], [0, 0]]
-        >>> found = mutual_nn_repeatability(corners, moved, np.eye(3), ((16, 16), (16, 16)))
-        >>> [round(entry.value, 3) for entry in found]
-        [0.667, 1.0, 1.0]
+    Returns for each radius the fraction of the fewer keypoints in the overlap that are repeated,
+    the one that as many random points reach (pixels, where the keypoints are pixels), and the mean
+    distance of the partners in px, NaN without any.
     """
-    visible0, visible1 = _in_overlap(points0, points1, homography, sizes)
-    fewest = min(len(visible0), len(visible1))
-    distances = _mutual_distances(visible0, visible1, max(radii_px))
+    visible = _in_overlap(points0, points1, homography, sizes)
+    distances = _mutual_distances(*visible, max(radii_px))
     on_pixels = all(bool((np.rint(points) == points).all()) for points in (points0, points1))
-    counts = (len(visible0), len(visible1))
+    counts = (len(visible[0]), len(visible[1]))
     chances = _chance(counts, homography, sizes, radii_px, seed, on_pixels)
     results = []
     for radius, chance in zip(radii_px, chances, strict=True):
         near = distances[distances <= radius]
-        mean = float(near.mean()) if len(near) else float("nan")
-        results.append(Repeatability(float(radius), len(near), fewest, mean, chance))
+        value = len(near) / min(counts) if min(counts) else 0.0
+        results.append((value, chance, float(near.mean()) if len(near) else float("nan")))
     return results
 
 
@@ -148,13 +79,7 @@ def repeated_fractions(
     sizes: Sizes,
     radii_px: Sequence[float] = (1.0, 3.0),
 ) -> list[float]:
-    """Return the values of `mutual_nn_repeatability` alone, without chance; its arguments.
-
-    Example:
-        >>> corners = np.array([[2.0, 2], [8, 3]])
-        >>> repeated_fractions(corners, corners + [[0, 0], [2, 0]], np.eye(3), ((16, 16), (16, 16)))
-        [0.5, 1.0]
-    """
+    """Return the values of `mutual_nn_repeatability` alone, without chance."""
     visible = _in_overlap(points0, points1, homography, sizes)
     fewest = min(map(len, visible))
     distances = _mutual_distances(*visible, max(radii_px))
@@ -243,3 +168,27 @@ def _overlapping_grids(homography: bytes, sizes: Sizes) -> tuple[np.ndarray, np.
 
     matrix = np.frombuffer(homography).reshape(3, 3)
     return _in_overlap(grid(sizes[0]), grid(sizes[1]), matrix, sizes)
+
+
+def coverage(xy: np.ndarray, size: tuple[int, int]) -> float:
+    """Return the fraction of the cells of a grid on a (width, height) image that hold a keypoint.
+
+    Cells at the right and lower border may be smaller.
+    """
+    columns, rows = -(-size[0] // CELL_PX), -(-size[1] // CELL_PX)
+    position = np.floor((np.asarray(xy, np.float64).reshape(-1, 2) + 0.5) / CELL_PX).astype(int)
+    position = np.clip(position, 0, (columns - 1, rows - 1))
+    return len(np.unique(position[:, 1] * columns + position[:, 0])) / (columns * rows)
+
+
+def foreground_fraction(xy: np.ndarray, foreground: np.ndarray) -> float:
+    """Return the fraction of (N, 2) keypoints on a (H, W) bool foreground; NaN without any.
+
+    Section IV-A of the paper.
+    """
+    if not len(xy):
+        return float("nan")
+    height, width = foreground.shape
+    column, row = np.rint(np.asarray(xy)).astype(int).T
+    inside = foreground[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    return float(inside.mean())

@@ -16,7 +16,18 @@ from ...datasets.types import PlanarPair
 from ...io.image import load_image
 from ..baselines.method import LocalFeature
 from ..metrics.homography import accuracy_at
-from ..report import Cell, Column, Columns, Row, Rows, Table, average, mean_of, tabulate, where
+from ..report import (
+    Cell,
+    Columns,
+    Measure,
+    Row,
+    Rows,
+    Table,
+    average,
+    mean_of,
+    tabulate,
+    where,
+)
 from ..run import Run
 from .standard import MATCHING_BUDGET, PAIRS, RADII_PX, budget_name, correct, pair_row, repeated
 
@@ -43,6 +54,17 @@ WHICH_TEXT = {
     ),
 }
 
+OVERVIEW_NOTE = (
+    f"Score over that of the same pairs in daylight, at {MATCHING_BUDGET:,} keypoints: mutual-NN "
+    "repeatability, and correct matches at 1 px. A dash where a method does not fill the budget."
+)
+
+NOTE = (
+    "Mutual-NN repeatability and correct matches as in the standard protocol; of daylight: over "
+    "the score of the same pairs in daylight. A budget that a method does not fill is a dash. "
+    "Keypoints: in the image that has fewer."
+)
+
 VALUES: tuple[tuple[str, int | None, str, Callable[[Rows], float | None]], ...] = (
     *(
         (f"@{radius:g} px", budget, ".3f", partial(repeated, budget=budget, radius=radius))
@@ -62,15 +84,8 @@ def degraded_rows(
 ) -> Rows:
     """Measure all features on all pairs, in daylight and with each degradation.
 
-    Args:
-        run: the copies are kept beside what is cached.
-        features: what is compared.
-        pairs: what it is measured on.
-        images: which of a pair are degraded.
-
-    Returns:
-        The rows of `standard.pair_row` with "light" and, in others than daylight, "daylight", the
-        row of the same pair; those of pairs that could not be measured in both are missing.
+    Returns the rows of `standard.pair_row` with "light" and "daylight", the row of the same pair in
+    daylight; those of pairs that could not be measured in both are missing.
     """
     items = {
         f"{pair.name}, {light}": (light, pair)
@@ -108,11 +123,7 @@ def degraded_pair(
 
 
 def degraded_copy(image: Path, degradation: Degradation, folder: Path) -> Path:
-    """Return the PNG file of a degraded copy of an image; it is made where it is missing.
-
-    Raises:
-        DeepDetectError: it cannot be written.
-    """
+    """Return the PNG file of a degraded copy of an image; it is made where it is missing."""
     digest = file_digest(image)[:16]
     path = folder / "degraded" / f"{digest}-{degradation.name}-v{degradation.version}.png"
     if not path.exists():
@@ -127,10 +138,30 @@ def degraded_tables(
     features: Sequence[LocalFeature], rows: Rows, key: str, what: str
 ) -> list[Table]:
     """Tabulate what is left of the daylight's score, and the scores with each degradation."""
-    return [
-        overview_table(features, rows, key, what),
-        *(degraded_table(features, rows, one, key, what) for one in DEGRADATIONS.values()),
-    ]
+    overview: Columns = {
+        f"{degradation.title}: {title}": (".0%", partial(_relative, light=light, value=value))
+        for light, degradation in DEGRADATIONS.items()
+        for title, budget, _, value in VALUES
+        if budget == MATCHING_BUDGET
+    }
+    title = f"Dark and blurred: fraction of the score in daylight, {what}"
+    tables = [tabulate(f"{key}_relative", title, features, rows, overview, OVERVIEW_NOTE)]
+    for light, degradation in DEGRADATIONS.items():
+        columns: dict[str, tuple[str, Measure]] = {**PAIRS}
+        for name, budget, style, value in VALUES:
+            name = f"{name}, {budget_name(budget)}"
+            columns[name] = style, value
+            columns[f"{name}: of daylight"] = ".0%", partial(_relative, light=light, value=value)
+        columns[f"homography at {HOMOGRAPHY_THRESHOLD_PX:g} px"] = ".3f", _homography_accuracy
+        most = BUDGETS[-1]
+        columns[f"keypoints, of at most {most:,}"] = average(",.0f", ("keypoints", most))
+        title, own = f"{degradation.title}, {what}", where(rows, light=light)
+        tables.append(tabulate(f"{key}_{light}", title, features, own, columns, NOTE))
+    return tables
+
+
+def _homography_accuracy(own: Rows) -> Cell:
+    return mean_of(accuracy_at(row["corner errors"], HOMOGRAPHY_THRESHOLD_PX) for row in own)
 
 
 def _relative(rows: Rows, light: str, value: Callable[[Rows], float | None]) -> Cell:
@@ -138,58 +169,3 @@ def _relative(rows: Rows, light: str, value: Callable[[Rows], float | None]) -> 
     own = where(rows, light=light)
     degraded, daylight = value(own), value([row["daylight"] for row in own])
     return degraded / daylight if degraded is not None and daylight else None
-
-
-def overview_table(features: Sequence[LocalFeature], rows: Rows, key: str, what: str) -> Table:
-    """Tabulate what is left of the daylight's score, at one budget and for all degradations."""
-    columns: Columns = [
-        (
-            Column(f"{degradation.title}: {title}", ".0%"),
-            partial(_relative, light=light, value=value),
-        )
-        for light, degradation in DEGRADATIONS.items()
-        for title, budget, _, value in VALUES
-        if budget == MATCHING_BUDGET
-    ]
-    note = (
-        f"Score over that of the same pairs in daylight, at {MATCHING_BUDGET:,} keypoints: "
-        "mutual-NN repeatability, and correct matches at 1 px. A dash where a method does not fill "
-        "the budget."
-    )
-    title = f"Dark and blurred: fraction of the score in daylight, {what}"
-    return tabulate(f"{key}_relative", title, features, rows, columns, note)
-
-
-def degraded_table(
-    features: Sequence[LocalFeature], rows: Rows, degradation: Degradation, key: str, what: str
-) -> Table:
-    """Tabulate the scores with a degradation, each with its fraction of that in daylight."""
-    light = degradation.name
-
-    def accuracy(own: Rows) -> Cell:
-        return mean_of(accuracy_at(row["corner errors"], HOMOGRAPHY_THRESHOLD_PX) for row in own)
-
-    most = BUDGETS[-1]
-    columns: Columns = [
-        PAIRS,
-        *(
-            column
-            for title, budget, style, value in VALUES
-            for column in (
-                (Column(f"{title}, {budget_name(budget)}", style), value),
-                (
-                    Column(f"{title}, {budget_name(budget)}: of daylight", ".0%"),
-                    partial(_relative, light=light, value=value),
-                ),
-            )
-        ),
-        (Column(f"homography at {HOMOGRAPHY_THRESHOLD_PX:g} px", ".3f"), accuracy),
-        average(f"keypoints, of at most {most:,}", ",.0f", ("keypoints", most)),
-    ]
-    note = (
-        "Mutual-NN repeatability and correct matches as in the standard protocol; of daylight: "
-        "over the score of the same pairs in daylight. A budget that a method does not fill is a "
-        "dash. Keypoints: in the image that has fewer."
-    )
-    title = f"{degradation.title}, {what}"
-    return tabulate(f"{key}_{light}", title, features, where(rows, light=light), columns, note)

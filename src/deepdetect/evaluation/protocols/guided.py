@@ -21,27 +21,29 @@ from ...matching.guided import guided_matches
 from ..baselines.method import LocalFeature
 from ..metrics.homography import corner_error
 from ..options import BenchmarkOptions
-from ..profiling import Profile, profiled
-from ..report import Cell, Column, Row, Section, Table
+from ..profiling import profiled
+from ..report import Cell, Row, Section, Table, where
 from ..run import Run
 from .paper import CORRECT_PX, PAPER_MATCHING
 
 SEEDS = 3
 
-COLUMNS = (
-    Column("matchable", ",d"),
-    Column("descriptors alone: correct", ",d"),
-    Column("descriptors alone: precision", ".2%"),
-    Column("guided by"),
-    Column("guided: correct", ",d"),
-    Column("± of correct", ",.0f"),
-    Column("guided: precision", ".2%"),
-    Column("guided: of the matchable", ".1%"),
-    Column("lowest", ".1%"),
-    Column("guided: unique", ",d"),
-    Column("guided: corner error, px", ".2f"),
-    Column("guided: seconds", ".2f"),
-)
+COLUMNS = {
+    "pair": "",
+    "method": "",
+    "matchable": ",d",
+    "descriptors alone: correct": ",d",
+    "descriptors alone: precision": ".2%",
+    "guided by": "",
+    "guided: correct": ",d",
+    "± of correct": ",.0f",
+    "guided: precision": ".2%",
+    "guided: of the matchable": ".1%",
+    "lowest": ".1%",
+    "guided: unique": ",d",
+    "guided: corner error, px": ".2f",
+    "guided: seconds": ".2f",
+}
 
 NOTE = (
     f"Correct: strictly under {CORRECT_PX:g} px by the true homography; each point of the first "
@@ -63,14 +65,14 @@ class GuidedPair:
         model: what guided: "homography", "fundamental" or "none", with which there are no matches.
         matrix: the geometry, or None.
         points0, points1: (M, 2) matched positions.
-        profile: of the guided matching alone: heat map and keypoints are not included.
+        seconds: of the guided matching alone: heat map and keypoints are not included.
     """
 
     model: str
     matrix: np.ndarray | None
     points0: np.ndarray
     points1: np.ndarray
-    profile: Profile
+    seconds: float
 
 
 def guided_section(
@@ -82,36 +84,29 @@ def guided_section(
 ) -> Section:
     """Match pairs by descriptors alone and guided.
 
-    Args:
-        run: data and cache.
-        options: what is compared.
-        truths: by name, the same pairs with the homographies that evaluate them.
-        key: beginning of the tables' keys.
-        title: of the section.
+    `truths` has the same pairs with the homographies that evaluate them, by the names of these.
     """
     features = (options.deepdetect_480(), *options.chance_baselines())
     pairs = {
         of_truth[0].name: dict(zip(truths, of_truth, strict=True))
         for of_truth in zip(*truths.values(), strict=True)
     }
-    rows = run.rows(
-        "guided matches of ",
-        features,
-        pairs,
-        lambda feature, by_truth: guided_row(run, feature, by_truth),
-    )
-    cells = {(row["item"], row["method"]): row for row in rows}
+
+    def measure(feature: LocalFeature, by_truth: Mapping[str, PlanarPair]) -> Row:
+        return guided_row(run, feature, by_truth)
+
+    rows = run.rows("guided matches of ", features, pairs, measure)
     tables = [
         Table(
             f"{key}_{truth}",
             f"Matches by descriptors alone and guided, {truth} homographies",
-            (Column("pair"), Column("method"), *COLUMNS),
-            tuple(
-                (pair, feature.title, *cells[pair, feature.name][truth])
+            COLUMNS,
+            [
+                {"pair": pair, "method": feature.title, **row[truth]}
                 for pair in pairs
                 for feature in features
-                if (pair, feature.name) in cells
-            ),
+                for row in where(rows, item=pair, method=feature.name)
+            ],
             NOTE,
         )
         for truth in truths
@@ -131,7 +126,7 @@ def guided_row(run: Run, feature: LocalFeature, by_truth: Mapping[str, PlanarPai
     pair = next(iter(by_truth.values()))
     images = (pair.first, pair.second)
     alone = run.matches(feature, images, PAPER_MATCHING)
-    sizes = [run.keypoints(feature, image).keypoints.image_size for image in images]
+    sizes = [run.keypoints(feature, image)[0].image_size for image in images]
     guided = [match_guided(run, feature, pair, seed) for seed in range(SEEDS)]
     cells: Row = {}
     for truth, one in by_truth.items():
@@ -139,44 +134,39 @@ def guided_row(run: Run, feature: LocalFeature, by_truth: Mapping[str, PlanarPai
         gaps = nearest_keypoints(places, alone.keypoints1, sizes[1])[1]
         matchable = int(np.count_nonzero(gaps < CORRECT_PX))
         correct = _correct(alone.points0, alone.points1, one)
-        cells[truth] = (
-            matchable,
-            int(correct.sum()),
-            float(correct.mean()) if len(correct) else None,
-            *_guided_cells(guided, one, matchable, sizes[0]),
-        )
+        cells[truth] = {
+            "matchable": matchable,
+            "descriptors alone: correct": int(correct.sum()),
+            "descriptors alone: precision": float(correct.mean()) if len(correct) else None,
+            **_guided_cells(guided, one, matchable, sizes[0]),
+        }
     return cells
 
 
 def _guided_cells(
     guided: Sequence[GuidedPair], pair: PlanarPair, matchable: int, size: tuple[int, int]
-) -> tuple[Cell, ...]:
+) -> dict[str, Cell]:
     correct = [_correct(found.points0, found.points1, pair) for found in guided]
     counts = [int(one.sum()) for one in correct]
     middle = int(np.argsort(counts, kind="stable")[(len(counts) - 1) // 2])
     unique = np.unique(guided[middle].points1[correct[middle]], axis=0)
     planes = [found.matrix for found in guided if found.model == "homography"]
     corners = [corner_error(matrix, pair.homography, size) for matrix in planes]
-    return (
-        guided_by([found.model for found in guided]),
-        counts[middle],
-        float(np.std(counts, ddof=1)),
-        float(correct[middle].mean()) if len(correct[middle]) else None,
-        counts[middle] / matchable if matchable else None,
-        min(counts) / matchable if matchable else None,
-        len(unique),
-        float(np.median(corners)) if corners else None,
-        float(np.median([found.profile.seconds for found in guided])),
-    )
+    return {
+        "guided by": guided_by([found.model for found in guided]),
+        "guided: correct": counts[middle],
+        "± of correct": float(np.std(counts, ddof=1)),
+        "guided: precision": float(correct[middle].mean()) if len(correct[middle]) else None,
+        "guided: of the matchable": counts[middle] / matchable if matchable else None,
+        "lowest": min(counts) / matchable if matchable else None,
+        "guided: unique": len(unique),
+        "guided: corner error, px": float(np.median(corners)) if corners else None,
+        "guided: seconds": float(np.median([found.seconds for found in guided])),
+    }
 
 
 def guided_by(models: Sequence[str]) -> str:
-    """Say what guided, and how many of the seeds where not all.
-
-    Example:
-        >>> guided_by(["homography", "none", "homography"])
-        'homography, 2 of 3 seeds guided'
-    """
+    """Say what guided, and how many of the seeds where not all."""
     trusted = [model for model in models if model != "none"]
     names = " or ".join(dict.fromkeys(trusted)) or "none"
     if len(trusted) in (0, len(models)):
@@ -191,7 +181,7 @@ def _correct(points0: np.ndarray, points1: np.ndarray, pair: PlanarPair) -> np.n
 def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -> GuidedPair:
     """Match a pair guided, or read that; its homography is not used."""
     images = (pair.first, pair.second)
-    first, second = (run.keypoints(feature, image).keypoints.xy for image in images)
+    first, second = (run.keypoints(feature, image)[0].xy for image in images)
 
     def make() -> Arrays:
         gray0, gray1 = (luma(load_image(image)) for image in images)
@@ -211,5 +201,5 @@ def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -
         found["matrix"] if len(found["matrix"]) else None,
         first[found["rows0"]],
         found["points1"],
-        Profile.unpacked(found["profile"]),
+        float(found["profile"][0]),
     )

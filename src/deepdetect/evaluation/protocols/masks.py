@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,10 @@ from ...detector.heatmap import HeatmapOptions, compute_maps
 from ...io.image import MINIMUM_SIDE, load_image, luma, scale_short_side
 from ...io.masks import load_mask
 from ...labels import LabelOptions, fuse, visibility_of
-from ..metrics.calibration import Calibration, calibration_of, pooled
-from ..metrics.masks import MaskScore, mean_score, score_heatmap
+from ..metrics.masks import MaskScore, Measured, mean_score, measure_heatmap
 
-Scored = tuple[MaskScore, Calibration]
+CERTAIN_LOGIT = 200.0
+"""Float32 rounds its probability to 1, and that of its negative to 0."""
 
 
 def sample_images(folder: str | Path) -> list[Path]:
@@ -36,48 +36,6 @@ def sample_images(folder: str | Path) -> list[Path]:
     return images
 
 
-def has_samples(folder: str | Path) -> bool:
-    """Whether a folder holds an image `image_*.png` with a mask, not photographs alone."""
-    return any(True for _ in Path(folder).glob("mask_image_*.png"))
-
-
-def score_samples(
-    heatmap: Callable[[np.ndarray], np.ndarray], images: Iterable[Path]
-) -> dict[str, Scored]:
-    """Score a detector on samples with known masks.
-
-    Args:
-        heatmap: maps a (H, W, 3) uint8 RGB image to a (H, W) probability.
-        images: of `sample_images`.
-
-    Returns:
-        By visibility, "normal" and "low", where there are images of it: the means over the images,
-        and the calibration over all their pixels.
-
-    Raises:
-        ImageError: a mask is missing or of another size.
-    """
-
-    def scored() -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-        for path in images:
-            rgb, mask = load_sample(path)
-            yield visibility_of(luma(rgb)), heatmap(rgb), mask
-
-    return _over_images(scored())
-
-
-def _over_images(images: Iterable[tuple[str, np.ndarray, np.ndarray]]) -> dict[str, Scored]:
-    """Score visibilities with heat maps and masks: the means, and all pixels, by visibility."""
-    scores: dict[str, list[Scored]] = {"normal": [], "low": []}
-    for visibility, heatmap, mask in images:
-        scores[visibility].append((score_heatmap(heatmap, mask), calibration_of(heatmap, mask)))
-    return {
-        name: (mean_score(score for score, _ in listed), pooled(found for _, found in listed))
-        for name, listed in scores.items()
-        if listed
-    }
-
-
 def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Load a sample: (H, W, 3) uint8 RGB, and its known mask, (H, W) bool.
 
@@ -91,51 +49,63 @@ def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return rgb, mask
 
 
-def readable_images(
-    images: Iterable[Path], load: Callable[[Path], object] = load_image
-) -> tuple[list[Path], tuple[str, ...]]:
-    """Return the images that can be loaded, and a sentence on each of the others.
+def score_samples(
+    heatmap: Callable[[np.ndarray], np.ndarray], samples: Iterable[tuple[np.ndarray, np.ndarray]]
+) -> dict[str, MaskScore]:
+    """Score what maps an image to a heat map on samples of `load_sample`, by visibility."""
+    return _by_visibility(
+        (visibility_of(luma(rgb)), measure_heatmap(heatmap(rgb), mask)) for rgb, mask in samples
+    )
 
-    Args:
-        images: their files.
-        load: `load_sample` for samples, which need a mask.
+
+def _by_visibility(images: Iterable[tuple[str, Measured]]) -> dict[str, MaskScore]:
+    """Score the images of each visibility, "normal" and "low", of which there are any."""
+    measured: dict[str, list[Measured]] = {"normal": [], "low": []}
+    for visibility, one in images:
+        measured[visibility].append(one)
+    return {name: mean_score(listed) for name, listed in measured.items() if listed}
+
+
+def check_scales(scales: Sequence[float]) -> None:
+    """Make sure that images can be scaled by these factors."""
+    for scale in scales:
+        if not (math.isfinite(scale) and scale > 0):
+            raise OptionError(f"a scale must be a number above 0, not {scale:g}")
+
+
+def score_at_scale(
+    detector: DeepDetect, images: Iterable[np.ndarray], scale: float
+) -> dict[str, MaskScore]:
+    """Score weights on (H, W, 3) images scaled by a factor, against labels of their own.
+
+    At native resolution; images are downscaled by area averaging and upscaled cubically. The
+    visibility of each image decides how it is labelled.
 
     Raises:
-        ImageError: there is none that can be loaded.
+        ImageError: an image is downscaled to under 16 pixels.
     """
-    whole: list[Path] = []
-    failures: list[str] = []
-    for path in images:
-        try:
-            load(path)
-            whole.append(path)
-        except ImageError as error:
-            failures.append(str(error))
-    if not whole:
-        raise ImageError(failures[0])
-    return whole, tuple(failures)
+    native = detector.configured(replace(detector.heatmap_options, resolution="native"))
 
+    def measured() -> Iterator[tuple[str, Measured]]:
+        for image in images:
+            short_side = round(scale * min(image.shape[:2]))
+            if short_side < MINIMUM_SIDE:
+                raise ImageError(
+                    f"an image scaled by {scale:g} has a side of {short_side} pixels: "
+                    f"it needs at least {MINIMUM_SIDE}, use larger scales"
+                )
+            rgb = scale_short_side(image, short_side)
+            label = fuse(luma(rgb))
+            yield label.visibility, measure_heatmap(native.heatmap(rgb), label.mask)
 
-CERTAIN_LOGIT = 200.0
-"""Float32 rounds its probability to 1, and that of its negative to 0."""
+    return _by_visibility(measured())
 
 
 class LabelDetector:
     """A detector whose keypoints are the fusion label itself, without a network.
 
-    Its numbers are those of weights without any error: they say how much of a metric learning the
-    labels better can give. Weights that exceed them do so by their errors.
-
-    Args:
-        options: how labels are made.
-        heatmap_options: the image is labelled as a network with these options sees it; default the
-            image as it is.
-
-    Example:
-        >>> image = np.zeros((32, 32), np.uint8)
-        >>> image[8:24, 8:24] = 255
-        >>> float(LabelDetector().heatmap(image)[8, 8])
-        1.0
+    Its numbers are those of weights without any error: weights that exceed them do so by their
+    errors. The image is labelled as a network with the heatmap options sees it, or as it is.
     """
 
     def __init__(
@@ -165,23 +135,12 @@ class LabelDensityDetector:
 
     Weights that mark more have more repeatable keypoints and more matches for that alone. With this
     detector all are compared at the same number of keypoints.
-
-    Args:
-        detector: with the weights and the resolution.
-        options: how labels are made; each image is labelled as the network sees it.
-
-    Example:
-        >>> image = np.zeros((64, 64), np.uint8)
-        >>> image[16:48, 16:48] = 255
-        >>> taken = LabelDensityDetector(DeepDetect()).heatmap(image)
-        >>> bool(taken.sum() == LabelDetector().heatmap(image).sum())
-        True
     """
 
-    def __init__(self, detector: DeepDetect, options: LabelOptions = LabelOptions()) -> None:
+    def __init__(self, detector: DeepDetect) -> None:
         self.detector = detector
         seen = HeatmapOptions(detector.heatmap_options.resolution)  # labels are not flipped
-        self.labels = LabelDetector(options, seen)
+        self.labels = LabelDetector(heatmap_options=seen)
 
     def heatmap(self, image: Any) -> np.ndarray:
         """Return (H, W) float32: 1 at the pixels that are taken, else 0."""
@@ -192,92 +151,3 @@ class LabelDensityDetector:
         # Of equal ones the first in the order of rows.
         taken[np.argsort(-logits.ravel(), kind="stable")[:count]] = 1
         return taken.reshape(heatmap.shape)
-
-
-@dataclass(frozen=True)
-class ScaleScore:
-    """What weights give at one scale.
-
-    Attributes:
-        scale: factor that the images were scaled by.
-        visibility: of the images, "normal" or "low".
-        score: against the labels of the scaled images.
-        calibration: over all their pixels.
-    """
-
-    scale: float
-    visibility: str
-    score: MaskScore
-    calibration: Calibration
-
-    @property
-    def label_density(self) -> float:
-        """Marked pixels of the labels per pixel."""
-        return self.calibration.label_density
-
-    @property
-    def density(self) -> float:
-        """Keypoints per pixel at threshold 0.5."""
-        return self.calibration.density
-
-
-def check_scales(scales: Sequence[float]) -> None:
-    """Make sure that images can be scaled by these factors.
-
-    Raises:
-        OptionError: one is not above 0, or not finite.
-    """
-    for scale in scales:
-        if not (math.isfinite(scale) and scale > 0):
-            raise OptionError(f"a scale must be a number above 0, not {scale:g}")
-
-
-def score_at_scale(
-    detector: DeepDetect,
-    images: Iterable[Any],
-    scale: float,
-    options: LabelOptions = LabelOptions(),
-) -> list[ScaleScore]:
-    """Score a detector on images scaled by a factor, against the labels of the scaled images.
-
-    Args:
-        detector: its weights are measured, at native resolution, whatever theirs is; its other
-            options stay.
-        images: anything `load_image` takes.
-        scale: above 0; images are downscaled by area averaging and upscaled cubically.
-        options: how labels are made; the visibility of each image decides the settings.
-
-    Returns:
-        A row for each visibility that occurs.
-
-    Raises:
-        OptionError: the scale is not above 0.
-        ImageError: an image cannot be read, or is downscaled to under 16 pixels.
-
-    Example:
-        >>> rng = np.random.default_rng(0)
-        >>> image = rng.integers(0, 256, (64, 64, 3), np.uint8)
-        >>> (row,) = score_at_scale(DeepDetect(), [image], 0.5)
-        >>> row.visibility, row.label_density  # noise has structure everywhere
-        ('normal', 1.0)
-    """
-    check_scales([scale])
-    native = detector.configured(replace(detector.heatmap_options, resolution="native"))
-
-    def scored() -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-        for image in images:
-            rgb = _scaled(load_image(image), scale)
-            label = fuse(luma(rgb), options)
-            yield label.visibility, native.heatmap(rgb), label.mask
-
-    return [ScaleScore(scale, name, *found) for name, found in _over_images(scored()).items()]
-
-
-def _scaled(rgb: np.ndarray, scale: float) -> np.ndarray:
-    short_side = round(scale * min(rgb.shape[:2]))
-    if short_side < MINIMUM_SIDE:
-        raise ImageError(
-            f"an image scaled by {scale:g} has a side of {short_side} pixels: "
-            f"it needs at least {MINIMUM_SIDE}, use larger scales"
-        )
-    return scale_short_side(rgb, short_side)

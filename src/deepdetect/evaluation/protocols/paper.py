@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,12 +18,10 @@ from ...io.image import load_image, luma
 from ...viz.draw import add_caption, hstack
 from ..baselines.method import LocalFeature
 from ..charts import picture
-from ..metrics.coverage import foreground_fraction
-from ..metrics.repeatability import repeatability_paper
+from ..metrics.repeatability import foreground_fraction, repeatability_paper
 from ..options import BenchmarkOptions
 from ..report import (
     Cell,
-    Column,
     Columns,
     Figure,
     Row,
@@ -33,7 +31,6 @@ from ..report import (
     average,
     mean,
     mean_of,
-    single,
     tabulate,
     where,
 )
@@ -85,21 +82,21 @@ def density_table(
 
     def measure(feature: LocalFeature, item: tuple[str, Path]) -> Row:
         scene, image = item
-        return {"scene": scene, "density": run.keypoints(feature, image).keypoints.density}
+        return {"scene": scene, "density": run.keypoints(feature, image)[0].density}
 
     def without(own: Rows) -> Cell:
         return mean_of(row["density"] for row in own if row["scene"] != NOT_IN_DENSITY)
 
     images = {f"{s.name}/{path.name}": (s.name, path) for s in scenes for path in s.images}
     rows = run.rows("density of ", features, images, measure)
-    columns: list[Any] = [
-        average("mean", ".4f", "density"),
-        *(average(scene.name, ".4f", "density", scene=scene.name) for scene in scenes),
-    ]
-    note = "The mean is over all images. Several keypoints on one pixel all count."
     title = f"mean without {NOT_IN_DENSITY}"
+    columns: Columns = {
+        "mean": average(".4f", "density"),
+        **({title: (".4f", without)} if with_paper else {}),
+        **{scene.name: average(".4f", "density", scene=scene.name) for scene in scenes},
+    }
+    note = "The mean is over all images. Several keypoints on one pixel all count."
     if with_paper:
-        columns.insert(1, (Column(title, ".4f"), without))
         note += f" The paper's means are those without {NOT_IN_DENSITY}."
     table = tabulate(key, "Keypoints per pixel", features, rows, columns, note)
     return with_paper_column(table, title, DENSITY) if with_paper else table
@@ -109,24 +106,19 @@ def repeatability_table(
     run: Run, features: Sequence[LocalFeature], scenes: Sequence[PlanarScene], key: str
 ) -> Table:
     """Measure the paper's repeatability at 1 px: the mean of the scenes, and that of each."""
-    pairs = {pair.name: pair for scene in scenes for pair in scene.pairs()}
-    rows = run.rows(
-        "repeatability of ",
-        features,
-        pairs,
-        lambda feature, pair: {
-            "scene": pair.scene,
-            "repeatability": pair_repeatability(run, feature, pair),
-        },
-    )
+
+    def measure(feature: LocalFeature, pair: PlanarPair) -> Row:
+        return {"scene": pair.scene, "repeatability": pair_repeatability(run, feature, pair)}
 
     def over_scenes(own: Rows) -> Cell:
         return mean_of(mean(where(own, scene=s.name), "repeatability") for s in scenes)
 
-    columns: Columns = [
-        (Column("mean", ".4f"), over_scenes),
-        *(average(scene.name, ".4f", "repeatability", scene=scene.name) for scene in scenes),
-    ]
+    pairs = {pair.name: pair for scene in scenes for pair in scene.pairs()}
+    rows = run.rows("repeatability of ", features, pairs, measure)
+    columns: Columns = {
+        "mean": (".4f", over_scenes),
+        **{scene.name: average(".4f", "repeatability", scene=scene.name) for scene in scenes},
+    }
     title = "Repeatability as in the paper"
     return tabulate(key, title, features, rows, columns, REPEATABILITY_NOTE)
 
@@ -144,15 +136,15 @@ def matches_table(
         correct, matches = correct_matches(run, feature, pair)
         return {"correct": correct, "precision": correct / matches if matches else None}
 
+    def value(own: Rows, item: str, name: str) -> Cell:
+        return next((row[name] for row in where(own, item=item)), None)
+
     rows = run.rows("matches of ", features, {pair.name: pair for pair in pairs}, measure)
-    columns: Columns = [
-        column
+    columns: Columns = {
+        f"{pair.name}{suffix}": (style, partial(value, item=pair.name, name=name))
         for pair in pairs
-        for column in (
-            single(pair.name, ",d", "correct", item=pair.name),
-            single(f"{pair.name}, precision", ".2%", "precision", item=pair.name),
-        )
-    ]
+        for suffix, style, name in (("", ",d", "correct"), (", precision", ".2%", "precision"))
+    }
     return tabulate(key, title, features, rows, columns, MATCHES_NOTE)
 
 
@@ -170,7 +162,26 @@ def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
         own = where(rows, method=feature.name)
         if empty := sum(row["fraction"] != row["fraction"] for row in own):  # NaN
             run.skipped.append(f"foreground of {feature.title}: {empty} images without a keypoint")
-    return [Section("Foreground (Table I)", (), [foreground_table(features, images, rows)])]
+
+    def over_chance(own: Rows) -> Cell:
+        known = [row for row in own if row["fraction"] == row["fraction"]]
+        fraction, chance = mean(known, "fraction"), mean(known, "covered")
+        return None if fraction is None or not chance else fraction / chance
+
+    title = "fraction on the foreground"
+    columns: Columns = {
+        title: average(".4f", "fraction"),
+        "over that of random points": (".2f", over_chance),
+        "keypoints per pixel": average(".4f", "density"),
+    }
+    covered = np.mean([image.foreground().mean() for image in images])
+    note = (
+        f"{len(images)} images; their foreground is {covered:.1%} of the pixels, which is what "
+        "random points reach. The paper's numbers are of 18 images that are not published."
+    )
+    table = tabulate("foreground", "Keypoints on the foreground", features, rows, columns, note)
+    table = with_paper_column(table, title, FOREGROUND)
+    return [Section("Foreground (Table I)", (), [table])]
 
 
 def foreground_row(run: Run, feature: LocalFeature, image: MaskedPhotograph) -> Row:
@@ -179,7 +190,7 @@ def foreground_row(run: Run, feature: LocalFeature, image: MaskedPhotograph) -> 
     Raises:
         ImageError: the mask is not of the image's size.
     """
-    keypoints = run.keypoints(feature, image.image).keypoints
+    keypoints, _ = run.keypoints(feature, image.image)
     mask = image.foreground()
     if mask.shape[::-1] != keypoints.image_size:
         raise ImageError(f"{image.mask.name} is not of the photograph's size")
@@ -187,37 +198,12 @@ def foreground_row(run: Run, feature: LocalFeature, image: MaskedPhotograph) -> 
     return {"fraction": fraction, "density": keypoints.density, "covered": float(mask.mean())}
 
 
-def foreground_table(
-    features: Sequence[LocalFeature], images: Sequence[MaskedPhotograph], rows: Rows
-) -> Table:
-    """Tabulate the fraction on the foreground, mean over the images, and the density."""
-
-    def over_chance(own: Rows) -> Cell:
-        known = [row for row in own if row["fraction"] == row["fraction"]]
-        fraction, chance = mean(known, "fraction"), mean(known, "covered")
-        return None if fraction is None or not chance else fraction / chance
-
-    title = "fraction on the foreground"
-    columns: Columns = [
-        average(title, ".4f", "fraction"),
-        (Column("over that of random points", ".2f"), over_chance),
-        average("keypoints per pixel", ".4f", "density"),
-    ]
-    covered = np.mean([image.foreground().mean() for image in images])
-    note = (
-        f"{len(images)} images; their foreground is {covered:.1%} of the pixels, which is what "
-        "random points reach. The paper's numbers are of 18 images that are not published."
-    )
-    table = tabulate("foreground", "Keypoints on the foreground", features, rows, columns, note)
-    return with_paper_column(table, title, FOREGROUND)
-
-
 def pair_repeatability(run: Run, feature: LocalFeature, pair: PlanarPair) -> float:
     """Return the paper's repeatability of a pair."""
     images = (pair.first, pair.second)
 
     def make() -> dict[str, np.ndarray]:
-        first, second = (run.keypoints(feature, image).keypoints.xy for image in images)
+        first, second = (run.keypoints(feature, image)[0].xy for image in images)
         return {"value": np.array(repeatability_paper(first, second, pair.homography))}
 
     depends = (feature.detection, images, pair.homography)
@@ -251,7 +237,7 @@ def keypoint_figure(run: Run, features: Sequence[LocalFeature], scene: PlanarSce
     rgb = load_image(image)
     panels, counts = [], []
     for feature in features:
-        found = run.keypoints(feature, image).keypoints
+        found, _ = run.keypoints(feature, image)
         inside = np.clip(np.rint(found.xy), 0, np.array(found.image_size) - 1)
         drawn = Keypoints(inside, found.scores, found.image_size).draw(rgb)
         counts.append(f"{feature.title} {len(found):,}")

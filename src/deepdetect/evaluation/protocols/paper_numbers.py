@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ..report import Cell, Table
+from ..report import Rows, Table
 
 DEEPDETECT = "DeepDetect, threshold 0.5"
 
@@ -46,23 +46,26 @@ def paper_title(title: str) -> str:
 
 def with_paper_rows(table: Table, paper: Paper) -> Table:
     """Put the paper's numbers in a row below each of ours; rows of the paper only come last."""
-    titles = [column.title for column in table.columns[1:]]
-    ours = [str(row[0]) for row in table.rows]
-    rows: list[tuple[Cell, ...]] = []
-    for row in (*table.rows, *((title,) for title in paper if title not in ours)):
+    first, *titles = table.columns
+    ours = [row[first] for row in table.rows]
+    rows: Rows = []
+    for row in (*table.rows, *({first: title} for title in paper if title not in ours)):
         if len(row) > 1:
             rows.append(row)
-        numbers = [paper.get(str(row[0]), {}).get(title) for title in titles]
-        if any(number is not None for number in numbers):
-            rows.append((paper_title(str(row[0])), *numbers))
-    return replace(table, rows=tuple(rows))
+        printed = paper.get(row[first], {})
+        numbers = {title: printed[title] for title in titles if title in printed}
+        if numbers:
+            rows.append({first: paper_title(row[first]), **numbers})
+    return replace(table, rows=rows)
 
 
 def with_paper_column(table: Table, title: str, paper: Mapping[str, float]) -> Table:
     """Put the paper's numbers, by title of the row, in a column beside the one of this title."""
-    k = [column.title for column in table.columns].index(title) + 1
-    beside = replace(table.columns[k - 1], title=paper_title(title))
-    rows = [(*row[:k], paper.get(str(row[0])), *row[k:]) for row in table.rows]
-    return replace(
-        table, columns=(*table.columns[:k], beside, *table.columns[k:]), rows=tuple(rows)
-    )
+    columns: dict[str, str] = {}
+    for name, style in table.columns.items():
+        columns[name] = style
+        if name == title:
+            columns[paper_title(title)] = style
+    first = next(iter(columns))
+    rows = [{**row, paper_title(title): paper.get(row[first])} for row in table.rows]
+    return replace(table, columns=columns, rows=rows)

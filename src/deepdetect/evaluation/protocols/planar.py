@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from ...datasets.hpatches import in_d2net_subset, is_illumination, load_hpatches
 from ...datasets.low_visibility import load_low_visibility
@@ -12,7 +12,7 @@ from ..baselines.method import LocalFeature
 from ..baselines.opencv import CLASSICAL, with_kd_trees
 from ..charts import bar_chart
 from ..options import BenchmarkOptions
-from ..report import Cell, Column, Figure, Section, Table
+from ..report import Figure, Rows, Section, Table
 from ..run import Run
 from . import paper
 from .paper_numbers import (
@@ -50,12 +50,9 @@ NOTHING_MOVES = "Nothing moves between the two images of a scene."
 def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
     """Tables I and II, the Oxford half of III, Figures 1, 2, 4 and 6; the other protocols."""
     folder = run.folder("oxford")
-    by_truth = {
-        "published": [scene.with_max_pairs(options.max_pairs) for scene in load_oxford(folder)],
-        "refined": [
-            scene.with_max_pairs(options.max_pairs) for scene in load_oxford(folder, "refined")
-        ],
-    }
+    by_truth = {"published": load_oxford(folder), "refined": load_oxford(folder, "refined")}
+    for truth, of_truth in by_truth.items():
+        by_truth[truth] = [scene.with_max_pairs(options.max_pairs) for scene in of_truth]
     scenes = by_truth["published"]
     if missing := [name for name in SCENES if name not in {scene.name for scene in scenes}]:
         run.skipped.append(f"Oxford's {', '.join(missing)}: not in {folder}")
@@ -72,9 +69,8 @@ def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
         sections.append(_oxford_paper(run, options, scenes))
     if "standard" in options.protocols:
         for truth, of_truth in by_truth.items():
-            title = f"Oxford, {truth} homographies"
-            text = TRUTHS[truth]
-            sections.append(_standard(run, options, of_truth, f"oxford_{truth}", title, text))
+            title, key = f"Oxford, {truth} homographies", f"oxford_{truth}"
+            sections.append(_standard(run, options, of_truth, key, title, TRUTHS[truth]))
         if "refined" not in by_truth:
             run.skipped.append(
                 "Oxford evaluated by refined homographies: there are no files H1toKp.refined; "
@@ -85,16 +81,10 @@ def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
                 f"refined homographies of {', '.join(unrefined)}: there is no file H1toKp.refined"
                 "; these pairs are evaluated by the published one in that section too"
             )
-    if "guided" in options.protocols:
-        from .guided import guided_section
-
-        chosen = {t: select_pairs(by_truth[t], GUIDED_PAIRS) for t in reversed(by_truth)}
-        sections.append(guided_section(run, options, chosen, "oxford_guided", "Oxford"))
-    if "degraded" in options.protocols:
-        truth, of_truth = list(by_truth.items())[-1]
-        title = f"Oxford, {truth} homographies"
-        sections.append(_degraded(run, options, of_truth, "oxford_degraded", title))
-    return sections
+    chosen = {t: select_pairs(by_truth[t], GUIDED_PAIRS) for t in reversed(by_truth)}
+    sections += _guided(run, options, chosen, "oxford", "Oxford")
+    truth, of_truth = list(by_truth.items())[-1]
+    return sections + _degraded(run, options, of_truth, "oxford", f"Oxford, {truth} homographies")
 
 
 def _oxford_paper(run: Run, options: BenchmarkOptions, scenes: Sequence[PlanarScene]) -> Section:
@@ -123,7 +113,7 @@ def _oxford_paper(run: Run, options: BenchmarkOptions, scenes: Sequence[PlanarSc
 
 
 def _repeatability_figure(table: Table) -> Figure:
-    values = {str(row[0]): float(row[1]) for row in table.rows if isinstance(row[1], float)}
+    values = {row["method"]: row["mean"] for row in table.rows if row["mean"] is not None}
     ours = [name for name in values if name.startswith("DeepDetect")]
     png = bar_chart(values, "repeatability as in the paper, mean of the scenes", ours)
     mean = OXFORD_REPEATABILITY[DEEPDETECT]["mean"]
@@ -143,10 +133,8 @@ def _figures(
     title = "Figure 6: correct matches"
     table = paper.matches_table(run, features, pairs, f"{key}_figure6", title)
     keypoints = [
-        run.attempt(
-            f"Figure 2, keypoints of {scene.name}", paper.keypoint_figure, run, features, scene
-        )
-        for scene in drawn
+        run.attempt(f"Figure 2, keypoints of {s.name}", paper.keypoint_figure, run, features, s)
+        for s in drawn
     ]
     matches = _match_figures(run, features[-1], pairs, "Figure 6")
     return with_paper_rows(table, FIGURE_6), [*filter(None, keypoints), *matches]
@@ -155,10 +143,9 @@ def _figures(
 def _match_figures(
     run: Run, feature: LocalFeature, pairs: Sequence[PlanarPair], number: str
 ) -> list[Figure]:
+    draw = paper.match_figure
     figures = [
-        run.attempt(
-            f"{number}, matches of {pair.name}", paper.match_figure, run, feature, pair, number
-        )
+        run.attempt(f"{number}, matches of {pair.name}", draw, run, feature, pair, number)
         for pair in pairs
     ]
     return [figure for figure in figures if figure is not None]
@@ -177,14 +164,8 @@ def hpatches(run: Run, options: BenchmarkOptions) -> list[Section]:
         for name, subset in hpatches_subsets(scenes):
             key, title = f"hpatches_{len(subset)}", f"HPatches, {name}"
             sections.append(_standard(run, options, subset, key, title, text))
-    if "guided" in options.protocols:
-        from .guided import guided_section
-
-        truths = {"published": last}
-        sections.append(guided_section(run, options, truths, "hpatches_guided", "HPatches"))
-    if "degraded" in options.protocols:
-        sections.append(_degraded(run, options, scenes, "hpatches_degraded", "HPatches"))
-    return sections
+    sections += _guided(run, options, {"published": last}, "hpatches", "HPatches")
+    return sections + _degraded(run, options, scenes, "hpatches", "HPatches")
 
 
 def hpatches_subsets(scenes: Sequence[PlanarScene]) -> list[tuple[str, list[PlanarScene]]]:
@@ -203,16 +184,16 @@ def _hpatches_paper(
     last: Sequence[PlanarPair],
 ) -> Section:
     features = options.density_features()
-    light = [is_illumination(scene) for scene in scenes]
     repeatability = paper.repeatability_table(run, features, scenes, "hpatches_repeatability")
-    of_kind = [[p for p, one in zip(last, light, strict=True) if one is k] for k in (True, False)]
+    light = {scene.name: is_illumination(scene) for scene in scenes}
+    of_kind = [[pair for pair in last if light[pair.scene] is kind] for kind in (True, False)]
     drawn = [pair for pairs in of_kind for pair in pairs[: FIGURE_7_SCENES // 2]]
     text = (
         f"{len(scenes)} scenes, of 116 in the whole set. Matches of images 1 and 6. The paper "
         f"reports {NUMBERS['max_matches']:,} as the most correct matches of a pair."
     )
     tables = [
-        _table_3(repeatability, light),
+        table_3(repeatability, light),
         repeatability,
         paper.density_table(run, features, scenes, "hpatches_density"),
         paper.matches_table(run, options.matching_features(), last, "hpatches_matches"),
@@ -221,23 +202,24 @@ def _hpatches_paper(
     return Section("HPatches, the paper's protocol", (text,), tables, figures)
 
 
-def _table_3(by_scene: Table, light: Sequence[bool]) -> Table:
+def table_3(by_scene: Table, light: Mapping[str, bool]) -> Table:
     """Average the repeatability by kind of scene; `light` says which change in illumination."""
-    kinds = {"illumination": True, "viewpoint": False}
-    titles = {kind: f"{kind}, {light.count(wanted)} scenes" for kind, wanted in kinds.items()}
-    rows: list[tuple[Cell, ...]] = []
+    scenes = {
+        kind: [name for name in light if light[name] is wanted]
+        for kind, wanted in (("illumination", True), ("viewpoint", False))
+    }
+    titles = {kind: f"{kind}, {len(names)} scenes" for kind, names in scenes.items()}
+    rows: Rows = []
     for row in by_scene.rows:
-        cells: list[Cell] = [row[0]]
-        for wanted in kinds.values():
-            values = [v for v, one in zip(row[2:], light, strict=True) if one is wanted]
-            known = [value for value in values if isinstance(value, float)]
-            cells.append(sum(known) / len(known) if known else None)
-        rows.append(tuple(cells))
+        rows.append({"method": row["method"]})
+        for kind, names in scenes.items():
+            known = [row[name] for name in names if row[name] is not None]
+            rows[-1][titles[kind]] = sum(known) / len(known) if known else None
     table = Table(
         "hpatches_table3",
         "Table III: repeatability as in the paper, by kind of scene",
-        (Column("method"), *(Column(title, ".4f") for title in titles.values())),
-        tuple(rows),
+        {"method": "", **dict.fromkeys(titles.values(), ".4f")},
+        rows,
         f"{by_scene.note} The paper's numbers are of 57 and 59 scenes.",
     )
     numbers = {
@@ -266,12 +248,7 @@ def low_visibility(run: Run, options: BenchmarkOptions) -> list[Section]:
         sections.append(Section(f"{title}, the paper's protocol", text, tables, figures))
     if "standard" in options.protocols:
         sections.append(_standard(run, options, scenes, key, title, NOTHING_MOVES))
-    if "guided" in options.protocols:
-        from .guided import guided_section
-
-        truths = {"published": pairs}
-        sections.append(guided_section(run, options, truths, f"{key}_guided", title))
-    return sections
+    return sections + _guided(run, options, {"published": pairs}, key, title)
 
 
 def _standard(
@@ -295,17 +272,33 @@ def _standard(
     )
 
 
+def _guided(
+    run: Run,
+    options: BenchmarkOptions,
+    truths: Mapping[str, Sequence[PlanarPair]],
+    key: str,
+    title: str,
+) -> list[Section]:
+    if "guided" not in options.protocols:
+        return []
+    from .guided import guided_section
+
+    return [guided_section(run, options, truths, f"{key}_guided", title)]
+
+
 def _degraded(
     run: Run, options: BenchmarkOptions, scenes: Sequence[PlanarScene], key: str, title: str
-) -> Section:
+) -> list[Section]:
+    if "degraded" not in options.protocols:
+        return []
     from . import degraded
 
     pairs, features = pairs_of(scenes), options.standard_features()
     rows = degraded.degraded_rows(run, features, pairs, options.degraded_images)
     what = f"{title} ({len(pairs)} pairs)"
     text = (degraded.TEXT, degraded.WHICH_TEXT[options.degraded_images])
-    tables = degraded.degraded_tables(features, rows, key, what)
-    return Section(f"{title}, dark and blurred", text, tables)
+    tables = degraded.degraded_tables(features, rows, f"{key}_degraded", what)
+    return [Section(f"{title}, dark and blurred", text, tables)]
 
 
 def pairs_of(scenes: Sequence[PlanarScene]) -> list[PlanarPair]:

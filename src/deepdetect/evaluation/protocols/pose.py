@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -31,9 +31,9 @@ from ..metrics.pose import (
 from ..options import BenchmarkOptions, without_repeats
 from ..report import (
     Cell,
-    Column,
     Columns,
     Figure,
+    Measure,
     Row,
     Rows,
     Section,
@@ -60,7 +60,6 @@ GOOD_DEG = 5.0
 CURVE_DEG = tuple(0.5 * step for step in range(41))
 """Errors at which the figure is drawn."""
 
-GUIDES = ("homography", "fundamental", "none")
 STRAIGHT_AHEAD = "no matches: straight ahead"
 
 TEXT = (
@@ -87,24 +86,9 @@ NOTE = (
     "over the pairs, where no matches count as 0."
 )
 
-Pose = tuple[np.ndarray, np.ndarray]
-"""(3, 3) rotation and (3,) translation: X1 = rotation @ X0 + translation."""
-
-
-@dataclass(frozen=True, eq=False)
-class FoundMatches:
-    """The matches of a pair.
-
-    Attributes:
-        points0, points1: (M, 2) matched positions.
-        seconds: from the images to the matches.
-        guided_by: "homography", "fundamental" or "none"; "" for methods that are never guided.
-    """
-
-    points0: np.ndarray
-    points1: np.ndarray
-    seconds: float
-    guided_by: str = ""
+Match = Callable[[tuple[Path, Path]], tuple[np.ndarray, np.ndarray, float, str]]
+"""Finds the (M, 2) matched positions of two images, the seconds that it took, and what guided:
+"homography", "fundamental" or "none"; "" for methods that are never guided."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +103,7 @@ class PoseMethod:
 
     name: str
     title: str
-    match: Callable[[tuple[Path, Path]], FoundMatches] | None = None
+    match: Match | None = None
     version: tuple[Any, ...] = ()
 
 
@@ -137,14 +121,19 @@ def pose(run: Run, options: BenchmarkOptions) -> list[Section]:
         return {"scene": scene.name, "distance": pair.frame_distance, "pair": pair.name, **values}
 
     rows = run.rows("pose of ", methods, items, measure)
-    tables = [scene_table(scenes, methods, rows)]
-    tables += [
-        distance_table(scene, methods, rows)
-        for scene in scenes
-        if scene.pairs[0].frame_distance is not None
+    sequences = [scene for scene in scenes if scene.pairs[0].frame_distance is not None]
+    tables = [
+        scene_table(scenes, methods, rows),
+        *(distance_table(scene, methods, rows) for scene in sequences),
+        pair_table(list(items), methods, rows),
     ]
-    tables.append(pair_table(list(items), methods, rows))
-    figures = [error_figure(scene, methods, rows) for scene in scenes]
+    figures = []
+    for scene in scenes:
+        own = where(rows, scene=scene.name)
+        errors = {m.title: [r["error"] for r in where(own, method=m.name)] for m in methods}
+        title = f"Relative poses in {scene.name}: fraction of the pairs up to each error"
+        png = error_chart(errors, CURVE_DEG, "pose error up to, °")
+        figures.append(Figure(f"pose_{file_name(scene.name)}", title, png))
     return [Section("Relative poses", TEXT, tables, figures)]
 
 
@@ -157,26 +146,24 @@ def pose_methods(run: Run, options: BenchmarkOptions) -> list[PoseMethod]:
     }
     chosen = {"sift": CLASSICAL["sift"], "orb": STANDARD["orb"]}
     classical = [feature for name, feature in chosen.items() if name in options.classical]
+    features = without_repeats((*classical, *options.others))
     return [
         *(
             PoseMethod(title, title, partial(_match_images, detector, way), (*own.key, way))
             for title, way in ways.items()
         ),
-        *(
-            _feature_method(run, feature)
-            for feature in without_repeats((*classical, *options.others))
-        ),
+        *(_feature_method(run, feature) for feature in features),
         PoseMethod("straight", STRAIGHT_AHEAD),
     ]
 
 
 def _match_images(
     detector: DeepDetect, way: dict[str, Any], images: tuple[Path, Path]
-) -> FoundMatches:
+) -> tuple[np.ndarray, np.ndarray, float, str]:
     options = MatchingOptions(matcher="patchmatch")
     found = match_images(*images, detector, model="none", options=options, **way)
     guided_by = found.two_view_geometry.model if found.two_view_geometry is not None else ""
-    return FoundMatches(found.points0, found.points1, sum(found.seconds.values()), guided_by)
+    return found.points0, found.points1, sum(found.seconds.values()), guided_by
 
 
 def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
@@ -185,11 +172,11 @@ def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
     settings = MatchSettings("exact", ratio, mutual=True, budget=BUDGET)
     test = "no ratio test" if feature.learned else f"ratio {RATIO:g}"
 
-    def match(images: tuple[Path, Path]) -> FoundMatches:
-        detect = [run.keypoints(feature, image).profile.seconds for image in images]
+    def match(images: tuple[Path, Path]) -> tuple[np.ndarray, np.ndarray, float, str]:
+        detect = [run.keypoints(feature, image)[1].seconds for image in images]
         found = run.matches(feature, images, settings)
         seconds = sum(detect) + found.describe.seconds + found.match.seconds
-        return FoundMatches(found.points0, found.points1, seconds)
+        return found.points0, found.points1, seconds, ""
 
     title = f"{feature.title}, {test}"
     return PoseMethod(feature.name, title, match, (*feature.key, settings))
@@ -198,31 +185,28 @@ def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
 def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
     """Measure a method on a pair, or read the result from the cache.
 
-    Returns:
-        By name "rotation" and "translation", the errors in degrees, infinite where no pose was
-        found, "error", the larger of both, "matches", "agreeing", the fraction of the matches that
-        agree with the true pose, "seconds" and "guided by"; all but errors None of the control.
+    By name "rotation" and "translation", the errors in degrees, infinite without a pose, "error",
+    the larger of both, "matches", "agreeing", the fraction of them that agree with the true pose,
+    "seconds" and "guided by"; all but errors None of the control.
     """
     match = method.match
     if match is None:
-        errors = (
-            rotation_error(np.eye(3), pair.rotation),
-            translation_error(np.array([0.0, 0.0, -1.0]), pair.translation),
-        )
+        rotation, translation = _errors((np.eye(3), np.array([0.0, 0.0, -1.0])), pair)
         rest = dict.fromkeys(("matches", "agreeing", "seconds", "guided by"))
-        return {"rotation": errors[0], "translation": errors[1], "error": max(errors), **rest}
+        error = max(rotation, translation)
+        return {"rotation": rotation, "translation": translation, "error": error, **rest}
     images = (pair.first.path, pair.second.path)
+    cameras = (pair.first.intrinsics, pair.second.intrinsics)
 
     def make() -> Arrays:
-        found = match(images)
-        agreeing = epipolar_inlier_ratio(found.points0, found.points1, pair.fundamental)
-        errors = _errors(found, pair)
+        points0, points1, seconds, guided_by = match(images)
+        agreeing = epipolar_inlier_ratio(points0, points1, pair.fundamental)
+        errors = _errors(estimate_pose(points0, points1, *cameras), pair)
         return {
-            "numbers": np.array([*errors, len(found.points0), agreeing, found.seconds]),
-            "guided_by": np.array(found.guided_by),
+            "numbers": np.array([*errors, len(points0), agreeing, seconds]),
+            "guided_by": np.array(guided_by),
         }
 
-    cameras = (pair.first.intrinsics, pair.second.intrinsics)
     truth = (*cameras, pair.rotation, pair.translation)
     estimate = (THRESHOLD_PX, CONFIDENCE, EPIPOLAR_THRESHOLD_PX)
     kept = run.cached("pose", (method.name, method.version, images, truth, estimate), make)
@@ -238,38 +222,21 @@ def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
     }
 
 
-def _errors(found: FoundMatches, pair: PosedPair) -> tuple[float, float]:
-    intrinsics = pair.first.intrinsics, pair.second.intrinsics
-    estimated = estimate_pose(found.points0, found.points1, *intrinsics)
-    if estimated is None:
+def _errors(pose: tuple[np.ndarray, np.ndarray] | None, pair: PosedPair) -> tuple[float, float]:
+    if pose is None:
         return float("inf"), float("inf")
-    rotation, translation = estimated
+    rotation, translation = pose
     return rotation_error(rotation, pair.rotation), translation_error(translation, pair.translation)
 
 
 def estimate_pose(
     points0: np.ndarray, points1: np.ndarray, intrinsics0: np.ndarray, intrinsics1: np.ndarray
-) -> Pose | None:
-    """Estimate the relative pose of two cameras from matches, the same way for all methods.
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Estimate the relative pose of two cameras from (M, 2) matches, the same way for all methods.
 
     An essential matrix by OpenCV's MAGSAC at `THRESHOLD_PX`, then that of its four poses with most
-    points in front of both cameras.
-
-    Args:
-        points0, points1: (M, 2) matched positions in pixels.
-        intrinsics0, intrinsics1: (3, 3) camera matrices.
-
-    Returns:
-        The pose with a translation of length 1; None with too few matches, or where there is none.
-
-    Example:
-        >>> rng = np.random.default_rng(0)
-        >>> points = rng.uniform((-4, -3, 8), (4, 3, 16), (200, 3))
-        >>> camera = np.array([[500, 0, 320], [0, 500, 240], [0, 0, 1.0]])
-        >>> first, second = ((p / p[:, 2:] @ camera.T)[:, :2] for p in (points, points - [1, 0, 0]))
-        >>> rotation, translation = estimate_pose(first, second, camera, camera)
-        >>> bool(np.allclose(translation, [-1, 0, 0], atol=1e-3))
-        True
+    points in front of both cameras: (3, 3) rotation and (3,) translation of length 1, X1 = rotation
+    @ X0 + translation. None with too few matches, or where there is none.
     """
     if len(points0) < MIN_MATCHES:
         return None
@@ -305,35 +272,37 @@ def _of_camera(points: np.ndarray, intrinsics: np.ndarray, camera: np.ndarray) -
     return np.ascontiguousarray((homogeneous @ (camera @ np.linalg.inv(intrinsics)).T)[:, :2])
 
 
-def _median(title: str, style: str, name: str) -> tuple[Column, Callable[[Rows], Cell]]:
+def _median(style: str, name: str) -> tuple[str, Measure]:
     def cell(own: Rows) -> Cell:
         known = [row[name] for row in own if row[name] is not None]
         return float(np.median(known)) if known else None
 
-    return Column(title, style), cell
+    return style, cell
 
 
 def _auc(own: Rows, threshold: float) -> Cell:
     return pose_auc([row["error"] for row in own], threshold) if own else None
 
 
-SUMMARY: Columns = (
-    (Column("pairs", ",d"), len),
-    (Column("failed", ",d"), lambda own: sum(row["error"] == float("inf") for row in own)),
-    *(
-        (Column(f"AUC at {threshold:g}°", ".3f"), partial(_auc, threshold=threshold))
+AGREEING = f"agreeing within {EPIPOLAR_THRESHOLD_PX:g} px"
+
+SUMMARY: Columns = {
+    "pairs": (",d", len),
+    "failed": (",d", lambda own: sum(row["error"] == float("inf") for row in own)),
+    **{
+        f"AUC at {threshold:g}°": (".3f", partial(_auc, threshold=threshold))
         for threshold in POSE_THRESHOLDS_DEG
-    ),
-    _median("median error, °", ".2f", "error"),
-    _median("matches", ",.0f", "matches"),
-    average(f"agreeing within {EPIPOLAR_THRESHOLD_PX:g} px", ".1%", "agreeing"),
-)
+    },
+    "median error, °": _median(".2f", "error"),
+    "matches": _median(",.0f", "matches"),
+    AGREEING: average(".1%", "agreeing"),
+}
 
 
 def _grouped(
     key: str,
     title: str,
-    first: Column,
+    first: str,
     groups: Sequence[tuple[Cell, Rows]],
     methods: Sequence[PoseMethod],
     columns: Columns,
@@ -341,8 +310,10 @@ def _grouped(
 ) -> Table:
     """Tabulate all methods in each group, whose value is the first column."""
     parts = [(value, tabulate(key, title, methods, own, columns, note)) for value, own in groups]
-    lines = tuple((value, *line) for value, part in parts for line in part.rows)
-    return replace(parts[0][1], columns=(first, *parts[0][1].columns), rows=lines)
+    lines = [{first: value, **line} for value, part in parts for line in part.rows]
+    table = parts[0][1]
+    style = "" if isinstance(groups[0][0], str) else "d"
+    return replace(table, columns={first: style, **table.columns}, rows=lines)
 
 
 def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], rows: Rows) -> Table:
@@ -358,78 +329,72 @@ def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], row
         guides = [row["guided by"] for row in own]
         return guides.count(guide) if set(guides) - {None} else None
 
-    columns: Columns = [
-        *SUMMARY,
-        *(
-            (
-                Column(f"guided by {guide}" if guide != "none" else "unguided", ",d"),
-                partial(guided, guide=guide),
-            )
-            for guide in GUIDES
-        ),
-        (Column("worse than SIFT", ",d"), partial(against_sift, only_sift=True)),
-        (Column("better than SIFT", ",d"), partial(against_sift, only_sift=False)),
-        _median("seconds", ".2f", "seconds"),
-    ]
+    columns: Columns = {
+        **SUMMARY,
+        "guided by homography": (",d", partial(guided, guide="homography")),
+        "guided by fundamental": (",d", partial(guided, guide="fundamental")),
+        "unguided": (",d", partial(guided, guide="none")),
+        "worse than SIFT": (",d", partial(against_sift, only_sift=True)),
+        "better than SIFT": (",d", partial(against_sift, only_sift=False)),
+        "seconds": _median(".2f", "seconds"),
+    }
     note = (
         f"{NOTE} Guided by: in how many pairs which geometry guided. Worse than SIFT: pairs with "
         f"an error of {GOOD_DEG:g}° or more where SIFT's is under it; better: the other way round. "
         "Seconds: median, from the images to the matches, of the run that made them."
     )
     groups = [(scene.name, where(rows, scene=scene.name)) for scene in scenes]
-    return _grouped("pose", "Relative poses", Column("scene"), groups, methods, columns, note)
+    return _grouped("pose", "Relative poses", "scene", groups, methods, columns, note)
 
 
 def distance_table(scene: PosedScene, methods: Sequence[PoseMethod], rows: Rows) -> Table:
     """Tabulate each method at each frame distance of a sequence."""
     distances = sorted({pair.frame_distance or 0 for pair in scene.pairs})
-    groups: list[tuple[Cell, Rows]] = [
-        (distance, where(rows, scene=scene.name, distance=distance)) for distance in distances
-    ]
+    groups = [(each, where(rows, scene=scene.name, distance=each)) for each in distances]
     title = f"Relative poses in {scene.name}, by frame distance"
-    key = f"pose_{_file_name(scene)}_distances"
-    return _grouped(key, title, Column("frame distance", "d"), groups, methods, SUMMARY)
+    key = f"pose_{file_name(scene.name)}_distances"
+    return _grouped(key, title, "frame distance", groups, methods, SUMMARY)
 
 
 PAIR_COLUMNS = {
-    "pair": Column("pair"),
-    "title": Column("method"),
-    "distance": Column("frame distance", "d"),
-    "rotation": Column("rotation error, °", ".3f"),
-    "translation": Column("translation error, °", ".3f"),
-    "error": Column("pose error, °", ".3f"),
-    "matches": Column("matches", ",d"),
-    "agreeing": Column(f"agreeing within {EPIPOLAR_THRESHOLD_PX:g} px", ".1%"),
-    "guided by": Column("guided by"),
-    "seconds": Column("seconds", ".2f"),
+    "pair": ("pair", ""),
+    "method": ("title", ""),
+    "frame distance": ("distance", "d"),
+    "rotation error, °": ("rotation", ".3f"),
+    "translation error, °": ("translation", ".3f"),
+    "pose error, °": ("error", ".3f"),
+    "matches": ("matches", ",d"),
+    AGREEING: ("agreeing", ".1%"),
+    "guided by": ("guided by", ""),
+    "seconds": ("seconds", ".2f"),
 }
+"""Name of the value, and style, by the column's title."""
 
 
 def pair_table(items: Sequence[str], methods: Sequence[PoseMethod], rows: Rows) -> Table:
     """Tabulate each method on each pair."""
-    lines = tuple(
-        tuple({**row, "title": method.title}[name] for name in PAIR_COLUMNS)
+    lines = [
+        {title: (row | {"title": method.title})[name] for title, (name, _) in PAIR_COLUMNS.items()}
         for item in items
         for method in methods
         for row in where(rows, item=item, method=method.name)
-    )
-    title, columns = "Relative poses, all pairs", tuple(PAIR_COLUMNS.values())
-    return Table("pose_pairs", title, columns, lines, NOTE, in_text=False)
+    ]
+    styles = {title: style for title, (_, style) in PAIR_COLUMNS.items()}
+    return Table("pose_pairs", "Relative poses, all pairs", styles, lines, NOTE, in_text=False)
 
 
-def error_figure(scene: PosedScene, methods: Sequence[PoseMethod], rows: Rows) -> Figure:
-    """Draw the fraction of the pairs under each error."""
-    lines = {}
-    for method in methods:
-        own = where(rows, scene=scene.name, method=method.name)
-        errors = np.array([row["error"] for row in own])
-        if len(errors):
-            curve = [float((errors <= limit).mean()) for limit in CURVE_DEG]
-            lines[method.title] = CURVE_DEG, curve
-    png = line_chart(lines, "pose error up to, °", "fraction of the pairs")
-    title = f"Relative poses in {scene.name}: fraction of the pairs up to each error"
-    return Figure(f"pose_{_file_name(scene)}", title, png)
+def error_chart(
+    errors: Mapping[str, Sequence[float]], limits: Sequence[float], x_label: str
+) -> bytes:
+    """Draw the fraction of the pairs up to each error, of each method that has any."""
+    lines = {
+        title: (limits, [float((np.array(own) <= limit).mean()) for limit in limits])
+        for title, own in errors.items()
+        if len(own)
+    }
+    return line_chart(lines, x_label, "fraction of the pairs")
 
 
-def _file_name(scene: PosedScene) -> str:
-    return re.sub(r"\W+", "_", scene.name)
+def file_name(scene: str) -> str:
+    """Return the name of a scene as a part of a file's name."""
+    return re.sub(r"\W+", "_", scene)

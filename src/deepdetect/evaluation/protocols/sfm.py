@@ -1,38 +1,44 @@
-"""Cameras and points of many images whose cameras are known: ranked points, SIFT, chance."""
+"""Cameras and points of many images whose cameras are known: ranked points, SIFT, chance.
+
+All methods go through the stages of `reconstruct_many` with the same options; only the keypoints,
+and for SIFT the matches, are others. Each runs in a process of its own, which tells its memory.
+"""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
+from ..._shared.errors import NoDepthError
 from ..._shared.records import Arrays
+from ...batch.extraction import feature_group
+from ...batch.hdf5 import Group, import_h5py, open_hdf5, write_groups
 from ...datasets.pair_selection import evenly_spaced
 from ...datasets.posed_images import PosedImage, PosedScene, load_posed_scenes
+from ...detector.point_detector import PointDetector
+from ...features.keypoints import Keypoints
+from ...features.scale_space import dominant_angles
+from ...features.sift import describe_keypoints
 from ...geometry.camera import Camera, PosedView
-from ...io.image import load_image
-from ...sfm.colmap import import_pycolmap
-from ..charts import line_chart
-from ..metrics.multi_view import camera_errors, relative_pose_errors
-from ..metrics.pose import pose_auc
+from ...io.image import load_image, luma
+from ...sfm.colmap import PIXEL_CENTRE, import_pycolmap, quiet_pycolmap
+from ...sfm.intrinsics import initial_intrinsics
+from ...sfm.mapping import read_sparse_model
+from ...sfm.options import MultiViewOptions
+from ...sfm.pipeline import MAX_KEYPOINTS
+from ...sfm.stages import Stages
+from ..metrics.pose import camera_errors, pose_auc, relative_pose_errors
 from ..options import BenchmarkOptions
-from ..profiling import run_in_child
-from ..report import Cell, Column, Figure, Row, Section, Table, where
+from ..profiling import peak_memory, run_in_child
+from ..report import Figure, Row, Rows, Section, Table, where
 from ..run import Run
-from .sfm_methods import (
-    KINDS,
-    OPTIONS,
-    SFM_POINTS,
-    SfmMethod,
-    SfmTask,
-    find_points,
-    find_random_points,
-    find_sift,
-    match_sift,
-    run_method,
-)
+from .pose import error_chart, file_name
 
 MIN_IMAGES = 3
 
@@ -41,6 +47,39 @@ POSE_THRESHOLDS_DEG = (0.5, 1.0, 5.0)
 
 CURVE_DEG = tuple(0.05 * step for step in range(61))
 """Errors at which the figure is drawn."""
+
+FEATURES, DATABASE = "features.h5", "sift.db"
+
+OPTIONS = MultiViewOptions(pairs="all")
+"""Of all methods: those of `reconstruct_many`, but every pair is matched."""
+
+SFM_POINTS = PointDetector(MAX_KEYPOINTS)
+
+KINDS = ("true", "estimated")
+"""Intrinsics that models are made with."""
+
+CAMERA_COLUMNS = {
+    **{"scene": "", "keypoints": "", "intrinsics": "", "images": "d", "registered": "d"},
+    **{f"AUC at {threshold:g}°": ".3f" for threshold in POSE_THRESHOLDS_DEG},
+    "centres, unit of the truth": ".5f",
+    "centres, ‰ of the extent": ".2f",
+    "from the first row's, unit of the truth": ".5f",
+    "rotations, °": ".3f",
+    "sparse points": ",d",
+    "track length": ".2f",
+    "reprojection error, px": ".3f",
+}
+
+COST_COLUMNS = {
+    "scene": "",
+    "keypoints": "",
+    "keypoints an image": ",.0f",
+    "matches": ",d",
+    "keypoints and matches, s": ".1f",
+    "keypoints and matches, CPU s": ".1f",
+    **{f"mapping, {kind} intrinsics, CPU s": ".1f" for kind in KINDS},
+    "memory, MB": ",.0f",
+}
 
 TEXT = (
     "The cameras of all images of a scene and sparse points are reconstructed from nothing but the "
@@ -72,19 +111,43 @@ COST_NOTE = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+Pair = tuple[str, str]
+Finder = Callable[[Stages, Path], None]
+Matcher = Callable[[Stages, Sequence[Pair]], dict[Pair, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class SfmMethod:
+    """A row of the tables.
+
+    Attributes:
+        title: how tables name it.
+        find: writes the keypoints of the images in a folder; a function of a module.
+        match: returns the matches of pairs, a function of a module; None: as `reconstruct_many`.
+        depends: what results depend on besides the code, the images and the options.
+        chance: the time it takes to find the points means nothing.
+    """
+
+    title: str
+    find: Finder
+    match: Matcher | None = None
+    depends: str = ""
+    chance: bool = False
+
+    @property
+    def name(self) -> str:
+        """By which the rows know it."""
+        return self.title
+
+
+@dataclass(eq=False)
 class SfmScene:
     """The images of a scene that are reconstructed, with their cameras."""
 
     name: str
     images: tuple[PosedImage, ...]
 
-    @property
-    def cameras(self) -> dict[str, Camera]:
-        """The true cameras by the names of the files."""
-        return {name: view.camera for name, view in self.truth.items()}
-
-    @property
+    @cached_property
     def truth(self) -> dict[str, PosedView]:
         """The true cameras and poses by the names of the files."""
         views = {}
@@ -97,48 +160,35 @@ class SfmScene:
         return views
 
 
-@dataclass(frozen=True, eq=False)
-class SfmModel:
-    """A model with one kind of intrinsics.
-
-    Attributes:
-        views: the registered cameras by name.
-        points: number of sparse points.
-        track_length: mean number of images that see one.
-        error_px: mean reprojection error.
-        cpu_seconds: of verification and mapping.
-    """
-
-    views: Mapping[str, PosedView]
-    points: int
-    track_length: float
-    error_px: float
-    cpu_seconds: float
-
-
 def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
     """Reconstruct all scenes by all methods."""
     import_pycolmap()  # what is missing is said at once
     folder = run.folder("sfm")
     scenes = load_posed_scenes(run.folder("pose") if folder == run.data else folder)
     chosen = {}
-    for scene in scenes:
-        if len(scene.images) < MIN_IMAGES:
-            run.fail(f"{scene.name}: it has {len(scene.images)} images, 3 are needed")
+    for each in scenes:
+        if len(each.images) < MIN_IMAGES:
+            run.fail(f"{each.name}: it has {len(each.images)} images, 3 are needed")
         else:
-            chosen[scene.name] = choose_images(scene, options.max_images)
+            chosen[each.name] = choose_images(each, options.max_images)
     for feature in options.others:
         run.skipped.append(f"sfm: {feature.title}: this benchmark runs no further methods")
     methods = sfm_methods(options)
     rows = run.rows("", methods, chosen, lambda method, scene: measure_scene(run, method, scene))
-    groups = [
-        (scene, method, row)
-        for name, scene in chosen.items()
-        for method in methods
-        for row in where(rows, item=name, method=method.name)
-    ]
-    tables = [camera_table(groups), cost_table(groups)]
-    figures = [error_figure(scene, groups) for scene in chosen.values()]
+    rows = [row for name in chosen for row in where(rows, item=name)]
+    tables = [camera_table(rows), cost_table(rows)]
+    figures = []
+    for name, scene in chosen.items():
+        errors = {
+            f"{row['method']}, {kind} intrinsics": relative_pose_errors(
+                row[kind]["views"], scene.truth
+            )
+            for row in where(rows, item=name)
+            for kind in KINDS
+        }
+        title = f"Relative poses of all pairs of {name}: fraction up to each error"
+        png = error_chart(errors, CURVE_DEG, "error of the relative pose up to, °")
+        figures.append(Figure(f"sfm_{file_name(name)}", title, png))
     return [Section("Many images", TEXT, tables, figures)]
 
 
@@ -166,121 +216,244 @@ def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
 def measure_scene(run: Run, method: SfmMethod, scene: SfmScene) -> Row:
     """Reconstruct a scene by a method, or read the result from the cache.
 
-    Returns:
-        The values of `run_method`, but a `SfmModel` each for "true" and "estimated" intrinsics.
+    Returns the values of `run_method`, the "scene", and for each kind of intrinsics the registered
+    "views" with the values of the tables' columns.
     """
     images = tuple(image.path for image in scene.images)
-    truth = scene.truth
-    task = SfmTask(method, images, scene.cameras)
+    cameras = {name: view.camera for name, view in scene.truth.items()}
     depends = (
         (method.title, method.depends),
         [(image.path, image.path.name, image.intrinsics) for image in scene.images],
         repr(vars(OPTIONS)),
         import_pycolmap().__version__,
     )
-    kept: Arrays = run.cached("sfm", depends, lambda: run_in_child(run_method, task))
-    row: Row = {name: value.tolist() for name, value in kept.items()}
+    kept: Arrays = run.cached(
+        "sfm", depends, lambda: run_in_child(run_method, method, images, cameras)
+    )
+    row: Row = {"scene": scene} | {name: value.tolist() for name, value in kept.items()}
     for kind in KINDS:
-        views = {
-            name: PosedView(name, truth[name].camera, pose[:9].reshape(3, 3), pose[9:])
-            for name, pose in zip(
-                kept[f"{kind} names"].tolist(), kept[f"{kind} poses"], strict=True
-            )
-        }
+        names, poses = row[f"{kind} names"], kept[f"{kind} poses"]
         points, track_length, error_px, cpu_seconds = row[f"{kind} numbers"]
-        row[kind] = SfmModel(views, int(points), track_length, error_px, cpu_seconds)
+        row[kind] = {
+            "views": {
+                name: PosedView(name, cameras[name], pose[:9].reshape(3, 3), pose[9:])
+                for name, pose in zip(names, poses, strict=True)
+            },
+            "sparse points": int(points),
+            "track length": track_length,
+            "reprojection error, px": error_px,
+            "cpu seconds": cpu_seconds,
+        }
     return row
 
 
-Groups = Sequence[tuple[SfmScene, SfmMethod, Row]]
-"""Scenes and methods with what was measured, in the order of the tables' lines."""
+def camera_table(rows: Rows) -> Table:
+    """Tabulate cameras and sparse points of each method on each scene."""
+    lines = []
+    for row in rows:
+        scene: SfmScene = row["scene"]
+        truth = scene.truth
+        first = next((each for each in where(rows, scene=scene, method=rows[0]["method"])), row)
+        for kind in KINDS:
+            views = row[kind]["views"]
+            errors = relative_pose_errors(views, truth)
+            line = {
+                **{"scene": scene.name, "keypoints": row["method"], "intrinsics": kind},
+                **{"images": len(scene.images), "registered": len(views)},
+                **{f"AUC at {each:g}°": pose_auc(errors, each) for each in POSE_THRESHOLDS_DEG},
+                **row[kind],
+            }
+            if len(views) >= MIN_IMAGES:
+                true = [truth[name] for name in views]
+                centres, rotations, _ = camera_errors(list(views.values()), true)
+                line["centres, unit of the truth"] = float(centres.mean())
+                line["centres, ‰ of the extent"] = 1000 * float(centres.mean()) / _extent(truth)
+                line["rotations, °"] = float(rotations.mean())
+            if first is not row:
+                apart = _apart(views, first[kind]["views"], truth)
+                line["from the first row's, unit of the truth"] = apart
+            lines.append(line)
+    return Table("sfm", "Cameras and sparse points", CAMERA_COLUMNS, lines, CAMERA_NOTE)
 
 
-def _apart(model: SfmModel, other: SfmModel, truth: Mapping[str, PosedView]) -> float | None:
+Views = Mapping[str, PosedView]
+
+
+def _apart(views: Views, others: Views, truth: Views) -> float | None:
     """Return the mean distance of the centres of two models in the unit of the truth."""
-    names = sorted(set(model.views) & set(other.views))
+    names = sorted(set(views) & set(others))
     if len(names) < MIN_IMAGES:
         return None
-    views, others = ([each.views[name] for name in names] for each in (model, other))
-    unit = camera_errors(others, [truth[name] for name in names]).scale
-    return unit * float(camera_errors(views, others).centres.mean())
+    own, other, true = ([each[name] for name in names] for each in (views, others, truth))
+    unit = camera_errors(other, true)[2]
+    return unit * float(camera_errors(own, other)[0].mean())
 
 
-def path_extent(truth: Mapping[str, PosedView]) -> float:
+def _extent(truth: Views) -> float:
     """Return the largest distance of two true cameras."""
     centres = np.array([view.centre for view in truth.values()])
     return float(np.linalg.norm(centres[:, None] - centres, axis=2).max())
 
 
-def camera_table(groups: Groups) -> Table:
-    """Tabulate cameras and sparse points of each method on each scene."""
-    columns = (
-        *(Column("scene"), Column("keypoints"), Column("intrinsics")),
-        *(Column("images", "d"), Column("registered", "d")),
-        *(Column(f"AUC at {threshold:g}°", ".3f") for threshold in POSE_THRESHOLDS_DEG),
-        *(Column("centres, unit of the truth", ".5f"), Column("centres, ‰ of the extent", ".2f")),
-        *(Column("from the first row's, unit of the truth", ".5f"), Column("rotations, °", ".3f")),
-        Column("sparse points", ",d"),
-        *(Column("track length", ".2f"), Column("reprojection error, px", ".3f")),
-    )
-    rows: list[tuple[Cell, ...]] = []
-    for scene, method, row in groups:
-        truth = scene.truth
-        first = next((r for s, m, r in groups if s is scene and m.name == groups[0][1].name), None)
-        for kind in KINDS:
-            model: SfmModel = row[kind]
-            pairs = relative_pose_errors(model.views, truth)
-            centre = rotation = None
-            if len(model.views) >= MIN_IMAGES:
-                views, true = list(model.views.values()), [truth[name] for name in model.views]
-                errors = camera_errors(views, true)
-                centre, rotation = (
-                    float(values.mean()) for values in (errors.centres, errors.rotations_deg)
-                )
-            rows.append(
-                (
-                    *(scene.name, method.title, kind, len(scene.images), len(model.views)),
-                    *(pose_auc(pairs, threshold) for threshold in POSE_THRESHOLDS_DEG),
-                    centre,
-                    None if centre is None else 1000 * centre / path_extent(truth),
-                    None if first is None or first is row else _apart(model, first[kind], truth),
-                    rotation,
-                    *(model.points, model.track_length, model.error_px),
-                )
-            )
-    return Table("sfm", "Cameras and sparse points", columns, tuple(rows), CAMERA_NOTE)
-
-
-def cost_table(groups: Groups) -> Table:
+def cost_table(rows: Rows) -> Table:
     """Tabulate what each method takes."""
-    columns = (
-        *(Column("scene"), Column("keypoints"), Column("keypoints an image", ",.0f")),
-        Column("matches", ",d"),
-        *(Column(f"keypoints and matches, {unit}", ".1f") for unit in ("s", "CPU s")),
-        *(Column(f"mapping, {kind} intrinsics, CPU s", ".1f") for kind in KINDS),
-        Column("memory, MB", ",.0f"),
-    )
-    rows = tuple(
-        (
-            *(scene.name, method.title, row["keypoints"], row["matches"], row["seconds"]),
-            row["cpu seconds"],
-            *(row[kind].cpu_seconds for kind in KINDS),
-            row["memory"] / 1e6,
+    lines = [
+        {
+            "scene": row["scene"].name,
+            "keypoints": row["method"],
+            "keypoints an image": row["keypoints"],
+            "matches": row["matches"],
+            "keypoints and matches, s": row["seconds"],
+            "keypoints and matches, CPU s": row["cpu seconds"],
+            **{f"mapping, {kind} intrinsics, CPU s": row[kind]["cpu seconds"] for kind in KINDS},
+            "memory, MB": row["memory"] / 1e6,
+        }
+        for row in rows
+    ]
+    return Table("sfm_cost", "Seconds and memory", COST_COLUMNS, lines, COST_NOTE)
+
+
+def find_points(stages: Stages, folder: Path) -> None:
+    """Find the ranked points of the images in a folder, as `reconstruct_many` does."""
+    stages.extract(folder, SFM_POINTS)
+
+
+def find_random_points(stages: Stages, folder: Path) -> None:
+    """Put as many random points in place of the ranked ones.
+
+    They get the sizes of these in another order, the dominant angle of the gradients there, and the
+    same descriptor.
+    """
+    find_points(stages, folder)
+    with import_h5py().File(stages.work / FEATURES, "r+") as file:
+        for number, name in enumerate(sorted(path.name for path in folder.iterdir())):
+            rng = np.random.default_rng((0, number))
+            group = file[name]
+            width, height = (int(side) for side in group["image_size"][()])
+            count = len(group["keypoints"])
+            xy = rng.uniform(0, (width - 1, height - 1), (count, 2)).astype(np.float32)
+            gray = luma(load_image(folder / name))
+            sizes = rng.permutation(2 * group["scales"][()])
+            points = Keypoints(
+                xy,
+                rng.random(count, np.float32),
+                (width, height),
+                sizes=sizes,
+                angles=dominant_angles(gray, xy, sizes),
+            )
+            made = feature_group(name, describe_keypoints(gray, points)).arrays
+            for kind in ("keypoints", "descriptors", "scores", "scales", "oris"):
+                group[kind][...] = made[kind]
+
+
+def find_sift(stages: Stages, folder: Path) -> None:
+    """Find keypoints by pycolmap's own SIFT with its defaults, at no more places than ours."""
+    names = sorted(path.name for path in folder.iterdir())
+    with quiet_pycolmap() as pycolmap:
+        how = pycolmap.FeatureExtractionOptions()
+        how.num_threads = 1
+        how.sift.max_num_features = MAX_KEYPOINTS
+        pycolmap.extract_features(
+            stages.work / DATABASE, folder, image_names=names, extraction_options=how
         )
-        for scene, method, row in groups
-    )
-    return Table("sfm_cost", "Seconds and memory", columns, rows, COST_NOTE)
+        groups = []
+        with pycolmap.Database.open(stages.work / DATABASE) as database:
+            for image in database.read_all_images():
+                camera = database.read_camera(image.camera_id)
+                xy = np.asarray(database.read_keypoints(image.image_id))[:, :2] - PIXEL_CENTRE
+                arrays = {
+                    "keypoints": xy.astype(np.float32),
+                    "image_size": np.array([camera.width, camera.height], np.int32),
+                }
+                groups.append(Group(image.name, arrays))
+    write_groups(stages.work / FEATURES, groups)
 
 
-def error_figure(scene: SfmScene, groups: Groups) -> Figure:
-    """Draw the fraction of the pairs of images under each error of their relative pose."""
-    lines = {}
-    for one, method, row in groups:
-        for kind in KINDS if one is scene else ():
-            errors = np.array(relative_pose_errors(row[kind].views, scene.truth))
-            shares = [float((errors <= limit).mean()) for limit in CURVE_DEG]
-            lines[f"{method.title}, {kind} intrinsics"] = CURVE_DEG, shares
-    png = line_chart(lines, "error of the relative pose up to, °", "fraction of the pairs")
-    title = f"Relative poses of all pairs of {scene.name}: fraction up to each error"
-    name = re.sub(r"\W+", "_", scene.name)
-    return Figure(f"sfm_{name}", title, png)
+def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
+    """Match by pycolmap's own matcher with its defaults; the verification is that of all."""
+    with quiet_pycolmap() as pycolmap:
+        how = pycolmap.FeatureMatchingOptions()
+        how.num_threads = 1
+        how.skip_geometric_verification = True
+        pycolmap.match_exhaustive(stages.work / DATABASE, matching_options=how)
+        with pycolmap.Database.open(stages.work / DATABASE) as database:
+            names = {image.image_id: image.name for image in database.read_all_images()}
+            found: dict[Pair, np.ndarray] = {}
+            for identifier, rows in zip(*database.read_all_matches(), strict=True):
+                one, other = (names[k] for k in pycolmap.pair_id_to_image_pair(identifier))
+                found[one, other] = np.asarray(rows, np.int64).reshape(-1, 2)
+    nothing = np.empty((0, 2), np.int64)
+    return {
+        pair: found[pair] if pair in found else found.get(pair[::-1], nothing)[:, ::-1]
+        for pair in pairs
+    }
+
+
+def run_method(
+    method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, Camera]
+) -> dict[str, np.ndarray]:
+    """Reconstruct images by a method; to be called in a process of its own.
+
+    Returns by name "keypoints", mean number in an image, "matches", of all pairs together,
+    "seconds" and "cpu seconds" of both, "memory", the most bytes that the process held; for each
+    kind of intrinsics the "names", "poses" and "numbers" of `_map`.
+    """
+    with tempfile.TemporaryDirectory(prefix="deepdetect-sfm-") as scratch:
+        stages = Stages(Path(scratch) / "model", OPTIONS, 1, True)
+        folder = stages.folder_of(images)
+        start = _times()
+        method.find(stages, folder)
+        took = _times() - start
+        with open_hdf5(stages.work / FEATURES) as file:
+            sides = {name: file[name]["image_size"][()].tolist() for name in sorted(file)}
+            counts = [len(file[name]["keypoints"]) for name in file]
+        sizes = {name: (int(width), int(height)) for name, (width, height) in sides.items()}
+        start = _times()
+        pairs = stages.choose_pairs(list(sizes))
+        matches = method.match(stages, pairs) if method.match else stages.match(pairs)
+        took = (0 if method.chance else took) + _times() - start
+        values = {
+            "keypoints": np.mean(counts),
+            "matches": sum(len(rows) for rows in matches.values()),
+            "seconds": took[0],
+            "cpu seconds": took[1],
+        }
+        for kind, known in zip(KINDS, (cameras, {}), strict=True):
+            model = _map(stages, folder, sizes, matches, known)
+            values |= {f"{kind} {name}": array for name, array in model.items()}
+        values["memory"] = peak_memory()
+        return {name: np.asarray(value) for name, value in values.items()}
+
+
+def _times() -> np.ndarray:
+    """Return wall time and CPU time in seconds."""
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+def _map(
+    stages: Stages,
+    folder: Path,
+    sizes: Mapping[str, tuple[int, int]],
+    matches: Mapping[Pair, np.ndarray],
+    known: Mapping[str, Camera],
+) -> dict[str, object]:
+    """Map with known cameras, or with those that are estimated; no model is a result, too.
+
+    Returns the "names" of the registered images, (N, 12) "poses", rotation and translation, and
+    "numbers": sparse points, mean track length, mean reprojection error and CPU seconds.
+    """
+    intrinsics = initial_intrinsics(folder, sizes, known)
+    start = time.process_time()
+    try:
+        model, _, _ = stages.map(folder, intrinsics, matches, bool(known))
+    except NoDepthError:
+        numbers = (0, np.nan, np.nan, time.process_time() - start)
+        return {"names": np.empty(0, np.str_), "poses": np.empty((0, 12)), "numbers": numbers}
+    seconds = time.process_time() - start
+    sparse = read_sparse_model(model)
+    views = sorted(sparse.views.values(), key=lambda view: view.name)
+    return {
+        "names": [view.name for view in views],
+        "poses": [[*view.rotation.ravel(), *np.ravel(view.translation)] for view in views],
+        "numbers": (len(sparse.points), sparse.tracks.mean(), sparse.errors.mean(), seconds),
+    }

@@ -7,7 +7,7 @@ from ...datasets.oxford import load_oxford
 from ...datasets.types import PlanarPair
 from ..baselines.method import LocalFeature
 from ..options import BenchmarkOptions
-from ..report import Cell, Column, Columns, Row, Rows, Section, tabulate
+from ..report import Cell, Columns, Row, Rows, Section, tabulate
 from ..run import Run
 from .paper import PAPER_MATCHING
 from .planar import select_pairs
@@ -21,9 +21,6 @@ def speed(run: Run, options: BenchmarkOptions) -> list[Section]:
     """Run all features on one pair in turn, so that a busy machine affects them equally.
 
     Nothing is read from the cache. The first round warms up and is not counted.
-
-    Raises:
-        ImageError: the pair is missing.
     """
     folder = run.folder("oxford")
     pairs = select_pairs(load_oxford(folder), [PAIR])
@@ -40,13 +37,13 @@ def speed(run: Run, options: BenchmarkOptions) -> list[Section]:
         totals = [sum(row["seconds", stage] for stage in STAGES) for row in own]
         return max(totals) / min(totals) if totals else None
 
-    columns: Columns = [
-        (Column("keypoints", ",d"), lambda own: own[0]["keypoints"] if own else None),
-        (Column("matches", ",d"), lambda own: own[0]["matches"] if own else None),
-        *stage_columns("seconds", chance),
-        (Column("slowest over fastest round", ".2f"), slowest),
-        *stage_columns("memory", chance),
-    ]
+    columns: Columns = {
+        "keypoints": (",d", lambda own: own[0]["keypoints"] if own else None),
+        "matches": (",d", lambda own: own[0]["matches"] if own else None),
+        **stage_columns("seconds", chance),
+        "slowest over fastest round": (".2f", slowest),
+        **stage_columns("memory", chance),
+    }
     note = (
         f"{pairs[0].name}, the paper's matching. Medians of {ROUNDS} rounds over all methods; "
         "detecting in the first image, describing both, matching the pair. Memory: the largest "
@@ -58,9 +55,9 @@ def speed(run: Run, options: BenchmarkOptions) -> list[Section]:
 
 def _measure(feature: LocalFeature, pair: PlanarPair) -> Row:
     fresh = Run(pair.first.parent)
-    detected = fresh.keypoints(feature, pair.first)
+    keypoints, detected = fresh.keypoints(feature, pair.first)
     found = fresh.matches(feature, (pair.first, pair.second), PAPER_MATCHING)
-    row: Row = {"keypoints": len(detected.keypoints), "matches": len(found.points0)}
-    for stage, profile in zip(STAGES, (detected.profile, found.describe, found.match), strict=True):
+    row: Row = {"keypoints": len(keypoints), "matches": len(found.points0)}
+    for stage, profile in zip(STAGES, (detected, found.describe, found.match), strict=True):
         row["seconds", stage], row["memory", stage] = profile.seconds, profile.memory
     return row

@@ -14,7 +14,6 @@ from ...features.keypoints import Keypoints
 from ...geometry import GeometryOptions, estimate_geometry
 from ..baselines.method import LocalFeature
 from ..charts import line_chart
-from ..metrics.coverage import coverage
 from ..metrics.homography import (
     CORNER_THRESHOLDS_PX,
     Sizes,
@@ -22,9 +21,21 @@ from ..metrics.homography import (
     area_under_curve,
     corner_error,
 )
-from ..metrics.matching import MatchAccuracy, match_accuracy
-from ..metrics.repeatability import mutual_nn_repeatability
-from ..report import Cell, Column, Columns, Figure, Row, Rows, Table, average, mean, tabulate, where
+from ..metrics.matching import THRESHOLDS_PX, MatchAccuracy, match_accuracy
+from ..metrics.repeatability import coverage, mutual_nn_repeatability
+from ..report import (
+    Cell,
+    Columns,
+    Figure,
+    Measure,
+    Row,
+    Rows,
+    Table,
+    average,
+    mean,
+    tabulate,
+    where,
+)
 from ..run import MatchSettings, PairMatches, Run
 
 BUDGETS: tuple[int | None, ...] = (512, 1024, 2048, 4096, 8192, None)
@@ -35,7 +46,6 @@ SEEDS = 5
 MATCHING_BUDGET = 2048
 RATIO = 0.85
 INLIER_THRESHOLD_PX = 3.0
-MATCH_THRESHOLDS_PX = tuple(range(1, 11))
 
 MIN_FILLED = 0.9
 """A budget is shown where a method fills at least this fraction of it, on average."""
@@ -53,19 +63,10 @@ MATCHING_NOTE = (
 )
 
 
-def standard_rows(
-    run: Run,
-    features: Sequence[LocalFeature],
-    pairs: Sequence[PlanarPair],
-    budgets: Sequence[int | None] = BUDGETS,
-) -> Rows:
+def standard_rows(run: Run, features: Sequence[LocalFeature], pairs: Sequence[PlanarPair]) -> Rows:
     """Measure all features on all pairs: see `pair_row`."""
-    return run.rows(
-        "",
-        features,
-        {pair.name: pair for pair in pairs},
-        lambda feature, pair: pair_row(run, feature, pair, budgets),
-    )
+    items = {pair.name: pair for pair in pairs}
+    return run.rows("", features, items, lambda feature, pair: pair_row(run, feature, pair))
 
 
 def pair_row(
@@ -81,10 +82,10 @@ def pair_row(
         ("memory", stage).
     """
     images = (pair.first, pair.second)
-    found = [run.keypoints(feature, image) for image in images]
-    sizes = found[0].keypoints.image_size, found[1].keypoints.image_size
+    (first, detected), (second, _) = (run.keypoints(feature, image) for image in images)
+    sizes = first.image_size, second.image_size
     # Each position once: another orientation of SIFT's is not another place.
-    places = [one.keypoints.distinct() for one in found]
+    places = [first.distinct(), second.distinct()]
     fewest = min(map(len, places))
     ratio = 1.0 if feature.learned else RATIO
     settings = MatchSettings("exact", ratio, mutual=True, budget=MATCHING_BUDGET)
@@ -103,26 +104,19 @@ def pair_row(
     for budget in budgets:
         row |= _repeatability(run, feature, pair, sizes, places, budget)
         row["coverage", budget] = coverage(_best(places[0], budget), sizes[0])
-    for px in MATCH_THRESHOLDS_PX:
+    for px in THRESHOLDS_PX:
         row["correct", px] = accuracy.correct[px - 1]
         row["precision", px] = accuracy.precision(px)
         row["score", px] = accuracy.matching_score(px)
-        row["accuracy", px] = without_ratio.accuracy[px - 1]
-    profiles = found[0].profile, matches.describe, matches.match
-    for stage, profile in zip(STAGES, profiles, strict=True):
+        row["accuracy", px] = without_ratio.precision(px)
+    for stage, profile in zip(STAGES, (detected, matches.describe, matches.match), strict=True):
         row["seconds", stage], row["memory", stage] = profile.seconds, profile.memory
     return row
 
 
 def _accuracy(matches: PairMatches, pair: PlanarPair, sizes: Sizes) -> MatchAccuracy:
-    return match_accuracy(
-        matches.points0,
-        matches.points1,
-        matches.keypoints0,
-        matches.keypoints1,
-        pair.homography,
-        sizes,
-    )
+    points = matches.points0, matches.points1, matches.keypoints0, matches.keypoints1
+    return match_accuracy(*points, pair.homography, sizes)
 
 
 def _corner_errors(
@@ -134,22 +128,17 @@ def _corner_errors(
     size: tuple[int, int],
 ) -> list[float]:
     """Return the corner error of the homography that each seed of MAGSAC gives."""
+    options = GeometryOptions(inlier_threshold=INLIER_THRESHOLD_PX)
 
     def error(seed: int) -> float:
-        estimated = estimate_geometry(
-            matches.points0,
-            matches.points1,
-            "homography",
-            seed=seed,
-            options=GeometryOptions(inlier_threshold=INLIER_THRESHOLD_PX),
-        ).matrix
+        points = matches.points0, matches.points1
+        estimated = estimate_geometry(*points, "homography", seed=seed, options=options).matrix
         return corner_error(estimated, pair.homography, size)
 
     images = (pair.first, pair.second)
-    estimate = (INLIER_THRESHOLD_PX, SEEDS)
     found = run.cached(
         "corner_errors",
-        (*feature.key, images, pair.homography, settings, estimate),
+        (*feature.key, images, pair.homography, settings, (INLIER_THRESHOLD_PX, SEEDS)),
         lambda: {"errors": np.array([error(seed) for seed in range(SEEDS)])},
     )
     errors: list[float] = found["errors"].tolist()
@@ -167,7 +156,7 @@ def _repeatability(
     def make() -> dict[str, np.ndarray]:
         first, second = (_best(keypoints, budget) for keypoints in places)
         found = mutual_nn_repeatability(first, second, pair.homography, sizes, RADII_PX)
-        return {"rows": np.array([(e.value, e.chance, e.localization_px) for e in found])}
+        return {"rows": np.array(found)}
 
     depends = (feature.detection, (pair.first, pair.second), pair.homography, budget, RADII_PX)
     rows = run.cached("repeatability_mutual_nn", depends, make)["rows"].tolist()
@@ -206,7 +195,7 @@ def standard_tables(
 ) -> list[Table]:
     """Tabulate the rows; `what` names the data in the titles."""
     chance = {feature.name for feature in features if feature.chance}
-    tables = [
+    tables: list[tuple[str, str, Columns, str]] = [
         (
             f"repeatability_{radius:g}px",
             f"Mutual-NN repeatability within {radius:g} px, {what}",
@@ -216,8 +205,7 @@ def standard_tables(
         for radius in RADII_PX
     ]
     if kinds := list(dict.fromkeys(row["kind"] for row in rows if row["kind"])):
-        title = f"By kind of pair, {what}"
-        tables.append(("kinds", title, _kind_columns(kinds), KIND_NOTE))
+        tables.append(("kinds", f"By kind of pair, {what}", _kind_columns(kinds), KIND_NOTE))
     tables += [
         ("matching", f"Matches, {what}", MATCHING_COLUMNS, MATCHING_NOTE),
         ("homography", f"Homographies, {what}", _homography_columns(), HOMOGRAPHY_NOTE),
@@ -225,7 +213,7 @@ def standard_tables(
         ("cost", "Coverage, time and memory", _cost_columns(chance), COST_NOTE),
     ]
     return [
-        tabulate(f"{key}_{name}", title, features, rows, [PAIRS, *columns], note)
+        tabulate(f"{key}_{name}", title, features, rows, {**PAIRS, **columns}, note)
         for name, title, columns, note in tables
     ]
 
@@ -237,36 +225,31 @@ def _repeatability_columns(radius: float) -> Columns:
             return None
         return (value - chance) / (1 - chance)
 
-    columns: list[tuple[Column, Callable[[Rows], Cell]]] = []
+    columns: dict[str, tuple[str, Measure]] = {}
     for budget in BUDGETS:
-        of = partial(repeated, budget=budget, radius=radius)
-        name = budget_name(budget)
-        columns += [
-            (Column(name, ".3f"), of),
-            (Column(f"{name}: chance", ".3f"), partial(of, name="chance")),
-            (Column(f"{name}: chance-corrected", ".3f"), partial(corrected, budget=budget)),
-        ]
+        of, name = partial(repeated, budget=budget, radius=radius), budget_name(budget)
+        columns[name] = ".3f", of
+        columns[f"{name}: chance"] = ".3f", partial(of, name="chance")
+        columns[f"{name}: chance-corrected"] = ".3f", partial(corrected, budget=budget)
     localization = ("localization", MATCHING_BUDGET, radius)
-    return [
-        *columns,
-        average("keypoints of all", ",.0f", ("keypoints", None)),
-        average(f"localization at {MATCHING_BUDGET:,}, px", ".2f", localization),
-    ]
+    columns["keypoints of all"] = average(",.0f", ("keypoints", None))
+    columns[f"localization at {MATCHING_BUDGET:,}, px"] = average(".2f", localization)
+    return columns
 
 
 def _kind_columns(kinds: Sequence[str]) -> Columns:
-    def of_kind(own: Rows, kind: str, cell: Callable[[Rows], Cell]) -> Cell:
+    def of_kind(own: Rows, kind: str, cell: Measure) -> Cell:
         return cell(where(own, kind=kind))
 
-    values: list[tuple[str, str, Callable[[Rows], Cell]]] = [
-        (f"@{radius:g} px", ".3f", partial(repeated, budget=MATCHING_BUDGET, radius=radius))
+    values: dict[str, tuple[str, Measure]] = {
+        f"@{radius:g} px": (".3f", partial(repeated, budget=MATCHING_BUDGET, radius=radius))
         for radius in (RADII_PX[0], RADII_PX[-1])
-    ]
-    return [
-        (Column(f"{kind}: {title}", style), partial(of_kind, kind=kind, cell=cell))
+    }
+    return {
+        f"{kind}: {title}": (style, partial(of_kind, kind=kind, cell=cell))
         for kind in kinds
-        for title, style, cell in [*values, ("correct", ",.0f", correct)]
-    ]
+        for title, (style, cell) in {**values, "correct": (",.0f", correct)}.items()
+    }
 
 
 def _homography_columns() -> Columns:
@@ -279,28 +262,25 @@ def _homography_columns() -> Columns:
         values = [metric(errors, px) for errors in seeds]
         return float(np.std(values, ddof=1) if spread else np.mean(values))
 
-    return [
-        (
-            Column(title.format(name, px), ".3f"),
-            partial(over_seeds, metric=metric, px=px, spread=spread),
-        )
+    return {
+        title.format(name, px): (".3f", partial(over_seeds, metric=metric, px=px, spread=spread))
         for name, metric in (("accuracy", accuracy_at), ("AUC", area_under_curve))
         for px in CORNER_THRESHOLDS_PX
         for title, spread in (("{} at {:g} px", False), ("± of {} {:g}", True))
-    ]
+    }
 
 
 def _cost_columns(chance: Container[str]) -> Columns:
-    return [
-        *(average(f"coverage, {budget_name(b)}", ".3f", ("coverage", b)) for b in BUDGETS),
-        *stage_columns("seconds", chance),
-        (
-            Column("pair, s", ".3f"),
-            lambda own: None if own and own[0]["method"] in chance else median_seconds(own),
-        ),
-        (Column("correct at 1 px", ",.0f"), correct),
-        *stage_columns("memory", chance),
-    ]
+    def seconds(own: Rows) -> Cell:
+        return None if own and own[0]["method"] in chance else median_seconds(own)
+
+    return {
+        **{f"coverage, {budget_name(b)}": average(".3f", ("coverage", b)) for b in BUDGETS},
+        **stage_columns("seconds", chance),
+        "pair, s": (".3f", seconds),
+        "correct at 1 px": (",.0f", correct),
+        **stage_columns("memory", chance),
+    }
 
 
 def stage_columns(what: Literal["seconds", "memory"], chance: Container[str]) -> Columns:
@@ -318,30 +298,30 @@ def stage_columns(what: Literal["seconds", "memory"], chance: Container[str]) ->
         return max((row["memory", stage] / 1e6 for row in own), default=None)
 
     if what == "seconds":
-        return [(Column(f"{s}, s", ".3f"), partial(seconds, stage=s)) for s in STAGES]
-    return [(Column(f"{s}, MB", ",.0f"), partial(megabytes, stage=s)) for s in STAGES]
+        return {f"{stage}, s": (".3f", partial(seconds, stage=stage)) for stage in STAGES}
+    return {f"{stage}, MB": (",.0f", partial(megabytes, stage=stage)) for stage in STAGES}
 
 
-PAIRS: tuple[Column, Callable[[Rows], Cell]] = (Column("pairs", ",d"), len)
+PAIRS: Columns = {"pairs": (",d", len)}
 
-MATCHING_COLUMNS: Columns = (
-    average("keypoints", ",.0f", ("keypoints", MATCHING_BUDGET)),
-    average("matches", ",.0f", "matches"),
-    *(
-        average(f"{title} at {px} px", style, (name, px))
+MATCHING_COLUMNS: Columns = {
+    "keypoints": average(",.0f", ("keypoints", MATCHING_BUDGET)),
+    "matches": average(",.0f", "matches"),
+    **{
+        f"{title} at {px} px": average(style, (name, px))
         for title, style, name in (
             ("correct", ",.0f", "correct"),
             ("precision", ".3f", "precision"),
             ("matching score", ".3f", "score"),
         )
         for px in (1, 3)
-    ),
-)
+    },
+}
 
-ACCURACY_COLUMNS: Columns = (
-    average("matches", ",.0f", "all matches"),
-    *(average(f"{px} px", ".3f", ("accuracy", px)) for px in MATCH_THRESHOLDS_PX),
-)
+ACCURACY_COLUMNS: Columns = {
+    "matches": average(",.0f", "all matches"),
+    **{f"{px} px": average(".3f", ("accuracy", px)) for px in THRESHOLDS_PX},
+}
 
 REPEATABILITY_NOTE = (
     "Keypoints that are mutual nearest neighbours, at most the radius apart, over the fewer of "
@@ -394,8 +374,8 @@ def standard_figures(
     measured = [(feature, own) for feature in features if (own := where(rows, method=feature.name))]
     accuracy = {
         feature.title: (
-            MATCH_THRESHOLDS_PX,
-            [mean(own, ("accuracy", px)) or 0.0 for px in MATCH_THRESHOLDS_PX],
+            THRESHOLDS_PX,
+            [mean(own, ("accuracy", px)) or 0.0 for px in THRESHOLDS_PX],
         )
         for feature, own in measured
     }

@@ -1,34 +1,48 @@
 """Stereo pairs with known disparity: reconstructions by several pipelines.
 
-Figure 8 of the paper, and what it lacks: the true disparity, a peer, and chance baselines.
+Figure 8 of the paper, and what it lacks: the true disparity, a peer, and chance baselines. A
+pipeline is a function from a scene to its points; it profiles the stages keypoints, matching and
+geometry.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 
 from ..._shared.errors import ImageError
-from ..._shared.records import Arrays
+from ..._shared.opencv import cv2
+from ..._shared.records import Arrays, file_digest
 from ...datasets.middlebury import load_calibrated_pair, load_middlebury
 from ...datasets.types import CalibratedStereoPair
+from ...detector.detector import AnyDetector, DeepDetect
+from ...detector.heatmap import HeatmapOptions
+from ...features.matchers import flann_neighbours, match_descriptors
+from ...features.selection import SelectionOptions
 from ...geometry.camera import Calibration
 from ...geometry.point_cloud import PointCloud
+from ...matching.stereo.matching import find_disparity_range
+from ...matching.unguided import check_memory
+from ...reconstruction.pipeline import reconstruct
 from ...viz.render import draw_clouds
+from ..baselines.method import LocalFeature, deepdetect_feature
+from ..baselines.opencv import self_described
+from ..baselines.random import AllPixels, RandomDetector
 from ..charts import picture
-from ..metrics.stereo import (
-    DISPARITY_TOLERANCES_PX,
-    disparity_accuracy,
-    half_occluded_accuracy,
-)
-from ..options import BenchmarkOptions
-from ..profiling import Profile
-from ..report import Cell, Column, Figure, Section, Table, where
+from ..metrics.stereo import DISPARITY_TOLERANCES_PX, disparity_scores
+from ..options import PAPER_RESOLUTION_PX, BenchmarkOptions
+from ..profiling import Profile, StageProfiler
+from ..report import Figure, Row, Section, Table, where
 from ..run import Run
 from .paper_numbers import FIGURE_8, with_paper_column
-from .stereo_pipelines import ROUNDS, STAGES, Pipeline, StereoPoints, pipelines
+
+STAGES = ("keypoints", "matching", "geometry")
+ROUNDS = 3
+"""Runs of what takes seconds; the one of median time is reported."""
 
 VOXEL_EDGES = {"mm": 2.0, "baseline": 0.05}
 """Edge of a voxel by unit."""
@@ -72,38 +86,81 @@ SHIFTED_NOTE = (
 )
 
 
-def middlebury(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Reconstruct the stereo pairs by all pipelines (Figure 8).
+@dataclass(frozen=True, eq=False)
+class StereoPoints:
+    """The points of a scene.
 
-    Raises:
-        ImageError: there is no scene.
+    Attributes:
+        pixels: (N, 2) float32 positions in the left image.
+        disparity: (N,) float32 in pixels.
+        filled: how many of them were not matched, but filled in.
+        profiles: of each of `STAGES` that the pipeline has.
+        memory: bytes that the process grew by at most, over all stages.
     """
+
+    pixels: np.ndarray
+    disparity: np.ndarray
+    filled: int
+    profiles: Mapping[str, Profile]
+    memory: int
+
+    @property
+    def seconds(self) -> float:
+        """Of all stages."""
+        return sum(profile.seconds for profile in self.profiles.values())
+
+
+@dataclass(frozen=True, eq=False)
+class Pipeline:
+    """What turns two images into points.
+
+    Attributes:
+        title: how tables name it.
+        run: reconstructs a scene.
+        version: what results depend on besides the title.
+        rounds: how often it is run for its time.
+        drawn: its title in Figure 8; empty: not drawn.
+        paper: the points in the paper by scene.
+    """
+
+    title: str
+    run: Callable[[CalibratedStereoPair], StereoPoints]
+    version: str = ""
+    rounds: int = ROUNDS
+    drawn: str = ""
+    paper: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """By which the cache and the rows know it."""
+        return self.title
+
+
+def middlebury(run: Run, options: BenchmarkOptions) -> list[Section]:
+    """Reconstruct the stereo pairs by all pipelines (Figure 8)."""
     folder = run.folder("middlebury")
-    scenes = sorted(path.parent for path in folder.glob("*/left.png"))
+    scenes = {path.parent.name: path.parent for path in sorted(folder.glob("*/left.png"))}
     if not scenes:
         raise ImageError(
             f"there are no stereo scenes in {folder}: it must hold SCENE/left.png and right.png"
         )
     compared = pipelines(options)
-    rows = run.rows(
-        "",
-        compared,
-        {scene.name: scene for scene in scenes},
-        lambda pipeline, scene: {"points": reconstruct_points(run, pipeline, scene)},
-    )
+
+    def measure(pipeline: Pipeline, scene: Path) -> Row:
+        return {"points": reconstruct_points(run, pipeline, scene)}
+
+    rows = run.rows("", compared, scenes, measure)
     tables: list[Table] = []
     figures: list[Figure] = []
-    for scene in scenes:
-        found = {row["method"]: row["points"] for row in where(rows, item=scene.name)}
+    for name, scene in scenes.items():
+        found = {row["method"]: row["points"] for row in where(rows, item=name)}
         if not found:
             continue
         pair = load_calibrated_pair(scene)
-        name = f"the ground truth of {scene.name}"
-        truths = run.attempt(name, ground_truths, scene) or {AS_IT_IS: None}
-        tables += [
-            points_table(pair, compared, found, name, truth) for name, truth in truths.items()
-        ]
-        figure = run.attempt(f"Figure 8 of {scene.name}", clouds_figure, pair, compared, found)
+        truths = run.attempt(f"the ground truth of {name}", ground_truths, scene)
+        for which, truth in (truths or {AS_IT_IS: None}).items():
+            tables.append(points_table(pair, compared, found, which, truth))
+        figure = run.attempt(f"Figure 8 of {name}", clouds_figure, pair, compared, found)
         figures += [figure] if figure else []
     return [Section("Middlebury stereo, and Figure 8", (TEXT,), tables, figures)]
 
@@ -125,75 +182,58 @@ def reconstruct_points(run: Run, pipeline: Pipeline, scene: Path) -> StereoPoint
 
     files = [scene / name for name in ("left.png", "right.png", "calib.json")]
     kept = run.cached("stereo", (pipeline.name, pipeline.version, files), make)
-    return StereoPoints(
-        kept["pixels"],
-        kept["disparity"],
-        int(kept["filled"]),
-        {stage: Profile.unpacked(kept[stage]) for stage in STAGES if stage in kept},
-        int(kept["memory"]),
-    )
+    profiles = {stage: Profile(*kept[stage].tolist()) for stage in STAGES if stage in kept}
+    points = kept["pixels"], kept["disparity"]
+    return StereoPoints(*points, int(kept["filled"]), profiles, int(kept["memory"]))
 
 
 def points_table(
     pair: CalibratedStereoPair,
     compared: Sequence[Pipeline],
     found: Mapping[str, StereoPoints],
-    name: str,
+    which: str,
     truth: np.ndarray | None,
 ) -> Table:
     """Tabulate number, accuracy, time and memory of the points of all pipelines."""
     unit = _unit(pair)
     edge = VOXEL_EDGES[unit]
-    columns = (
-        Column("pipeline"),
-        Column("points", ",d"),
-        Column("of them filled", ",d"),
-        Column(f"voxels of {edge:g} {unit}", ",d"),
-        *(Column(f"1 - bad-{tolerance:g}", ".4f") for tolerance in DISPARITY_TOLERANCES_PX),
-        Column("EPE, px", ".3f"),
-        Column("completeness at 1 px", ".4f"),
-        Column("F-score", ".4f"),
-        Column("half-occluded, with a point", ",d"),
-        Column("of these within 1 px", ".4f"),
-        *(Column(f"{stage}, s", ".2f") for stage in STAGES),
-        Column("seconds", ".2f"),
-        *(Column(f"{stage}, MB", ",.0f") for stage in STAGES),
-        Column("all, MB", ",.0f"),
-    )
-
-    def line(pipeline: Pipeline) -> tuple[Cell, ...]:
+    voxels = f"voxels of {edge:g} {unit}"
+    columns = {
+        **{"pipeline": "", "points": ",d", "of them filled": ",d", voxels: ",d"},
+        **{f"1 - bad-{tolerance:g}": ".4f" for tolerance in DISPARITY_TOLERANCES_PX},
+        **{"EPE, px": ".3f", "completeness at 1 px": ".4f", "F-score": ".4f"},
+        **{"half-occluded, with a point": ",d", "of these within 1 px": ".4f"},
+        **{f"{stage}, s": ".2f" for stage in STAGES},
+        "seconds": ".2f",
+        **{f"{stage}, MB": ",.0f" for stage in STAGES},
+        "all, MB": ",.0f",
+    }
+    lines: list[Row] = []
+    for pipeline in compared:
+        lines.append({"pipeline": pipeline.title})
         points = found.get(pipeline.name)
         if points is None:
-            return (pipeline.title, *(None,) * (len(columns) - 1))
-        accuracy: tuple[Cell, ...] = (None,) * (len(DISPARITY_TOLERANCES_PX) + 5)
+            continue
+        lines[-1] |= {
+            "points": len(points.pixels),
+            "of them filled": points.filled,
+            voxels: count_voxels(pair.calibration, points.pixels, points.disparity, edge),
+            "seconds": points.seconds,
+            "all, MB": points.memory / 1e6,
+        }
+        for stage, profile in points.profiles.items():
+            lines[-1] |= {f"{stage}, s": profile.seconds, f"{stage}, MB": profile.memory / 1e6}
         if truth is not None:
-            score = disparity_accuracy(points.pixels, points.disparity, truth)
-            outside = half_occluded_accuracy(points.pixels, points.disparity, truth)
-            accuracy = (*score.accuracy, score.epe_px, score.completeness, score.f_score)
-            accuracy += outside
-        profiles = [points.profiles.get(stage) for stage in STAGES]
-        return (
-            pipeline.title,
-            len(points.pixels),
-            points.filled,
-            count_voxels(pair.calibration, points.pixels, points.disparity, edge),
-            *accuracy,
-            *(None if p is None else p.seconds for p in profiles),
-            points.seconds,
-            *(None if p is None else p.memory / 1e6 for p in profiles),
-            points.memory / 1e6,
-        )
-
-    key = f"middlebury_{pair.name}" + ("_shifted" if name == SHIFTED else "")
+            lines[-1] |= disparity_scores(points.pixels, points.disparity, truth)
+    key = f"middlebury_{pair.name}" + ("_shifted" if which == SHIFTED else "")
     paper = {p.title: p.paper[pair.name] for p in compared if pair.name in p.paper}
-    title = f"{pair.name}, {name}" if name else pair.name
+    title = f"{pair.name}, {which}" if which else pair.name
     note = NOTE
     if truth is None:
         note = f"There is no true disparity: nothing is evaluated. {note}"
-    elif name == SHIFTED:
+    elif which == SHIFTED:
         note = f"{SHIFTED_NOTE} {note}"
-    table = Table(key, title, columns, tuple(map(line, compared)), note)
-    return with_paper_column(table, "points", paper)
+    return with_paper_column(Table(key, title, columns, lines, note), "points", paper)
 
 
 def _unit(pair: CalibratedStereoPair) -> str:
@@ -203,14 +243,7 @@ def _unit(pair: CalibratedStereoPair) -> str:
 def count_voxels(
     calibration: Calibration, pixels: np.ndarray, disparity: np.ndarray, edge: float
 ) -> int:
-    """Count the cubes of a grid that hold a point.
-
-    Args:
-        calibration: makes disparities depths.
-        pixels: (N, 2) in the left image.
-        disparity: (N,) in pixels.
-        edge: of a cube, in mm, or in baselines where that is not known.
-    """
+    """Count the cubes of a grid, with edges in mm or baselines, that hold a point."""
     cubes = np.floor(_triangulate(calibration, pixels, disparity)[0] / edge).astype(np.int64)
     return len(np.unique(cubes, axis=0))
 
@@ -248,11 +281,7 @@ def clouds_figure(
 
 
 def ground_truths(scene: Path) -> Mapping[str, np.ndarray | None]:
-    """Return the true disparities of a scene by name: "" as its file has it, and perhaps shifted.
-
-    Raises:
-        ImageError: the scene has no ground truth.
-    """
+    """Return the true disparities of a scene: as its file has it, and perhaps shifted."""
     disparity = load_middlebury(scene).disparity
     offset = TRUTH_OFFSETS.get(scene.name, 0)
     return {AS_IT_IS: disparity} | ({SHIFTED: shift_view(disparity, offset)} if offset else {})
@@ -262,10 +291,6 @@ def shift_view(disparity: np.ndarray, baselines: int) -> np.ndarray:
     """Show a disparity map from a view this many baselines to the right; NaN where it is hidden.
 
     Where several places fall on one pixel the nearest of them is visible.
-
-    Example:
-        >>> shift_view(np.array([[np.nan, np.nan, 1.0, 1.0, 2.0]]), 1).tolist()
-        [[nan, 1.0, 2.0, nan, nan]]
     """
     rows, columns = np.nonzero(np.isfinite(disparity))
     values = disparity[rows, columns]
@@ -274,3 +299,215 @@ def shift_view(disparity: np.ndarray, baselines: int) -> np.ndarray:
     out = np.full(disparity.shape, -np.inf, np.float32)
     np.maximum.at(out, (rows[inside], columns[inside]), values[inside])
     return np.where(np.isfinite(out), out, np.nan).astype(np.float32)
+
+
+PAPER_SETTINGS: dict[str, tuple[float, float, float, float]] = {
+    "cones": (0.9, 360, 225, 188),
+    "dolls": (0.85, 1512, 695, 555),
+    "moebius": (0.77, 1512, 695, 555),
+    "rocks": (0.9, 1512, 638, 555),
+    "cloth": (0.9, 1050, 641, 555),
+}
+"""Ratio, focal length and principal point in px, by scene, of the authors' notebooks."""
+
+PAPER_FLANN_TREES = 10
+PAPER_FLANN_CHECKS = 100
+PAPER_RANSAC_CONFIDENCE = 0.99999
+PAPER_RANSAC_THRESHOLD_PX = 0.5
+PAPER_RANSAC_ITERATIONS = 100_000
+
+
+def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
+    """Return what is compared, chance baselines last."""
+    detectors = options.stereo_detectors()
+    versions = [
+        f"{file_digest(each.weights)[:16]} {each.runtime} {each.heatmap_options}"
+        for each in detectors.values()
+    ]
+    found: list[Pipeline] = []
+    for (name, detector), version in zip(detectors.items(), versions, strict=True):
+        reconstruct_ours = partial(_ours, detector=detector)
+        drawn = "" if found else "ours"
+        found.append(Pipeline(f"ours, weights {name}", reconstruct_ours, version, drawn=drawn))
+    for name, detector in detectors.items():
+        squashed = detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX, "bgr"))
+        feature = deepdetect_feature(squashed, title=f"the paper's pipeline, weights {name}")
+        found.append(_paper(feature, paper=FIGURE_8["DeepDetect"]))
+    for name, title, drawn in (
+        ("sift", "SIFT", "SIFT default"),
+        ("sift-low", "SIFT, low settings", "SIFT low"),
+    ):
+        if name in options.classical:
+            found.append(_paper(self_described(name, title), drawn, FIGURE_8[title]))
+    random = partial(_random, like=next(iter(detectors.values())))
+    every = partial(_ours, detector=AllPixels())
+    return [
+        *found,
+        Pipeline("OpenCV's SGBM", sgbm),
+        Pipeline("baseline: as many random pixels as ours", random, versions[0], 1),
+        Pipeline("baseline: all pixels", every),
+        Pipeline("all pixels, --density 1", partial(every, density=1)),
+    ]
+
+
+def _ours(
+    scene: CalibratedStereoPair, *, detector: AnyDetector, density: float | None = None
+) -> StereoPoints:
+    """Reconstruct as `deepdetect reconstruct --rectified`."""
+    _compile_kernels()
+    profiler = StageProfiler()
+    found = reconstruct(
+        scene.left,
+        scene.right,
+        detector,
+        calibration=scene.calibration,
+        rectified=True,
+        selection=SelectionOptions(density=density),
+        progress=lambda stage: profiler.record(stage if stage in STAGES else "geometry"),
+    )
+    profiler.record("geometry")
+    assert found.disparity is not None
+    filled = int(np.count_nonzero(~found.matched))
+    return StereoPoints(found.pixels, found.disparity, filled, profiler.stages, profiler.memory)
+
+
+def _random(scene: CalibratedStereoPair, *, like: DeepDetect) -> StereoPoints:
+    """Reconstruct as many random pixels as a detector finds keypoints."""
+    density = float((like.heatmap(scene.left) > 0.5).mean())
+    return _ours(scene, detector=RandomDetector(), density=density)
+
+
+def _paper(feature: LocalFeature, drawn: str = "", paper: Mapping[str, float] = {}) -> Pipeline:
+    """Make the paper's pipeline with the keypoints and descriptors of a local feature."""
+
+    def run(scene: CalibratedStereoPair) -> StereoPoints:
+        feature.detect(scene.left)  # the first run of a size takes longer
+        profiler = StageProfiler()
+        points0, points1 = paper_points(feature, scene, profiler)
+        disparity = (points0[:, 0] - points1[:, 0]).astype(np.float32)
+        pixels = points0.astype(np.float32)
+        return StereoPoints(pixels, disparity, 0, profiler.stages, profiler.memory)
+
+    return Pipeline(feature.title, run, feature.version, 1, drawn, paper)
+
+
+def paper_points(
+    feature: LocalFeature, scene: CalibratedStereoPair, profiler: StageProfiler
+) -> tuple[np.ndarray, np.ndarray]:
+    """Match a stereo pair and keep what the essential matrix leaves: the paper's "voxels".
+
+    FLANN with 10 trees and 100 checks, a ratio chosen for each scene, and RANSAC; pose and
+    triangulation are computed for the time they take. Returns (M, 2) and (M, 2) float64.
+    """
+    images = scene.left, scene.right
+    ratio, camera_matrix = paper_settings(scene)
+    features = [feature.detect(rgb) for rgb in images]
+    profiler.record("keypoints")
+    check_memory([len(one) for one in features])
+    first, second = (feature.describe(rgb, one) for rgb, one in zip(images, features, strict=True))
+    flann = partial(flann_neighbours, trees=PAPER_FLANN_TREES, checks=PAPER_FLANN_CHECKS)
+    found = match_descriptors(first, second, flann, ratio=ratio)
+    profiler.record("matching")
+    kept = essential_inliers(
+        features[0].xy[found.indices0].astype(np.float64),
+        features[1].xy[found.indices1].astype(np.float64),
+        camera_matrix,
+    )
+    profiler.record("geometry")
+    return kept
+
+
+def paper_settings(scene: CalibratedStereoPair) -> tuple[float, np.ndarray]:
+    """Return the authors' ratio and camera matrix; of other scenes their most frequent ratio."""
+    camera = scene.calibration.camera0.matrix
+    own = 0.9, camera[0, 0], camera[0, 2], camera[1, 2]
+    ratio, focal, x, y = PAPER_SETTINGS.get(scene.name, own)
+    return ratio, np.array([[focal, 0, x], [0, focal, y], [0, 0, 1]], float)
+
+
+def essential_inliers(
+    points0: np.ndarray, points1: np.ndarray, camera_matrix: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Keep the inliers of the essential matrix; triangulate them for the time that takes."""
+    if len(points0) < 6:
+        return points0[:0], points1[:0]
+    essential, inliers = cv2.findEssentialMat(
+        points0,
+        points1,
+        camera_matrix,
+        method=cv2.RANSAC,
+        prob=PAPER_RANSAC_CONFIDENCE,
+        threshold=PAPER_RANSAC_THRESHOLD_PX,
+        maxIters=PAPER_RANSAC_ITERATIONS,
+    )
+    if essential is None:
+        return points0[:0], points1[:0]
+    kept = inliers.ravel() > 0
+    points0, points1 = points0[kept], points1[kept]
+    _, rotation, translation, _ = cv2.recoverPose(essential[:3], points0, points1, camera_matrix)
+    poses = np.eye(3, 4), np.column_stack([rotation, translation])
+    cv2.triangulatePoints(*(camera_matrix @ pose for pose in poses), points0.T, points1.T)
+    return points0, points1
+
+
+def sgbm(scene: CalibratedStereoPair) -> StereoPoints:
+    """Run OpenCV's semi-global matching on every pixel.
+
+    With the range that ours finds, from 0 or below, made a multiple of 16. Both views are extended
+    by what it reaches beyond them, so that it gives values at the margins, too.
+    """
+    profiler = StageProfiler()
+    gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
+    search = find_disparity_range(*gray)
+    smallest, largest = (0, 64) if search is None else (min(search[0], 0), search[1])
+    count = max(16, -(-(largest - smallest + 1) // 16) * 16)
+    borders = max(smallest + count, 0), -smallest
+    disparity = sgbm_disparity(scene.left, scene.right, count, borders, smallest)
+    rows, columns = np.nonzero(np.isfinite(disparity))
+    profiler.record("matching")
+    pixels = np.column_stack([columns, rows]).astype(np.float32)
+    return StereoPoints(pixels, disparity[rows, columns], 0, profiler.stages, profiler.memory)
+
+
+def sgbm_disparity(
+    left: np.ndarray,
+    right: np.ndarray,
+    num_disparities: int,
+    borders_px: tuple[int, int] = (0, 0),
+    min_disparity: int = 0,
+) -> np.ndarray:
+    """Run OpenCV's semi-global matching: block 5, three ways, uniqueness 10, speckle filter.
+
+    A multiple of 16 of disparities is tried; both (H, W, 3) uint8 RGB views are extended by the
+    borders on the left and on the right. Returns (H, W) float32 in pixels, NaN where there is none.
+    """
+    matcher = cv2.StereoSGBM_create(
+        minDisparity=min_disparity,
+        numDisparities=num_disparities,
+        blockSize=5,
+        P1=8 * 3 * 25,
+        P2=32 * 3 * 25,
+        uniquenessRatio=10,
+        speckleWindowSize=100,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+    views = [
+        cv2.copyMakeBorder(
+            cv2.cvtColor(image, cv2.COLOR_RGB2BGR), 0, 0, *borders_px, cv2.BORDER_REPLICATE
+        )
+        for image in (left, right)
+    ]
+    inside = slice(borders_px[0], borders_px[0] + left.shape[1])
+    disparity = matcher.compute(*views)[:, inside].astype(np.float32) / 16
+    return np.where(disparity >= min_disparity, disparity, np.nan)
+
+
+@lru_cache(maxsize=1)
+def _compile_kernels() -> None:
+    """Run once on a small scene, so that no scene's time includes the compilation."""
+    scene = np.random.default_rng(0).integers(0, 256, (96, 160), np.uint8)
+    scene = cv2.GaussianBlur(scene, (0, 0), 1)
+    column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in (160, 96)))
+    right = cv2.remap(scene, column + 4 + row / 12, row, cv2.INTER_LINEAR)
+    reconstruct(scene, right, AllPixels(), focal_px=100, rectified=True)

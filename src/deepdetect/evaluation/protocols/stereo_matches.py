@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 from ..._shared.progress import progress
 from ...datasets.types import StereoPair
@@ -12,57 +12,37 @@ from ...features.matches import Matches
 from ...features.selection import SelectionOptions
 from ...matching.pipeline import match_images
 from ..baselines.random import AllPixels, RandomDetector
-from ..metrics.stereo import StereoScore, stereo_score
-
-
-@dataclass(frozen=True)
-class StereoMatchScore:
-    """What one source of keypoints gives on one pair.
-
-    Attributes:
-        source: its name.
-        pair: the pair's name.
-        density: keypoints per pixel, mean of both views.
-        score: its matches, and how many of them are correct.
-    """
-
-    source: str
-    pair: str
-    density: float
-    score: StereoScore
+from ..metrics.stereo import stereo_score
 
 
 def score_stereo_matches(
     sources: Mapping[str, AnyDetector], pairs: Sequence[StereoPair], *, quiet: bool = True
-) -> list[StereoMatchScore]:
+) -> list[dict[str, Any]]:
     """Match rectified pairs with several sources of keypoints, and evaluate the matches.
 
-    Matching is by descriptors alone (SIFT, FLANN, ratio 0.99) over the whole image: neither the
-    rows nor the true disparity are used. Beside each source are random points at its density,
-    since more keypoints always find more; all pixels are the last row.
-
-    Args:
-        sources: detectors by name.
-        pairs: with their true disparity, for evaluation only.
-        quiet: show no progress bar.
-
-    Returns:
-        For each source its rows and then the random points', pair by pair.
+    By descriptors alone over the whole image (SIFT, FLANN, ratio 0.99): neither the rows nor the
+    true disparity are used. A source's rows are followed by those of random points at its density,
+    since more keypoints always find more; all pixels come last.
     """
     with progress(len(pairs) * (2 * len(sources) + 1), "matching", "pair", quiet) as bar:
 
-        def evaluated(source: str, pair: StereoPair, found: Matches) -> StereoMatchScore:
+        def evaluated(source: str, pair: StereoPair, found: Matches) -> dict[str, Any]:
             bar.update(1)
-            density = (found.keypoints0.density + found.keypoints1.density) / 2
             score = stereo_score(found.points0, found.points1, pair.disparity)
-            return StereoMatchScore(source, pair.name, density, score)
+            return {
+                "source": source,
+                "pair": pair.name,
+                "density": (found.keypoints0.density + found.keypoints1.density) / 2,
+                "score": vars(score),
+                "precision": score.precision,
+            }
 
-        rows: list[StereoMatchScore] = []
+        rows: list[dict[str, Any]] = []
         for name, detector in sources.items():
             own = [evaluated(name, pair, match_stereo(pair, detector)) for pair in pairs]
             rows += own
             rows += [
-                evaluated(f"random, as {name}", pair, match_random_points(pair, row.density))
+                evaluated(f"random, as {name}", pair, match_random_points(pair, row["density"]))
                 for pair, row in zip(pairs, own, strict=True)
             ]
         every = AllPixels()
