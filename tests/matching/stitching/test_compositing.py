@@ -8,14 +8,14 @@ from deepdetect import DeepDetectError, OptionError
 from deepdetect._shared import memory
 from deepdetect.geometry.images import downscale
 from deepdetect.matching.stitching.bundle_adjustment import RotatingCamera
-from deepdetect.matching.stitching.canvas import (
+from deepdetect.matching.stitching.compositing import (
     Canvas,
-    draw_plane,
+    composite,
+    crop_box,
     least_distorted,
     plan_curved,
     plan_plane,
 )
-from deepdetect.matching.stitching.compositing import composite, crop_box
 
 CAMERA = np.array([[400.0, 0, 199.5], [0, 400, 149.5], [0, 0, 1]])
 SIZE = (400, 300)
@@ -91,17 +91,16 @@ def test_the_one_in_the_middle_is_least_stretched() -> None:
 
 
 def test_an_image_is_drawn_where_it_belongs(scene: np.ndarray) -> None:
-    warped = draw_plane({0: moved(40, 10)}, {0: (30, 0, 700, 405)}, 0, scene, 1, 1)
-    drawn, mask = warped.image, warped.mask
-    assert drawn.shape == (405, 670, 3)
-    np.testing.assert_array_equal(drawn[10:, 10:610], scene[:395])
-    assert (mask[10:, 10:610] == 255).all()
-    assert mask.sum() == 255 * 395 * 600
+    canvas, _ = plan_plane({0: (600, 400), 1: SIZE}, {0: moved(40, 10), 1: moved(0)}, 1, 1)
+    warped = canvas.draw(0, scene, 1, 1)
+    assert warped.corner == (40, 10)
+    np.testing.assert_array_equal(warped.image, scene)
+    assert (warped.mask == 255).all()
     # Stripes of one pixel are grey when made smaller, not what sampling hits.
     stripes = np.zeros((200, 200, 3), np.uint8)
     stripes[:, ::2] = 255
-    quarter = np.diag([0.25, 0.25, 1])
-    small = draw_plane({0: quarter}, {0: (0, 0, 50, 50)}, 0, stripes, 1, 1).image
+    canvas, _ = plan_plane({0: (200, 200)}, {0: np.eye(3)}, 0, 0.25)
+    small = canvas.draw(0, stripes, 1, 1).image
     assert np.abs(small[5:-5, 5:-5].astype(int) - 127.5).max() < 30
 
 

@@ -14,8 +14,7 @@ import numpy as np
 from ..._shared.opencv import cv2
 from ...geometry.transforms import transform_points
 
-MAX_ITERATIONS = 20
-MIN_STEP = 1e-7
+MAX_ITERATIONS, MIN_STEP = 20, 1e-7
 """The fit ends after this many iterations, or with a smaller change of the parameters."""
 
 UNIT_PX = 500.0
@@ -29,6 +28,12 @@ FOCAL_LENGTHS = np.geomspace(0.3, 10, 100) * 640 / UNIT_PX
 
 FOCAL_WEIGHT = 1e-4
 """Of a focal length's distance from the common one: half a pixel of noise per tenth of its size."""
+
+Matrices = Mapping[int, np.ndarray]
+"""By the number of the image."""
+
+Links = list[tuple[int, int, np.ndarray, np.ndarray]]
+"""Numbers of two images, and (M, 2) points of both that are the same, in units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,35 +73,19 @@ class RotatingCamera:
 
 
 def adjust_homographies(
-    homographies: Mapping[int, np.ndarray],
-    pairs: Sequence[RegisteredPair],
-    sizes: Mapping[int, tuple[int, int]],
+    homographies: Matrices, pairs: Sequence[RegisteredPair], sizes: Mapping[int, tuple[int, int]]
 ) -> tuple[dict[int, np.ndarray], float]:
     """Fit all homographies but the first, which stays, to all pairs at once.
 
-    Args:
-        homographies: (3, 3) from each image to the frame of the first one, by number, near enough.
-        pairs: whose homographies say where points belong.
-        sizes: (width, height) of the images.
-
-    Returns:
-        The homographies, and the root mean square of the residuals in pixels.
-
-    Example:
-        >>> grid = np.argwhere(np.ones((5, 5))) * 20.0
-        >>> moved = np.array([[1, 0, -30.0], [0, 1, 0], [0, 0, 1]])
-        >>> pair = RegisteredPair(0, 1, moved, grid, len(grid))
-        >>> start = {0: np.eye(3), 1: np.array([[1, 0, 25.0], [0, 1, 3], [0, 0, 1]])}
-        >>> found, residual_px = adjust_homographies(start, [pair], {0: (100, 100), 1: (100, 100)})
-        >>> (found[1] / found[1][2, 2])[:2, 2].round(3).tolist(), round(residual_px, 3)
-        ([30.0, 0.0], 0.0)
+    `homographies` go from each image to the frame of the first one, near enough; `sizes` are
+    (width, height). Returns the root mean square of the residuals in pixels, too.
     """
-    to_unit, current, samples = _in_units(homographies, pairs, sizes)
+    to_unit, current, links = _in_units(homographies, pairs, sizes)
     reference, *moving = homographies
     columns = {number: 8 * k for k, number in enumerate(moving)}
     directions = dict.fromkeys(moving, np.eye(9)[:, :8])
     for _ in range(MAX_ITERATIONS):
-        normal, right = _normal_equations(current, pairs, samples, columns, directions)
+        normal, right = _normal_equations(current, links, columns, directions)
         step = np.linalg.lstsq(normal, right, rcond=None)[0]
         for number, column in columns.items():  # H (I + E), with the last element of E 0
             change = np.append(step[column : column + 8], 0).reshape(3, 3)
@@ -107,25 +96,14 @@ def adjust_homographies(
         number: np.linalg.inv(to_unit[reference]) @ matrix @ to_unit[number]
         for number, matrix in current.items()
     }
-    return refined, _residual_px(current, pairs, samples)
+    return refined, _residual_px(current, links)
 
 
 def adjust_cameras(
-    homographies: Mapping[int, np.ndarray],
-    pairs: Sequence[RegisteredPair],
-    sizes: Mapping[int, tuple[int, int]],
+    homographies: Matrices, pairs: Sequence[RegisteredPair], sizes: Mapping[int, tuple[int, int]]
 ) -> tuple[dict[int, RotatingCamera], float]:
-    """Fit rotations and focal lengths of all cameras to all pairs at once.
-
-    Args:
-        homographies: as of `adjust_homographies`.
-        pairs: whose homographies say where points belong.
-        sizes: (width, height) of the images.
-
-    Returns:
-        The cameras, and the root mean square of the residuals in pixels.
-    """
-    _, to_first, samples = _in_units(homographies, pairs, sizes)
+    """Fit rotations and focal lengths of all cameras; else as `adjust_homographies`."""
+    _, to_first, links = _in_units(homographies, pairs, sizes)
     starts = [_rotations(to_first, focal) for focal in FOCAL_LENGTHS]
     best = int(np.argmin([misfit for _, misfit in starts]))
     rotations, common = starts[best][0], float(FOCAL_LENGTHS[best])
@@ -134,20 +112,19 @@ def adjust_cameras(
     for _ in range(MAX_ITERATIONS):
         current = {n: rotations[n] @ np.diag([1 / f, 1 / f, 1]) for n, f in focals.items()}
         directions = {number: _turns_and_focal(focal) for number, focal in focals.items()}
-        normal, right = _normal_equations(current, pairs, samples, columns, directions)
+        normal, right = _normal_equations(current, links, columns, directions)
         for number, column in columns.items():
             normal[column + 3, column + 3] += FOCAL_WEIGHT
             right[column + 3] -= FOCAL_WEIGHT * np.log(focals[number] / common)
         step = np.linalg.lstsq(normal, right, rcond=None)[0]  # all may turn together
         for number, column in columns.items():
-            turn = cv2.Rodrigues(step[column : column + 3])[0]
-            rotations[number] = rotations[number] @ turn
+            rotations[number] = rotations[number] @ cv2.Rodrigues(step[column : column + 3])[0]
             focals[number] *= float(np.exp(step[column + 3]))
         if np.abs(step).max() < MIN_STEP:
             break
     current = {n: rotations[n] @ np.diag([1 / f, 1 / f, 1]) for n, f in focals.items()}
     cameras = {n: RotatingCamera(UNIT_PX * focals[n], rotations[n]) for n in rotations}
-    return cameras, _residual_px(current, pairs, samples)
+    return cameras, _residual_px(current, links)
 
 
 def level_cameras(
@@ -171,11 +148,9 @@ def level_cameras(
 
 
 def _in_units(
-    homographies: Mapping[int, np.ndarray],
-    pairs: Sequence[RegisteredPair],
-    sizes: Mapping[int, tuple[int, int]],
-) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], list[tuple[np.ndarray, np.ndarray]]]:
-    """Return the maps of pixels to units, 0 in the middle; and homographies and points in units."""
+    homographies: Matrices, pairs: Sequence[RegisteredPair], sizes: Mapping[int, tuple[int, int]]
+) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], Links]:
+    """Return the maps of pixels to units, 0 in the middle; and homographies and links in units."""
     to_unit = {}
     for number in homographies:
         x, y = (np.array(sizes[number]) - 1) / (2 * UNIT_PX)
@@ -185,23 +160,18 @@ def _in_units(
         number: _unit_determinant(frame @ matrix @ np.linalg.inv(to_unit[number]))
         for number, matrix in homographies.items()
     }
-    samples = [
-        (
-            transform_points(pair.points, to_unit[pair.first]),
-            # The homography is sharper than keypoints on whole pixels.
-            transform_points(transform_points(pair.points, pair.homography), to_unit[pair.second]),
-        )
-        for pair in pairs
-    ]
-    return to_unit, current, samples
+    links = []
+    for pair in pairs:
+        # The homography is sharper than keypoints on whole pixels.
+        targets = transform_points(pair.points, pair.homography)
+        points = transform_points(pair.points, to_unit[pair.first])
+        targets = transform_points(targets, to_unit[pair.second])
+        links.append((pair.first, pair.second, points, targets))
+    return to_unit, current, links
 
 
 def _normal_equations(
-    current: Mapping[int, np.ndarray],
-    pairs: Sequence[RegisteredPair],
-    samples: Sequence[tuple[np.ndarray, np.ndarray]],
-    columns: Mapping[int, int],
-    directions: Mapping[int, np.ndarray],
+    current: Matrices, links: Links, columns: Mapping[int, int], directions: Matrices
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return both sides of the normal equations.
 
@@ -210,15 +180,13 @@ def _normal_equations(
     """
     count = sum(matrix.shape[1] for matrix in directions.values())
     normal, right = np.zeros((count, count)), np.zeros(count)
-    for pair, (points, targets) in zip(pairs, samples, strict=True):
-        residuals, *jacobians = _linearised(
-            current[pair.first], current[pair.second], points, targets
-        )
+    for first, second, points, targets in links:
+        residuals, *jacobians = _linearised(current[first], current[second], points, targets)
         distances = UNIT_PX * np.linalg.norm(residuals, axis=1)
         weights = np.minimum(1, HUBER_THRESHOLD_PX / np.maximum(distances, 1e-12))
         blocks = [
             (columns[number], jacobian @ directions[number])
-            for number, jacobian in zip((pair.first, pair.second), jacobians, strict=True)
+            for number, jacobian in zip((first, second), jacobians, strict=True)
             if number in columns
         ]
         for row, jacobian in blocks:
@@ -226,9 +194,8 @@ def _normal_equations(
             rows = slice(row, row + jacobian.shape[2])
             right[rows] -= np.einsum("mai,ma->i", weighted, residuals)
             for start, other in blocks:
-                normal[rows, start : start + other.shape[2]] += np.einsum(
-                    "mai,maj->ij", weighted, other
-                )
+                columns_of_other = slice(start, start + other.shape[2])
+                normal[rows, columns_of_other] += np.einsum("mai,maj->ij", weighted, other)
     return normal, right
 
 
@@ -241,13 +208,8 @@ def _linearised(
     mapped = homogeneous @ between.T
     x, y, w = mapped.T
     zero = np.zeros_like(w)
-    projection = np.stack(
-        [
-            np.stack([1 / w, zero, -x / w**2], axis=1),
-            np.stack([zero, 1 / w, -y / w**2], axis=1),
-        ],
-        axis=1,
-    )
+    rows = [[1 / w, zero, -x / w**2], [zero, 1 / w, -y / w**2]]
+    projection = np.stack([np.stack(row, axis=1) for row in rows], axis=1)
     by_first = np.einsum("mka,mb->mkab", projection @ between, homogeneous)
     by_second = -np.einsum("mka,mb->mkab", projection, mapped)
     shape = (len(points), 2, 9)
@@ -255,23 +217,16 @@ def _linearised(
     return residuals, by_first.reshape(shape), by_second.reshape(shape)
 
 
-def _residual_px(
-    current: Mapping[int, np.ndarray],
-    pairs: Sequence[RegisteredPair],
-    samples: Sequence[tuple[np.ndarray, np.ndarray]],
-) -> float:
+def _residual_px(current: Matrices, links: Links) -> float:
     """Return the root mean square of the residuals in pixels."""
-    left = [
-        _linearised(current[pair.first], current[pair.second], *sample)[0]
-        for pair, sample in zip(pairs, samples, strict=True)
+    residuals = [
+        _linearised(current[first], current[second], points, targets)[0]
+        for first, second, points, targets in links
     ]
-    squares = np.concatenate([(values**2).sum(1) for values in left])
-    return float(UNIT_PX * np.sqrt(squares.mean()))
+    return float(UNIT_PX * np.sqrt((np.concatenate(residuals) ** 2).sum(1).mean()))
 
 
-def _rotations(
-    homographies: Mapping[int, np.ndarray], focal: float
-) -> tuple[dict[int, np.ndarray], float]:
+def _rotations(homographies: Matrices, focal: float) -> tuple[dict[int, np.ndarray], float]:
     """Return the rotations nearest to homographies in units, and how far these are from them."""
     rotations, misfit = {}, 0.0
     for number, matrix in homographies.items():

@@ -1,19 +1,38 @@
-"""Composites images on a canvas.
+"""Where the images of a panorama lie, on a plane, a cylinder or a sphere, and putting them there.
 
-Exposure and seams are found on small copies; the images themselves are warped one after the other,
-blended in frequency bands (Burt and Adelson, "A multiresolution spline with application to image
-mosaics", 1983; OpenCV's).
+Size and memory of a canvas are known before anything is drawn. Exposure and seams are found on
+small copies; the images themselves are warped one after the other and blended in frequency bands
+(Burt and Adelson, "A multiresolution spline with application to image mosaics", 1983; OpenCV's).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 
+from ..._shared.errors import OptionError, RegistrationError
+from ..._shared.memory import require_memory
 from ..._shared.opencv import cv2
-from .canvas import Box, Canvas, WarpedImage
+from ...geometry.images import downscale
+from ...geometry.transforms import scaled_homography, transform_points
+from .bundle_adjustment import Matrices, RotatingCamera
+
+Box = tuple[int, int, int, int]
+"""Left, top, right and bottom in pixels, right and bottom outside."""
+
+Sizes = Mapping[int, tuple[int, int]]
+"""(width, height) of the images, by number."""
+
+MAX_DEPTH_RATIO = 5.0
+"""How many times farther from the camera one corner of an image may lie on a flat canvas than
+another: near the horizon an image is stretched without bound."""
+
+MIN_WARP_SCALE = 0.67
+"""An image that the canvas shows smaller than this is downscaled first, against aliasing."""
 
 BLEND_FACTOR = 32
 """Brightness is multiplied by this for blending, whose bands are rounded down to whole numbers."""
@@ -32,6 +51,190 @@ GAIN_ERROR_STD, GAIN_PRIOR_STD = 0.05, 0.5
 of the images themselves."""
 
 
+@dataclass(frozen=True, eq=False)
+class WarpedImage:
+    """An image on the canvas.
+
+    Attributes:
+        image: (h, w, 3) uint8, mirrored beyond its borders.
+        mask: (h, w) uint8, 255 inside.
+        corner: left and top of them on the canvas.
+    """
+
+    image: np.ndarray
+    mask: np.ndarray
+    corner: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Canvas:
+    """Where images lie on a canvas.
+
+    Attributes:
+        boxes: of each image, by its number.
+        draw: draws an image, by its number, on the canvas, both made smaller: `draw(number, rgb,
+            scale_of_image, scale_of_canvas)`.
+    """
+
+    boxes: dict[int, Box]
+    draw: Callable[[int, np.ndarray, float, float], WarpedImage]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        _, _, right, bottom = np.max(list(self.boxes.values()), axis=0).tolist()
+        return right, bottom
+
+    def check_size(self, max_megapixels: float) -> None:
+        """Raise an OptionError if it has too many pixels, or needs more memory than there is."""
+        width, height = self.size
+        if width * height > max_megapixels * 1e6:
+            raise OptionError(
+                f"the panorama would be {width}x{height} pixels, {width * height / 1e6:.0f} "
+                f"megapixels and more than max_canvas_megapixels ({max_megapixels:g}): raise it, "
+                "or make `scale` smaller"
+            )
+        require_memory(
+            f"a panorama of {width}x{height} pixels would",
+            "make `scale` smaller",
+            canvas_pixel=width * height,
+            blended_pixel=max((box[2] - box[0]) * (box[3] - box[1]) for box in self.boxes.values()),
+        )
+
+
+def least_distorted(sizes: Sizes, homographies: Matrices) -> int:
+    """Return the number of the image in whose frame all images are least distorted."""
+
+    def stretch(frame: int) -> float:
+        back = np.linalg.inv(homographies[frame])
+        depths = [_depths(sizes[number], back @ homographies[number]) for number in homographies]
+        least = np.min(depths)
+        return round(float(np.max(depths) / least), 1) if least > 0 else np.inf
+
+    return min(homographies, key=stretch)
+
+
+def plan_plane(
+    sizes: Sizes, homographies: Matrices, reference: int, scale: float
+) -> tuple[Canvas, dict[int, np.ndarray]]:
+    """Find the smallest flat canvas of all images, with so many pixels per pixel of the reference.
+
+    The homographies go to any common frame; those that are returned go to the canvas.
+    """
+    back = np.linalg.inv(homographies[reference])
+    placed = {number: back @ matrix for number, matrix in homographies.items()}
+    for number, matrix in placed.items():
+        depths = _depths(sizes[number], matrix)
+        if depths.min() * MAX_DEPTH_RATIO <= depths.max():
+            raise RegistrationError(
+                f"images[{number}] is seen too much from the side of images[{reference}] for a "
+                "flat panorama: choose the projection 'cylindrical', or a `reference` between them"
+            )
+    placed = {number: scaled_homography(matrix, 1, scale) for number, matrix in placed.items()}
+    # A pixel belongs to an image when its centre does.
+    edges = {n: transform_points(_edges(sizes[n]), matrix) for n, matrix in placed.items()}
+    low = np.ceil(np.min([edge.min(0) for edge in edges.values()], axis=0))
+    boxes = {}
+    for number, edge in edges.items():
+        left, top = (np.ceil(edge.min(0)) - low).astype(int).tolist()
+        right, bottom = (np.floor(edge.max(0)) - low).astype(int).tolist()
+        boxes[number] = (left, top, right + 1, bottom + 1)
+    placed = {number: _shift(*-low) @ matrix for number, matrix in placed.items()}
+
+    def draw(number: int, rgb: np.ndarray, image_scale: float, canvas_scale: float) -> WarpedImage:
+        homography, (left, top, right, bottom) = placed[number], boxes[number]
+        if (image_scale, canvas_scale) != (1, 1):
+            homography = scaled_homography(homography, image_scale, canvas_scale)
+            left, top = (int(np.floor(side * canvas_scale)) for side in (left, top))
+            right, bottom = (int(np.ceil(side * canvas_scale)) for side in (right, bottom))
+        middle = np.array([(rgb.shape[1] - 1) / 2, (rgb.shape[0] - 1) / 2])
+        around = transform_points(middle + [[0, 0], [1, 0], [0, 1]], homography)
+        shown = float(np.sqrt(abs(np.linalg.det(around[1:] - around[0]))))
+        rgb, smaller = _downscaled(rgb, shown)
+        if smaller < 1:
+            homography = scaled_homography(homography, smaller, 1)
+        homography = _shift(-left, -top) @ homography
+        size = (right - left, bottom - top)
+        drawn = cv2.warpPerspective(
+            rgb, homography, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+        )
+        whole = np.full(rgb.shape[:2], 255, np.uint8)
+        mask = cv2.warpPerspective(whole, homography, size, flags=cv2.INTER_NEAREST)
+        return WarpedImage(drawn, mask, (left, top))
+
+    return Canvas(boxes, draw), placed
+
+
+def plan_curved(
+    projection: Literal["cylindrical", "spherical"],
+    sizes: Sizes,
+    cameras: Mapping[int, RotatingCamera],
+    reference: int,
+    scale: float,
+) -> Canvas:
+    """Find the smallest canvas of all images on a cylinder or a sphere.
+
+    It has `scale` pixels per pixel in the middle of the reference.
+    """
+    radius_px = cameras[reference].focal_px * scale
+    matrices = {
+        number: (one.intrinsics(sizes[number]).astype(np.float32), one.rotation.astype(np.float32))
+        for number, one in cameras.items()
+    }
+    warper = cv2.PyRotationWarper(projection, radius_px)
+    boxes = {}
+    for number in cameras:
+        left, top, width, height = warper.warpRoi(sizes[number], *matrices[number])
+        boxes[number] = (left, top, left + width, top + height)
+    x, y = (min(box[side] for box in boxes.values()) for side in (0, 1))
+    boxes = {n: (box[0] - x, box[1] - y, box[2] - x, box[3] - y) for n, box in boxes.items()}
+
+    def draw(number: int, rgb: np.ndarray, image_scale: float, canvas_scale: float) -> WarpedImage:
+        size, radius = sizes[number], radius_px * canvas_scale
+        warper = cv2.PyRotationWarper(projection, radius)
+        (left, top, _, _), *maps = warper.buildMaps(size, *matrices[number])
+        inside = [(one > -0.5) & (one < side - 0.5) for one, side in zip(maps, size, strict=True)]
+        rgb, smaller = _downscaled(rgb, radius / (cameras[number].focal_px * image_scale))
+        for one in maps:  # to pixels of the image that is drawn
+            one += np.float32(0.5)
+            one *= np.float32(image_scale * smaller)
+            one -= np.float32(0.5)
+        drawn = cv2.remap(rgb, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        mask = np.logical_and(*inside).astype(np.uint8) * np.uint8(255)
+        corner = left - round(x * canvas_scale), top - round(y * canvas_scale)
+        return WarpedImage(drawn, mask, corner)
+
+    return Canvas(boxes, draw)
+
+
+def _shift(x: float, y: float) -> np.ndarray:
+    return np.array([[1, 0, x], [0, 1, y], [0, 0, 1]])
+
+
+def _downscaled(rgb: np.ndarray, shown: float) -> tuple[np.ndarray, float]:
+    """Make an image smaller that is shown much smaller; return its scale, too."""
+    if shown >= MIN_WARP_SCALE:
+        return rgb, 1.0
+    return downscale(rgb, max(16, int(np.ceil(shown * max(rgb.shape[:2])))))
+
+
+def _edges(size: tuple[int, int]) -> np.ndarray:
+    """Return the outer corners of an image, half a pixel beyond the outermost centres; (4, 2)."""
+    right, bottom = size[0] - 0.5, size[1] - 0.5
+    return np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
+
+
+def _depths(size: tuple[int, int], homography: np.ndarray) -> np.ndarray:
+    """Return how far before the camera of the frame the corners of an image lie, (4,).
+
+    For images of equal cameras that only turned it is the cosine of the angle off the axis, but for
+    a factor; below 0 is behind the horizon.
+    """
+    # Matrices are known but for a factor; rotations do not mirror.
+    matrix = homography / np.cbrt(np.linalg.det(homography))
+    return _edges(size) @ matrix[2, :2] + matrix[2, 2]
+
+
 def composite(
     load: Callable[[int], np.ndarray],
     small: Mapping[int, tuple[np.ndarray, float]],
@@ -39,14 +242,9 @@ def composite(
 ) -> tuple[np.ndarray, np.ndarray, dict[int, float]]:
     """Put images onto a canvas.
 
-    Args:
-        load: returns an image, (H, W, 3) uint8 RGB, by its number; it is called once for each.
-        small: the same images made smaller, and their scales (`downscale`).
-        canvas: where they lie.
-
-    Returns:
-        (H, W, 3) uint8 RGB, black where there is nothing; (H, W) bool where there is something;
-        and the factor that the brightness of each image is multiplied by.
+    `load` returns an image, (H, W, 3) uint8 RGB, by its number, and is called once for each;
+    `small` are the same images made smaller, and their scales. Returns the panorama, black where
+    there is nothing; a mask of where there is something; and the gain of each image.
     """
     width, height = canvas.size
     scale = min(1.0, float(np.sqrt(SEAM_MEGAPIXELS * 1e6 / (width * height))))
@@ -73,47 +271,48 @@ def _gains(low: Mapping[int, WarpedImage]) -> dict[int, float]:
     Least squares of logarithms, else as Brown and Lowe, "Automatic panoramic image stitching using
     invariant features", 2007.
     """
-    numbers = list(low)
     rows, right = [*np.eye(len(low)) / GAIN_PRIOR_STD], [0.0] * len(low)
-    for i, j in combinations(range(len(low)), 2):
-        means = _overlap_means(low[numbers[i]], low[numbers[j]])
+    for (i, first), (j, second) in combinations(enumerate(low.values()), 2):
+        means = _overlap_means(first, second)
         if means is not None:
             row = np.zeros(len(low))
             row[i], row[j] = 1 / GAIN_ERROR_STD, -1 / GAIN_ERROR_STD
             rows.append(row)
             right.append(np.log(means[1] / means[0]) / GAIN_ERROR_STD)
     gains = np.exp(np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0])
-    return dict(zip(numbers, gains.tolist(), strict=True))
+    return dict(zip(low, gains.tolist(), strict=True))
 
 
 def _overlap_means(first: WarpedImage, second: WarpedImage) -> tuple[float, float] | None:
     """Return the mean brightness of both images where they overlap; None for too small a part."""
-    (x0, y0), (x1, y1) = first.corner, second.corner
-    left, top = max(x0, x1), max(y0, y1)
-    right = min(x0 + first.mask.shape[1], x1 + second.mask.shape[1])
-    bottom = min(y0 + first.mask.shape[0], y1 + second.mask.shape[0])
+    both = first, second
+    left, top = np.max([one.corner for one in both], axis=0)
+    right, bottom = np.min([np.add(one.corner, one.mask.shape[::-1]) for one in both], axis=0)
     if left >= right or top >= bottom:
         return None
     parts = [
-        (one, (slice(top - y, bottom - y), slice(left - x, right - x)))
-        for one, (x, y) in ((first, first.corner), (second, second.corner))
+        (
+            slice(top - one.corner[1], bottom - one.corner[1]),
+            slice(left - one.corner[0], right - one.corner[0]),
+        )
+        for one in both
     ]
-    both = np.logical_and(*(one.mask[part] > 0 for one, part in parts))
-    if np.count_nonzero(both) < MIN_OVERLAP_PX:
+    shared = (first.mask[parts[0]] > 0) & (second.mask[parts[1]] > 0)
+    if np.count_nonzero(shared) < MIN_OVERLAP_PX:
         return None
     # Black is not 0 times white.
-    means = [float(one.image[part][both].mean()) + 1 for one, part in parts]
+    means = [
+        float(one.image[part][shared].mean()) + 1 for one, part in zip(both, parts, strict=True)
+    ]
     return means[0], means[1]
 
 
 def _seams(low: Mapping[int, WarpedImage], gains: Mapping[int, float]) -> dict[int, np.ndarray]:
     """Divide the overlaps where the images differ least; (h, w) uint8 masks on the small canvas."""
     images = [one.image.astype(np.float32) * gains[number] for number, one in low.items()]
+    corners, masks = [one.corner for one in low.values()], [one.mask for one in low.values()]
     # Graph cuts take minutes where large overlaps are equal.
-    finder = cv2.detail_DpSeamFinder("COLOR")
-    masks = finder.find(
-        images, [one.corner for one in low.values()], [one.mask for one in low.values()]
-    )
+    masks = cv2.detail_DpSeamFinder("COLOR").find(images, corners, masks)
     return {
         number: mask.get() if isinstance(mask, cv2.UMat) else mask
         for number, mask in zip(low, masks, strict=True)
@@ -125,15 +324,10 @@ def _upscale_mask(seam: np.ndarray, corner: tuple[int, int], scale: float, box: 
     wide = cv2.dilate(seam, np.ones((3, 3), np.uint8))
     left, top, right, bottom = box
     shift = 0.5 * scale - 0.5
-    affine = np.array(
-        [
-            [scale, 0, scale * left + shift - corner[0]],
-            [0, scale, scale * top + shift - corner[1]],
-        ]
-    )
+    x, y = scale * left + shift - corner[0], scale * top + shift - corner[1]
     large = cv2.warpAffine(
         wide,
-        affine,
+        np.array([[scale, 0, x], [0, scale, y]]),
         (right - left, bottom - top),
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
@@ -144,12 +338,22 @@ def _upscale_mask(seam: np.ndarray, corner: tuple[int, int], scale: float, box: 
 def crop_box(valid: np.ndarray) -> Box:
     """Return the largest rectangle of a mask, (H, W) bool, that is true everywhere.
 
-    Example:
-        >>> valid = np.ones((20, 30), bool)
-        >>> valid[3, 25] = False
-        >>> crop_box(valid)
-        (0, 0, 25, 20)
+    Row by row, for each column: the run that ends there, and how far its whole height reaches to
+    the left and to the right.
     """
-    from .crop_kernel import largest_rectangle
-
-    return largest_rectangle(valid)
+    width = valid.shape[1]
+    column = np.arange(width)
+    runs, left, right = np.zeros(width, int), np.zeros(width, int), np.full(width, width)
+    area, box = 0, (0, 0, 0, 0)
+    for y, row in enumerate(valid):
+        gap_before = np.maximum.accumulate(np.where(row, -1, column))
+        gap_after = np.minimum.accumulate(np.where(row, width, column)[::-1])[::-1]
+        runs = np.where(row, runs + 1, 0)
+        left = np.where(row, np.maximum(left, gap_before + 1), 0)
+        right = np.where(row, np.minimum(right, gap_after), width)
+        areas = runs * (right - left)
+        best = int(areas.argmax())
+        if areas[best] > area:
+            area = int(areas[best])
+            box = (int(left[best]), y + 1 - int(runs[best]), int(right[best]), y + 1)
+    return box

@@ -18,8 +18,7 @@ from ...geometry.transforms import scaled_homography
 from ...io.image import load_image
 from ..guided.tentative_matches import MAX_SIDE_PX
 from .bundle_adjustment import RotatingCamera, level_cameras
-from .canvas import Canvas, least_distorted, plan_curved, plan_plane
-from .compositing import composite, crop_box
+from .compositing import Canvas, composite, crop_box, least_distorted, plan_curved, plan_plane
 from .registration import Registration, register_images
 
 STAGES = ("reading", "registration", "compositing")
@@ -160,8 +159,7 @@ def stitch(
             f"`reference` must be the number of an image, from 0 to {len(images) - 1}, "
             f"not {reference}"
         )
-    done = progress or (lambda stage: None)
-    timer = StageTimer()
+    timer = StageTimer(progress)
     small: dict[int, tuple[np.ndarray, float]] = {}
     sizes: dict[int, tuple[int, int]] = {}
     with timer.stage("reading"):
@@ -170,7 +168,6 @@ def stitch(
             sizes[number] = (rgb.shape[1], rgb.shape[0])
             small[number] = downscale(rgb, options.registration_side)
         del rgb
-    done("reading")
     with timer.stage("registration"):
         registration = register_images(
             [rgb for rgb, _ in small.values()],
@@ -179,7 +176,6 @@ def stitch(
             turning=projection != "plane",
             seed=seed,
         )
-    done("registration")
     scales = {number: scale for number, (_, scale) in small.items()}
     canvas, homographies, reference = _plan(
         registration, scales, sizes, projection, reference, options.scale
@@ -196,7 +192,6 @@ def stitch(
             if projection == "plane":
                 shift = np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1]])
                 homographies = {n: shift @ matrix for n, matrix in homographies.items()}
-    done("compositing")
     return Panorama(
         panorama,
         valid,

@@ -21,12 +21,7 @@ from ...features.sift import describe_keypoints, detect_sift
 from ...io.image import luma
 from ..guided import TentativeMatches, find_tentative_matches, guided_matches
 from ..guided.initial_geometry import estimate_initial_geometry
-from .bundle_adjustment import (
-    RegisteredPair,
-    RotatingCamera,
-    adjust_cameras,
-    adjust_homographies,
-)
+from .bundle_adjustment import RegisteredPair, RotatingCamera, adjust_cameras, adjust_homographies
 
 SIFT_KEYPOINTS = 2000
 """Sparse keypoints by which overlaps are found."""
@@ -46,17 +41,10 @@ MAX_CAMERA_RESIDUAL_PX = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """Images in a common frame.
+    """Images in a common frame, by number; fields as of `Panorama`.
 
-    Attributes:
-        homographies: (3, 3) each to the frame of the first one, by number of the image; in the
-            order in which they were connected.
-        cameras: where these are asked for, the cameras that turned, by number of the image.
-        matches: number of dense matches of each pair that was registered among these.
-        residual_px: root mean square of the distances between where a pair's own homography
-            takes its matches and where the fit of all does, in pixels; of homographies 0 without
-            closed loops.
-        unregistered: why each other image is not among them.
+    The homographies, in the order in which images were connected, go to the frame of the first one;
+    there are cameras where these are asked for.
     """
 
     homographies: dict[int, np.ndarray]
@@ -68,6 +56,8 @@ class Registration:
 
 @dataclass(frozen=True, eq=False)
 class _Image:
+    """An image with its sparse, described keypoints, and the (N, 2) dense ones."""
+
     gray: np.ndarray
     features: Keypoints
     keypoints: np.ndarray
@@ -85,36 +75,25 @@ def register_images(
     turning: bool = False,
     seed: int = 0,
 ) -> Registration:
-    """Find the homographies of overlapping images to a common frame.
+    """Find the homographies of overlapping images, (H, W, 3) uint8 RGB, to a common frame.
 
-    Args:
-        images: two or more, (H, W, 3) uint8 RGB each, their longer sides at most 1200 pixels.
-        detector: of points, which find the overlaps and confirm the homographies; or of heat maps:
-            SIFT's keypoints find the overlaps, dense ones confirm.
-        reference: number of an image that must be among them; None for the most images.
-        turning: find the cameras, too, which only turned.
-        seed: of all random choices.
-
-    Raises:
-        RegistrationError: no two images overlap, or the reference with none; or the cameras did
-            more than turn.
+    Points of a detector without heat map find the overlaps and confirm the homographies; else
+    SIFT's keypoints find them and dense ones confirm. `reference` is the number of an image that
+    must be among them, None for the most images; `turning` finds the cameras, too.
     """
     views = [_prepare(image, detector) for image in images]
     pairs = _registered_pairs(views, seed)
     groups = sorted({tuple(sorted(_connected(k, pairs))) for k in range(len(images))})
     if reference is not None:
         group = next(group for group in groups if reference in group)
+        nothing = f"the reference, images[{reference}], overlaps with no other image"
     else:
-        group = max(
-            groups,
-            key=lambda group: (len(group), sum(p.matches for p in pairs if p.first in group)),
-        )
+        matches = {group: sum(p.matches for p in pairs if p.first in group) for group in groups}
+        group = max(groups, key=lambda group: (len(group), matches[group]))
+        nothing = f"no two of these {len(images)} images overlap"
     if len(group) == 1:
-        what = f"no two of these {len(images)} images overlap"
-        if reference is not None:
-            what = f"the reference, images[{reference}], overlaps with no other image"
         raise RegistrationError(
-            f"{what} so that a homography can be trusted: they must show common detail, and be "
+            f"{nothing} so that a homography can be trusted: they must show common detail, and be "
             "taken from one place or show a plane"
         )
     unregistered = {
@@ -137,8 +116,8 @@ def register_images(
                 f"the cameras of these images did more than turn ({residual_px:.1f} px remain): "
                 "take all from one place, or choose the projection 'plane'"
             )
-    matches = {(pair.first, pair.second): pair.matches for pair in pairs}
-    return Registration(homographies, cameras, matches, residual_px, unregistered)
+    counts = {(pair.first, pair.second): pair.matches for pair in pairs}
+    return Registration(homographies, cameras, counts, residual_px, unregistered)
 
 
 def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
