@@ -1,4 +1,7 @@
-from .guided import TentativeMatches as TentativeMatches, tentative_matches as tentative_matches
+from .guided import (
+    TentativeMatches as TentativeMatches,
+    find_tentative_matches as find_tentative_matches,
+)
 from .options import (
     PUBLISHED_MATCHING as PUBLISHED_MATCHING,
     MatchingOptions as MatchingOptions,

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -15,7 +15,7 @@ from .._shared.image_array import Channels
 from .._shared.options import suggest_keywords
 from .._shared.timing import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_keypoints
-from ..detector.image_lists import Images
+from ..detector.image_lists import Images, ignore_masks
 from ..features.keypoints import Keypoints
 from ..features.matches import Matches, TwoViewGeometry, lazy
 from ..features.selection import SelectionOptions
@@ -23,31 +23,12 @@ from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
 from ..geometry.transforms import epipolar_errors, transfer_errors
 from ..io.image import load_image, luma
-from .guided import GuidedMatches, TentativeMatches, guided_matches, guiding_geometry
+from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .options import MatchingOptions
-from .unguided import unguided_matches
+from .unguided import check_memory, describe, match_features
 
 Points = tuple[np.ndarray, np.ndarray]
 Item = TypeVar("Item")
-
-
-@dataclass(frozen=True, eq=False)
-class LoadedPair:
-    """Two images, each loaded and converted once.
-
-    Attributes:
-        rgb: (H, W, 3) uint8 both.
-        gray: (H, W) uint8 luma both.
-    """
-
-    rgb: tuple[np.ndarray, np.ndarray]
-    gray: tuple[np.ndarray, np.ndarray]
-
-    @classmethod
-    def load(cls, image0: Any, image1: Any, channels: Channels = "rgb") -> LoadedPair:
-        """Load two images; arguments and errors as of `load_image`."""
-        rgb = load_image(image0, channels=channels), load_image(image1, channels=channels)
-        return cls(rgb, (luma(rgb[0]), luma(rgb[1])))
 
 
 @suggest_keywords
@@ -109,110 +90,61 @@ def match_images(
         >>> bool((matches.points0 == matches.points1).all())
         True
     """
-    return match_pair(
-        LoadedPair.load(image0, image1, channels),
-        detector,
-        selection=selection,
-        ignore=ignore,
-        guided_matching=guided_matching,
-        model=model,
-        mutual=mutual,
-        tentative_matches=tentative_matches,
-        seed=seed,
-        options=options,
-        progress=progress,
-    )
-
-
-def match_pair(
-    pair: LoadedPair,
-    detector: AnyDetector | None = None,
-    *,
-    selection: SelectionOptions | None = None,
-    ignore: np.ndarray | Images | None = None,
-    guided_matching: bool = True,
-    model: str = "auto",
-    mutual: bool = False,
-    tentative_matches: Points | TentativeMatches | None = None,
-    seed: int = 0,
-    options: MatchingOptions = MatchingOptions(),
-    progress: Callable[[str], object] | None = None,
-) -> Matches:
-    """Match two loaded images; all else as of `match_images`."""
     check_model(model, seed, options.geometry)
     guiding = guiding_model(model, options)
     if tentative_matches is not None and not guided_matching:
         raise OptionError("`tentative_matches` guide: leave them out, or `guided_matching=False`")
-    timer = StageTimer(progress)
     detector = DeepDetect() if detector is None else detector
     check_selection(detector, selection)
-    masks = ignore if isinstance(ignore, (list, tuple)) else (ignore, ignore)
-    if len(masks) != 2:
-        raise OptionError(f"`ignore` holds {len(masks)} masks for two images: give one each")
+    masks = ignore_masks(ignore, 2)
+    rgb = load_image(image0, channels=channels), load_image(image1, channels=channels)
+    grays = luma(rgb[0]), luma(rgb[1])
+    timer = StageTimer(progress)
     find = [
-        partial(find_keypoints, detector, rgb, selection, mask)
-        for rgb, mask in zip(pair.rgb, masks, strict=True)
+        partial(find_keypoints, detector, image, selection, mask)
+        for image, mask in zip(rgb, masks, strict=True)
     ]
     if not guided_matching:
         with timer.stage("keypoints"):
-            keypoints0, keypoints1 = find[0](), find[1]()
-        found = unguided_matches(pair.gray, (keypoints0, keypoints1), options, mutual, seed, timer)
-        points0, points1 = keypoints0.xy[found.indices0], keypoints1.xy[found.indices1]
-        with timer.stage("geometry"):
-            geometry = estimate_geometry(
-                points0, points1, model, seed=seed, options=options.geometry
-            )
-        return Matches(
-            points0,
-            points1,
-            np.clip(1 - found.ratios, 0, 1),
-            geometry.inliers,
-            geometry.model,
-            geometry.matrix,
-            keypoints0,
-            keypoints1,
-            timer.seconds,
-            indices0=found.indices0,
-            indices1=found.indices1,
-        )
-    swapped = mutual and _comes_after(*pair.gray)
-    gray0, gray1 = _ordered(pair.gray, swapped)
-    known = tentative_matches
-    if isinstance(known, TentativeMatches):
-        known = known.swapped() if swapped else known
-    elif known is not None:
-        known = _ordered((known[0], known[1]), swapped)
+            keypoints = find[0](), find[1]()
+        return _match_unguided(grays, keypoints, model, mutual, seed, options, timer)
+    # A pair and the swapped pair are matched alike: images are ordered by their pixels.
+    swapped = mutual and _key(grays[0]) > _key(grays[1])
+    gray0, gray1 = _ordered(grays, swapped)
+    source: Any = tentative_matches
+    if swapped and source is not None:
+        made = isinstance(source, TentativeMatches)
+        source = source.swapped() if made else tuple(source)[::-1]
     first = None
     # Keypoints of the network take no part in the first geometry, and finding them cannot fail:
     # where no geometry can be trusted nobody may ever ask for them.
     if isinstance(detector, DeepDetect) and all(mask is None for mask in masks):
         with timer.stage("initial geometry"):
-            first = guiding_geometry(gray0, gray1, guiding, seed, known)
+            first = guiding_geometry(gray0, gray1, guiding, seed, source)
         if first.matrix is None:
             guide = first.as_two_view_geometry()
-            return _no_matches((lazy(find[0]), lazy(find[1])), guide, timer)
+            return _no_matches(lazy(find[0]), lazy(find[1]), guide, timer)
     with timer.stage("keypoints"):
         keypoints = find[0](), find[1]()
     with timer.stage("guided matching"):
-        ordered = _ordered(keypoints, swapped)
+        keypoints0, keypoints1 = _ordered(keypoints, swapped)
+        source = (keypoints0, keypoints1) if source is None else source
+        pixels0, pixels1 = np.rint(keypoints0.xy), np.rint(keypoints1.xy)
         guide, matched = guided_matches(
-            gray0,
-            gray1,
-            np.rint(ordered[0].xy),
-            np.rint(ordered[1].xy),
-            guiding,
-            seed,
-            known,
-            points=ordered,
-            first=first,
+            gray0, gray1, pixels0, pixels1, guiding, seed, source, first
         )
     if swapped:
         guide = guide.swapped()
     if matched is None:
-        return _no_matches(keypoints, guide, timer)
+        return _no_matches(*keypoints, guide, timer)
     if mutual:
         matched = matched.unique()
-    points0, points1 = _ordered(_points_of(matched, ordered), swapped)
+    points = keypoints0.xy[matched.indices0], matched.points1.astype(np.float32)
+    if matched.indices1 is not None:
+        points = points[0], keypoints1.xy[matched.indices1]
+    else:  # the end in the second image is where the pixel of the first one is seen
+        points = np.rint(points[0]), points[1]
+    points0, points1 = _ordered(points, swapped)
     indices0, indices1 = _ordered((matched.indices0, matched.indices1), swapped)
     with timer.stage("geometry"):
         geometry = _final_geometry(points0, points1, model, seed, options.geometry, guide)
@@ -236,50 +168,69 @@ def _ordered(both: tuple[Item, Item], swapped: bool) -> tuple[Item, Item]:
     return (both[1], both[0]) if swapped else both
 
 
+def _match_unguided(
+    grays: tuple[np.ndarray, np.ndarray],
+    keypoints: tuple[Keypoints, Keypoints],
+    model: str,
+    mutual: bool,
+    seed: int,
+    options: MatchingOptions,
+    timer: StageTimer,
+) -> Matches:
+    """Match all keypoints with all others by their descriptors, then estimate the geometry."""
+    check_memory([len(each) for each in keypoints])
+    with timer.stage("descriptors"):
+        features0, features1 = (
+            describe(gray, each, options) for gray, each in zip(grays, keypoints, strict=True)
+        )
+    with timer.stage("matching"):
+        matches = match_features(
+            features0,
+            features1,
+            matcher=options.matcher,
+            ratio=options.ratio,
+            mutual=mutual,
+            seed=seed,
+        )
+    with timer.stage("geometry"):
+        points = matches.points0, matches.points1
+        geometry = estimate_geometry(*points, model, seed=seed, options=options.geometry)
+    return replace(
+        matches,
+        inliers=geometry.inliers,
+        model=geometry.model,
+        matrix=geometry.matrix,
+        keypoints0=keypoints[0],
+        keypoints1=keypoints[1],
+        seconds=timer.seconds,
+    )
+
+
 def guiding_model(model: str, options: MatchingOptions) -> str:
     """Return the geometry that guides: a plane would drop what is off it, so the model decides.
 
     Raises:
         OptionError: the model and the options contradict each other.
     """
-    open_to = options.two_view_model
-    fitting = {"essential": "fundamental", "auto": open_to, "none": open_to}.get(model, model)
-    if options.two_view_model not in ("auto", fitting):
+    asked = options.two_view_model
+    fitting = {"essential": "fundamental", "auto": asked, "none": asked}.get(model, model)
+    if asked not in ("auto", fitting):
         raise OptionError(
-            f"`two_view_model={options.two_view_model!r}` contradicts the model {model}: leave "
-            "one of them out"
+            f"`two_view_model={asked!r}` contradicts the model {model}: leave one of them out"
         )
     return fitting
 
 
 def _no_matches(
-    keypoints: Sequence[Keypoints], guide: TwoViewGeometry, timer: StageTimer
+    keypoints0: Keypoints, keypoints1: Keypoints, guide: TwoViewGeometry, timer: StageTimer
 ) -> Matches:
-    nothing, nowhere = np.empty(0, np.float32), np.empty((0, 2), np.float32)
-    return Matches(
-        *(nowhere, nowhere, nothing, nothing, "none", None),
-        keypoints[0],
-        keypoints[1],
-        timer.seconds,
-        guide,
-    )
+    nothing = np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty(0), "none", None
+    return Matches(*nothing, keypoints0, keypoints1, timer.seconds, guide)
 
 
-def _comes_after(gray0: np.ndarray, gray1: np.ndarray) -> bool:
-    """Order images by their pixels, so that a pair and the swapped pair are matched alike."""
-    keys = [(gray.shape, hashlib.sha256(gray.tobytes()).digest()) for gray in (gray0, gray1)]
-    return keys[0] > keys[1]
-
-
-def _points_of(
-    found: GuidedMatches, keypoints: Sequence[Keypoints]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions of matches in both images."""
-    points0 = keypoints[0].xy[found.indices0]
-    if found.indices1 is not None:
-        return points0, keypoints[1].xy[found.indices1]
-    # The end in the second image is where the pixel of the first one is seen.
-    return np.rint(points0), found.points1.astype(np.float32)
+def _key(gray: np.ndarray) -> tuple[tuple[int, ...], bytes]:
+    """Return what images are ordered by."""
+    return gray.shape, hashlib.sha256(gray.tobytes()).digest()
 
 
 def _final_geometry(

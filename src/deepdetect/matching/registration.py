@@ -17,7 +17,8 @@ from ..detector.image_lists import Images
 from ..features.selection import SelectionOptions
 from ..geometry.images import downscale, median_local_zncc, warp_to_reference
 from ..geometry.transforms import scaled_homography
-from .pipeline import LoadedPair, match_pair
+from ..io.image import load_image, luma
+from .pipeline import match_images
 
 SQUARES = 8
 """Squares of the checkerboard along the shorter side."""
@@ -114,9 +115,10 @@ def register(
         >>> found.homography[:2, 2].round(1).tolist()
         [-12.0, 0.0]
     """
-    pair = LoadedPair.load(image0, image1, channels)
-    found = match_pair(
-        pair,
+    first, second = (load_image(image, channels=channels) for image in (image0, image1))
+    matches = match_images(
+        first,
+        second,
         detector,
         selection=selection,
         ignore=ignore,
@@ -125,43 +127,25 @@ def register(
         seed=seed,
         progress=progress,
     )
-    if not found.guided or found.matrix is None:
+    homography = matches.homography
+    if not matches.guided or homography is None:
         raise RegistrationError(
             "no homography can be trusted between these images: they must overlap, and show a "
             "plane or be taken from one place"
         )
-    first, second = pair.rgb
-    if not agree(*pair.gray, found.matrix):
+    grays = luma(first), luma(second)
+    if not agree(*grays, homography):
         raise RegistrationError(
             "the images contradict the homography that their matches agree with: where they would "
             "overlap they are no more alike than images of different things"
         )
-    size = (first.shape[1], first.shape[0])
-    warped, valid = warp_to_reference(second, found.matrix, size)
-    return Registration(
-        found.matrix,
-        first,
-        warped,
-        valid,
-        len(found),
-        median_local_zncc(*pair.gray, found.matrix),
-    )
+    warped, valid = warp_to_reference(second, homography, (first.shape[1], first.shape[0]))
+    zncc = median_local_zncc(*grays, homography)
+    return Registration(homography, first, warped, valid, len(matches), zncc)
 
 
 def agree(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> bool:
-    """Return whether images are more alike under a homography than under shifts of it.
-
-    Args:
-        gray0, gray1: (H, W) uint8 luma.
-        homography: (3, 3) from the first to the second.
-
-    Example:
-        >>> rng = np.random.default_rng(0)
-        >>> noise = rng.integers(0, 256, (2, 99, 99)).astype(np.uint8)
-        >>> first, second = (cv2.GaussianBlur(each, (0, 0), 2) for each in noise)
-        >>> agree(first, first, np.eye(3)), agree(first, second, np.eye(3))
-        (True, False)
-    """
+    """Return whether images, (H, W) uint8 luma, are more alike under a homography than shifted."""
     first, scale0 = downscale(gray0, COMPARED_SIDE_PX)
     second, scale1 = downscale(gray1, COMPARED_SIDE_PX)
     matrix = scaled_homography(homography, scale0, scale1)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.memory import require_memory
 from .._shared.options import suggest_keywords
-from .._shared.timing import StageTimer
 from ..features.keypoints import Keypoints
-from ..features.matchers import DescriptorMatches, get_matcher, match_descriptors
+from ..features.matchers import get_matcher, match_descriptors
 from ..features.matches import Matches
 from ..features.sift import get_descriptor, scaled_sift_descriptors, to_root_sift
 from .options import MatchingOptions
@@ -62,13 +62,15 @@ def match_features(
         )
     if not 0 < ratio <= 1:
         raise OptionError(f"the ratio must be above 0 and at most 1, not {ratio}")
-    found = _match(
-        (features0, features1),
-        (features0.descriptors, features1.descriptors),
-        matcher=matcher,
+    alike = features0.sizes is None and features1.sizes is None  # all of one scale and angle
+    found = match_descriptors(
+        features0.descriptors,
+        features1.descriptors,
+        get_matcher(matcher),
         ratio=ratio,
         mutual=mutual,
         seed=seed,
+        positions=(features0.xy, features1.xy) if alike else None,
     )
     return Matches(
         features0.xy[found.indices0],
@@ -84,71 +86,21 @@ def match_features(
     )
 
 
-def unguided_matches(
-    grays: Sequence[np.ndarray],
-    keypoints: Sequence[Keypoints],
-    options: MatchingOptions,
-    mutual: bool,
-    seed: int,
-    timer: StageTimer,
-) -> DescriptorMatches:
-    """Describe all keypoints, and match all with all others.
-
-    Raises:
-        OptionError: there are too many keypoints for the memory.
-    """
-    check_memory([len(each) for each in keypoints])
-    with timer.stage("descriptors"):
-        descriptors = [
-            _describe(gray, each, options) for gray, each in zip(grays, keypoints, strict=True)
-        ]
-    with timer.stage("matching"):
-        return _match(
-            keypoints,
-            descriptors,
-            matcher=options.matcher,
-            ratio=options.ratio,
-            mutual=mutual,
-            seed=seed,
-        )
-
-
-def _match(
-    keypoints: Sequence[Keypoints],
-    descriptors: Sequence[np.ndarray],
-    *,
-    matcher: str,
-    ratio: float,
-    mutual: bool,
-    seed: int,
-) -> DescriptorMatches:
-    alike = all(each.sizes is None for each in keypoints)  # all of one scale and angle
-    return match_descriptors(
-        descriptors[0],
-        descriptors[1],
-        get_matcher(matcher),
-        ratio=ratio,
-        mutual=mutual,
-        seed=seed,
-        positions=(keypoints[0].xy, keypoints[1].xy) if alike else None,
-    )
-
-
-def _describe(gray: np.ndarray, keypoints: Keypoints, options: MatchingOptions) -> np.ndarray:
-    """Return descriptors at the keypoints' own sizes and angles, or at those of the options."""
+def describe(gray: np.ndarray, keypoints: Keypoints, options: MatchingOptions) -> Keypoints:
+    """Add descriptors at the keypoints' own sizes and angles, or at those of the options."""
     if keypoints.sizes is None or keypoints.angles is None:
-        describe = get_descriptor(options.descriptor)
-        return describe(gray, keypoints.xy, options.keypoint_size, options.angle)
-    found = scaled_sift_descriptors(gray, keypoints.xy, keypoints.sizes, keypoints.angles)
-    return to_root_sift(found, True) if options.descriptor == "rootsift" else found
+        of_pixels = get_descriptor(options.descriptor)
+        descriptors = of_pixels(gray, keypoints.xy, options.keypoint_size, options.angle)
+    else:
+        scaled = keypoints.xy, keypoints.sizes, keypoints.angles
+        descriptors = scaled_sift_descriptors(gray, *scaled)
+        if options.descriptor == "rootsift":
+            descriptors = to_root_sift(descriptors, True)
+    return replace(keypoints, descriptors=descriptors, descriptor_type=options.descriptor)
 
 
 def check_memory(keypoints: Sequence[int]) -> None:
-    """Stop before the descriptors and their search trees fill the memory.
-
-    Raises:
-        OptionError: there are too many.
-    """
+    """Raise an OptionError where descriptors and their search trees would fill the memory."""
     require_memory(
         f"matches of {' and '.join(f'{count:,}' for count in keypoints)} keypoints",
         "make them fewer with max_keypoints, density, or a smaller resolution",

@@ -26,7 +26,7 @@ from ..geometry.camera import Calibration, Camera, read_calibration
 from ..io.exif import calibration_from_exif
 from ..io.image import load_image, luma
 from ..matching.options import MatchingOptions
-from ..matching.pipeline import LoadedPair, match_pair
+from ..matching.pipeline import match_images
 from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity
 from .outliers import PointFilterOptions, sor_inliers_on_grid
 from .rectification import (
@@ -158,8 +158,8 @@ def reconstruct(
         made = _from_disparities(keypoints, grays, known, selection, options, timer)
     else:
         with timer.stage("keypoints and matching"):
-            matches = match_pair(
-                LoadedPair(rgb, grays),
+            matches = match_images(
+                *rgb,
                 detector,
                 selection=whole,
                 ignore=masks,

@@ -10,12 +10,8 @@ from scipy.spatial import KDTree
 from deepdetect.features.keypoints import nearest_keypoints
 from deepdetect.geometry import transfer_errors
 from deepdetect.io.image import luma
-from deepdetect.matching.guided.homography import (
-    MAX_DISTANCE_PX as REACH,
-)
-from deepdetect.matching.guided.homography import (
-    match_by_homography,
-)
+from deepdetect.matching.guided.pipeline import MAX_DISTANCE_PX as REACH
+from deepdetect.matching.guided.pipeline import match_by_homography
 
 SHIFT = np.array([[1.0, 0, 9], [0, 1, -6], [0, 0, 1]])
 MILD = np.array([[0.95, -0.06, 15.0], [0.08, 0.97, -5.0], [1e-4, -1e-4, 1.0]])

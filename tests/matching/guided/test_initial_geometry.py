@@ -13,14 +13,12 @@ from deepdetect.geometry.two_view import GUIDING_THRESHOLDS_PX
 from deepdetect.io.image import load_image, luma
 from deepdetect.matching.guided import initial_geometry as module
 from deepdetect.matching.guided.initial_geometry import (
+    MAX_SIDE_PX as LONGEST,
+)
+from deepdetect.matching.guided.initial_geometry import (
     InitialGeometry,
     estimate_initial_geometry,
     find_initial_geometry,
-)
-from deepdetect.matching.guided.tentative_matches import (
-    MAX_SIDE_PX as LONGEST,
-)
-from deepdetect.matching.guided.tentative_matches import (
     find_tentative_matches,
 )
 
@@ -182,7 +180,7 @@ def test_matches_that_are_there_already_are_not_made_again(
     other = warped(gray, MILD, (256, 256))
     expected = initial_geometry(gray, other)
     tentative = find_tentative_matches(gray, other)
-    monkeypatch.setattr("deepdetect.matching.guided.tentative_matches.detect_sift", None)
+    monkeypatch.setattr("deepdetect.matching.guided.initial_geometry.detect_sift", None)
     found = estimate_initial_geometry(tentative)
     np.testing.assert_array_equal(found.matrix, expected.matrix)
 

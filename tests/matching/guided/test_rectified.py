@@ -12,7 +12,7 @@ from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.features.matches import GuidedMatches
 from deepdetect.geometry import epipolar_errors, transform_points
 from deepdetect.io.image import luma
-from deepdetect.matching.guided import rectified, rectified_view
+from deepdetect.matching.guided import rectified
 from deepdetect.matching.guided.initial_geometry import find_initial_geometry
 from deepdetect.matching.guided.rectified import match_by_rectification
 
@@ -73,7 +73,7 @@ def test_low_correlation_is_kept_where_little_is_found_by_chance(cones, monkeypa
     left, right, _ = cones
     xy0 = every_second(left)
     lenient = match(left, right, xy0)
-    monkeypatch.setattr(rectified_view, "FALSE_DISCOVERY_RATE", 0.0)
+    monkeypatch.setattr(rectified, "FALSE_DISCOVERY_RATE", 0.0)
     strict = match(left, right, xy0)
     assert strict is not None
     assert lenient is not None
@@ -85,7 +85,7 @@ def test_low_correlation_is_kept_where_little_is_found_by_chance(cones, monkeypa
 def test_a_pair_with_too_much_to_search_is_matched_on_smaller_copies(cones, monkeypatch) -> None:
     left, right, _ = cones
     xy0 = every_second(left)
-    monkeypatch.setattr(rectified_view, "MAX_VOLUME", 3e6)
+    monkeypatch.setattr(rectified, "MAX_VOLUME", 3e6)
     found = match(left, right, xy0)
     assert found is not None
     assert len(found) > 0.25 * len(xy0)

@@ -10,8 +10,8 @@ from deepdetect import Keypoints, PointDetector
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import guided_matches
-from deepdetect.matching.guided import tentative_matches as module
-from deepdetect.matching.guided.tentative_matches import find_tentative_matches, matches_of_points
+from deepdetect.matching.guided import initial_geometry as module
+from deepdetect.matching.guided.initial_geometry import find_tentative_matches, matches_of_points
 
 TURNED = np.vstack([cv2.getRotationMatrix2D((128, 128), 30, 1.2), [0, 0, 1]])
 
@@ -69,7 +69,7 @@ def test_guided_matching_begins_with_points(pair, points, monkeypatch) -> None:
     places = [np.rint(each.xy) for each in points]
     with monkeypatch.context() as patched:
         patched.setattr(module, "detect_sift", None)
-        guide, found = guided_matches(*grays, *places, points=points)
+        guide, found = guided_matches(*grays, *places, source=points)
     assert guide.model == "homography"
     assert found is not None
     errors = np.linalg.norm(
@@ -83,7 +83,7 @@ def test_where_points_give_nothing_sift_is_tried(pair, points) -> None:
     places = [np.rint(each.xy) for each in points]
     shuffled = np.random.default_rng(0).permutation(len(points[1]))
     wrong = replace(points[1], xy=points[1].xy[shuffled][:, ::-1])
-    guide, found = guided_matches(*grays, *places, points=(points[0], wrong))
+    guide, found = guided_matches(*grays, *places, source=(points[0], wrong))
     plain, _ = guided_matches(*grays, *places)
     assert found is not None
     np.testing.assert_array_equal(guide.matrix, plain.matrix)

@@ -237,13 +237,13 @@ def test_under_a_point_of_the_shifted_image_lies_its_null_partner(
         assert 0 < len(left_out) < 0.4 * len(points)  # their partners alone lie at an edge
         assert at_edge(gray, points[null.rows])[~null.interior].all()
         assert not at_edge(gray, points[left_out]).any()
-        assert not at_edge(gray, null.places[null.interior]).any()
+        assert not at_edge(gray, null.partners[null.interior]).any()
         here = points[null.rows]
         np.testing.assert_array_equal(
             null.shifted[here[:, 1], here[:, 0]],
-            gray[null.places[:, 1], null.places[:, 0]],
+            gray[null.partners[:, 1], null.partners[:, 0]],
         )
-        apart = np.abs(here - null.places).max(axis=1)
+        apart = np.abs(here - null.partners).max(axis=1)
         assert apart.min() >= min(gray.shape) // 3
 
 
@@ -254,6 +254,6 @@ def test_interior_descriptors_are_those_of_the_image_that_is_not_shifted(
     for null in sample_null_pairs(points, gray, everywhere(gray)):
         assert 0.1 < null.interior.mean() < 0.9
         moved = dense_sift(null.shifted, points[null.rows], size)
-        unmoved = dense_sift(gray, null.places, size)
+        unmoved = dense_sift(gray, null.partners, size)
         np.testing.assert_array_equal(moved[null.interior], unmoved[null.interior])
         assert (moved != unmoved).any(axis=1).mean() > 0.03  # those at an edge are others

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,25 +31,16 @@ ROTATION_STEP_DEG = 72.0
 
 
 def simulated_views(gray: np.ndarray, tilt: float, max_keypoints: int) -> Iterator[Keypoints]:
-    """Detect keypoints of an image seen from the side, at most so many in each view.
-
-    Yields:
-        The described keypoints of each view, at their positions in the image itself.
-    """
+    """Yield the described keypoints of views from the side, at their positions in the image."""
 
     def see(rotation_deg: float) -> Keypoints:
         view, to_view = simulate_view(gray, tilt, rotation_deg)
-        found = detect_sift(view, max_keypoints)
+        keypoints = detect_sift(view, max_keypoints)
         back = cv2.invertAffineTransform(to_view)
-        xy = found.xy @ back[:, :2].T.astype(np.float32) + back[:, 2].astype(np.float32)
-        inside = ((xy > 0) & (xy < np.array(gray.shape[::-1]) - 1)).all(1)
-        assert found.descriptors is not None
-        return Keypoints(
-            xy[inside],
-            found.scores[inside],
-            (gray.shape[1], gray.shape[0]),
-            descriptors=found.descriptors[inside],
-        )
+        xy = keypoints.xy @ back[:, :2].T.astype(np.float32) + back[:, 2].astype(np.float32)
+        size = gray.shape[1], gray.shape[0]
+        moved = replace(keypoints, xy=xy, image_size=size, sizes=None, angles=None)
+        return moved[((xy > 0) & (xy < np.array(size) - 1)).all(1)]
 
     directions = round(180 * tilt / ROTATION_STEP_DEG)
     rotations = np.linspace(0, 180, directions, endpoint=False).tolist()
@@ -61,23 +53,22 @@ def simulate_view(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rotate an image and shorten it along x, blurred before as by a camera.
 
-    Returns:
-        The view, gray outside the image, and the (2, 3) affine map from the image to it.
+    Returns the view, gray outside the image, and the (2, 3) affine map from the image to it.
     """
     height, width = gray.shape
     angle = np.deg2rad(rotation_deg)
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) @ rotation.T
     low = corners.min(0)
-    across, down = np.ceil(corners.max(0) - low).astype(int)
+    across, down = np.ceil(corners.max(0) - low).astype(int).tolist()
     affine = np.column_stack([rotation, -low])
     border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": GRAY_OUTSIDE}
-    rotated = cv2.warpAffine(gray, affine, (int(across), int(down)), **border)
+    rotated = cv2.warpAffine(gray, affine, (across, down), **border)
     blur = BLUR * np.sqrt(tilt**2 - 1)
     if blur > 0:
         rotated = cv2.GaussianBlur(rotated, (0, 0), sigmaX=blur, sigmaY=0.01)
-    size = (max(1, round(across / tilt)), int(down))
     shorten = np.array([[1 / tilt, 0, 0], [0, 1.0, 0]])
+    size = max(1, round(across / tilt)), down
     view = cv2.warpAffine(rotated, shorten, size, flags=cv2.INTER_LINEAR, **border)
     affine[0] /= tilt
     return view, affine

@@ -34,40 +34,23 @@ of the longer side of the image."""
 
 
 def epipolar_search(
-    first: Keypoints,
-    second: Keypoints,
-    fundamental: np.ndarray,
+    first: Keypoints, second: Keypoints, fundamental: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match keypoints near each other's epipolar lines, mutually.
+    """Match described keypoints near each other's epipolar lines, mutually.
 
-    Args:
-        first, second: keypoints with descriptors.
-        fundamental: (3, 3) with x1^T F x0 = 0.
-
-    Returns:
-        (M, 2) float64 positions in both images.
-
-    Example:
-        >>> rows = np.array([[0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # lines are the rows
-        >>> xy = np.array([[5.0, 5.0], [50.0, 50.0]])
-        >>> keypoints = Keypoints(xy, [1, 1], (99, 99), descriptors=np.eye(2, 128))
-        >>> epipolar_search(keypoints, keypoints, rows)[1].tolist()
-        [[5.0, 5.0], [50.0, 50.0]]
+    Returns (M, 2) float64 positions in both images.
     """
     points0, points1 = first.xy.astype(np.float64), second.xy.astype(np.float64)
-    nowhere = np.empty((0, 2))
     if not len(points0) or not len(points1):
-        return nowhere, nowhere
+        return np.empty((0, 2)), np.empty((0, 2))
     assert first.descriptors is not None
     assert second.descriptors is not None
     described0 = first.descriptors.astype(np.float32)
     described1 = second.descriptors.astype(np.float32)
     squares1 = (described1**2).sum(axis=1)
-    lines1 = _lines(points0, fundamental)
-    lines0 = _lines(points1, fundamental.T)
-    ones0, ones1 = (
-        np.column_stack([points, np.ones(len(points))]).astype(np.float32)
-        for points in (points0, points1)
+    (ones0, lines1), (ones1, lines0) = (
+        _points_and_lines(points0, fundamental),
+        _points_and_lines(points1, fundamental.T),
     )
     count = len(points0)
     best = np.full(count, np.inf, np.float32)
@@ -89,13 +72,10 @@ def epipolar_search(
         value = inside[nearest, np.arange(len(points1))]
         better = value < best1
         best1[better], partner1[better] = value[better], nearest[better] + start
-        own = inside.argmin(axis=1)
-        best[rows], partner[rows] = inside[np.arange(len(own)), own], own
-        there = points1[own]
-        apart = (
-            np.hypot(points1[:, 0] - there[:, :1], points1[:, 1] - there[:, 1:])
-            >= MIN_SEPARATION_PX
-        )
+        nearest = inside.argmin(axis=1)
+        best[rows], partner[rows] = inside[np.arange(len(nearest)), nearest], nearest
+        offsets = points1 - points1[nearest][:, None]
+        apart = np.hypot(offsets[..., 0], offsets[..., 1]) >= MIN_SEPARATION_PX
         second_best[rows] = np.where(apart, inside, np.inf).min(axis=1)
     kept = np.isfinite(best) & (partner1[partner] == np.arange(count))
     kept &= best < MAX_RATIO_ELSEWHERE * np.minimum(elsewhere0, elsewhere1[partner])
@@ -103,32 +83,28 @@ def epipolar_search(
     return points0[kept], points1[partner[kept]]
 
 
+def _points_and_lines(points: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return homogeneous points and their epipolar lines, whose products are distances."""
+    homogeneous = np.column_stack([points, np.ones(len(points))])
+    lines = homogeneous @ matrix.T
+    length = np.maximum(np.hypot(lines[:, 0], lines[:, 1]), 1e-300)
+    return homogeneous.astype(np.float32), (lines / length[:, None]).astype(np.float32)
+
+
 def log10_p_value(
-    first: Keypoints,
-    second: Keypoints,
-    fundamental: np.ndarray,
-    used: np.ndarray,
+    first: Keypoints, second: Keypoints, fundamental: np.ndarray, used: np.ndarray
 ) -> float:
     """Return how likely chance explains the matches along lines that a geometry did not come from.
 
-    Lines at wrong places, the same but moved, find matches by chance alone. As many as the right
-    lines find are unlikely among them (a Poisson distribution of the mean number, at least 1).
-
-    Args:
-        first, second: keypoints with descriptors.
-        fundamental: (3, 3) with x1^T F x0 = 0.
-        used: (K, 2) positions in the first image of the matches that it was estimated from, right
-            or wrong: they are no evidence.
-
-    Returns:
-        The decimal logarithm of the probability, at most 0. It is independent of the number of
-        false alarms of the geometry.
+    `used` are the positions in the first image of those that it was estimated from, right or wrong:
+    they are no evidence. Lines at wrong places, the same but moved, find matches by chance alone;
+    as many as the right lines find are unlikely among them (a Poisson distribution).
     """
     known = {(float(x), float(y)) for x, y in np.asarray(used, np.float32)}
 
     def further(matrix: np.ndarray) -> int:
-        found = epipolar_search(first, second, matrix)[0].astype(np.float32)
-        return sum((float(x), float(y)) not in known for x, y in found)
+        points0 = epipolar_search(first, second, matrix)[0].astype(np.float32)
+        return sum((float(x), float(y)) not in known for x, y in points0)
 
     side = max(second.image_size)
     by_chance = []
@@ -138,8 +114,7 @@ def log10_p_value(
             back[:2, 2] = -side * share * np.array([right, down])
             by_chance.append(further(back.T @ fundamental))
     expected = max(float(np.mean(by_chance)), 1.0)
-    count = further(fundamental)
-    return math.log10(max(_poisson_tail(count, expected), 1e-300))
+    return math.log10(max(_poisson_tail(further(fundamental), expected), 1e-300))
 
 
 def _poisson_tail(count: int, mean: float) -> float:
@@ -152,10 +127,3 @@ def _poisson_tail(count: int, mean: float) -> float:
     terms = np.exp(start + np.concatenate([[0.0], np.cumsum(steps)]))
     # Small ones are added up directly, as one less the others would be rounded off.
     return float(terms.sum()) if count > mean else float(max(0.0, 1 - terms[:count].sum()))
-
-
-def _lines(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Return the epipolar lines of points, (N, 3) float32, so that a product is a distance."""
-    lines = np.column_stack([points, np.ones(len(points))]) @ matrix.T
-    length = np.hypot(lines[:, 0], lines[:, 1])
-    return (lines / np.maximum(length, 1e-300)[:, None]).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The initial geometry of a pair, from tentative matches, or that none can be trusted.
+"""Tentative matches of a pair, and the initial geometry they show, or that none can be trusted.
 
 A coarse pass on small copies first, which is enough where the pair is clearly a plane or clearly
 has depth; then plain SIFT on larger ones; simulated views (`asift`) only when that gives nothing.
@@ -9,13 +9,18 @@ Oxford and Middlebury, Strecha's fountain and a KITTI clip.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..._shared.errors import OptionError, unknown_name
+from ..._shared.errors import OptionError
+from ...features.keypoints import Keypoints
+from ...features.matchers import exact_neighbours, match_descriptors
 from ...features.matches import TwoViewGeometry
+from ...features.sift import describe_keypoints, detect_sift
 from ...geometry.estimation import MAX_LOG10_NFA, Parallax, TwoViewModel
+from ...geometry.images import downscale
 from ...geometry.semi_calibrated import MATCH_SIGMA_PX, refine_fundamental
 from ...geometry.transforms import (
     epipolar_errors,
@@ -26,20 +31,29 @@ from ...geometry.transforms import (
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, choose_model
 from .asift import TILTS, simulated_views
 from .epipolar_search import epipolar_search, log10_p_value
-from .tentative_matches import (
-    MAX_KEYPOINTS,
-    MAX_RATIOS,
-    MAX_SIDE_PX,
-    Points,
-    TentativeMatches,
-    find_tentative_matches,
-    match_sparse,
-    separate,
-)
 
-MODELS = ("auto", "homography", "fundamental")
+Points = tuple[np.ndarray, np.ndarray]
+"""(M, 2) matched positions in both images, row by row."""
 
-Size = tuple[int, int]
+Sizes = tuple[tuple[int, int], tuple[int, int]]
+"""(width, height) of both images."""
+
+MAX_SIDE_PX = 1200
+"""Longer sides are scaled down to this: the initial geometry need not be fine."""
+
+MAX_KEYPOINTS = 4000
+"""Of SIFT in each image."""
+
+MIN_POINTS = 1000
+"""Where both images have at least so many points of all scales (a budget was asked for), these take
+the place of SIFT's keypoints."""
+
+MAX_RATIOS = (0.85, 0.8)
+"""Of the ratio test, in the order in which they are tried: fewer matches, with fewer wrong ones
+among them, may show what more do not."""
+
+MIN_SEPARATION_PX = 2.0
+"""Matches that begin or end nearer together than this count as one."""
 
 COARSE_SIDE_PX, COARSE_KEYPOINTS = 640, 2000
 """Longer side of the copies of the coarse pass, and keypoints of each."""
@@ -67,6 +81,121 @@ MAX_HINT_LOG10_NFA = 0.0
 """Where the logarithm of the number of false alarms of the best geometry so far is below this, it
 may be more than chance: views of a larger tilt are simulated, and further matches along epipolar
 lines are counted."""
+
+
+@dataclass(frozen=True, eq=False)
+class TentativeMatches:
+    """Sparse matches of two images, before any geometry.
+
+    Attributes:
+        views: both images as uint8 luma, scaled down where they are large.
+        scales: of the views, at most 1.
+        features: SIFT keypoints of the views, with their descriptors.
+        matched: (M, 2) positions in both views.
+        ratios: (M,) of the ratio test.
+    """
+
+    views: tuple[np.ndarray, np.ndarray]
+    scales: tuple[float, float]
+    features: tuple[Keypoints, Keypoints]
+    matched: Points
+    ratios: np.ndarray
+
+    @property
+    def points0(self) -> np.ndarray:
+        """Matched positions in the first image at its own size, (M, 2) float64."""
+        return scaled_points(self.matched[0], 1 / self.scales[0])
+
+    @property
+    def points1(self) -> np.ndarray:
+        """Matched positions in the second image at its own size, (M, 2) float64."""
+        return scaled_points(self.matched[1], 1 / self.scales[1])
+
+    def swapped(self) -> TentativeMatches:
+        """Return the matches from the second image to the first."""
+        views, scales, features = self.views[::-1], self.scales[::-1], self.features[::-1]
+        return TentativeMatches(views, scales, features, self.matched[::-1], self.ratios)
+
+
+def find_tentative_matches(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    features: tuple[Keypoints, Keypoints] | None = None,
+    *,
+    max_side_px: int = MAX_SIDE_PX,
+    max_keypoints: int = MAX_KEYPOINTS,
+) -> TentativeMatches:
+    """Match sparse SIFT keypoints of two images, exactly, mutually and by the ratio test.
+
+    Args:
+        gray0, gray1: (H, W) uint8 luma.
+        features: keypoints of both images, scaled down where they are large, with their
+            descriptors; None: they are detected.
+        max_side_px: longer sides are scaled down to this.
+        max_keypoints: that are detected in each image.
+
+    Example:
+        >>> image = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
+        >>> found = find_tentative_matches(image, image)
+        >>> bool((found.points0 == found.points1).all()), len(found.points0) > 10
+        (True, True)
+    """
+    (view0, scale0), (view1, scale1) = (downscale(gray, max_side_px) for gray in (gray0, gray1))
+    if features is None:
+        with ThreadPoolExecutor(2) as pool:  # OpenCV's SIFT leaves a second processor idle
+            of_first = pool.submit(detect_sift, view0, max_keypoints)
+            of_second = detect_sift(view1, max_keypoints)
+            features = of_first.result(), of_second
+    points0, points1, ratios = _match_sparse(*features)
+    return TentativeMatches((view0, view1), (scale0, scale1), features, (points0, points1), ratios)
+
+
+def matches_of_points(
+    gray0: np.ndarray, gray1: np.ndarray, points: tuple[Keypoints, Keypoints]
+) -> TentativeMatches | None:
+    """Match points of all scales, best first, at their own sizes and angles, as sparse keypoints.
+
+    Of two images in unlike light, or of which one is blurred, they give two to five times as many
+    correct matches as SIFT's. None where there are too few, or they have no sizes and angles.
+    """
+    if min(len(each) for each in points) < MIN_POINTS:
+        return None
+    described = []
+    for gray, each in zip((gray0, gray1), points, strict=True):
+        if each.sizes is None or each.angles is None:
+            return None
+        best = describe_keypoints(gray, each[:MAX_KEYPOINTS])
+        scale = min(1.0, MAX_SIDE_PX / max(gray.shape))
+        described.append(replace(best, xy=scaled_points(best.xy, scale)))
+    features = described[0], described[1]
+    return find_tentative_matches(gray0, gray1, features, max_side_px=MAX_SIDE_PX)
+
+
+def _match_sparse(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, ...]:
+    """Return matched positions in both images, and the ratios of the ratio test."""
+    assert first.descriptors is not None
+    assert second.descriptors is not None
+    found = match_descriptors(
+        first.descriptors,
+        second.descriptors,
+        exact_neighbours,
+        ratio=max(MAX_RATIOS),
+        mutual=True,
+    )
+    return _separate(first.xy[found.indices0], second.xy[found.indices1], found.ratios)
+
+
+def _separate(*matches: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Keep each place once in each image: one corner in many views is no further evidence.
+
+    The first two arrays are the positions in both images; others are kept like them.
+    """
+    for side in (0, 1):
+        places = np.rint(matches[side] / MIN_SEPARATION_PX)
+        _, kept = np.unique(places, axis=0, return_index=True)
+        kept.sort()
+        matches = tuple(values[kept] for values in matches)
+    return matches
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,11 +227,8 @@ class InitialGeometry:
     def of(cls, found: TwoViewModel, points: Points) -> InitialGeometry:
         """Return a model with the matches that agree with it."""
         on_model = points[0][found.inliers], points[1][found.inliers]
-        num_matches = len(found.inliers)
-        return cls(
-            *(found.model, found.matrix, *on_model, num_matches, found.log10_nfa),
-            parallax=found.parallax,
-        )
+        count, alarms = len(found.inliers), found.log10_nfa
+        return cls(found.model, found.matrix, *on_model, count, alarms, parallax=found.parallax)
 
     @property
     def trusted(self) -> bool:
@@ -111,10 +237,8 @@ class InitialGeometry:
 
     def untrusted(self) -> InitialGeometry:
         """Return that there is none, and how near it was."""
-        nowhere = np.empty((0, 2))
-        return InitialGeometry(
-            "none", None, nowhere, nowhere, self.num_matches, self.log10_nfa, self.num_views
-        )
+        points, evidence = np.empty((0, 2)), (self.num_matches, self.log10_nfa, self.num_views)
+        return InitialGeometry("none", None, points, points, *evidence)
 
     def rescaled(self, scale0: float, scale1: float) -> InitialGeometry:
         """Return a geometry of images at other scales as one of the images themselves."""
@@ -129,14 +253,36 @@ class InitialGeometry:
 
     def as_two_view_geometry(self) -> TwoViewGeometry:
         """Return what the user is told of it."""
+        counts = self.num_matches, len(self.points0)
         return TwoViewGeometry(
-            self.model,
-            self.matrix,
-            self.num_matches,
-            len(self.points0),
-            float(self.log10_nfa),
-            self.num_views,
+            self.model, self.matrix, *counts, float(self.log10_nfa), self.num_views
         )
+
+
+def guiding_geometry(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    model: str = "auto",
+    seed: int = 0,
+    source: TentativeMatches | Points | tuple[Keypoints, Keypoints] | None = None,
+) -> InitialGeometry:
+    """Return the geometry to begin with.
+
+    `source` are matches that have been made already, (K, 2) positions in both images of another
+    matcher, or keypoints: these make the matches where they are points of all scales and enough.
+    Else SIFT does.
+    """
+    if isinstance(source, TentativeMatches) or source is None:
+        return find_initial_geometry(gray0, gray1, model, seed, source)
+    if not isinstance(source[0], Keypoints):
+        sizes = gray0.shape[::-1], gray1.shape[::-1]
+        return _geometry_of_positions(source, sizes, model, seed)
+    matches = matches_of_points(gray0, gray1, source)
+    if matches is not None:
+        found = estimate_initial_geometry(matches, model, seed)
+        if len(found.points0) >= MIN_COARSE_INLIERS:
+            return found
+    return find_initial_geometry(gray0, gray1, model, seed)
 
 
 def find_initial_geometry(
@@ -146,25 +292,7 @@ def find_initial_geometry(
     seed: int = 0,
     tentative: TentativeMatches | None = None,
 ) -> InitialGeometry:
-    """Find the geometry of a pair, by the least effort that it takes.
-
-    Args:
-        gray0, gray1: (H, W) uint8 luma.
-        model: as of `estimate_initial_geometry`.
-        seed: of the random samples.
-        tentative: matches, where `find_tentative_matches` has made them already.
-
-    Returns:
-        The geometry, or one with the model "none".
-
-    Raises:
-        OptionError: the model is unknown.
-
-    Example:
-        >>> image = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
-        >>> find_initial_geometry(image, image).model
-        'homography'
-    """
+    """Find the geometry of a pair by SIFT, by the least effort that it takes."""
     longest = max(*gray0.shape, *gray1.shape)
     if tentative is None and longest > COARSE_SIDE_PX and model != "fundamental":
         coarse = find_tentative_matches(
@@ -188,30 +316,22 @@ def find_initial_geometry(
     )
 
 
-def geometry_of_points(
-    points: Points, sizes: tuple[Size, Size], model: str = "auto", seed: int = 0
-) -> InitialGeometry:
-    """Estimate the geometry of a pair from sparse matches that were found elsewhere.
+def _is_clear(found: InitialGeometry) -> bool:
+    """Whether most matches of the coarse pass, and enough, agree with a model that fits alone."""
+    depth = found.model == "fundamental"
+    least = MIN_COARSE_DEPTH_INLIERS if depth else MIN_COARSE_INLIERS
+    most = len(found.points0) >= max(least, MIN_COARSE_FRACTION * found.num_matches)
+    parallax = found.parallax
+    doubtful = parallax is not None and parallax.exceeds(MIN_PARALLAX_FRACTION)
+    return found.matrix is not None and most and (depth or not doubtful)
 
-    Args:
-        points: (K, 2) positions in both images, some of them wrong.
-        sizes: (width, height) of both images.
-        model: as of `estimate_initial_geometry`.
-        seed: of the random samples.
 
-    Returns:
-        The geometry, or one with the model "none".
+def _geometry_of_positions(points: Points, sizes: Sizes, model: str, seed: int) -> InitialGeometry:
+    """Estimate the geometry from sparse matches of another matcher, some of them wrong.
 
     Raises:
-        OptionError: the model is unknown, or these are not two (K, 2) arrays of finite numbers.
-
-    Example:
-        >>> points = np.random.default_rng(0).uniform(0, 99, (30, 2))
-        >>> found = geometry_of_points((points, points + 3), ((110, 110), (110, 110)))
-        >>> found.matrix[:2, 2].round(3)
-        array([3., 3.])
+        OptionError: these are not two (K, 2) arrays of finite numbers.
     """
-    check_model(model)
     try:
         points0, points1 = (np.array(each, np.float64) for each in points)
     except (TypeError, ValueError):
@@ -228,7 +348,7 @@ def geometry_of_points(
         (round(size[0] * scale), round(size[1] * scale))
         for size, scale in zip(sizes, (scale0, scale1), strict=True)
     )
-    scaled0, scaled1 = separate(scaled_points(points0, scale0), scaled_points(points1, scale1))
+    scaled0, scaled1 = _separate(scaled_points(points0, scale0), scaled_points(points1, scale1))
     chosen = choose_model(scaled0, scaled1, (size0, size1), model, seed)
     found = InitialGeometry.of(chosen, (scaled0, scaled1))
     return found.rescaled(scale0, scale1) if found.trusted else found.untrusted()
@@ -244,23 +364,9 @@ def estimate_initial_geometry(
 ) -> InitialGeometry:
     """Estimate the geometry of a pair from its tentative matches, and those of simulated views.
 
-    Args:
-        tentative: the matches.
-        model: "homography", "fundamental", or "auto": the homography, but the fundamental matrix
-            where the matches alone show depth (`Parallax.shows_depth`).
-        seed: of the random samples.
-        semi_calibrated: whether a fundamental matrix may assume cameras as most are; for small
-            copies that would take as long as the rest.
-        view_keypoints: of each view that is simulated where the matches alone give nothing; 0:
-            none is simulated.
-
-    Returns:
-        The geometry, or one with the model "none".
-
-    Raises:
-        OptionError: the model is unknown.
+    Of each view that is simulated, where the matches alone give nothing, there are so many
+    keypoints; with 0 none is simulated. The other arguments are those of `choose_model`.
     """
-    check_model(model)
     size0, size1 = ((view.shape[1], view.shape[0]) for view in tentative.views)
     nowhere = np.empty((0, 2))
     best = InitialGeometry("none", None, nowhere, nowhere, 0, float("inf"))
@@ -282,22 +388,6 @@ def estimate_initial_geometry(
     return replace(best, num_views=num_views).untrusted()
 
 
-def check_model(model: str) -> None:
-    """Raise `OptionError` unless a model is known."""
-    if model not in MODELS:
-        raise unknown_name("model", model, MODELS)
-
-
-def _is_clear(found: InitialGeometry) -> bool:
-    """Whether most matches of the coarse pass, and enough, agree with a model that fits alone."""
-    depth = found.model == "fundamental"
-    least = MIN_COARSE_DEPTH_INLIERS if depth else MIN_COARSE_INLIERS
-    most = len(found.points0) >= max(least, MIN_COARSE_FRACTION * found.num_matches)
-    parallax = found.parallax
-    doubtful = parallax is not None and parallax.exceeds(MIN_PARALLAX_FRACTION)
-    return found.matrix is not None and most and (depth or not doubtful)
-
-
 def _more_and_more_matches(
     tentative: TentativeMatches, view_keypoints: int
 ) -> Iterator[tuple[Points, np.ndarray, int]]:
@@ -309,12 +399,12 @@ def _more_and_more_matches(
         for side in (0, 1):
             other = tentative.features[1 - side]
             for seen in simulated_views(tentative.views[side], tilt, view_keypoints):
-                found = match_sparse(seen, other)
+                found = _match_sparse(seen, other)
                 points0 = np.concatenate([points0, found[side]])
                 points1 = np.concatenate([points1, found[1 - side]])
                 ratios = np.concatenate([ratios, found[2]])
                 views += 1
-        points0, points1, ratios = separate(points0, points1, ratios)
+        points0, points1, ratios = _separate(points0, points1, ratios)
         yield (points0, points1), ratios, views
 
 
@@ -331,14 +421,14 @@ def _with_further_evidence(
 
 
 def _with_further_matches(
-    found: InitialGeometry, tentative: TentativeMatches, sizes: tuple[Size, Size]
+    found: InitialGeometry, tentative: TentativeMatches, sizes: Sizes
 ) -> InitialGeometry:
     """Search along the lines of a fundamental matrix that few matches agree with, and refit it."""
     if found.model != "fundamental" or len(found.points0) >= MAX_MATCHES_TO_SEARCH:
         return found
     assert found.matrix is not None
     further = epipolar_search(*tentative.features, found.matrix)
-    points0, points1 = separate(
+    points0, points1 = _separate(
         np.concatenate([found.points0, further[0]]), np.concatenate([found.points1, further[1]])
     )
     sigmas = np.full(len(points0), MATCH_SIGMA_PX)

@@ -12,20 +12,18 @@ import numpy as np
 
 from ...features.keypoints import Keypoints, nearest_keypoints
 from ...features.matches import GuidedMatches, TwoViewGeometry
-from .homography import (
-    match_by_homography,
-    refine_guiding_homography,
-)
+from ...geometry.homography_refinement import refine_homography
+from ...geometry.images import downscale, warp_to_reference
+from ...geometry.transforms import scaled_homography, transform_points
 from .initial_geometry import (
-    MIN_COARSE_INLIERS,
     MIN_PARALLAX_FRACTION,
     InitialGeometry,
-    estimate_initial_geometry,
-    find_initial_geometry,
-    geometry_of_points,
+    Points,
+    TentativeMatches,
+    guiding_geometry,
 )
 from .rectified import match_by_rectification
-from .tentative_matches import Points, TentativeMatches, matches_of_points
+from .verification import dissimilarity
 
 MIN_VERIFIED_FRACTION = 0.5
 """Of what a homography proposes, this must be the same patches: with less, little of the scene lies
@@ -41,6 +39,26 @@ that agree with its geometry are taken."""
 MIN_MATCHES = 8
 """With fewer the geometry is not trusted after all."""
 
+MAX_DISTANCE_PX = 1.0
+"""From where the homography takes a keypoint to its partner."""
+
+MIN_PROPOSED_FRACTION = 0.25
+"""Where fewer of the keypoints that the second image shows under the homography have a partner
+there, keypoints are few, and all of them are verified."""
+
+MAX_VERIFIED_MEGAPIXELS = 6.0
+"""Larger images are compared at this size, which bounds memory and time."""
+
+MAX_REFINED_SIDE_PX = 1600
+"""Longer sides are scaled down to this while the homography is refined."""
+
+MAX_SCALE_RATIO = 1.5
+"""Of the two images; where one shows the scene finer by more than this, it is scaled down to the
+other for the refinement: corners of different scales are not at the same place."""
+
+MIN_SCALE = 1 / 16
+"""Of one image in the other; beyond it a homography shows nothing that could be refined."""
+
 
 def guided_matches(
     gray0: np.ndarray,
@@ -49,8 +67,7 @@ def guided_matches(
     xy1: np.ndarray,
     model: str = "auto",
     seed: int = 0,
-    tentative: TentativeMatches | Points | None = None,
-    points: tuple[Keypoints, Keypoints] | None = None,
+    source: TentativeMatches | Points | tuple[Keypoints, Keypoints] | None = None,
     first: InitialGeometry | None = None,
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
     """Match the keypoints of two images by their geometry.
@@ -60,85 +77,48 @@ def guided_matches(
         xy0, xy1: (N, 2), (M, 2) keypoints on whole pixels.
         model: "homography", "fundamental" or "auto".
         seed: of all random choices.
-        tentative: sparse matches of the pair, where `find_tentative_matches` has made them
-            already, or (K, 2) positions in both images that take the place of our own.
-        points: keypoints of both images, best first; where they have sizes and angles and are
-            enough, the sparse matches are made of them.
+        source: of the sparse matches, as of `guiding_geometry`; None: SIFT.
         first: the geometry to begin with, where `guiding_geometry` has found it already.
 
     Returns:
         The geometry that guided, and the matches; None when no geometry could be trusted.
-
-    Raises:
-        OptionError: the model is unknown, or the positions are no matches.
     """
     if first is None:
-        first = guiding_geometry(gray0, gray1, model, seed, tentative, points)
-    if first.matrix is None:
-        return first.as_two_view_geometry(), None
+        first = guiding_geometry(gray0, gray1, model, seed, source)
     enough = MIN_MATCHED_FRACTION * min(len(xy0), len(xy1))
-    matrix: np.ndarray = first.matrix
-    found = None
     if first.model == "homography":
-        matrix, found = _match_plane((gray0, gray1, xy0, xy1), first, seed)
-        if found is None:
-            known = first.tentative if tentative is None else tentative
-            depth = guiding_geometry(gray0, gray1, "fundamental", seed, known, points)
-            first = replace(depth, num_views=depth.num_views + first.num_views)
-            if first.matrix is None:
-                return first.untrusted().as_two_view_geometry(), None
-        elif len(found) < enough:
-            return first.untrusted().as_two_view_geometry(), None
-    if found is None:
         assert first.matrix is not None
-        made = match_by_rectification(gray0, gray1, xy0, first.points0, first.points1, first.matrix)
-        if made is None or len(made[1]) < enough:
-            # Too little around the sparse matches is alike, but they are distinct, and agree.
-            matrix, found = first.matrix, _sparse_matches(gray0, xy0, first)
-        else:
-            matrix, found = made
-    if len(found) < MIN_MATCHES:
+        matrix = _refine_homography(gray0, gray1, first.matrix)
+        matches, verified = match_by_homography(gray0, gray1, xy0, xy1, matrix, seed)
+        if verified >= _least_verified(first):
+            return _trusted(first, matrix, matches, max(enough, MIN_MATCHES))
+        source = source if first.tentative is None else first.tentative
+        depth = guiding_geometry(gray0, gray1, "fundamental", seed, source)
+        first = replace(depth, num_views=depth.num_views + first.num_views)
+    if first.matrix is None:
         return first.untrusted().as_two_view_geometry(), None
-    return replace(first, matrix=matrix).as_two_view_geometry(), found
+    dense = match_by_rectification(gray0, gray1, xy0, first.points0, first.points1, first.matrix)
+    if dense is None or len(dense[1]) < enough:
+        # Too little around the sparse matches is alike, but they are distinct, and agree.
+        dense = first.matrix, _sparse_matches(gray0, xy0, first)
+    return _trusted(first, *dense, MIN_MATCHES)
 
 
-def guiding_geometry(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    model: str = "auto",
-    seed: int = 0,
-    tentative: TentativeMatches | Points | None = None,
-    points: tuple[Keypoints, Keypoints] | None = None,
-) -> InitialGeometry:
-    """Return the geometry to begin with: of given matches, of points where enough, else of SIFT.
-
-    Arguments and errors are those of `guided_matches`.
-    """
-    if tentative is not None and not isinstance(tentative, TentativeMatches):
-        sizes = gray0.shape[::-1], gray1.shape[::-1]
-        return geometry_of_points(tentative, sizes, model, seed)
-    if tentative is None and points is not None:
-        matches = matches_of_points(gray0, gray1, points)
-        if matches is not None:
-            found = estimate_initial_geometry(matches, model, seed)
-            if len(found.points0) >= MIN_COARSE_INLIERS:
-                return found
-    return find_initial_geometry(gray0, gray1, model, seed, tentative)
+def _trusted(
+    first: InitialGeometry, matrix: np.ndarray, matches: GuidedMatches, least: float
+) -> tuple[TwoViewGeometry, GuidedMatches | None]:
+    """Return a geometry with its matches; with fewer than `least` it is not trusted after all."""
+    if len(matches) < least:
+        return first.untrusted().as_two_view_geometry(), None
+    return replace(first, matrix=matrix).as_two_view_geometry(), matches
 
 
-def _match_plane(
-    pair: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], first: InitialGeometry, seed: int
-) -> tuple[np.ndarray, GuidedMatches | None]:
-    """Match by a homography; None where the images show that the scene is no plane."""
-    assert first.matrix is not None
-    matrix = refine_guiding_homography(pair[0], pair[1], first.matrix)
-    found, verified = match_by_homography(*pair, matrix, seed)
-    parallax = first.parallax
-    least = 0.0  # a homography was asked for
-    if parallax is not None:
-        doubtful = parallax.exceeds(MIN_PARALLAX_FRACTION)
-        least = MIN_VERIFIED_FRACTION_OF_DEPTH if doubtful else MIN_VERIFIED_FRACTION
-    return matrix, found if verified >= least else None
+def _least_verified(first: InitialGeometry) -> float:
+    """Return the fraction that must be verified for the scene to be the plane of a homography."""
+    if first.parallax is None:  # a homography was asked for
+        return 0.0
+    doubtful = first.parallax.exceeds(MIN_PARALLAX_FRACTION)
+    return MIN_VERIFIED_FRACTION_OF_DEPTH if doubtful else MIN_VERIFIED_FRACTION
 
 
 def _sparse_matches(gray0: np.ndarray, xy0: np.ndarray, first: InitialGeometry) -> GuidedMatches:
@@ -149,3 +129,83 @@ def _sparse_matches(gray0: np.ndarray, xy0: np.ndarray, first: InitialGeometry) 
     moved = first.points1[near] + xy0[rows[near]] - first.points0[near]
     rows, order = np.unique(rows[near].astype(np.int64), return_index=True)
     return GuidedMatches(rows, moved[order], np.full(len(rows), 0.5, np.float32))
+
+
+def match_by_homography(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    xy0: np.ndarray,
+    xy1: np.ndarray,
+    homography: np.ndarray,
+    seed: int = 0,
+) -> tuple[GuidedMatches, float]:
+    """Match keypoints by a homography, and keep those whose patches are the same.
+
+    Returns:
+        The matches, each keypoint of the first image once at most, with scores 1 less the
+        `dissimilarity` of their patches; and the fraction with the same patches of the pairs that
+        the homography proposes, or, where keypoints are few, of all keypoints of the first image
+        that the second one shows under it.
+    """
+    predicted = transform_points(xy0, homography)
+    indices1, distances = nearest_keypoints(predicted, xy1, (gray1.shape[1], gray1.shape[0]))
+    with np.errstate(invalid="ignore"):
+        shown = (predicted > -0.5) & (predicted < np.array(gray1.shape[::-1]) - 0.5)
+    near = distances < MAX_DISTANCE_PX
+    indices0 = np.flatnonzero(shown.all(axis=1))
+    proposed = np.flatnonzero(near)
+    # Where keypoints are few it is chance which of them have another there: all are judged.
+    if len(proposed) >= MIN_PROPOSED_FRACTION * len(indices0):
+        indices0 = proposed
+    ratios = _compare(gray0, gray1, xy0[indices0], homography, seed)
+    same = ratios < 1
+    kept = same & near[indices0]
+    indices0 = indices0[kept]
+    indices1 = indices1[indices0]
+    scores = np.clip(1 - ratios[kept], 0, 1)
+    matches = GuidedMatches(indices0, xy1[indices1].astype(np.float64), scores, indices1=indices1)
+    return matches, float(same.mean()) if len(same) else 0.0
+
+
+def _compare(
+    gray0: np.ndarray, gray1: np.ndarray, pixels: np.ndarray, homography: np.ndarray, seed: int
+) -> np.ndarray:
+    """Return the `dissimilarity` of keypoints, of large images on smaller copies."""
+    (gray0, scale0), (gray1, scale1) = (
+        downscale(gray, round(max(gray.shape) * min(1, np.sqrt(MAX_VERIFIED_MEGAPIXELS / area))))
+        for gray, area in ((each, each.size / 1e6) for each in (gray0, gray1))
+    )
+    if scale0 < 1 or scale1 < 1:
+        homography = scaled_homography(homography, scale0, scale1)
+        last = np.array(gray0.shape[::-1], np.float32) - 1
+        pixels = np.clip(np.rint((pixels + np.float32(0.5)) * scale0 - 0.5), 0, last)
+    warped, valid = warp_to_reference(gray1, homography, (gray0.shape[1], gray0.shape[0]))
+    return dissimilarity(gray0, warped, valid, pixels, seed)
+
+
+def _refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    """Refine a homography on the images, scaled down to what that needs; (3, 3)."""
+    scales = _scales_at_centre(homography, gray0.shape)
+    (small0, scale0), (small1, scale1) = (
+        downscale(gray, min(MAX_REFINED_SIDE_PX, round(max(gray.shape) * scale)))
+        for gray, scale in zip((gray0, gray1), scales, strict=True)
+    )
+    start = scaled_homography(homography, scale0, scale1)
+    return scaled_homography(refine_homography(small0, small1, start), 1 / scale0, 1 / scale1)
+
+
+def _scales_at_centre(homography: np.ndarray, shape: tuple[int, ...]) -> tuple[float, float]:
+    """Return the scales of both images at which the finer one is as coarse as the other.
+
+    Finer: in every direction, by more than `MAX_SCALE_RATIO`, in the middle of the first image.
+    """
+    centre = np.array([shape[1] / 2, shape[0] / 2])
+    around = transform_points(centre + [[0, 0], [1, 0], [0, 1]], homography)
+    if not np.isfinite(around).all():
+        return 1.0, 1.0
+    largest, smallest = np.linalg.svd(around[1:] - around[0], compute_uv=False)
+    if largest * MAX_SCALE_RATIO < 1:
+        return max(float(largest), MIN_SCALE), 1.0
+    if smallest > MAX_SCALE_RATIO:
+        return 1.0, max(1 / float(smallest), MIN_SCALE)
+    return 1.0, 1.0

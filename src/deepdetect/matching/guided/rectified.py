@@ -1,9 +1,10 @@
 """Dense matches of a scene with depth, by rectification: epipolar lines become rows.
 
 Both images are warped into a frame in which matches lie on the same row
-(`geometry.epipolar_rectification`), the row matcher finds a disparity for each pixel
-(`matching.stereo`), and its matches are taken back to the images. They are sub-pixel
-positions, not keypoints of the second image.
+(`geometry.epipolar_rectification`), rows are matched (`matching.stereo`) in the range that sparse
+matches, and small copies, allow, and the matches are taken back to the images: sub-pixel positions,
+not keypoints of the second image. Which disparities are kept is told by what the windows of both
+views show; how well they correlate by chance is measured on rows that show something else.
 
 A fundamental matrix from few matches may miss by some pixels where none of them was. So corners are
 tracked in both directions around their matches, and the matrix is fitted to them: matches are moved
@@ -13,16 +14,58 @@ of what has been found, the images are rectified again.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..._shared.opencv import cv2
 from ...features.matches import GuidedMatches
-from ...geometry.images import equalise, track_round_trip
+from ...geometry.epipolar_rectification import PolarFrame, RectifiedFrame, rectified_frame
+from ...geometry.images import downscale, equalise, gaussian_blur, local_zncc, track_round_trip
 from ...geometry.semi_calibrated import refine_fundamental
-from ...geometry.transforms import epipolar_errors, scaled_points
-from .rectified_view import RectifiedView, range_with_margin, rectified_view
+from ...geometry.transforms import epipolar_errors, scaled_fundamental, scaled_points
+from ..stereo.matching import (
+    DisparityMap,
+    DisparityOptions,
+    compute_disparity,
+    find_disparity_range,
+)
+
+Pair = tuple[np.ndarray, np.ndarray]
+
+DISPARITY = DisparityOptions(discontinuity_margin_px=1)
+"""How rows are matched; the range is found."""
+
+MAX_VOLUME = 1e8
+"""Pixels of the frame times disparities; with more, the images are scaled down."""
+
+TAIL_FRACTION = 0.01
+"""Of the disparities of sparse matches at each end, which may be wrong."""
+
+MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25
+"""Added to the range of disparities at both ends, in pixels, and as a fraction of it."""
+
+MIN_FRACTION_OF_ONE_SIGN = 0.8
+"""Where so many sparse matches grow about an epipole, or shrink, others do so by `MARGIN_PX` at
+most."""
+
+CORRELATION_WINDOW_PX, CORRELATION_SIGMA_PX = 9, 1.0
+"""Side of the window in which both images are compared after matching, and of the blur before."""
+
+MIN_CORRELATION = 0.3
+"""A match whose windows correlate less is left out, unless `FALSE_DISCOVERY_RATE` allows it."""
+
+FALSE_POSITIVE_RATE = 0.01
+"""So many of the pixels may be matched by chance; matches whose windows correlate too little for
+that are left out. It is measured on rows that show something else."""
+
+FALSE_DISCOVERY_RATE = 0.01
+"""While no more than this fraction of the matches is found by chance, the two bounds above hold
+only for the matches that geometry relies on."""
+
+NULL_FRACTION = 0.25
+"""Of the rows, which are matched with others for that."""
 
 MAX_ROW_ERROR_PX, ROW_QUANTILE = 0.5, 0.9
 """Where this fraction of the tracked corners has its rows nearer than this to the lines of the new
@@ -35,9 +78,8 @@ the range of what was found."""
 MIN_SIGMA_PX = 0.1
 """A track or a sparse match is never counted as more exact than this."""
 
-TRACKED_CORNERS = 2000
-TRACKED_WINDOW_PX = 15
-"""Side of the windows in which they are tracked."""
+TRACKED_CORNERS, TRACKED_WINDOW_PX = 2000, 15
+"""Corners that are tracked, and the side of the windows."""
 
 MAX_ROUND_TRIP_PX = 0.3
 """A track counts when it ends this near to its start, forth and back."""
@@ -57,17 +99,40 @@ MIN_AGREEMENT = 0.75
 
 
 @dataclass(frozen=True, eq=False)
-class Tracks:
-    """Corners that were tracked around their matches.
+class RectifiedView:
+    """Two images in their frame, and the disparities between them.
 
     Attributes:
-        positions: (N, 2) in both images at their own size.
-        on_rows: the same, moved in the frame to the rows of the first: where row matching may
-            look for them.
+        frame: the frame, of the images at `scale`.
+        scale: of both images, at most 1.
+        first, second: (H, W) uint8, the warped images.
+        disparities: of every pixel of the first, those that geometry may rely on.
+        kept: (H, W) float32 disparities of the matches that are kept, perhaps more; else NaN.
+        correlation: (H, W) float32 local ZNCC of both after the disparity, where one is kept.
     """
 
-    positions: tuple[np.ndarray, np.ndarray]
-    on_rows: tuple[np.ndarray, np.ndarray]
+    frame: RectifiedFrame
+    scale: float
+    first: np.ndarray
+    second: np.ndarray
+    disparities: DisparityMap
+    kept: np.ndarray
+    correlation: np.ndarray
+
+    def to_frame(self, points: np.ndarray, side: int) -> np.ndarray:
+        """Return where points of an image at its own size lie in the frame."""
+        return self.frame.to_frame(scaled_points(points, self.scale), side)
+
+    def from_frame(self, points: np.ndarray, side: int) -> np.ndarray:
+        """Return where points of the frame lie in an image at its own size."""
+        return scaled_points(self.frame.from_frame(points, side), 1 / self.scale)
+
+    def pixels_of(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the rows of the places inside the frame, and the nearest columns and rows."""
+        height, width = self.first.shape
+        nearest = np.rint(np.where(np.isfinite(places), places, -1)).astype(np.int64)
+        inside = np.flatnonzero(((nearest >= 0) & (nearest < (width, height))).all(axis=1))
+        return inside, *nearest[inside].T
 
 
 def match_by_rectification(
@@ -100,15 +165,18 @@ def match_by_rectification(
     tracks = None if view is None else _track(view)
     if view is None or tracks is None:
         return None
-    fundamental = _refine(fundamental, sparse, tracks, sizes)
-    near = _are_near(tracks, fundamental)
-    wide = _is_range_too_wide(view)
-    if (wide or not near) and not exact:
-        again = rectified_view(gray0, gray1, *tracks.positions, fundamental)
-        found = None if again is None else _track(again)
-        if again is not None and found is not None and _matched(again) >= _matched(view):
-            view, tracks, near = again, found, True
-            fundamental = _refine(fundamental, sparse, tracks, sizes)
+    tracked, on_rows = tracks[:2], tracks[2]
+    fundamental = _refine(fundamental, sparse, tracked, sizes)
+    errors = epipolar_errors(tracked[0], on_rows, fundamental)
+    near = float(np.quantile(errors, ROW_QUANTILE)) < MAX_ROW_ERROR_PX
+    if not exact and (not near or _is_range_too_wide(view)):
+        again = rectified_view(gray0, gray1, *tracked, fundamental)
+        tracks = None if again is None else _track(again)
+        if again is not None and tracks is not None:
+            counts = [np.count_nonzero(each.disparities.matched) for each in (view, again)]
+            if counts[1] >= counts[0]:
+                view, near = again, True
+                fundamental = _refine(fundamental, sparse, tracks[:2], sizes)
     if not exact and _agreement(view, sparse) < MIN_AGREEMENT:
         return None
     # Rows that are off, and could not be corrected, are a reason to doubt low correlation.
@@ -120,46 +188,141 @@ def match_by_rectification(
     return fundamental, GuidedMatches(rows[inside], places[inside], scores[inside], subpixel=True)
 
 
-def _refine(
+def rectified_view(
+    gray0: np.ndarray,
+    gray1: np.ndarray,
+    points0: np.ndarray,
+    points1: np.ndarray,
     fundamental: np.ndarray,
-    sparse: tuple[np.ndarray, np.ndarray],
-    tracks: Tracks,
-    sizes: tuple[tuple[int, int], tuple[int, int]],
-) -> np.ndarray:
-    """Fit the fundamental matrix to tracks and sparse matches, as exact as each of them are."""
-    sigmas = []
-    for points0, points1 in (sparse, tracks.positions):
-        errors = epipolar_errors(points0, points1, fundamental)
-        sigma = max(1.4826 * float(np.median(errors)), MIN_SIGMA_PX)
-        sigmas.append(np.full(len(points0), sigma))
-    points0, points1 = (np.concatenate([sparse[side], tracks.positions[side]]) for side in (0, 1))
-    return refine_fundamental(points0, points1, fundamental, sizes, np.concatenate(sigmas))
+) -> RectifiedView | None:
+    """Rectify both images, smaller where there would be too much to search, and match rows."""
+    scale, sizes = 1.0, (gray0.shape[::-1], gray1.shape[::-1])
+    frame = rectified_frame(points0, points1, fundamental, *sizes)
+    if frame is None:
+        return None
+    low, high = _range_of_matches(frame, points0, points1)
+    volume = float(np.prod(frame.size)) * (high - low + 1)
+    if volume > MAX_VOLUME:
+        longest = max(*gray0.shape, *gray1.shape)
+        scale = max(1, round(longest * (MAX_VOLUME / volume) ** (1 / 3))) / longest
+        gray0, gray1 = (
+            downscale(gray, round(max(gray.shape) * scale))[0] for gray in (gray0, gray1)
+        )
+        points0, points1 = scaled_points(points0, scale), scaled_points(points1, scale)
+        fundamental = scaled_fundamental(fundamental, scale, scale)
+        frame = rectified_frame(points0, points1, fundamental, gray0.shape[::-1], gray1.shape[::-1])
+        if frame is None:
+            return None
+        low, high = _range_of_matches(frame, points0, points1)
+    (first, valid0), (second, valid1) = frame.warp(gray0, 0), frame.warp(gray1, 1)
+    # About an epipole everything grows, or everything shrinks: what small copies of the two views
+    # agree on in the other direction is wrong.
+    seen = None if isinstance(frame, PolarFrame) else find_disparity_range(first, second)
+    if seen is not None:
+        widened = min(low, seen[0]), max(high, seen[1])
+        # What both views agree on may be far off where much of a frame shows nothing.
+        if widened[1] - widened[0] <= int(MAX_VOLUME / float(np.prod(frame.size))):
+            low, high = widened
+    widest = frame.size[0] - 1
+    low, high = max(low, -widest), min(high, widest)
+    if low >= high:
+        return None
+    options = replace(DISPARITY, disparity_range=(low, high))
+    found, correlation = _match_rows(first, second, valid0, valid1, options)
+    # Some rows are matched with rows of the second view that show something else: what is found
+    # there is found by chance, the best of as many disparities as everywhere.
+    height = len(first)
+    count = max(1, round(height * NULL_FRACTION))
+    rows = (height - count) // 2 + np.arange(count)
+    others = (rows + height // 2) % height
+    null, null_correlation = _match_rows(
+        first[rows], second[others], valid0[rows], valid1[others], options
+    )
+    pixels, null_pixels = (int(np.count_nonzero(valid)) for valid in (valid0, valid0[rows]))
+    bounds = _correlation_bounds(
+        correlation[found.matched], pixels, null_correlation[null.matched], null_pixels
+    )
+    relied, kept = (found.matched & (correlation >= bound) for bound in bounds)
+    nan = np.float32(np.nan)
+    return RectifiedView(
+        frame,
+        scale,
+        first,
+        second,
+        DisparityMap(np.where(relied, found.disparity, nan), relied, found.disparity_range),
+        np.where(kept, found.disparity, nan),
+        np.where(kept, correlation, nan),
+    )
 
 
-def _agreement(view: RectifiedView, sparse: tuple[np.ndarray, np.ndarray]) -> float:
-    """Return the fraction of the sparse matches with a disparity that lie where it says.
+def _match_rows(
+    first: np.ndarray,
+    second: np.ndarray,
+    valid0: np.ndarray,
+    valid1: np.ndarray,
+    options: DisparityOptions,
+) -> tuple[DisparityMap, np.ndarray]:
+    """Return the disparities where both views show something, and the correlation after them."""
+    found = compute_disparity(first, second, options)
+    row, column = np.indices(first.shape, dtype=np.float32)
+    known = found.matched & np.isfinite(found.disparity)
+    x = np.where(known, column - found.disparity, -1).astype(np.float32)
+    aligned = cv2.remap(second, x, row, cv2.INTER_LINEAR)
+    shown = cv2.remap(valid1.astype(np.uint8), x, row, cv2.INTER_NEAREST) > 0
+    known &= valid0 & shown
+    correlation = local_zncc(
+        gaussian_blur(first, CORRELATION_SIGMA_PX),
+        gaussian_blur(aligned, CORRELATION_SIGMA_PX),
+        np.ones(first.shape, bool),
+        CORRELATION_WINDOW_PX,
+    )
+    matched = DisparityMap(found.disparity, known, found.disparity_range)
+    return matched, np.where(known, np.nan_to_num(correlation), np.float32(-1))
 
-    They know nothing of each other: where most contradict, what looks alike on the rows is another
-    of many like things.
+
+def _correlation_bounds(
+    correlations: np.ndarray, pixels: int, null: np.ndarray, null_pixels: int
+) -> tuple[float, float]:
+    """Return the least correlation of a match that geometry relies on, and of one that is kept.
+
+    From the correlations of matches and of matches by chance, and for how many pixels they were
+    sought.
     """
-    places = [
-        view.frame.to_frame(scaled_points(points, view.scale), side)
-        for side, points in enumerate(sparse)
-    ]
-    disparity = view.disparities.disparity
-    height, width = disparity.shape
-    nearest = np.rint(np.where(np.isfinite(places[0]), places[0], -1)).astype(np.int64)
-    inside = ((nearest >= 0) & (nearest < (width, height))).all(axis=1)
-    column, row = nearest[inside].T
-    errors = places[0][inside, 0] - places[1][inside, 0] - disparity[row, column]
-    errors = np.abs(errors[np.isfinite(errors)])
-    return float((errors < MAX_DISAGREEMENT_PX).mean()) if len(errors) else 0.0
+    null = np.sort(null)[::-1]
+    allowed = int(FALSE_POSITIVE_RATE * null_pixels)
+    high = max(MIN_CORRELATION, float(null[allowed]) if len(null) > allowed else -1.0)
+    # Where nearly nothing is found by chance and nearly all else is, low correlation is no reason
+    # to doubt: smooth surfaces are matched by what surrounds them.
+    ordered = np.sort(correlations)
+    bounds = np.append(-1.0, null[::-1])
+    matches = len(ordered) - np.searchsorted(ordered, bounds)
+    wrong = (len(null) - np.searchsorted(null[::-1], bounds)) * pixels / max(null_pixels, 1)
+    few = bounds[(wrong <= FALSE_DISCOVERY_RATE * matches) & (null_pixels > 0)]
+    return high, min(high, float(few.min())) if len(few) else high
 
 
-def _are_near(tracks: Tracks, fundamental: np.ndarray) -> bool:
-    """Whether the rows that were matched are near the lines of a matrix."""
-    errors = epipolar_errors(*tracks.on_rows, fundamental)
-    return float(np.quantile(errors, ROW_QUANTILE)) < MAX_ROW_ERROR_PX
+def _range_of_matches(
+    frame: RectifiedFrame, points0: np.ndarray, points1: np.ndarray
+) -> tuple[int, int]:
+    """Return the disparities of sparse matches, with a margin on both sides."""
+    disparity = frame.to_frame(points0, 0)[:, 0] - frame.to_frame(points1, 1)[:, 0]
+    disparity = disparity[np.isfinite(disparity)]
+    if not len(disparity):
+        return 0, 0
+    smallest, largest = _range_with_margin(disparity)
+    if isinstance(frame, PolarFrame):
+        if np.mean(disparity > 0) > MIN_FRACTION_OF_ONE_SIGN:
+            smallest = max(smallest, -MARGIN_PX)
+        if np.mean(disparity < 0) > MIN_FRACTION_OF_ONE_SIGN:
+            largest = min(largest, MARGIN_PX)
+    return int(np.floor(smallest)), int(np.ceil(largest))
+
+
+def _range_with_margin(disparity: np.ndarray) -> tuple[float, float]:
+    """Return the range of most disparities, with a margin on both sides."""
+    low, high = np.quantile(disparity, [TAIL_FRACTION, 1 - TAIL_FRACTION])
+    margin = MARGIN_PX + MARGIN_FRACTION * (high - low)
+    return float(low - margin), float(high + margin)
 
 
 def _is_range_too_wide(view: RectifiedView) -> bool:
@@ -167,9 +330,65 @@ def _is_range_too_wide(view: RectifiedView) -> bool:
     searched = view.disparities.disparity_range
     if view.scale == 1 or searched is None:
         return False
-    low, high = range_with_margin(view.disparities.disparity[view.disparities.matched])
-    width = searched[1] - searched[0]
-    return width > MAX_RANGE_EXCESS * (high - low)
+    low, high = _range_with_margin(view.disparities.disparity[view.disparities.matched])
+    return searched[1] - searched[0] > MAX_RANGE_EXCESS * (high - low)
+
+
+def _track(view: RectifiedView) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Track corners around their matches; None with fewer than `MIN_TRACKS`.
+
+    Returns their positions in both images at their own size, and those in the second moved in the
+    frame to the rows of the first: where row matching may look for them.
+    """
+    first, second = equalise(view.first), equalise(view.second)
+    mask = view.disparities.matched.astype(np.uint8)
+    corners = cv2.goodFeaturesToTrack(first, TRACKED_CORNERS, 0.001, 5, mask=mask)
+    if corners is None or len(corners) < MIN_TRACKS:
+        return None
+    start = corners.reshape(-1, 2)
+    column, row = np.rint(start).astype(np.int64).T
+    disparity = view.disparities.disparity[row, column]
+    expected = start - np.column_stack([disparity, np.zeros(len(start))]).astype(np.float32)
+    ends, gaps = track_round_trip(
+        first, second, start, TRACKED_WINDOW_PX, levels=1, expected=expected
+    )
+    good = gaps < MAX_ROUND_TRIP_PX
+    good &= np.abs(ends - expected).max(axis=1) < MAX_TRACK_PX
+    if np.count_nonzero(good) < MIN_TRACKS:
+        return None
+    start, ends = start[good], ends[good]
+    on_rows = np.column_stack([ends[:, 0], start[:, 1]])
+    return view.from_frame(start, 0), view.from_frame(ends, 1), view.from_frame(on_rows, 1)
+
+
+def _refine(
+    fundamental: np.ndarray,
+    sparse: Pair,
+    tracked: Sequence[np.ndarray],
+    sizes: tuple[tuple[int, int], tuple[int, int]],
+) -> np.ndarray:
+    """Fit the fundamental matrix to tracks and sparse matches, as exact as each of them are."""
+    sigmas = []
+    for points0, points1 in (sparse, tracked):
+        errors = epipolar_errors(points0, points1, fundamental)
+        sigma = max(1.4826 * float(np.median(errors)), MIN_SIGMA_PX)
+        sigmas.append(np.full(len(points0), sigma))
+    points0, points1 = (np.concatenate([sparse[side], tracked[side]]) for side in (0, 1))
+    return refine_fundamental(points0, points1, fundamental, sizes, np.concatenate(sigmas))
+
+
+def _agreement(view: RectifiedView, sparse: Pair) -> float:
+    """Return the fraction of the sparse matches with a disparity that lie where it says.
+
+    They know nothing of each other: where most contradict, what looks alike on the rows is another
+    of many like things.
+    """
+    places = [view.to_frame(points, side) for side, points in enumerate(sparse)]
+    inside, column, row = view.pixels_of(places[0])
+    disparity = view.disparities.disparity[row, column]
+    errors = places[0][inside, 0] - places[1][inside, 0] - disparity
+    errors = np.abs(errors[np.isfinite(errors)])
+    return float((errors < MAX_DISAGREEMENT_PX).mean()) if len(errors) else 0.0
 
 
 def _moved_to_lines(
@@ -183,51 +402,16 @@ def _moved_to_lines(
     return np.asarray(points1 - normal * (distance / squared)[:, None])
 
 
-def _matched(view: RectifiedView) -> int:
-    return int(np.count_nonzero(view.disparities.matched))
-
-
-def _track(view: RectifiedView) -> Tracks | None:
-    """Track corners around their matches; None with fewer than `MIN_TRACKS`."""
-    first, second = equalise(view.first), equalise(view.second)
-    mask = view.disparities.matched.astype(np.uint8)
-    corners = cv2.goodFeaturesToTrack(first, TRACKED_CORNERS, 0.001, 5, mask=mask)
-    if corners is None or len(corners) < MIN_TRACKS:
-        return None
-    start = corners.reshape(-1, 2)
-    column, row = np.rint(start).astype(np.int64).T
-    expected = start - np.column_stack(
-        [view.disparities.disparity[row, column], np.zeros(len(start))]
-    ).astype(np.float32)
-    there, gaps = track_round_trip(
-        first, second, start, TRACKED_WINDOW_PX, levels=1, expected=expected
-    )
-    good = gaps < MAX_ROUND_TRIP_PX
-    good &= np.abs(there - expected).max(axis=1) < MAX_TRACK_PX
-    if np.count_nonzero(good) < MIN_TRACKS:
-        return None
-    on_rows = np.column_stack([there[good, 0], start[good, 1]])
-    first_places, second_places, row_places = (
-        scaled_points(view.frame.from_frame(points, side), 1 / view.scale)
-        for points, side in ((start[good], 0), (there[good], 1), (on_rows, 1))
-    )
-    return Tracks((first_places, second_places), (first_places, row_places))
-
-
 def _sample(
     view: RectifiedView, disparity: np.ndarray, xy0: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the rows of the keypoints that have a disparity, their places and scores."""
+    """Return the rows of the keypoints that have a disparity, their positions and scores."""
     height, width = disparity.shape
-    places = view.frame.to_frame(scaled_points(xy0, view.scale), 0)
-    nearest = np.rint(np.where(np.isfinite(places), places, -1)).astype(np.int64)
-    inside = ((nearest >= 0) & (nearest < (width, height))).all(axis=1)
-    rows = np.flatnonzero(inside)
-    column, row = nearest[rows].T
+    places = view.to_frame(xy0, 0)
+    rows, column, row = view.pixels_of(places)
     known = np.isfinite(disparity[row, column])
     rows, column, row = rows[known], column[known], row[known]
-    places, own = places[rows], disparity[row, column]
-    scores = view.correlation[row, column]
+    places, nearest = places[rows], disparity[row, column]
     # Bilinear, of the neighbours on the same surface.
     left, top = np.floor(places).astype(np.int64).T
     total, weights = np.zeros(len(rows)), np.full(len(rows), 1e-9)
@@ -238,9 +422,9 @@ def _sample(
             weight = np.abs(1 - across - (places[:, 0] - left)) * np.abs(
                 1 - down - (places[:, 1] - top)
             )
-            weight *= np.abs(value - own) <= 1  # not for NaN
-            total += weight * np.nan_to_num(value - own)
+            weight *= np.abs(value - nearest) <= 1  # not for NaN
+            total += weight * np.nan_to_num(value - nearest)
             weights += weight
-    shift = np.column_stack([own + total / weights, np.zeros(len(rows))])
-    there = scaled_points(view.frame.from_frame(places - shift, 1), 1 / view.scale)
-    return rows, there, np.clip(scores, 0, 1)
+    shift = np.column_stack([nearest + total / weights, np.zeros(len(rows))])
+    scores = np.clip(view.correlation[row, column], 0, 1)
+    return rows, view.from_frame(places - shift, 1), scores

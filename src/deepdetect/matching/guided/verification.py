@@ -67,24 +67,20 @@ class NullPairs:
 
     Attributes:
         rows: (N,) the points that have a partner.
-        places: (N, 2) where it is in the second image.
-        interior: (N,) bool: no descriptor sees an edge: it is the same with and without the shift.
-            Of the others the first image's edge cuts both descriptors.
+        partners: (N, 2) where that is in the second image.
+        interior: (N,) bool: no descriptor sees an edge, and is the same with and without the shift;
+            of the others the first image's edge cuts both descriptors.
         shifted: (H, W) uint8, the second image shifted cyclically.
     """
 
     rows: np.ndarray
-    places: np.ndarray
+    partners: np.ndarray
     interior: np.ndarray
     shifted: np.ndarray
 
 
 def dissimilarity(
-    gray0: np.ndarray,
-    warped: np.ndarray,
-    valid: np.ndarray,
-    pixels: np.ndarray,
-    seed: int = 0,
+    gray0: np.ndarray, warped: np.ndarray, valid: np.ndarray, pixels: np.ndarray, seed: int = 0
 ) -> np.ndarray:
     """Compare the patches around points.
 
@@ -106,8 +102,8 @@ def dissimilarity(
     known = np.flatnonzero(valid[pixels[:, 1], pixels[:, 0]])
     if not len(known):
         return result
-    here, shape = pixels[known], gray0.shape
-    described = _lattice_near(here, shape)
+    seen, shape = pixels[known], gray0.shape
+    described = _lattice_near(seen, shape)
     described = described[valid[described[:, 1], described[:, 0]]]
     null_pairs = sample_null_pairs(described, warped, valid, seed)
     distances, null_distances = _distances(gray0, warped, described, null_pairs)
@@ -119,11 +115,10 @@ def dissimilarity(
     bound = np.quantile(together, FALSE_POSITIVE_RATE) if len(together) else 0
     if bound <= MIN_NULL_DISTANCE:  # all null pairs look the same: similarity says nothing
         return result
-    ratios = gaussian_means(described, distances, shape, SMOOTHING_SIGMA_PX, here) / np.float32(
-        bound
-    )
+    means = gaussian_means(described, distances, shape, SMOOTHING_SIGMA_PX, seen)
+    ratios = means / np.float32(bound)
     count, passed = (
-        window_sums(here, part, shape, WINDOW_PX, dtype=np.float32) for part in (1, ratios < 1)
+        window_sums(seen, part, shape, WINDOW_PX, dtype=np.float32) for part in (1, ratios < 1)
     )
     support = passed / np.maximum(count, 1)
     result[known] = np.where(support >= MIN_SUPPORT, ratios, np.inf)
@@ -131,21 +126,12 @@ def dissimilarity(
 
 
 def sample_null_pairs(
-    points: np.ndarray,
-    warped: np.ndarray,
-    valid: np.ndarray,
-    seed: int = 0,
+    points: np.ndarray, warped: np.ndarray, valid: np.ndarray, seed: int = 0
 ) -> list[NullPairs]:
-    """Pair points of some blocks of the image with unrelated places of the second image.
+    """Pair points of some blocks with unrelated places of the second image, for each shift.
 
-    Args:
-        points: (N, 2) int64 pixels of the first image.
-        warped: (H, W) uint8, the second one in the frame of the first.
-        valid: (H, W) bool, where that has content: partners lie there only.
-        seed: of the choice of blocks; up to a megapixel all blocks are taken, whatever the seed.
-
-    Returns:
-        One entry for each shift.
+    Arguments are those of `dissimilarity`; partners lie where the second image has content. Up to
+    a megapixel all blocks are taken, whatever the seed.
     """
     size = np.array(warped.shape[::-1])
     # Shifts by whole steps, also around the edge: most partners lie on the lattice, too, where a
@@ -154,22 +140,21 @@ def sample_null_pairs(
     period = np.maximum(size // step, 1) * step
     rows_and_columns = [np.arange(length) for length in warped.shape]
     result = []
-    blocks = _sample_blocks(points, seed)
-    for rows, fraction in zip(blocks, NULL_SHIFTS, strict=True):
+    for rows, fraction in zip(_sample_blocks(points, seed), NULL_SHIFTS, strict=True):
         shift = np.rint(np.array(fraction) * period / step).astype(np.int64) * step
-        places = (points[rows] - shift) % period
+        partners = (points[rows] - shift) % period
         inner, whole = (
             (np.minimum(xy, end - 1 - xy) >= DESCRIPTOR_REACH).all(axis=1)
-            for xy, end in ((points[rows], size), (places, period))
+            for xy, end in ((points[rows], size), (partners, period))
         )
         # Where only the partner is at an edge: a seam in the shifted image, which no warped has.
-        kept = valid[places[:, 1], places[:, 0]] & (whole | ~inner)
-        rows, places, interior = rows[kept], places[kept], inner[kept]
+        kept = valid[partners[:, 1], partners[:, 0]] & (whole | ~inner)
         y, x = (
             (line - by) % end
             for line, by, end in zip(rows_and_columns, shift[::-1], period[::-1], strict=True)
         )
-        result.append(NullPairs(rows, places, interior, warped[np.ix_(y, x)]))
+        shifted = warped[np.ix_(y, x)]
+        result.append(NullPairs(rows[kept], partners[kept], inner[kept], shifted))
     return result
 
 
@@ -183,16 +168,13 @@ def index_map(pixels: np.ndarray, shape: Sequence[int]) -> tuple[np.ndarray, np.
 
 
 def _distances(
-    gray0: np.ndarray,
-    warped: np.ndarray,
-    points: np.ndarray,
-    null_pairs: Sequence[NullPairs],
+    gray0: np.ndarray, warped: np.ndarray, points: np.ndarray, null_pairs: Sequence[NullPairs]
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return 1 - correlation of the points and of the null pairs, summed over the sizes."""
     # Each place of the second image is described once, however often it is part of a null pair.
-    used = [points, *(null.places[null.interior] for null in null_pairs)]
+    used = [points, *(null.partners[null.interior] for null in null_pairs)]
     places, index = index_map(np.concatenate(used), warped.shape)
-    own = index[points[:, 1], points[:, 0]]
+    rows_of_points = index[points[:, 1], points[:, 0]]
     distances = np.zeros(len(points), np.float32)
     null_distances = [np.zeros(len(null.rows), np.float32) for null in null_pairs]
     gradients = [sift_gradient(gray) for gray in (gray0, warped)]
@@ -205,9 +187,11 @@ def _distances(
         mean = (total / len(first) if enough else 0 * total).astype(np.float32)
         described = dense_sift(warped, places, size, LATTICE_PX, gradients[1])
         second = to_root_sift(described, overwrite=True)
-        distances += correlation_distance(first, np.arange(len(first)), second, own, mean)
+        distances += correlation_distance(
+            first, np.arange(len(first)), second, rows_of_points, mean
+        )
         for values, null, gradient in zip(null_distances, null_pairs, shifted, strict=True):
-            x, y = null.places[null.interior].T
+            x, y = null.partners[null.interior].T
             inner, outer = null.rows[null.interior], null.rows[~null.interior]
             values[null.interior] += correlation_distance(first, inner, second, index[y, x], mean)
             described = dense_sift(null.shifted, points[outer], size, LATTICE_PX, gradient)
@@ -223,8 +207,8 @@ def _lattice_near(pixels: np.ndarray, shape: Sequence[int]) -> np.ndarray:
     index = np.clip(pixels // LATTICE_PX, 0, np.maximum(last, 0))
     used = np.zeros(index.max(axis=0) + 1, bool)
     used[index[:, 0], index[:, 1]] = True
-    places = np.argwhere(used) * LATTICE_PX + LATTICE_PX // 2
-    return np.minimum(places, np.array(shape[1::-1]) - 1)
+    centres = np.argwhere(used) * LATTICE_PX + LATTICE_PX // 2
+    return np.minimum(centres, np.array(shape[1::-1]) - 1)
 
 
 def _sample_blocks(pixels: np.ndarray, seed: int) -> list[np.ndarray]:
