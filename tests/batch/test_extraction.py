@@ -14,7 +14,7 @@ import pytest
 
 from deepdetect import DeepDetect, OptionError, PointDetector, SelectionOptions, load_image
 from deepdetect.batch import extract_features
-from deepdetect.batch.extraction import IMAGES_PER_SHARD, shards_of
+from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.features.sift import describe_keypoints, root_sift_descriptors
 from deepdetect.io.image import luma
 
@@ -129,8 +129,8 @@ def test_bad_images_do_not_stop_the_others(
     extract_features(folder, tmp_path / "good.h5", FEW, workers=1)
     (folder / "bad.png").write_bytes(b"not a photograph")
     (folder / os.fsdecode(b"\xff.png")).write_bytes((folder / "a/00.png").read_bytes())
-    for expected in ((3, 0), (0, 3)):
-        report = extract_features(folder, tmp_path / "f.h5", FEW, workers=2)
+    for workers, expected in ((2, (3, 0)), (1, (0, 3))):
+        report = extract_features(folder, tmp_path / "f.h5", FEW, workers=workers)
         assert (len(report.counts), report.skipped) == expected
         first, second = report.failures
         assert "bad.png is not an image" in first + second
@@ -138,15 +138,6 @@ def test_bad_images_do_not_stop_the_others(
     assert same_content(tmp_path / "f.h5", tmp_path / "good.h5")
     (folder / "bad.png").write_bytes((folder / "a/00.png").read_bytes())
     assert list(extract_features(folder, tmp_path / "f.h5", FEW).counts) == ["bad.png"]
-
-
-def test_several_processes_give_the_same(
-    collection: Callable[..., Path], tmp_path: Path, same_content: Callable[..., bool]
-) -> None:
-    folder = collection(6)
-    for workers in (1, 2):
-        extract_features(folder, tmp_path / f"{workers}.h5", FEW, workers=workers)
-    assert same_content(tmp_path / "1.h5", tmp_path / "2.h5")
 
 
 def test_images_that_are_gone_lose_their_features(
@@ -169,12 +160,35 @@ def test_images_that_are_gone_lose_their_features(
     assert names() == ["a/02.png", "b/01.png"]
 
 
-@pytest.mark.parametrize("count", [0, 1, 255, 256, 600, 5000])
-def test_parts(count: int) -> None:
-    parts = shards_of(range(count), IMAGES_PER_SHARD)
-    assert [number for part in parts for number in part] == list(range(count))
-    assert all(1 <= len(part) <= IMAGES_PER_SHARD for part in parts)
-    assert len(parts) >= min(count, 256)
+def test_an_image_that_is_too_large_is_a_failure(
+    collection: Callable[..., Path], photo: np.ndarray, tmp_path: Path
+) -> None:
+    from PIL import Image
+
+    folder = collection(2)
+    Image.fromarray(photo).save(folder / "large.png")
+    report = extract_features(folder, tmp_path / "f.h5", FEW, workers=1, max_megapixels=0.02)
+    assert list(report.counts) == ["a/00.png", "b/01.png"]
+    (failure,) = report.failures
+    assert "large.png has 256x256 pixels, which is over 0.02 megapixels" in failure
+
+
+def test_weights_that_have_changed_are_loaded_again(
+    collection: Callable[..., Path], tmp_path: Path, same_content: Callable[..., bool]
+) -> None:
+    folder, weights = collection(1), tmp_path / "weights.onnx"
+    for name in ("dense", "free"):
+        weights.write_bytes(pretrained_weights(name).read_bytes())
+        detector = DeepDetect(weights, threads=1)
+        if name == "free":
+            with pytest.raises(OptionError, match=r"other settings \(`weights`\)"):
+                extract_features(folder, tmp_path / "f.h5", detector, workers=1)
+        options = {"selection": PIXELS, "workers": 1, "overwrite": True}
+        extract_features(folder, tmp_path / "f.h5", detector, **options)
+        own = DeepDetect(name, threads=1)
+        extract_features(folder, tmp_path / f"{name}.h5", own, **options)
+        assert same_content(tmp_path / "f.h5", tmp_path / f"{name}.h5")
+    assert not same_content(tmp_path / "dense.h5", tmp_path / "free.h5")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs process groups")

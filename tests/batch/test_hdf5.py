@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -126,22 +127,31 @@ def test_a_shard_is_whole_or_not_there(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_other_settings_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "out.h5"
-    with ShardedWriter(path, {"ratio": 0.8, "same": [1]}).opened() as file:
-        write_groups(file.shard(["x"]), [group("x", 1)])
-        file.merge()
-    other = {"ratio": 0.9, "same": (1,)}
-    with (
-        pytest.raises(OptionError, match=r"other settings \(`ratio`\).*--overwrite"),
-        ShardedWriter(path, other).opened(),
-    ):
-        pass
-    with ShardedWriter(path, other, overwrite=True).opened() as file:
-        assert file.done({"x": (1,)}) == set()
-        write_groups(file.shard(["y"]), [group("y", 2)])
-        file.merge()
-    assert values(path) == {"y": 2}
+def test_groups_are_written_one_by_one(tmp_path: Path) -> None:
+    """The memory does not grow with their number."""
+    made: list[weakref.ref] = []
+
+    def groups():
+        for k in range(9):
+            each = group(f"{k}", k)
+            made.append(weakref.ref(each.arrays["numbers"]))
+            yield each
+            assert sum(reference() is not None for reference in made) <= 3
+
+    write_groups(tmp_path / "part.h5", groups())
+    assert values(tmp_path / "part.h5") == {f"{k}": k for k in range(9)}
+
+
+@pytest.mark.parametrize("count", [0, 1, 255, 256, 600, 5000])
+def test_shards_are_small_and_hold_everything_once(count: int, tmp_path: Path) -> None:
+    items = [(number, (1,)) for number in range(count)]
+    paths, shards = [], []
+    for path, shard in ShardedWriter(tmp_path / "out.h5", {}).tasks(items, 16):
+        paths.append(path)
+        shards.append(shard)
+    assert [item for shard in shards for item in shard] == items
+    assert all(1 <= len(shard) <= 16 for shard in shards)
+    assert len(set(paths)) == len(shards) >= min(count, 256)
 
 
 def test_files_of_others_are_not_replaced(tmp_path: Path) -> None:
@@ -162,16 +172,26 @@ def test_files_of_others_are_not_replaced(tmp_path: Path) -> None:
         pass
 
 
-def test_shards_of_other_settings_are_not_used(tmp_path: Path) -> None:
+def test_other_settings_are_refused_and_their_shards_not_used(tmp_path: Path) -> None:
     path = tmp_path / "out.h5"
     for ratio in (0.8, 0.9):
-        with ShardedWriter(path, {"ratio": ratio}).opened() as file:
+        with ShardedWriter(path, {"ratio": ratio, "same": (1,)}).opened() as file:
             assert file.done({"x": (1,)}) == set()
             write_groups(file.shard(["x"]), [group("x", round(10 * ratio))])
-    with ShardedWriter(path, {"ratio": 0.8}).opened() as file:
+    with ShardedWriter(path, {"ratio": 0.8, "same": [1]}).opened() as file:
         assert file.done({"x": (1,)}) == {"x"}
         file.merge()
     assert values(path) == {"x": 8}
+    other = {"ratio": 0.9, "same": (1,)}
+    with (
+        pytest.raises(OptionError, match=r"other settings \(`ratio`\).*--overwrite"),
+        ShardedWriter(path, other).opened(),
+    ):
+        pass
+    with ShardedWriter(path, other, overwrite=True).opened() as file:
+        write_groups(file.shard(["y"]), [group("y", 2)])
+        file.merge()
+    assert values(path) == {"y": 2}
     assert list(tmp_path.iterdir()) == [path]
 
 

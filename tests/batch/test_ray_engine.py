@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -48,16 +48,12 @@ def test_outcomes_and_errors(monkeypatch: pytest.MonkeyPatch) -> None:
         list(map_on_ray(load_image, ["none.png"], 1))
 
 
-def start(
-    folder: Path,
-    output: Path,
-    address: str = "local",
-    words: Sequence[str] = ("extract", "--max-keypoints", "500"),
-) -> subprocess.Popen[str]:
-    """Start an extraction, or another command, on Ray."""
-    command = [sys.executable, "-m", "deepdetect", words[0], str(folder), "-o", str(output)]
+def start(folder: Path, output: Path, address: str = "local") -> subprocess.Popen[str]:
+    """Start an extraction on Ray."""
+    command = [sys.executable, "-m", "deepdetect", "extract", str(folder), "-o", str(output)]
+    command += ["--max-keypoints", "500", "--engine", "ray", "--workers", "2", "--json"]
     return subprocess.Popen(
-        [*command, *words[1:], "--engine", "ray", "--workers", "2", "--json"],
+        command,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -67,14 +63,10 @@ def start(
 
 
 def wait_for_shards(output: Path, count: int, process: subprocess.Popen[str]) -> None:
-    """Wait until so many parts of an extraction are written."""
-    wait_for_files(output.with_name(output.name + ".shards"), "*/[0-9a-f]*.h5", count, process)
-
-
-def wait_for_files(folder: Path, pattern: str, count: int, process: subprocess.Popen[str]) -> None:
-    """Wait until a folder has so many files of a pattern."""
+    """Wait until so many shards of an extraction are written."""
+    folder = output.with_name(output.name + ".shards")
     deadline = time.monotonic() + 600
-    while len(list(folder.glob(pattern))) < count:
+    while len(list(folder.glob("*/[0-9a-f]*.h5"))) < count:
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.01)

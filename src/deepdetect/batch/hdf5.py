@@ -37,35 +37,34 @@ SETTINGS = "deepdetect"
 """Attribute of the file: what its content depends on besides the inputs, as JSON."""
 
 STATE = "source_state"
-"""Attribute of a group: whole numbers that change when its input does."""
+"""Attribute of a group."""
 
 FORMAT = ("v110", "v110")
 """Of the files: read by HDF5 1.10 (2016) and later; groups of a million members stay fast."""
 
 
+MIN_SHARDS = 256
+"""Of as many inputs, so that all workers have something to do."""
+
+State = tuple[int, ...]
+"""Of an input of a group: whole numbers that change when it does."""
+
+
 @dataclass(frozen=True)
 class Group:
-    """A group of an HDF5 file.
+    """A group of an HDF5 file: its path, its datasets and their attributes by name.
 
-    Attributes:
-        name: its path in the file.
-        arrays: its datasets by name.
-        state: of its input.
-        attributes: of datasets, by the name of the dataset.
+    `state` is that of its input.
     """
 
     name: str
     arrays: Mapping[str, np.ndarray]
-    state: tuple[int, ...] = ()
+    state: State = ()
     attributes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
 
 def import_h5py() -> Any:
-    """Import h5py.
-
-    Raises:
-        MissingExtraError: it is not installed.
-    """
+    """Import h5py, or raise a MissingExtraError."""
     try:
         import h5py
     except ImportError:
@@ -81,7 +80,6 @@ def open_hdf5(path: Path) -> Iterator[Any]:
 
     Raises:
         DeepDetectError: it is missing or damaged, which may be found while it is read.
-        MissingExtraError: h5py is not installed.
     """
     h5py = import_h5py()
     if path.is_dir():
@@ -144,19 +142,15 @@ def write_groups(path: Path, groups: Iterable[Group]) -> None:
                 dataset.attrs.update(group.attributes.get(name, {}))
 
 
-def state_of(group: Any) -> tuple[int, ...]:
+def state_of(group: Any) -> State:
     """Return the state of a group's input; empty where another program has written it."""
     return tuple(int(number) for number in group.attrs.get(STATE, ()))
 
 
 class ShardedWriter:
-    """Writes an HDF5 file by shards, which many processes may fill.
+    """Writes an HDF5 file by shards, in PATH.shards beside it, which many processes may fill.
 
-    Args:
-        path: the file; the shards are in PATH.shards beside it.
-        settings: all that the content depends on besides the inputs. Shards of other settings are
-            not used.
-        overwrite: replace the file.
+    Settings are all that the content depends on besides the inputs; shards of others are not used.
     """
 
     def __init__(self, path: Path, settings: Mapping[str, Any], overwrite: bool = False) -> None:
@@ -191,7 +185,7 @@ class ShardedWriter:
         with lock(self.folder / "lock", self.path):
             yield self
 
-    def done(self, wanted: Mapping[str, tuple[int, ...]]) -> set[str]:
+    def done(self, wanted: Mapping[str, State]) -> set[str]:
         """Return which groups are in the file or in shards with the states that are wanted."""
         found: set[str] = set()
         for path in [self.path] * self.keep + self._shard_files():
@@ -202,16 +196,33 @@ class ShardedWriter:
                         found.add(name)
         return found
 
-    def shard(self, names: Sequence[str]) -> Path:
-        """Return the file for the shard with these groups: the same names give the same file."""
-        return self.shards / f"{key(list(names))}.h5"
+    def shard(self, names: Sequence[Any]) -> Path:
+        """Return the file for the shard of these inputs: the same names give the same file."""
+        return self.shards / f"{key(names)}.h5"
+
+    def tasks(
+        self, items: Sequence[tuple[Any, State]], most: int
+    ) -> list[tuple[Path, Sequence[tuple[Any, State]]]]:
+        """Divide inputs and their states into shards of at most so many, or fewer of a few."""
+        size = min(most, max(1, len(items) // MIN_SHARDS))
+        shards = [items[k : k + size] for k in range(0, len(items), size)]
+        return [(self.shard([name for name, _ in shard]), shard) for shard in shards]
+
+    @staticmethod
+    def collect(
+        outcomes: Iterable[tuple[dict[Any, int], list[str]]], bar: Any
+    ) -> tuple[dict[Any, int], list[str]]:
+        """Join the counts and the failures of shards as they are made."""
+        counts: dict[Any, int] = {}
+        failures: list[str] = []
+        for made, failed in outcomes:
+            bar.update(len(made) + len(failed))
+            counts |= made
+            failures += failed
+        return counts, failures
 
     def merge(self, quiet: bool = True, stays: Callable[[str], bool] = lambda name: True) -> None:
-        """Merge all shards into the file, and remove them.
-
-        Args:
-            quiet: show no progress bar.
-            stays: whether a group of this name may stay or be added.
+        """Merge all shards into the file, and remove them; `stays` says which groups may be in it.
 
         Raises:
             DeepDetectError: the file cannot be written; the shards stay.

@@ -18,13 +18,13 @@ from .._shared.progress import progress
 from .._shared.records import key
 from .._shared.registry import look_up
 from ..features.keypoints import Keypoints
-from ..features.matchers import MATCHERS, get_matcher
+from ..features.matchers import MATCHERS
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
 from ..matching.unguided import match_features
 from .engines import get_engine
-from .extraction import DESCRIPTOR, keypoints_of, shards_of
-from .hdf5 import SETTINGS, Group, ShardedWriter, damaged, open_hdf5, state_of, write_groups
+from .extraction import DESCRIPTOR, keypoints_of
+from .hdf5 import SETTINGS, Group, ShardedWriter, State, damaged, open_hdf5, state_of, write_groups
 from .pair_list import Pair, check_pairs, pair_name, read_pairs
 from .report import BatchReport
 
@@ -126,38 +126,18 @@ def match_pairs(
     settings = {**vars(options), "features": made_with, "version": __version__}
     work = partial(_match_shard, features=source, options=options)
     list(map_tasks(work, [], workers))  # what the engine lacks is said before a file is made
-    _require_matcher(options.matcher)
-    counts: dict[Pair, int] = {}
     with ShardedWriter(target, settings, overwrite).opened() as file:
         turned = {pair[::-1]: states[::-1] for pair, states in found.items()}
         wanted = {pair_name(*pair): sum(states, ()) for pair, states in (turned | found).items()}
         done = file.done(wanted)
         left = [p for p in found if done.isdisjoint((pair_name(*p), pair_name(*p[::-1])))]
-        tasks = [
-            (
-                file.shard([pair_name(*pair) for pair in shard]),
-                tuple((pair, wanted[pair_name(*pair)]) for pair in shard),
-            )
-            for shard in shards_of(sorted(left), PAIRS_PER_SHARD)
-        ]
+        items = [(pair, wanted[pair_name(*pair)]) for pair in sorted(left)]
         skipped = len(found) - len(left)
         with progress(len(found), "matching", "pair", quiet, skipped) as bar:
-            for matched, failed in map_tasks(work, tasks, workers):
-                bar.update(len(matched) + len(failed))
-                counts |= matched
-                failures += failed
+            tasks = file.tasks(items, PAIRS_PER_SHARD)
+            counts, failed = file.collect(map_tasks(work, tasks, workers), bar)
         file.merge(quiet, lambda name: name not in gone)
-    return BatchReport(Path(path), counts, skipped, tuple(failures), "pairs")
-
-
-def _require_matcher(name: str) -> None:
-    """Raise a MissingExtraError where what a matcher needs is not installed."""
-    if name == "faiss":
-        some = np.eye(2, dtype=np.float32)
-        get_matcher(name)(some, some, 1, 0)
-
-
-State = tuple[int, ...]
+    return BatchReport(Path(path), counts, skipped, (*failures, *failed), "pairs")
 
 
 def _find_pairs(
@@ -165,10 +145,9 @@ def _find_pairs(
 ) -> tuple[dict[Pair, tuple[State, State]], list[str], set[str], str]:
     """Look for the features of pairs.
 
-    Returns:
-        Pairs that can be matched, with the states of their features; a sentence on each other;
-        groups of pairs without features, whose matches would point nowhere; and a digest of the
-        settings of the features.
+    Return pairs that can be matched, with the states of their features; a sentence on each other;
+    groups of pairs without features, whose matches would point nowhere; and a digest of the
+    settings of the features.
     """
     found: dict[Pair, tuple[State, State]] = {}
     failures: list[str] = []
@@ -207,7 +186,7 @@ def _state(file: Any, name: str) -> State | None:
 
 
 def _match_shard(
-    task: tuple[Path, tuple[tuple[Pair, State], ...]], features: Path, options: PairMatchingOptions
+    task: tuple[Path, Sequence[tuple[Pair, State]]], features: Path, options: PairMatchingOptions
 ) -> tuple[dict[Pair, int], list[str]]:
     """Write a shard; return the number of matches of each pair, and what could not be done."""
     path, pairs = task

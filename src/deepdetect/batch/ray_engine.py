@@ -17,12 +17,7 @@ from typing import Any
 
 from .._shared.errors import DeepDetectError, MissingExtraError, OptionError
 from .._shared.memory import disable_malloc_trim
-from .._shared.parallel import (
-    Outcome,
-    Task,
-    processor_count,
-    use_one_thread,
-)
+from .._shared.parallel import Outcome, Task, processor_count, use_one_thread
 
 MAX_BLOCKS = 4096
 """Parts of the work that Ray schedules: each costs a few milliseconds, and is repeated as a whole
@@ -31,9 +26,6 @@ where its worker dies."""
 PROCESSORS_PER_WORKER = 0.5
 """That are reserved. A worker uses one; when half of the machines are lost, those that are left
 have room for all workers. (Tasks wait for their worker, and would wait for ever.)"""
-
-START_TRIES = 3
-"""Of a cluster that is started here."""
 
 OBJECT_STORE_BYTES = 200_000_000
 """Shared memory of a cluster that is started here: outcomes are small, results go to files."""
@@ -56,14 +48,6 @@ def map_on_ray(
     or that runs on this machine (`ray start`), else, or with RAY_ADDRESS=local, one that is started
     here and ends with the work. All its machines need this package, and the files under the same
     paths.
-
-    Args:
-        function: a module-level function, which may run twice for a task; it runs on one thread.
-        tasks: its arguments, which are pickled for the workers.
-        workers: number of workers; default one per processor of the cluster.
-
-    Yields:
-        The outcomes, in the order in which they are ready.
 
     Raises:
         MissingExtraError: Ray is not installed.
@@ -134,25 +118,21 @@ def _import_ray() -> Any:
 
 
 def _start_cluster(ray: Any, processors: int, quiet: dict[str, Any]) -> None:
-    for left in reversed(range(START_TRIES)):
-        try:
-            ray.init(
-                address="local",
-                num_cpus=processors,
-                include_dashboard=False,
-                object_store_memory=OBJECT_STORE_BYTES,
-                **quiet,
-            )
-            return
-        except Exception as error:  # it waits half a minute for its parts, and raises many kinds
-            ray.shutdown()
-            if left:
-                continue
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-            raise DeepDetectError(
-                f"Ray does not start ({reason}): wait until the machine is less busy, or use the "
-                "engine processes"
-            ) from error
+    try:
+        ray.init(
+            address="local",
+            num_cpus=processors,
+            include_dashboard=False,
+            object_store_memory=OBJECT_STORE_BYTES,
+            **quiet,
+        )
+    except Exception as error:  # it waits half a minute for its parts, and raises many kinds
+        ray.shutdown()
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise DeepDetectError(
+            f"Ray does not start ({reason}): wait until the machine is less busy, or use the "
+            "engine processes"
+        ) from error
 
 
 @contextmanager

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.options import suggest_keywords
@@ -38,10 +37,7 @@ class DeepDetectDetector(Module):
     """
 
     @suggest_keywords
-    def __init__(
-        self,
-        detector: PointDetector = PointDetector(),
-    ) -> None:
+    def __init__(self, detector: PointDetector = PointDetector()) -> None:
         super().__init__()
         self._laf_from_center_scale_ori = import_package("kornia.feature").laf_from_center_scale_ori
         self._detector = detector
@@ -61,15 +57,14 @@ class DeepDetectDetector(Module):
         Raises:
             ImageError: an image is not fit.
         """
+        return self._frames(_found(self._detector.detect, img, mask), img)
+
+    def _frames(self, found: list[Keypoints], img: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the LAFs and the scores of a batch."""
         import torch
 
-        found = [
-            self._detector.detect(image_from_tensor(one), ignore=hidden)
-            for one, hidden in zip(img, _hidden(mask, img), strict=True)
-        ]
         lafs = [self._lafs(points) for points in found]
-        scores = [torch.from_numpy(points.scores) for points in found]
-        return _padded(lafs, img), _padded(scores, img)
+        return _padded(lafs, img), _padded([torch.from_numpy(one.scores) for one in found], img)
 
     def _lafs(self, points: Keypoints) -> Tensor:
         """Return (N, 2, 3) frames."""
@@ -109,30 +104,27 @@ class DeepDetectFeature(DeepDetectDetector):
         """
         import torch
 
-        found = [
-            self._detector.extract(image_from_tensor(one), ignore=hidden)
-            for one, hidden in zip(img, _hidden(mask, img), strict=True)
-        ]
-        lafs = [self._lafs(points) for points in found]
-        scores = [torch.from_numpy(points.scores) for points in found]
+        found = _found(self._detector.extract, img, mask)
         descriptors = [
             torch.from_numpy(unit_length(points.descriptors))
             for points in found
             if points.descriptors is not None  # always
         ]
-        return _padded(lafs, img), _padded(scores, img), _padded(descriptors, img)
+        return *self._frames(found, img), _padded(descriptors, img)
 
 
-def _hidden(mask: Tensor | None, img: Tensor) -> list[np.ndarray | None]:
-    """Return for each image where no keypoint is wanted."""
+def _found(find: Callable[..., Keypoints], img: Tensor, mask: Tensor | None) -> list[Keypoints]:
+    """Return the keypoints of each image, where the mask is above 0."""
+    images = [image_from_tensor(one) for one in img]
     if mask is None:
-        return [None] * len(img)
+        return [find(image) for image in images]
     if mask.shape != (len(img), 1, *img.shape[-2:]):
         raise OptionError(
             f"the mask must have the shape {(len(img), 1, *img.shape[-2:])}, "
             f"not {tuple(mask.shape)}"
         )
-    return [(one[0] <= 0).cpu().numpy() for one in mask]
+    hidden = [(one[0] <= 0).cpu().numpy() for one in mask]
+    return [find(image, ignore=where) for image, where in zip(images, hidden, strict=True)]
 
 
 def _padded(rows: list[Tensor], img: Tensor) -> Tensor:

@@ -42,10 +42,7 @@ class DeepDetectExtractor(Module):
 
     @suggest_keywords
     def __init__(
-        self,
-        detector: PointDetector = PointDetector(),
-        *,
-        scale: Scale = "diameter",
+        self, detector: PointDetector = PointDetector(), *, scale: Scale = "diameter"
     ) -> None:
         super().__init__()
         if detector.max_keypoints is None or detector.max_keypoints > MAX_KEYPOINTS:

@@ -43,10 +43,7 @@ class DeepDetectFeature2D:
 
     @suggest_keywords
     def __init__(
-        self,
-        detector: PointDetector = PointDetector(),
-        *,
-        channels: Channels = "bgr",
+        self, detector: PointDetector = PointDetector(), *, channels: Channels = "bgr"
     ) -> None:
         check_channels(channels)
         self._channels = channels

@@ -25,12 +25,7 @@ HOW_TO_INSTALL = {
 
 
 def missing_package(module: str) -> MissingExtraError:
-    """Return the error for a package that is not installed, for the caller to raise.
-
-    Example:
-        >>> print(missing_package("h5py"))
-        the drop-in for h5py needs the package h5py, which is not installed: run pip install h5py
-    """
+    """Return the error for a package that is not installed, for the caller to raise."""
     package = module.partition(".")[0]
     install = HOW_TO_INSTALL.get(package, install_command(package))
     program = "PyTorch" if package == "torch" else package
@@ -66,21 +61,16 @@ class _Missing(type):
 
 
 def base_class(module: str, name: str) -> type:
-    """Return a class to derive from, of a package that need not be installed.
+    """Return a class to derive from, as "Module" of "torch.nn", of a package that may be missing.
 
-    Without the package modules can still be imported; what is derived from the class raises a
-    MissingExtraError when it is used.
-
-    Args:
-        module: where the class is, as "torch.nn".
-        name: of the class.
+    What is derived from it then raises a MissingExtraError when it is used.
 
     Example:
         >>> base_class("no_such_package", "Model")()
         Traceback (most recent call last):
         ...
         deepdetect.MissingExtraError: the drop-in for no_such_package needs the package \
-no_such_package, which is not installed: run pip install no_such_package
+    no_such_package, which is not installed: run pip install no_such_package
     """
     if importlib.util.find_spec(module.partition(".")[0]) is None:
         return _Missing(name, (), {"module": module})

@@ -54,10 +54,7 @@ class DeepDetectFeatures:
     descriptors: np.ndarray | None = None
 
     @suggest_keywords
-    def __init__(
-        self,
-        detector: PointDetector = PointDetector(),
-    ) -> None:
+    def __init__(self, detector: PointDetector = PointDetector()) -> None:
         self._detector = detector
 
     def detect(self, image: Any) -> None:

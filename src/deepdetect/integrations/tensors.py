@@ -16,14 +16,7 @@ OVERSHOOT = 0.25
 
 
 def image_from_tensor(image: torch.Tensor) -> np.ndarray:
-    """Return a (C, H, W) tensor as (H, W, 3) uint8 RGB.
-
-    Args:
-        image: of 1 or 3 channels, red first, in [0, 1].
-
-    Raises:
-        ImageError: the image is not fit, as of `load_image`.
-    """
+    """Return a (C, H, W) tensor of 1 or 3 channels, red first, in [0, 1], as (H, W, 3) uint8."""
     values: Any = image.detach().float().cpu().numpy()
     if values.size and values.min() >= -OVERSHOOT and values.max() <= 1 + OVERSHOOT:
         values = np.clip(values, 0, 1)

@@ -17,7 +17,6 @@ from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.heatmap import MAX_AUTO_PIXELS, STRIDE
 from ..detector.pretrained import resolve_weights
-from ..features.keypoints import Keypoints
 from ..features.selection import Maps, SelectionOptions, select_from_maps
 from ..io.image import load_image
 from .packages import base_class, import_package
@@ -74,9 +73,7 @@ class DeepDetectConfig(PreTrainedConfig):
     def selection(self) -> SelectionOptions:
         """Return the options of selection."""
         return SelectionOptions(
-            self.keypoint_threshold,
-            max_keypoints=self.max_keypoints,
-            nms_radius=self.nms_radius,
+            self.keypoint_threshold, max_keypoints=self.max_keypoints, nms_radius=self.nms_radius
         )
 
 
@@ -151,13 +148,7 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
             WeightsError: the weights are missing, damaged or do not fit.
             OptionError: an option is unknown or out of its range.
         """
-        model = cls(
-            DeepDetectConfig(
-                keypoint_threshold=keypoint_threshold,
-                max_keypoints=max_keypoints,
-                nms_radius=nms_radius,
-            )
-        )
+        model = cls(DeepDetectConfig(keypoint_threshold, max_keypoints, nms_radius))
         from ..detector.network.weights import load_network
 
         network = load_network(resolve_weights(weights, ".safetensors"))
@@ -182,7 +173,6 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
             return_dict: False for a tuple instead of the output by names.
             **keywords: not used; programs that go through all models give some.
         """
-        import torch
         from torch.nn.functional import binary_cross_entropy_with_logits
 
         sizes = _sizes(pixel_values, pixel_mask)
@@ -193,20 +183,24 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
             loss = binary_cross_entropy_with_logits(
                 logits, labels.to(logits.dtype), weight, reduction="sum"
             ) / (logits.numel() if weight is None else weight.sum())
-        found = self._select(logits, sizes)
-        most = max(len(points) for points in found)
-        keypoints, scores = (
-            logits.new_zeros(len(found), most, 2),
-            logits.new_zeros(len(found), most),
-        )
-        mask = torch.zeros(len(found), most, dtype=torch.int, device=logits.device)
-        for row, points in enumerate(found):
-            relative = (points.xy + np.float32(0.5)) / np.array(points.image_size, np.float32)
-            keypoints[row, : len(points)] = torch.from_numpy(relative).to(logits)
-            scores[row, : len(points)] = torch.from_numpy(points.scores).to(logits)
-            mask[row, : len(points)] = 1
+        maps = logits.detach().float().cpu().numpy()
+        found = [
+            select_from_maps(
+                Maps.of_logits(np.ascontiguousarray(values[:height, :width])),
+                self.config.selection(),
+            )
+            for values, (height, width) in zip(maps, sizes, strict=True)
+        ]
+        relative = [
+            (points.xy + np.float32(0.5)) / np.array(points.image_size, np.float32)
+            for points in found
+        ]
         output = DeepDetectKeypointOutput(
-            loss=loss, logits=logits, keypoints=keypoints, scores=scores, mask=mask
+            loss=loss,
+            logits=logits,
+            keypoints=_padded(relative).to(logits),
+            scores=_padded([points.scores for points in found]).to(logits),
+            mask=_padded([np.ones(len(points), np.int32) for points in found]).to(logits.device),
         )
         if return_dict is None:
             return_dict = getattr(self.config, "return_dict", True)
@@ -227,15 +221,6 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
             )
             logits[rows, :height, :width] = self.network(filled)[:, 0, :height, :width].to(logits)
         return logits
-
-    def _select(self, logits: Tensor, sizes: list[tuple[int, int]]) -> list[Keypoints]:
-        """Select the keypoints of each image."""
-        options = self.config.selection()
-        maps = logits.detach().float().cpu().numpy()
-        return [
-            select_from_maps(Maps.of_logits(np.ascontiguousarray(values[:height, :width])), options)
-            for values, (height, width) in zip(maps, sizes, strict=True)
-        ]
 
 
 class DeepDetectImageProcessor(BaseImageProcessor):
@@ -347,6 +332,14 @@ def register() -> None:
     transformers.AutoImageProcessor.register(
         config, slow_image_processor_class=DeepDetectImageProcessor, exist_ok=True
     )
+
+
+def _padded(arrays: list[np.ndarray]) -> Tensor:
+    """Return arrays of unequal lengths as one tensor, filled with zeros."""
+    import torch
+
+    tensors = [torch.from_numpy(array) for array in arrays]
+    return torch.nn.utils.rnn.pad_sequence(tensors, batch_first=True)
 
 
 def _sizes(pixel_values: Tensor, pixel_mask: Tensor | None) -> list[tuple[int, int]]:

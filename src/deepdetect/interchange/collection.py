@@ -131,14 +131,7 @@ def describe_collection(collection: Collection, quiet: bool = True) -> Collectio
 
 
 def check_names(names: Iterable[str]) -> None:
-    """Refuse names that a list of names with blanks between them cannot hold.
-
-    Raises:
-        OptionError: a name has a blank.
-
-    Example:
-        >>> check_names(["db/1.jpg"])
-    """
+    """Refuse names with blanks, which a list of names with blanks between them cannot hold."""
     for name in names:
         if len(name.split()) != 1:
             raise OptionError(f"lists of this format separate names by blanks: rename {name!r}")
@@ -147,11 +140,7 @@ def check_names(names: Iterable[str]) -> None:
 def check_upright(paths: Iterable[Path]) -> None:
     """Refuse images that EXIF turns, for readers that take the size from the file as it is stored.
 
-    Args:
-        paths: of images; those that cannot be read are not checked.
-
-    Raises:
-        OptionError: one is to be turned.
+    Those that cannot be read are not checked.
     """
     for path in paths:
         try:

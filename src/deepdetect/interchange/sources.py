@@ -77,11 +77,7 @@ def read_collection(
 
 
 def read_features_file(path: Path) -> dict[str, Keypoints]:
-    """Read all features of an HDF5 file of hloc's layout, by the name of the image.
-
-    Raises:
-        DeepDetectError: the file is missing or damaged, or holds no features.
-    """
+    """Read all features of an HDF5 file of hloc's layout, by the name of the image."""
     h5py = import_h5py()
     names: list[str] = []
     found: dict[str, Keypoints] = {}
@@ -106,11 +102,9 @@ def read_features_file(path: Path) -> dict[str, Keypoints]:
 
 
 def read_matches_file(path: Path, keypoints: Mapping[str, Keypoints]) -> dict[Pair, PairMatches]:
-    """Read all matches of an HDF5 file of hloc's layout.
+    """Read all matches of these keypoints from an HDF5 file of hloc's layout.
 
-    Args:
-        path: the file.
-        keypoints: that were matched, by the name of the image; the file writes "-" for "/" in it.
+    The file writes "-" for "/" in the names of images.
 
     Raises:
         DeepDetectError: the file is missing or damaged, holds no matches, it is not known of which

@@ -16,32 +16,18 @@ HEADROOM = 4.0
 
 
 def save_depth_png(depth: np.ndarray, path: Path, unit: str) -> dict[str, str | float]:
-    """Write a depth map as a grey PNG of 16 bits, whole or not at all.
+    """Write a depth map as a grey PNG of 16 bits, whole or not at all; return what is in it.
 
-    value = round(depth * value_per_unit), and 0 where the depth is unknown. Unit and scale
-    are also written into the PNG, as text chunks `unit` and `value_per_unit`.
-
-    Args:
-        depth: (H, W) depths; not finite, 0 or less: unknown.
-        path: the file.
-        unit: of the depths, as "mm" or "baseline" (multiples of the distance of the two cameras).
-
-    Returns:
-        `unit`; `value_per_unit`, the finest of 1, 2 or 5 times a power of ten that holds all
-        depths up to 4 times the 99th percentile; `unknown`, the value of unknown pixels;
-        `known_pixels`; and `out_of_range`, the number of pixels whose depth 16 bits cannot hold at
-        this scale: they are written as unknown, never as another depth.
-
-    Raises:
-        DeepDetectError: the file cannot be written.
+    value = round(depth * value_per_unit), and 0 where the depth is unknown: not finite, 0 or less.
+    `value_per_unit` is the finest of 1, 2 or 5 times a power of ten that holds all depths up to 4
+    times the 99th percentile; those that do not fit, `out_of_range`, are written as unknown. Unit
+    and scale are also in the PNG, as text chunks `unit` and `value_per_unit`.
 
     Example:
         >>> import tempfile
         >>> path = Path(tempfile.mkdtemp()) / "depth.png"
         >>> save_depth_png(np.array([[500.25, np.nan, 3000.0]]), path, "mm")
         {'unit': 'mm', 'value_per_unit': 20.0, 'unknown': 0, 'known_pixels': 2, 'out_of_range': 0}
-        >>> np.asarray(Image.open(path)).tolist()
-        [[10005, 0, 60000]]
     """
     known = np.isfinite(depth) & (depth > 0)
     scale = _scale(depth[known])
@@ -63,17 +49,7 @@ def save_depth_png(depth: np.ndarray, path: Path, unit: str) -> dict[str, str | 
 
 
 def save_depth_npz(depth: np.ndarray, path: Path, unit: str, **arrays: np.ndarray) -> None:
-    """Write a depth map as floats, whole or not at all.
-
-    Args:
-        depth: (H, W) depths; not finite, 0 or less: unknown, written as NaN.
-        path: the file; it gets `depth` (H, W) float32 and `unit`.
-        unit: as for `save_depth_png`.
-        **arrays: further arrays, as `disparity`.
-
-    Raises:
-        DeepDetectError: the file cannot be written.
-    """
+    """Write `depth` (H, W) float32, NaN where it is unknown, its `unit`, and further arrays."""
     known = np.isfinite(depth) & (depth > 0)
     stored = np.where(known, depth, np.nan).astype(np.float32)
     with atomic_path(path) as temporary, temporary.open("wb") as file:

@@ -36,29 +36,16 @@ ADVICE = "give `focal_px` or `calibration`"
 
 
 def calibration_from_exif(image0: Any, image1: Any, size0: Size, size1: Size) -> Calibration:
-    """Read a calibration from two photographs; the principal points are in the middle.
-
-    Args:
-        image0, image1: files or PIL images, as for `load_image`.
-        size0, size1: (width, height) in pixels as `load_image` returns them: files are turned
-            upright, PIL images are not.
-
-    Raises:
-        ReconstructionError: a photograph carries no usable focal length.
-    """
+    """Read a calibration from two photographs; arguments and errors as of `camera_from_exif`."""
     left, right = camera_from_exif(image0, size0), camera_from_exif(image1, size1)
     return Calibration(left, right, source="EXIF")
 
 
 def camera_from_exif(image: Any, size: Size) -> Camera:
-    """Read the camera of a photograph.
+    """Read the camera of a photograph, a file or a PIL image, of (width, height) as it is loaded.
 
-    Its focal length is that of FocalLength and the resolution of the sensor, where these agree
-    with FocalLengthIn35mmFilm or it is missing; else that of FocalLengthIn35mmFilm.
-
-    Args:
-        image: a path, a file's content as bytes, an open binary file, or a PIL image.
-        size: (width, height) in pixels, as `load_image` returns it.
+    Its focal length is that of FocalLength and the resolution of the sensor, where these agree with
+    FocalLengthIn35mmFilm or it is missing; else that of FocalLengthIn35mmFilm.
 
     Raises:
         ReconstructionError: it carries no usable focal length, or has been cropped since.

@@ -31,16 +31,10 @@ FLOAT, UNSIGNED_SHORT, ARRAY_BUFFER, POINTS = 5126, 5123, 34962, 0
 
 
 def write_glb(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> None:
-    """Write the points in glTF's frame, x right, y up, z backward, with their colours.
+    """Write the points in glTF's frame with their colours, 20 bytes per point.
 
-    (x, y, z) becomes (x, -y, -z), which is a half turn about the x axis: nothing is mirrored.
-    Colours become linear as glTF requires, with 16 bits, which keep each of the 256 sRGB
-    levels apart. 20 bytes per point.
-
-    Args:
-        cloud: the cloud; millimetres become metres, a baseline becomes 1 metre.
-        path: the file.
-        metadata: stored in the asset's extras, with unit and frame.
+    Colours become linear as glTF requires, with 16 bits, which keep each of the 256 sRGB levels
+    apart. The metadata are in the asset's extras, with unit and frame.
     """
     positions = to_gltf_frame(cloud).astype("<f4")
     colors = np.full((len(cloud), 4), 65535, "<u2")
@@ -58,13 +52,7 @@ def write_glb(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> Non
 
 
 def to_gltf_frame(cloud: PointCloud) -> np.ndarray:
-    """Return the points in glTF's frame: x right, y up, z backward, in metres.
-
-    Example:
-        >>> cloud = PointCloud([[10.0, 20.0, 3000.0]], [[0, 0, 0]], "mm")
-        >>> to_gltf_frame(cloud).tolist()
-        [[0.01, -0.02, -3.0]]
-    """
+    """Return the points with x right, y up, z backward, in metres: a half turn about the x axis."""
     return cloud.points * (np.array([1, -1, -1]) * METRES_PER_UNIT[cloud.unit])
 
 
@@ -77,6 +65,9 @@ def _linear_levels() -> np.ndarray:
 
 def _tree(cloud: PointCloud, positions: np.ndarray, metadata: Mapping[str, str]) -> dict[str, Any]:
     count = len(cloud)
+    box = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
+    primitive = {"attributes": {"POSITION": 0, "COLOR_0": 1}, "mode": POINTS, "material": 0}
+    rough = {"metallicFactor": 0, "roughnessFactor": 1}
     return {
         "asset": {
             "version": "2.0",
@@ -90,46 +81,18 @@ def _tree(cloud: PointCloud, positions: np.ndarray, metadata: Mapping[str, str])
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "point cloud"}],
-        "meshes": [
-            {
-                "primitives": [
-                    {"attributes": {"POSITION": 0, "COLOR_0": 1}, "mode": POINTS, "material": 0}
-                ]
-            }
-        ],
+        "meshes": [{"primitives": [primitive]}],
         # Points without normals are not lit; the extension says so to all viewers.
         "extensionsUsed": ["KHR_materials_unlit"],
-        "materials": [
-            {
-                "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 1},
-                "extensions": {"KHR_materials_unlit": {}},
-            }
-        ],
+        "materials": [{"pbrMetallicRoughness": rough, "extensions": {"KHR_materials_unlit": {}}}],
         "accessors": [
-            {
-                "bufferView": 0,
-                "componentType": FLOAT,
-                "count": count,
-                "type": "VEC3",
-                "min": positions.min(0).tolist(),
-                "max": positions.max(0).tolist(),
-            },
-            {
-                "bufferView": 1,
-                "componentType": UNSIGNED_SHORT,
-                "normalized": True,
-                "count": count,
-                "type": "VEC4",
-            },
+            {"bufferView": 0, "componentType": FLOAT, "type": "VEC3", "count": count, **box},
+            {"bufferView": 1, "componentType": UNSIGNED_SHORT, "type": "VEC4", "count": count}
+            | {"normalized": True},
         ],
         "bufferViews": [
-            {"buffer": 0, "byteOffset": 0, "byteLength": 12 * count, "target": ARRAY_BUFFER},
-            {
-                "buffer": 0,
-                "byteOffset": 12 * count,
-                "byteLength": 8 * count,
-                "target": ARRAY_BUFFER,
-            },
+            {"buffer": 0, "byteOffset": offset, "byteLength": length, "target": ARRAY_BUFFER}
+            for offset, length in ((0, 12 * count), (12 * count, 8 * count))
         ],
         "buffers": [{"byteLength": 20 * count}],
     }

@@ -39,7 +39,6 @@ SHORT_UNITS = {"mm": "mm", "baseline": "baselines", "spacing": "spacings"}
 CAMERA_SIZE = 0.35
 """Depth of the pyramid that stands for a camera, over the distance to the nearest other one."""
 
-
 OVERVIEW_RADIANS = (0.4, 0.5)
 """Azimuth and elevation from which a page with cameras is first seen."""
 
@@ -49,13 +48,9 @@ OVERVIEW_POINTS = 2000
 
 @dataclass(frozen=True, eq=False)
 class PagePoints:
-    """Points as the page stores them: position = offset + levels * step.
+    """Points (N, 3) as the page stores them: position = offset + levels * step.
 
-    Attributes:
-        levels: (N, 3) uint16.
-        colors: (N, 3) uint8.
-        offset, step: (3,) float64, in the cloud's unit.
-        left_out: number of points too far away for the page.
+    `left_out` is the number of points too far away for the page.
     """
 
     levels: np.ndarray
@@ -73,12 +68,8 @@ def write_html_page(
 ) -> None:
     """Write the page: 12 bytes per point, as 16-bit positions and 8-bit colours in base64.
 
-    Args:
-        cloud: the cloud.
-        path: the file.
-        metadata: added to the caption, which has the counts, the unit and the precision; the
-            entry "title" becomes the heading.
-        cameras: drawn as pyramids, with a line from each to the next.
+    The metadata are added to the caption, which has the counts, the unit and the precision; the
+    entry "title" becomes the heading. Cameras are pyramids, with a line from each to the next.
     """
     stored = page_points(cloud)
     caption = {
@@ -107,12 +98,6 @@ def page_points(cloud: PointCloud) -> PagePoints:
     """Quantise positions to 16 bits per axis, without those far outside the robust box.
 
     A few points very far away would make the steps coarse for all.
-
-    Example:
-        >>> points = np.array([[0.0, 0.0, 1.0]] * 99 + [[1.0, 1.0, 2.0]] * 99 + [[0, 0, 1e6]])
-        >>> stored = page_points(PointCloud(points, np.zeros((199, 3), np.uint8), "mm"))
-        >>> stored.left_out, (stored.offset + stored.levels * stored.step).max(0).tolist()
-        (1, [1.0, 1.0, 2.0])
     """
     box = robust_box(cloud)
     # Points on a line or a plane have a flat box: the margin is that of the box's radius.
@@ -126,15 +111,7 @@ def page_points(cloud: PointCloud) -> PagePoints:
 
 
 def camera_lines(cameras: Sequence[PosedView]) -> np.ndarray:
-    """Return the ends (N, 2, 3) of the lines that draw cameras, and the path from each to the next.
-
-    Example:
-        >>> from deepdetect.geometry.camera import Camera
-        >>> poses = [(np.eye(3), np.array([x, 0.0, 0])) for x in (0.0, -1.0)]
-        >>> cameras = [PosedView("", Camera((64, 48), 50.0), *pose) for pose in poses]
-        >>> camera_lines(cameras).shape, camera_lines(cameras)[-1].tolist()
-        ((17, 2, 3), [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
-    """
+    """Return the ends (N, 2, 3) of lines that draw cameras, and the path from each to the next."""
     if not len(cameras):
         return np.empty((0, 2, 3))
     centres = np.array([camera.centre for camera in cameras])

@@ -112,14 +112,10 @@ def scale_short_side(rgb: np.ndarray, short_side: int) -> np.ndarray:
 
 
 def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
-    """List the image files below a folder, sorted by path: "2.png" comes before "10.png".
-
-    Args:
-        folder: the folder.
-        exclude: folders below it that are left out, such as the output folder.
+    """List the image files below a folder in natural order: "2.png" comes before "10.png".
 
     Raises:
-        ImageError: the folder is missing, is a file, or holds no image.
+        ImageError: the folder is missing, is a file, or holds no image outside of `exclude`.
     """
     from natsort import natsorted, ns
 

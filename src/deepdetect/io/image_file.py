@@ -48,11 +48,8 @@ def limit_megapixels(max_megapixels: float) -> Iterator[None]:
     """Refuse larger images than these in the block, where a call gives no limit of its own.
 
     It is for commands: what reads a photograph, and how often, lies deep below them.
-
-    Raises:
-        OptionError: `max_megapixels` is not above 0.
     """
-    token = _limit.set(_check_limit(max_megapixels))
+    token = _limit.set(megapixel_limit(max_megapixels))
     try:
         yield
     finally:
@@ -60,15 +57,9 @@ def limit_megapixels(max_megapixels: float) -> Iterator[None]:
 
 
 def megapixel_limit(max_megapixels: float | None) -> float:
-    """Return the limit that is given, or what `--max-megapixels` says, for other processes.
-
-    Raises:
-        OptionError: `max_megapixels` is not above 0.
-    """
-    return _limit.get() if max_megapixels is None else _check_limit(max_megapixels)
-
-
-def _check_limit(max_megapixels: float) -> float:
+    """Return the limit that is given, or what `--max-megapixels` says, for other processes."""
+    if max_megapixels is None:
+        return _limit.get()
     if not (isinstance(max_megapixels, (int, float)) and max_megapixels > 0):
         raise OptionError(f"`max_megapixels` must be above 0, not {max_megapixels}")
     return max_megapixels
@@ -80,21 +71,14 @@ def open_image(
 ) -> Iterator[Any]:
     """Open an image file as a PIL image; its pixels are decoded when it is loaded.
 
-    Args:
-        source: a path; the content of a file, as bytes; or a binary file, which is read from its
-            beginning and stays open.
-        what: what errors call an image that has no name.
-        max_megapixels: larger images are refused before they are decoded. None: 200, or the
-            limit of `limit_megapixels`.
-
-    Yields:
-        The image. Errors of Pillow in the block become those below.
+    The source is a path; the content of a file, as bytes; or a binary file, which is read from its
+    beginning and stays open. Errors of Pillow in the block become those below; they call an image
+    without a name by `what`.
 
     Raises:
         ImageError: the file is missing, truncated, damaged (as far as its format lets one see),
-            too large or no image.
+            larger than `max_megapixels` or no image.
         MissingExtraError: it is a HEIF image, and pillow-heif is not installed.
-        OptionError: `max_megapixels` is not above 0.
     """
     limit = megapixel_limit(max_megapixels)
     name = file_name(source, what)
@@ -102,16 +86,17 @@ def open_image(
         with _binary_file(source, name) as file:
             _check_png(file, name)
             with _identify(file, name) as image:
-                _check_size(image.size, name, limit)
+                width, height = image.size
+                if width * height > 1e6 * limit:
+                    raise ImageError(
+                        f"{name} has {width}x{height} pixels, which is over {limit:g} megapixels: "
+                        "make it smaller, or allow more by `max_megapixels`"
+                    )
                 yield image
     except DeepDetectError:
         raise
     except FileNotFoundError:
         raise MissingImageError(f"there is no file {name}: check the path") from None
-    except IsADirectoryError:
-        raise ImageError(f"{name} is a folder: name an image file") from None
-    except PermissionError:
-        raise ImageError(f"{name} may not be read: check its rights") from None
     except OSError as error:  # of the file system; Pillow's have no number
         if error.errno is None:
             raise damaged_image(name, error) from None
@@ -223,15 +208,6 @@ def _identify(file: BinaryIO, name: str) -> Any:
     if heif:
         raise MissingExtraError(f"{name} is a HEIF image: run pip install pillow-heif to read it")
     raise ImageError(f"{name} is not an image that can be read: use PNG or JPEG")
-
-
-def _check_size(size: tuple[int, int], name: str, max_megapixels: float) -> None:
-    megapixels = size[0] * size[1] / 1e6
-    if megapixels > max_megapixels:
-        raise ImageError(
-            f"{name} has {size[0]}x{size[1]} pixels, which is over {max_megapixels:g} megapixels: "
-            "make it smaller, or allow more by `max_megapixels`"
-        )
 
 
 def _hide_warning_of_large_images() -> None:

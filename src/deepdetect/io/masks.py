@@ -28,20 +28,10 @@ def encode_mask(mask: np.ndarray) -> bytes:
 
 
 def load_mask(source: Any, *, max_megapixels: float | None = None) -> np.ndarray:
-    """Read a mask of any bit depth: True where a pixel is brighter than half.
+    """Read a mask of any bit depth as (H, W) bool: True where a pixel is brighter than half.
 
-    In a file that holds only zeros and ones, the ones are True.
-
-    Args:
-        source: a path, the content of a file as bytes, or an open binary file.
-        max_megapixels: larger files are refused before they are decoded. None: 200, or what
-            `--max-megapixels` says.
-
-    Returns:
-        (H, W) bool.
-
-    Raises:
-        ImageError: the file is missing, damaged, too large or no image.
+    In a file that holds only zeros and ones, the ones are True. Arguments and errors are those of
+    `open_image`.
     """
     with open_image(source, what="mask", max_megapixels=max_megapixels) as opened:
         deep = opened.mode.startswith("I")  # 16 bits per pixel

@@ -25,10 +25,7 @@ UNIT_NAMES = {
 def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> None:
     """Write float x y z and uchar red green blue, little-endian, 15 bytes per point.
 
-    Args:
-        cloud: the cloud; its frame and unit are kept, and written as comments.
-        path: the file.
-        metadata: further comments; what is not ASCII becomes "?".
+    Frame, unit and metadata are comments, in which what is not ASCII becomes "?".
     """
     vertices = np.empty(len(cloud), VERTEX)
     vertices["xyz"] = cloud.points

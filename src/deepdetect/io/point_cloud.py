@@ -61,11 +61,7 @@ def save_point_cloud(cloud: PointCloud, path: str | Path, metadata: Metadata | N
 
 
 def find_writer(path: str | Path) -> PointCloudWriter:
-    """Return the writer for a path; also used to check a suffix before the work begins.
-
-    Raises:
-        OptionError: the suffix is unknown (the nearest right one is named).
-    """
+    """Return the writer for a path; also used to check a suffix before the work begins."""
     return look_up("ending", Path(path).suffix.lower(), POINT_CLOUD_WRITERS)
 
 

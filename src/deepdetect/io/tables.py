@@ -13,7 +13,7 @@ from typing import BinaryIO
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import DeepDetectError, InvalidFileError, MissingFileError, OptionError
+from .._shared.errors import InvalidFileError, MissingFileError, OptionError
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
 from ..features.matches import Matches, TwoViewGeometry
@@ -180,15 +180,8 @@ def _load_npz(path: str | Path, content: str) -> dict[str, np.ndarray]:
                 return dict(arrays)
     except FileNotFoundError:
         raise MissingFileError(f"there is no file {path}: check the path") from None
-    except PermissionError:
-        raise DeepDetectError(f"{path} may not be read: check its rights") from None
-    except MemoryError:
-        raise DeepDetectError(
-            f"there is not enough memory to read {path}: close other programs"
-        ) from None
     except Exception as error:  # zip, its compressions and NumPy raise many kinds
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise _holds_none(path, content, reason) from None
+        raise _holds_none(path, content, error) from None
 
 
 @contextmanager
@@ -196,14 +189,14 @@ def _building(path: str | Path, content: str) -> Iterator[None]:
     """Say of which file the arrays are that do not make the object."""
     try:
         yield
-    except KeyError as error:
-        raise _holds_none(path, content, f"it has no array {error}") from error
-    except (ValueError, TypeError, OptionError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise _holds_none(path, content, reason) from error
+    except (KeyError, ValueError, TypeError) as error:
+        raise _holds_none(path, content, error) from error
 
 
-def _holds_none(path: str | Path, content: str, reason: str) -> InvalidFileError:
+def _holds_none(path: str | Path, content: str, error: Exception) -> InvalidFileError:
+    reason = (str(error).splitlines() or [type(error).__name__])[0]
+    if isinstance(error, KeyError):
+        reason = f"it has no array {reason}"
     return InvalidFileError(f"{path} holds no {content} ({reason}): write the file again")
 
 
@@ -220,11 +213,7 @@ def _integer(array: np.ndarray) -> int:
 
 
 def _check_npz(file: BinaryIO) -> None:
-    """Check that the arrays have the sizes that they state: NumPy allocates them first.
-
-    Raises:
-        ValueError: they have not, or are compressed in another way than NumPy's.
-    """
+    """Raise a ValueError where arrays have not the sizes they state: NumPy allocates them first."""
     length = file.seek(0, os.SEEK_END)
     with zipfile.ZipFile(file) as archive:
         for entry in archive.infolist():
