@@ -70,7 +70,7 @@ def base_class(module: str, name: str) -> type:
         Traceback (most recent call last):
         ...
         deepdetect.MissingExtraError: the drop-in for no_such_package needs the package \
-    no_such_package, which is not installed: run pip install no_such_package
+no_such_package, which is not installed: run pip install no_such_package
     """
     if importlib.util.find_spec(module.partition(".")[0]) is None:
         return _Missing(name, (), {"module": module})
