@@ -183,27 +183,14 @@ def test_a_folder_of_something_else_is_refused(
     assert server.ranges == []
 
 
-def other_file(server: Server) -> str:
-    """Another address of the same server."""
-    return server.url.replace("train", "mirror")
-
-
-def test_a_mirror_is_asked_when_a_host_fails(
-    dataset: RemoteDataset, server: Server, tmp_path: Path
-) -> None:
-    two = with_file(dataset, urls=("http://127.0.0.1:9/train.zip", other_file(server)))
-    assert unpacked(get_dataset(two, tmp_path / "tiny")) == NAMES
-    assert len(server.ranges) == 1
-
-
-def test_a_mirror_is_asked_when_a_host_sends_wrong_bytes(
+def test_a_mirror_is_asked_when_a_host_fails_or_sends_wrong_bytes(
     dataset: RemoteDataset, server: Server, tmp_path: Path
 ) -> None:
     good = server.content
     bad = good[:-1] + b"?"
     server.contents = {"/train.zip": bad, "/mirror.zip": good}
-    two = with_file(dataset, urls=(server.url, other_file(server)))
-    assert unpacked(get_dataset(two, tmp_path / "tiny")) == NAMES
+    urls = "http://127.0.0.1:9/train.zip", server.url, server.url.replace("train", "mirror")
+    assert unpacked(get_dataset(with_file(dataset, urls=urls), tmp_path / "tiny")) == NAMES
     assert server.ranges == [None, None], "nothing of the wrong bytes is kept"
 
 
@@ -264,34 +251,18 @@ def test_a_damaged_tar_is_refused_without_a_checksum(
     assert not (tmp_path / "tiny").exists()
 
 
-@pytest.mark.parametrize("broken_off", [False, True])
 def test_the_checksum_that_a_host_states_is_checked(
-    dataset: RemoteDataset, server: Server, tmp_path: Path, broken_off: bool
+    dataset: RemoteDataset, server: Server, tmp_path: Path
 ) -> None:
     url = server.url.replace("/train.zip", "/resolve/train.zip")
     unknown = with_file(dataset, urls=(url,), checksum=None)
     server.stated = hashlib.sha256(server.content).hexdigest()
-    if broken_off:
-        server.break_after = 300_000
-        with pytest.raises(DeepDetectError, match="to resume"):
-            get_dataset(unknown, tmp_path / "tiny")
-        server.break_after = None
-    folder = get_dataset(unknown, tmp_path / "tiny")
-    assert unpacked(folder) == NAMES
-    if broken_off:
-        assert server.ranges[-1] is not None, "it went on, and the whole was checked"
-
-
-def changed(content: bytes, place: int, value: int) -> bytes:
-    """Change a byte of each member's header, and the same field in the directory."""
-    shifts = {b"PK\3\4": 0, b"PK\1\2": 2}
-    data = bytearray(content)
-    for signature, shift in shifts.items():
-        start = 0
-        while (start := data.find(signature, start)) >= 0:
-            data[start + place + shift] = value
-            start += 4
-    return bytes(data)
+    server.break_after = 300_000
+    with pytest.raises(DeepDetectError, match="to resume"):
+        get_dataset(unknown, tmp_path / "tiny")
+    server.break_after = None
+    assert unpacked(get_dataset(unknown, tmp_path / "tiny")) == NAMES
+    assert server.ranges[-1] is not None, "it went on, and the whole was checked"
 
 
 def zipped(names: list[str]) -> bytes:
@@ -303,12 +274,8 @@ def zipped(names: list[str]) -> bytes:
 
 
 DAMAGED_ARCHIVES = {
-    "encrypted": changed(archive(), 6, 1),
-    "compressed in an unknown way": changed(archive(), 8, 99),
-    "of a later version": changed(archive(), 4, 255),
     "a name too long": zipped(["a" * 300 + ".jpg"]),
     "a file that is a folder, too": zipped(["a.jpg", "a.jpg/b.jpg"]),
-    "a folder that is a file, too": zipped(["a.jpg/b.jpg", "a.jpg"]),
     "an offset before its start": archive()[600_000:],
 }
 

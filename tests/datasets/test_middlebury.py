@@ -34,10 +34,12 @@ def test_a_small_map_is_read_at_each_pixel(scene: Path) -> None:
     assert disparity[-1, -1] == 127 / 4
 
 
-LARGE = [pytest.param(name, marks=pytest.mark.slow) for name in ("dolls", "moebius")]
+LARGE = [
+    pytest.param(name, marks=pytest.mark.slow) for name in ("teddy", "art", "dolls", "moebius")
+]
 
 
-@pytest.mark.parametrize("name", ["cones", "teddy", "art", "motorcycle", *LARGE])
+@pytest.mark.parametrize("name", ["cones", "motorcycle", *LARGE])
 def test_the_truth_fits_the_photographs(shared: Path, name: str) -> None:
     """The right view, sampled at x - disparity, looks like the left view; at x + it does not."""
     scene = shared / "data" / "middlebury" / name
@@ -61,43 +63,22 @@ def test_the_truth_fits_the_photographs(shared: Path, name: str) -> None:
 
 
 def test_what_is_missing_or_wrong_is_named(scene: Path, one_line) -> None:
-    calibration = scene / "calib.json"
+    calibration, good = scene / "calib.json", '"file": "disparity.png", "value_per_pixel": 4'
     for text, message in (
         ("{}", "no ground truth"),
-        ('{"ground_truth": {"file": "disparity.png"}}', "does not say"),
-        ("[]", "does not say"),
-        ("{", "does not say"),
         ("[" * 100_000, "does not say"),
-        (
-            '{"ground_truth": {"file": "d.png", "unknown": 0, "value_per_pixel": 1'
-            + "0" * 400
-            + "}}",
-            "does not say",
-        ),
-        (
-            '{"ground_truth": {"file": "no.png", "value_per_pixel": 4, "unknown": 0}}',
-            "no.png is missing",
-        ),
-        (
-            '{"ground_truth": {"file": "disparity.png", "value_per_pixel": 0, "unknown": 0}}',
-            "scale above 0",
-        ),
-        *(
-            (
-                '{"ground_truth": {"file": "disparity.png", "value_per_pixel": 4, '
-                f'"unknown": {unknown}}}}}',
-                "does not say",
-            )
-            for unknown in ("[1, 2]", "null", "{}")
-        ),
+        ("[]", "does not say"),
+        ('{"ground_truth": {"file": "disparity.png"}}', "does not say"),
+        (f'{{"ground_truth": {{{good}, "unknown": null}}}}', "does not say"),
+        (f'{{"ground_truth": {{{good}{"0" * 400}, "unknown": 0}}}}', "does not say"),
+        (f'{{"ground_truth": {{{good}, "unknown": 0, "file": "no.png"}}}}', "no.png is missing"),
+        (f'{{"ground_truth": {{{good}e-400, "unknown": 0}}}}', "scale above 0"),
     ):
         calibration.write_text(text)
         with pytest.raises(ImageError, match=message) as error:
             load_middlebury(scene)
         one_line(error.value)
-    calibration.write_text(
-        '{"ground_truth": {"file": "disparity.png", "value_per_pixel": 4, "unknown": 0}}'
-    )
+    calibration.write_text(f'{{"ground_truth": {{{good}, "unknown": 0}}}}')
     truth = scene / "disparity.png"
     content = bytearray(truth.read_bytes())
     content[content.index(b"IEND") - 5] ^= 1  # the last byte of the pixels' checksum

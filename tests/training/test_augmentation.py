@@ -62,31 +62,6 @@ def test_a_transposed_photograph_has_the_transposed_label(name: str, photo: np.n
     ).sum()
 
 
-@pytest.mark.parametrize(
-    ("name", "least", "most"),
-    [
-        ("shi-tomasi", 0, 0.1),
-        ("sift", 0.1, 0.6),
-        ("orb", 0.3, 0.8),
-        ("brisk", 0.4, 0.97),
-        ("canny", 0.97, 1),
-        ("fast", 1, 1),
-        ("agast", 1, 1),
-        ("harris", 0.999, 1),
-        ("sobel", 0.999, 1),
-    ],
-)
-def test_a_mirrored_photograph_has_another_label(
-    name: str, least: float, most: float, photo: np.ndarray
-) -> None:
-    """Why crops are not flipped: OpenCV's Shi-Tomasi, for one, marks the pixel beside."""
-    options = LabelOptions((name,))
-    for axis in (0, 1):
-        flipped, expected = flip(photo, fuse(luma(photo), options).mask, axis)
-        found = fuse(luma(flipped), options).mask
-        assert least <= (found & expected).sum() / (found | expected).sum() <= most
-
-
 @given(image=IMAGES)
 def test_to_gray_the_luma_is_the_same(image: np.ndarray) -> None:
     gray = to_gray(image)
@@ -127,27 +102,6 @@ def photos() -> dict[str, np.ndarray]:
     }
 
 
-PHOTOS = ("astronaut", "chelsea", "coffee")
-
-
-@pytest.mark.parametrize("name", PHOTOS)
-@pytest.mark.parametrize(
-    ("brightness", "contrast"),
-    [
-        (0.3, 0.4),
-        (1, 1),
-        (0.45, 0.55),
-        (0.001, 0.001),
-    ],
-)
-def test_equals_pillow(name: str, brightness: float, contrast: float, photos: dict) -> None:
-    darkening = Darkening(brightness, contrast)
-    dark = darken(photos[name], darkening)
-    assert dark.dtype == np.uint8
-    assert dark.shape == photos[name].shape
-    np.testing.assert_array_equal(dark, by_pillow(photos[name], darkening))
-
-
 def test_equals_pillow_where_the_mean_is_near_a_half(photos: dict) -> None:
     # Pillow's luma and OpenCV's differ in a few colours, which can move the rounded mean.
     darkening = Darkening(0.519637822662576, 0.11474348861540308)
@@ -166,17 +120,13 @@ def test_equals_pillow_on_any_image(rgb: np.ndarray, brightness: float, contrast
     np.testing.assert_array_equal(darken(rgb, darkening), by_pillow(rgb, darkening))
 
 
-@pytest.mark.parametrize("name", PHOTOS)
-@pytest.mark.parametrize(
-    ("brightness", "contrast"), [(0.2, 0.55), (0.3, 0.4), (0.45, 0.3), (0.45, 0.55)]
-)
-def test_a_darkened_photograph_is_of_low_visibility(
-    name: str, brightness: float, contrast: float, photos: dict
-) -> None:
-    dark = darken(photos[name], Darkening(brightness, contrast))
+@pytest.mark.parametrize("name", ["astronaut", "chelsea", "coffee"])
+def test_a_darkened_photograph_is_of_low_visibility(name: str, photos: dict) -> None:
     assert visibility_of(luma(photos[name])) == "normal"
-    assert visibility_of(luma(dark)) == "low"
-    assert dark.mean() < photos[name].mean() / 2
+    for brightness, contrast in ((0.2, 0.55), (0.45, 0.3), (0.45, 0.55)):
+        dark = darken(photos[name], Darkening(brightness, contrast))
+        assert visibility_of(luma(dark)) == "low"
+        assert dark.mean() < photos[name].mean() / 2
 
 
 @given(seed=st.integers(0, 2**32 - 1))
@@ -185,16 +135,6 @@ def test_the_widest_image_is_of_low_visibility_too(seed: int) -> None:
     extreme = generator.choice(np.array([0, 255], np.uint8), (16, 16, 3))
     dark = darken(extreme, draw_darkening(generator))
     assert luma_range(luma(dark)) < LOW_VISIBILITY_RANGE
-
-
-@given(seed=st.integers(0, 2**32 - 1))
-def test_drawn_factors(seed: int) -> None:
-    drawn = draw_darkening(np.random.default_rng(seed))
-    assert augmentation.BRIGHTNESS[0] <= drawn.brightness <= augmentation.BRIGHTNESS[1]
-    assert augmentation.CONTRAST[0] <= drawn.contrast <= augmentation.CONTRAST[1]
-    assert drawn.brightness * drawn.contrast < 0.25
-    assert drawn == Darkening(float(f"{drawn.brightness:.3f}"), float(f"{drawn.contrast:.3f}"))
-    assert draw_darkening(np.random.default_rng(seed)) == drawn
 
 
 @given(
@@ -216,7 +156,7 @@ def test_all_of_it_comes_from_inside() -> None:
     rows, columns = np.mgrid[0:200, 0:240].astype(np.uint8)
     ramps = np.dstack([columns, rows, np.zeros_like(rows)])
     edges = []
-    for seed in range(200):
+    for seed in range(60):
         generator = np.random.default_rng(seed)
         view = augmentation._rotated_crop(ramps, 100, generator).astype(float)
         across = view[50, 75, :2] - view[50, 25, :2]
@@ -233,18 +173,6 @@ def test_all_of_it_comes_from_inside() -> None:
         edges.append(np.linalg.norm(across) / 50)
     assert min(edges) < 1.1
     assert max(edges) > 1.6
-
-
-def test_relighting_is_one_rising_curve_for_all_channels() -> None:
-    levels = np.arange(256, dtype=np.uint8)[None, :, None].repeat(3, 2)
-    generators = map(np.random.default_rng, range(30))
-    curves = [augmentation._relight(levels, generator)[0] for generator in generators]
-    for curve in curves:
-        assert (curve == curve[:, :1]).all()
-        assert (np.diff(curve[:, 0].astype(int)) >= 0).all()
-    middles = [int(curve[128, 0]) for curve in curves]
-    assert min(middles) < 110
-    assert max(middles) > 145
 
 
 def test_compression_is_that_of_pillow(photo: np.ndarray) -> None:

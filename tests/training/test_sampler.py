@@ -17,14 +17,6 @@ from deepdetect.training.sampler import CropSampler, Schedule, epoch_order
 OPTIONS = TrainingOptions(stages=(Stage(64, 4, 2), Stage(32, 2, 1)), short_sides=(64,), seed=5)
 
 
-def test_learning_rate_is_a_cosine_from_first_to_final() -> None:
-    schedule = Schedule(TrainingOptions(stages=(Stage(64, 2, 10),), short_sides=(64,)), 20)
-    assert schedule.steps == 100
-    assert schedule.learning_rate(0) == pytest.approx(1e-3)
-    assert schedule.learning_rate(50) == pytest.approx((1e-3 + 1e-6) / 2)
-    assert schedule.learning_rate(100) == pytest.approx(1e-6)
-
-
 def test_the_warm_up_rises_evenly_into_the_cosine() -> None:
     stages = (Stage(64, 2, 10),)
     plain = Schedule(TrainingOptions(stages=stages, short_sides=(64,)), 20)

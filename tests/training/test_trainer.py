@@ -19,7 +19,7 @@ torch = pytest.importorskip("torch", reason="needs torch, which is for training 
 
 from safetensors.torch import load_file, save_file  # noqa: E402
 
-from deepdetect import DeepDetect, DeepDetectError, OptionError, WeightsError  # noqa: E402
+from deepdetect import DeepDetect, DeepDetectError, OptionError  # noqa: E402
 from deepdetect.detector.network.espnet import ESPNet  # noqa: E402
 from deepdetect.detector.network.weights import (  # noqa: E402
     average_weights,
@@ -39,8 +39,8 @@ from deepdetect.training.trainer import TrainingResult  # noqa: E402
 
 PLAIN = DeviceOptions("cpu", "float32", compile=False, threads=1)
 OPTIONS = TrainingOptions(
-    stages=(Stage(64, 4, 3), Stage(96, 2, 1)),
-    short_sides=(96, 64),
+    stages=(Stage(32, 4, 3), Stage(64, 2, 1)),
+    short_sides=(64, 48),
     labels=LabelOptions(("fast", "sobel")),
     val_count=3,
 )
@@ -129,15 +129,12 @@ def test_a_run_writes_weights_and_curves(run: Path) -> None:
     np.testing.assert_allclose(torch_map, onnx_map, atol=1e-4)
 
 
-def test_the_best_weights_are_those_of_the_lowest_validation_loss(run: Path) -> None:
-    point = json.loads(read_notes(run / "best.safetensors")["point"])
+def test_the_best_weights_say_where_they_come_from(run: Path) -> None:
+    notes = read_notes(run / "best.safetensors")
+    point = json.loads(notes["point"])
     rows = list(csv.DictReader((run / "curves.csv").read_text().splitlines()))
     lowest = min(float(row["validation_loss"]) for row in rows)
     assert point["validation_loss"] == pytest.approx(lowest, rel=1e-5)
-
-
-def test_where_weights_come_from_is_written_into_them(run: Path) -> None:
-    notes = read_notes(run / "best.safetensors")
     assert "torch 2." in notes["versions"]
     assert len(notes["images_digest"]) == 16
     assert json.loads(notes["options"])["seed"] == 0
@@ -146,13 +143,11 @@ def test_where_weights_come_from_is_written_into_them(run: Path) -> None:
     card = (run / "MODEL_CARD.md").read_text()
     for name in ("command", "commit", "versions", "images_digest", "initial_weights"):
         assert notes[name] in card
-    assert "short_sides | [96, 64]" in card
+    assert "short_sides | [64, 48]" in card
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("method", "count"), [("training_step", 6), pytest.param("heatmap", 3, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("method", "count"), [("training_step", 6), ("heatmap", 3)])
 def test_an_interrupted_run_ends_with_the_same_weights(
     method: str, count: int, run: Path, tmp_path: Path, fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -197,24 +192,6 @@ def test_another_run_in_the_same_folder_is_refused(
         one_line(caught.value)
 
 
-@pytest.mark.parametrize(
-    "change", [{"step": -1}, {"step": 10**9}, {"points": 3}, {"loss_sum": None}]
-)
-def test_an_altered_checkpoint_is_refused(
-    change: dict[str, Any], run: Path, tmp_path: Path, fit, one_line
-) -> None:
-    found = read_checkpoint(run / "checkpoint.safetensors")
-    state = json.dumps({**found.metadata, **change})
-    save_file(found.tensors, tmp_path / "checkpoint.safetensors", metadata={"state": state})
-    with pytest.raises(WeightsError, match="delete it, or train into another folder") as caught:
-        fit(tmp_path)
-    one_line(caught.value)
-
-
-def _damaged(path: Path) -> None:
-    path.write_bytes(b"damaged")
-
-
 def _not_finite(path: Path) -> None:
     tensors = {
         name: torch.full_like(value, float("nan")) if value.is_floating_point() else value
@@ -227,13 +204,7 @@ def _without_notes(path: Path) -> None:
     save_file(load_file(path), path)
 
 
-def _of_another_point(path: Path) -> None:
-    save_file(load_file(path), path, metadata={**read_notes(path), "point": '{"step": "1"}'})
-
-
-@pytest.mark.parametrize(
-    "change", [Path.unlink, _damaged, _not_finite, _without_notes, _of_another_point]
-)
+@pytest.mark.parametrize("change", [Path.unlink, _not_finite, _without_notes])
 def test_damaged_best_weights_of_a_finished_run_are_replaced_by_the_last(
     change: Any, run: Path, tmp_path: Path, fit
 ) -> None:

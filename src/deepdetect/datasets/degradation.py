@@ -15,19 +15,12 @@ import numpy as np
 
 from .._shared.opencv import cv2
 
+FULL_WELL = 10_000.0
+"""Electrons that white gives in full light, each colour of each pixel by itself; their number is
+Poisson distributed (shot noise)."""
 
-@dataclass(frozen=True)
-class SensorModel:
-    """The noise of a camera's sensor.
-
-    Attributes:
-        full_well: electrons that white gives in full light, each colour of each pixel by itself;
-            their number is Poisson distributed (shot noise).
-        read_noise: standard deviation in electrons of what reading adds (Gaussian).
-    """
-
-    full_well: float = 10_000.0
-    read_noise: float = 3.0
+READ_NOISE = 3.0
+"""Standard deviation in electrons of what reading the sensor adds (Gaussian)."""
 
 
 @dataclass(frozen=True)
@@ -76,28 +69,17 @@ def to_linear(rgb: np.ndarray) -> np.ndarray:
 
 
 def to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Apply the gamma of sRGB, and round to uint8.
-
-    Example:
-        >>> every = np.arange(256, dtype=np.uint8)
-        >>> bool((to_srgb(to_linear(every)) == every).all())
-        True
-    """
+    """Apply the gamma of sRGB, and round to uint8."""
     light = np.clip(linear, 0, 1)
     value = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     return np.rint(255 * value).astype(np.uint8)
 
 
-def darken(
-    linear: np.ndarray,
-    generator: np.random.Generator,
-    fraction: float,
-    sensor: SensorModel = SensorModel(),
-) -> np.ndarray:
+def darken(linear: np.ndarray, generator: np.random.Generator, fraction: float) -> np.ndarray:
     """Photograph a scene in a fraction of the light, with the same exposure and gain."""
-    electrons = generator.poisson(linear * (fraction * sensor.full_well)).astype(np.float32)
-    electrons += generator.normal(0, sensor.read_noise, linear.shape).astype(np.float32)
-    return to_srgb(electrons / sensor.full_well)
+    electrons = generator.poisson(linear * (fraction * FULL_WELL)).astype(np.float32)
+    electrons += generator.normal(0, READ_NOISE, linear.shape).astype(np.float32)
+    return to_srgb(electrons / FULL_WELL)
 
 
 def blur_gaussian(linear: np.ndarray, _: np.random.Generator, sigma_px: float) -> np.ndarray:
@@ -113,13 +95,7 @@ def blur_motion(linear: np.ndarray, generator: np.random.Generator, length_px: f
 def motion_kernel(length_px: float, angle: float) -> np.ndarray:
     """Return the kernel of an even motion along a line around the pixel; its sum is 1.
 
-    Args:
-        length_px: of the line.
-        angle: of the line in radians, from x towards y.
-
-    Example:
-        >>> motion_kernel(3, 0).round(2)[2].tolist()
-        [0.04, 0.29, 0.33, 0.29, 0.04]
+    The angle of the line is in radians, from x towards y.
     """
     radius = int(np.ceil(length_px / 2))
     kernel = np.zeros((2 * radius + 1, 2 * radius + 1), np.float64)

@@ -142,11 +142,8 @@ def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = Tru
     try:
         store.mkdir(parents=True, exist_ok=True)
         paths = [store / f"{k:02d}-{file.name}" for k, file in enumerate(dataset.files)]
-        missing = [
-            (file, path)
-            for file, path in zip(dataset.files, paths, strict=True)
-            if not path.exists()
-        ]
+        every = zip(dataset.files, paths, strict=True)
+        missing = [(file, path) for file, path in every if not path.exists()]
         # Twice the size: for the archives, and for what is unpacked.
         done = sum(_size(_part(path)) for _, path in missing)
         _require_space(store, dataset.size + sum(file.size for file, _ in missing) - done)
@@ -168,15 +165,8 @@ def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = Tru
 def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
     """Download a file; it appears when it is whole and its checksum is right.
 
-    Until then the bytes are in `path` with ".part" added, where the next call resumes.
-
-    Args:
-        file: the file.
-        path: the final path.
-        quiet: show no progress bar.
-
-    Raises:
-        DeepDetectError: every host failed; the message is that of the last one.
+    Until then the bytes are in `path` with ".part" added, where the next call resumes. Where every
+    host fails, the error is that of the last one.
     """
     from requests import HTTPError, RequestException
 
@@ -220,16 +210,11 @@ def has_checksum(path: Path, checksum: str) -> bool:
 
 
 def content_digest(folder: Path, name: str) -> str | None:
-    """Return the SHA-256 of a file's content, whatever format it is stored in.
+    """Return the SHA-256 of a file's content in any format, None when there is no such file.
 
-    Args:
-        folder: the data set.
-        name: path in it. Of an image, which is named without its suffix, the pixels with their
-            shape and type are digested, so that a lossless copy in another format has the same
-            digest; of any other file the words, without white space.
-
-    Returns:
-        64 hexadecimal digits, or None when there is no such file.
+    Of an image, which is named without its suffix, the pixels with their shape and type are
+    digested, so that a lossless copy in another format has the same digest; of any other file the
+    words, without white space.
     """
     path = folder / name
     if path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES:
@@ -356,11 +341,8 @@ def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
         else:
             _check_gzip(archive)
             with tarfile.open(archive) as tar:
-                members = [
-                    member
-                    for member in tar.getmembers()
-                    if not file.suffixes or member.name.lower().endswith(file.suffixes)
-                ]
+                endings = file.suffixes or ("",)
+                members = [m for m in tar.getmembers() if m.name.lower().endswith(endings)]
                 _extract(members, lambda one: _extract_member(tar, one, target), quiet)
     except Exception as error:  # zip, tar and their compressions raise many kinds
         if isinstance(error, OSError) and error.errno in WRITE_ERRORS:

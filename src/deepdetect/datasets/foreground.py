@@ -24,20 +24,12 @@ class MaskedPhotograph:
     mask: Path
 
     def foreground(self) -> np.ndarray:
-        """Read the mask, (H, W) bool.
-
-        Raises:
-            ImageError: it cannot be read.
-        """
+        """Read the mask, (H, W) bool."""
         return load_mask(self.mask)
 
 
 def load_foreground(folder: str | Path) -> list[MaskedPhotograph]:
-    """List the photographs that have a mask.
-
-    Raises:
-        ImageError: there is none.
-    """
+    """List the photographs that have a mask; an ImageError where there is none."""
     found = []
     for mask in sorted(Path(folder).glob("*_mask.png")):
         stem = mask.name.removesuffix("_mask.png")

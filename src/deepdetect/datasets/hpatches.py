@@ -14,30 +14,15 @@ ILLUMINATION, VIEWPOINT = "illumination", "viewpoint"
 """The kinds of scenes."""
 
 SUFFIXES = (".ppm", ".png")
-NOT_IN_D2NET_SUBSET = frozenset(
-    (
-        "i_contruction",
-        "i_crownnight",
-        "i_dc",
-        "i_pencils",
-        "i_whitebuilding",
-        "v_artisans",
-        "v_astronautis",
-        "v_talent",
-    )
-)
+NOT_IN_D2NET_SUBSET = {
+    *("i_contruction", "i_crownnight", "i_dc", "i_pencils", "i_whitebuilding"),
+    *("v_artisans", "v_astronautis", "v_talent"),
+}
 """The eight scenes with images beyond 1600x1200, which most papers leave out (D2-Net's list)."""
 
 
 def load_hpatches(folder: str | Path) -> list[PlanarScene]:
-    """List the scenes that are there: 116 in the whole set.
-
-    Args:
-        folder: the data set, whose folders i_* and v_* are its scenes.
-
-    Raises:
-        ImageError: there is no scene, or a file of one is missing.
-    """
+    """List the scenes that are there, folders i_* and v_*: 116 in the whole set."""
     root = Path(folder)
     found = [*sorted(root.glob("i_*")), *sorted(root.glob("v_*"))]
     scenes = [path for path in found if path.is_dir()]

@@ -25,14 +25,7 @@ from .types import CalibratedStereoPair, StereoPair
 
 
 def load_middlebury(folder: str | Path) -> StereoPair:
-    """Load a scene with its ground truth, at the size and in the pixels of the images.
-
-    Args:
-        folder: the scene.
-
-    Raises:
-        ImageError: a file is missing or damaged, or the scene has no ground truth.
-    """
+    """Load a scene with its ground truth, at the size and in the pixels of the images."""
     root, left, right = _load_views(folder)
     path = root / "calib.json"
     try:
@@ -62,12 +55,7 @@ def _load_gray(path: Path) -> np.ndarray | None:
 
 
 def load_calibrated_pair(folder: str | Path) -> CalibratedStereoPair:
-    """Load a scene with its calib.json, without its ground truth: the disparity is NaN.
-
-    Raises:
-        ImageError: an image is missing or damaged, or the two differ in size.
-        ReconstructionError: the calibration is missing or damaged.
-    """
+    """Load a scene with its calib.json, without its ground truth: the disparity is NaN."""
     root, left, right = _load_views(folder)
     size = (left.shape[1], left.shape[0])
     calibration = read_calibration(root / "calib.json", size, size)
@@ -79,9 +67,6 @@ def load_motorcycle() -> StereoPair:
     """Load the Motorcycle pair of Middlebury 2014 (741x500) and the true disparity.
 
     It is part of the scikit-image wheel, so nothing is downloaded.
-
-    Raises:
-        MissingExtraError: scikit-image is not installed.
     """
     try:
         from skimage import data

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from .._shared.errors import ImageError, unknown_name
+from .._shared.errors import ImageError
 from .types import PlanarScene, load_planar_scene
 
 KINDS = {
@@ -33,16 +33,8 @@ def load_oxford(
 ) -> list[PlanarScene]:
     """List the eight scenes, or those of them that are there.
 
-    Args:
-        folder: the data set.
-        truth: "published" reads H1toKp; "refined" reads H1toKp.refined where there is one.
-
-    Raises:
-        ImageError: there is no scene, or a file of one is missing.
-        OptionError: the truth is unknown.
+    The "published" truth is in H1toKp; "refined" reads H1toKp.refined where there is one.
     """
-    if truth not in ("published", "refined"):
-        raise unknown_name("truth", truth, ("published", "refined"))
     root = Path(folder)
     there = [name for name in SCENES if (root / name).is_dir()]
     if not there:
@@ -54,10 +46,8 @@ def _load_scene(folder: Path, truth: str) -> PlanarScene:
     homographies = [f"H1to{number}p" for number in range(2, 7)]
     if truth == "refined":
         refined = [f"{name}.refined" for name in homographies]
-        homographies = [
-            new if (folder / new).exists() else name
-            for name, new in zip(homographies, refined, strict=True)
-        ]
+        pairs = zip(homographies, refined, strict=True)
+        homographies = [new if (folder / new).exists() else name for name, new in pairs]
     images = [f"img{number}" for number in range(1, 7)]
     return load_planar_scene(
         folder, images, homographies, SUFFIXES, LAYOUT, KINDS.get(folder.name, "")

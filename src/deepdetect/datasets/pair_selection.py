@@ -17,10 +17,6 @@ FRAME_DISTANCES = (1, 3, 5, 10, 15, 20)
 def unordered_pairs(count: int, max_pairs: int) -> list[tuple[int, int]]:
     """Choose pairs of images in no order: all, or where there are more evenly spaced ones.
 
-    Args:
-        count: of the images.
-        max_pairs: at most this many.
-
     Example:
         >>> unordered_pairs(3, 60)
         [(0, 1), (0, 2), (1, 2)]
@@ -38,15 +34,7 @@ def unordered_pairs(count: int, max_pairs: int) -> list[tuple[int, int]]:
 def sequence_pairs(
     frames: Sequence[int], max_pairs: int, distances: Sequence[int]
 ) -> list[tuple[int, int]]:
-    """Choose pairs of frames: as many evenly spaced ones at each of the distances.
-
-    Args:
-        frames: their numbers, ascending; some may be missing.
-        max_pairs: at most this many.
-        distances: between the two frames of a pair.
-
-    Returns:
-        Pairs of numbers.
+    """Choose pairs of frame numbers: as many evenly spaced ones at each of the distances.
 
     Example:
         >>> sequence_pairs(range(12), 5, (1, 10))
@@ -65,12 +53,7 @@ def sequence_pairs(
 
 
 def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
-    """Return evenly spaced ones of a sequence, the first and the last included.
-
-    Example:
-        >>> evenly_spaced(range(10), 4)
-        [0, 3, 6, 9]
-    """
+    """Return evenly spaced ones of a sequence, the first and the last included."""
     if len(items) <= count:
         return list(items)
     return [items[row] for row in np.linspace(0, len(items) - 1, count).round().astype(int)]

@@ -50,16 +50,10 @@ SOURCES_FOLDER = "sources"
 
 @dataclass(frozen=True)
 class Source:
-    """A public repository with images.
+    """A repository on GitHub, "OWNER/NAME", at a commit, with images in some folders, or in all.
 
-    Attributes:
-        name: with which the names of its crops begin.
-        repository: owner and name, on GitHub.
-        commit: whose files are taken.
-        folders: of these folders only; empty for all.
-        licence: as the repository states it; single files may have others.
-        megabytes: of the archive, about.
-        other_licences: licences of the files in some folders.
+    The names of its crops begin with `name`. The archive has about so many megabytes. Some folders
+    have other licences than the repository.
     """
 
     name: str
@@ -92,15 +86,9 @@ def listed_sources() -> tuple[Source, ...]:
 
 @dataclass(frozen=True)
 class Crop:
-    """A square of a picture.
+    """A square of a picture of a `Source`, with the picture's licence and the SHA-256 of its file.
 
-    Attributes:
-        source: name of its `Source`.
-        path: of the picture in the repository.
-        sha256: of the picture's file.
-        licence: of the picture.
-        short_side_px: that the picture is scaled to.
-        x, y: upper left corner of the square in the scaled picture.
+    Its upper left corner is (x, y) in the picture, scaled to a shorter side of `short_side_px`.
     """
 
     source: str
@@ -134,15 +122,9 @@ def listed_crops() -> tuple[Crop, ...]:
 
 
 def write_crops(folder: Path, crops: Sequence[Crop], quiet: bool = True) -> None:
-    """Replace unpacked repositories by crops of their pictures.
+    """Replace the repositories below `sources` by crops in `train` and `val`, and licences.csv.
 
-    Args:
-        folder: with the repositories below `sources`; gets `train`, `val` and `licences.csv`.
-        crops: which ones, those of a picture one after the other.
-        quiet: show no progress bar.
-
-    Raises:
-        DeepDetectError: a picture is missing, or is not the one that is listed.
+    Crops of a picture come one after the other.
     """
     rows = [("file", "picture", "licence", "sha256")]
     repositories = {source.name: source for source in listed_sources()}

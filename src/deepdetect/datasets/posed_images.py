@@ -57,13 +57,7 @@ class PosedImage:
 
 @dataclass(frozen=True, eq=False)
 class PosedPair:
-    """Two images of a scene.
-
-    Attributes:
-        scene: the scene's name.
-        first, second: the images.
-        frame_distance: how many frames of a sequence lie between them; None for other images.
-    """
+    """Two images of a scene, and how many frames lie between them, None for unordered images."""
 
     scene: str
     first: PosedImage
@@ -121,50 +115,45 @@ def load_posed_scenes(folder: str | Path, max_pairs: int = 60) -> list[PosedScen
     """
     root = Path(folder).resolve()
     below = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
-    folders = [root] if _reader(root) else [path for path in below if _reader(path)]
-    if not folders:
+    folders = [root] if _reader(root) else below
+    readers = {path: read for path in folders if (read := _reader(path)) is not None}
+    if not readers:
         raise ImageError(
             f"there are no images with cameras in {folder}: it, or each of its folders, must hold "
             "NNNN.camera files (Strecha), calib.txt and poses.txt (KITTI), or cameras.txt and "
             "images.txt (COLMAP)"
         )
-    return [_load_scene(path, max_pairs) for path in folders]
+    return [_load_scene(path, read, max_pairs) for path, read in readers.items()]
 
 
 def _reader(folder: Path) -> Callable[[Path], list[PosedImage]] | None:
     """Return the function that reads the layout of a folder."""
     if any(folder.glob("*.camera")):
         return _read_strecha
-    if _is_sequence(folder):
+    if (folder / "calib.txt").is_file() and (folder / "poses.txt").is_file():
         return _read_kitti
     return None if _colmap_model(folder) is None else _read_colmap
 
 
-def _is_sequence(folder: Path) -> bool:
-    return (folder / "calib.txt").is_file() and (folder / "poses.txt").is_file()
-
-
-def _load_scene(folder: Path, max_pairs: int) -> PosedScene:
-    read = _reader(folder)
-    images = read(folder) if read is not None else []
-    frames = [int(image.path.stem) for image in images] if read is _read_kitti else None
-    if frames is None:
-        chosen = unordered_pairs(len(images), max_pairs) if len(images) > 1 else []
-    else:
-        rows = {frame: row for row, frame in enumerate(frames)}
-        chosen = [(rows[a], rows[b]) for a, b in sequence_pairs(frames, max_pairs, FRAME_DISTANCES)]
-    if not chosen:
-        distances = "" if frames is None else f" at the frame distances {FRAME_DISTANCES}"
+def _load_scene(
+    folder: Path, read: Callable[[Path], list[PosedImage]], max_pairs: int
+) -> PosedScene:
+    images, name = read(folder), folder.name
+    pairs = []
+    distances = ""
+    if read is _read_kitti:
+        distances = f" at the frame distances {FRAME_DISTANCES}"
+        of_frame = {int(image.path.stem): image for image in images}
+        for a, b in sequence_pairs([*of_frame], max_pairs, FRAME_DISTANCES):
+            pairs.append(PosedPair(name, of_frame[a], of_frame[b], b - a))
+    elif len(images) > 1:
+        for a, b in unordered_pairs(len(images), max_pairs):
+            pairs.append(PosedPair(name, images[a], images[b]))
+    if not pairs:
         raise ImageError(
             f"there are no two images with cameras{distances} in {folder}: put more images there"
         )
-    pairs = (
-        PosedPair(
-            folder.name, images[a], images[b], None if frames is None else frames[b] - frames[a]
-        )
-        for a, b in chosen
-    )
-    return PosedScene(folder.name, tuple(images), tuple(pairs))
+    return PosedScene(name, tuple(images), tuple(pairs))
 
 
 def _read_strecha(folder: Path) -> list[PosedImage]:
@@ -174,19 +163,12 @@ def _read_strecha(folder: Path) -> list[PosedImage]:
         numbers = _numbers(_text(file).split(), 26, str(file))
         size = (numbers[24], numbers[25])
         stem = folder / file.name.removesuffix(".camera")
-        found = [
-            path for path in (stem, *(Path(f"{stem}{end}") for end in SUFFIXES)) if path.is_file()
-        ]
+        found = [path for end in ("", *SUFFIXES) if (path := Path(f"{stem}{end}")).is_file()]
         if not found:
             raise ImageError(f"there is no image {stem}.jpg or .png for {file}: put it there")
-        images.append(
-            _posed_image(
-                found[0],
-                _scaled(numbers[:9].reshape(3, 3), size, found[0], file),
-                *_world_to_camera(numbers[12:21].reshape(3, 3), numbers[21:24]),
-                file,
-            )
-        )
+        intrinsics = _scaled(numbers[:9].reshape(3, 3), size, found[0], file)
+        pose = _world_to_camera(numbers[12:21].reshape(3, 3), numbers[21:24])
+        images.append(_posed_image(found[0], intrinsics, *pose, file))
     return images
 
 

@@ -15,15 +15,10 @@ from .pair_selection import evenly_spaced
 
 @dataclass(frozen=True, eq=False)
 class PlanarPair:
-    """Two images of a plane, or from one point of view.
+    """Two images of a plane, or from one point of view; the first one's number is 1.
 
-    Attributes:
-        scene: the scene's name.
-        number: the second image's number; the first one's is 1.
-        first, second: the images' files.
-        homography: (3, 3) float64, takes columns (x, y, 1) of the first image to the
-            second; centre of the first pixel (0, 0).
-        kind: what changes between the two images; "" where the data set does not say.
+    The (3, 3) homography takes columns (x, y, 1) of the first image to the second; centre of the
+    first pixel (0, 0). `kind` is what changes between them, "" where the data set does not say.
     """
 
     scene: str
@@ -43,12 +38,7 @@ class PlanarPair:
 class PlanarScene:
     """A scene: its first image, and others with their homographies from the first.
 
-    Attributes:
-        name: the scene's name.
-        images: the files, the first one first.
-        homographies: one for each image but the first.
-        kind: what changes between its images; "" where the data set does not say.
-        numbers: of the images but the first; empty for 2, 3 and so on.
+    `numbers` are those of the others; empty for 2, 3 and so on.
     """
 
     name: str
@@ -103,11 +93,7 @@ class CalibratedStereoPair(StereoPair):
 
 
 def read_homography(path: Path) -> np.ndarray:
-    """Read nine numbers from a text file as a (3, 3) float64 matrix.
-
-    Raises:
-        ImageError: the file is missing or holds something else.
-    """
+    """Read nine numbers from a text file as a (3, 3) float64 matrix."""
     try:
         matrix = np.array(path.read_text().split(), np.float64).reshape(3, 3)
     except OSError as error:
@@ -127,18 +113,9 @@ def load_planar_scene(
     layout: str,
     kind: str = "",
 ) -> PlanarScene:
-    """Load a scene from a folder.
+    """Load a scene from a folder: images, named without their suffixes, and homographies.
 
-    Args:
-        folder: the scene.
-        images: names of the images without their suffixes, the first image first.
-        homographies: names of the text files of the others' homographies.
-        suffixes: the image formats that are looked for, in this order.
-        layout: what the folder must hold, for the error.
-        kind: as of `PlanarScene`.
-
-    Raises:
-        ImageError: a file is missing, or a homography is wrong.
+    The suffixes are looked for in this order; `layout` says what the folder must hold.
     """
     files = []
     for name in images:

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from ..labels import LabelOptions
 from .augmentation import flip, jitter_color, transpose
 from .recipe import Stage, TrainingOptions
 from .sampler import CropIndex
-from .shards import Shards, ShardSource, has_shards
+from .shards import Shards, ShardSource
 from .views import (
     SourceImage,
     View,
@@ -35,20 +35,6 @@ from .views import (
     render,
     train_val_split,
 )
-
-
-class ImageSource(Protocol):
-    """Images with labels, in a folder or in shards."""
-
-    def __len__(self) -> int: ...
-
-    def __getitem__(self, index: int) -> SourceImage:
-        """Return an image, which lists its views."""
-        ...
-
-    def load(self, index: int, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """Return a view as (H, W, 3) uint8 RGB, and its label as (H, W) bool."""
-        ...
 
 
 class FolderSource:
@@ -162,6 +148,10 @@ def _make_labels(
     return task, made, ""
 
 
+ImageSource = FolderSource | ShardSource
+"""Images with labels, in a folder or in shards."""
+
+
 class CropDataset(Dataset[tuple[Tensor, Tensor]]):
     """Random crops of views, augmented. Its indices come from a `CropSampler`.
 
@@ -255,7 +245,7 @@ def prepare_data(
     """
     images, output = Path(images), Path(output)
     folder = output / "labels" if labels is None else Path(labels)
-    shards = Shards.open(images, options) if has_shards(images) else None
+    shards = Shards.open(images, options)
     listed, held_out = [], []
     if shards is None:
         listed = list_images(images, options, (output, folder), options.max_images)

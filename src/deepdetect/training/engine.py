@@ -27,11 +27,7 @@ LABELS_TIMEOUT = datetime.timedelta(hours=24)
 
 
 def launch(options: DeviceOptions) -> Fabric:
-    """Join the processes that `torchrun` has started, or be the only one.
-
-    Raises:
-        OptionError: there are more processes than GPUs on this machine.
-    """
+    """Join the processes that `torchrun` has started, or be the only one."""
     from lightning_fabric import Fabric
     from lightning_fabric.plugins.environments.lightning import LightningEnvironment
     from lightning_fabric.plugins.environments.torchelastic import TorchElasticEnvironment
@@ -43,8 +39,8 @@ def launch(options: DeviceOptions) -> Fabric:
     local, world = (1 if alone else int(os.environ[f"{n}WORLD_SIZE"]) for n in ("LOCAL_", ""))
     if options.accelerator == "cuda" and local > torch.cuda.device_count():
         raise OptionError(
-            f"{local} processes on this machine need as many GPUs, but there are "
-            f"{torch.cuda.device_count()}: lower torchrun's --nproc-per-node"
+            f"there are {torch.cuda.device_count()} CUDA devices on this machine for {local} "
+            "processes: use `device=cpu`, or lower torchrun's --nproc-per-node"
         )
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     fabric = Fabric(

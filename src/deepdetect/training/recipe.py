@@ -210,11 +210,6 @@ class DeviceOptions:
         for name, known in (("device", DEVICES), ("precision", PRECISIONS)):
             if getattr(self, name) not in known:
                 raise unknown_name(name, getattr(self, name), known)
-        if self.device == "cuda":
-            from torch.cuda import is_available
-
-            if not is_available():
-                raise OptionError("there is no CUDA device: use `device=cpu`")
         check_ranges(self, positive=("threads",), not_negative=("num_workers",))
 
     @property

@@ -150,10 +150,7 @@ class CropSampler(Sampler[list[CropIndex]]):
 def epoch_order(
     seed: int, epoch: int, count: int, shard_sizes: tuple[int, ...] | None = None
 ) -> np.ndarray:
-    """Return the numbers of the images in the order of an epoch, each once.
-
-    With shards, the images of `SHUFFLED_SHARDS` of them are shuffled at a time.
-    """
+    """Return the numbers of the images in the order of an epoch, by a few shards at a time."""
     if shard_sizes is None:
         return np.random.default_rng([seed, 1, epoch]).permutation(count)
     shards = np.split(np.arange(count), np.cumsum(shard_sizes)[:-1])

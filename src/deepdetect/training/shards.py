@@ -61,13 +61,17 @@ class Shards:
     validation: Files
 
     @classmethod
-    def open(cls, folder: Path, options: TrainingOptions) -> Shards:
-        """Read the index of a folder of shards for a recipe.
+    def open(cls, folder: Path, options: TrainingOptions) -> Shards | None:
+        """Read the index of a folder of shards for a recipe; None where there are none.
 
         Raises:
             OptionError: the shards were made with other options.
             ImageError: the index is damaged, or a shard is missing.
         """
+        if not (folder / INDEX).is_file():
+            if any(folder.glob("training-*-*.tar")):
+                raise ImageError(f"the shards in {folder} are not complete: write them again")
+            return None
         index = _read_index(folder, options)
         try:
             training, validation = (
@@ -120,15 +124,6 @@ class ShardSource:
             raise _damaged(path, f"{len(samples)} images instead of {count}")
         key, sample = samples[index - self.ends[number] + count]
         return path, key, sample
-
-
-def has_shards(folder: Path) -> bool:
-    """Return whether a folder holds shards; an ImageError where not all of them are written."""
-    if (folder / INDEX).is_file():
-        return True
-    if any(folder.glob("training-*-*.tar")):
-        raise ImageError(f"the shards in {folder} are not complete: write the shards again")
-    return False
 
 
 @suggest_keywords

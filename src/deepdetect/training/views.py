@@ -21,13 +21,9 @@ from .recipe import TrainingOptions
 
 @dataclass(frozen=True)
 class View:
-    """How an image is shown to the network.
+    """How an image is shown to the network: its shorter side in pixels, and its light.
 
-    Attributes:
-        short_side: length in pixels that the shorter side is scaled to.
-        darkening: the darkening, or None for normal light.
-        square: squashed to a square instead of scaled evenly.
-        augmentation: seed of an augmented square (`augment`), or None for the whole image.
+    It is scaled evenly, or squashed to a square, or it is the augmented square of a seed.
     """
 
     short_side: int
@@ -49,13 +45,7 @@ class View:
 
 @dataclass(frozen=True)
 class SourceImage:
-    """An image that is trained on or validated with.
-
-    Attributes:
-        path: its file.
-        digest: hexadecimal digits that depend on the content.
-        normal, dark: its views.
-    """
+    """An image that is trained on or validated with: file, digest of its content, and views."""
 
     path: Path
     digest: str

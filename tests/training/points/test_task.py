@@ -130,20 +130,11 @@ def test_an_altered_checkpoint_is_one_sentence(
     whole: TrainingResult, textures: Path, tmp_path: Path, one_line
 ) -> None:
     found = read_checkpoint(whole.weights.parent / CHECKPOINT)
-    moment = "optimizer.exp_avg_sq.ranker.first.weight"
-    for state, tensors, told in (
-        ({"step": None}, {}, "step"),
-        ({}, {moment: torch.zeros(3)}, moment),
-    ):
-        save_file(
-            {**found.tensors, **tensors},
-            tmp_path / CHECKPOINT,
-            metadata={"state": json.dumps({**found.metadata, **state})},
-        )
-        with pytest.raises(WeightsError, match="delete it, or train into another") as caught:
-            run(textures, tmp_path)
-        assert str(tmp_path / CHECKPOINT) in one_line(caught.value)
-        assert told in str(caught.value)
+    state = json.dumps({**found.metadata, "step": None})
+    save_file(found.tensors, tmp_path / CHECKPOINT, metadata={"state": state})
+    with pytest.raises(WeightsError, match="delete it, or train into another") as caught:
+        run(textures, tmp_path)
+    assert str(tmp_path / CHECKPOINT) in one_line(caught.value)
 
 
 @pytest.mark.parametrize("content", [b"damaged", None])

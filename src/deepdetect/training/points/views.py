@@ -29,13 +29,9 @@ SUBTLE = 0.25
 
 @dataclass(frozen=True, eq=False)
 class ViewPair:
-    """Two views of one photograph.
+    """Two views of one photograph: (H, W) uint8 images, and where they show it, (H, W) bool.
 
-    Attributes:
-        images: (H, W) uint8 each.
-        valid: (H, W) bool each: where the view shows the photograph.
-        homography: (3, 3) from the first view to the second.
-        kind: one of `KINDS`.
+    The (3, 3) homography leads from the first view to the second.
     """
 
     images: tuple[np.ndarray, np.ndarray]
@@ -44,38 +40,32 @@ class ViewPair:
     kind: str
 
 
-@dataclass(frozen=True)
-class Geometry:
-    """From a photograph to a view.
+def view_homography(
+    side: int,
+    center: np.ndarray,
+    scale: float,
+    rotation: float = 0.0,
+    tilt: float = 0.0,
+    azimuth: float = 0.0,
+    focal: float = 2.0,
+) -> np.ndarray:
+    """Return the (3, 3) homography from a photograph to a view of some side in pixels.
 
-    Attributes:
-        center: (x, y) of the photograph, which the view has in its centre.
-        scale: pixels of the view per pixel of the photograph.
-        rotation, tilt, azimuth: in radians; the tilt is about an axis in the direction `azimuth`.
-        focal: focal length in sides of the view, where it is tilted.
+    The view has the place `center` in its centre, and `scale` pixels per pixel of the photograph.
+    The tilt is about an axis in the direction `azimuth`; the focal length is in sides.
     """
-
-    center: tuple[float, float]
-    scale: float
-    rotation: float = 0.0
-    tilt: float = 0.0
-    azimuth: float = 0.0
-    focal: float = 2.0
-
-    def matrix(self, side: int) -> np.ndarray:
-        """Return the (3, 3) homography from the photograph to a view of this side in pixels."""
-        focal = self.focal * side
-        turn = self.scale * _rotation(self.rotation)[:2, :2]
-        axis = _rotation(self.azimuth)
-        c, s = math.cos(self.tilt), math.sin(self.tilt)
-        tilted = axis @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ axis.T
-        plane = np.vstack([focal * tilted[:2, :2], tilted[2, :2]])
-        projection = np.column_stack([plane, [0, 0, focal]])
-        similarity = np.eye(3)
-        similarity[:2, :2] = turn
-        similarity[:2, 2] = -turn @ self.center
-        middle = (side - 1) / 2
-        return np.array([[1, 0, middle], [0, 1, middle], [0, 0, 1]]) @ projection @ similarity
+    turn = scale * _rotation(rotation)[:2, :2]
+    axis = _rotation(azimuth)
+    c, s = math.cos(tilt), math.sin(tilt)
+    tilted = axis @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ axis.T
+    focal_px = focal * side
+    plane = np.vstack([focal_px * tilted[:2, :2], tilted[2, :2]])
+    projection = np.column_stack([plane, [0, 0, focal_px]])
+    similarity = np.eye(3)
+    similarity[:2, :2] = turn
+    similarity[:2, 2] = -turn @ center
+    middle = (side - 1) / 2
+    return np.array([[1, 0, middle], [0, 1, middle], [0, 0, 1]]) @ projection @ similarity
 
 
 def _rotation(angle: float) -> np.ndarray:
@@ -84,16 +74,8 @@ def _rotation(angle: float) -> np.ndarray:
 
 
 def draw_pair(photo: np.ndarray, kind: str, side: int, generator: np.random.Generator) -> ViewPair:
-    """Draw two views of a photograph.
-
-    Args:
-        photo: (H, W) uint8 grey.
-        kind: one of `KINDS`.
-        side: of the square views in pixels.
-        generator: of the random numbers.
-    """
-    places = _draw_geometry(photo.shape, kind, side, generator)
-    matrices = [place.matrix(side) for place in places]
+    """Draw two square views of a photograph, (H, W) uint8 grey."""
+    matrices = _draw_homographies(photo.shape, kind, side, generator)
     rendered = [render(photo, matrix, side) for matrix in matrices]
     affected = int(generator.integers(2))  # the view that has most of the blur or of the light
     images = [degrade(rendered[k][0], kind if k == affected else "", generator) for k in range(2)]
@@ -106,9 +88,10 @@ def draw_pair(photo: np.ndarray, kind: str, side: int, generator: np.random.Gene
     )
 
 
-def _draw_geometry(
+def _draw_homographies(
     shape: tuple[int, ...], kind: str, side: int, generator: np.random.Generator
-) -> tuple[Geometry, Geometry]:
+) -> list[np.ndarray]:
+    """Draw where both views are taken from: the homographies from the photograph."""
     height, width = shape
     smallest = side / min(height, width)  # shows all of the photograph's shorter side
     uniform = generator.uniform
@@ -138,20 +121,12 @@ def _draw_geometry(
     if kind == "zoom":  # anywhere in the first view
         second = first + uniform(-0.3, 0.3, 2) * side / scale
     base = uniform(-math.pi, math.pi) if generator.random() < 0.2 else 0.0
-    places = [
-        Geometry((first[0], first[1]), scale, base),
-        Geometry(
-            (second[0], second[1]),
-            scale * zoom,
-            base + angle,
-            tilt,
-            uniform(0, 2 * math.pi),
-            uniform(1.2, 3),
-        ),
+    azimuth, focal = uniform(0, 2 * math.pi), uniform(1.2, 3)
+    matrices = [
+        view_homography(side, first, scale, base),
+        view_homography(side, second, scale * zoom, base + angle, tilt, azimuth, focal),
     ]
-    if generator.random() < 0.5:
-        places.reverse()
-    return places[0], places[1]
+    return matrices[::-1] if generator.random() < 0.5 else matrices
 
 
 def render(photo: np.ndarray, matrix: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -188,13 +163,7 @@ def render(photo: np.ndarray, matrix: np.ndarray, side: int) -> tuple[np.ndarray
 def degrade(image: np.ndarray, kind: str, generator: np.random.Generator) -> np.ndarray:
     """Blur, light, noise and JPEG of a kind in full, of the others now and then a little.
 
-    Args:
-        image: (H, W) uint8.
-        kind: one of `KINDS`, or "" where the view is the better one of its pair.
-        generator: of the random numbers.
-
-    Returns:
-        (H, W) uint8.
+    The kind is "" where the view, (H, W) uint8, is the better one of its pair.
     """
     uniform, chance = generator.uniform, generator.random
     values = image.astype(np.float32) / 255
