@@ -54,9 +54,9 @@ def test_bad_frames_are_listed_at_the_end(run, frames: Path, tmp_path: Path) -> 
 
 
 def test_a_video_that_is_cut_off_is_said_to_be(run, frames: Path, tmp_path: Path) -> None:
-    with write_video(tmp_path / "whole.avi", 10) as writer:
+    with write_video(tmp_path / "whole.avi", 10) as write:
         for path in sorted(frames.iterdir()) * 3:
-            writer.write(np.asarray(Image.open(path)))
+            write(np.asarray(Image.open(path)))
     content = (tmp_path / "whole.avi").read_bytes()
     (tmp_path / "cut.avi").write_bytes(content[: len(content) * 2 // 3])
     texts = [

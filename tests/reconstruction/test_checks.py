@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, Matches, MatchingOptions, SelectionOptions, match_images
+from deepdetect import DeepDetect, Matches, MatchingOptions, match_images
 from deepdetect._shared.errors import DeepDetectError, ReconstructionError
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift import detect_sift
@@ -26,11 +27,6 @@ from deepdetect.reconstruction.subpixel import refine_matches
 from deepdetect.reconstruction.two_view import check_focal, check_matches, check_pose
 
 SIZE = (370, 250)
-
-
-@pytest.fixture(scope="module")
-def detector() -> DeepDetect:
-    return DeepDetect("dense")
 
 
 def sparse(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -80,7 +76,7 @@ def test_one_picture_twice(photo: np.ndarray, level: Any, one_line) -> None:
             check_images(*np.full((2, 40, 40), grey, np.uint8))
 
 
-@pytest.mark.parametrize("mean", [0.5, 1, 3, 10])
+@pytest.mark.parametrize("mean", [0.5, 3])
 def test_dark_pairs_are_two_pictures(level: Any, photo: np.ndarray, mean: float, one_line) -> None:
     factor = mean / level.left.mean()
     dark = [luma(np.rint(view * factor).astype(np.uint8)) for view in (level.left, level.right)]
@@ -90,13 +86,12 @@ def test_dark_pairs_are_two_pictures(level: Any, photo: np.ndarray, mean: float,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("guide", ["auto", pytest.param("fundamental", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("guide", ["auto", "fundamental"])
 def test_a_camera_that_only_rotated(
-    level: Any, only_turned: np.ndarray, detector: DeepDetect, guide: str, one_line
+    level: Any, only_turned: np.ndarray, guide: str, one_line
 ) -> None:
-    found = match_images(
-        level.left, only_turned, detector, options=MatchingOptions(two_view_model=guide)
-    )
+    options = MatchingOptions(two_view_model=guide)
+    found = match_images(level.left, only_turned, DeepDetect("dense"), options=options)
     points = found.points0, found.points1
     camera = level.calibration.camera0
     assert "a rotation of the camera explains all" in refusal(
@@ -130,26 +125,14 @@ def test_planar_photographs(shared: Path, name: str, other: int, one_line) -> No
     assert "one homography explains all" in refusal(sparse(*images), one_line)
 
 
-@pytest.mark.parametrize("unguided", [False, True])
-def test_unrelated_photographs(detector: DeepDetect, unguided: bool, one_line) -> None:
+def test_unrelated_photographs(one_line) -> None:
     data = pytest.importorskip("skimage.data")
     first, second = (
         np.ascontiguousarray(image[:250, :370]) for image in (data.astronaut(), data.coffee())
     )
-    if unguided:
-        found = match_images(
-            first,
-            second,
-            detector,
-            selection=SelectionOptions(density=0.1),
-            guided_matching=False,
-            model="none",
-        )
-        points = found.points0, found.points1
-        assert len(points[0]) > 1000
-    else:
-        points = sparse(first, second)
-    assert "do not overlap" in refusal(points, one_line)
+    at_random = tuple(np.random.default_rng(0).uniform(0, SIZE, (2, 2000, 2)))
+    for points in (sparse(first, second), at_random):
+        assert "do not overlap" in refusal(points, one_line)
 
 
 def test_no_overlap(level: Any, one_line) -> None:
@@ -201,6 +184,8 @@ def test_a_wrong_focal_length(turned: Any, refined: Any, factor: float, one_line
         check_all(refined, calibration)
     message = one_line(error.value)
     assert f"{calibration.camera0.focal_px[0]:.0f} px (calib.json) is probably wrong" in message
+    if factor == 0.5:  # the right one is named
+        assert re.search(r"one of about (4[5-9]\d|5[0-4]\d) px", message)
 
 
 @pytest.mark.parametrize("factor", [0.4, 1.0, 2.0, 3.0])
@@ -217,16 +202,6 @@ def test_too_long_a_focal_length_is_seen_where_the_camera_turned_more(
         return
     with pytest.raises(ReconstructionError, match="focal length"):
         check_all(points, calibration)
-
-
-def test_the_right_focal_length_is_named(turned: Any, refined: Any) -> None:
-    calibration = scaled(turned.calibration, 0.5)
-    cells, scene = check_matches(*refined, SIZE, calibration)
-    used = cells[scene.epipolar.inliers]
-    points = refined[0][used], refined[1][used]
-    pose = estimate_relative_pose(*refined, calibration)
-    with pytest.raises(ReconstructionError, match=r"one of about (4[5-9]\d|5[0-4]\d) px"):
-        check_focal(*points, pose.errors[used], calibration)
 
 
 def test_what_stands_in_front_of_a_plane() -> None:

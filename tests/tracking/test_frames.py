@@ -21,9 +21,9 @@ def test_a_folder_gives_its_images_by_name(frame_folder, moving_photo) -> None:
 
 
 def test_a_video_gives_what_was_written(moving_photo, tmp_path: Path) -> None:
-    with write_video(tmp_path / "v.mp4", 12.0) as writer:
+    with write_video(tmp_path / "v.mp4", 12.0) as write:
         for k in range(6):
-            writer.write(moving_photo(k))
+            write(moving_photo(k))
     with FrameSource(tmp_path / "v.mp4") as source:
         assert source.count == 6
         assert source.fps == pytest.approx(12)

@@ -19,8 +19,8 @@ from deepdetect.tracking.video import (
 
 def test_there_is_no_file_unless_it_is_whole(moving_photo, tmp_path: Path) -> None:
     def stopped() -> None:
-        with write_video(tmp_path / "v.mp4", 10) as writer:
-            writer.write(moving_photo(0))
+        with write_video(tmp_path / "v.mp4", 10) as write:
+            write(moving_photo(0))
             raise RuntimeError
 
     with pytest.raises(RuntimeError):
@@ -36,7 +36,7 @@ def test_no_encoder_is_one_sentence(moving_photo, tmp_path: Path, monkeypatch, o
     import cv2
 
     class Closed:
-        def __init__(self, *arguments: object) -> None:
+        def open(self, *arguments: object) -> None:
             pass
 
         def isOpened(self) -> bool:
@@ -46,8 +46,8 @@ def test_no_encoder_is_one_sentence(moving_photo, tmp_path: Path, monkeypatch, o
             pass
 
     monkeypatch.setattr(cv2, "VideoWriter", Closed)
-    with pytest.raises(DeepDetectError) as caught, write_video(tmp_path / "v.mp4", 10) as writer:
-        writer.write(moving_photo(0))
+    with pytest.raises(DeepDetectError) as caught, write_video(tmp_path / "v.mp4", 10) as write:
+        write(moving_photo(0))
     assert "no encoder (mp4v)" in one_line(caught.value)
     assert not list(tmp_path.iterdir())
 
@@ -58,21 +58,22 @@ def test_a_full_disk_is_one_sentence(suffix: str, missing: str, tmp_path: Path, 
     """The limit of a file's size stands for the disk: OpenCV says nothing in either case."""
     resource = pytest.importorskip("resource", reason="needs limits of processes")
 
-    def write(name: str) -> Path:
+    def write_noise(name: str) -> Path:
         noise = np.random.default_rng(0)
-        with write_video(tmp_path / f"{name}{suffix}", 10) as writer:
+        with write_video(tmp_path / f"{name}{suffix}", 10) as write:
             for _ in range(20):
-                writer.write(noise.integers(0, 256, (120, 160, 3), dtype=np.uint8))
+                write(noise.integers(0, 256, (120, 160, 3), dtype=np.uint8))
         return tmp_path / f"{name}{suffix}"
 
-    whole = write("whole")
+    whole = write_noise("whole")
+    assert count_frames(whole) == 20
     room = 100_000 if missing == "most" else whole.stat().st_size - 1
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     usual = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
     try:
         with pytest.raises(DeepDetectError) as caught:
-            write("v")
+            write_noise("v")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, usual)
@@ -82,19 +83,11 @@ def test_a_full_disk_is_one_sentence(suffix: str, missing: str, tmp_path: Path, 
     assert list(tmp_path.iterdir()) == [whole]
 
 
-def test_all_frames_arrive(moving_photo, tmp_path: Path) -> None:
-    for suffix in CODECS:
-        with write_video(tmp_path / f"v{suffix}", 10) as writer:
-            for k in range(3):
-                writer.write(moving_photo(k))
-        assert count_frames(tmp_path / f"v{suffix}") == 3
-
-
 def test_frames_of_another_size_are_refused(moving_photo, tmp_path: Path) -> None:
-    with write_video(tmp_path / "v.avi", 10) as writer:
-        writer.write(moving_photo(0))
+    with write_video(tmp_path / "v.avi", 10) as write:
+        write(moving_photo(0))
         with pytest.raises(DeepDetectError, match="pixels"):
-            writer.write(moving_photo(0)[:100])
+            write(moving_photo(0)[:100])
 
 
 def test_tracks_are_drawn_where_they_are() -> None:
@@ -112,9 +105,3 @@ def test_tracks_are_drawn_where_they_are() -> None:
     assert not drawn[50:].any()
     assert not black.any()
     assert drawer.draw(black, frame, "12 frames/s").astype(int).sum() > drawn.astype(int).sum()
-
-
-def test_colors_differ() -> None:
-    colors = np.array([track_color(k) for k in range(8)], float)
-    gaps = np.linalg.norm(colors[:, None] - colors, axis=2) + 999 * np.eye(8)
-    assert gaps.min() > 30

@@ -78,7 +78,6 @@ class FrameSource(AbstractContextManager["FrameSource"]):
         self.every, self.max_frames = every, max_frames
         self.camera = _camera_number(source)
         self.live = self.camera is not None
-        self._name = f"camera {self.camera}" if self.live else str(source)
         self._capture: Any = None
         self._images: list[Path] = []
         self.failures: list[str] = []
@@ -130,24 +129,23 @@ class FrameSource(AbstractContextManager["FrameSource"]):
                 return
 
     def _from_images(self) -> Iterator[Frame]:
-        first: tuple[int, int] | None = None
-        for number in range(0, len(self._images), self.every):
-            path = self._images[number]
+        first: tuple[int, ...] = ()
+        for number, path in list(enumerate(self._images))[:: self.every]:
             try:
                 rgb = load_image(path)
             except ImageError as error:
                 self.failures.append(str(error))
                 continue
-            size = rgb.shape[1], rgb.shape[0]
-            first = first or size
-            if size != first:
+            height, width = rgb.shape[:2]
+            first = first or (width, height)
+            if (width, height) == first:
+                yield Frame(number, rgb)
+            else:
                 self.failures.append(
-                    f"{path} has {size[0]}x{size[1]} pixels, the first frame has "
+                    f"{path} has {width}x{height} pixels, the first frame has "
                     f"{first[0]}x{first[1]}: give frames of one size"
                 )
-                continue
-            yield Frame(number, rgb)
-        if first is None:
+        if not first:
             count = len(self.failures)
             raise BatchError(f"none of {count} frames can be read", self.failures)
 
@@ -163,7 +161,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
                 yield Frame(number, load_image(bgr, channels="bgr"))
             number += 1
         if not number:
-            raise DeepDetectError(f"{self._name} gives no frame: check it with another program")
+            raise DeepDetectError("the source gives no frame: check it with another program")
 
     def __exit__(
         self,

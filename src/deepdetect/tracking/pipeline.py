@@ -149,18 +149,15 @@ def track(
         tracker = Tracker(detect, options)
         stopped = stack.enter_context(_ended_by_signals(opened.live))
         write = stack.enter_context(write_tracks(table))
-        drawn: Any = None
-        if video is not None:
-            drawn = stack.enter_context(write_video(video, opened.fps))
+        draw = None if video is None else stack.enter_context(write_video(video, opened.fps))
         drawer, ticks = TrackDrawer(tail), deque([begun], RATE_FRAMES + 1)
         bar = stack.enter_context(progress(opened.count, "tracking", "frame", quiet))
         for rgb, frame in track_frames(opened, tracker, max_side=max_side):
             write(frame)
             ticks.append(time.perf_counter())
             rate = (len(ticks) - 1) / max(1e-9, ticks[-1] - ticks[0])
-            if drawn is not None:
-                caption = f"{rate:.1f} frames/s   {len(frame)} tracks"
-                drawn.write(drawer.draw(rgb, frame, caption))
+            if draw is not None:
+                draw(drawer.draw(rgb, frame, f"{rate:.1f} frames/s   {len(frame)} tracks"))
             frames += 1
             tracks = max(tracks, int(frame.tracks.max(initial=-1)) + 1)
             positions += len(frame)
@@ -188,15 +185,7 @@ def _check_side(max_side: int | None) -> None:
 
 
 def output_files(output: str | Path) -> tuple[Path | None, Path]:
-    """Return the files of the video, None where there is none, and of the table.
-
-    Raises:
-        OptionError: the ending is no video's.
-
-    Example:
-        >>> [str(path) for path in output_files("walk.mp4")]
-        ['walk.mp4', 'walk.csv']
-    """
+    """Return the files of the video, None where there is none, and of the table."""
     path = Path(output)
     if path.suffix.lower() == ".csv":
         return None, path
@@ -208,8 +197,7 @@ def output_files(output: str | Path) -> tuple[Path | None, Path]:
 def _ended_by_signals(live: bool) -> Iterator[Callable[[], bool]]:
     """Note the first Ctrl-C, SIGTERM or SIGHUP of a live source, so that its files are finished.
 
-    A second one ends all at once, and leaves no file. A SIGTERM or SIGHUP that the caller handles
-    is the caller's, and one that is ignored, as nohup has it, is none.
+    A second one ends all at once, and leaves no file.
     """
     noted: list[int] = []
     with ExitStack() as handlers:

@@ -25,7 +25,6 @@ from .tracks import TrackedFrame
 Detect = Callable[[np.ndarray], Keypoints]
 """Keypoints of a (H, W, 3) uint8 RGB image."""
 
-
 CANDIDATES = 3
 """Keypoints that are detected for each track that is wanted: the best well apart are taken."""
 
@@ -111,7 +110,6 @@ class Tracker:
         self.detect = detect
         self.options = options
         self._gray: np.ndarray | None = None
-        self._size: tuple[int, int] | None = None
         self._frames = 0
         self._since_detection = 0
         self._next_track = 0
@@ -137,17 +135,15 @@ class Tracker:
             OptionError: it has another size than the frames before.
         """
         rgb = load_image(image, channels=channels)
-        size = rgb.shape[1], rgb.shape[0]
-        if self._size is not None and self._size != size:
-            raise OptionError(
-                f"a frame has {size[0]}x{size[1]} pixels, those before have "
-                f"{self._size[0]}x{self._size[1]}: use a tracker for each size"
-            )
-        self._size = size
-        options = self.options
-        gray = luma(rgb)
-        if self._gray is not None and len(self._xy):
-            self._follow(gray)
+        options, gray = self.options, luma(rgb)
+        if self._gray is not None:
+            if self._gray.shape != gray.shape:
+                (height, width), (before_height, before_width) = gray.shape, self._gray.shape
+                raise OptionError(
+                    f"a frame has {width}x{height} pixels, those before have "
+                    f"{before_width}x{before_height}: use a tracker for each size"
+                )
+            self._follow(self._gray, gray)
         if (
             not len(self._xy)
             or self._since_detection >= options.detect_every
@@ -169,11 +165,12 @@ class Tracker:
         self._frames += 1
         return found
 
-    def _follow(self, gray: np.ndarray) -> None:
+    def _follow(self, before: np.ndarray, gray: np.ndarray) -> None:
         """Move the points to where the next frame shows them; drop those that are lost."""
-        assert self._gray is not None
+        if not len(self._xy):
+            return
         there, errors = track_round_trip(
-            self._gray,
+            before,
             gray,
             self._xy,
             WINDOW_PX,
@@ -183,8 +180,7 @@ class Tracker:
             min_eigenvalue=MIN_EIGENVALUE,
             back_to_start=True,
         )
-        assert self._size is not None
-        low, high = BORDER_PX, np.array(self._size) - 1 - BORDER_PX
+        low, high = BORDER_PX, np.array(gray.shape[::-1]) - 1 - BORDER_PX
         kept = (
             (errors <= self.options.max_return_error_px)
             & (there >= low).all(axis=1)
@@ -209,16 +205,9 @@ class Tracker:
 def free_keypoints(
     keypoints: Keypoints, taken: np.ndarray, distance_px: float, count: int
 ) -> np.ndarray:
-    """Choose the best keypoints that are far from positions that are taken, and from each other.
+    """Choose up to `count` keypoints, the best first, far from (M, 2) positions and each other.
 
-    Args:
-        keypoints: of an image.
-        taken: (M, 2) positions.
-        distance_px: smallest distance, of the nearest pixels.
-        count: at most so many.
-
-    Returns:
-        (K,) rows of the keypoints, best first.
+    Returns (K,) rows of the keypoints; distances are those of the nearest pixels.
 
     Example:
         >>> points = Keypoints([[2, 2], [3, 2], [9, 2], [15, 2]], [0.5, 0.9, 0.8, 0.7], (20, 5))

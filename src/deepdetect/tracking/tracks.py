@@ -59,15 +59,7 @@ class TrackedFrame:
 def write_tracks(path: str | Path) -> Iterator[Callable[[TrackedFrame], None]]:
     """Open a CSV file of tracks, which appears when the block ends, whole or not at all.
 
-    Args:
-        path: ending in .csv.
-
-    Yields:
-        What writes the rows of a frame: columns frame, track, x, y and score.
-
-    Raises:
-        OptionError: the ending is another.
-        DeepDetectError: the file cannot be written.
+    What writes the rows of a frame is given: columns frame, track, x, y and score.
     """
     if Path(path).suffix.lower() != ".csv":
         raise OptionError(f"{path} must end in .csv")
@@ -139,16 +131,9 @@ def load_tracks(path: str | Path) -> list[TrackedFrame]:
     born: dict[int, int] = {}
     frames = []
     parts = np.split(table, begins[1:])
-    for place, (number, part) in enumerate(zip(numbers, parts, strict=True)):
+    for place, (number, part) in enumerate(zip(numbers.tolist(), parts, strict=True)):
         tracks = part[:, 1].astype(np.int64)
         ages = np.array([place - born.setdefault(track, place) for track in tracks.tolist()])
-        frames.append(
-            TrackedFrame(
-                int(number),
-                tracks,
-                part[:, 2:4].astype(np.float32),
-                part[:, 4].astype(np.float32),
-                ages,
-            )
-        )
+        xy, scores = part[:, 2:4].astype(np.float32), part[:, 4].astype(np.float32)
+        frames.append(TrackedFrame(number, tracks, xy, scores, ages))
     return frames

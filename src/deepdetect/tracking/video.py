@@ -5,10 +5,9 @@ from __future__ import annotations
 import colorsys
 import os
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -30,47 +29,6 @@ HUE_STEP = 0.61803
 """Of the colours of following tracks: neighbours are far apart (the golden ratio)."""
 
 
-class VideoWriter:
-    """Writes frames; the first one decides the size.
-
-    OpenCV does not say when a frame could not be written: `write_video` checks the whole file.
-
-    Attributes:
-        frames: that were given to be written until now.
-    """
-
-    def __init__(self, path: Path, codec: str, fps: float, name: Path) -> None:
-        self._path, self._codec, self._fps, self._name = path, codec, fps, name
-        self._writer: Any = None
-        self._size = (0, 0)
-        self.frames = 0
-
-    def write(self, rgb: np.ndarray) -> None:
-        """Write a (H, W, 3) uint8 RGB frame.
-
-        Raises:
-            DeepDetectError: OpenCV has no encoder, or the frame has another size than the first.
-        """
-        size = rgb.shape[1], rgb.shape[0]
-        if self._writer is None:
-            code = cv2.VideoWriter_fourcc(*self._codec)
-            self._writer, self._size = cv2.VideoWriter(str(self._path), code, self._fps, size), size
-            if not self._writer.isOpened():
-                raise DeepDetectError(
-                    f"the installed OpenCV has no encoder ({self._codec}) for {self._name}: give a "
-                    "name that ends in .avi, or in .csv for the tracks alone"
-                )
-        if size != self._size:
-            raise DeepDetectError(f"a frame has {size} pixels, the first one had {self._size}")
-        self._writer.write(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-        self.frames += 1
-
-    def close(self) -> None:
-        """Finish the file."""
-        if self._writer is not None:
-            self._writer.release()
-
-
 def count_frames(path: Path) -> int:
     """Return how many frames of a video file can be read one after the other."""
     backend, settings = cv2.CAP_ANY, []
@@ -85,15 +43,7 @@ def count_frames(path: Path) -> int:
 
 
 def check_video_name(path: str | Path) -> str:
-    """Return the codec of a video file by its suffix; call it before any expensive work.
-
-    Raises:
-        OptionError: the ending is another.
-
-    Example:
-        >>> check_video_name("walk.MP4")
-        'mp4v'
-    """
+    """Return the codec of a video file by its suffix; call it before any expensive work."""
     suffix = Path(path).suffix.lower()
     if suffix not in CODECS:
         raise OptionError(f"{path} must end in {', '.join(CODECS)}, or .csv")
@@ -101,29 +51,43 @@ def check_video_name(path: str | Path) -> str:
 
 
 @contextmanager
-def write_video(path: str | Path, fps: float) -> Iterator[VideoWriter]:
+def write_video(path: str | Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
     """Open a video file, which appears when the block ends, whole or not at all.
 
-    Args:
-        path: ending in .mp4, .mov, .mkv or .avi.
-        fps: frames per second when it is shown.
+    What writes a (H, W, 3) uint8 RGB frame is given; all have the size of the first. OpenCV does
+    not say when a frame could not be written: the whole file is checked.
 
     Raises:
-        OptionError: the ending is another.
         DeepDetectError: the file cannot be written, as where the disk is full, or no frame was.
     """
     codec = check_video_name(path)
+    sizes: list[tuple[int, int]] = []
     with atomic_path(path) as temporary:
-        writer = VideoWriter(temporary, codec, fps, Path(path))
+        writer = cv2.VideoWriter()
+
+        def write(rgb: np.ndarray) -> None:
+            size = rgb.shape[1], rgb.shape[0]
+            if not sizes:
+                writer.open(str(temporary), cv2.VideoWriter_fourcc(*codec), fps, size)
+                if not writer.isOpened():
+                    raise DeepDetectError(
+                        f"the installed OpenCV has no encoder ({codec}) for {path}: give a name "
+                        "that ends in .avi, or in .csv for the tracks alone"
+                    )
+            elif size != sizes[0]:
+                raise DeepDetectError(f"a frame has {size} pixels, the first one had {sizes[0]}")
+            writer.write(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
+            sizes.append(size)
+
         try:
-            yield writer
+            yield write
         finally:
-            writer.close()
-        if not writer.frames:
+            writer.release()
+        if not sizes:
             raise DeepDetectError(f"there is no frame to be written to {path}: check the source")
-        if (found := count_frames(temporary)) < writer.frames:
+        if (found := count_frames(temporary)) < len(sizes):
             raise DeepDetectError(
-                f"cannot write {path} ({found} of {writer.frames} frames are in the file): free "
+                f"cannot write {path} ({found} of {len(sizes)} frames are in the file): free "
                 "some space, or choose another place"
             )
         _check_space(temporary)
@@ -139,23 +103,13 @@ def _check_space(path: Path) -> None:
 
 
 class TrackDrawer:
-    """Draws tracks with their last positions over frames.
-
-    Args:
-        tail: number of positions that are drawn of each track.
-    """
+    """Draws tracks with their last positions, up to `tail`, over frames."""
 
     def __init__(self, tail: int = 10) -> None:
-        self._frames: deque[TrackedFrame] = deque(maxlen=max(1, tail))
+        self._frames: deque[TrackedFrame] = deque(maxlen=tail)
 
     def draw(self, rgb: np.ndarray, frame: TrackedFrame, caption: str = "") -> np.ndarray:
-        """Return a copy of a frame with its tracks and a caption.
-
-        Args:
-            rgb: (H, W, 3) uint8.
-            frame: its tracks.
-            caption: a line, as the number of frames per second.
-        """
+        """Return a copy of a frame, (H, W, 3) uint8, with its tracks and a caption."""
         self._frames.append(frame)
         canvas = np.ascontiguousarray(rgb.copy())
         unit = max(1.0, rgb.shape[1] / READABLE_WIDTH_PX)
@@ -182,11 +136,6 @@ class TrackDrawer:
 
 
 def track_color(track: int) -> tuple[int, int, int]:
-    """Return a bright RGB colour that a track keeps.
-
-    Example:
-        >>> track_color(0)
-        (255, 51, 51)
-    """
+    """Return a bright RGB colour that a track keeps."""
     red, green, blue = colorsys.hsv_to_rgb(track * HUE_STEP % 1, 0.8, 1.0)
     return round(255 * red), round(255 * green), round(255 * blue)
