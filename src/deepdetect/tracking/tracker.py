@@ -34,18 +34,13 @@ MIN_DISTANCE_PX = 8.0
 WINDOW_PX = 21
 """Side of the patch that is followed."""
 
-PYRAMID_LEVELS = 4
-"""Images, each half as large as the one before, on which a point is looked for: the more, the
-farther it may move."""
-
-MAX_ITERATIONS = 30
-"""Largest number of steps on each level."""
-
-MIN_STEP_PX = 0.01
-"""A smaller step ends the iterations."""
-
-MIN_EIGENVALUE = 1e-4
-"""Smallest of the patch's gradients (OpenCV's minEigThreshold): flat patches are not followed."""
+SEARCH: dict[str, Any] = {
+    "levels": 3,  # above the image itself, each half as large: the more, the farther a point moves
+    "iterations": 30,
+    "step_px": 0.01,
+    "min_eigenvalue": 1e-4,  # of the patch's gradients: flat patches are not followed
+}
+"""How a patch is searched for, as `track_round_trip` takes it."""
 
 BORDER_PX = 2.0
 """Points nearer to the border of the image are dropped."""
@@ -107,17 +102,16 @@ class Tracker:
 
     @suggest_keywords
     def __init__(self, detect: Detect, options: TrackingOptions = TrackingOptions()) -> None:
-        self.detect = detect
-        self.options = options
+        self.detect, self.options = detect, options
         self._gray: np.ndarray | None = None
-        self._frames = 0
-        self._since_detection = 0
-        self._next_track = 0
+        self._frames = self._since_detection = self._next_track = 0
         self._most = 0  # tracks after the last detection
-        self._tracks = np.empty(0, np.int64)
-        self._xy = np.empty((0, 2), np.float32)
-        self._scores = np.empty(0, np.float32)
-        self._ages = np.empty(0, np.int64)
+        self._points: dict[str, np.ndarray] = {
+            "tracks": np.empty(0, np.int64),
+            "xy": np.empty((0, 2), np.float32),
+            "scores": np.empty(0, np.float32),
+            "ages": np.empty(0, np.int64),
+        }
 
     @suggest_keywords
     def update(
@@ -144,62 +138,51 @@ class Tracker:
                     f"{before_width}x{before_height}: use a tracker for each size"
                 )
             self._follow(self._gray, gray)
+        count = len(self._points["xy"])
         if (
-            not len(self._xy)
+            not count
             or self._since_detection >= options.detect_every
-            or len(self._xy) < options.min_kept * self._most
+            or count < options.min_kept * self._most
         ):
             self._add(self.detect(rgb))
-            self._most = len(self._xy)
+            self._most = len(self._points["xy"])
             self._since_detection = 0
         self._since_detection += 1
         self._gray = gray
-        found = TrackedFrame(
-            self._frames if number is None else number,
-            self._tracks.copy(),
-            self._xy.copy(),
-            self._scores.copy(),
-            self._ages.copy(),
-        )
-        self._ages += 1
+        points = {name: values.copy() for name, values in self._points.items()}
+        found = TrackedFrame(self._frames if number is None else number, **points)
+        self._points["ages"] += 1
         self._frames += 1
         return found
 
     def _follow(self, before: np.ndarray, gray: np.ndarray) -> None:
         """Move the points to where the next frame shows them; drop those that are lost."""
-        if not len(self._xy):
+        xy = self._points["xy"]
+        if not len(xy):
             return
-        there, errors = track_round_trip(
-            before,
-            gray,
-            self._xy,
-            WINDOW_PX,
-            levels=PYRAMID_LEVELS - 1,
-            iterations=MAX_ITERATIONS,
-            step_px=MIN_STEP_PX,
-            min_eigenvalue=MIN_EIGENVALUE,
-            back_to_start=True,
-        )
+        there, errors = track_round_trip(before, gray, xy, WINDOW_PX, back_to_start=True, **SEARCH)
         low, high = BORDER_PX, np.array(gray.shape[::-1]) - 1 - BORDER_PX
         kept = (
             (errors <= self.options.max_return_error_px)
             & (there >= low).all(axis=1)
             & (there <= high).all(axis=1)
         )
-        self._xy = there[kept]
-        self._tracks, self._scores = self._tracks[kept], self._scores[kept]
-        self._ages = self._ages[kept]
+        self._points["xy"] = there
+        self._points = {name: values[kept] for name, values in self._points.items()}
 
     def _add(self, keypoints: Keypoints) -> None:
         """Begin tracks with the best keypoints that are far enough from all tracks."""
-        room = self.options.max_keypoints - len(self._xy)
-        rows = free_keypoints(keypoints, self._xy, MIN_DISTANCE_PX, room)
-        count = len(rows)
-        self._tracks = np.append(self._tracks, np.arange(count) + self._next_track)
-        self._next_track += count
-        self._xy = np.concatenate([self._xy, keypoints.xy[rows]])
-        self._scores = np.append(self._scores, keypoints.scores[rows]).astype(np.float32)
-        self._ages = np.append(self._ages, np.zeros(count, np.int64))
+        xy = self._points["xy"]
+        rows = free_keypoints(keypoints, xy, MIN_DISTANCE_PX, self.options.max_keypoints - len(xy))
+        new = {
+            "tracks": np.arange(len(rows)) + self._next_track,
+            "xy": keypoints.xy[rows],
+            "scores": keypoints.scores[rows],
+            "ages": np.zeros(len(rows), np.int64),
+        }
+        self._next_track += len(rows)
+        for name, values in self._points.items():
+            self._points[name] = np.concatenate([values, new[name]])
 
 
 def free_keypoints(

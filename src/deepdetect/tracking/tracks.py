@@ -49,11 +49,6 @@ class TrackedFrame:
     def __len__(self) -> int:
         return len(self.tracks)
 
-    @property
-    def begun(self) -> int:
-        """Number of tracks that begin in this frame."""
-        return int(np.count_nonzero(self.ages == 0))
-
 
 @contextmanager
 def write_tracks(path: str | Path) -> Iterator[Callable[[TrackedFrame], None]]:
