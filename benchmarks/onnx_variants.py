@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from deepdetect import DeepDetect, MissingExtraError, OptionError
-from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx
+from deepdetect.detector.network.onnx_export import OnnxOptions, write_onnx
 from deepdetect.evaluation.protocols.masks import load_sample, sample_images, score_samples
 from deepdetect.evaluation.report import Row, Table
 from deepdetect.io.image import find_images, load_image

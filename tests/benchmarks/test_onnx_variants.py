@@ -10,7 +10,7 @@ from PIL import Image
 
 onnx = pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
 
-from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx  # noqa: E402
+from deepdetect.detector.network.onnx_export import OnnxOptions, write_onnx  # noqa: E402
 from deepdetect.io.image import luma  # noqa: E402
 from deepdetect.labels import fuse  # noqa: E402
 

@@ -12,7 +12,7 @@ from PIL import Image
 pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
 
 from deepdetect import DeepDetect
-from deepdetect.detector.network.onnx_variants import write_onnx
+from deepdetect.detector.network.onnx_export import write_onnx
 from tests.docs.test_pages import blocks
 
 

@@ -56,7 +56,7 @@ def test_the_keypoints_are_those_of_the_package(
 @pytest.mark.slow
 def test_a_file_that_gives_keypoints(installed: Path, photo: np.ndarray, tmp_path: Path) -> None:
     pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
-    from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx
+    from deepdetect.detector.network.onnx_export import OnnxOptions, write_onnx
 
     (installed / "best.mjs").write_text(
         """

@@ -11,7 +11,7 @@ from cyclopts import App, Parameter
 
 from .._shared.errors import BatchError, MissingFileError, OptionError
 from .._shared.records import Outputs, check_not_made
-from ..detector.network.onnx_variants import OnnxOptions, write_onnx
+from ..detector.network.onnx_export import OnnxOptions, write_onnx
 from ..detector.point_detector import PointDetector
 from ..detector.pretrained import resolve_weights
 from ..geometry.camera import Camera

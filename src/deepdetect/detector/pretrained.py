@@ -20,39 +20,14 @@ PRETRAINED: dict[str, str] = {
 
 
 def pretrained_weights(name: str = "default", suffix: str = ".onnx") -> Path:
-    """Return the path of weights inside the package.
+    """Return the path of weights inside the package, for inference or (".safetensors") training.
 
-    Args:
-        name: "default", for all purposes and in the dark; "dense", for the geometry of
-            scenes in normal light; or "free", as "default" but trained on photographs of
-            free licences alone.
-        suffix: ".onnx", or ".safetensors" for training.
-
-    Raises:
-        OptionError: the name is unknown (the nearest right one is named).
-
-    Example:
-        >>> pretrained_weights("dense").name
-        'dense.onnx'
+    An OptionError names the nearest name that is known.
     """
     return (FOLDER / look_up("weights", name, PRETRAINED)).with_suffix(suffix)
 
 
 def resolve_weights(weights: str | Path, suffix: str = ".onnx") -> Path:
-    """Return the path of weights that are named, or are a file.
-
-    Args:
-        weights: a name of `PRETRAINED`, or a path (`is_path`).
-        suffix: as of `pretrained_weights`.
-
-    Raises:
-        OptionError: it is a word that is no name.
-
-    Example:
-        >>> resolve_weights("run/best.safetensors").name
-        'best.safetensors'
-    """
+    """Return the path of weights that are named in `PRETRAINED`, or are a file."""
     found = resolve_name_or_path("weights", weights, PRETRAINED)
-    if isinstance(found, Path):
-        return found
-    return pretrained_weights(str(weights), suffix)
+    return found if isinstance(found, Path) else pretrained_weights(str(weights), suffix)

@@ -14,8 +14,8 @@ import cv2  # noqa: E402
 import onnxruntime  # noqa: E402
 
 from deepdetect import DeepDetect  # noqa: E402
+from deepdetect.detector.network.onnx_export import OnnxOptions, write_onnx  # noqa: E402
 from deepdetect.detector.network.onnx_keypoints import MAX_KEYPOINTS, add_keypoints  # noqa: E402
-from deepdetect.detector.network.onnx_variants import OnnxOptions, write_onnx  # noqa: E402
 from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
 from deepdetect.features.keypoints import Keypoints  # noqa: E402
 from deepdetect.features.selection import (  # noqa: E402

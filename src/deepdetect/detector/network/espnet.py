@@ -94,27 +94,22 @@ class NormActivation(nn.Module):
         return self.act(self.bn(x))
 
 
-class ConvolutionNormActivation(nn.Module):
+class ConvolutionNormActivation(Convolution):
     """Convolution, batch normalisation, PReLU."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(
-            inputs, outputs, kernel, stride=stride, padding=kernel // 2, bias=False
-        )
+        super().__init__(inputs, outputs, kernel, stride)
         self.bn = nn.BatchNorm2d(outputs, eps=EPSILON)
         self.act = nn.PReLU(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.act(self.bn(self.conv(x)))
+        return self.act(self.bn(super().forward(x)))
 
 
 class SpatialPyramid(nn.Module):
     """Reduce, then five dilated branches, fused by running sums and joined.
 
-    Args:
-        inputs, outputs: channels.
-        reduce: kernel of the reducing convolution: 1, or 3 with stride 2 to halve the size.
+    The reducing convolution has a kernel of 1, or of 3 and stride 2 to halve the size.
     """
 
     d1: DilatedConvolution

@@ -1,52 +1,207 @@
-"""From torch to an ONNX file for any image size: `image` in; maps and the best keypoints out."""
+"""ONNX files for other programs: any size or one, in three precisions, with or without keypoints.
+
+Their input is `image`; outputs are `probability`, `logits` and those of `add_keypoints`.
+"""
 
 from __future__ import annotations
 
 import io
 import logging
 import warnings
-from collections.abc import Mapping
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-import torch
-from torch import Tensor, nn
+import numpy as np
 
 from ..._shared.atomic import atomic_path
-from .onnx_graph import ANY_SIZE, add_padding, write_metadata
-from .onnx_keypoints import MAX_KEYPOINTS, add_keypoints
+from ..._shared.errors import OptionError, WeightsError, unknown_name
+from ..._shared.options import check_ranges, suggest_keywords
+from ...features.selection import check_max_keypoints
+from ...io.image import load_image
+from ..backends import require_packages
+from ..pretrained import resolve_weights
+from .onnx_graph import (
+    add_padding,
+    check_graph,
+    fix_size,
+    read_metadata,
+    to_float16,
+    to_int8,
+    write_metadata,
+)
+from .onnx_keypoints import MAX_KEYPOINTS, add_keypoints, remove_keypoints
 
+if TYPE_CHECKING:
+    from onnx import ModelProto
+    from torch import nn
+
+PRECISIONS = ("fp32", "fp16", "int8")
+ANY_SIZE = {"precision": "fp32", "size": "any", "batch": "any"}
 OPSET = 17
 
-
-class ProbabilityAndLogits(nn.Module):
-    """The network followed by the sigmoid, and its logits, which distinguish the best pixels."""
-
-    def __init__(self, network: nn.Module) -> None:
-        super().__init__()
-        self.network = network
-
-    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        logits = self.network(image)
-        return torch.sigmoid(logits), logits
+MAX_CALIBRATION_IMAGES = 32
+"""At most this many images calibrate int8, evenly chosen."""
 
 
-def export_onnx(
-    network: nn.Module, path: str | Path, metadata: Mapping[str, str] | None = None
-) -> None:
-    """Write a network as ONNX, whole or not at all.
+@suggest_keywords
+@dataclass(frozen=True)
+class OnnxOptions:
+    """What an exported ONNX file is like.
+
+    Attributes:
+        size: height and width in pixels of a file that takes this size only, for OpenCV 4 and other
+            runtimes without dynamic shapes. None: any height and width.
+        batch: number of images that a file with a size takes; without a size it is free.
+        precision: "fp32", "fp16" (half the bytes), or "int8" (quantised, for
+            which it needs calibration images; it marks other pixels).
+        max_keypoints: the file gives this many dense keypoints, too, the best ones: what
+            `DeepDetect.detect` finds with the same `max_keypoints`, `nms_radius=1` and
+            `subpixel=True`. 0: maps only; OpenCV 4 refuses files with keypoints.
+
+    Raises:
+        OptionError: a value is unknown or out of its range.
+    """
+
+    size: tuple[int, int] | None = None
+    batch: int = 1
+    precision: Literal["fp32", "fp16", "int8"] = "fp32"
+    max_keypoints: int = MAX_KEYPOINTS
+
+    def __post_init__(self) -> None:
+        if self.precision not in PRECISIONS:
+            raise unknown_name("precision", self.precision, PRECISIONS)
+        if self.size is not None and len(self.size) != 2:
+            raise OptionError(f"`size` must be height and width, not {self.size}")
+        ranges = {"size": (8, 16384), "batch": (1, 1024), "max_keypoints": (0, 100_000)}
+        check_ranges(self, between=ranges)
+        if self.max_keypoints:
+            check_max_keypoints(self.max_keypoints)
+        if self.batch > 1 and self.size is None:
+            raise OptionError("`batch` needs `size`: a file for any size takes any batch")
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """What the file says of its options."""
+        values = {**ANY_SIZE, "precision": self.precision}
+        if self.size is not None:
+            height, width = self.size
+            values |= {"size": f"{height}x{width}", "batch": str(self.batch)}
+        if self.max_keypoints:
+            values["max_keypoints"] = str(self.max_keypoints)
+        return values
+
+
+def export_onnx(network: nn.Module, path: str | Path) -> None:
+    """Write a network, as `ESPNet`, for any size; whole or not at all."""
+    _write(_of_torch(network), path, OnnxOptions(), {})
+
+
+def write_onnx(
+    weights: str | Path,
+    path: str | Path,
+    options: OnnxOptions = OnnxOptions(),
+    *,
+    calibration: Sequence[Path] = (),
+    licence: str | None = None,
+) -> dict[str, str]:
+    """Write weights as an ONNX file for other programs, whole or not at all.
 
     Args:
-        network: maps (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W) logits; H and W
-            are multiples of 8.
-        path: file ending in .onnx. Its input is `image` (batch, 3, height, width)
-            float32 of any size, its outputs `probability` and `logits`, both
-            (batch, 1, height, width) float32, and those of `add_keypoints`.
-        metadata: what the file says beside what all say (`onnx_graph.METADATA`), as its licence.
+        weights: "default", "dense" or "free"; an ONNX file that this package has written in fp32
+            for any size; or a safetensors file, which needs torch.
+        path: the file to be written, ending in .onnx.
+        options: its size and precision, and whether it gives keypoints.
+        calibration: images for int8, like those that it will be used on.
+        licence: what the file says of the licence of the weights. None: that of the given file.
+
+    Returns:
+        The metadata that the file holds.
+
+    Raises:
+        MissingExtraError: the package onnx, or torch for safetensors, is not installed.
+        OptionError: calibration images are missing for int8, or given for another precision.
+        WeightsError: the weights are missing, damaged, or no fp32 network for any size.
+        ImageError: a calibration image cannot be read.
     """
+    if Path(path).suffix.lower() != ".onnx":
+        raise OptionError(f"the name of an ONNX file ends in .onnx, not {Path(path).name}")
+    if (options.precision == "int8") != bool(calibration):
+        raise OptionError(
+            "int8 needs images to take the ranges of values from: give `calibration`"
+            if not calibration
+            else f"`calibration` is for int8, not {options.precision}: leave one of them out"
+        )
+    require_packages("exporting to ONNX", "onnx")
+    model, origin = _load(resolve_weights(weights))
+    if licence is not None:
+        origin["licence"] = licence
+    return _write(model, path, options, origin, calibration)
+
+
+def _write(
+    model: ModelProto,
+    path: str | Path,
+    options: OnnxOptions,
+    origin: Mapping[str, str],
+    calibration: Sequence[Path] = (),
+) -> dict[str, str]:
+    """Write what the options make of a network in fp32 for any size; return its metadata."""
+    if options.precision == "int8":
+        model = to_int8(model, _images(calibration))
+    if options.size is not None:
+        fix_size(model, *options.size, options.batch)
+    if options.precision == "fp16":
+        to_float16(model)
+    if options.max_keypoints:
+        add_keypoints(model, options.max_keypoints)
+    write_metadata(model, {**options.metadata, **origin})
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(model.SerializeToString())
+    return read_metadata(model)
+
+
+def _load(path: Path) -> tuple[ModelProto, dict[str, str]]:
+    """Return weights as a network in fp32 for any size, and where they come from."""
     import onnx
 
-    module = ProbabilityAndLogits(network.cpu()).eval()
-    example = torch.zeros(2, 3, 64, 96)
+    if not path.is_file():
+        raise WeightsError(f"there is no weights file {path}: check the path")
+    suffix = path.suffix.lower()
+    if suffix == ".safetensors":
+        require_packages(f"exporting {path.name}", "torch", "safetensors")
+        from .weights import load_network
+
+        return _of_torch(load_network(path)), {"weights": path.name}
+    if suffix != ".onnx":
+        raise WeightsError(f"{path} is no weights file: it must end in .onnx or .safetensors")
+    try:
+        model = onnx.load_model_from_string(path.read_bytes())
+    except Exception as error:  # protobuf's, which onnx hands on
+        raise WeightsError(
+            f"{path} is not an ONNX file that can be read ({error}): download it again"
+        ) from None
+    remove_keypoints(model)
+    check_graph(model, str(path))
+    found = read_metadata(model)
+    if any(found.get(name, value) != value for name, value in ANY_SIZE.items()):
+        raise WeightsError(
+            f"{path} has the size {found.get('size')} and the precision {found.get('precision')}: "
+            "give the file that it was made from"
+        )
+    kept = {name: value for name, value in found.items() if name in ("weights", "licence")}
+    return model, {"weights": path.name, **kept}
+
+
+def _of_torch(network: nn.Module) -> ModelProto:
+    """Return a network of torch as one that pads its image, in fp32 for any size."""
+    import onnx
+    import torch
+
+    # Its parts are named after it: `tiling` knows the names that PyTorch's exporter gives.
+    module = torch.nn.Sequential(OrderedDict(network=network.cpu())).eval()
     axes = {0: "batch", 2: "height", 3: "width"}
     written = io.BytesIO()
     with warnings.catch_warnings():
@@ -54,11 +209,11 @@ def export_onnx(
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         torch.onnx.export(
             module,
-            (example,),
+            (torch.zeros(2, 3, 64, 96),),
             written,  # type: ignore[arg-type]  # its annotation is of the other exporter
             input_names=["image"],
-            output_names=["probability", "logits"],
-            dynamic_axes={"image": axes, "probability": axes, "logits": axes},
+            output_names=["logits"],
+            dynamic_axes={"image": axes, "logits": axes},
             opset_version=OPSET,
             dynamo=False,
             # Keeps batch normalisation as nodes, for `add_padding` to fold in float64. The network
@@ -67,8 +222,11 @@ def export_onnx(
         )
     model = onnx.load_model_from_string(written.getvalue())
     add_padding(model)
-    add_keypoints(model, MAX_KEYPOINTS)
-    of_keypoints = {"max_keypoints": str(MAX_KEYPOINTS)}
-    write_metadata(model, {**ANY_SIZE, **of_keypoints, **(metadata or {})})
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(model.SerializeToString())
+    return model
+
+
+def _images(paths: Sequence[Path]) -> Iterator[np.ndarray]:
+    """Yield some of the images, evenly chosen."""
+    step = max(1, len(paths) / MAX_CALIBRATION_IMAGES)
+    for k in range(min(len(paths), MAX_CALIBRATION_IMAGES)):
+        yield load_image(paths[int(k * step)])

@@ -1,11 +1,15 @@
-"""The graph of an ONNX file: padding and cropping inside it, a fixed size, its metadata.
+"""The graph of an ONNX file: padding and cropping inside it, a fixed size, precision, metadata.
 
 The package `onnx` is needed, torch is not: files are made from files.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import logging
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +18,7 @@ from ... import __version__
 from ..._shared.errors import WeightsError
 
 if TYPE_CHECKING:
-    from onnx import GraphProto, ModelProto, NodeProto, TensorProto
+    from onnx import GraphProto, ModelProto, NodeProto
 
 IMAGE, PROBABILITY, LOGITS = "image", "probability", "logits"
 PADDED_IMAGE, PADDED_LOGITS = "padded_image", "padded_logits"
@@ -37,26 +41,29 @@ METADATA = {
 }
 """What every file says of itself, beside version, weights, licence, precision and size."""
 
+QUANTIZED = "/network/encoder/level3"
+"""Beginning of the names of the convolutions that int8 changes: those at an eighth of the size.
 
-ANY_SIZE = {"precision": "fp32", "size": "any", "batch": "any"}
+Three quarters of all weights are there. Before and behind them rounding to 255 steps costs more
+marks than it saves time (docs/other-programs.md#onnx).
+"""
+
+_FACTOR_SHAPES = {"Conv": (-1, 1, 1, 1), "ConvTranspose": (-1, 1, 1)}
+"""What a number for each output channel is multiplied with a kernel as."""
 
 
 def add_padding(model: ModelProto) -> None:
-    """Let a network take any height and width, and give probabilities that are at most 1.
+    """Let a network, `image` to `logits`, take any size, and give probabilities of at most 1.
 
-    The image is padded by repeating its last row and column to multiples of 8, and the maps are
-    cropped, as `compute_maps` does it. Batch normalisation is folded, and numbers for each
-    channel have four dimensions.
-
-    Args:
-        model: maps `image` to `logits` for multiples of 8; changed in place.
+    The image is padded by its last row and column to multiples of 8, and the maps are cropped, as
+    `compute_maps` does it. Batch normalisation is folded.
     """
     from onnx import helper
 
     graph = model.graph
     fold_normalisation(graph)
     give_four_dimensions(graph)
-    rest = split_nodes(graph)[1]
+    rest = list(graph.node)
     for node in rest:
         rename(node, IMAGE, PADDED_IMAGE)
         rename(node, LOGITS, PADDED_LOGITS)
@@ -71,19 +78,13 @@ def add_padding(model: ModelProto) -> None:
         helper.make_node("Pad", [IMAGE, "padding"], [PADDED_IMAGE], mode="edge"),
     ]
     replace_nodes(graph, [*before, *rest, *_ending(graph)])
-    for value in (*graph.input, *graph.output):
-        for axis, name in ((0, "batch"), (2, "height"), (3, "width")):
-            value.type.tensor_type.shape.dim[axis].dim_param = name
+    graph.output.insert(0, graph.output[0])
+    graph.output[0].name = PROBABILITY
+    _set_sides(graph, "dim_param", batch="batch", height="height", width="width")
 
 
 def fix_size(model: ModelProto, height: int, width: int, batch: int) -> None:
-    """Give a network with padding one size, and no node that asks for the size.
-
-    Args:
-        model: what `add_padding` made; changed in place.
-        height, width: of the images, in pixels.
-        batch: number of images.
-    """
+    """Give a network with padding one size, and no node that asks for the size."""
     from onnx import helper
 
     graph = model.graph
@@ -97,17 +98,67 @@ def fix_size(model: ModelProto, height: int, width: int, batch: int) -> None:
             rename(node, PADDED_IMAGE, IMAGE)
             rename(node, PADDED_LOGITS, LOGITS)
     replace_nodes(graph, [*before, *inner, *_ending(graph, crop=bool(below or right))])
-    for value in (*graph.input, *graph.output):
-        for axis, length in ((0, batch), (2, height), (3, width)):
-            value.type.tensor_type.shape.dim[axis].dim_value = length
+    _set_sides(graph, "dim_value", batch=batch, height=height, width=width)
+
+
+def to_float16(model: ModelProto) -> None:
+    """Turn the weights of a network with padding into float16, and compute with them.
+
+    Images, padding, logits and probabilities stay float32, here and in `to_int8`.
+    """
+    from onnx import TensorProto, helper, numpy_helper
+
+    graph = model.graph
+    before, inner, behind = split_nodes(graph)
+    weights = {name for node in inner for name in node.input}
+    for one in graph.initializer:
+        if one.name in weights:
+            halved = numpy_helper.to_array(one).astype(np.float16)
+            one.CopyFrom(numpy_helper.from_array(halved, one.name))
+    image, logits = (PADDED_IMAGE, PADDED_LOGITS) if before else (IMAGE, LOGITS)
+    for node in inner:
+        rename(node, image, f"{image}_float16")
+        rename(node, logits, f"{logits}_float16")
+    down = helper.make_node("Cast", [image], [f"{image}_float16"], to=TensorProto.FLOAT16)
+    up = helper.make_node("Cast", [f"{logits}_float16"], [logits], to=TensorProto.FLOAT)
+    replace_nodes(graph, [*before, down, *inner, up, *behind])
+
+
+def to_int8(model: ModelProto, images: Iterable[np.ndarray]) -> ModelProto:
+    """Quantise the convolutions named `QUANTIZED`: weights per channel, activations per tensor.
+
+    Their ranges are those of the (H, W, 3) uint8 images. The result is in ONNX's QDQ format.
+    """
+    import onnx
+    from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
+
+    inputs = (
+        {IMAGE: np.ascontiguousarray(rgb.transpose(2, 0, 1)[None] / np.float32(255))}
+        for rgb in images
+    )
+    convolutions = [node.name for node in model.graph.node if node.op_type == "Conv"]
+    logging.disable(logging.WARNING)  # advice of the quantiser
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            made = Path(folder) / "int8.onnx"
+            quantize_static(
+                model,
+                made,
+                SimpleNamespace(get_next=lambda: next(inputs, None)),
+                quant_format=QuantFormat.QDQ,
+                op_types_to_quantize=["Conv"],
+                per_channel=True,
+                activation_type=QuantType.QUInt8,
+                weight_type=QuantType.QInt8,
+                nodes_to_exclude=[name for name in convolutions if not name.startswith(QUANTIZED)],
+            )
+            return onnx.load_model(str(made))
+    finally:
+        logging.disable(logging.NOTSET)
 
 
 def check_graph(model: ModelProto, name: str) -> None:
-    """Check that a graph maps `image` to `logits`.
-
-    Raises:
-        WeightsError: it does not.
-    """
+    """Raise a WeightsError where a graph does not map `image` to `logits`."""
     inputs = [value.name for value in model.graph.input]
     outputs = {value.name for value in model.graph.output}
     if inputs != [IMAGE] or outputs != {PROBABILITY, LOGITS}:
@@ -118,12 +169,10 @@ def check_graph(model: ModelProto, name: str) -> None:
 
 
 def write_metadata(model: ModelProto, values: Mapping[str, str]) -> None:
-    """Write `METADATA`, this package's version, and values; those of before stay beside them."""
+    """Write values, `METADATA` and this package's version in place of a file's metadata."""
     from onnx import helper
 
-    known = {*METADATA, "version", "weights", "licence", "precision", "size", "batch"}
-    kept = {name: value for name, value in read_metadata(model).items() if name in known}
-    written = {**kept, **METADATA, "version": __version__, **values}
+    written = {**METADATA, "version": __version__, **values}
     helper.set_model_props(model, dict(sorted(written.items())))
     # OpenCV 4 divides averages at the border as it should only where this name is here.
     model.producer_name = "pytorch"
@@ -166,19 +215,19 @@ def _ending(graph: GraphProto, crop: bool = True) -> list[NodeProto]:
     ]
 
 
-_FACTOR_SHAPES = {"Conv": (-1, 1, 1, 1), "ConvTranspose": (-1, 1, 1)}
-"""What a number for each output channel is multiplied with a kernel as."""
+def _set_sides(graph: GraphProto, kind: str, **sides: str | int) -> None:
+    """Write the batch, height and width of the image and the maps."""
+    for value in (*graph.input, *graph.output):
+        dimensions = value.type.tensor_type.shape.dim
+        for axis, name in ((0, "batch"), (2, "height"), (3, "width")):
+            setattr(dimensions[axis], kind, sides[name])
 
 
 def fold_normalisation(graph: GraphProto) -> None:
     """Fold batch normalisation into the convolution before it, or into a factor and an offset.
 
     Computed in float64, so that the same weights give the same numbers everywhere: PyTorch's
-    exporter, which folds those behind convolutions in float32, rounds differently by processor.
-    Those behind a sum or a concatenation become a multiplication and an addition.
-
-    Args:
-        graph: of an `ESPNet`, whose convolutions have no bias; changed in place.
+    exporter rounds differently by processor. Convolutions have no bias before.
     """
     from onnx import helper, numpy_helper
 
@@ -221,12 +270,8 @@ def fold_normalisation(graph: GraphProto) -> None:
 def give_four_dimensions(graph: GraphProto) -> None:
     """Write numbers for each channel as (1, C, 1, 1), not as (C, 1, 1), which means the same.
 
-    OpenVINO keeps the channels of a pixel together in convolutions, but not in a sum, product or
-    PReLU with an array of fewer dimensions than the image: it then turns the image around before
-    and after, which took a third of the time.
-
-    Args:
-        graph: changed in place.
+    OpenVINO would otherwise turn the image around before and after each sum, product or PReLU with
+    one of them, which took a third of the time.
     """
     from onnx import numpy_helper
 
@@ -255,17 +300,14 @@ def replace_nodes(graph: GraphProto, nodes: Sequence[NodeProto]) -> None:
 def rename(node: NodeProto, old: str, new: str) -> None:
     """Rename a tensor in the inputs and outputs of a node."""
     for names in (node.input, node.output):
-        for k, name in enumerate(names):
-            if name == old:
-                names[k] = new
+        names[:] = [new if name == old else name for name in names]
 
 
 def add_constants(graph: GraphProto, values: Mapping[str, Any], kind: type = np.int64) -> None:
     """Add small constants; one whose name is there already is replaced."""
     from onnx import numpy_helper
 
-    others: list[TensorProto] = [one for one in graph.initializer if one.name not in values]
+    others = [one for one in graph.initializer if one.name not in values]
+    added = [numpy_helper.from_array(np.array(value, kind), name) for name, value in values.items()]
     del graph.initializer[:]
-    graph.initializer.extend(others)
-    for name, value in values.items():
-        graph.initializer.append(numpy_helper.from_array(np.array(value, kind), name))
+    graph.initializer.extend([*others, *added])

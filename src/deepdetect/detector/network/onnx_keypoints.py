@@ -38,15 +38,10 @@ NEIGHBOURS = np.array([[-1, 0], [0, -1], [1, 0], [0, 1], [-1, -1], [1, -1], [-1,
 
 
 def add_keypoints(model: ModelProto, max_keypoints: int) -> None:
-    """Let a network give the best dense keypoints, too.
+    """Let a network with float32 `logits`, of any size or of one, give the best keypoints, too.
 
-    It gets two more outputs: `keypoints` (batch, N, 2) float32, x and y in pixels, and
-    `keypoint_logits` (batch, N) float32, the highest first. Behind the last keypoint of an image
-    the positions are -1 and the logits -infinity.
-
-    Args:
-        model: a network with `logits` in float32, of any size or of one; changed in place.
-        max_keypoints: N, which may be larger than the number of pixels.
+    `keypoints` are (batch, N, 2) float32, x and y in pixels; `keypoint_logits` (batch, N) float32,
+    the highest first. Behind the last keypoint of an image they are -1 and -infinity.
     """
     from onnx import TensorProto, helper
 
@@ -83,8 +78,9 @@ def add_keypoints(model: ModelProto, max_keypoints: int) -> None:
     }
     for values, kind in ((whole, np.int64), (real, np.float32)):
         add_constants(graph, {f"{PREFIX}_{name}": one for name, one in values.items()}, kind)
-    sizes = [] if isinstance(width, int) else _width()
-    replace_nodes(graph, [*graph.node, *sizes, *_candidates(), *_neighbours(), *_keypoints()])
+    sizes = [_node("Shape", LOGITS, "shape"), _node("Gather", "shape third", "width")]
+    nodes = _keypoints() if isinstance(width, int) else [*sizes, *_keypoints()]
+    replace_nodes(graph, [*graph.node, *nodes])
     for name, shape in (
         (KEYPOINTS, (batch, max_keypoints, 2)),
         (KEYPOINT_LOGITS, (batch, max_keypoints)),
@@ -103,17 +99,10 @@ def remove_keypoints(model: ModelProto) -> None:
     replace_nodes(graph, [node for node in graph.node if not node.output[0].startswith(PREFIX)])
 
 
-def _width() -> list[NodeProto]:
-    """Make the nodes that ask for the width."""
+def _keypoints() -> list[NodeProto]:
+    """Make the nodes that find the best keypoints."""
     return [
-        _node("Shape", LOGITS, "shape"),
-        _node("Gather", "shape third", "width"),
-    ]
-
-
-def _candidates() -> list[NodeProto]:
-    """Make the nodes that find the best pixels that no neighbour exceeds: `value`, `pixel`."""
-    return [
+        # The best pixels that no neighbour exceeds: `value`, `pixel`.
         _node("Pad", f"{LOGITS} frame least", "framed"),
         _node("MaxPool", "framed", "highest", kernel_shape=[3, 3]),
         _node("Equal", f"{LOGITS} highest", "is_highest"),
@@ -125,12 +114,7 @@ def _candidates() -> list[NodeProto]:
         _node("Unsqueeze", "numbers last_axis", "number"),
         _node("Greater", "value zero", "passing"),
         _node("Where", "passing number first", "pixel"),  # some are behind the last pixel
-    ]
-
-
-def _neighbours() -> list[NodeProto]:
-    """Make the nodes that look up the logits around each pixel: `column`, `row`, `neighbours`."""
-    return [
+        # The logits around each of them: `column`, `row`, `neighbours`.
         _node("Mod", "pixel width", "column"),
         _node("Div", "pixel width", "row"),
         # In the framed logits, whose rows are two pixels longer.
@@ -144,12 +128,7 @@ def _neighbours() -> list[NodeProto]:
         _node("Reshape", "framed in_a_row", "framed_in_a_row"),
         _node("GatherElements", "framed_in_a_row places_in_a_row", "found_in_a_row", axis=1),
         _node("Reshape", "found_in_a_row around", "neighbours"),
-    ]
-
-
-def _keypoints() -> list[NodeProto]:
-    """Make the nodes that drop all but one of equal neighbours, and refine the others."""
-    return [
+        # Of equal neighbours all but one are dropped.
         _node("Mod", "column two", "odd_column"),
         _node("Mod", "row two", "odd_row"),
         _node("Mul", "odd_row two", "parity_of_row"),

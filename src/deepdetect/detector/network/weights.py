@@ -16,16 +16,7 @@ from .espnet import ESPNet
 
 
 def save_weights(network: nn.Module, path: str | Path, notes: dict[str, str]) -> None:
-    """Write a network's state dict, whole or not at all.
-
-    Args:
-        network: the network.
-        path: file ending in .safetensors.
-        notes: text to be kept in the file's header.
-
-    Raises:
-        DeepDetectError: the file cannot be written.
-    """
+    """Write a network's state dict, with notes in the file's header, whole or not at all."""
     tensors = {
         name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()
     }
@@ -37,23 +28,14 @@ def save_weights(network: nn.Module, path: str | Path, notes: dict[str, str]) ->
 
 
 def load_network(path: str | Path, make: Callable[[], nn.Module] = ESPNet) -> nn.Module:
-    """Make a network from a weights file, in evaluation mode.
-
-    Args:
-        path: the file.
-        make: makes the network with any weights.
-
-    Raises:
-        WeightsError: the file is missing, damaged or does not fit the network.
-    """
+    """Make a network from a weights file, in evaluation mode."""
     if not Path(path).is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")
     network = make()
     try:
         with safe_open(path, framework="pt") as file:
-            names = list(file.keys())
-            network.load_state_dict({name: file.get_tensor(name) for name in names})
-    except (SafetensorError, OSError, RuntimeError, KeyError) as error:
+            network.load_state_dict({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
+    except (SafetensorError, OSError, RuntimeError) as error:
         # torch names the first wrong tensor on its second line.
         reason = " ".join(str(error).split("\n\t")[:2]).strip()
         reason = reason if len(reason) < 160 else reason[:160] + "..."
@@ -71,9 +53,6 @@ def average_weights(
 
     The mean of runs that went on from one another is often better than each of them
     (Wortsman et al., "Model soups", 2022). Counts, which have no mean, are the first file's.
-
-    Raises:
-        WeightsError: a file is missing, damaged or does not fit the network.
     """
     networks = [load_network(path, make) for path in paths]
     states = [network.state_dict() for network in networks]
@@ -88,11 +67,7 @@ def average_weights(
 
 
 def read_notes(path: str | Path) -> dict[str, str]:
-    """Read the notes in a weights file's header.
-
-    Raises:
-        WeightsError: the file is missing or damaged.
-    """
+    """Read the notes in a weights file's header."""
     try:
         with safe_open(path, framework="pt") as file:
             return dict(file.metadata() or {})

@@ -27,30 +27,23 @@ DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR = 1e-7, 1e-6, 1e-8
 def describe_candidates(
     space: ScaleSpace, candidates: Candidates, rows: np.ndarray | None = None
 ) -> np.ndarray:
-    """Compute the features of candidates.
+    """Compute the (N, `FEATURES`) float32 features of candidates, or of some rows of them.
 
     The first is the logarithm of |det Hessian|, scaled. The others are: the same at neighbouring
     scales and the largest nearby there, relative to it; whether the candidate is a blob or a
     saddle; trace, gradient and grey value; mean, largest and smallest of |det Hessian|, grey value
     and gradient on rings; its rank among all candidates per pixel; its level.
-
-    Args:
-        space: the scale space that the candidates were found in.
-        candidates: all of them, since each is ranked among the others.
-        rows: those that are described; None: all.
-
-    Returns:
-        (N, `FEATURES`) float32, of the rows in their order.
     """
     levels, height, width = space.smooth.shape
-    rank = _ranks(candidates.strength(space))
+    rank = np.empty(len(candidates), np.int64)
+    strongest = np.argsort(-candidates.strength(space), kind="stable")
+    rank[strongest] = np.arange(len(candidates))
     if rows is not None:
         candidates, rank = candidates[rows], rank[rows]
-    flat = [
+    determinant, trace, gradient, smooth, highest = (
         maps.reshape(-1)
         for maps in (space.determinant, space.trace, space.gradient, space.smooth, space.highest)
-    ]
-    determinant, trace, gradient, smooth, highest = flat
+    )
     pixel = candidates.row * width + candidates.column
     plane = height * width
 
@@ -94,10 +87,3 @@ def describe_candidates(
     columns.append(np.log((rank + 1) / plane) / 2 + 3)
     columns.append((candidates.level - 4) / 3)
     return np.stack(columns, 1).astype(np.float32)
-
-
-def _ranks(strength: np.ndarray) -> np.ndarray:
-    """Return the place of each in the order from the strongest to the weakest."""
-    ranks = np.empty(len(strength), np.int64)
-    ranks[np.argsort(-strength, kind="stable")] = np.arange(len(strength))
-    return ranks

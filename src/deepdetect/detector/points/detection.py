@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 
+from ..._shared.memory import require_memory
 from ...features.keypoints import Keypoints
 from ...features.scale_space import dominant_angles
 from ...features.selection import (
@@ -15,7 +16,7 @@ from ...features.selection import (
     suppress_neighbors,
 )
 from .candidate_features import describe_candidates
-from .hessian_scales import build_scale_space, check_memory, find_candidates
+from .hessian_scales import SIGMAS_PX, build_scale_space, find_candidates
 from .ranker import Ranker, load_ranker
 
 Spread = Literal["none", "grid", "anms"]
@@ -53,38 +54,19 @@ def detect_points(
     ignore: np.ndarray | None = None,
     ranker: Ranker | None = None,
 ) -> Keypoints:
-    """Detect keypoints of all scales.
+    """Detect keypoints of all scales in a (H, W) uint8 image, best first, as `PointDetector` says.
 
-    Candidates are the maxima of |det Hessian| at seven scales; a small trained network ranks them
-    by how surely they are found again in another photograph of the same place.
-
-    Args:
-        gray: (H, W) uint8.
-        max_keypoints: at most this many; None: all.
-        spread: "none": the best; "grid": in turn the best of each cell of a grid; "anms": the
-            best, at least so far from each other that there are just enough (adaptive
-            non-maximal suppression).
-        ignore: (H, W) array, true where no keypoint is wanted.
-        ranker: None: the trained one inside the package.
-
-    Returns:
-        Keypoints with sub-pixel positions (centre of the first pixel (0, 0)), sizes in pixels and
-        angles in degrees, best first; their logits rank them, and so do their scores in (0, 1), of
-        which no two are equal.
-
-    Raises:
-        OptionError: the mask does not fit, or the image is too large for the memory.
-
-    Example:
-        >>> gray = np.zeros((64, 64), np.uint8)
-        >>> gray[20:40, 24:44] = 255
-        >>> len(detect_points(gray, 4))
-        4
+    Their logits rank them, and so do their scores in (0, 1), of which no two are equal.
     """
-    check_memory(gray.shape)
+    height, width = gray.shape
+    require_memory(
+        f"points of an image of {width}x{height} pixels",
+        "use `resolution='auto'`, or a smaller image",
+        pixel_of_level=gray.size * len(SIGMAS_PX),
+    )
     space = build_scale_space(gray)
     candidates = find_candidates(space)
-    size = (gray.shape[1], gray.shape[0])
+    size = (width, height)
     if not len(candidates):
         none = np.empty(0, np.float32)
         return Keypoints(np.empty((0, 2)), none, size, logits=none, sizes=none, angles=none)
@@ -108,17 +90,9 @@ def detect_points(
 
 
 def ranking_scores(logits: np.ndarray) -> np.ndarray:
-    """Map logits that do not rise to scores in (0, 1) that fall.
+    """Map (N,) float32 logits that do not rise to scores in (0, 1) that fall.
 
-    Args:
-        logits: (N,) float32, the highest first.
-
-    Returns:
-        (N,) float32; where rounding makes two equal, the later one gets the next lower number.
-
-    Example:
-        >>> ranking_scores(np.array([1, 0, 0, -1], np.float32)).round(2).tolist()
-        [0.75, 0.5, 0.5, 0.25]
+    Where rounding makes two equal, the later one gets the next lower number.
     """
     tail = 0.5 / (1 + np.abs(logits))
     scores = np.where(logits < 0, tail, 1 - tail).astype(np.float32)

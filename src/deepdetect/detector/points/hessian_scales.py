@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..._shared.memory import require_memory
 from ..._shared.opencv import cv2
 from ..._shared.parallel import parallel_for
 
@@ -29,15 +28,10 @@ MAX_OFFSET_PX = 0.499
 
 @dataclass(frozen=True, eq=False)
 class ScaleSpace:
-    """Smoothed copies of an image, with derivatives that are normalised by their scale.
+    """Smoothed copies of an image in [0, 1], with derivatives normalised by their scale.
 
-    Attributes:
-        sigmas_px: (L,) of the levels.
-        smooth: (L, H, W) float32, the image in [0, 1] smoothed.
-        determinant: (L, H, W) float32, determinant of the Hessian times sigma^4.
-        trace: (L, H, W) float32, trace of the Hessian times sigma^2.
-        gradient: (L, H, W) float32, squared magnitude of the gradient times sigma^2.
-        highest: (L, H, W) float32, the largest |determinant| within `NMS_RADIUS` in x and y.
+    All but the sigmas are (L, H, W) float32. `determinant` and `trace` are the Hessian's, the
+    gradient is squared, `highest` is the largest |determinant| within `NMS_RADIUS` in x and y.
     """
 
     sigmas_px: np.ndarray
@@ -50,13 +44,7 @@ class ScaleSpace:
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Maxima of |det Hessian| in each level of a scale space.
-
-    Attributes:
-        level, row, column: (N,) where they are in the scale space.
-        xy: (N, 2) float64 sub-pixel positions in the image.
-        sigma_px: (N,) of their levels.
-    """
+    """Maxima of |det Hessian| in each level of a scale space, with sub-pixel positions `xy`."""
 
     level: np.ndarray
     row: np.ndarray
@@ -77,29 +65,8 @@ class Candidates:
         return Candidates(*(part[rows] for part in parts))
 
 
-def check_memory(shape: tuple[int, ...]) -> None:
-    """Stop before a scale space fills the memory.
-
-    Raises:
-        OptionError: it would.
-    """
-    require_memory(
-        f"points of an image of {shape[1]}x{shape[0]} pixels",
-        "use `resolution='auto'`, or a smaller image",
-        pixel_of_level=shape[0] * shape[1] * len(SIGMAS_PX),
-    )
-
-
 def build_scale_space(gray: np.ndarray) -> ScaleSpace:
-    """Smooth an image at all scales, and differentiate it.
-
-    Args:
-        gray: (H, W) uint8.
-
-    Example:
-        >>> build_scale_space(np.zeros((32, 48), np.uint8)).smooth.shape
-        (10, 32, 48)
-    """
+    """Smooth a (H, W) uint8 image at all scales, and differentiate it."""
     maps = [np.empty((len(SIGMAS_PX), *gray.shape), np.float32) for _ in range(5)]
     smooth, determinant, trace, gradient, highest = maps
     window = np.ones((2 * NMS_RADIUS + 1,) * 2, np.uint8)
@@ -134,12 +101,8 @@ def _differentiate(
 ) -> None:
     """Compute the derivatives of rows `start` to before `stop`, by central differences.
 
-    Args:
-        start, stop: rows.
-        padded: (H + 2, W + 2) float32, the smoothed image with a border.
-        variance: sigma^2 in pixels, which derivatives are normalised by.
-        determinant, trace, gradient, strength: (H, W) float32, written: of the Hessian
-            determinant and trace, the squared magnitude of the gradient, and |determinant|.
+    The smoothed image has a border of one pixel. Determinant, trace and squared gradient, which are
+    normalised by the variance, and |determinant| are written.
     """
     width = determinant.shape[1]
     step = max(1, PIXELS_AT_ONCE // width)
@@ -186,10 +149,10 @@ def find_candidates(space: ScaleSpace) -> Candidates:
         row, column = np.nonzero(peak[1:-1, 1:-1])
         found.append(np.stack([np.full(len(row), k), row + 1, column + 1]))
     level, row, column = np.concatenate(found, 1)
-    offset = np.stack(
-        [_peak_offset(space.determinant, level, row, column, *step) for step in ((0, 1), (1, 0))], 1
-    )
-    xy = np.stack([column, row], 1) + offset
+    offsets = [
+        _peak_offset(space.determinant, level, row, column, *step) for step in ((0, 1), (1, 0))
+    ]
+    xy = np.stack([column, row], 1) + np.stack(offsets, 1)
     return Candidates(level, row, column, xy, space.sigmas_px[level])
 
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -18,9 +18,7 @@ from .candidate_features import FEATURES
 MAX_DEVIATIONS = 6.0
 """Features further from their mean are taken as this many standard deviations away."""
 
-_LAYERS = ("weight0", "bias0", "weight1", "bias1", "weight2", "bias2")
 _CHUNK = 65_536
-_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +37,7 @@ class Ranker:
     notes: str = ""
 
     def rank(self, features: np.ndarray) -> np.ndarray:
-        """Compute logits.
-
-        Args:
-            features: (N, F) float32.
-
-        Returns:
-            (N,) float32, the higher the better.
-        """
+        """Compute the (N,) float32 logits of (N, F) float32 features, the higher the better."""
         logits = np.empty(len(features), np.float32)
         for start in range(0, len(features), _CHUNK):
             part = features[start : start + _CHUNK]
@@ -61,14 +52,7 @@ class Ranker:
 
 
 def load_ranker(path: Path = RANKER) -> Ranker:
-    """Load a ranker; the last few are kept.
-
-    Args:
-        path: an npz file, as `deepdetect train-points` writes it.
-
-    Raises:
-        WeightsError: the file is missing, damaged or of another network.
-    """
+    """Load an npz file, as `deepdetect train-points` writes it; the last few are kept."""
     try:
         state = path.stat().st_mtime_ns
     except OSError:
@@ -81,30 +65,25 @@ def _load(path: Path, state: int) -> Ranker:
     """Read a file; one whose state has changed since is read again."""
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            found = {name: file[name] for name in ("mean", "deviation", *_LAYERS, "notes")}
+            notes = str(file["notes"])
+            mean, deviation = (file[name].astype(np.float32) for name in ("mean", "deviation"))
+            layers = tuple(
+                (file[f"weight{k}"].astype(np.float32), file[f"bias{k}"].astype(np.float32))
+                for k in range(3)
+            )
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         reason = (str(error).splitlines() or ["it is empty"])[0]
         raise WeightsError(f"{path} does not hold weights of the ranker ({reason})") from None
-    notes = str(found.pop("notes"))
-    sides = [found[name].shape for name in _LAYERS]
+    inputs = (FEATURES, *(len(bias) for _, bias in layers[:-1]))
     fits = (
-        found["mean"].shape == found["deviation"].shape == (FEATURES,)
-        and all(len(weight) == 2 and bias == weight[:1] for weight, bias in _pairs(sides))
-        and [weight[1] for weight, _ in _pairs(sides)]
-        == [FEATURES, *(weight[0] for weight, _ in _pairs(sides)[:-1])]
-        and sides[-1] == (1,)
-        and all(np.isfinite(value).all() for value in found.values())
+        mean.shape == deviation.shape == (FEATURES,)
+        and all(w.shape == (*b.shape, count) for (w, b), count in zip(layers, inputs, strict=True))
+        and layers[-1][1].shape == (1,)
+        and all(np.isfinite(each).all() for each in (mean, deviation, *itertools.chain(*layers)))
     )
     if not fits:
         raise WeightsError(f"{path} holds another network than the ranker: use other weights")
-    values = [found[name].astype(np.float32) for name in _LAYERS]
-    mean, deviation = (found[name].astype(np.float32) for name in ("mean", "deviation"))
-    return Ranker(mean, deviation, tuple(_pairs(values)), notes)
-
-
-def _pairs(items: list[_Item]) -> list[tuple[_Item, _Item]]:
-    """Return weights with their biases."""
-    return list(zip(items[::2], items[1::2], strict=True))
+    return Ranker(mean, deviation, layers, notes)
 
 
 def notes_of(ranker: Ranker) -> dict[str, object]:
