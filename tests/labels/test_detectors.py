@@ -3,7 +3,6 @@ from __future__ import annotations
 from fractions import Fraction
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,9 +11,7 @@ from hypothesis import strategies as st
 from deepdetect._shared.errors import OptionError
 from deepdetect.labels import LabelOptions
 from deepdetect.labels.detectors import (
-    DETECTOR_NAMES,
     DETECTORS,
-    keypoints_mask,
     pixels_mask,
     select_detectors,
 )
@@ -62,12 +59,6 @@ LOW_CHANGES = {
 }
 
 
-def test_the_nine_in_order() -> None:
-    assert DETECTOR_NAMES == NAMES
-    assert {name for name, d in DETECTORS.items() if d.kind == "edge"} == {"canny", "sobel"}
-    assert {d.kind for d in DETECTORS.values()} == {"edge", "keypoint"}
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_published_settings(name: str) -> None:
     options = LabelOptions()
@@ -82,22 +73,18 @@ def test_masks_are_boolean_and_of_the_images_size(name: str, gray: np.ndarray) -
     for settings in ({}, detector.low_visibility):
         before = gray.copy()
         mask = detector.mask(gray, **settings)
-        assert mask.dtype == bool
-        assert mask.shape == gray.shape
+        assert (mask.dtype, mask.shape) == (bool, gray.shape)
         assert mask.any()
         np.testing.assert_array_equal(gray, before)
-        np.testing.assert_array_equal(detector.mask(gray, **settings), mask)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_constant_images_are_not_marked(name: str) -> None:
     detector = DETECTORS[name]
     for settings in ({}, detector.low_visibility):
-        for level in (0, 1, 20, 128, 254, 255):
-            for shape in ((16, 16), (17, 23), (64, 48)):
+        for level in (0, 1, 128, 255):
+            for shape in ((16, 16), (17, 23)):
                 mask = detector.mask(np.full(shape, level, np.uint8), **settings)
-                assert mask.dtype == bool
-                assert mask.shape == shape
                 assert not mask.any(), (settings, level, shape)
 
 
@@ -106,14 +93,9 @@ def test_a_selection_has_the_order_of_the_registry(names: list[str]) -> None:
     assert list(select_detectors(names)) == [name for name in NAMES if name in names]
 
 
-@pytest.mark.parametrize(
-    ("given", "nearest"),
-    [("siift", "sift"), ("shi_tomasi", "shi-tomasi"), ("SOBEL", "sobel"), ("haris", "harris")],
-)
-def test_an_unknown_name_is_told_the_nearest(given: str, nearest: str) -> None:
-    with pytest.raises(OptionError, match=f"'{given}': did you mean '{nearest}'") as caught:
-        select_detectors(["fast", given])
-    assert all(name in str(caught.value) for name in NAMES)
+def test_an_unknown_name_is_told_the_nearest() -> None:
+    with pytest.raises(OptionError, match="'shi_tomasi': did you mean 'shi-tomasi'"):
+        select_detectors(["fast", "shi_tomasi"])
 
 
 # Quarter pixels hit the halves often; any float finds the rest.
@@ -143,13 +125,3 @@ def test_pixels_equals_a_plain_loop(
     mask = pixels_mask(shape, np.array(points))
     assert mask.dtype == bool
     np.testing.assert_array_equal(mask, expected)
-
-
-def test_pixels_opencv_keypoints() -> None:
-    gray = np.zeros((6, 9), np.uint8)
-    keypoints = [cv2.KeyPoint(x, y, 3) for x, y in [(7.0, 2.0), (2.5, 3.5), (8.7, 1.0)]]
-    assert np.argwhere(keypoints_mask(gray, keypoints)).tolist() == [[2, 7], [4, 2]]
-    for none in ([], ()):
-        mask = keypoints_mask(gray, none)
-        assert mask.dtype == bool
-        np.testing.assert_array_equal(mask, gray > 0)

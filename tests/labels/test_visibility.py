@@ -49,10 +49,6 @@ def test_the_range_is_that_of_two_percentiles(gray: np.ndarray) -> None:
     assert luma_range(gray) == float(high) - float(low)
 
 
-@pytest.mark.parametrize(
-    ("given", "hint"), [("lo", "did you mean 'low'"), ("dark", "auto, normal, low"), ("", "auto")]
-)
-def test_an_unknown_choice(given: str, hint: str) -> None:
-    with pytest.raises(OptionError, match=f"unknown visibility '{given}'") as caught:
-        visibility_of(two_levels(0, 255), given)
-    assert hint in str(caught.value)
+def test_an_unknown_choice() -> None:
+    with pytest.raises(OptionError, match="unknown visibility 'lo': did you mean 'low'"):
+        visibility_of(two_levels(0, 255), "lo")

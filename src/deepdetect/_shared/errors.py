@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Iterable
 
 
@@ -132,6 +133,16 @@ def install_command(*packages: str) -> str:
     names = " ".join(DISTRIBUTIONS.get(package, package) for package in packages)
     command = f"pip install {names}"
     return f"{command}, {WITHOUT_GPU}" if "torch" in packages else command
+
+
+def require_packages(what: str, *packages: str) -> None:
+    """Raise a MissingExtraError where something needs a package that is not installed."""
+    for package in packages:
+        if importlib.util.find_spec(package) is None:
+            raise MissingExtraError(
+                f"{what} needs the package {package}, which is not installed: "
+                f"run {install_command(package)}"
+            )
 
 
 for _error in (

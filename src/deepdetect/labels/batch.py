@@ -19,15 +19,7 @@ from .settings import LabelOptions
 
 @dataclass(frozen=True)
 class LabelTask:
-    """A mask to be made from an image file.
-
-    Attributes:
-        image: the image file.
-        mask: the file the mask is written to.
-        options: how the label is made.
-        figure: the file for the paper's Figure 4 of this label, or None.
-        overwrite: replace whatever there is.
-    """
+    """A mask to be made from an image file; `figure` is the paper's Figure 4 of this label."""
 
     image: Path
     mask: Path
@@ -44,15 +36,7 @@ class LabelTask:
 
 @dataclass(frozen=True)
 class LabelReport:
-    """The result for one mask.
-
-    Attributes:
-        image: the image file.
-        mask: the mask file.
-        visibility: the settings that were used, "normal" or "low"; None when it failed.
-        density: fraction of the pixels that are marked; NaN when it failed.
-        error: what went wrong, or None.
-    """
+    """The result for one mask: its settings and the marked fraction, or an error."""
 
     image: Path
     mask: Path
@@ -67,23 +51,9 @@ def label_files(
     callback: Callable[[LabelReport], None] | None = None,
     map_tasks: TaskMap = map_in_processes,
 ) -> list[LabelReport]:
-    """Label image files, in parallel over processes.
+    """Label image files, in parallel over processes; one report per mask, in order of completion.
 
-    An image that cannot be read is reported, and the others are labelled all the same. A script
-    must call this under `if __name__ == "__main__":`, since processes are started.
-
-    Args:
-        tasks: the images and their masks.
-        workers: number of processes; default one per processor.
-        callback: called after each mask.
-        map_tasks: what runs them, where it is not the processes of this machine.
-
-    Returns:
-        One report per mask, in order of completion.
-
-    Raises:
-        OptionError: `workers` is under 1, or a mask exists that was made otherwise.
-        DeepDetectError: a worker process died, or a mask cannot be written.
+    An image that cannot be read is reported, and the others are labelled all the same.
     """
     reports = []
     for report in map_tasks(label_file, tasks, workers):
@@ -94,12 +64,7 @@ def label_files(
 
 
 def label_file(task: LabelTask) -> LabelReport:
-    """Make the mask of an image file.
-
-    Raises:
-        DeepDetectError: the mask cannot be written, or a package is missing, which concerns all
-            images.
-    """
+    """Make the mask of an image file."""
     try:
         rgb = load_image(task.image)
         label = fuse(luma(rgb), task.options)

@@ -12,7 +12,7 @@ from .._shared.options import suggest_keywords
 from .._shared.registry import resolve_name_or_path
 from .._shared.text_files import read_toml
 from .detectors import DETECTOR_NAMES, DETECTORS, Value, select_detectors
-from .visibility import Visibility, VisibilityChoice, check_visibility
+from .visibility import Visibility, VisibilityChoice
 
 Settings = Mapping[str, Mapping[str, Mapping[str, Value]]]
 """Changed settings by detector, section and parameter, as a settings file holds them."""
@@ -56,7 +56,8 @@ class LabelOptions:
     def __post_init__(self) -> None:
         names = (self.detectors,) if isinstance(self.detectors, str) else self.detectors
         object.__setattr__(self, "detectors", select_detectors(names))
-        check_visibility(self.visibility)
+        if self.visibility not in ("auto", *SECTIONS):
+            raise unknown_name("visibility", self.visibility, ("auto", *SECTIONS))
         checked = {name: _checked(name, self.settings[name]) for name in self.settings}
         object.__setattr__(self, "settings", checked)
         if idle := sorted(checked.keys() - set(self.detectors)):
@@ -81,13 +82,13 @@ class LabelOptions:
 def _checked(detector: str, sections: Any) -> dict[str, dict[str, Value]]:
     if detector not in DETECTORS:
         raise unknown_name("label detector", detector, ("detectors", *DETECTOR_NAMES))
-    if not isinstance(sections, Mapping):
-        raise OptionError(f"{detector} must be a table, as [{detector}]")
-    for section, values in sections.items():
+    if not isinstance(sections, Mapping) or not all(
+        isinstance(values, Mapping) for values in sections.values()
+    ):
+        raise OptionError(f"{detector} must be a table of tables, as normal = {{ threshold = 20 }}")
+    for section in sections:
         if section not in SECTIONS.values():
             raise unknown_name(f"part of {detector}", section, SECTIONS.values())
-        if not isinstance(values, Mapping):
-            raise OptionError(f"{section} of {detector} must be a table, as {{ threshold = 20 }}")
     return {
         section: {name: _checked_value(detector, name, value) for name, value in values.items()}
         for section, values in sections.items()
@@ -95,20 +96,21 @@ def _checked(detector: str, sections: Any) -> dict[str, dict[str, Value]]:
 
 
 def _checked_value(detector: str, name: str, value: Any) -> Value:
-    defaults = DETECTORS[detector].defaults
-    if name not in defaults:
-        raise unknown_name(f"setting of {detector}", name, defaults)
-    kind = type(defaults[name])
+    settings = DETECTORS[detector].settings
+    if name not in settings:
+        raise unknown_name(f"setting of {detector}", name, settings)
+    default, limits = settings[name]
+    kind = type(default)
     if type(value) is not kind and not (kind is float and type(value) is int):
         raise OptionError(
             f"the setting {name} of {detector} must be of type {kind.__name__}, not {value!r}"
         )
-    if kind is bool:
+    if limits is None:
         return bool(value)
-    limits = DETECTORS[detector].limits[name]
-    low, high = limits[0], limits[-1]
-    if not low <= value <= high:  # nor NaN
-        raise OptionError(f"the setting {name} of {detector} must lie in [{low:.12g}, {high:.12g}]")
+    if not limits[0] <= value <= limits[-1]:  # nor NaN
+        raise OptionError(
+            f"the setting {name} of {detector} must lie in [{limits[0]:.12g}, {limits[-1]:.12g}]"
+        )
     if isinstance(limits, range) and value not in limits:
         raise OptionError(f"the setting {name} of {detector} must be odd, not {value}")
     return kind(value)

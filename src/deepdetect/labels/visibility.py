@@ -51,17 +51,8 @@ def visibility_of(gray: np.ndarray, choice: VisibilityChoice = "auto") -> Visibi
         >>> visibility_of(np.full((16, 16), 20, np.uint8))
         'low'
     """
-    check_visibility(choice)
+    if choice not in get_args(VisibilityChoice):
+        raise unknown_name("visibility", choice, get_args(VisibilityChoice))
     if choice != "auto":
         return choice
     return "low" if luma_range(gray) < LOW_VISIBILITY_RANGE else "normal"
-
-
-def check_visibility(choice: VisibilityChoice) -> None:
-    """Check the name of a choice.
-
-    Raises:
-        OptionError: it is unknown (the nearest right one is named).
-    """
-    if choice not in get_args(VisibilityChoice):
-        raise unknown_name("visibility", choice, get_args(VisibilityChoice))

@@ -12,13 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from ..._shared.errors import (
-    MissingExtraError,
-    MissingWeightsError,
-    OptionError,
-    WeightsError,
-    install_command,
-)
+from ..._shared.errors import MissingWeightsError, OptionError, WeightsError, require_packages
 from .interface import Network, RuntimeOptions, check_answer
 from .onnxruntime_backend import open_onnxruntime
 from .openvino_backend import open_openvino
@@ -53,16 +47,6 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
     require_packages(f"reading {path.name} with the backend {name}", *backend.packages)
     file = path.stat()
     return _open(name, path, options, (path.absolute(), file.st_mtime_ns, file.st_size)), name
-
-
-def require_packages(what: str, *packages: str) -> None:
-    """Raise a MissingExtraError where a package is not installed that something needs."""
-    for package in packages:
-        if importlib.util.find_spec(package) is None:
-            raise MissingExtraError(
-                f"{what} needs the package {package}, which is not installed: "
-                f"run {install_command(package)}"
-            )
 
 
 @functools.lru_cache(maxsize=4)

@@ -17,11 +17,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from ..._shared.atomic import atomic_path
-from ..._shared.errors import OptionError, WeightsError, unknown_name
+from ..._shared.errors import OptionError, WeightsError, require_packages, unknown_name
 from ..._shared.options import check_ranges, suggest_keywords
 from ...features.selection import check_max_keypoints
 from ...io.image import load_image
-from ..backends import require_packages
 from ..pretrained import resolve_weights
 from .onnx_graph import (
     add_padding,
