@@ -14,7 +14,7 @@ import pytest
 from deepdetect.detector.heatmap import HeatmapOptions, compute_maps
 from deepdetect.features.selection import select_keypoints
 from deepdetect.labels import DETECTORS
-from deepdetect.labels.detectors import keypoints_mask, pixels_mask
+from deepdetect.labels.detectors import pixels_mask
 
 
 def compute_heatmap(*arguments: Any) -> np.ndarray:
@@ -62,7 +62,9 @@ def test_opencv_keypoints_share_the_convention() -> None:
     gray = dot(37, 12)[:, :, 0]
     corners = cv2.FastFeatureDetector_create(13, False).detect(gray, None)
     assert [corner.pt for corner in corners] == [(37.0, 12.0)]
-    assert np.argwhere(keypoints_mask(gray, corners)).tolist() == [[12, 37]]
+    assert np.argwhere(pixels_mask(gray.shape, cv2.KeyPoint_convert(corners))).tolist() == [
+        [12, 37]
+    ]
 
 
 @pytest.mark.parametrize(("x", "y"), [(0, 0), (49, 0), (0, 29), (37, 12)])

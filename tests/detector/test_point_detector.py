@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import OptionError, PointDetector, WeightsError, save_keypoints
-from deepdetect.batch.extraction import feature_group
+from deepdetect import OptionError, PointDetector, WeightsError
 from deepdetect.detector.points.detection import detect_points
 from deepdetect.detector.points.ranker import load_ranker
 from deepdetect.features.sift import scaled_sift_descriptors, to_root_sift
@@ -39,23 +38,6 @@ def test_extracted_points_are_the_detected_ones_described(
     sift = scaled_sift_descriptors(gray, expected.xy, expected.sizes, expected.angles)
     np.testing.assert_array_equal(found.descriptors, to_root_sift(sift))
     assert found.descriptor_type == "rootsift"
-
-
-def test_the_best_500_of_an_image_have_no_ties(shared: Path, tmp_path: Path) -> None:
-    """In OpenCV's keypoints, in CSV, and in what hloc, LightGlue and kornia get: the scores."""
-    for name in ("graf", "leuven"):
-        found = PointDetector(500).extract(shared / "data" / "oxford" / name / "img1.png")
-        save_keypoints(found, tmp_path / "points.csv")
-        lines = (tmp_path / "points.csv").read_text().splitlines()
-        column = lines[0].split(",").index("score")
-        for scores in (
-            found.scores.tolist(),
-            [point.response for point in found.to_opencv()],
-            [float(line.split(",")[column]) for line in lines[1:]],
-            feature_group("a.png", found).arrays["scores"].tolist(),
-        ):
-            assert len(set(scores)) == 500
-            assert scores == sorted(scores, reverse=True)
 
 
 def test_a_ranker_of_ones_own_ranks(image: np.ndarray, tmp_path: Path) -> None:

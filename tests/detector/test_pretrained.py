@@ -1,12 +1,11 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
 from deepdetect import DeepDetect, OptionError
-from deepdetect.detector.pretrained import PRETRAINED, pretrained_weights, resolve_weights
+from deepdetect.detector.pretrained import PRETRAINED, pretrained_weights
 
 
 @pytest.mark.parametrize("name", PRETRAINED)
@@ -22,11 +21,6 @@ def test_the_names_stand_for_different_weights() -> None:
     assert len({pretrained_weights(name).read_bytes() for name in PRETRAINED}) == len(PRETRAINED)
     assert DeepDetect().weights == DeepDetect("default").weights == pretrained_weights()
     assert DeepDetect("dense").weights == pretrained_weights("dense")
-
-
-def test_a_path_is_left_as_it_is(tmp_path: Path) -> None:
-    for path in ("best.safetensors", "run/deepdetect.onnx", tmp_path / "weights"):
-        assert resolve_weights(path) == Path(path)
 
 
 def test_an_unknown_name_says_the_nearest() -> None:

@@ -38,14 +38,6 @@ def test_the_or_of_all_parts(visibility: str, gray: np.ndarray, single: dict) ->
     assert 0 < label.density < 1
 
 
-@pytest.mark.parametrize("name", DETECTOR_NAMES)
-def test_one_detector_by_itself(name: str, gray: np.ndarray, single: dict) -> None:
-    label = fuse(gray, LabelOptions((name,), "normal"))
-    np.testing.assert_array_equal(label.mask, single[name, "normal"])
-    empty = label.edges if DETECTORS[name].kind == "keypoint" else label.keypoints
-    assert not empty.any()
-
-
 def published(shared: Path) -> list[tuple[Path, bool]]:
     """The published images, and whether each is dark."""
     first_dark = {"train": 32986, "val": 35996}

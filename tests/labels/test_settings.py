@@ -123,22 +123,12 @@ def test_the_ends_of_the_ranges_work(name: str, key: str) -> None:
             assert run_detector(name, image, {key: kind(value)}).shape == shape
 
 
-def test_pyramids_end_with_the_image(gray: np.ndarray) -> None:
-    small = gray[:16, :60]
-    for name, most in (("orb", {"levels": 32, "scale_factor": 10.0}), ("brisk", {"octaves": 16})):
-        assert run_detector(name, small, most).shape == small.shape
-
-
 def test_what_opencv_refuses_is_one_sentence(
     gray: np.ndarray, one_line: Callable[[BaseException], str]
 ) -> None:
     with pytest.raises(OptionError) as caught:
         run_detector("sobel", gray, {"kernel_size": 4})
     assert "OpenCV refuses sobel(kernel_size=4)" in one_line(caught.value)
-
-
-def test_the_paper_s_are_the_default() -> None:
-    assert find_label_settings("paper") == LabelOptions()
 
 
 def test_those_for_geometry_mark_more_and_nothing_less(photo: np.ndarray) -> None:

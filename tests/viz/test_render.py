@@ -51,8 +51,9 @@ def test_from_the_left_camera_the_photograph_comes_back(
     np.testing.assert_array_equal(render(cloud, camera, point_width=1), photo)
 
 
-@pytest.mark.parametrize(("azimuth", "elevation"), [(0, 0), (25, 10), (-60, 40), (180, -90)])
-@pytest.mark.parametrize("size", [(200, 150), (90, 200)])
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "size"), [(0, 0, (200, 150)), (-60, 40, (90, 200))]
+)
 def test_the_cloud_fills_the_picture(
     cloud: PointCloud, azimuth: float, elevation: float, size: tuple[int, int]
 ) -> None:

@@ -73,8 +73,7 @@ class DeepDetect:
         tta: "flip": a flipped or turned image gives the same keypoints of the heat map, in eight
             times the time.
         tile_megapixels: with `resolution="native"`, images above so many megapixels are run in
-            tiles of this size, which takes
-            less memory and four to six times the time. "auto": where the memory is too small.
+            tiles of this size: less memory, four to six times the time. "auto": where it is needed.
 
     Attributes:
         backend: name of the backend that runs.
@@ -176,9 +175,8 @@ class DeepDetect:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Compute the heat map and the logits of its probabilities, of one image.
 
-        Float32 rounds the highest probabilities to 1. The logits still distinguish these pixels, so
-        keypoints are ranked by them. Both together are all that `select_keypoints` needs to select
-        again, with other options, what `detect` would find.
+        Float32 rounds the highest probabilities to 1; the logits still distinguish these pixels. Of
+        both `select_keypoints` selects, with other options, what `detect` would find.
 
         Args:
             image, channels: as of `heatmap`.

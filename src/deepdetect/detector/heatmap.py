@@ -38,25 +38,16 @@ Run = Callable[[list[np.ndarray]], list[np.ndarray]]
 @suggest_keywords
 @dataclass(frozen=True)
 class HeatmapOptions:
-    """How an image is shown to the network.
+    """How an image is shown to the network: the options of `DeepDetect` of these names.
 
     Attributes:
-        resolution: "native" takes the image as it is. "auto" does so up to two megapixels, and
-            scales larger images down to that and the map back: their finest pixels show blur and
-            noise more than structure, and the network needs seconds and gigabytes for them. A
-            number of pixels squashes the image to a square of that side and the map back, as the
-            paper does with 480.
-        network_channels: order of the colours that the network sees. "bgr" is what the paper's
-            published code feeds, though the weights were trained on RGB. It says nothing of the
-            images that are given: that is `channels` of each function that takes one.
-        tta: test-time augmentation. "flip" takes the mean of the logits of the image in its eight
-            flips and quarter turns: eight times the time, and a flipped or turned image gives the
-            same keypoints. Without it .92 to .94 of them are the same.
-        tile_megapixels: with `resolution="native"`, images above so many megapixels are run in
-            tiles of this size, with the logits of the whole image to 1e-4, in four to six times the
-            time and less memory.
-            At least 1.5; "auto": tiles of 2.7 where the image is too large for the
-            free memory. Only weights of this package's training in ONNX files can be tiled.
+        resolution: larger images are scaled down by "auto" since their finest pixels show blur and
+            noise more than structure, and the network needs seconds and gigabytes for them.
+        network_channels: "bgr" is what the paper's published code feeds, though the weights were
+            trained on RGB. It says nothing of the images that are given.
+        tta: test-time augmentation by the mean of the logits in eight flips and quarter turns.
+        tile_megapixels: from 1.5 on; "auto": 2.7 where the image is too large for the free memory.
+            Only weights of this package's training in ONNX files can be tiled.
 
     Raises:
         OptionError: a value is unknown or out of its range.

@@ -43,61 +43,30 @@ WHITE = (255, 255, 255)
 
 
 def save_picture(rgb: np.ndarray, path: str | Path) -> None:
-    """Write a (H, W, 3) uint8 RGB picture, whole or not at all.
-
-    Args:
-        rgb: the picture.
-        path: ending in .png, .jpg or .jpeg.
-
-    Raises:
-        OptionError: the ending is another.
-        DeepDetectError: the file cannot be written, or its format holds no picture of this size.
-    """
+    """Write a (H, W, 3) uint8 RGB picture as .png, .jpg or .jpeg, whole or not at all."""
     suffix = picture_suffix(path)
-    data = _encode(rgb, suffix)
-    if data is None:
+    # Checked before OpenCV is asked, which would also log it.
+    if suffix != ".png" and max(rgb.shape[:2]) > MAX_JPEG_SIDE_PX:
         size = f"{rgb.shape[1]}x{rgb.shape[0]}"
-        advice = "make it smaller" if suffix == ".png" else "give it a name that ends in .png"
-        raise DeepDetectError(f"{path} cannot hold a picture of {size} pixels: {advice}")
+        raise DeepDetectError(
+            f"{path} cannot hold a picture of {size} pixels: give it a name that ends in .png"
+        )
+    settings = [] if suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    _, data = cv2.imencode(suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), settings)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
+        temporary.write_bytes(data.tobytes())
 
 
 def picture_suffix(path: str | Path) -> str:
-    """Return the suffix of a picture's file in lower case; call it before any expensive work.
-
-    Raises:
-        OptionError: `save_picture` does not write such files.
-
-    Example:
-        >>> picture_suffix("panorama.JPG")
-        '.jpg'
-    """
+    """Return the suffix of a picture's file in lower case; call it before any expensive work."""
     suffix = Path(path).suffix.lower()
     if suffix not in SUFFIXES:
         raise OptionError(f"{path} must end in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
     return suffix
 
 
-def _encode(rgb: np.ndarray, suffix: str) -> bytes | None:
-    """Return the file's content, or None where the format does not hold such a picture."""
-    # Checked before OpenCV is asked, which would also log it.
-    if suffix != ".png" and max(rgb.shape[:2]) > MAX_JPEG_SIDE_PX:
-        return None
-    try:
-        settings = [] if suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-        done, data = cv2.imencode(suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), settings)
-    except cv2.error:
-        return None
-    return data.tobytes() if done else None
-
-
 def draw_heatmap(heatmap: np.ndarray) -> np.ndarray:
-    """Colour a (H, W) probability map: dark blue is 0, yellow is 1.
-
-    Returns:
-        (H, W, 3) uint8 RGB.
-    """
+    """Colour a (H, W) probability map, as (H, W, 3) uint8: dark blue is 0, yellow is 1."""
     levels = np.rint(np.clip(heatmap, 0, 1) * 255).astype(np.uint8)
     return cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
 
@@ -107,13 +76,10 @@ def draw_logits(logits: np.ndarray) -> np.ndarray:
 
     Of probabilities most would be the darkest or the brightest colour: a sixth of the pixels of a
     photograph have one that float32 rounds to 1.
-
-    Returns:
-        (H + caption, W, 3) uint8 RGB; not larger than `fit_picture` makes it.
     """
     shown = fit_picture(np.asarray(logits, np.float32))
     known = np.where(np.isfinite(shown), shown, 0)
-    low, high = (float(v) for v in np.percentile(known, (100 - SHOWN_PERCENTILE, SHOWN_PERCENTILE)))
+    low, high = _shown_range(known)
     low, high = min(low, -1.0), max(high, 1.0)
     levels = np.where(np.isfinite(shown), (known - low) / (high - low), shown > 0)
     words = "logit of a keypoint, 0 is a probability of 0.5"
@@ -121,16 +87,14 @@ def draw_logits(logits: np.ndarray) -> np.ndarray:
 
 
 def draw_depth(depth: np.ndarray, unit: str) -> np.ndarray:
-    """Colour a (H, W) depth map, NaN where unknown: yellow is near, dark blue far, black unknown.
+    """Colour a (H, W) depth map, NaN where unknown, with a scale, as `fit_picture` sizes it.
 
-    Returns:
-        (H + caption, W, 3) uint8 RGB with a scale; not larger than `fit_picture` makes it.
+    Yellow is near, dark blue far, black unknown.
     """
     known = np.isfinite(depth)
     if not known.any():
         return add_caption(np.zeros((*depth.shape, 3), np.uint8), "no depth is known")
-    few = 100 - SHOWN_PERCENTILE
-    near, far = (float(v) for v in np.percentile(depth[known], (few, SHOWN_PERCENTILE)))
+    near, far = _shown_range(depth[known])
     # By inverse depth, as differences are seen.
     inverse = 1 / np.maximum(np.where(known, depth, far), 1e-9)
     levels = (inverse - 1 / far) / max(1 / near - 1 / far, 1e-12)
@@ -143,14 +107,10 @@ def draw_depth(depth: np.ndarray, unit: str) -> np.ndarray:
 
 
 def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    """Draw the best keypoints of all parts of an image, coloured by their score.
+    """Draw the best keypoints of all parts of an image, coloured by score or logit, with a scale.
 
     At most `SHOWN_KEYPOINTS`, fewer on small images: in turn the best of each cell of a grid. They
-    are circles of their size, or all alike where they have none.
-
-    Returns:
-        (H + caption, W, 3) uint8 RGB with a scale of the scores, or of the logits where there are
-        any; not larger than `fit_picture` makes it.
+    are circles of their size, or all alike where they have none. `fit_picture` sizes the picture.
     """
     shown = fit_picture(rgb)
     factor = shown.shape[1] / rgb.shape[1]
@@ -168,8 +128,7 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     counted += _counted(keypoints)
     if not len(rows):
         return add_caption(canvas, "no keypoints")
-    few = 100 - SHOWN_PERCENTILE
-    low, high = (float(v) for v in np.percentile(values[rows], (few, SHOWN_PERCENTILE)))
+    low, high = _shown_range(values[rows])
     levels = np.clip((values[rows] - low) / max(high - low, 1e-9), 0, 1)
     colors = _viridis(LEAST_LEVEL + (1 - LEAST_LEVEL) * levels).tolist()
     radii = np.full(len(rows), 3 * unit)
@@ -191,6 +150,12 @@ def draw_dense_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
 
 def _counted(keypoints: Keypoints) -> str:
     return f"{len(keypoints):,} keypoint{'' if len(keypoints) == 1 else 's'}"
+
+
+def _shown_range(values: np.ndarray) -> tuple[float, float]:
+    """Return the values that have the last colours."""
+    low, high = np.percentile(values, (100 - SHOWN_PERCENTILE, SHOWN_PERCENTILE))
+    return float(low), float(high)
 
 
 def fit_picture(picture: np.ndarray) -> np.ndarray:
@@ -221,16 +186,7 @@ def _viridis(levels: np.ndarray) -> np.ndarray:
 
 
 def draw_masks(rgb: np.ndarray, masks: Mapping[str, np.ndarray], title: str) -> np.ndarray:
-    """Draw an image and masks of it in a row.
-
-    Args:
-        rgb: (H, W, 3) uint8 RGB.
-        masks: (H, W) bool masks by title.
-        title: the caption of the image.
-
-    Returns:
-        One panel for the image and one per mask, each mask captioned with its density.
-    """
+    """Draw an image and (H, W) bool masks of it by title, with their densities, in a row."""
     panels = [add_caption(rgb, title)]
     for name, mask in masks.items():
         picture = np.repeat((mask * np.uint8(255))[:, :, None], 3, 2)

@@ -35,12 +35,7 @@ MAX_POINT_WIDTH_PX = 5
 class ViewCamera:
     """A perspective camera that looks at a cloud.
 
-    Attributes:
-        position: (3,) float64 centre, in the cloud's frame.
-        axes: (3, 3) float64, whose rows are its right, down and forward.
-        focal: in pixels.
-        principal_point: (2,) float64 pixel position of its axis.
-        size: (width, height) of the picture in pixels.
+    The rows of `axes` are its right, down and forward; the rest is in pixels, the size (W, H).
     """
 
     position: np.ndarray
@@ -50,15 +45,7 @@ class ViewCamera:
     size: tuple[int, int]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Project points.
-
-        Args:
-            points: (N, 3).
-
-        Returns:
-            (N, 2) float64 pixel positions, and (N,) float64 depths along the axis; the positions
-            of points whose depth is not above 0 are undefined.
-        """
+        """Return (N, 2) pixel positions and (N,) depths, where these are not above 0 undefined."""
         seen = (points - self.position) @ self.axes.T
         depth = seen[:, 2]
         scale = self.focal / np.where(depth > 0, depth, np.inf)
@@ -74,20 +61,7 @@ def orbit_camera(
     """Place a camera that looks at the robust centre of a cloud, which fills its picture.
 
     Its distance from the centre is that of the left camera, so that small angles give a picture
-    like the photograph.
-
-    Args:
-        cloud: the cloud.
-        azimuth: degrees, from the left camera's direction (0) to the right of the scene.
-        elevation: degrees, from there up; 90 looks down.
-        size: (width, height) of the picture in pixels.
-
-    Returns:
-        The camera; 98 % of the points lie between its left and right border, and 98 % between
-        its upper and lower one.
-
-    Raises:
-        OptionError: the cloud is empty, or a value is out of its range.
+    like the photograph: to the right of the scene (azimuth) and up (elevation; 90 looks down).
 
     Example:
         >>> rng = np.random.default_rng(0)
@@ -119,25 +93,9 @@ def orbit_camera(
 
 
 def render(cloud: PointCloud, camera: ViewCamera, point_width: float | None = None) -> np.ndarray:
-    """Draw a cloud on white, each point as a square that hides what lies behind it.
+    """Draw a cloud on white, (H, W, 3) uint8, each point as a square that hides what is behind it.
 
-    Args:
-        cloud: the cloud.
-        camera: the viewer.
-        point_width: width of the points in pixels; by default each is as wide as its spacing
-            and depth need for a closed surface.
-
-    Returns:
-        (H, W, 3) uint8 RGB.
-
-    Raises:
-        OptionError: the cloud is empty, or the width is not above 0.
-
-    Example:
-        >>> cloud = PointCloud([[0.0, 0.0, 5.0]], [[200, 0, 0]], "mm")
-        >>> camera = ViewCamera(np.zeros(3), np.eye(3), 10.0, np.ones(2), (3, 3))
-        >>> render(cloud, camera, point_width=1)[..., 1].tolist()
-        [[255, 255, 255], [255, 0, 255], [255, 255, 255]]
+    Without a width in pixels each is as wide as a closed surface needs at its spacing and depth.
     """
     require_points(cloud)
     if point_width is not None and not point_width > 0:
@@ -161,27 +119,9 @@ def draw_clouds(
     width: int = 796,
     columns: int = 2,
 ) -> np.ndarray:
-    """Draw the left image and the clouds made from it, all seen by one camera.
+    """Draw the left image and clouds by title, which share its frame and one unit, in panels.
 
-    Args:
-        left: (H, W, 3) uint8 RGB, the left image.
-        clouds: by title; the one with the most points decides where the camera stands. All
-            are in the frame of the left camera and in one unit.
-        azimuth, elevation: degrees, as for `orbit_camera`.
-        width: of a panel in pixels.
-        columns: panels a row.
-
-    Returns:
-        (H', W', 3) uint8 RGB: rows of panels, each with its title and its count below.
-
-    Raises:
-        OptionError: there is no cloud with a point, or their units differ.
-
-    Example:
-        >>> left = np.zeros((30, 40, 3), np.uint8)
-        >>> cloud = PointCloud([[0.0, 0.0, 5.0], [1.0, 1.0, 6.0]], left[0, :2], "mm")
-        >>> draw_clouds(left, {"ours": cloud}, width=80).shape
-        (88, 166, 3)
+    All are seen by one camera, which the one with the most points places.
     """
     if not any(map(len, clouds.values())):
         raise OptionError("no cloud has a point: there is nothing to draw")

@@ -89,13 +89,12 @@ def test_onnx_gives_the_same_probabilities_at_any_size(tmp_path: Path) -> None:
         np.testing.assert_allclose(session.run(None, {"image": image})[0], expected, atol=1e-5)
 
 
-@pytest.mark.parametrize("dilation", [1, 4, 16])
-@pytest.mark.parametrize("layout", [torch.channels_last, torch.contiguous_format])
-@pytest.mark.parametrize(("inputs", "outputs"), [(12, 16), (25, 28), (2, 2)])
-def test_dilated_gradients_in_bfloat16(
-    dilation: int, layout: torch.memory_format, inputs: int, outputs: int
-) -> None:
+@pytest.mark.parametrize(
+    ("dilation", "inputs", "outputs"), [(1, 12, 16), (4, 25, 28), (16, 2, 2), (16, 25, 28)]
+)
+def test_dilated_gradients_in_bfloat16(dilation: int, inputs: int, outputs: int) -> None:
     torch.manual_seed(dilation)
+    layout = torch.channels_last
     layer = DilatedConvolution(inputs, outputs, dilation).to(memory_format=layout)
     x = torch.randn(2, inputs, 40, 36).to(memory_format=layout).requires_grad_()
     wanted = torch.randn(2, outputs, 40, 36)

@@ -87,21 +87,13 @@ def path(count: int, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(("height", "width"), SIZES)
 def test_they_are_what_detect_finds(
-    height: int, width: int, path: Path, count: int, tmp_path: Path, photo: np.ndarray
+    height: int, width: int, path: Path, count: int, photo: np.ndarray
 ) -> None:
     rgb = photo[:height, :width]
-    names = ["probability", "logits", *OUTPUTS]
-    probability, logits, xy, values = session_of(path).run(names, {"image": planes_of(rgb)})
+    xy, values = session_of(path).run(OUTPUTS, {"image": planes_of(rgb)})
     expected = best(rgb, count)
     assert count == MAX_KEYPOINTS or (len(expected) < count) == (width < 64)
     check_keypoints(xy[0], values[0], expected, count)
-    # The maps are those of a file without keypoints.
-    write_onnx("default", tmp_path / "maps.onnx", OnnxOptions(max_keypoints=0))
-    maps = session_of(tmp_path / "maps.onnx")
-    assert [value.name for value in maps.get_outputs()] == names[:2]
-    alone = maps.run(names[:2], {"image": planes_of(rgb)})
-    np.testing.assert_allclose(probability, alone[0], atol=1e-5)
-    np.testing.assert_allclose(logits, alone[1], atol=1e-4)
 
 
 def test_a_batch_gives_those_of_each_image(path: Path, count: int, photo: np.ndarray) -> None:
@@ -193,10 +185,6 @@ def test_opencv_5(path: Path, count: int, photo: np.ndarray) -> None:
         *_, xy, values = network.forward(["probability", "logits", *OUTPUTS])
         for k, rgb in enumerate(images):
             assert same_share(xy[k], values[k], best(rgb, count)) > 0.99
-        # A list of names must name all of them; one name alone may be any.
-        with pytest.raises(cv2.error):
-            network.forward(["probability", "logits"])
-        assert network.forward("logits").shape == (2, 1, height, width)
 
 
 @pytest.fixture(scope="module")
@@ -256,43 +244,6 @@ def test_of_equal_ones_at_the_last_place_any_are_kept(keypoints_of: Any) -> None
     assert xy[0, 0].tolist() == [6, 6]
     assert (logits[0, 0][xy[0].astype(int)[:, 1], xy[0].astype(int)[:, 0]] == values[0]).all()
     assert len(np.unique(xy[0], axis=0)) == 4
-
-
-@pytest.mark.parametrize("grey", [0, 128, 255])
-def test_a_constant_image_has_weak_ones(grey: int, path: Path, photo: np.ndarray) -> None:
-    """The package gives none; the file gives what the network says, far below a photograph's."""
-    rgb = np.full((100, 130, 3), grey, np.uint8)
-    assert len(best(rgb)) == 0
-    session = session_of(path)
-    (values,) = session.run(["keypoint_logits"], {"image": planes_of(rgb)})
-    assert np.isfinite(values).any()
-    assert values.max() < 7
-    (others,) = session.run(["keypoint_logits"], {"image": planes_of(photo)})
-    assert others.max() > 20
-
-
-@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
-def test_the_package_reads_the_maps_of_such_a_file(
-    backend: str, path: Path, photo: np.ndarray
-) -> None:
-    if backend == "openvino":
-        pytest.importorskip("openvino", reason="needs OpenVINO")
-    rgb = photo[:123, :157]
-    found, expected = (
-        DeepDetect(weights, backend=backend, threads=1).heatmap_and_logits(rgb)
-        for weights in (path, "default")
-    )
-    np.testing.assert_allclose(found[1], expected[1], atol=1e-4)
-
-
-def test_such_a_file_runs_in_tiles(path: Path, photo: np.ndarray) -> None:
-    from deepdetect.detector.tiling import open_tiled
-
-    found, expected = (
-        open_tiled(weights, threads=1)(photo[:64, :200], tile_megapixels=0.05)
-        for weights in (path, pretrained_weights())
-    )
-    np.testing.assert_array_equal(found, expected)
 
 
 def test_a_file_is_made_of_such_a_file(path: Path, tmp_path: Path) -> None:

@@ -71,18 +71,6 @@ def test_a_zoomed_image_has_the_same_points_at_larger_sizes(gray) -> None:
 
 
 @pytest.mark.parametrize("spread", ["grid", "anms"])
-def test_spread_points_cover_more_of_the_image(gray, spread) -> None:
-    shaded = (gray * np.linspace(1, 0.15, 320)[None]).astype(np.uint8)
-    cells = []
-    for name in ("none", spread):
-        found = detect_points(shaded, 150, spread=name)
-        assert len(found) == 150
-        assert (np.diff(found.logits) <= 0).all()
-        cells.append(len(np.unique((found.xy // 32).astype(int), axis=0)))
-    assert cells[1] > cells[0]
-
-
-@pytest.mark.parametrize("spread", ["grid", "anms"])
 def test_dim_regions_get_their_share_of_spread_points(spread, monkeypatch) -> None:
     """Also where the strongest candidates of an image all lie elsewhere."""
     noise = np.random.default_rng(5).standard_normal((600, 800))
@@ -120,13 +108,6 @@ def test_the_strongest_candidates_are_enough(gray, monkeypatch) -> None:
     assert len(find_candidates(build_scale_space(gray))) > 600
     same = (np.linalg.norm(few.xy[:, None] - everything.xy, axis=2).min(1) < 0.1).mean()
     assert same > 0.9
-
-
-def test_scores_rank_without_ties(photo) -> None:
-    found = detect_points(cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY), 500)
-    assert (np.diff(found.scores) < 0).all()
-    assert 0 < found.scores[-1] < found.scores[0] < 1
-    assert found.scores[0] - found.scores[-1] > 0.005
 
 
 def test_equal_logits_get_falling_scores() -> None:
