@@ -164,15 +164,22 @@ class PointDetector:
         if ignore is not None:
             ignore = check_ignore(ignore, gray.shape)
         scale = (MAX_AUTO_PIXELS / gray.size) ** 0.5
-        if self.resolution == "native" or scale >= 1:
-            return self._detect(gray, ignore)
-        size = [max(1, round(side * scale)) for side in (width, height)]
-        small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
-        if ignore is not None:
+        scaled = self.resolution == "auto" and scale < 1
+        size = (width, height)
+        if scaled:
+            size = (max(1, round(width * scale)), max(1, round(height * scale)))
+            gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+        if scaled and ignore is not None:
             # Wherever a pixel of the small image, or one beside it, holds something to be ignored.
             share = cv2.resize(ignore.astype(np.float32), size, interpolation=cv2.INTER_AREA)
             ignore = cv2.dilate((share > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
-        found = self._detect(small, ignore)
+        ranker = load_ranker(self.ranker)
+        with memory_named(gray.shape):
+            found = detect_points(
+                gray, self.max_keypoints, spread=self.spread, ignore=ignore, ranker=ranker
+            )
+        if not scaled:
+            return found
         factor = np.divide((width, height), size)
         return replace(
             found,
@@ -180,13 +187,3 @@ class PointDetector:
             image_size=(width, height),
             sizes=None if found.sizes is None else found.sizes * factor.mean(),
         )
-
-    def _detect(self, gray: np.ndarray, ignore: np.ndarray | None) -> Keypoints:
-        with memory_named(gray.shape):
-            return detect_points(
-                gray,
-                self.max_keypoints,
-                spread=self.spread,
-                ignore=ignore,
-                ranker=load_ranker(self.ranker),
-            )

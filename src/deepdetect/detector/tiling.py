@@ -1,6 +1,6 @@
 """The network on images that are too large for the memory: in parts, and each part in tiles.
 
-A logit depends on pixels up to `REACH_PX` away, most of it through the zeros that pad the layers
+A logit depends on pixels up to 1,738 px away, most of it through the zeros that pad the layers
 at an eighth of the size, so tiles of the image alone would either differ from the whole at their
 seams or overlap almost entirely. Cut into parts, no layer reaches far: each part runs on tiles
 that overlap by as much as it sees, and the logits are those of the whole image.
@@ -24,12 +24,6 @@ from .backends.onnx_parts import cut_onnx
 from .backends.onnxruntime_backend import start_session
 
 STRIDE = 8
-
-REACH_PX = 1744
-"""How far the whole network sees, rounded up: seven pyramids of 64 pixels, ten of 128, and kernels.
-
-`4679d01:benchmarks/receptive_field.py` measures it.
-"""
 
 BLOCKS = 9
 """Pyramids at an eighth of the size."""

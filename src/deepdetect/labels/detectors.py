@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from .._shared.errors import OptionError, unknown_name
 from .._shared.opencv import cv2, opencv_factory
 
 Value = bool | int | float
+Settings = Mapping[str, Any]
 Range = tuple[float, float] | range
 """Smallest and largest value, or all values."""
 
@@ -51,7 +52,7 @@ class LabelDetector:
     """
 
     kind: Literal["keypoint", "edge"]
-    function: Callable[..., np.ndarray]
+    function: Callable[[np.ndarray, Settings], np.ndarray]
     settings: Mapping[str, tuple[Value, Range | None]]
     low_visibility: Mapping[str, Value] = field(default_factory=dict)
 
@@ -62,7 +63,7 @@ class LabelDetector:
 
     def mask(self, gray: np.ndarray, **settings: Value) -> np.ndarray:
         """Return what it marks in a (H, W) uint8 image, (H, W) bool, with some other settings."""
-        return self.function(gray, **{**self.defaults, **settings})
+        return self.function(gray, {**self.defaults, **settings})
 
 
 def pixels_mask(shape: tuple[int, ...], xy: np.ndarray) -> np.ndarray:
@@ -84,38 +85,30 @@ def _marked(gray: np.ndarray, detector: cv2.Feature2D) -> np.ndarray:
     return pixels_mask(gray.shape, cv2.KeyPoint_convert(detector.detect(gray, None)))
 
 
-def _sift(
-    gray: np.ndarray,
-    contrast_threshold: float,
-    edge_threshold: float,
-    sigma: float,
-    octave_layers: int,
-) -> np.ndarray:
+def _sift(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """Extrema of the difference-of-Gaussians scale space (Lowe, 2004).
 
     By default the edge test is practically switched off.
     """
-    detector = cv2.SIFT_create(0, octave_layers, contrast_threshold, edge_threshold, sigma)
+    detector = cv2.SIFT_create(
+        nOctaveLayers=settings["octave_layers"],
+        contrastThreshold=settings["contrast_threshold"],
+        edgeThreshold=settings["edge_threshold"],
+        sigma=settings["sigma"],
+    )
     return _marked(gray, detector)
 
 
-def _orb(
-    gray: np.ndarray,
-    features: int,
-    scale_factor: float,
-    levels: int,
-    edge_threshold: int,
-    fast_threshold: int,
-) -> np.ndarray:
+def _orb(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """FAST corners on an image pyramid (Rublee et al., 2011); by default nothing is cut off."""
     # OpenCV refuses levels of less than a pixel.
-    most = 1 + int(math.log(min(gray.shape)) / math.log(scale_factor))
+    most = 1 + int(math.log(min(gray.shape)) / math.log(settings["scale_factor"]))
     detector = cv2.ORB_create(
-        features,
-        scale_factor,
-        min(levels, most),
-        edgeThreshold=edge_threshold,
-        fastThreshold=fast_threshold,
+        nfeatures=settings["features"],
+        scaleFactor=settings["scale_factor"],
+        nlevels=min(settings["levels"], most),
+        edgeThreshold=settings["edge_threshold"],
+        fastThreshold=settings["fast_threshold"],
     )
     return _marked(gray, detector)
 
@@ -126,71 +119,67 @@ def _brisk_detector(threshold: int, octaves: int) -> cv2.Feature2D:
     return opencv_factory("BRISK_create")(thresh=threshold, octaves=octaves)
 
 
-def _brisk(gray: np.ndarray, threshold: int, octaves: int) -> np.ndarray:
+def _brisk(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """AGAST corners in a scale space (Leutenegger et al., 2011)."""
     # OpenCV refuses octaves of less than a pixel; in each, a layer has 2/3 of the size.
     most = (2 * min(gray.shape) // 3).bit_length()
-    return _marked(gray, _brisk_detector(threshold, min(octaves, most)))
+    return _marked(gray, _brisk_detector(settings["threshold"], min(settings["octaves"], most)))
 
 
-def _fast(gray: np.ndarray, threshold: int, suppression: bool) -> np.ndarray:
+def _fast(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """The segment test on a circle of 16 pixels (Rosten and Drummond, 2006)."""
     kind = cv2.FAST_FEATURE_DETECTOR_TYPE_9_16
-    return _marked(gray, cv2.FastFeatureDetector_create(threshold, suppression, kind))
+    create = cv2.FastFeatureDetector_create
+    return _marked(gray, create(settings["threshold"], settings["suppression"], kind))
 
 
-def _agast(gray: np.ndarray, threshold: int, suppression: bool) -> np.ndarray:
+def _agast(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """The segment test with an adaptive decision tree (Mair et al., 2010).
 
     With equal settings the mask is that of FAST: only the order of the comparisons differs.
     """
     create = opencv_factory("AgastFeatureDetector_create")
-    return _marked(gray, create(threshold, suppression, AGAST_OAST_9_16))
+    return _marked(gray, create(settings["threshold"], settings["suppression"], AGAST_OAST_9_16))
 
 
-def _harris(
-    gray: np.ndarray,
-    block_size: int,
-    aperture: int,
-    k: float,
-    relative_threshold: float,
-    dilate: bool,
-) -> np.ndarray:
+def _harris(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """Corners of the gradient covariance (Harris and Stephens, 1988).
 
     The response is dilated by 3x3, which makes blobs, before it is compared with a threshold
     relative to the largest response.
     """
-    response = cv2.cornerHarris(gray, block_size, aperture, k)
-    if dilate:
+    response = cv2.cornerHarris(gray, settings["block_size"], settings["aperture"], settings["k"])
+    if settings["dilate"]:
         response = cv2.dilate(response, None)
-    return response > relative_threshold * max(float(response.max()), 0.0)
+    return response > settings["relative_threshold"] * max(float(response.max()), 0.0)
 
 
-def _shi_tomasi(
-    gray: np.ndarray, corners: int, quality_level: float, minimum_distance: float, block_size: int
-) -> np.ndarray:
+def _shi_tomasi(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """The smaller eigenvalue of the gradient covariance (Shi and Tomasi, 1994).
 
     0 `corners` are all of them.
     """
     found = cv2.goodFeaturesToTrack(
-        gray, corners, quality_level, minimum_distance, blockSize=block_size
+        gray,
+        maxCorners=settings["corners"],
+        qualityLevel=settings["quality_level"],
+        minDistance=settings["minimum_distance"],
+        blockSize=settings["block_size"],
     )
     return pixels_mask(gray.shape, np.empty((0, 2)) if found is None else found)
 
 
-def _canny(gray: np.ndarray, low_threshold: float, high_threshold: float) -> np.ndarray:
+def _canny(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """Thin edges: gradient maxima with hysteresis (Canny, 1986), without a blur before."""
-    return cv2.Canny(gray, low_threshold, high_threshold) > 0
+    return cv2.Canny(gray, settings["low_threshold"], settings["high_threshold"]) > 0
 
 
-def _sobel(gray: np.ndarray, kernel_size: int, relative_threshold: float) -> np.ndarray:
+def _sobel(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """Thick edges: a gradient by a wide filter, large relative to the largest one."""
-    dx = cv2.Sobel(gray, cv2.CV_64F, 1, 0, ksize=kernel_size)
-    dy = cv2.Sobel(gray, cv2.CV_64F, 0, 1, ksize=kernel_size)
+    dx = cv2.Sobel(gray, cv2.CV_64F, 1, 0, ksize=settings["kernel_size"])
+    dy = cv2.Sobel(gray, cv2.CV_64F, 0, 1, ksize=settings["kernel_size"])
     magnitude = cv2.magnitude(dx, dy)
-    return magnitude > relative_threshold * float(magnitude.max())
+    return magnitude > settings["relative_threshold"] * float(magnitude.max())
 
 
 _CORNER_TEST: dict[str, tuple[Value, Range | None]] = {

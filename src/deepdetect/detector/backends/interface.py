@@ -54,14 +54,15 @@ class RuntimeOptions:
 
     def check_backend(self, backend: str) -> None:
         """Raise an OptionError if a backend has not what is asked of it."""
-        wanted = {
-            f'`precision="{self.precision}"`': "openvino" if self.precision != "float32" else None,
-            f'`device="{self.device}"`': "onnxruntime" if self.device != "cpu" else None,
-        }
-        for option, needed in wanted.items():
-            if needed not in (None, backend):
+        for option, usual, needed in (
+            ("precision", "float32", "openvino"),
+            ("device", "cpu", "onnxruntime"),
+        ):
+            value = getattr(self, option)
+            if value != usual and backend != needed:
                 raise OptionError(
-                    f"{option} needs the backend {needed}, not {backend}: leave one of them out"
+                    f'`{option}="{value}"` needs the backend {needed}, not {backend}: leave one of '
+                    "them out"
                 )
 
 

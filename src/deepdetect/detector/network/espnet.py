@@ -52,18 +52,13 @@ class _DilatedBfloat16(torch.autograd.Function):
         gradient = gradient.contiguous(memory_format=torch.channels_last)  # once, for both
         turned = weight.flip(2, 3).transpose(0, 1).contiguous(memory_format=torch.channels_last)
         of_input = conv2d(gradient, turned, padding=d, dilation=d)
-        filled_x = _fill_block(x)
+        missing = -x.shape[1] % 16 if x.shape[1] > 16 else 0
+        filled_x = pad(x, (0, 0, 0, 0, 0, missing)) if missing else x
         of_weight = torch.ops.aten.convolution_backward(
             *(gradient, filled_x, weight.new_empty(weight.shape[0], filled_x.shape[1], 3, 3), None),
             *([1, 1], [d, d], [d, d], False, [0, 0], 1, [False, True, False]),
         )[1]
         return of_input, of_weight[:, : weight.shape[1]].float(), None
-
-
-def _fill_block(x: Tensor) -> Tensor:
-    """Fill (B, C, H, W) with channels of zeros to whole blocks of 16; up to 16 stay as they are."""
-    missing = -x.shape[1] % 16 if x.shape[1] > 16 else 0
-    return pad(x, (0, 0, 0, 0, 0, missing)) if missing else x
 
 
 class DilatedConvolution(nn.Module):

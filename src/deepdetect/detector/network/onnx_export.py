@@ -23,8 +23,10 @@ from ...features.selection import check_max_keypoints
 from ...io.image import load_image
 from ..pretrained import resolve_weights
 from .onnx_graph import (
+    IMAGE,
+    LOGITS,
+    PROBABILITY,
     add_padding,
-    check_graph,
     fix_size,
     read_metadata,
     to_float16,
@@ -183,7 +185,12 @@ def _load(path: Path) -> tuple[ModelProto, dict[str, str]]:
             f"{path} is not an ONNX file that can be read ({error}): download it again"
         ) from None
     remove_keypoints(model)
-    check_graph(model, str(path))
+    tensors = [value.name for value in (*model.graph.input, *model.graph.output)]
+    if tensors != [IMAGE, PROBABILITY, LOGITS]:
+        raise WeightsError(
+            f"{path} is no network of deepdetect (it has {', '.join(tensors)}): give a file that "
+            "deepdetect has written"
+        )
     found = read_metadata(model)
     if any(found.get(name, value) != value for name, value in ANY_SIZE.items()):
         raise WeightsError(

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ... import __version__
-from ..._shared.errors import WeightsError
 
 if TYPE_CHECKING:
     from onnx import GraphProto, ModelProto, NodeProto
@@ -155,17 +154,6 @@ def to_int8(model: ModelProto, images: Iterable[np.ndarray]) -> ModelProto:
             return onnx.load_model(str(made))
     finally:
         logging.disable(logging.NOTSET)
-
-
-def check_graph(model: ModelProto, name: str) -> None:
-    """Raise a WeightsError where a graph does not map `image` to `logits`."""
-    inputs = [value.name for value in model.graph.input]
-    outputs = {value.name for value in model.graph.output}
-    if inputs != [IMAGE] or outputs != {PROBABILITY, LOGITS}:
-        raise WeightsError(
-            f"{name} is no network of deepdetect (it maps {', '.join(inputs)} to "
-            f"{', '.join(sorted(outputs))}): give a file that deepdetect has written"
-        )
 
 
 def write_metadata(model: ModelProto, values: Mapping[str, str]) -> None:
