@@ -105,17 +105,6 @@ def test_other_networks_are_not_tiled(onnx_file: Callable[..., Path]) -> None:
     assert open_tiled(onnx_file()) is None
 
 
-def test_flips_of_sides_that_are_no_multiples_of_eight_are_symmetric(photo: np.ndarray) -> None:
-    rgb = np.ascontiguousarray(photo[:155, :203])
-    options: dict[str, object] = {"backend": "onnxruntime", "resolution": "native", "tta": "flip"}
-    whole = DeepDetect(threads=1, **options)
-    expected = whole.heatmap_and_logits(rgb)[1]
-    mirrored = whole.heatmap_and_logits(np.ascontiguousarray(rgb[:, ::-1]))[1]
-    turned = whole.heatmap_and_logits(np.ascontiguousarray(np.rot90(rgb)))[1]
-    assert np.abs(mirrored[:, ::-1] - expected).max() < 1e-3
-    assert np.abs(np.rot90(turned, -1) - expected).max() < 1e-3
-
-
 def test_a_size_of_tiles_is_never_ignored(photo: np.ndarray) -> None:
     large = np.tile(photo, (6, 6, 1))
     with pytest.raises(OptionError, match="resolution='native'"):

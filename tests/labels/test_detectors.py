@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect._shared.errors import OptionError
-from deepdetect.labels import LabelOptions
 from deepdetect.labels.detectors import (
     DETECTORS,
     pixels_mask,
@@ -17,54 +15,6 @@ from deepdetect.labels.detectors import (
 )
 
 NAMES = ("sift", "orb", "brisk", "fast", "agast", "harris", "shi-tomasi", "canny", "sobel")
-
-# The settings that reproduce the published labels.
-PUBLISHED: dict[str, dict[str, Any]] = {
-    "sift": {
-        "contrast_threshold": 0.04,
-        "edge_threshold": 1000,
-        "sigma": 1.6,
-        "octave_layers": 3,
-    },
-    "orb": {
-        "features": 1_000_000,
-        "scale_factor": 1.2,
-        "levels": 7,
-        "edge_threshold": 13,
-        "fast_threshold": 13,
-    },
-    "brisk": {"threshold": 11, "octaves": 3},
-    "fast": {"threshold": 13, "suppression": False},
-    "agast": {"threshold": 13, "suppression": False},
-    "harris": {
-        "block_size": 3,
-        "aperture": 5,
-        "k": 0.001,
-        "relative_threshold": 0.001,
-        "dilate": True,
-    },
-    "shi-tomasi": {
-        "corners": 0,
-        "quality_level": 0.01,
-        "minimum_distance": 1,
-        "block_size": 2,
-    },
-    "canny": {"low_threshold": 150, "high_threshold": 250},
-    "sobel": {"kernel_size": 11, "relative_threshold": 0.1},
-}
-LOW_CHANGES = {
-    "fast": {"threshold": 1},
-    "agast": {"threshold": 1},
-    "sobel": {"relative_threshold": 0.5},
-}
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_published_settings(name: str) -> None:
-    options = LabelOptions()
-    assert options.parameters(name, "normal") == PUBLISHED[name]
-    low = PUBLISHED[name] | LOW_CHANGES.get(name, {})
-    assert options.parameters(name, "low") == low
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -134,26 +134,6 @@ def test_one_size(
             check_keypoints(xy[k], values[k], best(images[k], 500), 500)
 
 
-@pytest.mark.slow
-def test_they_are_what_detect_finds_in_photographs(shared: Path, tmp_path: Path) -> None:
-    from deepdetect.io.image import load_image
-
-    data = shared / "data"
-    photographs = [
-        *sorted((data / "label-samples/val").glob("image_*.png"))[:6:2],
-        data / "middlebury/teddy/left.png",
-        data / "oxford/graf/img1.png",
-        data / "kitti-clip/000000.jpg",
-    ]
-    made = tmp_path / "made.onnx"
-    write_onnx("default", made, OnnxOptions(max_keypoints=2000))
-    session = session_of(made)
-    for photograph in photographs:
-        rgb = load_image(photograph)
-        xy, values = session.run(OUTPUTS, {"image": planes_of(rgb)})
-        check_keypoints(xy[0], values[0], best(rgb, 2000), 2000)
-
-
 def same_share(xy: np.ndarray, values: np.ndarray, expected: Keypoints) -> float:
     """Return the share of keypoints that another runtime finds within a hundredth of a pixel."""
     assert np.isfinite(values).sum() == len(expected)
