@@ -58,11 +58,9 @@ Reader = Callable[[slice, slice], np.ndarray]
 class TiledNetwork:
     """A network in parts.
 
-    Attributes:
-        start: of the image, the reduced features at an eighth and at a quarter of the size.
-        blocks: one after the other on the features at an eighth of the size.
-        middle: of the reduced features and those of the last block, the decoder's.
-        end: of the image and the decoder's features at a quarter and an eighth, the logits.
+    The image gives `start`, the reduced features at an eighth and those at a quarter of the size.
+    `blocks` and `middle` give the decoder's at an eighth. `end` makes logits of the image and the
+    last two.
     """
 
     start: Part

@@ -97,8 +97,12 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
     openvino = import_openvino()
     from openvino.frontend import FrontEndManager
 
-    if options.precision == "bfloat16" and not computes_bfloat16():
-        raise OptionError("this processor has no instructions for bfloat16: leave `precision` out")
+    if options.precision == "bfloat16":
+        known = openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+        if "BF16" not in known:
+            raise OptionError(
+                "this processor has no instructions for bfloat16: leave `precision` out"
+            )
     # Its default on newer CPUs is bfloat16, which moves keypoints.
     settings: dict[str, object] = {
         "INFERENCE_PRECISION_HINT": "bf16" if options.precision == "bfloat16" else "f32",
@@ -119,12 +123,6 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
         return OpenVinoNetwork(compile_model, path, options)
     except Exception as error:  # its exceptions share no base class
         raise unreadable(path, error) from None
-
-
-def computes_bfloat16() -> bool:
-    """Return whether this processor has instructions for `precision="bfloat16"`."""
-    capabilities = import_openvino().Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
-    return bool("BF16" in capabilities)
 
 
 def _keep_what_is_read(graph: Any) -> None:

@@ -188,19 +188,9 @@ class Encoder(nn.Module):
 
 
 class ESPNet(nn.Module):
-    """The whole network: a logit for each pixel of the image.
+    """The whole network: a logit for each pixel of an image whose sides are multiples of 8.
 
-    Args:
-        p: pyramids at 1/4 of the size (paper: 5).
-        q: pyramids at 1/8 of the size (paper: 9).
-        decoder_channels: channels of the decoder (paper: 10).
-
-    The default has 408,039 parameters. Height and width of the input must be
-    multiples of 8; channels are RGB in [0, 1], without further normalisation.
-
-    Example:
-        >>> ESPNet()(torch.zeros(1, 3, 16, 24)).shape
-        torch.Size([1, 1, 16, 24])
+    The default has 408,039 parameters: `p` pyramids at 1/4 of the size and `q` at 1/8.
     """
 
     def __init__(self, p: int = 5, q: int = 9, decoder_channels: int = 10) -> None:

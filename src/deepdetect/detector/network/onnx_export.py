@@ -108,24 +108,11 @@ def write_onnx(
     calibration: Sequence[Path] = (),
     licence: str | None = None,
 ) -> dict[str, str]:
-    """Write weights as an ONNX file for other programs, whole or not at all.
+    """Write weights as an ONNX file for other programs, whole or not at all; return its metadata.
 
-    Args:
-        weights: "default", "dense" or "free"; an ONNX file that this package has written in fp32
-            for any size; or a safetensors file, which needs torch.
-        path: the file to be written, ending in .onnx.
-        options: its size and precision, and whether it gives keypoints.
-        calibration: images for int8, like those that it will be used on.
-        licence: what the file says of the licence of the weights. None: that of the given file.
-
-    Returns:
-        The metadata that the file holds.
-
-    Raises:
-        MissingExtraError: the package onnx, or torch for safetensors, is not installed.
-        OptionError: calibration images are missing for int8, or given for another precision.
-        WeightsError: the weights are missing, damaged, or no fp32 network for any size.
-        ImageError: a calibration image cannot be read.
+    The weights are named, a safetensors file, or an ONNX file that this package has written in fp32
+    for any size. Images for int8 should be like those that it will be used on. Without a licence
+    the file says that of the given one.
     """
     if Path(path).suffix.lower() != ".onnx":
         raise OptionError(f"the name of an ONNX file ends in .onnx, not {Path(path).name}")

@@ -25,10 +25,8 @@ _CHUNK = 65_536
 class Ranker:
     """Weights of the ranker: a logit is the first feature plus a perceptron of all of them.
 
-    Attributes:
-        mean, deviation: (F,) float32 of the features over the photographs it was trained on.
-        layers: weights (outputs, inputs) and biases of three layers, with ReLU between them.
-        notes: what is known about its training.
+    Features are normalised by mean and deviation; layers are weights (outputs, inputs) and biases,
+    with ReLU between them.
     """
 
     mean: np.ndarray
