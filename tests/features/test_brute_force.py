@@ -142,14 +142,6 @@ def test_neighbours_equal_those_of_counting_all_bits(width: int, count: int) -> 
     assert_nearest(random_bytes(count, 60, width), random_bytes(9, 80, width), count)
 
 
-@pytest.mark.parametrize("block", [1, 7, 59, 60, 61])
-def test_blocks_do_not_change_the_hamming_result(
-    block: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(matchers, "HAMMING_QUERIES", block)
-    assert_nearest(random_bytes(0, 60, 32), random_bytes(1, 80, 32), 2)
-
-
 def test_the_base_may_be_as_large_as_that_of_any_matcher() -> None:
     """OpenCV's brute force ends at 2^18 rows; ORB with low settings finds more."""
     base = random_bytes(0, (1 << 18) + 3, 8)

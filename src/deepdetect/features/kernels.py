@@ -1,10 +1,9 @@
-"""Compiled parts of descriptors, nearest keypoints and suppression. The first call compiles.
+"""Compiled parts of descriptors, matchers, nearest keypoints and suppression.
 
 Dense SIFT works in tiles, so that intermediate results stay in the processor's cache: for each
 pixel of a tile eight soft orientations, summed along its row into the descriptor's four columns,
 then along the column into its four rows. The innermost loops run over all keypoints in a row of the
-tile and their orientations, which lie side by side in memory, so that the processor handles many of
-them at once.
+tile and their orientations, which lie side by side in memory.
 """
 
 from __future__ import annotations
@@ -170,20 +169,18 @@ def correlation_distances(start, stop, first, rows0, second, rows1, mean, out): 
 
 
 @compiled(nogil=True)
-def nearest_of_nine(first, last, places, xy, grid, nearest, distances):  # type: ignore[no-untyped-def]
-    """Find the nearest keypoint in the 3x3 pixels around the places from `first` to before `last`.
+def nearest_of_nine(first, last, positions, xy, grid, nearest, distances):  # type: ignore[no-untyped-def]
+    """Find the nearest keypoint in the 3x3 pixels around the positions from `first` to `last`.
 
     Args:
-        first, last: rows of the places.
-        places: (N, 2) float64; not finite: none is found.
+        positions: (N, 2) float64; not finite: none is found.
         xy: (M, 2) float64 keypoints.
         grid: (H, W) int32 row of the keypoint on each pixel, or -1.
-        nearest: (N,) int32, written: the row of the nearest keypoint where there is one.
-        distances: (N,) float64, written.
+        nearest, distances: (N,) int32 rows and float64 distances, written where there is one.
     """
     height, width = grid.shape
     for k in range(first, last):
-        x, y = places[k, 0], places[k, 1]
+        x, y = positions[k, 0], positions[k, 1]
         if not (-1.5 < x < width + 0.5 and -1.5 < y < height + 0.5):
             continue
         column, row = int(np.floor(x + 0.5)), int(np.floor(y + 0.5))
@@ -204,14 +201,7 @@ def nearest_of_nine(first, last, places, xy, grid, nearest, distances):  # type:
 def keep_distant(x, y, radii, cell, columns, rows):  # type: ignore[no-untyped-def]
     """Return which points, best first, have no kept point closer than the smaller of their radii.
 
-    Args:
-        x, y: (N,) float64 positions, all of them 0 or more.
-        radii: (N,) float64 in pixels.
-        cell: side of the cells of a grid that kept points are listed in.
-        columns, rows: of that grid.
-
-    Returns:
-        (N,) bool.
+    The (N,) float64 positions are 0 or more; kept points are listed in a grid of square cells.
     """
     kept = np.zeros(len(x), np.bool_)
     first = np.full((rows, columns), -1, np.int64)

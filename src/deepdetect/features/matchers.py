@@ -26,12 +26,6 @@ MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
 MAX_EXACT_PRODUCT = 4e8
 """Keypoints of both images, multiplied, up to which all distances are computed in a moment."""
 
-HAMMING_QUERIES = 20_000
-"""At a time: OpenCV keeps an object for each of their neighbours."""
-
-HAMMING_BASE = 200_000
-"""At a time: OpenCV's search takes fewer than 2^18."""
-
 FLANN_INDEX_KDTREE, TREES, CHECKS = 1, 5, 50
 """Of FLANN, as in the paper's code."""
 
@@ -128,29 +122,12 @@ def hamming_neighbours(
         raise OptionError(
             "the matcher hamming compares binary descriptors, such as ORB's: use exact or flann"
         )
-    rows = np.empty((len(queries), count), np.int32)
-    distances = np.empty((len(queries), count), np.float32)
-    for start in range(0, len(queries), HAMMING_QUERIES):
-        some = queries[start : start + HAMMING_QUERIES]
-        parts = [
-            _search_part(some, base[first : first + HAMMING_BASE], count, first)
-            for first in range(0, len(base), HAMMING_BASE)
-        ]
-        candidates, gaps = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
-        order = np.argsort(gaps, axis=1, kind="stable")[:, :count]
-        rows[start : start + HAMMING_QUERIES] = np.take_along_axis(candidates, order, 1)
-        distances[start : start + HAMMING_QUERIES] = np.take_along_axis(gaps, order, 1)
-    return rows, distances
-
-
-def _search_part(
-    queries: np.ndarray, base: np.ndarray, count: int, first: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Search a part of the base, whose first row has the number `first`."""
-    matches = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(queries, base, min(count, len(base)))
-    rows = np.array([[match.trainIdx for match in some] for some in matches], np.int32)
-    distances = np.array([[match.distance for match in some] for some in matches], np.float32)
-    return rows + first, distances
+    if not len(queries):
+        return np.empty((0, count), np.int32), np.empty((0, count), np.float32)
+    distances, rows = cv2.batchDistance(
+        queries, base, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=count
+    )
+    return rows, distances.astype(np.float32)
 
 
 def flann_neighbours(
@@ -307,11 +284,9 @@ def get_matcher(name: str) -> Matcher:
 
 @dataclass(frozen=True, eq=False)
 class DescriptorMatches:
-    """Matches between two sets of descriptors.
+    """Matched rows (M,) of two sets of descriptors.
 
-    Attributes:
-        indices0, indices1: (M,) int, matched rows of the first and of the second set.
-        ratios: (M,) float32, Lowe's ratio: distance of the best over that of the second-best.
+    `ratios` are Lowe's, (M,) float32: the distance of the best over that of the second-best.
     """
 
     indices0: np.ndarray
@@ -332,7 +307,7 @@ def match_descriptors(
     seed: int = 0,
     positions: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> DescriptorMatches:
-    """Match by nearest neighbour and ratio test (Lowe, 2004).
+    """Match by nearest neighbour and ratio test (Lowe, 2004), by ascending row of the first set.
 
     Args:
         descriptors0, descriptors1: (N, D) and (M, D), uint8 or float32.
@@ -340,14 +315,9 @@ def match_descriptors(
         ratio: the ratio of a match must be below this (paper's code: 0.99).
         mutual: keep only mutual nearest neighbours.
         seed: of a matcher that is random.
-        positions: (N, 2) and (M, 2) of the keypoints, for a matcher that uses them; None where
-            they are not all of one scale and angle.
-
-    Returns:
-        The matches, by ascending row of the first set. There are none when the second set has
-        fewer than two descriptors, as there is no second-best neighbour.
+        positions: of the keypoints, as of `Matcher`.
     """
-    if len(descriptors0) == 0 or len(descriptors1) < 2:
+    if len(descriptors0) == 0 or len(descriptors1) < 2:  # there is no second-best neighbour
         none = np.empty(0, np.int32)
         return DescriptorMatches(none, none, np.empty(0, np.float32))
     rows, distances = matcher(descriptors0, descriptors1, 2, seed, positions)

@@ -45,7 +45,7 @@ ROWS_AT_ONCE = 1024
 def sift_descriptors(
     gray: np.ndarray, xy: np.ndarray, size: float = 3.0, angle: float = 0.0
 ) -> np.ndarray:
-    """Compute SIFT descriptors, by the fastest implementation for these keypoints.
+    """Compute (N, 128) uint8 SIFT descriptors, by the fastest implementation for these keypoints.
 
     Many upright keypoints on whole pixels are described all at once, which differs from OpenCV's
     result by 1 in one of ten thousand numbers; others by OpenCV.
@@ -56,9 +56,6 @@ def sift_descriptors(
         size: diameter of the keypoint in pixels.
         angle: its orientation in degrees; 0 is upright. -1 is OpenCV's "unset", which its SIFT
             takes for a rotation by one degree; the published code does the same.
-
-    Returns:
-        (N, 128) uint8.
     """
     dense = len(xy) > MIN_DENSE_DENSITY * gray.size
     upright = angle == 0 and DENSE_SIZES_PX[0] <= size <= DENSE_SIZES_PX[1]
@@ -158,20 +155,11 @@ def opencv_sift_descriptors(
 def scaled_sift_descriptors(
     gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray, angles: np.ndarray
 ) -> np.ndarray:
-    """Compute SIFT descriptors of keypoints at their own sizes and angles.
+    """Compute (N, 128) uint8 SIFT descriptors of keypoints at their own sizes and angles.
 
     The gradients are those of the image of the scale space that is nearest to the size, as of
-    keypoints that SIFT detects itself. (`sift_descriptors` takes the finest image for all.)
-
-    Args:
-        gray: (H, W) uint8 luma.
-        xy: (N, 2) positions, centre of the first pixel (0, 0).
-        sizes: (N,) diameters in pixels: twice sigma, as of OpenCV's keypoints of SIFT. A descriptor
-            covers a square with six times this side.
-        angles: (N,) orientations in degrees, as of `dominant_angles`.
-
-    Returns:
-        (N, 128) uint8.
+    keypoints that SIFT detects itself. (`sift_descriptors` takes the finest image for all.) Sizes
+    are diameters, twice sigma: a descriptor covers a square with six times this side.
     """
     if not len(xy):
         return np.empty((0, 128), np.uint8)
@@ -264,16 +252,10 @@ def correlation_distance(
     rows1: np.ndarray,
     mean: np.ndarray,
 ) -> np.ndarray:
-    """Return the correlation distance of pairs of descriptors about a mean descriptor.
+    """Return 1 - correlation of pairs of descriptors about a (D,) float32 mean, (K,) float32.
 
-    Args:
-        first, second: (N, D), (M, D) uint8 descriptors.
-        rows0, rows1: (K,) rows of the pairs.
-        mean: (D,) float32, subtracted from both.
-
-    Returns:
-        (K,) float32: 1 - correlation, from 0 to 2: 0 where both are equal, 0 but for rounding
-        where they differ by a factor; 1 where one of them is the mean.
+    The pairs are (K,) rows of (N, D) and (M, D) uint8 descriptors. 0 where both are equal, 1 where
+    one of them is the mean.
     """
     from .kernels import correlation_distances
 

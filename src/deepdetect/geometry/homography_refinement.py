@@ -85,7 +85,7 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
         return local_zncc(blurred, gaussian_blur(warped, BLUR_SIGMA_PX), known, step_px=STEP_PX)
 
     equalised = equalise(gray0)
-    steps: list[Callable[[np.ndarray, np.ndarray], Fit | None]] = [
+    steps: list[Callable[[np.ndarray, np.ndarray], Fit]] = [
         partial(_fit_to_corners, equalised, *settings) for settings in TRACKING_ROUNDS
     ]
     steps.append(partial(_fit_to_pixels, gray0))
@@ -93,8 +93,6 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
     for step in steps:
         warped, valid_mask = warp_to_reference(gray1, current, size)
         fit = step(warped, valid_mask)
-        if fit is None:
-            continue
         corrections = fit(half), fit(~half)
         views = [warp_to_reference(gray1, current @ m, size) for m in corrections if m is not None]
         if len(views) < 2:
@@ -119,7 +117,7 @@ def _fit_to_corners(
     levels: int,
     warped: np.ndarray,
     valid_mask: np.ndarray,
-) -> Fit | None:
+) -> Fit:
     """Track corners, and return the fit to those in a part of the image.
 
     Weighted least squares: right on most of an image that no single homography fits (a lens that
@@ -128,8 +126,8 @@ def _fit_to_corners(
     margin = np.ones((window_px, window_px), np.uint8)
     inside = cv2.erode(valid_mask.astype(np.uint8), margin, borderValue=0)
     corners = cv2.goodFeaturesToTrack(equalised, max_corners, 0.001, 5, mask=inside)
-    if corners is None or len(corners) < MIN_TRACKS:
-        return None
+    if corners is None:
+        return lambda used: None
     start = corners.reshape(-1, 2)
     end, gaps = track_round_trip(
         equalised,
@@ -141,8 +139,6 @@ def _fit_to_corners(
         step_px=TRACKING_STEP_PX,
     )
     good = gaps < MAX_ROUND_TRIP_PX
-    if np.count_nonzero(good) < MIN_TRACKS:
-        return None
     start, end = start[good], end[good]
     x, y = np.rint(start).astype(np.int64).T
 

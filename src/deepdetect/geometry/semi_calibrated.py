@@ -83,6 +83,14 @@ def estimate_semi_calibrated(
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
     if len(points0) < MIN_MATCHES:
         return None
+
+    def judge(fundamental: np.ndarray) -> TwoViewModel:
+        """Count the matches that agree, and how likely that is by chance."""
+        inliers = epipolar_errors(points0, points1, fundamental) < inlier_threshold
+        tried = MODELS_PER_SAMPLE * len(FOCAL_LENGTHS)
+        alarms = log10_nfa(inliers, "essential", inlier_threshold, sizes[1], tried)
+        return TwoViewModel("fundamental", fundamental, inliers, alarms)
+
     # OpenCV draws the same samples every time; another order of the matches draws others.
     order = np.random.default_rng(seed).permutation(len(points0))
     best = start = None
@@ -93,7 +101,7 @@ def estimate_semi_calibrated(
             continue
         fundamental = cameras.fundamental(essential)
         fundamental = fundamental / np.linalg.norm(fundamental)
-        model = _judge(fundamental, sizes, points0, points1, inlier_threshold)
+        model = judge(fundamental)
         if best is None or model.log10_nfa < best.log10_nfa:
             best, start = model, (essential, cameras)
     if best is None or start is None or np.count_nonzero(best.inliers) < MIN_MATCHES:
@@ -104,7 +112,7 @@ def estimate_semi_calibrated(
     for _ in range(MAX_FITS):
         inliers = points0[best.inliers], points1[best.inliers]
         views = _fit(views, *inliers, np.full(len(inliers[0]), MATCH_SIGMA_PX))
-        model = _judge(views.fundamental, sizes, points0, points1, inlier_threshold)
+        model = judge(views.fundamental)
         if model.log10_nfa > best.log10_nfa:
             break
         hopeless = best.log10_nfa == model.log10_nfa > 0
@@ -136,25 +144,21 @@ def refine_fundamental(
     """
     if len(points0) < MIN_MATCHES:
         return fundamental
-    cameras, essential = _nearest_cameras(fundamental, sizes)
+    cameras = _nearest_cameras(fundamental, sizes)
+    essential = cameras.essential(fundamental)
     views = _Views(best_of_four(essential, points0, points1, cameras.calibration), cameras)
     matrix = _fit(views, points0, points1, match_sigmas_px).fundamental
     return np.asarray(matrix / np.linalg.norm(matrix))
 
 
-def _nearest_cameras(
-    fundamental: np.ndarray, sizes: tuple[Size, Size]
-) -> tuple[_Cameras, np.ndarray]:
+def _nearest_cameras(fundamental: np.ndarray, sizes: tuple[Size, Size]) -> _Cameras:
     """Return the cameras of one focal length under which the matrix is most nearly essential."""
-    tried = []
-    for focal in START_FOCAL_LENGTHS:
-        cameras = _Cameras.guess(sizes, focal)
-        calibration = cameras.calibration
-        essential = calibration.camera1.matrix.T @ fundamental @ calibration.camera0.matrix
-        largest, middle, _ = np.linalg.svd(essential, compute_uv=False)
-        tried.append((middle / largest, cameras, essential))
-    _, cameras, essential = max(tried, key=lambda one: one[0])
-    return cameras, essential
+
+    def likeness(cameras: _Cameras) -> float:
+        largest, middle, _ = np.linalg.svd(cameras.essential(fundamental), compute_uv=False)
+        return float(middle / largest)
+
+    return max((_Cameras.guess(sizes, focal) for focal in START_FOCAL_LENGTHS), key=likeness)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +195,11 @@ class _Cameras:
         """Return the fundamental matrix of an essential one."""
         inverse0, inverse1 = self.inverses
         return np.asarray(inverse1.T @ essential @ inverse0)
+
+    def essential(self, fundamental: np.ndarray) -> np.ndarray:
+        """Return the essential matrix of a fundamental one."""
+        calibration = self.calibration
+        return calibration.camera1.matrix.T @ fundamental @ calibration.camera0.matrix
 
     def moved(self, change: np.ndarray) -> _Cameras:
         """Return cameras near these: a change of 6 parameters."""
@@ -248,20 +257,6 @@ def _fit_essential(
     if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return None
     return np.asarray(matrix)
-
-
-def _judge(
-    fundamental: np.ndarray,
-    sizes: tuple[Size, Size],
-    points0: np.ndarray,
-    points1: np.ndarray,
-    inlier_threshold: float,
-) -> TwoViewModel:
-    """Count the matches that agree, and how likely that is by chance."""
-    inliers = epipolar_errors(points0, points1, fundamental) < inlier_threshold
-    tried = MODELS_PER_SAMPLE * len(FOCAL_LENGTHS)
-    alarms = log10_nfa(inliers, "essential", inlier_threshold, sizes[1], tried)
-    return TwoViewModel("fundamental", fundamental, inliers, alarms)
 
 
 def _fit(views: _Views, points0: np.ndarray, points1: np.ndarray, sigmas: np.ndarray) -> _Views:
