@@ -60,7 +60,7 @@ def test_three_of_ten_right_matches_are_enough(focal: float, motion: np.ndarray)
 def test_five_points_are_trusted_where_seven_are_not() -> None:
     """What it is for: one right match of five."""
     seven, five = [], []
-    for seed in range(5):
+    for seed in range(3):
         first, second, _ = matches(18, 72, seed=seed)
         options = GeometryOptions(inlier_threshold=1.5)
         plain = estimate_geometry(first, second, seed=seed, options=options).matrix
@@ -73,9 +73,9 @@ def test_five_points_are_trusted_where_seven_are_not() -> None:
     assert np.median(five) < -3
 
 
-@pytest.mark.parametrize("count", [20, 60, 200])
+@pytest.mark.parametrize("count", [20, 100])
 def test_random_matches_are_never_trusted(count: int) -> None:
-    for seed in range(5):
+    for seed in range(2):
         first, second, _ = matches(6, count, seed=seed)
         found = estimate_semi_calibrated(first[6:], second[6:], SIZES, seed=seed)
         assert found is not None
