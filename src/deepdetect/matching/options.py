@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from .._shared.errors import OptionError, unknown_name
-from .._shared.options import suggest_keywords
+from .._shared.options import check_ranges, suggest_keywords
 from ..features.matchers import get_matcher
 from ..features.sift import get_descriptor
 from ..geometry import GeometryOptions
@@ -58,14 +58,10 @@ class MatchingOptions:
             )
         if self.two_view_model not in TWO_VIEW_MODELS:
             raise unknown_name("two-view model", self.two_view_model, TWO_VIEW_MODELS)
-        if not 0 < self.keypoint_size <= 100:
-            raise OptionError(
-                f"`keypoint_size` must be above 0 and at most 100 pixels, not {self.keypoint_size}"
-            )
         if self.angle != -1 and not 0 <= self.angle < 360:
             raise OptionError(f"the angle must lie in [0, 360) or be -1, not {self.angle}")
-        if not 0 < self.ratio <= 1:
-            raise OptionError(f"the ratio must be above 0 and at most 1, not {self.ratio}")
+        limits = {"keypoint_size": (0, 100), "ratio": (0, 1)}
+        check_ranges(self, positive=tuple(limits), between=limits)
 
 
 PUBLISHED_MATCHING = MatchingOptions(angle=-1.0, ratio=0.99, matcher="flann")

@@ -111,8 +111,8 @@ def register(
         >>> rng = np.random.default_rng(0)
         >>> scene = cv2.GaussianBlur(rng.integers(0, 256, (160, 200)).astype(np.uint8), (0, 0), 2)
         >>> scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
-        >>> found = register(scene[:, :180], scene[:, 12:], RandomDetector())
-        >>> found.homography[:2, 2].round(1).tolist()
+        >>> registration = register(scene[:, :180], scene[:, 12:], RandomDetector())
+        >>> registration.homography[:2, 2].round(1).tolist()
         [-12.0, 0.0]
     """
     first, second = (load_image(image, channels=channels) for image in (image0, image1))

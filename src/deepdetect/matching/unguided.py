@@ -49,8 +49,8 @@ def match_features(
         >>> rng = np.random.default_rng(0)
         >>> image = rng.integers(0, 256, (64, 64), np.uint8).repeat(2, 0).repeat(2, 1)
         >>> features = PointDetector(100).extract(image)
-        >>> found = match_features(features, features)
-        >>> bool((found.points0 == found.points1).all())
+        >>> matches = match_features(features, features)
+        >>> bool((matches.points0 == matches.points1).all())
         True
     """
     if features0.descriptors is None or features1.descriptors is None:
@@ -63,7 +63,7 @@ def match_features(
     if not 0 < ratio <= 1:
         raise OptionError(f"the ratio must be above 0 and at most 1, not {ratio}")
     alike = features0.sizes is None and features1.sizes is None  # all of one scale and angle
-    found = match_descriptors(
+    matches = match_descriptors(
         features0.descriptors,
         features1.descriptors,
         get_matcher(matcher),
@@ -73,16 +73,16 @@ def match_features(
         positions=(features0.xy, features1.xy) if alike else None,
     )
     return Matches(
-        features0.xy[found.indices0],
-        features1.xy[found.indices1],
-        np.clip(1 - found.ratios, 0, 1),
-        np.ones(len(found), bool),
+        features0.xy[matches.indices0],
+        features1.xy[matches.indices1],
+        np.clip(1 - matches.ratios, 0, 1),
+        np.ones(len(matches), bool),
         "none",
         None,
         features0,
         features1,
-        indices0=found.indices0,
-        indices1=found.indices1,
+        indices0=matches.indices0,
+        indices1=matches.indices1,
     )
 
 

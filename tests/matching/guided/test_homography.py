@@ -3,11 +3,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
-from deepdetect.features.keypoints import nearest_keypoints
 from deepdetect.geometry import transfer_errors
 from deepdetect.io.image import luma
 from deepdetect.matching.guided.pipeline import MAX_DISTANCE_PX as REACH
@@ -32,20 +29,6 @@ def every_pixel(gray: np.ndarray) -> np.ndarray:
 def warped(gray: np.ndarray, homography: np.ndarray) -> np.ndarray:
     size = (gray.shape[1], gray.shape[0])
     return cv2.warpPerspective(gray, homography, size, flags=cv2.INTER_CUBIC)
-
-
-@given(seed=st.integers(0, 2**32 - 1))
-def test_all_within_reach_are_found_wherever_they_lie(seed: int) -> None:
-    """Also from places half a pixel off, and from outside the image."""
-    generator = np.random.default_rng(seed)
-    order = generator.permutation(70)[:25]
-    xy = np.column_stack([order % 10, order // 10])
-    where = np.rint(generator.uniform(-2, [12, 9], (60, 2)) * 4) / 4
-    nearest = KDTree(xy).query(where)[0]
-    distances = nearest_keypoints(where, xy, (10, 7))[1]
-    within = nearest < REACH
-    np.testing.assert_allclose(distances[within], nearest[within], atol=1e-9)
-    assert (distances[~within] >= REACH).all()
 
 
 def test_a_shift_by_whole_pixels_matches_each_pixel_with_its_own(photo: np.ndarray) -> None:

@@ -40,10 +40,8 @@ def test_nearly_all_points_of_a_plane_are_matched_right(
     photo: np.ndarray, second: np.ndarray
 ) -> None:
     matches = match(photo, second, Everywhere())
-    assert (matches.model, matches.guided, matches.two_view_geometry.model) == (
-        "homography",
-        True,
-    ) + ("homography",)
+    assert matches.guided
+    assert matches.model == matches.two_view_geometry.model == "homography"
     errors = np.linalg.norm(transform_points(matches.points0, WARP) - matches.points1, axis=1)
     assert (errors < 1).mean() > 0.99
     places = transform_points(matches.keypoints0.xy, WARP)
@@ -52,18 +50,6 @@ def test_nearly_all_points_of_a_plane_are_matched_right(
     assert ((matches.scores > 0) & (matches.scores <= 1)).all()
     assert matches.inliers.all()
     assert len(np.unique(matches.points0, axis=0)) == len(matches)
-
-
-@pytest.mark.slow
-def test_what_cannot_be_trusted_has_no_matches_and_says_so(photo: np.ndarray) -> None:
-    data = pytest.importorskip("skimage.data")
-    other = np.ascontiguousarray(data.coffee()[:256, :256])
-    matches = match(photo, other, Everywhere(), ratio=0.9)
-    assert matches.two_view_geometry.model == "none"
-    assert matches.two_view_geometry.matrix is None
-    assert not matches.success
-    assert not matches.guided
-    assert len(matches) == 0
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -16,7 +15,6 @@ from deepdetect.matching.guided.verification import (
     FALSE_POSITIVE_RATE,
     KEYPOINT_SIZES_PX,
     NULL_SHIFTS,
-    NullPairs,
     dissimilarity,
     sample_null_pairs,
 )
@@ -74,13 +72,7 @@ def test_the_same_image_agrees_nearly_everywhere(photo: np.ndarray) -> None:
 
 @pytest.mark.parametrize(
     ("name", "other"),
-    [
-        ("camera", "rocket"),
-        pytest.param("astronaut", "coffee", marks=pytest.mark.slow),
-        pytest.param("camera", "astronaut", marks=pytest.mark.slow),
-        pytest.param("astronaut", "chelsea", marks=pytest.mark.slow),
-        pytest.param("camera", "brick", marks=pytest.mark.slow),
-    ],
+    [("camera", "rocket"), pytest.param("astronaut", "coffee", marks=pytest.mark.slow)],
 )
 def test_under_another_photograph_next_to_nothing_agrees(
     picture: Callable[..., np.ndarray], name: str, other: str
@@ -126,20 +118,6 @@ def test_what_is_not_seen_does_not_agree(photo: np.ndarray) -> None:
     assert not same_patches(gray, gray, np.zeros(gray.shape, bool), pixels).any()
 
 
-def test_dissimilarity_is_one_at_the_bound_and_infinite_where_nothing_is_seen(
-    photo: np.ndarray,
-) -> None:
-    gray = luma(photo)
-    pixels, seen = edges(gray), everywhere(gray)
-    seen[:, 150:] = False
-    found = dissimilarity(gray, seen_again(gray), seen, pixels)
-    assert found.dtype == np.float32
-    np.testing.assert_array_equal(np.isinf(found), pixels[:, 0] >= 150)
-    assert np.median(found[pixels[:, 0] < 150]) < np.median(
-        dissimilarity(gray, np.roll(gray, 25, 1), seen, pixels)[pixels[:, 0] < 150]
-    )
-
-
 def test_follows_the_order_of_the_points(photo: np.ndarray) -> None:
     gray = luma(photo)
     pixels = edges(gray)
@@ -153,42 +131,11 @@ def test_follows_the_order_of_the_points(photo: np.ndarray) -> None:
     )
 
 
-@pytest.mark.slow
-def test_what_is_known_of_the_unmoved_image_is_not_described_again_and_the_same(
-    photo: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    gray = cv2.resize(luma(photo), (300, 240))
-    pixels, second = edges(gray), seen_again(np.roll(gray, 40, 1))
-    second[:, :200] = seen_again(gray)[:, :200]
-    found = [dissimilarity(gray, second, everywhere(gray), pixels)]
-    for interior in (False, True):
-
-        def sample(*arguments: Any, interior: bool = interior) -> list[NullPairs]:
-            return [
-                replace(null, interior=np.full(len(null.rows), interior))
-                for null in sample_null_pairs(*arguments)
-            ]
-
-        monkeypatch.setattr(verification, "sample_null_pairs", sample)
-        found.append(dissimilarity(gray, second, everywhere(gray), pixels))
-    real, plain, none = found  # as it is; all described in moved images; none
-    assert 0.3 < (plain < 1).mean() < 0.95
-    np.testing.assert_array_equal(np.isinf(real), np.isinf(plain))
-    some = np.isfinite(plain)
-    np.testing.assert_allclose(real[some], plain[some], rtol=1e-4)
-    assert not np.allclose(none[some], plain[some], rtol=1e-3)  # at edges it is not the same
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "width",
-    [120, pytest.param(180, marks=pytest.mark.slow), pytest.param(260, marks=pytest.mark.slow)],
-)
-def test_images_that_are_flat_for_a_large_part_tell_nothing(width: int) -> None:
+def test_images_that_are_flat_for_a_large_part_tell_nothing() -> None:
     """A hundredth of the null pairs are equal, flat ones: nothing can be more similar."""
     gray = np.full((300, 400), 235, np.uint8)
-    noise = np.random.default_rng(width).normal(size=(300, width))
-    gray[:, :width] = np.clip(128 + 150 * cv2.GaussianBlur(noise, (0, 0), 1.5), 0, 255)
+    noise = np.random.default_rng(0).normal(size=(300, 180))
+    gray[:, :180] = np.clip(128 + 150 * cv2.GaussianBlur(noise, (0, 0), 1.5), 0, 255)
     assert np.isinf(dissimilarity(gray, gray, everywhere(gray), every_pixel(gray))).all()
 
 

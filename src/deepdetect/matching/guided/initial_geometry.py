@@ -136,8 +136,8 @@ def find_tentative_matches(
 
     Example:
         >>> image = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
-        >>> found = find_tentative_matches(image, image)
-        >>> bool((found.points0 == found.points1).all()), len(found.points0) > 10
+        >>> matches = find_tentative_matches(image, image)
+        >>> bool((matches.points0 == matches.points1).all()), len(matches.points0) > 10
         (True, True)
     """
     (view0, scale0), (view1, scale1) = (downscale(gray, max_side_px) for gray in (gray0, gray1))
@@ -175,14 +175,14 @@ def _match_sparse(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, ...]
     """Return matched positions in both images, and the ratios of the ratio test."""
     assert first.descriptors is not None
     assert second.descriptors is not None
-    found = match_descriptors(
+    matches = match_descriptors(
         first.descriptors,
         second.descriptors,
         exact_neighbours,
         ratio=max(MAX_RATIOS),
         mutual=True,
     )
-    return _separate(first.xy[found.indices0], second.xy[found.indices1], found.ratios)
+    return _separate(first.xy[matches.indices0], second.xy[matches.indices1], matches.ratios)
 
 
 def _separate(*matches: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -191,8 +191,8 @@ def _separate(*matches: np.ndarray) -> tuple[np.ndarray, ...]:
     The first two arrays are the positions in both images; others are kept like them.
     """
     for side in (0, 1):
-        places = np.rint(matches[side] / MIN_SEPARATION_PX)
-        _, kept = np.unique(places, axis=0, return_index=True)
+        cells = np.rint(matches[side] / MIN_SEPARATION_PX)
+        _, kept = np.unique(cells, axis=0, return_index=True)
         kept.sort()
         matches = tuple(values[kept] for values in matches)
     return matches
@@ -200,17 +200,12 @@ def _separate(*matches: np.ndarray) -> tuple[np.ndarray, ...]:
 
 @dataclass(frozen=True, eq=False)
 class InitialGeometry:
-    """A geometry from tentative matches.
+    """A geometry from tentative matches, at the images' own size.
 
-    Attributes:
-        model: "homography", "fundamental", or "none" when no geometry can be trusted.
-        matrix: (3, 3) float64 at the images' own size, or None.
-        points0, points1: (M, 2) the matches that agree with it, at the images' own size.
-        num_matches: tentative matches that it was estimated from.
-        log10_nfa: decimal logarithm of its number of false alarms.
-        num_views: simulated views that it took.
-        parallax: of a homography that was chosen, not asked for: what it leaves.
-        tentative: the matches of the larger images, where they have been made.
+    The model is "homography", "fundamental", or "none" when none can be trusted. `points0` and
+    `points1` are the matches that agree with it; `num_matches` those it was estimated from;
+    `parallax` what a homography leaves that was chosen, not asked for; `tentative` the matches of
+    the larger images, where they have been made.
     """
 
     model: str
@@ -224,11 +219,13 @@ class InitialGeometry:
     tentative: TentativeMatches | None = None
 
     @classmethod
-    def of(cls, found: TwoViewModel, points: Points) -> InitialGeometry:
+    def of(cls, two_view: TwoViewModel, points: Points) -> InitialGeometry:
         """Return a model with the matches that agree with it."""
-        on_model = points[0][found.inliers], points[1][found.inliers]
-        count, alarms = len(found.inliers), found.log10_nfa
-        return cls(found.model, found.matrix, *on_model, count, alarms, parallax=found.parallax)
+        on_model = points[0][two_view.inliers], points[1][two_view.inliers]
+        count, alarms = len(two_view.inliers), two_view.log10_nfa
+        return cls(
+            two_view.model, two_view.matrix, *on_model, count, alarms, parallax=two_view.parallax
+        )
 
     @property
     def trusted(self) -> bool:
@@ -279,9 +276,9 @@ def guiding_geometry(
         return _geometry_of_positions(source, sizes, model, seed)
     matches = matches_of_points(gray0, gray1, source)
     if matches is not None:
-        found = estimate_initial_geometry(matches, model, seed)
-        if len(found.points0) >= MIN_COARSE_INLIERS:
-            return found
+        geometry = estimate_initial_geometry(matches, model, seed)
+        if len(geometry.points0) >= MIN_COARSE_INLIERS:
+            return geometry
     return find_initial_geometry(gray0, gray1, model, seed)
 
 
@@ -298,14 +295,14 @@ def find_initial_geometry(
         coarse = find_tentative_matches(
             gray0, gray1, max_side_px=COARSE_SIDE_PX, max_keypoints=COARSE_KEYPOINTS
         )
-        found = estimate_initial_geometry(coarse, model, seed, semi_calibrated=False)
-        if _is_clear(found):
-            return found
+        geometry = estimate_initial_geometry(coarse, model, seed, semi_calibrated=False)
+        if _is_clear(geometry):
+            return geometry
     if tentative is None:
         tentative = find_tentative_matches(gray0, gray1)
-    found = estimate_initial_geometry(tentative, model, seed)
-    if found.matrix is not None:
-        return replace(found, tentative=tentative)
+    geometry = estimate_initial_geometry(tentative, model, seed)
+    if geometry.matrix is not None:
+        return replace(geometry, tentative=tentative)
     if longest <= SIMULATED_SIDE_PX:
         return estimate_initial_geometry(tentative, model, seed, view_keypoints=MAX_KEYPOINTS // 2)
     tentative = find_tentative_matches(
@@ -316,14 +313,14 @@ def find_initial_geometry(
     )
 
 
-def _is_clear(found: InitialGeometry) -> bool:
+def _is_clear(geometry: InitialGeometry) -> bool:
     """Whether most matches of the coarse pass, and enough, agree with a model that fits alone."""
-    depth = found.model == "fundamental"
+    depth = geometry.model == "fundamental"
     least = MIN_COARSE_DEPTH_INLIERS if depth else MIN_COARSE_INLIERS
-    most = len(found.points0) >= max(least, MIN_COARSE_FRACTION * found.num_matches)
-    parallax = found.parallax
+    most = len(geometry.points0) >= max(least, MIN_COARSE_FRACTION * geometry.num_matches)
+    parallax = geometry.parallax
     doubtful = parallax is not None and parallax.exceeds(MIN_PARALLAX_FRACTION)
-    return found.matrix is not None and most and (depth or not doubtful)
+    return geometry.matrix is not None and most and (depth or not doubtful)
 
 
 def _geometry_of_positions(points: Points, sizes: Sizes, model: str, seed: int) -> InitialGeometry:
@@ -350,8 +347,8 @@ def _geometry_of_positions(points: Points, sizes: Sizes, model: str, seed: int) 
     )
     scaled0, scaled1 = _separate(scaled_points(points0, scale0), scaled_points(points1, scale1))
     chosen = choose_model(scaled0, scaled1, (size0, size1), model, seed)
-    found = InitialGeometry.of(chosen, (scaled0, scaled1))
-    return found.rescaled(scale0, scale1) if found.trusted else found.untrusted()
+    geometry = InitialGeometry.of(chosen, (scaled0, scaled1))
+    return geometry.rescaled(scale0, scale1) if geometry.trusted else geometry.untrusted()
 
 
 def estimate_initial_geometry(
@@ -376,10 +373,10 @@ def estimate_initial_geometry(
         for ratio in MAX_RATIOS:
             chosen = points[0][ratios < ratio], points[1][ratios < ratio]
             two_view = choose_model(*chosen, (size0, size1), model, seed, semi_calibrated)
-            found = InitialGeometry.of(two_view, chosen)
-            found = _with_further_evidence(found, chosen[0], tentative)
-            if found.log10_nfa < best.log10_nfa:
-                best = replace(found, num_views=num_views)
+            geometry = InitialGeometry.of(two_view, chosen)
+            geometry = _with_further_evidence(geometry, chosen[0], tentative)
+            if geometry.log10_nfa < best.log10_nfa:
+                best = replace(geometry, num_views=num_views)
             if best.trusted:
                 best = _with_further_matches(best, tentative, (size0, size1))
                 return best.rescaled(*tentative.scales)
@@ -399,41 +396,42 @@ def _more_and_more_matches(
         for side in (0, 1):
             other = tentative.features[1 - side]
             for seen in simulated_views(tentative.views[side], tilt, view_keypoints):
-                found = _match_sparse(seen, other)
-                points0 = np.concatenate([points0, found[side]])
-                points1 = np.concatenate([points1, found[1 - side]])
-                ratios = np.concatenate([ratios, found[2]])
+                further = _match_sparse(seen, other)
+                points0 = np.concatenate([points0, further[side]])
+                points1 = np.concatenate([points1, further[1 - side]])
+                ratios = np.concatenate([ratios, further[2]])
                 views += 1
         points0, points1, ratios = _separate(points0, points1, ratios)
         yield (points0, points1), ratios, views
 
 
 def _with_further_evidence(
-    found: InitialGeometry, used: np.ndarray, tentative: TentativeMatches
+    geometry: InitialGeometry, used: np.ndarray, tentative: TentativeMatches
 ) -> InitialGeometry:
     """Let keypoints that no match was made of decide where a fundamental matrix is in doubt."""
-    doubtful = not found.trusted and found.log10_nfa < MAX_HINT_LOG10_NFA
-    if found.model != "fundamental" or not doubtful:
-        return found
-    assert found.matrix is not None
-    chance = log10_p_value(*tentative.features, found.matrix, used)
-    return replace(found, log10_nfa=found.log10_nfa + chance)
+    doubtful = not geometry.trusted and geometry.log10_nfa < MAX_HINT_LOG10_NFA
+    if geometry.model != "fundamental" or not doubtful:
+        return geometry
+    assert geometry.matrix is not None
+    chance = log10_p_value(*tentative.features, geometry.matrix, used)
+    return replace(geometry, log10_nfa=geometry.log10_nfa + chance)
 
 
 def _with_further_matches(
-    found: InitialGeometry, tentative: TentativeMatches, sizes: Sizes
+    geometry: InitialGeometry, tentative: TentativeMatches, sizes: Sizes
 ) -> InitialGeometry:
     """Search along the lines of a fundamental matrix that few matches agree with, and refit it."""
-    if found.model != "fundamental" or len(found.points0) >= MAX_MATCHES_TO_SEARCH:
-        return found
-    assert found.matrix is not None
-    further = epipolar_search(*tentative.features, found.matrix)
+    if geometry.model != "fundamental" or len(geometry.points0) >= MAX_MATCHES_TO_SEARCH:
+        return geometry
+    assert geometry.matrix is not None
+    further = epipolar_search(*tentative.features, geometry.matrix)
     points0, points1 = _separate(
-        np.concatenate([found.points0, further[0]]), np.concatenate([found.points1, further[1]])
+        np.concatenate([geometry.points0, further[0]]),
+        np.concatenate([geometry.points1, further[1]]),
     )
     sigmas = np.full(len(points0), MATCH_SIGMA_PX)
-    matrix = refine_fundamental(points0, points1, found.matrix, sizes, sigmas)
+    matrix = refine_fundamental(points0, points1, geometry.matrix, sizes, sigmas)
     inliers = epipolar_errors(points0, points1, matrix) < GUIDING_THRESHOLDS_PX["fundamental"]
-    if np.count_nonzero(inliers) <= len(found.points0):
-        return found
-    return replace(found, matrix=matrix, points0=points0[inliers], points1=points1[inliers])
+    if np.count_nonzero(inliers) <= len(geometry.points0):
+        return geometry
+    return replace(geometry, matrix=matrix, points0=points0[inliers], points1=points1[inliers])

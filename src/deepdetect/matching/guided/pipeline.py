@@ -70,18 +70,11 @@ def guided_matches(
     source: TentativeMatches | Points | tuple[Keypoints, Keypoints] | None = None,
     first: InitialGeometry | None = None,
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
-    """Match the keypoints of two images by their geometry.
+    """Match keypoints on whole pixels, (N, 2) and (M, 2), of two images by their geometry.
 
-    Args:
-        gray0, gray1: (H, W) uint8 luma.
-        xy0, xy1: (N, 2), (M, 2) keypoints on whole pixels.
-        model: "homography", "fundamental" or "auto".
-        seed: of all random choices.
-        source: of the sparse matches, as of `guiding_geometry`; None: SIFT.
-        first: the geometry to begin with, where `guiding_geometry` has found it already.
-
-    Returns:
-        The geometry that guided, and the matches; None when no geometry could be trusted.
+    `first` is the geometry to begin with where `guiding_geometry`, whose arguments the others are,
+    has found it already. Returns the geometry that guided, and the matches; None when no geometry
+    could be trusted.
     """
     if first is None:
         first = guiding_geometry(gray0, gray1, model, seed, source)
@@ -141,11 +134,9 @@ def match_by_homography(
 ) -> tuple[GuidedMatches, float]:
     """Match keypoints by a homography, and keep those whose patches are the same.
 
-    Returns:
-        The matches, each keypoint of the first image once at most, with scores 1 less the
-        `dissimilarity` of their patches; and the fraction with the same patches of the pairs that
-        the homography proposes, or, where keypoints are few, of all keypoints of the first image
-        that the second one shows under it.
+    Each keypoint of the first image is matched once at most, with the score 1 - `dissimilarity`.
+    Returns the fraction with the same patches, too: of the pairs that the homography proposes, or,
+    where keypoints are few, of all keypoints that the second image shows under it.
     """
     predicted = transform_points(xy0, homography)
     indices1, distances = nearest_keypoints(predicted, xy1, (gray1.shape[1], gray1.shape[0]))

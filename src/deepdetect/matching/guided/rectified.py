@@ -1,15 +1,10 @@
 """Dense matches of a scene with depth, by rectification: epipolar lines become rows.
 
-Both images are warped into a frame in which matches lie on the same row
-(`geometry.epipolar_rectification`), rows are matched (`matching.stereo`) in the range that sparse
-matches, and small copies, allow, and the matches are taken back to the images: sub-pixel positions,
-not keypoints of the second image. Which disparities are kept is told by what the windows of both
-views show; how well they correlate by chance is measured on rows that show something else.
-
+Rows are matched (`matching.stereo`) in the range that sparse matches, and small copies, allow, and
+the matches are taken back to the images: sub-pixel positions, not keypoints of the second image.
 A fundamental matrix from few matches may miss by some pixels where none of them was. So corners are
-tracked in both directions around their matches, and the matrix is fitted to them: matches are moved
-to its lines, and where these are far from the rows, or larger images can be searched in the range
-of what has been found, the images are rectified again.
+tracked around their matches and the matrix is fitted to them; where its lines are far from the
+rows, or larger images can be searched, the images are rectified again.
 """
 
 from __future__ import annotations
@@ -100,15 +95,10 @@ MIN_AGREEMENT = 0.75
 
 @dataclass(frozen=True, eq=False)
 class RectifiedView:
-    """Two images in their frame, and the disparities between them.
+    """Two images, at `scale`, in their frame, and the disparities between them, (H, W) each.
 
-    Attributes:
-        frame: the frame, of the images at `scale`.
-        scale: of both images, at most 1.
-        first, second: (H, W) uint8, the warped images.
-        disparities: of every pixel of the first, those that geometry may rely on.
-        kept: (H, W) float32 disparities of the matches that are kept, perhaps more; else NaN.
-        correlation: (H, W) float32 local ZNCC of both after the disparity, where one is kept.
+    `disparities` are those that geometry may rely on; `kept` those of all matches that are kept,
+    perhaps more, else NaN; `correlation` the local ZNCC of both views after the disparity.
     """
 
     frame: RectifiedFrame
@@ -127,10 +117,10 @@ class RectifiedView:
         """Return where points of the frame lie in an image at its own size."""
         return scaled_points(self.frame.from_frame(points, side), 1 / self.scale)
 
-    def pixels_of(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the rows of the places inside the frame, and the nearest columns and rows."""
+    def pixels_of(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the rows of the points inside the frame, and the nearest columns and rows."""
         height, width = self.first.shape
-        nearest = np.rint(np.where(np.isfinite(places), places, -1)).astype(np.int64)
+        nearest = np.rint(np.where(np.isfinite(points), points, -1)).astype(np.int64)
         inside = np.flatnonzero(((nearest >= 0) & (nearest < (width, height))).all(axis=1))
         return inside, *nearest[inside].T
 
@@ -144,20 +134,12 @@ def match_by_rectification(
     fundamental: np.ndarray,
     exact: bool = False,
 ) -> tuple[np.ndarray, GuidedMatches] | None:
-    """Match keypoints of the first image by rectifying the pair.
+    """Match (N, 2) keypoints of the first image by rectifying the pair.
 
-    Args:
-        gray0, gray1: (H, W) uint8 luma.
-        xy0: (N, 2) keypoints of the first image.
-        points0, points1: (K, 2) sparse matches that fit the fundamental matrix.
-        fundamental: (3, 3) with x1^T F x0 = 0.
-        exact: whether the matrix is known: the images are not rectified again by a better one, and
-            sparse matches that contradict do not matter.
-
-    Returns:
-        The refined fundamental matrix and the matches, which fit it exactly; None where the pair
-        cannot be rectified, too few corners can be tracked from one image to where they are
-        matched, or the sparse matches contradict.
+    `points0` and `points1` are sparse matches that fit the fundamental matrix, x1^T F x0 = 0. An
+    `exact` matrix is known: it is not corrected, and sparse matches that contradict do not matter.
+    Returns the refined matrix and the matches, which fit it exactly; None where the pair cannot be
+    rectified, too few corners can be tracked, or the sparse matches contradict.
     """
     sizes = (gray0.shape[::-1], gray1.shape[::-1])
     sparse = points0, points1
@@ -181,11 +163,11 @@ def match_by_rectification(
         return None
     # Rows that are off, and could not be corrected, are a reason to doubt low correlation.
     disparity = view.kept if near else view.disparities.disparity
-    rows, places, scores = _sample(view, disparity, xy0)
-    places = _moved_to_lines(xy0[rows], places, fundamental)
+    rows, ends, scores = _sample(view, disparity, xy0)
+    ends = _moved_to_lines(xy0[rows], ends, fundamental)
     height, width = gray1.shape
-    inside = ((places > -0.5) & (places < (width - 0.5, height - 0.5))).all(axis=1)
-    return fundamental, GuidedMatches(rows[inside], places[inside], scores[inside], subpixel=True)
+    inside = ((ends > -0.5) & (ends < (width - 0.5, height - 0.5))).all(axis=1)
+    return fundamental, GuidedMatches(rows[inside], ends[inside], scores[inside], subpixel=True)
 
 
 def rectified_view(
@@ -228,7 +210,7 @@ def rectified_view(
     if low >= high:
         return None
     options = replace(DISPARITY, disparity_range=(low, high))
-    found, correlation = _match_rows(first, second, valid0, valid1, options)
+    disparities, correlation = _match_rows(first, second, valid0, valid1, options)
     # Some rows are matched with rows of the second view that show something else: what is found
     # there is found by chance, the best of as many disparities as everywhere.
     height = len(first)
@@ -240,17 +222,19 @@ def rectified_view(
     )
     pixels, null_pixels = (int(np.count_nonzero(valid)) for valid in (valid0, valid0[rows]))
     bounds = _correlation_bounds(
-        correlation[found.matched], pixels, null_correlation[null.matched], null_pixels
+        correlation[disparities.matched], pixels, null_correlation[null.matched], null_pixels
     )
-    relied, kept = (found.matched & (correlation >= bound) for bound in bounds)
+    relied, kept = (disparities.matched & (correlation >= bound) for bound in bounds)
     nan = np.float32(np.nan)
     return RectifiedView(
         frame,
         scale,
         first,
         second,
-        DisparityMap(np.where(relied, found.disparity, nan), relied, found.disparity_range),
-        np.where(kept, found.disparity, nan),
+        DisparityMap(
+            np.where(relied, disparities.disparity, nan), relied, disparities.disparity_range
+        ),
+        np.where(kept, disparities.disparity, nan),
         np.where(kept, correlation, nan),
     )
 
@@ -263,10 +247,10 @@ def _match_rows(
     options: DisparityOptions,
 ) -> tuple[DisparityMap, np.ndarray]:
     """Return the disparities where both views show something, and the correlation after them."""
-    found = compute_disparity(first, second, options)
+    disparities = compute_disparity(first, second, options)
     row, column = np.indices(first.shape, dtype=np.float32)
-    known = found.matched & np.isfinite(found.disparity)
-    x = np.where(known, column - found.disparity, -1).astype(np.float32)
+    known = disparities.matched & np.isfinite(disparities.disparity)
+    x = np.where(known, column - disparities.disparity, -1).astype(np.float32)
     aligned = cv2.remap(second, x, row, cv2.INTER_LINEAR)
     shown = cv2.remap(valid1.astype(np.uint8), x, row, cv2.INTER_NEAREST) > 0
     known &= valid0 & shown
@@ -276,7 +260,7 @@ def _match_rows(
         np.ones(first.shape, bool),
         CORRELATION_WINDOW_PX,
     )
-    matched = DisparityMap(found.disparity, known, found.disparity_range)
+    matched = DisparityMap(disparities.disparity, known, disparities.disparity_range)
     return matched, np.where(known, np.nan_to_num(correlation), np.float32(-1))
 
 
@@ -383,10 +367,10 @@ def _agreement(view: RectifiedView, sparse: Pair) -> float:
     They know nothing of each other: where most contradict, what looks alike on the rows is another
     of many like things.
     """
-    places = [view.to_frame(points, side) for side, points in enumerate(sparse)]
-    inside, column, row = view.pixels_of(places[0])
+    positions = [view.to_frame(points, side) for side, points in enumerate(sparse)]
+    inside, column, row = view.pixels_of(positions[0])
     disparity = view.disparities.disparity[row, column]
-    errors = places[0][inside, 0] - places[1][inside, 0] - disparity
+    errors = positions[0][inside, 0] - positions[1][inside, 0] - disparity
     errors = np.abs(errors[np.isfinite(errors)])
     return float((errors < MAX_DISAGREEMENT_PX).mean()) if len(errors) else 0.0
 
@@ -407,24 +391,24 @@ def _sample(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the rows of the keypoints that have a disparity, their positions and scores."""
     height, width = disparity.shape
-    places = view.to_frame(xy0, 0)
-    rows, column, row = view.pixels_of(places)
+    positions = view.to_frame(xy0, 0)
+    rows, column, row = view.pixels_of(positions)
     known = np.isfinite(disparity[row, column])
     rows, column, row = rows[known], column[known], row[known]
-    places, nearest = places[rows], disparity[row, column]
+    positions, nearest = positions[rows], disparity[row, column]
     # Bilinear, of the neighbours on the same surface.
-    left, top = np.floor(places).astype(np.int64).T
+    left, top = np.floor(positions).astype(np.int64).T
     total, weights = np.zeros(len(rows)), np.full(len(rows), 1e-9)
     for down in (0, 1):
         for across in (0, 1):
             x, y = np.clip(left + across, 0, width - 1), np.clip(top + down, 0, height - 1)
             value = disparity[y, x]
-            weight = np.abs(1 - across - (places[:, 0] - left)) * np.abs(
-                1 - down - (places[:, 1] - top)
+            weight = np.abs(1 - across - (positions[:, 0] - left)) * np.abs(
+                1 - down - (positions[:, 1] - top)
             )
             weight *= np.abs(value - nearest) <= 1  # not for NaN
             total += weight * np.nan_to_num(value - nearest)
             weights += weight
     shift = np.column_stack([nearest + total / weights, np.zeros(len(rows))])
     scores = np.clip(view.correlation[row, column], 0, 1)
-    return rows, view.from_frame(places - shift, 1), scores
+    return rows, view.from_frame(positions - shift, 1), scores

@@ -1,15 +1,11 @@
 """Whether the patches around matched points are the same, once the geometry is taken out.
 
-The second image is warped into the frame of the first, and descriptors of two sizes are taken from
-both at the same pixels. They are compared by their correlation about the mean descriptor: all
-descriptors have much in common, those of noise-like texture nearly everything.
-
-What unrelated patches look like is measured on the pair itself, by null pairs: the warped image is
-shifted by a third of its size and more, and what then lies under a point is unrelated to it, but of
-the same kind of scene and light. A point passes when its descriptors, averaged with those of its
-neighbours, are more similar than all but `FALSE_POSITIVE_RATE` of the null pairs, and when most
-points around it pass, too. Only places on a lattice are described, those nearest to the points:
-neighbours have nearly the same descriptors.
+The second image is warped into the frame of the first, and descriptors of two sizes are compared
+by their correlation about the mean descriptor, which all have in common. What unrelated patches
+look like is measured on the pair itself, by null pairs: the warped image, shifted by a third of its
+size and more. A point passes when its descriptors, averaged with those of its neighbours, are more
+similar than nearly all null pairs, and when most points around it pass, too. Only places on a
+lattice are described, those nearest to the points.
 """
 
 from __future__ import annotations
@@ -63,14 +59,10 @@ MIN_NULL_DISTANCE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class NullPairs:
-    """Pairs of unrelated points, by one shift of the second image.
+    """Pairs of points, (N,) `rows`, with unrelated `partners`, (N, 2), by one shift of the image.
 
-    Attributes:
-        rows: (N,) the points that have a partner.
-        partners: (N, 2) where that is in the second image.
-        interior: (N,) bool: no descriptor sees an edge, and is the same with and without the shift;
-            of the others the first image's edge cuts both descriptors.
-        shifted: (H, W) uint8, the second image shifted cyclically.
+    `interior` ones see no edge: their descriptors are the same with and without the shift. Of the
+    others the first image's edge cuts both. `shifted` is the second image, shifted cyclically.
     """
 
     rows: np.ndarray
@@ -82,20 +74,12 @@ class NullPairs:
 def dissimilarity(
     gray0: np.ndarray, warped: np.ndarray, valid: np.ndarray, pixels: np.ndarray, seed: int = 0
 ) -> np.ndarray:
-    """Compare the patches around points.
+    """Compare the patches around (N, 2) whole pixels of the first image, `gray0`.
 
-    Args:
-        gray0: (H, W) uint8, the first image.
-        warped: (H, W) uint8, the second one in the frame of the first.
-        valid: (H, W) bool, where that has content.
-        pixels: (N, 2) whole pixels of the first image.
-        seed: of the null pairs.
-
-    Returns:
-        (N,) float32: 1 - correlation, averaged over neighbours, relative to the bound below which
-        the fraction `FALSE_POSITIVE_RATE` of null pairs is. Infinite where the second image has no
-        content, where most points around are dissimilar, and everywhere when all null pairs look
-        the same.
+    `warped` is the second one in its frame, with content where `valid`. Returns (N,) float32: 1 -
+    correlation, averaged over neighbours, relative to the bound below which the fraction
+    `FALSE_POSITIVE_RATE` of null pairs is. Infinite where there is no content, where most points
+    around are dissimilar, and everywhere when all null pairs look the same.
     """
     pixels = np.asarray(pixels).astype(np.int64)
     result = np.full(len(pixels), np.inf, np.float32)
@@ -173,7 +157,7 @@ def _distances(
     """Return 1 - correlation of the points and of the null pairs, summed over the sizes."""
     # Each place of the second image is described once, however often it is part of a null pair.
     used = [points, *(null.partners[null.interior] for null in null_pairs)]
-    places, index = index_map(np.concatenate(used), warped.shape)
+    pixels, index = index_map(np.concatenate(used), warped.shape)
     rows_of_points = index[points[:, 1], points[:, 0]]
     distances = np.zeros(len(points), np.float32)
     null_distances = [np.zeros(len(null.rows), np.float32) for null in null_pairs]
@@ -185,7 +169,7 @@ def _distances(
         total = first.sum(axis=0, dtype=np.int64)  # exact: the order of the points does not matter
         enough = len(first) >= MIN_POINTS_OF_MEAN
         mean = (total / len(first) if enough else 0 * total).astype(np.float32)
-        described = dense_sift(warped, places, size, LATTICE_PX, gradients[1])
+        described = dense_sift(warped, pixels, size, LATTICE_PX, gradients[1])
         second = to_root_sift(described, overwrite=True)
         distances += correlation_distance(
             first, np.arange(len(first)), second, rows_of_points, mean

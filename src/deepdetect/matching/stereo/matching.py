@@ -32,6 +32,9 @@ MAX_SPECKLE_AREA_PX = 100
 SPECKLE_SUBDIVISIONS = 4
 """Parts of a pixel in which OpenCV's speckle filter counts."""
 
+OCCLUDING_EDGE_PX = 1
+"""Outermost pixels of a nearer surface that count as hidden where occlusions are filled."""
+
 OCCLUSION_SLACK_PX = 8
 """By which a gap may be wider than the step of disparity explains: the windows on both sides."""
 
@@ -69,11 +72,8 @@ class DisparityOptions:
             beside it: between two surfaces that of the farther one; where the counterpart lies
             outside the right image that of the first surface in sight, extrapolated along a line
             as far as this predicts the surface itself, unless the surfaces above and below suggest
-            another. Such pixels have no match: `DisparityMap.matched`.
-        occluding_edge_px: so many of the outermost pixels of a nearer surface, and of the columns
-            at both ends of the right image, have no match, but are filled as what is hidden there,
-            or keep their disparity where that is not known: the windows give them the nearer
-            disparity too often. 0 takes them as matched.
+            another. Such pixels have no match (`DisparityMap.matched`), nor have the outermost of a
+            nearer surface and of the right image, which windows give its disparity too often.
 
     Raises:
         OptionError: a value is out of its range.
@@ -83,7 +83,6 @@ class DisparityOptions:
     uniqueness_ratio: float = 1.05
     discontinuity_margin_px: int = 4
     fill_occlusions: bool = False
-    occluding_edge_px: int = 0
 
     def __post_init__(self) -> None:
         whole = self.disparity_range
@@ -94,17 +93,11 @@ class DisparityOptions:
             )
         check_ranges(
             self,
-            between={
-                "uniqueness_ratio": (1, math.inf),
-                "discontinuity_margin_px": (0, 100),
-                "occluding_edge_px": (0, 100),
-            },
+            between={"uniqueness_ratio": (1, math.inf), "discontinuity_margin_px": (0, 100)},
         )
 
 
-DENSE = DisparityOptions(
-    uniqueness_ratio=1.0, discontinuity_margin_px=0, fill_occlusions=True, occluding_edge_px=1
-)
+DENSE = DisparityOptions(uniqueness_ratio=1.0, discontinuity_margin_px=0, fill_occlusions=True)
 """As many pixels as possible: those near discontinuities too, and what is hidden is filled."""
 
 
@@ -114,9 +107,7 @@ class RectifiedMatches:
 
     Attributes:
         indices: (K,) int64 of the keypoints that have a disparity, rising.
-        disparity: (K,) float32 in pixels: the match of the left (x, y) is the right
-            (x - disparity, y).
-        matched: (K,) bool, as of `DisparityMap`.
+        disparity, matched: (K,) as of `DisparityMap`.
     """
 
     indices: np.ndarray
@@ -208,10 +199,10 @@ def disparity_map(
     Example:
         >>> scene = np.random.default_rng(0).integers(0, 256, (64, 120), np.uint8)
         >>> scene = cv2.GaussianBlur(scene, (0, 0), 1)
-        >>> found = disparity_map(scene[:, :100], scene[:, 12:112])
-        >>> float(np.nanmedian(found.disparity).round(1))
+        >>> disparities = disparity_map(scene[:, :100], scene[:, 12:112])
+        >>> float(np.nanmedian(disparities.disparity).round(1))
         12.0
-        >>> found.at(np.array([[40, 20], [60, 30], [2, 30]])).indices.tolist()
+        >>> disparities.at(np.array([[40, 20], [60, 30], [2, 30]])).indices.tolist()
         [0, 1]
     """
     grays = [luma(load_image(image, channels=channels)) for image in (left, right)]
@@ -241,15 +232,14 @@ def compute_disparity(
     known = filter_speckles(coarse.disparity, trusted, MAX_SPECKLE_AREA_PX)
     disparity = refine_disparity(left, right, coarse.disparity, known)
     known &= _leads_inside(disparity)
-    sure = kept = known
-    edge_px, margin_px = options.occluding_edge_px, options.discontinuity_margin_px
-    if edge_px:
-        hiding = on_occluding_edge(disparity, known, edge_px)
-        sure = known & _leads_inside(disparity, edge_px) & ~hiding
-    if margin_px:
-        kept = known & ~near_discontinuity(disparity, known, margin_px)
-    matched = kept & sure
+    kept = known
+    if options.discontinuity_margin_px:
+        kept = known & ~near_discontinuity(disparity, known, options.discontinuity_margin_px)
+    matched = kept
     if options.fill_occlusions:
+        hiding = on_occluding_edge(disparity, known, OCCLUDING_EDGE_PX)
+        sure = known & _leads_inside(disparity, OCCLUDING_EDGE_PX) & ~hiding
+        matched = kept & sure
         behind, occluded = fill_occlusions(disparity, sure)
         beyond = extrapolate_disparity(disparity, sure, coarse.disparity)
         occluded &= ~sure

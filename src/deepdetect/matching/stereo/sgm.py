@@ -1,16 +1,9 @@
 """Semi-global matching, and the refinement of its disparities to sub-pixels.
 
-After Hirschmüller, "Stereo processing by semi-global matching and mutual information" (PAMI 2008).
-The cost of a disparity is the Hamming distance of census transforms (Zabih and Woodfill,
-"Non-parametric local transforms for computing visual correspondence", ECCV 1994), which gain,
-offset and gamma do not change, plus what its neighbours along eight straight paths add: P1 for a
-disparity that changes by one pixel, P2 for a larger change, less where the grey level changes.
-
-A parabola through the costs of three whole disparities pulls towards whole pixels. So it only
-starts a least-squares fit of the grey values (Lucas and Kanade, "An iterative image registration
-technique", 1981) along the row, in which gain and offset are free, each pixel is mapped by its own
-smoothed disparity, and pixels of other surfaces do not count. On the Motorcycle pair
-(`benchmarks/row_matching.py`) 82 % of the disparities are within 0.25 px, with the parabola 73 %.
+Hirschmüller, "Stereo processing by semi-global matching and mutual information" (PAMI 2008), with
+census transforms (Zabih and Woodfill, ECCV 1994), which the light does not change. The parabola
+through the costs of three disparities pulls towards whole pixels, so it only starts a fit of the
+grey values along the row (Lucas and Kanade, 1981): `benchmarks/row_matching.py` measures both.
 """
 
 from __future__ import annotations
@@ -93,13 +86,10 @@ searched from the right x - largest to x - smallest."""
 
 @dataclass(frozen=True, eq=False)
 class SGMResult:
-    """Raw disparities of the left view, (H, W) each.
+    """Raw disparities of the left view, (H, W) each: float32 in pixels, and how sure they are.
 
-    Attributes:
-        disparity: float32 in pixels; outside the right image only that of the surface around.
-        consistent: whether it leads inside, and both views agree on it within a pixel.
-        uniqueness_ratio: float32, the least cost elsewhere inside the right image over the cost of
-            this place; 1 where the disparity leads outside.
+    `consistent`: it leads inside the right image, and both views agree on it within a pixel.
+    `uniqueness_ratio`: the least cost elsewhere inside over the cost of this place; 1 outside.
     """
 
     disparity: np.ndarray
@@ -122,7 +112,7 @@ def semi_global_matching(
     censuses = census(left), census(right)
     match = match_distance(*censuses, disparities)
     outside = round(match + OUTSIDE_COST * (WRONG_PLACE_BITS - match))
-    found = SGMResult(
+    result = SGMResult(
         disparity=np.zeros((height, width), np.float32),
         consistent=np.zeros((height, width), bool),
         uniqueness_ratio=np.ones((height, width), np.float32),
@@ -137,9 +127,9 @@ def semi_global_matching(
         bands = left[band], censuses[0][band], censuses[1][band]
         total = aggregate(*bands, disparities[0], count, outside)[top - first : bottom - first]
         inner = slice(top, bottom)
-        outputs = found.disparity[inner], found.consistent[inner], found.uniqueness_ratio[inner]
+        outputs = result.disparity[inner], result.consistent[inner], result.uniqueness_ratio[inner]
         parallel_for(len(total), best_of_rows, total, *tried, *outputs)
-    return found
+    return result
 
 
 def census(gray: np.ndarray) -> np.ndarray:

@@ -38,13 +38,10 @@ Links = list[tuple[int, int, np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True, eq=False)
 class RegisteredPair:
-    """Two images related by a homography that dense keypoints confirm.
+    """Two images, by their numbers, related by a homography that dense keypoints confirm.
 
-    Attributes:
-        first, second: numbers of the images.
-        homography: (3, 3) from the first to the second.
-        points: (M, 2) some of the keypoints of the first that have a match in the second.
-        matches: number of all of these.
+    `points` are some of the keypoints of the first that have a match in the second, of so many
+    `matches`.
     """
 
     first: int
@@ -58,9 +55,7 @@ class RegisteredPair:
 class RotatingCamera:
     """A camera that only turned, with its principal point in the middle of the image.
 
-    Attributes:
-        focal_px: focal length in pixels.
-        rotation: (3, 3) from the camera to the common frame: x right, y down, z forward.
+    The rotation goes from the camera to the common frame: x right, y down, z forward.
     """
 
     focal_px: float

@@ -1,8 +1,8 @@
 """Where the images of a panorama lie, on a plane, a cylinder or a sphere, and putting them there.
 
 Size and memory of a canvas are known before anything is drawn. Exposure and seams are found on
-small copies; the images themselves are warped one after the other and blended in frequency bands
-(Burt and Adelson, "A multiresolution spline with application to image mosaics", 1983; OpenCV's).
+small copies; the images are warped one after the other and blended in frequency bands (Burt and
+Adelson, "A multiresolution spline with application to image mosaics", 1983; OpenCV's).
 """
 
 from __future__ import annotations
@@ -53,12 +53,9 @@ of the images themselves."""
 
 @dataclass(frozen=True, eq=False)
 class WarpedImage:
-    """An image on the canvas.
+    """An image on the canvas, mirrored beyond its borders, whose left and top are the `corner`.
 
-    Attributes:
-        image: (h, w, 3) uint8, mirrored beyond its borders.
-        mask: (h, w) uint8, 255 inside.
-        corner: left and top of them on the canvas.
+    The mask is 255 inside. Both are uint8, (h, w, 3) and (h, w).
     """
 
     image: np.ndarray
@@ -68,12 +65,9 @@ class WarpedImage:
 
 @dataclass(frozen=True, eq=False)
 class Canvas:
-    """Where images lie on a canvas.
+    """Where images lie on a canvas: a box for each, by its number.
 
-    Attributes:
-        boxes: of each image, by its number.
-        draw: draws an image, by its number, on the canvas, both made smaller: `draw(number, rgb,
-            scale_of_image, scale_of_canvas)`.
+    `draw(number, rgb, scale_of_image, scale_of_canvas)` draws one, both made smaller.
     """
 
     boxes: dict[int, Box]

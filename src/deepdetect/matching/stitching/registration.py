@@ -136,9 +136,9 @@ def _registered_pairs(views: Sequence[_Image], seed: int) -> list[RegisteredPair
     for first, second in combinations(range(len(views)), 2):
         a, b = views[first], views[second]
         initial = find_tentative_matches(a.gray, b.gray, (a.features, b.features))
-        found = estimate_initial_geometry(initial, "homography", seed)
-        if found.model != "none":
-            overlaps.append((len(found.points0), first, second, initial))
+        geometry = estimate_initial_geometry(initial, "homography", seed)
+        if geometry.model != "none":
+            overlaps.append((len(geometry.points0), first, second, initial))
     overlaps.sort(key=lambda overlap: -overlap[0])
     pairs: list[RegisteredPair] = []
     partners = [0] * len(views)
