@@ -115,15 +115,3 @@ def test_images_of_one_plane_agree_and_others_do_not(shared: Path) -> None:
         homography = np.loadtxt(folder / name / "H1to4p")
         assert agree(first[name], second[name], homography)
         assert not agree(first[name], second[other], homography)
-
-
-@pytest.mark.slow
-def test_the_command_refuses_in_one_sentence(photo: np.ndarray, tmp_path: Path) -> None:
-    noise = np.random.default_rng(0).integers(0, 256, photo.shape).astype(np.uint8)
-    for name, image in (("a", photo), ("b", noise)):
-        Image.fromarray(image).save(tmp_path / f"{name}.png")
-    words = ["register", str(tmp_path / "a.png"), str(tmp_path / "b.png")]
-    result = run_command([*words, "-o", str(tmp_path / "out")])
-    assert result.exit_code == 3
-    assert result.stderr.startswith("deepdetect: no homography can be trusted")
-    assert not (tmp_path / "out").exists()

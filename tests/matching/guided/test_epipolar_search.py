@@ -69,22 +69,6 @@ def test_finds_what_plain_loops_find(
     np.testing.assert_allclose(np.column_stack(found), expected, atol=1e-6)
 
 
-def test_a_pattern_that_repeats_elsewhere_is_matched_on_its_line(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The same descriptor on every row: the best and the second-best are equally far."""
-    descriptor = np.random.default_rng(0).integers(0, 256, 128)
-    xy = np.array([[50.0, y] for y in range(10, 290, 40)])
-    noise = np.random.default_rng(1).integers(-4, 5, (2, len(xy), 128))
-    first = keypoints(xy, np.clip(descriptor + noise[0], 0, 255))
-    second = keypoints(xy + [30, 0.5], np.clip(descriptor + noise[1], 0, 255))
-    monkeypatch.setattr(module, "MAX_RATIO_ELSEWHERE", 0.5)
-    assert len(epipolar_search(first, second, ROWS)[0]) == 0
-    monkeypatch.setattr(module, "MAX_RATIO_ELSEWHERE", 1)
-    points0, points1 = epipolar_search(first, second, ROWS)
-    np.testing.assert_allclose(points1 - points0, np.tile([30, 0.5], (len(points0), 1)))
-
-
 def test_right_lines_find_more_than_chance() -> None:
     first, second = random_pair(300)
     nothing = np.empty((0, 2))

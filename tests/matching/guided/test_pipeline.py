@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, Matches, OptionError
+from deepdetect import DeepDetect, OptionError
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.evaluation.metrics.stereo import stereo_score
 from deepdetect.geometry import transform_points
@@ -143,36 +143,3 @@ def test_who_asks_for_depth_gets_no_plane(facade: Any, model: str) -> None:
         assert (errors[part] < 2).mean() > 0.9
     with pytest.raises(OptionError, match=f"contradicts the model {model}"):
         match(*images, model=model, camera0=camera, camera1=camera, two_view_model="homography")
-
-
-@pytest.mark.slow
-def test_mutual_matches_are_one_to_one(photo: np.ndarray, second: np.ndarray) -> None:
-    def best_of_each_place(found: Matches) -> dict[tuple[float, ...], float]:
-        rows: dict[tuple[float, ...], list[int]] = {}
-        for row, place in enumerate(map(tuple, found.points1.tolist())):
-            rows.setdefault(place, []).append(row)
-        assert len(rows) < 0.95 * len(found)
-        return {place: float(found.scores[of].max()) for place, of in rows.items()}
-
-    def scored_pairs(found: Matches, swapped: bool) -> dict[tuple[float, ...], float]:
-        points = (found.points1, found.points0) if swapped else (found.points0, found.points1)
-        pairs = map(tuple, np.column_stack(points).tolist())
-        return dict(zip(pairs, found.scores.tolist(), strict=True))
-
-    mutual = match(photo, second, Everywhere(), mutual=True)
-    assert mutual.guided
-    # Which image is first is decided by what is in them: it is the best of one of both ways.
-    pairs = scored_pairs(mutual, False)
-    agreeing = 0
-    for swapped in (False, True):
-        images = (second, photo) if swapped else (photo, second)
-        plain = match(*images, Everywhere())
-        assert plain.guided
-        best = best_of_each_place(plain)
-        if scored_pairs(plain, swapped).items() >= pairs.items():
-            agreeing += 1
-            places = mutual.points0 if swapped else mutual.points1
-            scores = zip(map(tuple, places.tolist()), mutual.scores.tolist(), strict=True)
-            assert dict(scores) == best
-            assert len(mutual) == len(best)
-    assert agreeing

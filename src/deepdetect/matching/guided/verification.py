@@ -142,22 +142,17 @@ def sample_null_pairs(
     return result
 
 
-def index_map(pixels: np.ndarray, shape: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct pixels, (P, 2), and the (H, W) image of their rows, -1 elsewhere."""
-    index = np.full(tuple(shape[:2]), -1, np.int32)
-    index[pixels[:, 1], pixels[:, 0]] = 0
-    row, column = np.nonzero(index == 0)
-    index[row, column] = np.arange(len(row))
-    return np.column_stack([column, row]), index
-
-
 def _distances(
     gray0: np.ndarray, warped: np.ndarray, points: np.ndarray, null_pairs: Sequence[NullPairs]
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return 1 - correlation of the points and of the null pairs, summed over the sizes."""
     # Each place of the second image is described once, however often it is part of a null pair.
     used = [points, *(null.partners[null.interior] for null in null_pairs)]
-    pixels, index = index_map(np.concatenate(used), warped.shape)
+    index = np.full(warped.shape, -1, np.int32)
+    for x, y in (each.T for each in used):
+        index[y, x] = 0
+    pixels = np.argwhere(index == 0)[:, ::-1]
+    index[pixels[:, 1], pixels[:, 0]] = np.arange(len(pixels))
     rows_of_points = index[points[:, 1], points[:, 0]]
     distances = np.zeros(len(points), np.float32)
     null_distances = [np.zeros(len(null.rows), np.float32) for null in null_pairs]

@@ -19,8 +19,8 @@ from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
 from ...features.sift import describe_keypoints, detect_sift
 from ...io.image import luma
-from ..guided import TentativeMatches, find_tentative_matches, guided_matches
-from ..guided.initial_geometry import estimate_initial_geometry
+from ..guided import find_tentative_matches, guided_matches
+from ..guided.initial_geometry import InitialGeometry, estimate_initial_geometry
 from .bundle_adjustment import RegisteredPair, RotatingCamera, adjust_cameras, adjust_homographies
 
 SIFT_KEYPOINTS = 2000
@@ -132,23 +132,23 @@ def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
 
 def _registered_pairs(views: Sequence[_Image], seed: int) -> list[RegisteredPair]:
     """Register the pairs that overlap most, until all are connected and have enough partners."""
-    overlaps: list[tuple[int, int, int, TentativeMatches]] = []
+    overlaps: list[tuple[InitialGeometry, int, int]] = []
     for first, second in combinations(range(len(views)), 2):
         a, b = views[first], views[second]
-        initial = find_tentative_matches(a.gray, b.gray, (a.features, b.features))
-        geometry = estimate_initial_geometry(initial, "homography", seed)
+        tentative = find_tentative_matches(a.gray, b.gray, (a.features, b.features))
+        geometry = estimate_initial_geometry(tentative, "homography", seed)
         if geometry.model != "none":
-            overlaps.append((len(geometry.points0), first, second, initial))
-    overlaps.sort(key=lambda overlap: -overlap[0])
+            overlaps.append((geometry, first, second))
+    overlaps.sort(key=lambda overlap: -len(overlap[0].points0))
     pairs: list[RegisteredPair] = []
     partners = [0] * len(views)
-    for _, first, second, initial in overlaps:
+    for geometry, first, second in overlaps:
         enough = min(partners[first], partners[second]) >= MIN_PARTNERS
         if enough and second in _connected(first, pairs):
             continue
         a, b = views[first], views[second]
         guide, matches = guided_matches(
-            a.gray, b.gray, a.keypoints, b.keypoints, "homography", seed, initial
+            a.gray, b.gray, a.keypoints, b.keypoints, seed=seed, first=geometry
         )
         if guide.matrix is not None and matches is not None and len(matches):
             points = a.keypoints[matches.indices0]
