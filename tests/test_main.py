@@ -56,11 +56,3 @@ def test_opencv_says_nothing_beside_the_sentence(source: str, said: str, tmp_pat
     assert result.returncode == 2
     (line,) = result.stderr.splitlines()
     assert said in line
-
-
-def test_the_command_is_the_module() -> None:
-    """What pip installs as `deepdetect` catches Ctrl-C as `python -m deepdetect` does."""
-    import tomllib
-
-    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
-    assert project["scripts"] == {"deepdetect": "deepdetect.__main__:main"}

@@ -8,13 +8,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import deepdetect
-from deepdetect.geometry.point_cloud import PointCloud
-from deepdetect.labels import Label
-from deepdetect.matching import DisparityMap, Panorama, Registration
 
 ROOT = Path(deepdetect.__path__[0])
 HEAVY = {"cv2", "matplotlib", "numba", "numpy", "onnxruntime", "openvino", "scipy", "torch"}
@@ -84,25 +80,6 @@ def test_options_are_frozen_dataclasses(name: str) -> None:
     kind = getattr(deepdetect, name)
     assert dataclasses.is_dataclass(kind)
     assert kind.__dataclass_params__.frozen
-
-
-def test_results_say_what_they_hold() -> None:
-    rgb, mask = np.zeros((20, 30, 3), np.uint8), np.ones((20, 30), bool)
-    matrix, cloud = np.eye(3), np.zeros((4, 3))
-    results = [
-        Label(mask, ~mask, "low"),
-        PointCloud(cloud, cloud.astype(np.uint8), "mm"),
-        DisparityMap(np.full((20, 30), np.nan, np.float32), ~mask, None),
-        Registration(matrix, rgb, rgb, mask, 1234, 0.5),
-        Panorama(rgb, mask, {0: matrix, 1: matrix}, 0, {}, {(0, 1): 9}, 0.25, {}, {}),
-    ]
-    assert [repr(result) for result in results] == [
-        "Label(30x20, density 1.000, low visibility)",
-        "PointCloud(4 points, unit='mm')",
-        "DisparityMap(30x20, 0.0% known, 0.0% matched)",
-        "Registration(30x20, overlap 100%, 1,234 matches, zncc=0.500)",
-        "Panorama(30x20, 2 images, unregistered={}, residual_px=0.250)",
-    ]
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:

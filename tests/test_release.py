@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import re
 from pathlib import Path
 from types import ModuleType
@@ -43,15 +42,6 @@ def test_links_of_the_readme_work_on_an_index() -> None:
         if page or picture:
             assert (ROOT / (page or picture)[1]).exists(), target
     assert "raw.githubusercontent.com" in text
-
-
-def test_the_metadata_name_the_tag_of_the_version() -> None:
-    pytest.importorskip("hatchling", reason="needs hatchling, which builds the wheel")
-    hook = load("hatch_build.py").ReadmeHook(str(ROOT), {})
-    metadata: dict[str, object] = {}
-    hook.update(metadata)
-    assert metadata["readme"]["content-type"] == "text/markdown"
-    assert f"/blob/v{deepdetect.__version__}/docs/" in metadata["readme"]["text"]
 
 
 def test_versions_that_differ_are_found(check: ModuleType, tmp_path: Path) -> None:
@@ -96,37 +86,3 @@ def test_what_is_missing_in_a_wheel_is_found(
         check.check_contents(wheel((*check.IN_THE_WHEEL, "tests/conftest.py")), archive)
     with pytest.raises(SystemExit, match=r"lead nowhere on an index: docs/a\.md"):
         check.check_contents(wheel(check.IN_THE_WHEEL, "[a](docs/a.md)"), archive)
-
-
-def test_the_container_names_extras_that_exist() -> None:
-    import tomllib
-
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    dockerfile = (ROOT / "Dockerfile").read_text("utf-8")
-    named = re.search(r"^ARG EXTRAS=(\S+)$", dockerfile, re.M)[1].split(",")
-    named.append(re.search(r"\[\$\{EXTRAS\},(\w+)\]", dockerfile)[1])
-    assert set(named) <= set(project["optional-dependencies"])
-    python = re.search(r"^ARG PYTHON=(\S+)$", dockerfile, re.M)[1]
-    assert f"Programming Language :: Python :: {python}" in project["classifiers"]
-    # What the wheel is built from must not be left out of what Docker sees.
-    hidden = (ROOT / ".dockerignore").read_text("utf-8").splitlines()
-    for needed in ("src", "README.md", "LICENSE", "pyproject.toml", "hatch_build.py"):
-        assert needed not in hidden
-        assert (ROOT / needed).exists()
-
-
-def test_the_folder_of_editors_sets_up_what_make_does() -> None:
-    text = (ROOT / ".devcontainer/devcontainer.json").read_text("utf-8")
-    settings = json.loads(re.sub(r"^\s*//.*$", "", text, flags=re.M))
-    target = settings["postCreateCommand"].removeprefix("make ").replace(".venv", "$(VENV)")
-    assert re.search(rf"^{re.escape(target)}:", (ROOT / "Makefile").read_text("utf-8"), re.M)
-
-
-@pytest.mark.parametrize("workflow", ["ci.yml", "release.yml"])
-def test_workflows_run_targets_that_exist(workflow: str) -> None:
-    text = (ROOT / ".github/workflows" / workflow).read_text("utf-8")
-    makefile = (ROOT / "Makefile").read_text("utf-8")
-    targets = re.findall(r"run: make ([a-z][\w-]*)", text)
-    assert targets
-    for target in targets:
-        assert re.search(rf"^{target}:", makefile, re.M), target

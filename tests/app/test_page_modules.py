@@ -67,12 +67,6 @@ def test_keypoints_among_many_equal_ranks(
     compare(run_node, logits, options)
 
 
-def test_an_impossible_pixel_is_never_taken(run_node: Any) -> None:
-    logits = np.full((20, 24), -1000, np.float32)
-    logits[3, 4] = 2
-    assert compare(run_node, logits, {"density": 0.5}) == 1
-
-
 @pytest.mark.parametrize("size", [(250, 200), (131, 77)], ids=str)
 def test_reduction_is_that_of_opencv(
     size: tuple[int, int], run_node: Any, photo: np.ndarray

@@ -21,7 +21,7 @@ from deepdetect._shared.errors import OptionError
 from deepdetect.app import jobs
 from deepdetect.app.jobs import Job
 from deepdetect.app.options import AppOptions
-from deepdetect.app.server import STATIC, AppServer
+from deepdetect.app.server import AppServer
 
 from .conftest import Client, packed
 
@@ -57,13 +57,6 @@ def test_the_page_is_served_with_a_strict_policy(path: str, serve: Any) -> None:
     assert "unsafe-inline" not in policy
     assert "Access-Control-Allow-Origin" not in answer.headers
     assert answer.headers["X-Content-Type-Options"] == "nosniff"
-
-
-def test_the_policy_of_the_file_is_that_of_the_server(serve: Any) -> None:
-    """So that the page is as safe on any web server; frames are what a file cannot speak of."""
-    client, _ = serve()
-    policy = client.ask("GET", "/").headers["Content-Security-Policy"]
-    assert policy.removesuffix("; frame-ancestors 'none'") in (STATIC / "index.html").read_text()
 
 
 @pytest.mark.parametrize(
@@ -338,14 +331,6 @@ def test_a_worker_ends_with_the_server(tmp_path: Path) -> None:
         time.sleep(0.1)
 
 
-def test_a_request_that_stands_still_is_ended(serve: Any) -> None:
-    client, _ = serve(max_request_s=0.3)
-    with socket.create_connection(("127.0.0.1", client.server.port)) as connection:
-        connection.settimeout(30)
-        connection.sendall(b"GET / HTTP/1.1\r\nHost: ")
-        assert connection.recv(100) == b""
-
-
 def test_a_body_that_trickles_is_ended(serve: Any) -> None:
     client, _ = serve(max_request_s=0.1)
     head = (
@@ -392,11 +377,11 @@ def test_the_last_place_is_taken_once(serve: Any, monkeypatch: pytest.MonkeyPatc
 def test_a_full_disk_is_said_by_the_task(tmp_path: Path) -> None:
     code = (
         "import errno, multiprocessing, pathlib, sys, types\n"
-        "from deepdetect.app import worker\n"
+        "from deepdetect.app import jobs\n"
         "def full(*given):\n    raise OSError(errno.ENOSPC, 'No space left on device')\n"
-        "worker.TASKS['match'] = types.SimpleNamespace(run=full)\n"
+        "jobs.TASKS['match'] = types.SimpleNamespace(run=full)\n"
         "receiver, sender = multiprocessing.Pipe(duplex=False)\n"
-        "worker.main(sender, pathlib.Path(sys.argv[1]), 'match', [], {}, 1)\n"
+        "jobs.run_task(sender, pathlib.Path(sys.argv[1]), 'match', [], {}, 1)\n"
         "pathlib.Path(sys.argv[1], 'told').write_text(receiver.recv()['error'])\n"
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True)

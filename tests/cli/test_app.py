@@ -13,30 +13,7 @@ import pytest
 from tests.command_line import run_command
 
 
-def test_it_prints_its_address_and_ends_without_a_trace(tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "deepdetect", "app", "--port", "0"]
-    started = subprocess.Popen(
-        words,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "TMPDIR": str(tmp_path)},
-    )
-    assert started.stdout is not None
-    line = started.stdout.readline()
-    found = re.fullmatch(r"DeepDetect is at (http://127\.0\.0\.1:\d+/)#key=\S{32}\n", line)
-    assert found, line
-    with urllib.request.urlopen(found[1]) as page:
-        assert b"<title>DeepDetect" in page.read()
-    assert list(tmp_path.iterdir())
-    started.send_signal(signal.SIGINT)
-    said = started.communicate(timeout=60)[1]
-    assert started.returncode == 0
-    assert said.splitlines() == ["Ctrl+C ends it.", "deepdetect: ended; nothing was kept"]
-    assert list(tmp_path.iterdir()) == []
-
-
-def started(temporary: Path) -> subprocess.Popen[str]:
+def started(temporary: Path) -> tuple[subprocess.Popen[str], str]:
     """Start the program, and wait until it has said its address."""
     process = subprocess.Popen(
         [sys.executable, "-m", "deepdetect", "app", "--port", "0"],
@@ -46,32 +23,37 @@ def started(temporary: Path) -> subprocess.Popen[str]:
         env={**os.environ, "TMPDIR": str(temporary)},
     )
     assert process.stdout is not None
-    assert process.stdout.readline()
-    return process
+    line = process.stdout.readline()
+    found = re.fullmatch(r"DeepDetect is at (http://127\.0\.0\.1:\d+/)#key=\S{32}\n", line)
+    assert found, line
+    return process, found[1]
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
-@pytest.mark.parametrize("signal_name", ["SIGTERM", "SIGHUP"])
-def test_no_signal_that_asks_leaves_files(signal_name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("signal_name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_a_signal_ends_it_without_a_trace(signal_name: str, tmp_path: Path) -> None:
     if signal.getsignal(getattr(signal, signal_name)) == signal.SIG_IGN:
         pytest.skip("whoever started the tests ignores it, as nohup does")
-    process = started(tmp_path)
+    process, address = started(tmp_path)
+    with urllib.request.urlopen(address) as page:
+        assert b"<title>DeepDetect" in page.read()
     assert list(tmp_path.iterdir())
     process.send_signal(getattr(signal, signal_name))
-    process.communicate(timeout=60)
+    said = process.communicate(timeout=60)[1]
     assert process.returncode == 0
+    assert said.splitlines() == ["Ctrl+C ends it.", "deepdetect: ended; nothing was kept"]
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals of POSIX")
 def test_what_a_killed_server_left_is_removed_at_the_next_start(tmp_path: Path) -> None:
-    process = started(tmp_path)
+    process, _ = started(tmp_path)
     (left,) = tmp_path.iterdir()
     (left / "photograph.jpg").write_bytes(b"x")
     process.kill()
     process.communicate(timeout=60)
     assert left.is_dir()
-    process = started(tmp_path)
+    process, _ = started(tmp_path)
     (now,) = tmp_path.iterdir()
     assert now != left
     process.terminate()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deepdetect.cli.demo import run_demo
+from deepdetect.cli.evaluate import run_demo
 from deepdetect.datasets import StereoPair
 
 

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import errno
 import json
 import shutil
 import subprocess
@@ -38,20 +37,6 @@ def test_writes_keypoints_and_pictures(run, photos: Path) -> None:
     for name in ("keypoints", "dense", "heatmap"):
         picture = np.asarray(Image.open(f"out/cat_{name}.jpg"))
         assert picture.shape == (150 + CAPTION_HEIGHT, 200, 3)
-
-
-def test_points_have_no_dense_picture(run, photos: Path) -> None:
-    result = run("detect", photos / "cat.jpg", "-o", "out", "--detector", "points")
-    assert result.exit_code == 0, result.output
-    assert {p.name for p in Path("out").glob("cat*")} == {"cat.npz", "cat_keypoints.jpg"}
-
-
-def test_the_ignore_mask_is_kept_free(run, photos: Path) -> None:
-    mask = np.zeros((150, 200), np.uint8)
-    mask[:, 100:] = 255
-    Image.fromarray(mask).save("ignore.png")
-    assert run("detect", photos / "cat.jpg", "-o", "out", "--ignore", "ignore.png").exit_code == 0
-    assert load_keypoints("out/cat.npz").xy[:, 0].max() < 100
 
 
 def test_one_bad_image_does_not_stop_the_others(run, photos: Path, tmp_path: Path) -> None:
@@ -152,16 +137,6 @@ def test_what_is_done_is_skipped(run, photos: Path) -> None:
     assert not any(image["skipped"] for image in detect(run, photos, "--overwrite"))
 
 
-def test_pictures_and_other_formats_of_the_same_keypoints_are_added(run, photos: Path) -> None:
-    detect(run, photos / "cat.jpg")
-    kept = contents(Path("out"))
-    assert not detect(run, photos / "cat.jpg", "--pictures")[0]["skipped"]
-    assert not detect(run, photos / "cat.jpg", "--format", "csv")[0]["skipped"]
-    assert len(contents(Path("out"))) == 5
-    assert contents(Path("out")).items() >= kept.items()
-    assert detect(run, photos / "cat.jpg", "--pictures")[0]["skipped"]
-
-
 def test_an_image_that_has_changed_is_done_again(run, photos: Path) -> None:
     folder = copies(photos, Path("in"))
     detect(run, folder)
@@ -170,17 +145,6 @@ def test_an_image_that_has_changed_is_done_again(run, photos: Path) -> None:
     np.testing.assert_array_equal(
         load_keypoints("out/1.npz").xy, DeepDetect().detect(photos / "left.png").xy
     )
-
-
-def test_an_edited_output_of_a_changed_image_is_not_replaced(run, photos: Path) -> None:
-    image = copies(photos, Path("in"), 1) / "0.jpg"
-    detect(run, image)
-    Path("out/0.npz").write_bytes(b"edited")
-    shutil.copy(photos / "left.png", image)
-    detect(run, image, "--format", "csv", "--overwrite")
-    result = run("detect", image, "-o", "out", "--no-pictures")
-    assert result.exit_code == 2
-    assert Path("out/0.npz").read_bytes() == b"edited"
 
 
 @pytest.mark.parametrize(
@@ -294,23 +258,6 @@ def test_an_input_is_never_written_over(run, photos: Path) -> None:
     assert contents(Path()) == before
 
 
-def test_a_full_disk_stops_all_images_at_once(
-    run, photos: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls = []
-
-    def full(*_: object, **__: object) -> None:
-        calls.append(1)
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(np.lib.format, "write_array", full)
-    result = run("detect", photos, "-o", "out", "--no-pictures")
-    assert result.exit_code == 2
-    assert "No space left" in result.stderr.splitlines()[-1]
-    assert len(calls) == 1
-    assert not Path("out").exists()
-
-
 def start(folder: Path, output: Path) -> subprocess.Popen[bytes]:
     arguments = ["detect", str(folder), "-o", str(output), "--no-pictures"]
     return subprocess.Popen(
@@ -318,17 +265,6 @@ def start(folder: Path, output: Path) -> subprocess.Popen[bytes]:
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-
-
-def test_two_commands_into_one_folder_do_not_harm_each_other(run, photos: Path) -> None:
-    folder = copies(photos, Path("in"), 8)
-    both = [start(folder, Path("out")) for _ in range(2)]
-    assert [process.wait(timeout=120) for process in both] == [0, 0]
-    expected = DeepDetect().detect(photos / "cat.jpg")
-    for k in range(8):
-        np.testing.assert_array_equal(load_keypoints(f"out/{k}.npz").xy, expected.xy)
-    assert len(contents(Path("out"))) == 8
-    assert all(image["skipped"] for image in detect(run, folder))
 
 
 def test_a_killed_run_goes_on_where_it_stopped(run, photos: Path) -> None:

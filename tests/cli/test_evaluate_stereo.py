@@ -44,9 +44,6 @@ def test_the_command_prints_a_row_for_each(photo: np.ndarray, tmp_path: Path) ->
 
 def test_scenes_none_of_which_can_be_read(tmp_path: Path) -> None:
     gone = [str(tmp_path / name) for name in ("first", "second")]
-    alone = run_command(["evaluate-stereo", gone[0]])
-    assert alone.exit_code == 2, alone.output
-    assert gone[0] in alone.stderr
     result = run_command(["evaluate-stereo", *gone])
-    assert result.exit_code == 1, result.output
+    assert result.exit_code == 2, result.output
     assert all(name in result.stderr for name in gone)

@@ -97,30 +97,6 @@ def test_a_photograph_is_never_replaced_by_its_mask(run, photos: Path, tmp_path:
     assert photograph.read_bytes() == (photos / "left.png").read_bytes()
 
 
-def test_masks_below_the_photographs_are_not_labelled_themselves(run, photos: Path) -> None:
-    Path("in").mkdir()
-    Path("in/left.png").write_bytes((photos / "left.png").read_bytes())
-    for expected in ("1 labelled, 0 already done", "0 labelled, 1 already done"):
-        result = run("label", "in", "-o", "in/masks", "--workers", 1)
-        assert result.exit_code == 0, result.output
-        assert expected in result.stdout
-
-
-def test_a_mask_of_another_image_is_not_passed_off(run, photos: Path) -> None:
-    for folder, name in (("a", "left.png"), ("b", "right.png")):
-        Path(folder).mkdir()
-        Path(folder, "x.png").write_bytes((photos / name).read_bytes())
-    assert run("label", "a", "-o", "masks", "--workers", 1).exit_code == 0
-    before = Path("masks/x.png").read_bytes()
-    result = run("label", "b", "-o", "masks", "--workers", 1)
-    assert result.exit_code == 2
-    assert "made from" in result.stderr
-    assert "--overwrite" in result.stderr
-    assert Path("masks/x.png").read_bytes() == before
-    assert run("label", "b", "-o", "masks", "--workers", 1, "--overwrite").exit_code == 0
-    assert Path("masks/x.png").read_bytes() != before
-
-
 def test_an_image_that_has_changed_is_labelled_again(run, photos: Path) -> None:
     Path("x.png").write_bytes((photos / "left.png").read_bytes())
     run("label", "x.png", "-o", "masks", "--workers", 1)
@@ -139,13 +115,3 @@ def test_a_figure_is_never_written_over_a_mask(run, photos: Path) -> None:
     assert result.exit_code == 2
     assert "would both write" in result.stderr
     assert not Path("masks").exists()
-
-
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_full_disk_stops_all_images_at_once(run, photos: Path, workers: int) -> None:
-    Path("masks").write_text("no folder can be made here")
-    result = run("label", photos, "-o", "masks", "--workers", workers)
-    assert result.exit_code == 2
-    told = result.stderr.splitlines()[-1]
-    assert told.startswith("deepdetect: cannot write")
-    assert "images failed" not in result.stderr

@@ -9,7 +9,6 @@ import pytest
 
 from deepdetect.cli._app import make_app, with_flags
 from deepdetect.cli._commands import COMMANDS
-from deepdetect.cli._options import attribute_helps
 from tests.command_line import run_command
 
 WORDS = [
@@ -83,10 +82,19 @@ def test_what_is_misspelt_names_the_right_word(arguments: str, right: str) -> No
     assert len(result.stderr.splitlines()) == 1
 
 
-@pytest.mark.parametrize("flag", ["--num-keypoints", "--top-k", "--max-num-keypoints"])
-def test_other_names_of_the_number_of_keypoints(flag: str) -> None:
-    _, bound, _ = make_app().parse_args(["detect", "photo.jpg", flag, "7"], exit_on_error=False)
-    assert bound.arguments["max_keypoints"] == 7
+@pytest.mark.parametrize(
+    "words",
+    [
+        "detect a --json b",
+        "stitch a -o p.jpg b",
+        "average a --output out b",
+        "evaluate-stereo a --weights dense b",
+        "export hloc a --overwrite b",
+    ],
+)
+def test_options_may_stand_between_paths(words: str) -> None:
+    _, bound, _ = make_app().parse_args(words.split(), print_error=False, exit_on_error=False)
+    assert [str(path) for path in bound.args] == ["a", "b"]
 
 
 def test_completion_knows_commands_options_and_choices() -> None:
@@ -104,12 +112,6 @@ def test_the_help_is_fast() -> None:
     loaded = done.stdout.splitlines()[-1]
     for name in ("numpy", "cv2", "onnxruntime", "openvino", "torch", "PIL", "rich", "cyclopts"):
         assert f"'{name}'" not in loaded
-
-
-def test_the_first_sentence_of_each_argument_is_its_help() -> None:
-    doc = "Options.\n\nArgs:\n  ratio, mutual: of the test. More.\n  size: in\n    px (all).\n"
-    expected = {"ratio": "Of the test.", "mutual": "Of the test.", "size": "In px (all)."}
-    assert attribute_helps(doc) == expected
 
 
 def test_a_folder_or_a_file_is_named_by_o(tmp_path: Path) -> None:

@@ -123,29 +123,6 @@ def test_a_pair_without_a_geometry_has_its_own_exit_code(run, tmp_path: Path, mo
         assert (report["matches"], report["success"]) == (0, False)
 
 
-def test_an_essential_matrix_from_camera_files(run, photos: Path) -> None:
-    np.savetxt("K.txt", [[994.978, 0, 11.193], [0, 994.978, 154.877], [0, 0, 1]])
-    result = run(
-        *("match", photos / "left.png", photos / "right.png", "--model", "essential"),
-        *("--camera0", "K.txt", "--json", "--no-pictures"),
-    )
-    report = json.loads(result.stdout)
-    assert report["model"] == "essential"
-    assert report["inliers"] > 0.3 * report["matches"]
-
-
-@pytest.mark.slow
-def test_resolution_changes_the_preset(run, photos: Path) -> None:
-    counts = []
-    for more in ([], ["--resolution", "240"]):
-        result = run(
-            *("match", photos / "left.png", photos / "right.png", "--preset", "published"),
-            *("--json", "--no-pictures", *more),
-        )
-        counts.append(json.loads(result.stdout)["keypoints0"])
-    assert counts[0] != counts[1]
-
-
 def test_matches_of_other_images_are_not_written_over(run, photos: Path) -> None:
     others = Path("others")
     others.mkdir()
@@ -165,14 +142,3 @@ def test_matches_of_other_images_are_not_written_over(run, photos: Path) -> None
     assert run(*other, "--overwrite").exit_code == 0
     assert Path("out/left_right_matches.npz").read_bytes() != written
     assert run(*first).exit_code == 2
-
-
-def test_an_image_is_not_written_over_by_its_matches(run, photos: Path) -> None:
-    source = Path("a.png")
-    source.write_bytes((photos / "left.png").read_bytes())
-    Path("a_a_matches.jpg").write_bytes((photos / "cat.jpg").read_bytes())
-    result = run("match", "a.png", "a_a_matches.jpg", "-o", ".", "--unguided")
-    assert result.exit_code == 0 or "is an input" in result.stderr
-    result = run("match", "a.png", "a.png", "-o", ".", "--unguided", "--max-keypoints", 50)
-    assert result.exit_code == 2
-    assert "is not known to be of" in result.stderr

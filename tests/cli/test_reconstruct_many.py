@@ -130,9 +130,3 @@ def test_without_pycolmap_it_says_what_to_install(run, tmp_path: Path, monkeypat
     assert one_sentence(result.stderr)
     assert "run pip install pycolmap h5py" in result.stderr
     assert not Path("model").exists()
-
-
-def test_a_missing_folder_is_one_sentence(run) -> None:
-    result = run("reconstruct", "nowhere")
-    assert result.exit_code == 2
-    assert "Traceback" not in result.output

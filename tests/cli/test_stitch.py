@@ -103,7 +103,7 @@ def test_an_unknown_ending_ends_before_the_work(
     files: list[Path], output: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "deepdetect.cli.stitch.stitch_images", lambda *_, **__: pytest.fail("it worked")
+        "deepdetect.cli.match.stitch_images", lambda *_, **__: pytest.fail("it worked")
     )
     assert "must end in .png, .jpg or .jpeg" in refused(*files, "-o", output)
 
@@ -152,15 +152,3 @@ def test_too_few_that_can_be_read(bad: str, files: list[Path]) -> None:
     assert "there is no panorama" in result.stderr
     assert "bad.png" in result.stderr.splitlines()[-1]
     assert not Path("p.png").exists()
-
-
-def test_a_panorama_of_other_photographs_is_not_replaced(files: list[Path]) -> None:
-    Image.new("RGB", (9, 9)).save("panorama.jpg")
-    before = Path("panorama.jpg").read_bytes()
-    assert "--overwrite" in refused(*files)
-    assert Path("panorama.jpg").read_bytes() == before
-    replaced = run_command(["stitch", *map(str, files), "--overwrite"])
-    assert replaced.exit_code == 0, replaced.output
-    assert Path("panorama.jpg").read_bytes() != before
-    again = run_command(["stitch", *map(str, files)])  # of the same photographs
-    assert again.exit_code == 0, again.output

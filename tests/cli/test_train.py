@@ -38,10 +38,10 @@ def test_train_and_shards(run, images: Path, tmp_path: Path) -> None:
     assert packed.exit_code == 0, packed.output
     assert re.search(r"training +5\n", packed.output)
     packed = run("shards", images, "-o", "packed", "--shard-size", "3", *fixed, "--json")
-    assert json.loads(packed.output)["validation"] == 1
+    assert json.loads(packed.stdout)["validation"] == 1
     trained = run("train", "packed", "-o", "run", *TINY, "--workers", "1", "--json")
     assert trained.exit_code == 0, trained.output
-    values = json.loads(trained.output)
+    values = json.loads(trained.stdout)
     assert Path(values["onnx"]).is_file()
     assert values["validation_loss"] > 0
     again = run("train", "packed", "-o", "run", *TINY, "--workers", "1")
@@ -52,7 +52,7 @@ def test_train_and_shards(run, images: Path, tmp_path: Path) -> None:
     timed = run("train", images, "-o", "timed", *TINY, "--workers", "1", "--profile")
     assert re.search(r"stage: crop +64\n +stage: batch +4\n", timed.output), timed.output
     timed = run("train", images, "-o", "timed", *TINY, "--workers", "1", "--profile", "--json")
-    assert json.loads(timed.output)[0]["stage"]["crop"] == 64
+    assert json.loads(timed.stdout)[0]["stage"]["crop"] == 64
 
 
 @pytest.mark.parametrize(

@@ -52,13 +52,6 @@ def test_links_in_code_stay(hooks: ModuleType) -> None:
     assert hooks.turn_links(text, "docs/index.md", "index.md") == text
 
 
-def test_badges_are_left_out(hooks: ModuleType) -> None:
-    readme = hooks.without_badges((ROOT / "README.md").read_text("utf-8"))
-    assert not re.search(r"!\[[^\]]*\]\[", readme)
-    assert "# DeepDetect" in readme
-    assert "## Results" in readme
-
-
 def test_the_page_in_the_browser_is_embedded_where_it_is_there(
     hooks: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -33,10 +33,6 @@ def printed(notebook: list[dict[str, Any]]) -> list[str]:
     return re.findall(r"\d+", re.sub(r"(?<=\d),(?=\d{3})", "", text))
 
 
-def test_there_are_four() -> None:
-    assert [path.stem for path in NOTEBOOKS] == ["detect", "match", "points", "reconstruct"]
-
-
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_output_is_kept_whole_and_small(path: Path) -> None:
     assert path.stat().st_size < MAX_BYTES

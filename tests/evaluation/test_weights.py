@@ -231,7 +231,7 @@ def test_samples_that_cannot_be_read_are_listed_and_not_scored(
     assert result.exit_code == 1
     assert "normal" in result.stdout
     *_, told, first, second = result.stderr.splitlines()
-    assert told == "deepdetect: 2 of 3 samples are not in the scores:"
+    assert told == "deepdetect: 2 of the parts failed, the others are done:"
     assert "image_a.png" in first
     assert "mask_image_b.png" in second
     (tmp_path / "image_c.png").unlink()
@@ -266,7 +266,7 @@ def test_damaged_photographs_do_not_end_the_measurement_of_the_others(
     assert result.exit_code == 1
     assert "foreground: fraction" in result.stdout
     *_, told, first, second = result.stderr.splitlines()
-    assert told == "deepdetect: 2 parts could not be measured, the scores are of the rest:"
+    assert told == "deepdetect: 2 of the parts failed, the others are done:"
     assert first.startswith("  foreground of the weights on a.png: ")
     assert second.startswith("  foreground of the weights on b.png: ")
     for name in ("b.png", "c.png"):
@@ -294,7 +294,7 @@ def test_damaged_images_do_not_end_the_measurement_of_the_other_scenes(
     assert "boat 1-2" in result.stdout
     assert "graf" not in result.stdout
     told = result.stderr.splitlines()[-10:]
-    assert told[0] == "deepdetect: 9 parts could not be measured, the scores are of the rest:"
+    assert told[0] == "deepdetect: 9 of the parts failed, the others are done:"
     assert told[1].startswith("  density of the weights on boat/img6.png: ")
     assert told[3].startswith("  repeatability of the weights on boat 1-6: ")
     assert told[-1].startswith("  matches of the weights on graf 1-6: ")

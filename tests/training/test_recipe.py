@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from deepdetect._shared.errors import OptionError
-from deepdetect.cli._training import chosen_recipe
+from deepdetect.cli.train import chosen_recipe
 from deepdetect.labels import LabelOptions, find_label_settings
 from deepdetect.training.recipe import (
     DeviceOptions,

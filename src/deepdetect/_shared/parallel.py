@@ -70,7 +70,7 @@ def map_in_processes(
         DeepDetectError: a worker process died.
     """
     if workers is not None and workers < 1:
-        raise OptionError(f"workers must be at least 1, not {workers}")
+        raise OptionError(f"`workers` must be at least 1, not {workers}")
     count = min(workers or processor_count(), len(tasks))
     if count <= 1:
         with _one_opencv_thread():

@@ -1,7 +1,9 @@
-"""Signals that ask a process to end: the one place where their handlers are set."""
+"""Signals that ask a process to end: the one place where they are handled, and sent."""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -40,6 +42,41 @@ def exit_by_signal(number: int, frame: FrameType | None) -> None:
 
 
 @contextmanager
+def noted_interrupts() -> Iterator[list[int]]:
+    """Give a list that gets an entry at each Ctrl-C, which still raises KeyboardInterrupt.
+
+    Packages that are interrupted while they are imported may raise something else.
+    """
+    noted: list[int] = []
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        noted.append(number)
+        raise KeyboardInterrupt
+
+    with handle_signals(stop, ["SIGINT"]):
+        yield noted
+
+
+@contextmanager
+def endings_interrupt() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP be as Ctrl-C while the block runs."""
+    with (
+        handle_signals(signal.default_int_handler, ["SIGTERM"]),
+        handle_signals(lambda *_: signal.raise_signal(signal.SIGTERM), ["SIGHUP"]),
+    ):
+        yield
+
+
+@contextmanager
+def sigterm_kept() -> Iterator[None]:
+    """Undo what native code that the block loads does to SIGTERM, which Python does not know."""
+    handler = signal.getsignal(signal.SIGTERM)
+    yield
+    if handler is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, handler)
+
+
+@contextmanager
 def signals_held() -> Iterator[None]:
     """Let Ctrl-C wait while the block starts processes, and in these until `release_interrupt`."""
     if not hasattr(signal, "pthread_sigmask"):
@@ -60,3 +97,10 @@ def release_interrupt() -> None:
     """Let Ctrl-C come that `signals_held` holds in a process that has been started."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+
+
+def kill_group(process: int = 0) -> None:
+    """Kill the group of a process, of this one by default; nothing where there is no group."""
+    if hasattr(os, "killpg"):
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process, signal.SIGKILL)

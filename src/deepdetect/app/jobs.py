@@ -7,20 +7,19 @@ import multiprocessing
 import os
 import secrets
 import shutil
-import signal
 import tempfile
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 from .._shared.atomic import private_folder
-from .._shared.errors import OptionError
-from .._shared.signals import signals_held
-from . import worker
+from .._shared.errors import DeepDetectError, OptionError
+from .._shared.signals import kill_group, signals_held
 from .options import AppOptions
-from .tasks import SentImage
+from .tasks import TASKS, SentImage
 
 FOLDER_PREFIX = "deepdetect-app-"
 """Of the folder of a server, in the folder for temporary files."""
@@ -31,18 +30,10 @@ NO_RESULT = "the task ended without a result: there may be too little memory for
 class Job:
     """A task, the process that does it, and the folder of its files.
 
-    Args:
-        folder: its own, with the images in it; removed by `remove`.
-        kind: of the task.
-        images: in the folder.
-        options: of the task.
-        max_megapixels: larger images are refused.
-
     Attributes:
         name: secret, known to the page alone.
         state: what the page is told.
         started, asked: when it began, and when the page has last asked for it.
-        process: that does it.
     """
 
     def __init__(
@@ -61,7 +52,7 @@ class Job:
         context = multiprocessing.get_context("spawn")
         self._receiver, sender = context.Pipe(duplex=False)
         task = (sender, folder, kind, images, options, max_megapixels)
-        self.process = context.Process(target=worker.main, args=task)
+        self.process = context.Process(target=run_task, args=task)
         with signals_held(), sender:  # Ctrl+C is for the server, which ends its tasks
             self.process.start()
         self._listener = threading.Thread(target=self._listen, daemon=True)
@@ -75,8 +66,8 @@ class Job:
     def stop(self, reason: str) -> None:
         """End the process with all that it has started."""
         self._reason = reason
-        with contextlib.suppress(ProcessLookupError, PermissionError, AttributeError):
-            os.killpg(self.process.pid or 0, signal.SIGKILL)
+        if self.process.pid is not None:
+            kill_group(self.process.pid)
         self.process.kill()  # before it had a group, and on Windows
         self._listener.join()
 
@@ -95,11 +86,7 @@ class Job:
 
 
 class Jobs:
-    """All tasks of a server. They are started by one thread, that of the server.
-
-    Args:
-        limits: of the server.
-    """
+    """All tasks of a server. They are started by one thread, that of the server."""
 
     def __init__(self, limits: AppOptions) -> None:
         self.limits = limits
@@ -119,17 +106,9 @@ class Jobs:
             )
 
     def start(
-        self,
-        folder: Path,
-        kind: str,
-        images: Sequence[SentImage],
-        options: Mapping[str, float],
+        self, folder: Path, kind: str, images: Sequence[SentImage], options: Mapping[str, float]
     ) -> Job:
-        """Start a task with the images of a folder.
-
-        Raises:
-            OptionError: too many tasks are at work.
-        """
+        """Start a task with the images of a folder, where there is room."""
         self.check_room()
         job = Job(folder, kind, images, options, self.limits.max_megapixels)
         self._jobs[job.name] = job
@@ -163,3 +142,56 @@ class Jobs:
         for name in list(self._jobs):
             self.remove(name)
         shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def run_task(
+    sender: Connection,
+    folder: Path,
+    kind: str,
+    images: Sequence[SentImage],
+    options: Mapping[str, float],
+    max_megapixels: float,
+) -> None:
+    """Do a task, in a process of its own: its files are in `results`, its state is sent."""
+    from ..io.image_file import limit_megapixels
+
+    if hasattr(os, "setsid"):
+        os.setsid()  # so that all it starts can be ended
+    for stream in (1, 2):  # what libraries print
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+    threading.Thread(target=_end_with_the_server, daemon=True).start()
+    (folder / "results").mkdir()
+
+    def report(stage: str, done: int, total: int) -> None:
+        sender.send({"state": "running", "stage": stage, "done": done, "total": total})
+
+    try:
+        with limit_megapixels(max_megapixels):
+            result = TASKS[kind].run(images, options, folder / "results", report)
+        sender.send({"state": "done", **vars(result)})
+        return
+    except DeepDetectError as error:
+        reason = _for_the_page(str(error), images, folder)
+    except MemoryError:
+        reason = "there is not enough memory for this: use smaller images"
+    except OSError as error:
+        reason = f"the files cannot be written ({error.strerror or error}): free some space"
+    sender.send({"state": "failed", "error": reason})
+
+
+def _for_the_page(message: str, images: Sequence[SentImage], folder: Path) -> str:
+    """Name images and files as the user does, and options as `deepdetect app` does."""
+    for number, image in enumerate(images):
+        message = message.replace(str(image.path), image.name)
+        message = message.replace(f"images[{number}]", image.name)
+    for path in (folder / "results", folder):
+        message = message.replace(f"{path}{os.sep}", "")
+    return message.replace("`max_megapixels`", "--max-megapixels")
+
+
+def _end_with_the_server() -> None:
+    server = multiprocessing.parent_process()
+    if server is not None:
+        server.join()
+        kill_group()
+        os._exit(1)

@@ -22,7 +22,7 @@ class AppOptions:
         max_task_s: seconds after which a task is ended.
         abandoned_s: seconds without a question from the page after which a task, or its result,
             is forgotten. Pages in the background ask once a minute.
-        max_request_s: seconds that a request may stand still.
+        max_request_s: seconds that the images of a task may take to arrive.
 
     Raises:
         OptionError: a value is out of its range.
@@ -36,7 +36,7 @@ class AppOptions:
     max_tasks: int = 2
     max_task_s: float = 3600.0
     abandoned_s: float = 300.0
-    max_request_s: float = 30.0
+    max_request_s: float = 300.0
 
     def __post_init__(self) -> None:
         limits = [field.name for field in fields(self) if field.name != "port"]

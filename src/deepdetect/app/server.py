@@ -1,7 +1,7 @@
 """The server of the page: for one user, on the loopback address only, keeping nothing.
 
 Starlette and uvicorn speak HTTP. It answers only requests that name this computer and come from
-its own page with the key of this start, and that are neither too large nor too slow.
+its own page with the key of this start, and that are not too large.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import json
 import mimetypes
 import secrets
 import shutil
-import signal
 import socket
 import threading
 from collections.abc import AsyncIterator
@@ -24,18 +23,16 @@ from typing import Any
 import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from .. import __version__
 from .._shared.errors import DeepDetectError, OptionError, unknown_name
-from .._shared.signals import handle_signals
 from ..detector.pretrained import RANKER
 from .jobs import Jobs
 from .options import AppOptions
@@ -46,16 +43,7 @@ NAMES = (HOST, "localhost")
 HTTP_PORT = 80
 STATIC = Path(__file__).parent / "static"
 
-SLOWEST = 10
-"""A request may last so many times as long in all as it may stand still."""
-
-DRAINED_BYTES = 16 << 20
-"""Of a refused request that are read before it is answered: browsers look for the answer only when
-they have sent everything. What is not too large is read whole."""
-
-ACCEPTED = "deepdetect.accepted_bytes"
-"""Key of the length of a request that is not too large."""
-
+CLOSE = {"Connection": "close"}
 SHUTDOWN_S = 1
 """How long the end waits for requests that are being answered."""
 
@@ -95,15 +83,11 @@ VIEWER_POLICY = (
 
 
 class AppServer:
-    """Serves the page until it is closed.
-
-    Args:
-        options: its port and its limits.
+    """Serves the page until it is closed; a context manager that ends tasks and removes files.
 
     Attributes:
         key: the secret of this start, which every request but those for the page must have.
         port: the one that it listens at.
-        address: of the page, with the key.
 
     Raises:
         OptionError: the port is taken.
@@ -131,8 +115,7 @@ class AppServer:
         self.port = self._socket.getsockname()[1]
         self._server = uvicorn.Server(
             uvicorn.Config(
-                _Guard(self, self._routes()),
-                http=_protocol(options.max_request_s),
+                self._routes(),
                 ws="none",
                 log_config=None,
                 log_level="error",
@@ -144,18 +127,11 @@ class AppServer:
         )
 
     def __enter__(self) -> AppServer:
-        # A signal to end is Ctrl+C, so that tasks are ended and their files removed.
-        self._signals = contextlib.ExitStack()
-        self._signals.enter_context(handle_signals(signal.default_int_handler, ["SIGTERM"]))
-        self._signals.enter_context(
-            handle_signals(lambda *_: signal.raise_signal(signal.SIGTERM), ["SIGHUP"])
-        )
         return self
 
     def __exit__(self, *_: object) -> None:
         self._socket.close()
         self.jobs.close()
-        self._signals.close()
 
     @property
     def address(self) -> str:
@@ -163,7 +139,7 @@ class AppServer:
         return f"http://{HOST}:{self.port}/#key={self.key}"
 
     def serve_forever(self) -> None:
-        """Answer requests until `stop`, or until Ctrl+C or a signal to end: KeyboardInterrupt."""
+        """Answer requests until `stop`, or until Ctrl+C: KeyboardInterrupt."""
         self._server.run(sockets=[self._socket])
 
     def stop(self) -> None:
@@ -188,10 +164,29 @@ class AppServer:
             exception_handlers={
                 HTTPException: lambda _, error: _refusal(error.status_code, error.detail),
                 DeepDetectError: lambda _, error: _refusal(400, str(error)),
+                TimeoutError: lambda *_: _refusal(408, "the request takes too long", CLOSE),
                 OSError: lambda _, error: _refusal(400, CANNOT_START.format(error.strerror)),
+                ClientDisconnect: lambda *_: _refusal(400, "the connection has ended"),
             },
+            middleware=[Middleware(BaseHTTPMiddleware, dispatch=self._guard)],
             lifespan=self._watched,
         )
+
+    async def _guard(self, request: Request, answer: RequestResponseEndpoint) -> Response:
+        """Refuse requests for other computers (DNS rebinding), and of other pages."""
+        host = request.headers.get("Host")
+        allowed = [f"{name}:{self.port}" for name in NAMES]
+        if self.port == HTTP_PORT:  # browsers leave it out
+            allowed += NAMES
+        if host not in allowed:
+            response = _refusal(421, "this address is not served here")
+        elif request.headers.get("Origin", f"http://{host}") != f"http://{host}":
+            response = _refusal(403, "only the page of deepdetect app may ask this")
+        else:
+            response = await answer(request)
+        for name, value in HEADERS.items():
+            response.headers.setdefault(name, value)
+        return response
 
     @contextlib.asynccontextmanager
     async def _watched(self, _: Starlette) -> AsyncIterator[None]:
@@ -257,7 +252,8 @@ class AppServer:
             raise HTTPException(400, f"an image cannot be {width}x{height} here")
         if _body_length(request, 3 * width * height) != 3 * width * height:
             raise HTTPException(400, "these are not the pixels of such an image")
-        rgb = np.frombuffer(await request.body(), np.uint8).reshape(height, width, 3)
+        async with asyncio.timeout(self.options.max_request_s):
+            rgb = np.frombuffer(await request.body(), np.uint8).reshape(height, width, 3)
 
         def logits() -> bytes:
             with self._network:
@@ -273,11 +269,15 @@ class AppServer:
             raise unknown_name("task", kind[:MAX_NAME_LENGTH], TASKS)
         left = _body_length(request, int(options.max_task_mb * 1e6) + MAX_DESCRIPTION_BYTES)
         self.jobs.check_room()
-        body = _Body(request)
+        async with asyncio.timeout(options.max_request_s):
+            return await self._received(kind, _Body(request), left)
+
+    async def _received(self, kind: str, body: _Body, left: int) -> Response:
         size = int.from_bytes(await body.read(min(4, left)))
         if not 0 < size <= min(MAX_DESCRIPTION_BYTES, left - 4):
             raise HTTPException(400, "the description of the task is missing")
         names, sizes, given = _described(await body.read(size))
+        options = self.options
         if len(names) > options.max_files:
             raise OptionError(
                 f"there are {len(names)} images, over {options.max_files}: give fewer, or "
@@ -329,83 +329,6 @@ class AppServer:
         return JSONResponse({})
 
 
-class _Guard:
-    """Refuses requests for other computers (DNS rebinding), of other pages, and too slow ones."""
-
-    def __init__(self, server: AppServer, app: ASGIApp) -> None:
-        self.server, self.app = server, app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":  # the server's start and end
-            await self.app(scope, receive, send)
-            return
-        clock, still_s = asyncio.get_running_loop().time, self.server.options.max_request_s
-        deadline = clock() + SLOWEST * still_s
-        whole = False
-
-        async def receive_in_time() -> Message:
-            nonlocal whole
-            if whole:  # it is waited for the end of the connection
-                return await receive()
-            try:
-                async with asyncio.timeout_at(min(deadline, clock() + still_s)):
-                    message = await receive()
-            except TimeoutError:
-                raise HTTPException(408, "the request takes too long") from None
-            whole = not message.get("more_body")
-            return message
-
-        async def send_guarded(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                left = max(DRAINED_BYTES, scope.get(ACCEPTED, 0))
-                with contextlib.suppress(HTTPException):
-                    while not whole and left > 0:
-                        left -= len((await receive_in_time()).get("body", b""))
-                headers = MutableHeaders(scope=message)
-                for name, value in HEADERS.items():
-                    headers.setdefault(name, value)
-                if not whole:  # the rest would be taken for the next request
-                    headers["Connection"] = "close"
-            await send(message)
-
-        refusal = self._refusal(Headers(scope=scope))
-        with contextlib.suppress(ClientDisconnect):
-            await (refusal or self.app)(scope, receive_in_time, send_guarded)
-
-    def _refusal(self, headers: Headers) -> Response | None:
-        host, port = headers.get("Host"), self.server.port
-        allowed = [f"{name}:{port}" for name in NAMES]
-        if port == HTTP_PORT:  # browsers leave it out
-            allowed += NAMES
-        if host not in allowed:
-            return _refusal(421, "this address is not served here")
-        if headers.get("Origin", f"http://{host}") != f"http://{host}":
-            return _refusal(403, "only the page of deepdetect app may ask this")
-        return None
-
-
-def _protocol(still_s: float) -> type[H11Protocol]:
-    """Return uvicorn's protocol, which also ends connections on which a request stands still."""
-
-    class Protocol(H11Protocol):
-        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-            super().connection_made(transport)
-            self._end_when_still()
-
-        def data_received(self, data: bytes) -> None:
-            super().data_received(data)
-            self._end_when_still()
-
-        def _end_when_still(self) -> None:
-            if self.cycle is None or self.cycle.response_complete:
-                self._unset_keepalive_if_required()
-                self.timeout_keep_alive_task = self.loop.call_later(
-                    still_s, self.timeout_keep_alive_handler
-                )
-
-    return Protocol
-
-
 class _Body:
     """The body of a request, read in parts of known lengths."""
 
@@ -424,8 +347,8 @@ class _Body:
         return b"".join([piece async for piece in self.pieces(length)])
 
 
-def _refusal(status: int, sentence: str) -> Response:
-    return JSONResponse({"error": sentence}, status)
+def _refusal(status: int, sentence: str, headers: dict[str, str] | None = None) -> Response:
+    return JSONResponse({"error": sentence}, status, headers)
 
 
 def _body_length(request: Request, largest: int) -> int:
@@ -437,7 +360,6 @@ def _body_length(request: Request, largest: int) -> int:
         raise HTTPException(
             413, f"this is over {largest / 1e6:.3g} MB: give fewer or smaller images"
         )
-    request.scope[ACCEPTED] = int(text)
     return int(text)
 
 

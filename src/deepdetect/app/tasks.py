@@ -30,29 +30,23 @@ ASSUMED_FOCAL = 1.2
 Report = Callable[[str, int, int], None]
 """Is told the stage that begins, how many are done, and how many there are (0: not known)."""
 
+Options = Mapping[str, float]
+
 
 @dataclass(frozen=True)
 class SentImage:
-    """An image that the page has sent.
-
-    Attributes:
-        path: of the file.
-        name: that the user knows it by; never used as a path.
-    """
+    """The file of an image that the page has sent, and its name there; never used as a path."""
 
     path: Path
     name: str
 
 
+Images = Sequence[SentImage]
+
+
 @dataclass(frozen=True)
 class TaskResult:
-    """What a task returns.
-
-    Attributes:
-        numbers: names and values, as text.
-        shown: name of the file that the page shows, .html, .jpg or .png.
-        files: names of all files that can be downloaded, in their order.
-    """
+    """Names and values as text, the file that the page shows, and all that can be downloaded."""
 
     numbers: Mapping[str, str]
     shown: str
@@ -63,18 +57,14 @@ class TaskResult:
 class Task:
     """A line of the table of tasks.
 
-    Attributes:
-        title, note: for the page.
-        run: does it, with the images, the options, the folder, and what is told the progress.
-        files: least and largest number of images; None for as many as are allowed.
-        packages: that it needs beside those that DeepDetect brings.
-        options: names of the numbers that it takes, and what the page calls them.
-        folder: whether it is for whole folders.
+    `files` are the least and the largest number of images, None for as many as are allowed;
+    `packages` those that it needs beside those that DeepDetect brings; `options` the names of the
+    numbers that it takes, and what the page calls them; `folder` whether it is for whole folders.
     """
 
     title: str
     note: str
-    run: Callable[[Sequence[SentImage], Mapping[str, float], Path, Report], TaskResult]
+    run: Callable[[Images, Options, Path, Report], TaskResult]
     files: tuple[int, int | None]
     packages: tuple[str, ...] = ()
     options: Mapping[str, str] = field(default_factory=dict)
@@ -87,12 +77,7 @@ class Task:
         return install_command(*absent) if absent else ""
 
     def check(self, count: int, options: Mapping[str, object]) -> dict[str, float]:
-        """Return the options as numbers.
-
-        Raises:
-            OptionError: the number of images or an option does not fit, or a package is
-                missing.
-        """
+        """Return the options as numbers, where they and the number of images fit."""
         least, most = self.files
         if count < least or (most is not None and count > most):
             number = f"{least}" if most == least else f"at least {least}"
@@ -107,9 +92,7 @@ class Task:
         return {name: float(value) for name, value in options.items()}  # type: ignore[arg-type]
 
 
-def run_match(
-    images: Sequence[SentImage], options: Mapping[str, float], folder: Path, report: Report
-) -> TaskResult:
+def run_match(images: Images, options: Options, folder: Path, report: Report) -> TaskResult:
     """Match two images, guided by a geometry."""
     from ..io.image import load_image
     from ..io.tables import save_matches
@@ -137,9 +120,7 @@ def run_match(
     return TaskResult(numbers, "matches.jpg", ("matches.csv", "matches.npz", "matches.jpg"))
 
 
-def run_register(
-    images: Sequence[SentImage], options: Mapping[str, float], folder: Path, report: Report
-) -> TaskResult:
+def run_register(images: Images, options: Options, folder: Path, report: Report) -> TaskResult:
     """Warp the second image into the frame of the first."""
     import numpy as np
 
@@ -164,9 +145,7 @@ def run_register(
     return TaskResult(numbers, "checkerboard.png", (*pictures, "homography.txt"))
 
 
-def run_stitch(
-    images: Sequence[SentImage], options: Mapping[str, float], folder: Path, report: Report
-) -> TaskResult:
+def run_stitch(images: Images, options: Options, folder: Path, report: Report) -> TaskResult:
     """Make a panorama."""
     from ..matching.stitching import STAGES, stitch
     from ..viz.draw import save_picture
@@ -186,9 +165,7 @@ def run_stitch(
     return TaskResult(numbers, "panorama.jpg", ("panorama.jpg",))
 
 
-def run_reconstruct(
-    images: Sequence[SentImage], options: Mapping[str, float], folder: Path, report: Report
-) -> TaskResult:
+def run_reconstruct(images: Images, options: Options, folder: Path, report: Report) -> TaskResult:
     """Make a 3D model of two images."""
     from ..detector.detector import DeepDetect
     from ..io.exif import calibration_from_exif
@@ -234,7 +211,7 @@ def run_reconstruct(
 
 
 def run_reconstruct_many(
-    images: Sequence[SentImage], options: Mapping[str, float], folder: Path, report: Report
+    images: Images, options: Options, folder: Path, report: Report
 ) -> TaskResult:
     """Make cameras and a dense model of many images."""
     from ..sfm.pipeline import reconstruct_many
@@ -253,7 +230,7 @@ def run_reconstruct_many(
 
 
 def run_folder_keypoints(
-    images: Sequence[SentImage], options: Mapping[str, float], folder: Path, report: Report
+    images: Images, options: Options, folder: Path, report: Report
 ) -> TaskResult:
     """Write the best keypoints of each image, as one CSV file each, into one ZIP file."""
     from ..detector.point_detector import PointDetector

@@ -102,6 +102,13 @@ def open_hdf5(path: Path) -> Iterator[Any]:
             raise damaged(path, error) from error
 
 
+def feature_names(file: Any) -> list[str]:
+    """List the images that have features in a file."""
+    names: list[str] = []
+    file.visit(names.append)
+    return [name.removesuffix("/keypoints") for name in names if name.endswith("/keypoints")]
+
+
 def damaged(path: Path, error: Exception) -> InvalidFileError:
     """Return the error of a file, or of a part of it, that cannot be read."""
     reason = (str(error).splitlines() or [type(error).__name__])[0]

@@ -51,6 +51,18 @@ def read_pairs(path: str | Path) -> list[Pair]:
     return _once_each(pairs)
 
 
+def sequential_pairs(names: Sequence[str], following: int) -> list[Pair]:
+    """Return each name with so many that follow it.
+
+    Example:
+        >>> sequential_pairs(["a", "b", "c", "d"], 2)
+        [('a', 'b'), ('a', 'c'), ('b', 'c'), ('b', 'd'), ('c', 'd')]
+    """
+    return [
+        (name, other) for k, name in enumerate(names) for other in names[k + 1 : k + 1 + following]
+    ]
+
+
 def check_pairs(pairs: Sequence[Pair]) -> list[Pair]:
     """Return pairs that were given from Python, once each.
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from natsort import natsorted, ns
 
 from .. import __version__
 from .._shared.errors import InvalidFileError, OptionError
@@ -24,8 +25,18 @@ from ..geometry.estimation import check_model
 from ..matching.unguided import match_features
 from .engines import get_engine
 from .extraction import DESCRIPTOR, keypoints_of
-from .hdf5 import SETTINGS, Group, ShardedWriter, State, damaged, open_hdf5, state_of, write_groups
-from .pair_list import Pair, check_pairs, pair_name, read_pairs
+from .hdf5 import (
+    SETTINGS,
+    Group,
+    ShardedWriter,
+    State,
+    damaged,
+    feature_names,
+    open_hdf5,
+    state_of,
+    write_groups,
+)
+from .pair_list import Pair, check_pairs, pair_name, read_pairs, sequential_pairs
 from .report import BatchReport
 
 PAIRS_PER_SHARD = 64
@@ -80,6 +91,7 @@ def match_pairs(
     engine: str = "processes",
     workers: int | None = None,
     overwrite: bool = False,
+    sequential: int = 10,
     quiet: bool = True,
 ) -> BatchReport:
     """Match the features of pairs of images, into an HDF5 file of hloc's layout.
@@ -94,13 +106,15 @@ def match_pairs(
 
     Args:
         features: file of `extract_features`, or of hloc.
-        pairs: of names, or a text file with one on each line. One that is there twice, or also the
-            other way round, is taken once.
+        pairs: "exhaustive": all; "sequential": each image with those that follow it by name; or
+            pairs of names, or a text file with one on each line, of which one that is there twice,
+            or also the other way round, is taken once.
         path: the file.
         options: how they are matched.
         engine: "processes" of this machine, or "ray" for a cluster.
         workers: number of processes; default one per processor.
         overwrite: replace the file.
+        sequential: number of following images that each is matched with.
         quiet: show no progress bar.
 
     Returns:
@@ -118,8 +132,15 @@ def match_pairs(
         ...     match_pairs("features.h5", "pairs.txt", "matches.h5").check()
     """
     map_tasks: TaskMap = get_engine(engine)
-    listed = read_pairs(pairs) if isinstance(pairs, (str, Path)) else check_pairs(pairs)
     source, target = Path(features).absolute(), Path(path).absolute()
+    if sequential < 1:
+        raise OptionError(f"`sequential` must be at least 1, not {sequential}")
+    if pairs in ("exhaustive", "sequential"):
+        with open_hdf5(source) as file:
+            names = natsorted(feature_names(file), alg=ns.PATH)
+        listed = sequential_pairs(names, len(names) if pairs == "exhaustive" else sequential)
+    else:
+        listed = read_pairs(pairs) if isinstance(pairs, (str, Path)) else check_pairs(pairs)
     if source == target:
         raise OptionError(f"{path} holds the features: give the matches another file with -o")
     found, failures, gone, made_with = _find_pairs(source, listed)

@@ -55,7 +55,7 @@ def map_on_ray(
         DeepDetectError: the cluster failed, or is what the function raised.
     """
     if workers is not None and workers < 1:
-        raise OptionError(f"workers must be at least 1, not {workers}")
+        raise OptionError(f"`workers` must be at least 1, not {workers}")
     ray = _import_ray()
     if not len(tasks):
         return

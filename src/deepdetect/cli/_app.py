@@ -7,14 +7,12 @@ import importlib
 import re
 import textwrap
 from collections.abc import Sequence
-from contextlib import nullcontext
 from itertools import zip_longest
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 from cyclopts.help import PlainFormatter
 
-from ..io.image_file import limit_megapixels
 from ._commands import COMMANDS
 from ._options import MORE
 
@@ -78,10 +76,24 @@ def make_app() -> App:
     )
     app["--help"].group = ()
     for group in COMMANDS.values():
-        for name in group:
-            module = name.replace("-", "_")
-            app.command(f"{__package__}.{module}:{module}", name=name)
+        for name, (module, _) in group.items():
+            app.command(f"{__package__}.{module}:{name.replace('-', '_')}", name=name)
     return app
+
+
+def completion(
+    shell: Annotated[
+        Literal["bash", "zsh", "fish", "powershell"], Parameter(help="Name of the shell.")
+    ],
+    /,
+) -> None:
+    """Print what makes a shell complete commands, options and choices.
+
+    deepdetect completion bash > ~/.local/share/bash-completion/completions/deepdetect
+    deepdetect completion zsh > ~/.zsh/completions/_deepdetect
+    deepdetect completion fish > ~/.config/fish/completions/deepdetect.fish
+    """
+    print(make_app().generate_completion(shell=shell))
 
 
 def call(words: Sequence[str]) -> int:
@@ -90,13 +102,12 @@ def call(words: Sequence[str]) -> int:
     Raises:
         CycloptsError: the command or an option is unknown, or a value cannot be read.
     """
-    importlib.import_module(f".{words[0].replace('-', '_')}", __package__)  # with its own errors
+    (module,) = (group[words[0]][0] for group in COMMANDS.values() if words[0] in group)
+    importlib.import_module(f".{module}", __package__)  # with its own errors
     FORMATTER.shows_all = "--help-all" in words
     words = ["--help" if word == "--help-all" else word for word in words]
     command, bound, _ = make_app().parse_args(words, print_error=False, exit_on_error=False)
-    megapixels = bound.arguments.pop("max_megapixels", None)
-    with nullcontext() if megapixels is None else limit_megapixels(megapixels):
-        return command(*bound.args, **bound.kwargs) or 0
+    return command(*bound.args, **bound.kwargs) or 0
 
 
 def with_flags(message: str, words: Sequence[str]) -> str:

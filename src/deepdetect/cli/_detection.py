@@ -20,15 +20,15 @@ Detector = Annotated[
 
 NETWORK = From(
     DeepDetect,
-    "weights resolution backend device threads precision tta tile_megapixels",
-    common="weights",
+    "weights",
+    more="resolution backend device threads precision tta tile_megapixels",
     types={"weights": str, "backend": Literal[("auto", *BACKENDS)]},
     defaults={"threads": "the backend's choice"},
 )
-POINTS = From(PointDetector, "spread ranker")
+POINTS = From(PointDetector, more="spread ranker")
 SELECTION = From(
     SelectionOptions,
-    common="max_keypoints threshold density",
+    "max_keypoints threshold density",
     defaults={"max_keypoints": "2048 with --detector points, else all"},
 )
 
@@ -38,20 +38,12 @@ def chosen_detector(
 ) -> tuple[DeepDetect | PointDetector, SelectionOptions | None]:
     """Make the detector that is chosen, and its selection, taking their options out of the values.
 
-    Args:
-        kind: "network" or "points".
-        values: of `NETWORK`, `POINTS` and `SELECTION`.
-        max_keypoints: of points, where nothing else is given.
-        defaults: of the network, where nothing else is given.
-
-    Raises:
-        OptionError: an option is of the other detector.
+    The number of points and the defaults of the network are used where nothing else is given.
     """
     network, points, selection = (source.take(values) for source in (NETWORK, POINTS, SELECTION))
     if kind == "points":
-        common = {name: network.pop(name) for name in ("resolution",) if name in network}
-        points = {"max_keypoints": max_keypoints, **common, **points}
-        points |= {n: selection.pop(n) for n in ("max_keypoints",) if n in selection}
+        points["max_keypoints"] = selection.pop("max_keypoints", max_keypoints)
+        points["resolution"] = network.pop("resolution", "auto")
     for name in (*network, *selection) if kind == "points" else points:
         other = "network" if kind == "points" else "points"
         raise OptionError(f"`{name}` is for --detector {other}: leave it out, or choose that")

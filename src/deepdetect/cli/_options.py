@@ -2,35 +2,33 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 import json
+import os
 import re
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from cyclopts import Group, Parameter
-from cyclopts.validators import Number
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import BatchError, DeepDetectError, OptionError
 from .._shared.records import Outputs, check_not_made, outputs_in
-from .._shared.signals import handle_signals
-
-NOTHING_FOUND = 3
-"""Exit code where all went well and nothing was found."""
+from .._shared.signals import exit_by_signal, handle_signals
+from ..io.image_file import MAX_MEGAPIXELS, limit_megapixels, open_image
+from ._commands import NOTHING_FOUND as NOTHING_FOUND
 
 MORE = Group("More options")
 """Shown by --help-all."""
 
 ALIASES = {"max_keypoints": ("--num-keypoints", "--top-k", "--max-num-keypoints")}
 """What people type."""
-
-Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 @dataclass(frozen=True)
@@ -41,8 +39,8 @@ class From:
 
     Attributes:
         target: the function or class.
-        names: of the parameters, with blanks between; empty for all.
-        common: those that --help shows; the others are shown by --help-all.
+        common: names of those that --help shows, with blanks between.
+        more: of those that --help-all shows; None: all others.
         flags: flags that are not the name, as {"focal_px": "--focal"}, or with the negative one
             after a slash.
         types: types of parameters that are wider than what can be typed.
@@ -50,18 +48,23 @@ class From:
     """
 
     target: Callable[..., Any]
-    names: str = ""
     common: str = ""
+    more: str | None = None
     flags: Mapping[str, str] = field(default_factory=dict)
     types: Mapping[str, Any] = field(default_factory=dict)
     defaults: Mapping[str, str] = field(default_factory=dict)
+
+    def names(self) -> dict[str, None]:
+        """Return the names of the parameters."""
+        more = inspect.signature(self.target).parameters if self.more is None else self.more.split()
+        return dict.fromkeys([*self.common.split(), *more])
 
     def parameters(self) -> Iterator[inspect.Parameter]:
         """Make the options as keyword parameters."""
         parameters = inspect.signature(self.target).parameters
         helps = attribute_helps(inspect.getdoc(self.target) or "")
         scope = vars(sys.modules[self.target.__module__])
-        for name in self.names.split() or parameters:
+        for name in self.names():
             hint = self.types.get(name) or eval(str(parameters[name].annotation), scope)
             flag, _, negative = self.flags.get(name, "").partition("/")
             settings: dict[str, Any] = {"name": flag or None, "alias": ALIASES.get(name)}
@@ -76,18 +79,76 @@ class From:
 
     def take(self, values: dict[str, Any]) -> dict[str, Any]:
         """Take these options out of those that were given."""
-        names = self.names.split() or inspect.signature(self.target).parameters
-        return {name: values.pop(name) for name in names if name in values}
+        return {name: values.pop(name) for name in self.names() if name in values}
 
 
-def with_options(*sources: From) -> Callable[[Function], Function]:
-    """Give a command with `**values` the options of other functions: those that are given."""
+MEGAPIXELS = From(
+    open_image, more="max_megapixels", defaults={"max_megapixels": f"{MAX_MEGAPIXELS:g}"}
+)
+"""Of commands that read images."""
 
-    def decorate(function: Function) -> Function:
-        own = [*inspect.signature(function).parameters.values()][:-1]
+Json = Annotated[bool, Parameter("--json", negative="", help="Print the result as JSON.")]
+JSON = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Json)
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a command has found, which is printed when it returns.
+
+    Attributes:
+        values: for --json, and as a table for the terminal unless there is a text.
+        text: for the terminal.
+        failures: a sentence on each input that could not be worked on: exit code 1.
+        total, what: number and name of the inputs; what is wrong with a single one is the error.
+        exit_code: where nothing failed.
+    """
+
+    values: Any
+    text: str = ""
+    failures: Sequence[str] = ()
+    total: int = 0
+    what: str = "images"
+    exit_code: int = 0
+
+    def show(self, as_json: bool) -> int:
+        """Print it; return the exit code, or raise what failed."""
+        if os.environ.get("RANK", "0") != "0":  # of the processes of torchrun the first one prints
+            return self.exit_code
+        if as_json:
+            print(json.dumps(self.values, indent=2, default=str))
+        else:
+            print(self.text or table(self.values))
+        if self.failures and self.total == 1:
+            raise DeepDetectError(self.failures[0])
+        if self.failures:
+            number = f"{len(self.failures)} of {self.total or 'the'} {self.what}"
+            raise BatchError(f"{number} failed, the others are done", self.failures)
+        return self.exit_code
+
+
+def command(
+    *sources: From, prints: bool = True
+) -> Callable[[Callable[..., Result | None]], Callable[..., int]]:
+    """Make a command of a function: its result is printed, and it has the option --json.
+
+    The options of the sources that are given are its `**values`.
+    """
+
+    def decorate(function: Callable[..., Result | None]) -> Callable[..., int]:
+        @functools.wraps(function)
+        def run(*arguments: Any, as_json: bool = False, **values: Any) -> int:
+            limited = "max_megapixels" in values
+            limit = limit_megapixels(values.pop("max_megapixels")) if limited else nullcontext()
+            with limit:
+                result = function(*arguments, **values)
+            return 0 if result is None else result.show(as_json)
+
+        signature = inspect.signature(function, eval_str=True)
+        own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
         made = [option for source in sources for option in source.parameters()]
-        function.__signature__ = inspect.Signature([*own, *made])  # type: ignore[attr-defined]
-        return function
+        options = [*own, *([JSON] if prints else []), *made]
+        run.__signature__ = signature.replace(parameters=options)  # type: ignore[attr-defined]
+        return run
 
     return decorate
 
@@ -115,33 +176,14 @@ def attribute_helps(doc: str) -> dict[str, str]:
     return helps
 
 
-Images = Annotated[list[Path], Parameter(help="Image files or folders.")]
+Images = Annotated[Path, Parameter(help="Image files or folders.", required=True)]
 Image = Annotated[Path, Parameter(help="Image file.")]
 Output = Annotated[Path, Parameter(name=("--output", "-o"))]
 Folder = Annotated[Path, Parameter(name=("--output", "-o"), help="Folder for the results.")]
 Overwrite = Annotated[
     bool, Parameter(negative="", help="Replace what exists already, and do all of it again.")
 ]
-Json = Annotated[bool, Parameter("--json", negative="", help="Print the result as JSON.")]
 Format = Annotated[Literal["npz", "csv"], Parameter("--format", help="Format of the data files.")]
-MaxMegapixels = Annotated[
-    float, Parameter(group=MORE, help="Refuse larger images before they are decoded.")
-]
-Workers = Annotated[
-    int | None,
-    Parameter(
-        group=MORE,
-        validator=Number(gte=1),
-        help="Processes at work.  [default: one per processor of the machine or cluster]",
-    ),
-]
-Engine = Annotated[
-    str,
-    Parameter(
-        group=MORE,
-        help="What does the work: processes of this machine, or ray for a cluster (RAY_ADDRESS).",
-    ),
-]
 
 
 def output_file(output: Path, name: str) -> Path:
@@ -150,25 +192,17 @@ def output_file(output: Path, name: str) -> Path:
 
 
 def output_folder(output: Path) -> Path:
-    """Return the folder that -o names.
-
-    Raises:
-        OptionError: it has the ending of a file.
-    """
+    """Return the folder that -o names, unless it has the ending of a file."""
     if re.fullmatch(r"\.(npz|csv|json|txt|png|jpe?g|tiff?|webp)", output.suffix.lower()):
         raise OptionError(f"-o names the folder for all results: {output} looks like one file")
     return output
 
 
 def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
-    """Replace folders by the images below them, and check that results will not collide.
+    """Replace folders by the images below them, and check that no two have one name.
 
     The folder of the results is left out when it lies in one of the folders; where it is one of
     them, what earlier runs made in it.
-
-    Raises:
-        ImageError: a folder holds no image.
-        OptionError: two images have one name, or a folder holds only what earlier runs made.
     """
     from ..io.image import find_images
 
@@ -193,30 +227,29 @@ def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
 
 
 def check_inputs_survive(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """Check that no file to be written is one of those that are read, under whatever name.
-
-    Raises:
-        OptionError: one is.
-    """
+    """Check that no file to be written is one of those that are read, under whatever name."""
     # Not by name: links, and capitals on some systems, give one file several.
-    existing = [path for path in inputs if path.exists()]
+    files = {(path.stat().st_dev, path.stat().st_ino) for path in inputs if path.exists()}
     for output in outputs:
-        if output.exists() and any(output.samefile(path) for path in existing):
+        if output.exists() and (output.stat().st_dev, output.stat().st_ino) in files:
             raise OptionError(
                 f"{output} would be written over, which is an input: choose another place with -o"
             )
 
 
 def check_folder_not_made(folder: Path, output: Path) -> None:
-    """Refuse a folder that holds images which earlier runs made, but for those below the output.
-
-    Raises:
-        OptionError: one of them is an output, or lies in a folder that is one.
-    """
+    """Refuse a folder that holds images which earlier runs made, but for those below the output."""
     from ..io.image import find_images
 
     if any(folder.glob("**/.deepdetect")):
         check_not_made(folder, find_images(folder, [output]))
+
+
+@contextmanager
+def claimed(outputs: Outputs) -> Iterator[dict[str, Any]]:
+    """Write outputs, as `Outputs.writing`; signals that end the process leave no trace either."""
+    with handle_signals(exit_by_signal), outputs.writing() as values:
+        yield values
 
 
 @contextmanager
@@ -227,22 +260,16 @@ def whole(files: Mapping[str, Path]) -> Iterator[dict[str, Path]]:
 
 
 @contextmanager
-def writing(outputs: Outputs) -> Iterator[dict[str, Any]]:
-    """Write outputs, as `Outputs.writing`; signals that end the process leave no trace either."""
+def writing(
+    files: Mapping[str, Path], inputs: Sequence[Path], overwrite: bool
+) -> Iterator[dict[str, Path]]:
+    """Give temporary paths for files, as `whole`, and record what they are made of.
 
-    def end(number: int, _: object) -> None:
-        raise SystemExit(128 + number)  # as a shell has it
-
-    with handle_signals(end), outputs.writing() as values:
-        yield values
-
-
-def report_failures(failures: Sequence[str], total: int, what: str = "images") -> None:
-    """Raise a BatchError when some of several images failed; of a single one, its error."""
-    if failures and total == 1:
-        raise DeepDetectError(failures[0])
-    if failures:
-        raise BatchError(f"{len(failures)} of {total} {what} failed, the others are done", failures)
+    No input is written over, nor what was made of others.
+    """
+    check_inputs_survive(files.values(), inputs)
+    with claimed(Outputs([*files.values()], inputs, overwrite=overwrite)), whole(files) as made:
+        yield made
 
 
 def note(text: str) -> None:
@@ -250,40 +277,25 @@ def note(text: str) -> None:
     print(text, file=sys.stderr)
 
 
-def print_json(value: Any) -> None:
-    """Print a value as JSON; paths become text."""
-    print(json.dumps(value, indent=2, default=str))
-
-
-def print_result(as_json: bool, values: Mapping[str, Any], title: str = "") -> None:
-    """Print the result of a command: as JSON, or as a table of its names and values."""
-    if as_json:
-        print_json(values)
-    else:
-        print_table(_rows(values), title)
-
-
-def print_columns(values: Sequence[Mapping[str, Any]]) -> None:
-    """Print several results of the same kind side by side."""
-    columns = [dict(_rows(each)) for each in values]
-    names = dict.fromkeys(name for column in columns for name in column)
-    wide = max(len(name) for name in names)
-    for name in names:
-        print(f"  {name:<{wide}}", *(f"{column.get(name, '-'):>20}" for column in columns))
-
-
 MAX_DEPTH = 2
 """Of dictionaries within others, in a table."""
 
 
-def _rows(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the rows of a table; tables and matrices within are left to JSON."""
+def table(values: Mapping[str, Any], title: str = "") -> str:
+    """Return names and values in two columns; tables and matrices among them are left to JSON."""
+    rows = [*table_rows(values)]
+    width = max((len(name) for name, _ in rows), default=0)
+    return "\n".join([*filter(None, [title]), *(f"  {n:<{width}}  {v}" for n, v in rows)])
+
+
+def table_rows(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the rows of a table."""
     for name, value in values.items():
         if name == "failures":  # listed at the end
             continue
         title = prefix + str(name).replace("_", " ")
         if isinstance(value, Mapping):
-            yield from () if prefix.count(":") == MAX_DEPTH else _rows(value, f"{title}: ")
+            yield from () if prefix.count(":") == MAX_DEPTH else table_rows(value, f"{title}: ")
         elif isinstance(value, (list, tuple)):
             if value and not any(isinstance(each, (list, tuple, Mapping)) for each in value):
                 yield title, ", ".join(map(_text, value))
@@ -297,13 +309,3 @@ def _text(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     return f"{value:,}" if isinstance(value, int) else str(value)
-
-
-def print_table(rows: Iterable[tuple[str, str]], title: str = "") -> None:
-    """Print names and values in two columns."""
-    if title:
-        print(title)
-    rows = list(rows)
-    width = max((len(name) for name, _ in rows), default=0)
-    for name, value in rows:
-        print(f"  {name:<{width}}  {value}")

@@ -8,11 +8,12 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from .._shared.errors import MissingExtraError, install_command
+from .._shared.signals import endings_interrupt
 from ..app.options import AppOptions
-from ._options import From, note, with_options
+from ._options import From, command, note
 
 
-@with_options(From(AppOptions, common="port"))
+@command(From(AppOptions, "port"), prints=False)
 def app(
     *,
     open_browser: Annotated[bool, Parameter("--open", negative="")] = False,
@@ -35,7 +36,8 @@ def app(
         raise MissingExtraError(
             f"deepdetect app needs {error.name}: run {install_command('starlette', 'uvicorn')}"
         ) from None
-    with AppServer(AppOptions(**values)) as server:
+    # Any signal to end is Ctrl+C, so that tasks are ended and their files removed.
+    with endings_interrupt(), AppServer(AppOptions(**values)) as server:
         try:
             print(f"DeepDetect is at {server.address}", flush=True)
             note("Ctrl+C ends it.")

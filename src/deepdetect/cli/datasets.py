@@ -9,41 +9,38 @@ from cyclopts import App, Parameter
 
 from ..datasets import find_remote_dataset, get_dataset, remote_datasets
 from ..io.image import find_images
-from ._options import Json, Output, print_json, print_result
+from ._options import Output, Result, command, table
 
 datasets = App("datasets", help="Download data sets for training and for the benchmarks.")
 
 
 @datasets.command(name="list")
-def list_datasets(*, as_json: Json = False) -> None:
+@command()
+def list_datasets() -> Result:
     """Show the data sets that can be downloaded."""
+    found = remote_datasets().values()
     values = [
         {
-            "name": dataset.name,
-            "title": dataset.title,
-            "images": dataset.images,
-            "bytes": dataset.size,
-            "licence": dataset.licence,
-            "urls": [url for file in dataset.files for url in file.urls],
+            **{name: getattr(each, name) for name in ("name", "title", "images", "licence")},
+            "bytes": each.size,
         }
-        for dataset in remote_datasets().values()
+        for each in found
     ]
-    if as_json:
-        print_json(values)
-        return
-    for each in values:
-        print_result(False, {**each, "urls": None})
-        print()
+    urls = [[url for file in each.files for url in file.urls] for each in found]
+    return Result(
+        [{**each, "urls": listed} for each, listed in zip(values, urls, strict=True)],
+        "\n\n".join(map(table, values)),
+    )
 
 
 @datasets.command
+@command()
 def get(
     name: Annotated[str, Parameter(help=f"One of {', '.join(remote_datasets())}.")],
     /,
     *,
     output: Output | None = None,
-    as_json: Json = False,
-) -> None:
+) -> Result:
     """Download a data set and unpack it.
 
     Run it again to resume a download that broke off.
@@ -57,7 +54,7 @@ def get(
         output: Folder for the images.  [default: data/NAME]
     """
     dataset = find_remote_dataset(name)
-    folder = get_dataset(dataset, output or Path("data") / dataset.name, quiet=as_json)
+    folder = get_dataset(dataset, output or Path("data") / dataset.name, quiet=False)
     images = len(find_images(folder))
-    values = {"name": dataset.name, "folder": folder, "images": images}
-    print_result(as_json, values | {"licence": dataset.licence})
+    values = {"name": name, "folder": folder, "images": images, "licence": dataset.licence}
+    return Result(values)

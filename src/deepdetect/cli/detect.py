@@ -25,21 +25,17 @@ from . import _options as cli
 from ._detection import NETWORK, POINTS, SELECTION, Detector, chosen_detector
 
 
-@cli.with_options(SELECTION, POINTS, NETWORK)
+@cli.command(SELECTION, POINTS, NETWORK, cli.MEGAPIXELS)
 def detect(
-    images: cli.Images,
-    /,
-    *,
+    *images: cli.Images,
     output: cli.Folder = Path("deepdetect-output"),
     detector: Detector = "network",
     ignore: Path | None = None,
     file_format: cli.Format = "npz",
     pictures: bool = True,
     overwrite: cli.Overwrite = False,
-    as_json: cli.Json = False,
-    max_megapixels: cli.MaxMegapixels = 200,
     **values: Any,
-) -> int:
+) -> cli.Result:
     """Detect the keypoints of images (files or folders).
 
     Writes for each image STEM.npz (or .csv) with the positions and scores, and the pictures
@@ -48,8 +44,7 @@ def detect(
 
     Images that are done are skipped when the same command runs again, and done again with other
     options. What was made from other images of the same name, or by something else, is replaced
-    with --overwrite only. An image that cannot be read does not stop the others: they are listed
-    at the end, with exit code 1. If no image has any keypoint the exit code is 3.
+    with --overwrite only. If no image has any keypoint the exit code is 3.
 
         deepdetect detect photo.jpg
         deepdetect detect photos/ -o keypoints --detector points --spread grid
@@ -70,124 +65,118 @@ def detect(
     }
     cli.check_inputs_survive([file for files in outputs.values() for file in files.values()], paths)
     mask = None if ignore is None else load_mask(ignore)
-    given = {*values}
-    chosen, selection = chosen_detector(detector, values)
-    if detector == "network" and "max_keypoints" in given:
+    if detector == "network" and "max_keypoints" in values:
         cli.note("these are the best pixels of the heat map: --detector points finds better points")
-    settings = plain(
-        chosen.settings
-        | vars(selection or SelectionOptions())
-        | {"ignore": mask, "version": __version__}
-    )
-    _check_and_say_what_is_replaced(outputs, settings, overwrite)
+    work = _Work(*chosen_detector(detector, values), mask, overwrite)
+    work.say_what_is_replaced(outputs)
     results: list[dict[str, Any]] = []
     failures: list[str] = []
     with progress(len(paths), "detecting", "image", quiet=len(paths) == 1) as bar:
         for path, files in outputs.items():
             try:
-                results.append(
-                    _detect_one(path, files, chosen, selection, mask, settings, overwrite)
-                )
+                results.append(work.detect(path, files))
             except _Failure as failure:
                 failures.append(str(failure))
             except MemoryError:
                 failures.append(f"{path}: there is not enough memory for it: use a smaller image")
             bar.update(1)
-    if as_json:
-        backend = getattr(chosen, "runtime", None)
-        cli.print_json({"backend": backend, "images": results, "failures": failures})
-    else:
-        for result in results:
-            how = "already done" if result["skipped"] else f"{result['seconds']:.2f} s"
-            count = result["keypoints"]
-            found = f"{count:,} keypoint{'' if count == 1 else 's'}"
-            if detector == "network":  # else the number was asked for
-                found += f", density {result['density']:.3f}"
-            print(f"{result['image']}: {found}, {how} -> {result['file']}")
-    cli.report_failures(failures, len(paths))
-    if not any(result["keypoints"] for result in results):
+    nothing = not failures and not any(result["keypoints"] for result in results)
+    if nothing:
         cli.note("no keypoint was found: the image is uniform, or the options leave none")
-        return cli.NOTHING_FOUND
-    return 0
+    backend = getattr(work.detector, "runtime", None)
+    return cli.Result(
+        {"backend": backend, "images": results, "failures": failures},
+        "\n".join(map(_line, results)),
+        failures,
+        len(paths),
+        exit_code=cli.NOTHING_FOUND if nothing else 0,
+    )
+
+
+def _line(result: dict[str, Any]) -> str:
+    how = "already done" if result["skipped"] else f"{result['seconds']:.2f} s"
+    found = f"{result['keypoints']:,} keypoint{'' if result['keypoints'] == 1 else 's'}"
+    return f"{result['image']}: {found}, density {result['density']:.3f}, {how} -> {result['file']}"
 
 
 class _Failure(Exception):
     """One image cannot be worked on; whatever else is raised concerns all of them."""
 
 
-def _check_and_say_what_is_replaced(
-    outputs: dict[Path, dict[str, Path]], settings: dict[str, Any], overwrite: bool
-) -> None:
-    """Refuse outputs of other images; name the options in which earlier ones differ."""
-    changed, names = [], set()
-    for path, files in outputs.items():
-        Outputs([*files.values()], [path], overwrite=overwrite).find()
-        before = Outputs([files["file"]], [path], overwrite=overwrite).find()
-        if before is not None and before["settings"] != settings:
-            both = {**before["settings"], **settings}
-            names |= {n for n in both if before["settings"].get(n) != settings.get(n)}
-            changed.append(path)
-    if changed:
-        names = {"detector"} if "detector" in names else names
-        flags = ", ".join("--" + name.replace("_", "-") for name in sorted(names))
-        whose = str(changed[0]) if len(changed) == 1 else f"{len(changed)} images"
-        cli.note(f"replacing the results of {whose} with other options ({flags})")
+class _Work:
+    """Detects keypoints in images, each unless it is done."""
 
+    def __init__(
+        self,
+        detector: DeepDetect | PointDetector,
+        selection: SelectionOptions | None,
+        mask: np.ndarray | None,
+        overwrite: bool,
+    ) -> None:
+        self.detector, self.selection, self.mask = detector, selection, mask
+        self.overwrite = overwrite
+        options = vars(selection or SelectionOptions())
+        noted = {"ignore": mask, "version": __version__}
+        self.settings = plain(detector.settings | options | noted)
 
-def _detect_one(
-    path: Path,
-    files: dict[str, Path],
-    detector: DeepDetect | PointDetector,
-    selection: SelectionOptions | None,
-    mask: np.ndarray | None,
-    settings: dict[str, Any],
-    overwrite: bool,
-) -> dict[str, Any]:
-    """Detect, save and draw the keypoints of one image unless it is done; return its numbers."""
-    shown = {"file": files["file"], "pictures": {n: files[n] for n in files if n != "file"}}
-    outputs = Outputs([*files.values()], [path], overwrite=overwrite)
-    done = outputs.find()  # another command may have done it meanwhile
-    if done is not None and done["settings"] == settings:
-        return {"image": path, **done["numbers"], **shown, "skipped": True}
-    before = Outputs([files["file"]], [path]).find() or {} if not overwrite else {}
-    try:
-        started = time.perf_counter()
-        rgb = load_image(path)
-        if "dense" in files and isinstance(detector, DeepDetect):  # the network is run once
-            heatmap, logits = detector.heatmap_and_logits(rgb)
-            keypoints = select_keypoints(
-                heatmap, selection or SelectionOptions(), logits, ignore=mask
-            )
-        else:
-            keypoints = find_keypoints(detector, rgb, selection, mask)
-        seconds = time.perf_counter() - started
-    except (MissingExtraError, WeightsError):  # concern all images
-        raise
-    except DeepDetectError as error:
-        named = str(error) if str(path) in str(error) else f"{path}: {error}"
-        raise _Failure(named) from error
-    numbers = {
-        "width": keypoints.image_size[0],
-        "height": keypoints.image_size[1],
-        "keypoints": len(keypoints),
-        "density": round(keypoints.density, 6),
-        "seconds": round(seconds, 4),
-    }
-    with outputs.writing() as noted, cli.whole(files) as made:
-        save_keypoints(keypoints, made["file"])
-        if "keypoints" in made:
-            save_picture(draw_best_keypoints(rgb, keypoints), made["keypoints"])
-        if "dense" in made:
-            save_picture(draw_dense_keypoints(rgb, keypoints), made["dense"])
-            save_picture(draw_logits(logits), made["heatmap"])
-        noted |= {
-            "numbers": numbers,
-            "settings": settings,
-            "files": [f.name for f in outputs.paths],
+    def say_what_is_replaced(self, outputs: dict[Path, dict[str, Path]]) -> None:
+        """Refuse outputs of other images; name the options in which earlier ones differ."""
+        changed, names = [], set()
+        for path, files in outputs.items():
+            Outputs([*files.values()], [path], overwrite=self.overwrite).find()
+            before = Outputs([files["file"]], [path], overwrite=self.overwrite).find()
+            if before is not None and (old := before["settings"]) != self.settings:
+                both = {**old, **self.settings}
+                names |= {name for name in both if old.get(name) != self.settings.get(name)}
+                changed.append(path)
+        if changed:
+            names = {"detector"} if "detector" in names else names
+            flags = ", ".join("--" + name.replace("_", "-") for name in sorted(names))
+            whose = str(changed[0]) if len(changed) == 1 else f"{len(changed)} images"
+            cli.note(f"replacing the results of {whose} with other options ({flags})")
+
+    def detect(self, path: Path, files: dict[str, Path]) -> dict[str, Any]:
+        """Detect, save and draw the keypoints of one image; return its numbers."""
+        shown = {"file": files["file"], "pictures": {n: files[n] for n in files if n != "file"}}
+        outputs = Outputs([*files.values()], [path], overwrite=self.overwrite)
+        done = outputs.find()  # another command may have done it meanwhile
+        if done is not None and done["settings"] == self.settings:
+            return {"image": path, **done["numbers"], **shown, "skipped": True}
+        earlier = None if self.overwrite else Outputs([files["file"]], [path]).find()
+        try:
+            started = time.perf_counter()
+            rgb = load_image(path)
+            if "dense" in files and isinstance(self.detector, DeepDetect):  # the network runs once
+                heatmap, logits = self.detector.heatmap_and_logits(rgb)
+                selection = self.selection or SelectionOptions()
+                keypoints = select_keypoints(heatmap, selection, logits, ignore=self.mask)
+            else:
+                keypoints = find_keypoints(self.detector, rgb, self.selection, self.mask)
+            seconds = time.perf_counter() - started
+        except (MissingExtraError, WeightsError):  # concern all images
+            raise
+        except DeepDetectError as error:
+            named = str(error) if str(path) in str(error) else f"{path}: {error}"
+            raise _Failure(named) from error
+        numbers = {
+            "width": keypoints.image_size[0],
+            "height": keypoints.image_size[1],
+            "keypoints": len(keypoints),
+            "density": round(keypoints.density, 6),
+            "seconds": round(seconds, 4),
         }
-    for name in before.get("files", ()):  # of other options
-        old = files["file"].with_name(name)
-        with contextlib.suppress(OptionError):  # it has been changed since
-            if old not in outputs.paths and Outputs([old], [path]).find():
-                old.unlink()
-    return {"image": path, **numbers, **shown, "skipped": False}
+        with outputs.writing() as noted, cli.whole(files) as made:
+            save_keypoints(keypoints, made["file"])
+            if "keypoints" in made:
+                save_picture(draw_best_keypoints(rgb, keypoints), made["keypoints"])
+            if "dense" in made:
+                save_picture(draw_dense_keypoints(rgb, keypoints), made["dense"])
+                save_picture(draw_logits(logits), made["heatmap"])
+            written = [file.name for file in outputs.paths]
+            noted |= {"numbers": numbers, "settings": self.settings, "files": written}
+        for name in (earlier or {}).get("files", ()):  # of other options
+            old = files["file"].with_name(name)
+            with contextlib.suppress(OptionError):  # it has been changed since
+                if old not in outputs.paths and Outputs([old], [path]).find():
+                    old.unlink()
+        return {"image": path, **numbers, **shown, "skipped": False}

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 from .._shared.errors import DeepDetectError, install_command
-from ._options import Json, print_json, print_table
+from ._options import Result, command, table
 
 PURPOSES = {
     "app": "app",
@@ -39,7 +39,8 @@ class Finding(NamedTuple):
     remedy: str = ""
 
 
-def doctor(*, as_json: Json = False) -> int:
+@command()
+def doctor() -> Result:
     """Check the installation: versions, OpenCV, back ends, and a self-test with a known answer.
 
     Ends with exit code 1 if something that is installed does not work. Nothing is sent anywhere;
@@ -54,14 +55,12 @@ def doctor(*, as_json: Json = False) -> int:
             line = (str(error).splitlines() or [""])[0]
             findings.append(Finding(check.__name__, "problem", "does not work", kind + line))
     healthy = not any(finding.status == "problem" for finding in findings)
-    if as_json:
-        print_json({"ok": healthy, "findings": [finding._asdict() for finding in findings]})
-    else:
-        marks = {"ok": "", "problem": "PROBLEM: ", "missing": "not installed: "}
-        print_table([(each.name, marks[each.status] + each.value) for each in findings])
-        remedies = [(each.name, each.remedy) for each in findings if each.remedy]
-        print_table(remedies, "\nwhat to do" if remedies else "\nall that is installed works")
-    return 0 if healthy else 1
+    marks = {"ok": "", "problem": "PROBLEM: ", "missing": "not installed: "}
+    remedies = {each.name: each.remedy for each in findings if each.remedy}
+    text = table({each.name: marks[each.status] + each.value for each in findings}) + "\n\n"
+    text += table(remedies, "what to do") if remedies else "all that is installed works"
+    values = {"ok": healthy, "findings": [finding._asdict() for finding in findings]}
+    return Result(values, text, exit_code=0 if healthy else 1)
 
 
 def packages() -> Iterator[Finding]:

@@ -1,126 +1,95 @@
-"""`deepdetect evaluate`: how good weights are."""
+"""`deepdetect evaluate`, `evaluate-stereo`, `benchmark` and `demo`: what weights are worth."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
+import numpy as np
 from cyclopts import Parameter
 
-from .._shared.errors import BatchError, OptionError
+from .._shared.errors import DeepDetectError, OptionError
+from .._shared.registry import look_up
+from ..datasets import StereoPair, load_stereo_pair
+from ..datasets.middlebury import load_middlebury
 from ..datasets.oxford import load_oxford
-from ..detector.detector import DeepDetect
+from ..detector.detector import DeepDetect, HeatmapDetector
 from ..detector.heatmap import HeatmapOptions
-from ..evaluation.options import PAPER_RESOLUTION_PX
+from ..detector.pretrained import PRETRAINED
+from ..evaluation.baselines.external import find_feature
+from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
+from ..evaluation.metrics.stereo import TOLERANCE_PX, score_errors
+from ..evaluation.options import PAPER_RESOLUTION_PX, BenchmarkOptions
 from ..evaluation.protocols.masks import LabelDetector
+from ..evaluation.protocols.stereo_matches import match_random_points, score_stereo_matches
 from ..evaluation.weights import Evaluation, OxfordScore, evaluate_oxford
 from ..evaluation.weights import evaluate as run
+from ..features.display import draw_matches
+from ..geometry import disparity_errors
+from ..labels import find_label_settings
+from ..matching.pipeline import match_images
+from ..viz.draw import add_caption, draw_heatmap, save_picture
+from . import _options as cli
 from ._detection import NETWORK
-from ._options import Json, print_columns, print_json, with_options
+
+MEASURES = cli.From(
+    run,
+    "oxford foreground equal_density",
+    more="",
+    types={"oxford": Path | None, "foreground": Path | None},
+)
 
 
-@with_options(NETWORK)
+@cli.command(MEASURES, NETWORK)
 def evaluate(
     samples: Annotated[Path, Parameter(help="Folder of image_NAME.png with mask_image_NAME.png.")],
     /,
     *,
     compare: list[str] | None = None,
-    oxford: Path | None = None,
     labels: bool = False,
-    foreground: Path | None = None,
-    equal_density: bool = False,
     scale: list[float] | None = None,
-    as_json: Json = False,
     **values: Any,
-) -> None:
+) -> cli.Result:
     """Score the network on a folder of images with known masks.
 
     Prints the mean binary cross-entropy (BCE) and intersection over union (IoU), the expected
     calibration error over all pixels, and the density of keypoints at 0.5 and of the masks,
     separately for normal and for low-visibility images; with --oxford also what the paper's
-    protocol gives: images squashed to 480x480, FLANN (mean of three seeds, of 64 where fewer than
-    1,000 matches are correct), ratio 0.99, correct under 1 px; with --labels also what the
-    labels give there, and with --equal-density at the labels' number of keypoints. With --scale,
-    whether the quality holds on larger and smaller images; SAMPLES may then be images without
-    masks.
+    protocol gives. What cannot be read or measured is listed at the end, and in no score.
 
-    Samples that cannot be read, and images of --oxford and --foreground that cannot be measured,
-    are listed at the end, with exit code 1, and are in no score.
-
-        deepdetect evaluate samples/
         deepdetect evaluate samples/ --weights run/deepdetect.onnx --compare other.onnx
-        deepdetect evaluate samples/ --scale 0.5 --scale 1 --scale 2
-        deepdetect evaluate photos/ --scale 1
+        deepdetect evaluate photos/ --scale 0.5 --scale 1 --scale 2
         deepdetect evaluate samples/ --oxford oxford/ --equal-density --compare other.onnx
 
     Args:
         compare: Evaluate these weights too, beside the first; may be repeated.
-        oxford: Folder of the eight Oxford scenes: measure density, repeatability and correct
-            matches on them, too.
         labels: With --oxford: measure the labels too, which weights without error would give.
-        foreground: Folder of images NAME.jpg and NAME_mask.png: measure the fraction of the
-            keypoints on the foreground, too.
-        equal_density: With --oxford and --foreground: of each image take as many keypoints as its
-            label marks, not those above 0.5, so that weights which mark more have no advantage.
         scale: Score the images scaled by this factor too, on labels of their own; may be repeated.
+            The images then need no masks.
     """
-    if labels and oxford is None:
+    measures = MEASURES.take(values)
+    if labels and "oxford" not in measures:
         raise OptionError("--labels measures on the Oxford scenes: name their folder with --oxford")
-    scenes = load_oxford(oxford) if oxford is not None else []  # before hours of work
+    # What is missing is said before hours of work.
+    scenes = load_oxford(measures["oxford"]) if "oxford" in measures else []
+    measures |= {"samples": samples, "scales": tuple(scale or ()), "quiet": False}
     weights = [values.pop("weights", "default"), *(compare or ())]
     detectors = [DeepDetect(path, **values) for path in weights]
-    found = [
-        run(
-            detector,
-            samples=samples,
-            scales=tuple(scale or ()),
-            oxford=oxford,
-            foreground=foreground,
-            equal_density=equal_density,
-            quiet=as_json,
-        )
-        for detector in detectors
-    ]
+    found = [run(detector, **measures) for detector in detectors]
     on_oxford = [each.oxford for each in found if each.oxford is not None]
-    results = [
+    columns = [
         {"weights": detector.weights, "backend": detector.runtime, **_values(evaluation)}
         for detector, evaluation in zip(detectors, found, strict=True)
     ]
-    further: dict[str, Any] = {"compare": results[1:]} if compare else {}
+    report = {**columns[0], **({"compare": columns[1:]} if compare else {})}
     if labels:
         squashed = LabelDetector(heatmap_options=HeatmapOptions(PAPER_RESOLUTION_PX))
-        on_oxford.append(evaluate_oxford(squashed, scenes, quiet=as_json))
-        further["labels"] = {"oxford": asdict(on_oxford[-1])}
-    if as_json:
-        print_json({**results[0], **further})
-    else:
-        columns = [*results, *([{"weights": "labels", **further["labels"]}] if labels else [])]
-        for each in columns:
-            rows = each.pop("scales", ())
-            each |= {f"x{row['scale']:g} {row['visibility']}": row for row in rows}
-        print_columns(columns)
-    _report_failures(found, on_oxford)
-
-
-def _report_failures(found: Sequence[Evaluation], on_oxford: Sequence[OxfordScore]) -> None:
-    """Raise a BatchError when something is in no score; what all weights lack is listed once."""
-    samples = found[0].failures
-    lists = [each.failures for each in on_oxford]
-    lists += [each.foreground.failures for each in found if each.foreground is not None]
-    parts = list(dict.fromkeys(failure for listed in lists for failure in listed))
-    if parts:
-        count = len(samples) + len(parts)
-        what = "one part" if count == 1 else f"{count} parts"
-        summary = f"{what} could not be measured, the scores are of the rest"
-        raise BatchError(summary, [*samples, *parts])
-    if samples:
-        scales = found[0].scales
-        first = [score for (scale, _), score in scales.items() if scale == min(scales)[0]]
-        scored = sum(score.images for score in found[0].masks.values() or first)
-        total = len(samples) + scored
-        raise BatchError(f"{len(samples)} of {total} samples are not in the scores", samples)
+        on_oxford.append(evaluate_oxford(squashed, scenes, quiet=False))
+        report["labels"] = {"oxford": asdict(on_oxford[-1])}
+        columns.append({"weights": "labels", **report["labels"]})
+    return cli.Result(report, _side_by_side(columns), _failures(found, on_oxford), what="parts")
 
 
 def _values(evaluation: Evaluation) -> dict[str, Any]:
@@ -131,8 +100,213 @@ def _values(evaluation: Evaluation) -> dict[str, Any]:
             {"scale": scale, "visibility": visibility, **asdict(score)}
             for (scale, visibility), score in evaluation.scales.items()
         ]
-    if evaluation.oxford is not None:
-        values["oxford"] = asdict(evaluation.oxford)
-    if evaluation.foreground is not None:
-        values["foreground"] = asdict(evaluation.foreground)
+    for name in ("oxford", "foreground"):
+        if (score := getattr(evaluation, name)) is not None:
+            values[name] = asdict(score)
     return values
+
+
+def _side_by_side(results: Sequence[Mapping[str, Any]]) -> str:
+    """Return the table of several results."""
+    columns = []
+    for each in results:
+        scales = {f"x{row['scale']:g} {row['visibility']}": row for row in each.get("scales", ())}
+        columns.append(dict(cli.table_rows({**each, "scales": None, **scales})))
+    names = dict.fromkeys(name for column in columns for name in column)
+    wide = max(len(name) for name in names)
+    rows = [(f"  {n:<{wide}}", *(f"{c.get(n, '-'):>20}" for c in columns)) for n in names]
+    return "\n".join(map(" ".join, rows))
+
+
+def _failures(found: Sequence[Evaluation], on_oxford: Sequence[OxfordScore]) -> list[str]:
+    """List what is in no score; what all weights lack is listed once."""
+    scores: list[Any] = [
+        *on_oxford,
+        *(each.foreground for each in found if each.foreground is not None),
+    ]
+    parts = [found[0].failures, *(score.failures for score in scores)]
+    return list(dict.fromkeys(failure for listed in parts for failure in listed))
+
+
+@cli.command()
+def evaluate_stereo(
+    *scenes: Annotated[
+        Path,
+        Parameter(
+            help="Folders with left.png, right.png, disparity.png and calib.json.", required=True
+        ),
+    ],
+    weights: list[str] | None = None,
+    label_settings: list[str] | None = None,
+) -> cli.Result:
+    """Match rectified stereo pairs, and evaluate the matches by their true disparity.
+
+    Matching uses neither the rows nor the truth; a match is correct within 1 px. Random points of
+    the same density and all pixels are the baselines.
+
+        deepdetect evaluate-stereo cones/ teddy/ --weights default --weights dense
+        deepdetect evaluate-stereo cones/ teddy/ --label-settings paper --label-settings mine.toml
+
+    Args:
+        weights: default, dense or free, the pretrained weights, or a file; may be repeated.
+        label_settings: Label settings whose labels are the keypoints, without a network: paper or
+            dense, or a file; may be repeated.
+    """
+    pairs, failures = [], []
+    for scene in scenes:
+        try:
+            pairs.append(load_middlebury(scene))
+        except DeepDetectError as error:
+            failures.append(str(error))
+    if not pairs:
+        raise DeepDetectError("; ".join(failures))
+    sources: dict[str, HeatmapDetector] = {}
+    for name in label_settings or ():
+        sources[f"labels {name}"] = LabelDetector(find_label_settings(name))
+    for name in weights or (() if label_settings else PRETRAINED):
+        sources[f"weights {name}"] = DeepDetect(name)
+    rows = score_stereo_matches(sources, pairs, quiet=False)
+    width = max(len(row["source"]) for row in rows)
+    heading = f"{'keypoints':<{width}}  {'pair':<12}{'density':>8}{'matches':>10}"
+    lines = [
+        f"{row['source']:<{width}}  {row['pair']:<12}{row['density']:>8.3f}"
+        f"{row['score']['matches']:>10,}{row['score']['correct']:>10,}{row['precision']:>11.3f}"
+        for row in rows
+    ]
+    return cli.Result(
+        rows,
+        "\n".join([f"{heading}{'correct':>10}{'precision':>11}", *lines]),
+        failures,
+        len(scenes),
+        "scenes",
+    )
+
+
+OPTIONS = cli.From(BenchmarkOptions, "degraded_images max_pairs max_images", more="ranker")
+
+
+@cli.command(OPTIONS, NETWORK)
+def benchmark(
+    name: Annotated[str, Parameter(help=f"One of {', '.join(BENCHMARKS)}, or all.")],
+    /,
+    *,
+    data: Path,
+    output: cli.Output = Path("benchmark"),
+    protocol: list[Literal["paper", "standard", "guided", "degraded"]] | None = None,
+    method: list[str] | None = None,
+    baselines: str | None = None,
+    preset: Literal["default", "published"] = "default",
+    cache: Path | None = None,
+    geometry_weights: list[str] | None = None,
+    **values: Any,
+) -> cli.Result:
+    """Write a report on the detectors: report.md with figures, tables/*.csv, report.json.
+
+    A second run does only what is new. What cannot be measured does not stop the rest: it is listed
+    at the end, with exit code 1.
+
+        deepdetect benchmark oxford --data data --max-pairs 1 --baselines sift -o quick
+        deepdetect benchmark oxford --data data -o report --method xfeat.onnx
+        deepdetect benchmark sfm --data data/fountain -o report
+
+    Args:
+        data: Folder of the data sets.
+        output: Folder for the report.
+        protocol: May be repeated.  [default: all but degraded]
+        method: A further method, NAME, FILE.onnx or MODULE:FUNCTION, as one more row; may be
+            repeated.
+        baselines: Classical methods to compare with, with commas between; none for none.
+            [default: all]
+        preset: published: show the network the channels as the paper's code does (BGR).
+        cache: Folder of the stages' results.  [default: cache in the output]
+        geometry_weights: Weights for stereo pairs, as --weights; may be repeated.  [default: dense]
+    """
+    output = cli.output_folder(output)
+    if values.get("resolution") not in (None, "auto", "native"):
+        raise OptionError(
+            "the protocols fix the resolution (480x480 and native): leave out --resolution"
+        )
+    names = list(BENCHMARKS) if name == "all" else [name]
+    for each in names:
+        look_up("benchmark", each, BENCHMARKS)
+    given = OPTIONS.take(values)
+    if baselines is not None:
+        listed = [word.strip() for word in baselines.split(",")]
+        given["classical"] = tuple(word for word in listed if word not in ("", "none"))
+    given |= {"protocols": tuple(protocol)} if protocol else {}
+    given |= {"geometry_weights": tuple(geometry_weights)} if geometry_weights else {}
+    options = BenchmarkOptions(
+        detector=DeepDetect(**values),
+        others=tuple(find_feature(word) for word in method or ()),
+        channels="bgr" if preset == "published" else "rgb",
+        **given,
+    )
+    report = run_benchmarks(names, data, options, cache=cache or output / "cache", quiet=False)
+    paths = report.save(output)
+    tables = [f"{t.title}\n\n{t.to_markdown()}\n" for t in report.tables() if t.in_text]
+    skipped = [f"skipped: {reason}" for reason in report.skipped if reason not in report.failures]
+    return cli.Result(
+        {**report.values(), "files": paths},
+        "\n".join([*tables, *skipped, f"report: {paths[0]}"]),
+        report.failures,
+        what="parts",
+    )
+
+
+@cli.command(NETWORK)
+def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Result:
+    """Detect and match the Motorcycle stereo pair; evaluate the matches by its true disparity.
+
+    The images (Middlebury 2014) come with the package scikit-image. Random points of the same
+    number are shown for comparison: a match by chance is not to be mistaken for skill.
+    """
+    detector = DeepDetect(**values)
+    folder = cli.output_folder(output)
+    numbers = run_demo(load_stereo_pair("motorcycle"), detector, folder)
+    values = {"weights": detector.weights, "backend": detector.runtime, **numbers}
+    return cli.Result(values, cli.table(values, "Correct: within 1 px of the true disparity."))
+
+
+def run_demo(pair: StereoPair, detector: HeatmapDetector, folder: Path) -> dict[str, Any]:
+    """Detect and match a stereo pair; evaluate the matches; write pictures; return the numbers.
+
+    As many random points as there are keypoints are matched too, by descriptors alone.
+    """
+    matches = match_images(pair.left, pair.right, detector)
+    both = matches.keypoints0, matches.keypoints1
+    errors = disparity_errors(matches.points0, matches.points1, pair.disparity)
+    random = match_random_points(pair, (both[0].density + both[1].density) / 2)
+    random_errors = disparity_errors(random.points0, random.points1, pair.disparity)
+    sets = {"all_matches": errors, "inliers": errors[matches.inliers], "random": random_errors}
+    scores = {name: score_errors(each) for name, each in sets.items()}
+    known = np.isfinite(errors)
+    points = matches.points0[known], matches.points1[known]
+    lines = draw_matches(pair.left, pair.right, *points, errors[known] <= TOLERANCE_PX)
+    caption = (
+        f"{len(matches):,} matches, a random sample drawn; green: within {TOLERANCE_PX:g} px of "
+        f"the true disparity ({scores['all_matches'].precision:.1%}), red: not"
+    )
+    heatmap = draw_heatmap(detector.heatmap(pair.left))
+    pictures = {
+        f"{side}_keypoints": add_caption(
+            keypoints.draw(rgb),
+            f"{len(keypoints):,} keypoints, density {keypoints.density:.3f}",
+        )
+        for side, rgb, keypoints in zip(
+            ("left", "right"), (pair.left, pair.right), both, strict=True
+        )
+    }
+    pictures["left_heatmap"] = add_caption(
+        heatmap, "probability of a keypoint: dark blue 0, yellow 1"
+    )
+    pictures["matches"] = add_caption(lines, caption)
+    paths = [folder / f"{pair.name}_{name}.jpg" for name in pictures]
+    for path, picture in zip(paths, pictures.values(), strict=True):
+        save_picture(picture, path)
+    return {
+        "keypoints": [len(each) for each in both],
+        "density": [each.density for each in both],
+        **{n: {**vars(each), "precision": each.precision} for n, each in scores.items()},
+        "seconds": matches.seconds,
+        "pictures": paths,
+    }

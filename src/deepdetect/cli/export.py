@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import App, Parameter
 
-from .._shared.errors import BatchError, MissingFileError, OptionError
+from .._shared.errors import MissingFileError, OptionError
 from .._shared.records import Outputs, check_not_made
 from ..detector.network.onnx_export import OnnxOptions, write_onnx
 from ..detector.point_detector import PointDetector
@@ -28,51 +29,71 @@ from ..interchange.collection import check_names, check_upright
 from ..io.image import find_images
 from ..sfm.colmap import import_pycolmap
 from ..sfm.intrinsics import initial_intrinsics, known_cameras
+from ..sfm.pipeline import reconstruct_many
 from . import _options as cli
+from .reconstruct import MANY
 
 export = App("export", help="Write files for other programs.")
 
 SAVED = cli.From(
     read_collection,
     "matches images",
-    common="matches images",
+    more="",
     types={"matches": Path | None, "images": Path | None},
 )
 FOLDER = cli.From(
     match_folder,
     "pairs sequential",
-    common="pairs sequential",
+    more="workers",
     types={"pairs": Path | None},
 )
-MAX_KEYPOINTS = cli.From(PointDetector, "max_keypoints", common="max_keypoints")
+MAX_KEYPOINTS = cli.From(PointDetector, "max_keypoints", more="")
+VERIFY = cli.From(write_colmap, "verify", more="")
+CAMERAS = cli.From(
+    reconstruct_many,
+    "calibration focal_px",
+    more="",
+    flags={"focal_px": "--focal"},
+    types={"calibration": Path | None},
+    defaults={"focal_px": "of EXIF, or a guess"},
+)
+SHARED_CAMERA = replace(MANY, more="single_camera")
+ONNX = cli.From(
+    OnnxOptions,
+    "size precision",
+    types={
+        "size": Annotated[
+            tuple[int, int] | None,
+            Parameter(converter=lambda _, tokens: size_of(tokens[0].value), n_tokens=1),
+        ]
+    },
+    defaults={"size": "any"},
+)
+CONTENT = cli.From(
+    write_onnx,
+    "calibration licence",
+    more="",
+    types={"calibration": list[Path]},
+    defaults={"calibration": "none"},
+)
 Sources = Annotated[
-    list[Path],
+    Path,
     Parameter(
+        required=True,
         help="File of `deepdetect extract` (with --matches), npz files of `detect` and `match` "
-        "(with --images), or a folder of images, which are matched first."
+        "(with --images), or a folder of images, which are matched first.",
     ),
 ]
 
 
 @export.command
-@cli.with_options(SAVED, FOLDER, MAX_KEYPOINTS)
+@cli.command(SAVED, FOLDER, MAX_KEYPOINTS, VERIFY, CAMERAS, SHARED_CAMERA, cli.MEGAPIXELS)
 def colmap(
-    sources: Sources,
-    /,
-    *,
+    *sources: Sources,
     output: cli.Output = Path("database.db"),
-    verify: bool = True,
-    calibration: Path | None = None,
-    focal_px: Annotated[float | None, Parameter("--focal")] = None,
-    single_camera: Annotated[
-        bool | None, Parameter(negative="--camera-each", group=cli.MORE)
-    ] = None,
-    workers: cli.Workers = None,
     overwrite: cli.Overwrite = False,
-    as_json: cli.Json = False,
-    max_megapixels: cli.MaxMegapixels = 200,
     **values: Any,
-) -> None:
+) -> cli.Result:
     """Write keypoints, descriptors and matches as a database of COLMAP 4.
 
     With a folder as -o, the text files of colmap feature_importer and matches_importer are written.
@@ -84,22 +105,18 @@ def colmap(
 
     Args:
         output: Database (.db), or a folder for text files.
-        verify: Estimate two-view geometries, which COLMAP's mapper needs.
-        calibration: JSON file of the camera (docs/reconstruction.md), taken to be exact.
-        focal_px: Focal length in pixels, roughly.  [default: of EXIF, or a guess]
-        single_camera: Whether images of one size share a camera.  [default: where the focal
-            lengths are equal]
     """
-    cameras = {"calibration": calibration, "focal_px": focal_px, "single_camera": single_camera}
+    cameras = CAMERAS.take(values) | SHARED_CAMERA.take(values)
+    verify = VERIFY.take(values)
     if output.suffix.lower() != ".db":
         if output.suffix:
             raise OptionError(f"{output} must end in .db, or be the name of a folder")
-        for name in (name for name in cameras if cameras[name] is not None):
+        for name in cameras:
             raise OptionError(f"text files hold no cameras: leave out `{name}`, or write a .db")
         marker = _new_folder(output, "matches.txt", overwrite)
-        _export(write_colmap_text, sources, output, marker, workers, overwrite, as_json, values)
-        return
+        return _export(write_colmap_text, sources, output, marker, overwrite, values)
     import_pycolmap("a database of COLMAP")  # what is missing is said before the work
+    calibration, focal_px = cameras.get("calibration"), cameras.get("focal_px")
     if calibration is not None and focal_px is not None:
         raise OptionError("give --calibration or --focal, not both")
     if focal_px is not None:
@@ -110,35 +127,26 @@ def colmap(
     def write(collection: Collection, path: Path) -> tuple[Path, ...]:
         sizes = {name: points.image_size for name, points in collection.keypoints.items()}
         known = {} if calibration is None else known_cameras(calibration, sizes)
-        for name in sorted(sizes.keys() - known.keys()) if calibration is not None else ():
-            raise OptionError(
-                f"{name} is {sizes[name][0]}x{sizes[name][1]} pixels, and the calibration is for "
-                "another size: leave the image out"
-            )
+        for name in sorted(sizes.keys() - known.keys()) if known else ():
+            raise OptionError(f"{name} has another size than the calibration: leave it out")
         folder = collection.folder or Path("no-such-folder")
-        intrinsics = initial_intrinsics(folder, sizes, known, focal_px, single_camera)
-        return write_colmap(collection, path, verify=verify, intrinsics=intrinsics)
+        shared = cameras.get("single_camera")
+        intrinsics = initial_intrinsics(folder, sizes, known, focal_px, shared)
+        return write_colmap(collection, path, intrinsics=intrinsics, **verify)
 
-    _export(write, sources, output, output, workers, overwrite, as_json, values, describe=False)
+    return _export(write, sources, output, output, overwrite, values, describe=False)
 
 
 @export.command
-@cli.with_options(SAVED, FOLDER, MAX_KEYPOINTS)
+@cli.command(SAVED, FOLDER, MAX_KEYPOINTS, cli.MEGAPIXELS)
 def hloc(
-    sources: Sources,
-    /,
-    *,
+    *sources: Sources,
     output: cli.Output = Path("hloc-files"),
     descriptors: bool = True,
-    workers: cli.Workers = None,
     overwrite: cli.Overwrite = False,
-    as_json: cli.Json = False,
-    max_megapixels: cli.MaxMegapixels = 200,
     **values: Any,
-) -> None:
+) -> cli.Result:
     """Write features.h5, matches.h5 and pairs.txt, the arguments of hloc.reconstruction.main.
-
-    Numbers are float32 and int32.
 
         deepdetect export hloc photos/ -o hloc/
         deepdetect export hloc out/*.npz --images photos/ -o hloc/
@@ -150,11 +158,7 @@ def hloc(
     marker = _new_folder(cli.output_folder(output), "features.h5", overwrite)
     if sources[0].is_dir():
         check_upright(find_images(sources[0]))
-    _export(
-        write_hloc,
-        *(sources, output, marker, workers, overwrite, as_json, values),
-        describe=descriptors,
-    )
+    return _export(write_hloc, sources, output, marker, overwrite, values, describe=descriptors)
 
 
 def _new_folder(folder: Path, marker: str, overwrite: bool) -> Path:
@@ -167,25 +171,17 @@ def _new_folder(folder: Path, marker: str, overwrite: bool) -> Path:
 
 def _export(
     write: Callable[[Collection, Path], tuple[Path, ...]],
-    sources: list[Path],
+    sources: Sequence[Path],
     output: Path,
     marker: Path,
-    workers: int | None,
     overwrite: bool,
-    as_json: bool,
     values: dict[str, Any],
     describe: bool = True,
-) -> None:
+) -> cli.Result:
     """Read or make a collection, and write it.
 
-    Args:
-        write: writes a collection to the output, and returns the files.
-        sources: files, or a folder of images.
-        output: file or folder.
-        marker: file by which it is known whose the output is.
-        workers, overwrite, as_json: as of the commands.
-        values: of `SAVED`, `FOLDER` and `MAX_KEYPOINTS`.
-        describe: whether keypoints without descriptors are described.
+    The marker is a file by which it is known whose the output is; the values are those of `SAVED`,
+    `FOLDER` and `MAX_KEYPOINTS`.
     """
     inputs = [*sources, *(values[name] for name in ("matches", "pairs") if name in values)]
     cli.check_inputs_survive([marker], inputs)
@@ -199,62 +195,37 @@ def _export(
         check_not_made(sources[0], paths)
         if marker != output:
             check_names(path.relative_to(sources[0]).as_posix() for path in paths)
-    with cli.writing(Outputs([marker], inputs, {"command": marker.name}, overwrite=overwrite)):
+    with cli.claimed(Outputs([marker], inputs, {"command": marker.name}, overwrite=overwrite)):
         if of_folder:
-            detector = PointDetector(**points)
-            collection = match_folder(sources[0], detector, workers=workers, quiet=False, **values)
+            collection = match_folder(sources[0], PointDetector(**points), quiet=False, **values)
         else:
             collection = read_collection(sources, **saved)
         if describe:
             collection = describe_collection(collection, quiet=False)
         files = write(collection, output)
+    failures = collection.failures
     numbers = {
         "images": len(collection.keypoints),
         "keypoints": sum(len(points) for points in collection.keypoints.values()),
         "pairs": len(collection.matches),
         "matches": sum(len(found) for found in collection.matches.values()),
         "files": files,
-        "failures": collection.failures,
+        "failures": failures,
     }
-    cli.print_result(as_json, numbers)
-    if count := len(collection.failures):
-        raise BatchError(
-            f"{count} of the images and pairs failed, the others are in {output}",
-            collection.failures,
-        )
+    return cli.Result(numbers, failures=failures, what="images and pairs")
 
 
-def size_of(_: object, tokens: Any) -> tuple[int, int] | None:
+def size_of(text: str) -> tuple[int, int]:
     """Read height and width, as 480x640."""
-    match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", tokens[0].value)
+    match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", text)
     if match is None:
-        raise ValueError(f"{tokens[0].value!r} is no height and width, as 480x640")
+        raise ValueError(f"{text!r} is no height and width, as 480x640")
     return int(match[1]), int(match[2])
 
 
 @export.command
-@cli.with_options(
-    cli.From(
-        OnnxOptions,
-        common="size precision",
-        types={
-            "size": Annotated[
-                tuple[int, int] | None, Parameter(converter=size_of, n_tokens=1, accepts_keys=False)
-            ]
-        },
-        defaults={"size": "any"},
-    )
-)
-def onnx(
-    weights: str = "default",
-    /,
-    *,
-    output: cli.Output,
-    calibration: list[Path] | None = None,
-    licence: str | None = None,
-    as_json: cli.Json = False,
-    **values: Any,
-) -> None:
+@cli.command(ONNX, CONTENT)
+def onnx(weights: str = "default", /, *, output: cli.Output, **values: Any) -> cli.Result:
     """Write weights as an ONNX file, for ONNX Runtime, OpenVINO, OpenCV and others.
 
     WEIGHTS are default, dense, free, an ONNX file that this package has written in fp32 for any
@@ -271,17 +242,14 @@ def onnx(
     Args:
         weights: Name or file of the weights.
         output: The .onnx file, or a folder for deepdetect.onnx.
-        calibration: Images or folders for int8, like those that it will be used on.
-        licence: What the file says of the licence of the weights.
     """
     file = cli.output_file(output, "deepdetect.onnx")
-    options = OnnxOptions(**values)
+    options = OnnxOptions(**ONNX.take(values))
     images = [
         image
-        for path in calibration or ()
+        for path in values.pop("calibration", ())
         for image in (find_images(path) if path.is_dir() else [path])
     ]
     cli.check_inputs_survive([file], [resolve_weights(weights), *images])
-    metadata = write_onnx(weights, file, options, calibration=images, licence=licence)
-    values = {"file": file, "bytes": file.stat().st_size, "metadata": metadata}
-    cli.print_result(as_json, values)
+    metadata = write_onnx(weights, file, options, calibration=images, **values)
+    return cli.Result({"file": file, "bytes": file.stat().st_size, "metadata": metadata})

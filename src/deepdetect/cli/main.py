@@ -13,7 +13,7 @@ from .._shared.errors import (
     RegistrationError,
     unknown_name,
 )
-from ._commands import COMMANDS
+from ._commands import COMMANDS, NOTHING_FOUND
 
 INTRODUCTION = """\
 Usage: deepdetect COMMAND
@@ -25,9 +25,6 @@ Dense keypoints from a tiny network, and their matches.
   deepdetect reconstruct left.jpg right.jpg --focal 1250    a 3D reconstruction
 """
 
-NOTHING_FOUND = 3
-"""Exit code where all went well and nothing was found."""
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command, and return the exit code that the README documents."""
@@ -35,9 +32,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not words or words[0] in ("-h", "--help", "--help-all"):
         print(INTRODUCTION)
         for title, commands in COMMANDS.items():
-            print(
-                f"{title}:", *(f"  {name:<17}{commands[name]}" for name in commands), "", sep="\n"
-            )
+            listed = (f"  {name:<17}{does}" for name, (_, does) in commands.items())
+            print(f"{title}:", *listed, "", sep="\n")
         print("`deepdetect COMMAND --help` shows the common options, --help-all shows all.")
         return 0
     if words == ["--version"]:

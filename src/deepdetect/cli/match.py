@@ -1,19 +1,20 @@
-"""`deepdetect match`: matches between two images."""
+"""`deepdetect match`, `register` and `stitch`: images that show the same."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from .._shared.errors import OptionError
+from .._shared.errors import ImageError, OptionError, RegistrationError
 from .._shared.progress import stage_progress
-from .._shared.records import Outputs
+from ..batch.pair_matching import MATCHERS_OF_FLOATS
 from ..detector.detector import DeepDetect
-from ..features.matchers import MATCHERS
+from ..detector.point_detector import PointDetector
 from ..features.matches import Matches
 from ..features.sift import DESCRIPTORS
 from ..geometry import GeometryOptions
@@ -27,35 +28,45 @@ from ..matching.options import (
     MatchingOptions,
 )
 from ..matching.pipeline import match_images
-from ..viz.draw import add_caption, save_picture
+from ..matching.registration import register as register_images
+from ..matching.stitching import STAGES, Panorama, StitchingOptions
+from ..matching.stitching import stitch as stitch_images
+from ..viz.draw import add_caption, picture_suffix, save_picture
 from . import _options as cli
 from ._detection import NETWORK, POINTS, SELECTION, Detector, chosen_detector
 
 PAIR = cli.From(
     match_images,
-    "guided_matching model mutual seed",
-    common="guided_matching model mutual",
+    "guided_matching model mutual",
+    more="seed",
     flags={"guided_matching": "--guided-matching/--no-guided-matching --unguided"},
     types={"model": Literal[MODEL_NAMES]},
 )
 MATCHING = cli.From(
     MatchingOptions,
-    "two_view_model descriptor keypoint_size angle matcher ratio",
-    common="ratio",
+    "ratio",
+    more="two_view_model descriptor keypoint_size angle matcher",
     types={
         "two_view_model": Literal[TWO_VIEW_MODELS],
         "descriptor": Literal[tuple(DESCRIPTORS)],
-        "matcher": Literal[tuple(name for name in MATCHERS if name != "hamming")],
+        "matcher": Literal[tuple(MATCHERS_OF_FLOATS)],
     },
 )
 GEOMETRY = cli.From(
     GeometryOptions,
-    "estimator inlier_threshold confidence iterations",
+    more="estimator inlier_threshold confidence iterations",
     types={"estimator": Literal[ESTIMATORS]},
 )
+PANORAMA = cli.From(stitch_images, "projection crop", more="seed")
+OPTIONS = cli.From(StitchingOptions)
+STITCH_KEYPOINTS = cli.From(PointDetector, more="max_keypoints")
 
 
-@cli.with_options(PAIR, SELECTION, MATCHING, GEOMETRY, POINTS, NETWORK)
+GUIDED_STAGES = ("keypoints", "guided matching", "geometry")
+UNGUIDED_STAGES = ("keypoints", "descriptors", "matching", "geometry")
+
+
+@cli.command(PAIR, SELECTION, MATCHING, GEOMETRY, POINTS, NETWORK, cli.MEGAPIXELS)
 def match(
     image0: cli.Image,
     image1: cli.Image,
@@ -70,18 +81,15 @@ def match(
     file_format: cli.Format = "npz",
     pictures: bool = True,
     overwrite: cli.Overwrite = False,
-    as_json: cli.Json = False,
-    max_megapixels: cli.MaxMegapixels = 200,
     **values: Any,
-) -> int:
+) -> cli.Result:
     """Match the keypoints of two images.
 
     Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their scores, the
     estimated geometry and which matches agree with it, and a picture of them. The options
     --descriptor, --keypoint-size, --angle, --matcher and --ratio apply with --unguided.
 
-    Ends with exit code 3 where there are no matches, as where no geometry between the images can
-    be trusted; the file then holds none.
+    Ends with exit code 3 where no geometry between the images can be trusted, or nothing matches.
 
         deepdetect match left.jpg right.jpg
         deepdetect match page1.jpg page2.jpg --model homography --mutual
@@ -98,7 +106,6 @@ def match(
     stem = cli.output_folder(output) / f"{image0.stem}_{image1.stem}_matches"
     files = {"file": stem.with_name(f"{stem.name}.{file_format}")}
     files |= {"picture": stem.with_name(f"{stem.name}.jpg")} if pictures else {}
-    cli.check_inputs_survive(files.values(), [image0, image1])
     rgb0, rgb1 = load_image(image0), load_image(image1)
     start = MatchingOptions()
     if preset == "published":
@@ -108,22 +115,34 @@ def match(
     if preset == "published" and isinstance(chosen, DeepDetect):
         chosen = chosen.configured(replace(chosen.heatmap_options, network_channels="bgr"))
     matrices = {"homography": homography, "camera0": camera0, "camera1": camera1 or camera0}
-    geometry: dict[str, Any] = {
+    known: dict[str, Any] = {
         name: _read_matrix(path) for name, path in matrices.items() if path is not None
     }
-    geometry |= GEOMETRY.take(values)
+    geometry = GeometryOptions(**known, **GEOMETRY.take(values))
     changes = MATCHING.take(values)
-    options = replace(start, geometry=GeometryOptions(**geometry), **changes)
+    how: dict[str, Any] = {
+        "selection": selection,
+        "options": replace(start, geometry=geometry, **changes),
+    }
     stages = GUIDED_STAGES if values.get("guided_matching", True) else UNGUIDED_STAGES
-    with cli.writing(Outputs([*files.values()], [image0, image1], overwrite=overwrite)):
+    with cli.writing(files, [image0, image1], overwrite) as made:
         with stage_progress("matching", stages) as done:
-            matches = match_images(
-                rgb0, rgb1, chosen, selection=selection, options=options, progress=done, **values
-            )
-        with cli.whole(files) as made:
-            save_matches(matches, made["file"])
-            if pictures:
-                _draw(rgb0, rgb1, matches, made["picture"])
+            matches = match_images(rgb0, rgb1, chosen, progress=done, **how, **values)
+        save_matches(matches, made["file"])
+        if pictures:
+            _draw(rgb0, rgb1, matches, made["picture"])
+    if matches.guided and (unused := [name for name in UNGUIDED_ONLY if name in changes]):
+        flags = " and ".join("--" + name.replace("_", "-") for name in unused)
+        cli.note(f"only unguided matching uses {flags}: add --unguided")
+    if not matches.success:
+        cli.note(
+            "no geometry between these images can be trusted, so there are no matches: if they "
+            "show the same scene, --unguided matches by descriptors alone"
+        )
+    elif not len(matches):
+        cli.note("there are no matches: the images show too little, or the options leave none")
+    elif matches.matrix is None and matches.model != "none":
+        cli.note(f"no {matches.model} could be estimated from these matches")
     numbers = {
         "image0": image0,
         "image1": image1,
@@ -143,24 +162,8 @@ def match(
         "file": files["file"],
         "picture": files.get("picture"),
     }
-    cli.print_result(as_json, numbers)
-    if matches.guided and (unused := [name for name in UNGUIDED_ONLY if name in changes]):
-        flags = " and ".join("--" + name.replace("_", "-") for name in unused)
-        cli.note(f"only unguided matching uses {flags}: add --unguided")
-    if not matches.success:
-        cli.note(
-            "no geometry between these images can be trusted, so there are no matches: if they "
-            "show the same scene, --unguided matches by descriptors alone"
-        )
-    elif not len(matches):
-        cli.note("there are no matches: the images show too little, or the options leave none")
-    elif matches.matrix is None and matches.model != "none":
-        cli.note(f"no {matches.model} could be estimated from these matches")
-    return 0 if len(matches) and matches.success else cli.NOTHING_FOUND
-
-
-GUIDED_STAGES = ("keypoints", "guided matching", "geometry")
-UNGUIDED_STAGES = ("keypoints", "descriptors", "matching", "geometry")
+    found = len(matches) > 0 and matches.success
+    return cli.Result(numbers, exit_code=0 if found else cli.NOTHING_FOUND)
 
 
 def _two_view_numbers(matches: Matches) -> dict[str, Any] | None:
@@ -185,7 +188,146 @@ def _read_matrix(path: Path) -> np.ndarray:
         return np.loadtxt(path, ndmin=2)
     except FileNotFoundError:
         raise OptionError(f"there is no file {path}: check the path") from None
-    except (OSError, ValueError, UnicodeDecodeError):
+    except (OSError, ValueError):
         raise OptionError(
             f"{path} holds no matrix: it must be three rows of three numbers"
         ) from None
+
+
+@cli.command(SELECTION, POINTS, NETWORK, cli.MEGAPIXELS)
+def register(
+    image0: cli.Image,
+    image1: cli.Image,
+    /,
+    *,
+    output: cli.Folder = Path("deepdetect-output"),
+    detector: Detector = "network",
+    overwrite: cli.Overwrite = False,
+    **values: Any,
+) -> cli.Result:
+    """Register the second image to the first: for planes, and for images from one place.
+
+    Writes STEM1_on_STEM0.png (the second image in the frame of the first), the same as
+    _checkerboard.png and _difference.png with the first, and _homography.txt (3x3, from the
+    first image to the second).
+
+        deepdetect register map.jpg photo-of-the-map.jpg -o registered
+    """
+    stem = cli.output_folder(output) / f"{image1.stem}_on_{image0.stem}"
+    endings = (".png", "_checkerboard.png", "_difference.png", "_homography.txt")
+    files = {ending: stem.with_name(stem.name + ending) for ending in endings}
+    chosen, selection = chosen_detector(detector, values)
+    with cli.writing(files, [image0, image1], overwrite) as made:
+        with stage_progress("registering", GUIDED_STAGES) as done:
+            found = register_images(image0, image1, chosen, selection=selection, progress=done)
+        pictures = (found.warped, found.checkerboard(), found.difference())
+        for ending, picture in zip(endings, pictures, strict=False):
+            save_picture(picture, made[ending])
+        np.savetxt(made["_homography.txt"], found.homography, fmt="%.12e")
+    return cli.Result(
+        {
+            "image0": image0,
+            "image1": image1,
+            "homography": found.homography.tolist(),
+            "matches": found.matches,
+            "overlap": round(float(found.valid.mean()), 4),
+            "correlation": round(found.zncc, 4),
+            "files": [*files.values()],
+        }
+    )
+
+
+@cli.command(PANORAMA, OPTIONS, STITCH_KEYPOINTS, POINTS, NETWORK, cli.MEGAPIXELS)
+def stitch(
+    *paths: cli.Images,
+    output: cli.Output = Path("panorama.jpg"),
+    reference: Path | None = None,
+    detector: Detector = "network",
+    overwrite: cli.Overwrite = False,
+    **values: Any,
+) -> cli.Result:
+    """Make a panorama of overlapping images from one place, or of a plane.
+
+    They may be in any order. Those that overlap with no other, or cannot be read, are named. A flat
+    panorama shows 100 to 120 degrees at the most, a cylindrical or spherical one all around.
+
+        deepdetect stitch left.jpg middle.jpg right.jpg -o panorama.jpg
+        deepdetect stitch *.jpg --projection cylindrical --crop -o panorama.jpg
+
+    Args:
+        output: The panorama's file, or a folder for it.
+        reference: The image that is not distorted, or in the middle of a curved panorama.
+            [default: the one in the middle]
+    """
+    file = cli.output_file(output, "panorama.jpg")
+    picture_suffix(file)  # before the work, which would else be lost
+    if reference is not None and reference not in paths:
+        raise OptionError(f"--reference {reference} must be one of the images: name it there")
+    if detector == "network" and "max_keypoints" in values:
+        raise OptionError("--max-keypoints is for --detector points: leave it out, or choose that")
+    chosen, _ = chosen_detector(detector, values)
+    options = StitchingOptions(**OPTIONS.take(values))
+    images, failures = _readable(paths)
+    if len(images) < min(len(paths), 2) or (reference is not None and reference not in images):
+        what = "too few images, or not the reference, can be read"
+        raise ImageError(f"there is no panorama, as {what}: {'; '.join(failures)}")
+    cli.check_inputs_survive([file], paths)
+    with cli.writing({"file": file}, images, overwrite) as made:
+        try:
+            with stage_progress("stitching", STAGES) as done:
+                panorama = stitch_images(
+                    images,
+                    detector=chosen,
+                    reference=None if reference is None else images.index(reference),
+                    options=options,
+                    progress=done,
+                    **values,
+                )
+        except (OptionError, RegistrationError) as error:  # they name images by their number
+            text = str(error)
+            for number, path in enumerate(images):
+                text = text.replace(f"images[{number}]", str(path))
+            raise type(error)(text) from error
+        save_picture(panorama.image, made["file"])
+    for number, reason in panorama.unregistered.items():
+        cli.note(f"not in the panorama: {images[number]}, as {reason}")
+    numbers = {**_numbers(panorama, images, file), "failures": failures}
+    return cli.Result(numbers, "", failures, len(paths))
+
+
+def _readable(images: Sequence[Path]) -> tuple[list[Path], list[str]]:
+    """Return the images that can be read, and what is wrong with each of the others."""
+    readable, failures = [], []
+    for path in images:
+        try:
+            load_image(path)
+        except ImageError as error:
+            failures.append(str(error))
+        else:
+            readable.append(path)
+    return readable, failures
+
+
+def _numbers(panorama: Panorama, images: Sequence[Path], output: Path) -> dict[str, Any]:
+    """Make what --json prints."""
+    height, width = panorama.valid.shape
+    used = sorted(panorama.homographies)
+    return {
+        "images": [images[k] for k in used],
+        "unregistered": [
+            {"image": images[k], "reason": reason} for k, reason in panorama.unregistered.items()
+        ],
+        "reference": images[panorama.reference],
+        "width": width,
+        "height": height,
+        "covered": round(float(panorama.valid.mean()), 4),
+        "homographies": [panorama.homographies[k].tolist() for k in used],
+        "gains": [round(panorama.gains[k], 4) for k in used],
+        "pairs": [
+            {"images": [images[first], images[second]], "matches": count}
+            for (first, second), count in panorama.matches.items()
+        ],
+        "residual_px": round(panorama.residual_px, 4),
+        "seconds": {stage: round(value, 4) for stage, value in panorama.seconds.items()},
+        "file": output,
+    }

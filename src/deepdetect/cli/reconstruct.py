@@ -6,46 +6,55 @@ import json
 import sys
 import time
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from .._shared.errors import OptionError
 from .._shared.progress import progress
-from .._shared.records import Outputs
+from .._shared.records import Outputs, check_not_made
 from ..io.depth import save_depth_npz, save_depth_png
 from ..io.point_cloud import POINT_CLOUD_WRITERS, find_writer, save_point_cloud
 from ..reconstruction.pipeline import reconstruct as reconstruct_pair
 from ..reconstruction.result import Reconstruction
+from ..sfm.colmap import import_pycolmap
+from ..sfm.options import MultiViewOptions
+from ..sfm.pipeline import MAX_KEYPOINTS, check_output_folder, output_files, reconstruct_many
+from ..sfm.stages import check_images
 from ..viz.draw import draw_depth, save_picture
 from . import _options as cli
-from ._detection import NETWORK, POINTS, SELECTION, Detector, chosen_detector
-from ._reconstruct_many import MANY, reconstruct_folder
+from ._detection import NETWORK, POINTS, SELECTION, Detector, Kind, chosen_detector
 
 CAMERAS = cli.From(
     reconstruct_pair,
     "calibration focal_px rectified",
-    common="calibration focal_px rectified",
+    more="",
     flags={"focal_px": "--focal", "rectified": "--rectified/--not-rectified"},
     types={"calibration": Path | None},
     defaults={"focal_px": "from EXIF", "rectified": "detected"},
 )
+MANY = cli.From(
+    MultiViewOptions,
+    flags={"stride_px": "--stride", "single_camera": "--single-camera/--camera-each"},
+)
+WORKERS = cli.From(reconstruct_many, more="workers")
+"""Options that two images do not have."""
+
 STAGES = 9
-"""Of a reconstruction at most."""
+"""Of a reconstruction of two images at most."""
+
+MAX_UNREGISTERED = 10
+"""Images that are named with a reason on the terminal."""
 
 
-@cli.with_options(CAMERAS, SELECTION, MANY, POINTS, NETWORK)
+@cli.command(CAMERAS, SELECTION, MANY, WORKERS, POINTS, NETWORK, cli.MEGAPIXELS)
 def reconstruct(
-    images: cli.Images,
-    /,
-    *,
+    *images: cli.Images,
     output: cli.Output = Path("deepdetect-output"),
     detector: Detector | None = None,
-    workers: cli.Workers = None,
     overwrite: cli.Overwrite = False,
-    as_json: cli.Json = False,
-    max_megapixels: cli.MaxMegapixels = 200,
     **values: Any,
-) -> None:
+) -> cli.Result:
     """Reconstruct a cloud of coloured 3D points from two images, or from a folder or more of them.
 
     Two images, left and right: writes model.ply and model.glb (the points), model.html (an offline
@@ -77,37 +86,31 @@ def reconstruct(
     if len(images) == 1 and not folders:
         raise OptionError("give two images, or more, or a folder of them")
     if len(images) > 2 or folders:
-        if output == Path("deepdetect-output"):
-            output = output / "model"
-        reconstruct_folder(
-            images, output, detector or "points", workers, overwrite, as_json, values
-        )
-        return
-    for name in (*MANY.take(values), *(["workers"] if workers else [])):
+        folder = output / "model" if output == Path("deepdetect-output") else output
+        return _reconstruct_many(images, folder, detector or "points", overwrite, values)
+    for name in (*MANY.take(values), *WORKERS.take(values)):
         raise OptionError(f"`{name}` is for more than two images")
     model = cli.output_file(output, "model.ply")
     find_writer(model)
     endings = (*POINT_CLOUD_WRITERS, "_depth.png", "_depth.npz", "_depth.jpg", ".json")
     files = {ending: model.with_name(model.stem + ending) for ending in endings}
     files[model.suffix.lower()] = model
-    calibration = values.get("calibration")
-    cli.check_inputs_survive(files.values(), [*images, *([calibration] if calibration else [])])
+    if "calibration" in values:
+        cli.check_inputs_survive(files.values(), [values["calibration"]])
     chosen, selection = chosen_detector(detector or "network", values, weights="dense")
-    outputs = Outputs([*files.values()], images, overwrite=overwrite)
-    outputs.check()
-    # On a terminal only: what is logged stays readable.
-    with progress(STAGES, "reconstructing", "stage", quiet=not sys.stderr.isatty()) as bar:
+    # The bar is on a terminal only: what is logged stays readable.
+    with (
+        cli.writing(files, images, overwrite) as made,
+        progress(STAGES, "reconstructing", "stage", quiet=not sys.stderr.isatty()) as bar,
+    ):
 
         def done(stage: str) -> None:
             bar.set_postfix_str(stage)
             bar.update()
 
-        found = reconstruct_pair(
-            images[0], images[1], chosen, selection=selection, progress=done, **values
-        )
-        with cli.writing(outputs), cli.whole(files) as made:
-            numbers = _write(found, made, files, images)
-    cli.print_result(as_json, numbers)
+        left, right = images
+        found = reconstruct_pair(left, right, chosen, selection=selection, progress=done, **values)
+        return cli.Result(_write(found, made, files, images))
 
 
 def _write(
@@ -135,3 +138,30 @@ def _write(
     text = json.dumps(numbers, indent=2, default=str) + "\n"
     made[".json"].write_text(text, encoding="utf-8")
     return numbers
+
+
+def _reconstruct_many(
+    images: Sequence[Path], output: Path, kind: Kind, overwrite: bool, values: dict[str, Any]
+) -> cli.Result:
+    """Reconstruct a folder, or three and more images."""
+    if "rectified" in values:
+        raise OptionError("--rectified and --not-rectified are for two images")
+    detector, selection = chosen_detector(kind, values, max_keypoints=MAX_KEYPOINTS, threads=1)
+    source: Path | Sequence[Path] = images[0] if len(images) == 1 else images
+    many = MANY.take(values)
+    if "sequential" in many:
+        many.setdefault("pairs", "sequential")
+    # What is missing or wrong is said before anything is written.
+    import_pycolmap()
+    check_output_folder(output)
+    found_images = check_images(source)
+    if isinstance(source, Path):
+        check_not_made(source, found_images.values())
+    values |= {"selection": selection, "options": MultiViewOptions(**many), "overwrite": overwrite}
+    files = output_files(output)
+    with Outputs(files, sorted(images), overwrite=overwrite, growing=True).writing():
+        reconstruct_many(source, output, detector, quiet=False, **values)
+    numbers = json.loads((output / "model.json").read_text(encoding="utf-8"))
+    # model.json names all, and where each camera is.
+    few = dict(islice(numbers["unregistered"].items(), MAX_UNREGISTERED))
+    return cli.Result(numbers, cli.table({**numbers, "cameras": None, "unregistered": few}))

@@ -16,33 +16,30 @@ from ..tracking.pipeline import track as track_points
 from ..tracking.tracker import TrackingOptions
 from . import _options as cli
 
-TRACKING = cli.From(TrackingOptions, common="max_keypoints")
+TRACKING = cli.From(TrackingOptions, "max_keypoints")
 FRAMES = cli.From(
     track_points,
-    "every max_frames max_side tail",
-    common="every max_frames max_side",
+    "every max_frames max_side",
+    more="tail",
     defaults={"max_frames": "all", "max_side": "no limit"},
 )
 
 
-@cli.with_options(FRAMES, TRACKING)
+@cli.command(FRAMES, TRACKING, cli.MEGAPIXELS)
 def track(
     source: Annotated[str, Parameter(help="A video file, a folder, or the number of a camera.")],
     /,
     *,
     output: cli.Output = Path("tracks.mp4"),
     overwrite: cli.Overwrite = False,
-    as_json: cli.Json = False,
-    max_megapixels: cli.MaxMegapixels = 200,
     **values: Any,
-) -> None:
+) -> cli.Result:
     """Follow keypoints through a video file, a folder of frames, or the camera of this number.
 
     Writes a video with the points, their last positions and the frames per second of the work, and
     beside it a table of all tracks (.csv): frame, track, x, y, score. Ctrl-C, SIGTERM or SIGHUP on
-    a camera ends the recording, and both files are written. An image of a folder that cannot be
-    read, or has another size than the first one, does not stop the others: they are listed at the
-    end, with exit code 1.
+    a camera ends the recording, and both files are written. Images of another size than the first
+    one, or that cannot be read, are listed at the end, with exit code 1.
 
         deepdetect track drive.mp4 -o tracks.mp4
         deepdetect track frames/ -o tracks.mp4 --max-keypoints 500
@@ -58,8 +55,8 @@ def track(
     options = TrackingOptions(**values)
     with FrameSource(source) as opened:
         live = opened.live
-    if live and not overwrite:
-        for path in (path for path in files if path.exists()):
+    for path in files if live and not overwrite else ():
+        if path.exists():
             raise OptionError(
                 f"{path} exists, of an earlier recording: choose another name with -o, or "
                 "replace it with --overwrite"
@@ -67,9 +64,9 @@ def track(
     if Path(source).is_file():
         cli.check_inputs_survive(files, [Path(source)])
     outputs = Outputs(files, [Path(source)], overwrite=overwrite)
-    with nullcontext() if live else cli.writing(outputs):
+    with nullcontext() if live else cli.claimed(outputs):
         report = track_points(source, file, options=options, quiet=False, **frames)
-    cli.print_result(as_json, vars(report))
-    if report.expected is not None and report.frames + len(report.failures) < report.expected:
+    total = report.frames + len(report.failures)
+    if report.expected is not None and total < report.expected:
         cli.note(f"the file states {report.expected:,} frames, and may be cut off")
-    cli.report_failures(report.failures, report.frames + len(report.failures), "frames")
+    return cli.Result(vars(report), "", report.failures, total, "frames")

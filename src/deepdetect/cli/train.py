@@ -1,24 +1,61 @@
-"""`deepdetect train`: weights from a folder of images."""
+"""`deepdetect train`, `train-points`, `label`, `shards` and `average`."""
 
 from __future__ import annotations
 
-import os
-from dataclasses import asdict
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from ..training import DeviceOptions, profile
+from .._shared.errors import MissingWeightsError, OptionError
+from .._shared.progress import progress
+from .._shared.provenance import provenance
+from ..batch.engines import get_engine
+from ..detector.pretrained import resolve_weights
+from ..labels import LabelOptions, find_label_settings
+from ..labels.batch import LabelTask, label_files
+from ..training import (
+    DeviceOptions,
+    PointsTrainingOptions,
+    Stage,
+    TrainingOptions,
+    profile,
+    training_preset,
+    write_shards,
+)
 from ..training import train as train_network
+from ..training import train_points as train_ranker
 from ..training.run import require_packages
 from . import _options as cli
-from ._training import RECIPE, Detectors, LabelSettings, Preset, chosen_recipe
+from .features import EXTRACTION
 
+Folder = Annotated[Path, Parameter(help="Folder of the images, of train also of shards.")]
+Detectors = Annotated[
+    str | None,
+    Parameter(
+        help="Some of sift, orb, brisk, fast, agast, harris, shi-tomasi, canny, sobel, with commas "
+        "between.  [default: all]"
+    ),
+]
+LabelSettings = Annotated[
+    str | None,
+    Parameter(help="Detectors and their settings: paper or dense, or a file.  [default: paper]"),
+]
+Preset = Annotated[
+    str,
+    Parameter(
+        help="Recipe that the other options change: default (its values are shown here), paper "
+        "(the paper's own), or dense (normal light only, denser labels)."
+    ),
+]
 RUN = cli.From(
     train_network,
-    "validation labels init_weights",
-    common="validation init_weights",
+    "validation init_weights",
+    more="labels workers",
     flags={"init_weights": "--init"},
     types={"init_weights": list[str] | None},
     defaults={
@@ -27,12 +64,41 @@ RUN = cli.From(
         "init_weights": "random ones, by the seed",
     },
 )
-DEVICE = cli.From(DeviceOptions, common="device")
+RECIPE = cli.From(
+    TrainingOptions,
+    "stages max_images learning_rate augmentations seed",
+    more=" ".join(n for n in TrainingOptions.__dataclass_fields__ if n != "labels"),
+    flags={
+        "stages": "--stage",
+        "short_sides": "--short-side",
+        "frozen_batch_norm": "--frozen-batch-norm/--batch-norm",
+    },
+    types={"stages": list[str] | None, "short_sides": list[int] | None},
+    defaults={
+        "stages": "240x16x44 480x8x10",
+        "short_sides": "480 360 240",
+        "max_images": "all",
+        "frozen_batch_norm": "with --init",
+        "low_light_pos_weight": "that of --pos-weight",
+    },
+)
+DEVICE = cli.From(DeviceOptions, "device")
+SHARDS = replace(RECIPE, common="max_images augmentations", more="short_sides square val_fraction")
+"""What of a recipe is fixed once the labels are made."""
+
+SHARD_SIZE = cli.From(write_shards, "shard_size", more="")
+ENGINE = replace(EXTRACTION, common="")
+POINTS_RUN = cli.From(
+    train_ranker,
+    "validation num_workers",
+    more="",
+    types={"validation": Path},
+)
 
 
-@cli.with_options(RUN, RECIPE, DEVICE)
+@cli.command(RUN, RECIPE, DEVICE)
 def train(
-    images: Annotated[Path, Parameter(help="Folder of images, or of shards.")],
+    images: Folder,
     /,
     *,
     output: cli.Output,
@@ -40,10 +106,8 @@ def train(
     detectors: Detectors = None,
     label_settings: LabelSettings = None,
     profiling: Annotated[bool, Parameter("--profile", negative="")] = False,
-    workers: cli.Workers = None,
-    as_json: cli.Json = False,
     **values: Any,
-) -> None:
+) -> cli.Result:
     """Train the network on the images, or the shards, in a folder.
 
     Labels are made first, once, by the detectors of `deepdetect label`. The run's folder gets
@@ -60,24 +124,18 @@ def train(
     """
     require_packages()
     cli.check_folder_not_made(images, output)
-    arguments = RUN.take(values)
-    if given := arguments.pop("init_weights", None):
-        arguments["init_weights"] = given[0] if len(given) == 1 else tuple(given)
-    arguments["device"] = DeviceOptions(**DEVICE.take(values))
-    arguments |= {"workers": workers, "log": None if as_json else print}
-    options = chosen_recipe(preset, detectors, label_settings, values)
+    run = RUN.take(values)
+    if given := run.pop("init_weights", None):
+        run["init_weights"] = given[0] if len(given) == 1 else tuple(given)
+    run |= {"device": DeviceOptions(**DEVICE.take(values)), "log": cli.note}
+    recipe = chosen_recipe(preset, detectors, label_settings, values)
     if profiling:
-        profiles = profile(images, output, options, **arguments)
-        if int(os.environ.get("RANK", 0)) == 0:  # of torchrun
-            if as_json:
-                cli.print_json([asdict(each) for each in profiles])
-            for each in () if as_json else profiles:
-                cli.print_result(False, asdict(each))
-        return
-    result = train_network(images, output, options, **arguments)
-    if int(os.environ.get("RANK", 0)) == 0:
-        best = result.best
-        values = {
+        profiles = [asdict(each) for each in profile(images, output, recipe, **run)]
+        return cli.Result(profiles, "\n".join(map(cli.table, profiles)))
+    result = train_network(images, output, recipe, **run)
+    best = result.best
+    return cli.Result(
+        {
             "weights": result.weights,
             "onnx": result.onnx,
             "epoch": best["epoch"],
@@ -86,4 +144,209 @@ def train(
             "dark": {"loss": best["dark_loss"], "iou": best["dark_iou"]},
             "images_per_second": round(result.images_per_second, 3),
         }
-        cli.print_result(as_json, values)
+    )
+
+
+@cli.command(POINTS_RUN, cli.From(PointsTrainingOptions, "steps seed"))
+def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
+    """Train the ranker of keypoints on the images in a folder.
+
+    Pairs of views are made of single images, so no labels are needed. The run's folder gets
+    best.npz (the weights of the highest validation score), MODEL_CARD.md, curves.csv, curves.png
+    and checkpoint.safetensors. An interrupted run resumes when the same command is given again.
+
+        deepdetect train-points photos/train --validation photos/val -o run
+
+    Args:
+        output: Folder of the run.
+    """
+    require_packages()
+    cli.check_folder_not_made(images, output)
+    run = {**POINTS_RUN.take(values), "output": output, "log": cli.note}
+    result = train_ranker(images, options=PointsTrainingOptions(**values), **run)
+    return cli.Result({"weights": result.weights, "best": result.best, "points": result.points})
+
+
+@cli.command(SHARDS, SHARD_SIZE, ENGINE)
+def shards(
+    images: Folder,
+    /,
+    *,
+    output: cli.Output,
+    preset: Preset = "default",
+    detectors: Detectors = None,
+    label_settings: LabelSettings = None,
+    **values: Any,
+) -> cli.Result:
+    """Pack the images in a folder with their labels into tar files.
+
+    They are in WebDataset's layout. Training reads a few of them at a time, so they may be on a
+    slow disk or a network. Give both commands the same options. When it is interrupted, the same
+    command resumes.
+
+        deepdetect shards --preset paper data/coco -o data/shards
+        deepdetect train --preset paper data/shards -o run
+
+    Args:
+        output: Folder for the shards.
+    """
+    folder = cli.output_folder(output)
+    cli.check_folder_not_made(images, folder)
+    how = {**SHARD_SIZE.take(values), **_engine(values)}
+    # Shards are for any stages: one that fits every size stands for them.
+    recipe = chosen_recipe(preset, detectors, label_settings, {**values, "stages": ["16x1x1"]})
+    made = write_shards(images, folder, recipe, quiet=False, **how)
+    return cli.Result(
+        {
+            "folder": folder,
+            "training": sum(count for _, count in made.training),
+            "validation": sum(count for _, count in made.validation),
+            "shards": len(made.training) + len(made.validation),
+            "bytes": sum(path.stat().st_size for path, _ in made.training + made.validation),
+        }
+    )
+
+
+@cli.command(cli.From(LabelOptions, "visibility", more=""), ENGINE)
+def label(
+    *images: cli.Images,
+    output: cli.Output,
+    detectors: Detectors = None,
+    label_settings: LabelSettings = None,
+    visualize: bool = False,
+    overwrite: cli.Overwrite = False,
+    **values: Any,
+) -> cli.Result:
+    """Mark the keypoints and edges of images (files or folders) by nine classical detectors.
+
+    Writes a 1-bit PNG mask STEM.png for each image: white where one of the detectors marks the
+    pixel. Masks that exist already are skipped, unless their image has changed; what was made of
+    another image or with other settings is replaced with --overwrite only.
+
+        deepdetect label photos/ -o masks
+        deepdetect label photo.jpg -o masks --detectors fast,sobel --visualize
+
+    Args:
+        output: Folder for the masks.
+        visualize: Also write STEM_labels.png, the paper's Figure 4.
+    """
+    folder = cli.output_folder(output)
+    how = _engine(values)
+    options = replace(chosen_label_settings(detectors, label_settings), **values)
+    tasks = []
+    for image in cli.expand_images(images, folder):
+        figure = folder / f"{image.stem}_labels.png" if visualize else None
+        tasks.append(LabelTask(image, folder / f"{image.stem}.png", options, figure, overwrite))
+    _check_outputs(tasks)
+    left = [task for task in tasks if task.outputs.find() is None]
+    with progress(len(left), "labelling", "image") as bar:
+        reports = label_files(left, callback=lambda _: bar.update(1), **how)
+    done = sorted((r for r in reports if r.error is None), key=lambda r: str(r.image))
+    failures = [report.error for report in reports if report.error is not None]
+    names = ("image", "mask", "visibility", "density")
+    skipped = len(tasks) - len(left)
+    found = {
+        "labelled": [{name: getattr(report, name) for name in names} for report in done],
+        "skipped": skipped,
+        "mean_density": sum(report.density for report in done) / len(done) if done else None,
+        "failures": failures,
+    }
+    text = f"{len(done)} labelled, {skipped} already done"
+    if done:
+        low = sum(report.visibility == "low" for report in done)
+        text += f"; mean density {found['mean_density']:.3f}, {low} of low visibility"
+    return cli.Result(found, f"{text} -> {folder}", failures, len(tasks))
+
+
+@cli.command()
+def average(
+    *weights: Annotated[
+        str,
+        Parameter(
+            help=".safetensors files, or default, dense or free; one twice counts double.",
+            required=True,
+        ),
+    ],
+    output: cli.Output,
+    overwrite: cli.Overwrite = False,
+) -> cli.Result:
+    """Average weights (a model soup) into best.safetensors and deepdetect.onnx.
+
+    The mean of runs that continue each other is often better than each of them. Files of another
+    run are replaced with --overwrite only.
+
+        deepdetect average first/best.safetensors second/best.safetensors -o mean
+        deepdetect evaluate samples/ --weights mean/deepdetect.onnx
+
+    Args:
+        output: Folder for both files.
+    """
+    require_packages()
+    if len(weights) < 2:
+        raise OptionError("give at least two weights: the mean of one is itself")
+    paths = [resolve_weights(name, ".safetensors") for name in weights]
+    for path in paths:  # before torch is imported, which takes a second
+        if not path.exists():
+            raise MissingWeightsError(f"there is no weights file {path}: check the path")
+    folder = cli.output_folder(output)
+    files = {"weights": folder / "best.safetensors", "onnx": folder / "deepdetect.onnx"}
+
+    from ..detector.network.onnx_export import export_onnx
+    from ..detector.network.weights import (
+        average_weights,
+        load_network,
+        read_notes,
+        save_weights,
+        weights_digest,
+    )
+
+    with cli.writing(files, paths, overwrite) as made:
+        network = average_weights(paths)
+        parts = [{"sha256": weights_digest(load_network(p)), **read_notes(p)} for p in paths]
+        save_weights(network, made["weights"], {"parts": json.dumps(parts), **provenance()})
+        export_onnx(network, made["onnx"])
+    return cli.Result(files)
+
+
+def chosen_label_settings(detectors: str | None, chosen: str | None) -> LabelOptions:
+    """Find settings by name or TOML file; detectors (with commas between) replace theirs."""
+    settings = find_label_settings(chosen or "paper")
+    if detectors is None:
+        return settings
+    names = tuple(name.strip() for name in detectors.split(",") if name.strip())
+    return replace(settings, detectors=names)
+
+
+def chosen_recipe(
+    preset: str, detectors: str | None, label_settings: str | None, values: dict[str, Any]
+) -> TrainingOptions:
+    """Return a preset's training options with the given values changed."""
+    if "stages" in values:
+        values["stages"] = tuple(map(Stage.parse, values["stages"]))
+    if "short_sides" in values:
+        values["short_sides"] = tuple(values["short_sides"])
+    recipe = training_preset(preset)
+    if label_settings is not None:
+        values["labels"] = chosen_label_settings(detectors, label_settings)
+    elif detectors is not None:  # the preset's settings, for the detectors that are used
+        chosen = chosen_label_settings(detectors, None).detectors
+        values["labels"] = recipe.labels.with_detectors(chosen)
+    return replace(recipe, **values)
+
+
+def _engine(values: dict[str, Any]) -> dict[str, Any]:
+    """Take what does the work out of the values."""
+    chosen = ENGINE.take(values)
+    map_tasks = get_engine(chosen.get("engine", "processes"))
+    return {"map_tasks": map_tasks, "workers": chosen.get("workers")}
+
+
+def _check_outputs(tasks: Sequence[LabelTask]) -> None:
+    """Check that no image is replaced, and no output by another."""
+    outputs = [path for task in tasks for path in task.outputs.paths]
+    cli.check_inputs_survive(outputs, [task.image for task in tasks])
+    for path, count in Counter(outputs).items():
+        if count > 1:
+            raise OptionError(
+                f"two images would both write {path}: rename one, or leave out --visualize"
+            )

@@ -5,22 +5,20 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from .._shared.errors import InvalidFileError, OptionError
 from .._shared.options import suggest_keywords
 from ..batch.extraction import extract_features, keypoints_of
-from ..batch.hdf5 import import_h5py, open_hdf5
-from ..batch.pair_list import Pair, read_pairs
+from ..batch.hdf5 import feature_names, import_h5py, open_hdf5
+from ..batch.pair_list import Pair, read_pairs, sequential_pairs
 from ..batch.pair_matching import match_pairs
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
 from ..io.image import find_images
 from ..io.tables import load_keypoints, load_matches
-from ..sfm.pair_selection import sequential_pairs
 from .collection import Collection, PairMatches
 
 MAX_ALL_PAIRS = 50
@@ -78,17 +76,9 @@ def read_collection(
 
 def read_features_file(path: Path) -> dict[str, Keypoints]:
     """Read all features of an HDF5 file of hloc's layout, by the name of the image."""
-    h5py = import_h5py()
-    names: list[str] = []
     found: dict[str, Keypoints] = {}
     with open_hdf5(path) as file:
-
-        def note(name: str, each: Any) -> None:
-            if isinstance(each, h5py.Dataset) and name.endswith("/keypoints"):
-                names.append(name.removesuffix("/keypoints"))
-
-        file.visititems(note)
-        for name in sorted(names):
+        for name in sorted(feature_names(file)):
             try:
                 found[name] = keypoints_of(file[name])
             except (OptionError, ValueError, TypeError) as error:

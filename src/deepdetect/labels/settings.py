@@ -31,7 +31,8 @@ class LabelOptions:
 
     Attributes:
         detectors: names of the detectors to fuse (default: all nine).
-        visibility: "auto" decides by `visibility_of`; "normal" and "low" override it.
+        visibility: settings for "normal" or "low" light, or "auto": low where the luma spans fewer
+            than 64 grey levels from the 1st to the 99th percentile.
         settings: settings of detectors that differ from the paper's, for normal images and for
             those of low visibility.
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import signal
-import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from .._shared.errors import MissingExtraError
 from .._shared.opencv import import_opencv
+from .._shared.signals import sigterm_kept
 
 PIXEL_CENTRE = 0.5
 """COLMAP's position of the centre of the first pixel; ours is 0."""
@@ -26,24 +24,15 @@ def import_pycolmap(purpose: str = "a reconstruction from many images") -> Any:
         MissingExtraError: it is not installed, or h5py is not.
     """
     import_opencv()
-    first = "pycolmap" not in sys.modules
-    try:
-        import h5py  # noqa: F401
-        import pycolmap
-    except ImportError:
-        raise MissingExtraError(
-            f"{purpose} needs pycolmap and h5py: run pip install pycolmap h5py"
-        ) from None
-    if first:
-        _restore_sigterm()
+    with sigterm_kept():  # or a process that is ended would print a stack trace
+        try:
+            import h5py  # noqa: F401
+            import pycolmap
+        except ImportError:
+            raise MissingExtraError(
+                f"{purpose} needs pycolmap and h5py: run pip install pycolmap h5py"
+            ) from None
     return pycolmap
-
-
-def _restore_sigterm() -> None:
-    """Undo what pycolmap does at import: a process that is ended would print a stack trace."""
-    handler = signal.getsignal(signal.SIGTERM)  # Python does not know that it has been replaced
-    if handler is not None and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, handler)
 
 
 @contextmanager

@@ -26,18 +26,6 @@ KMEANS_ITERATIONS = 10
 MAX_TRAINING_DESCRIPTORS = 50_000
 
 
-def sequential_pairs(names: Sequence[str], following: int) -> list[Pair]:
-    """Return each name with so many that follow it.
-
-    Example:
-        >>> sequential_pairs(["a", "b", "c", "d"], 2)
-        [('a', 'b'), ('a', 'c'), ('b', 'c'), ('b', 'd'), ('c', 'd')]
-    """
-    return [
-        (name, other) for k, name in enumerate(names) for other in names[k + 1 : k + 1 + following]
-    ]
-
-
 def similar_pairs(names: Sequence[str], vectors: np.ndarray, count: int) -> list[Pair]:
     """Return each name with the `count` whose vectors (N, D) are most alike, every pair once.
 

@@ -25,7 +25,7 @@ from .._shared.progress import progress
 from .._shared.records import file_state, key, load_arrays, save_arrays
 from ..batch.extraction import extract_features
 from ..batch.hdf5 import open_hdf5
-from ..batch.pair_list import Pair, pair_name
+from ..batch.pair_list import Pair, pair_name, sequential_pairs
 from ..batch.pair_matching import PairMatchingOptions, match_pairs
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
@@ -44,13 +44,7 @@ from .dense import (
 from .intrinsics import CameraIntrinsics
 from .mapping import RegisteredImage, SparseModel, adjust, map_images, normalise_model, verify_pairs
 from .options import MultiViewOptions
-from .pair_selection import (
-    COMPARED_KEYPOINTS,
-    SIMILAR,
-    sequential_pairs,
-    similar_pairs,
-    vlad_vectors,
-)
+from .pair_selection import COMPARED_KEYPOINTS, SIMILAR, similar_pairs, vlad_vectors
 
 WORK = "work"
 """Folder of what the stages made, within that of the results."""

@@ -1,0 +1,97 @@
+"""`deepdetect extract` and `match-many`: features and matches of a collection of images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from ..batch.extraction import extract_features
+from ..batch.pair_matching import MATCHERS_OF_FLOATS, PairMatchingOptions, match_pairs
+from ..batch.report import BatchReport
+from . import _options as cli
+from ._detection import NETWORK, POINTS, SELECTION, Detector, chosen_detector
+
+EXTRACTION = cli.From(extract_features, "overwrite", more="engine workers")
+PAIRS = cli.From(match_pairs, "sequential overwrite", more="engine workers")
+MATCHING = cli.From(
+    PairMatchingOptions,
+    "ratio mutual verify",
+    types={
+        "matcher": Literal[tuple(MATCHERS_OF_FLOATS)],
+        "verify": Literal["none", "fundamental", "homography", "auto"],
+    },
+)
+
+
+@cli.command(EXTRACTION, SELECTION, POINTS, NETWORK, cli.MEGAPIXELS)
+def extract(
+    folder: Annotated[Path, Parameter(help="Folder of the images.")],
+    /,
+    *,
+    output: cli.Output = Path("features.h5"),
+    detector: Detector = "points",
+    **values: Any,
+) -> cli.Result:
+    """Extract the keypoints and RootSIFT descriptors of all images below a folder.
+
+    Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. When it is
+    interrupted or killed, the same command goes on; new and changed images are added later, and
+    the features of images that are gone are removed.
+
+        deepdetect extract photos/ -o features.h5
+        deepdetect extract photos/ -o features.h5 --engine ray --workers 64
+        deepdetect match-many features.h5 --pairs exhaustive
+
+    Args:
+        output: File for the features, or a folder for it.
+    """
+    file = cli.output_file(output, "features.h5")
+    cli.check_folder_not_made(folder, file)
+    how = EXTRACTION.take(values)
+    chosen, selection = chosen_detector(detector, values, threads=1)  # one a process
+    report = extract_features(folder, file, chosen, selection=selection, quiet=False, **how)
+    keypoints = sum(report.counts.values())
+    return _result(report, "keypoints", images=[*report.counts], keypoints=keypoints)
+
+
+@cli.command(PAIRS, MATCHING)
+def match_many(
+    features: Annotated[Path, Parameter(help="File of `deepdetect extract`, or of hloc.")],
+    /,
+    *,
+    pairs: str,
+    output: cli.Output = Path("matches.h5"),
+    **values: Any,
+) -> cli.Result:
+    """Match the descriptors in a file of features, pair by pair.
+
+    Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. When it is
+    interrupted or killed, the same command goes on; new pairs are added later.
+
+        deepdetect match-many features.h5 --pairs exhaustive
+        deepdetect match-many features.h5 --pairs sequential --verify fundamental
+        deepdetect match-many features.h5 --pairs pairs.txt -o matches.h5
+
+    Args:
+        pairs: exhaustive (all), sequential (each image with those that follow it by name), or a
+            text file with the names of two images on each line, as hloc writes it.
+        output: File for the matches, or a folder for it.
+    """
+    file = cli.output_file(output, "matches.h5")
+    how = PAIRS.take(values)
+    options = PairMatchingOptions(**values)
+    report = match_pairs(features, pairs, file, options=options, quiet=False, **how)
+    matches = [{"pair": pair, "matches": count} for pair, count in report.counts.items()]
+    return _result(report, "matches", matches=matches)
+
+
+def _result(report: BatchReport, unit: str, **listed: Any) -> cli.Result:
+    count, skipped, failures = len(report.counts), report.skipped, report.failures
+    text = (
+        f"{count} {report.of} with {sum(report.counts.values()):,} {unit}, {skipped} already done"
+    )
+    text += f" -> {report.path}" if report.path.exists() else ""
+    values = {"path": report.path, **listed, "skipped": skipped, "failures": failures}
+    return cli.Result(values, text, failures, count + skipped + len(failures), report.of)
