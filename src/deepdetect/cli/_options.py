@@ -21,7 +21,8 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import BatchError, DeepDetectError, OptionError
 from .._shared.records import Outputs, check_not_made, outputs_in
 from .._shared.signals import exit_by_signal, handle_signals
-from ..io.image_file import MAX_MEGAPIXELS, limit_megapixels, open_image
+from ..io.image import load_image
+from ..io.image_file import MAX_MEGAPIXELS, limit_megapixels
 from ._commands import NOTHING_FOUND as NOTHING_FOUND
 
 MORE = Group("More options")
@@ -83,7 +84,7 @@ class From:
 
 
 MEGAPIXELS = From(
-    open_image, more="max_megapixels", defaults={"max_megapixels": f"{MAX_MEGAPIXELS:g}"}
+    load_image, more="max_megapixels", defaults={"max_megapixels": f"{MAX_MEGAPIXELS:g}"}
 )
 """Of commands that read images."""
 

@@ -69,13 +69,6 @@ ONNX = cli.From(
     },
     defaults={"size": "any"},
 )
-CONTENT = cli.From(
-    write_onnx,
-    "calibration licence",
-    more="",
-    types={"calibration": list[Path]},
-    defaults={"calibration": "none"},
-)
 Sources = Annotated[
     Path,
     Parameter(
@@ -224,8 +217,16 @@ def size_of(text: str) -> tuple[int, int]:
 
 
 @export.command
-@cli.command(ONNX, CONTENT)
-def onnx(weights: str = "default", /, *, output: cli.Output, **values: Any) -> cli.Result:
+@cli.command(ONNX)
+def onnx(
+    weights: str = "default",
+    /,
+    *,
+    output: cli.Output,
+    calibration: list[Path] | None = None,
+    licence: str | None = None,
+    **values: Any,
+) -> cli.Result:
     """Write weights as an ONNX file, for ONNX Runtime, OpenVINO, OpenCV and others.
 
     WEIGHTS are default, dense, free, an ONNX file that this package has written in fp32 for any
@@ -242,14 +243,16 @@ def onnx(weights: str = "default", /, *, output: cli.Output, **values: Any) -> c
     Args:
         weights: Name or file of the weights.
         output: The .onnx file, or a folder for deepdetect.onnx.
+        calibration: Images or folders for int8, like those that it will be used on.
+        licence: What the file says of the licence of the weights.
     """
     file = cli.output_file(output, "deepdetect.onnx")
-    options = OnnxOptions(**ONNX.take(values))
+    options = OnnxOptions(**values)
     images = [
         image
-        for path in values.pop("calibration", ())
+        for path in calibration or ()
         for image in (find_images(path) if path.is_dir() else [path])
     ]
     cli.check_inputs_survive([file], [resolve_weights(weights), *images])
-    metadata = write_onnx(weights, file, options, calibration=images, **values)
+    metadata = write_onnx(weights, file, options, calibration=images, licence=licence)
     return cli.Result({"file": file, "bytes": file.stat().st_size, "metadata": metadata})
