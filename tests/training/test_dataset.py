@@ -88,17 +88,6 @@ def test_an_image_that_cannot_be_read_is_named(photographs: Path, tmp_path: Path
     assert len(list(made.label_folder.glob("*.png"))) == 2 * 2, "the others are kept"
 
 
-def test_photographs_of_one_name_have_their_own_labels(photographs: Path, tmp_path: Path) -> None:
-    """Training and validation folders often number their photographs in the same way."""
-    paths = []
-    for part, name in (("train", "photo00.png"), ("val", "photo05.png")):
-        (tmp_path / part).mkdir()
-        (tmp_path / part / "0001.png").write_bytes((photographs / name).read_bytes())
-        made = FolderSource(list_images(tmp_path / part, OPTIONS), tmp_path, OPTIONS.labels)
-        paths.append(made.label_path(made[0], made[0].normal[0]))
-    assert paths[0] != paths[1]
-
-
 def loader(source, options: TrainingOptions = OPTIONS, workers: int = 0, **steps) -> DataLoader:
     sampler = CropSampler(Schedule(options, len(source)), **steps)
     return DataLoader(CropDataset(source, options), batch_sampler=sampler, num_workers=workers)

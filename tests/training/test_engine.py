@@ -24,20 +24,22 @@ def gradients(engine: Engine, images: torch.Tensor, truth: torch.Tensor) -> list
     return [parameter.grad.clone() for parameter in engine.network.parameters()]
 
 
-def test_gradients_in_bfloat16_are_those_of_float32_within_rounding() -> None:
+def two_engines(side: int, options: DeviceOptions) -> tuple[list[torch.Tensor], ...]:
+    """Return the gradients of one network, by an eager engine in float32 and by another one."""
     torch.manual_seed(0)
     first, second = ESPNet(), ESPNet()
     second.load_state_dict(first.state_dict())
-    rgb = torch.randint(0, 256, (2, 96, 96, 3), dtype=torch.uint8)
-    truth = (torch.rand(2, 1, 96, 96) < 0.4).float()
-    exact = make_engine(first, DeviceOptions("cpu", "float32", compile=False))
-    rounded = make_engine(second, DeviceOptions("cpu", "bfloat16", compile=False))
-    expected = gradients(exact, exact.to_float(rgb), truth)
-    found = gradients(rounded, rounded.to_float(rgb), truth)
-    for name, gradient in zip(dict(first.named_parameters()), found, strict=True):
-        assert torch.isfinite(gradient).all(), name
-    a = torch.cat([gradient.flatten() for gradient in expected])
-    b = torch.cat([gradient.flatten() for gradient in found])
+    rgb = torch.randint(0, 256, (2, side, side, 3), dtype=torch.uint8)
+    truth = (torch.rand(2, 1, side, side) < 0.4).float()
+    plain = make_engine(first, DeviceOptions("cpu", "float32", compile=False))
+    other = make_engine(second, options)
+    return tuple(gradients(engine, engine.to_float(rgb), truth) for engine in (plain, other))
+
+
+def test_gradients_in_bfloat16_are_those_of_float32_within_rounding() -> None:
+    expected, found = two_engines(96, DeviceOptions("cpu", "bfloat16", compile=False))
+    a, b = (torch.cat([gradient.flatten() for gradient in each]) for each in (expected, found))
+    assert torch.isfinite(b).all()
     assert torch.nn.functional.cosine_similarity(a, b, dim=0) > 0.97
     assert (a - b).norm() / a.norm() < 0.25
 
@@ -62,18 +64,8 @@ def test_a_compiler_that_does_not_work_is_left_out(monkeypatch: pytest.MonkeyPat
     reason="takes minutes: set DEEPDETECT_TEST_COMPILE=1",
 )
 def test_compiled_training_gives_the_eager_gradients() -> None:
-    torch.manual_seed(0)
-    first, second = ESPNet(), ESPNet()
-    second.load_state_dict(first.state_dict())
-    rgb = torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8)
-    truth = (torch.rand(2, 1, 64, 64) < 0.4).float()
-    eager = make_engine(first, DeviceOptions("cpu", "float32", compile=False))
-    compiled = make_engine(second, DeviceOptions("cpu", "float32", compile=True))
-    for a, b in zip(
-        gradients(eager, eager.to_float(rgb), truth),
-        gradients(compiled, compiled.to_float(rgb), truth),
-        strict=True,
-    ):
+    expected, found = two_engines(64, DeviceOptions("cpu", "float32", compile=True))
+    for a, b in zip(expected, found, strict=True):
         torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-3)
 
 

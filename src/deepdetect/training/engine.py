@@ -1,7 +1,6 @@
 """Running a network for training: device, precision, compilation, one process or several GPUs.
 
-Lightning Fabric places the network and wraps it for several GPUs (DistributedDataParallel), whose
-processes `torchrun` starts.
+Lightning Fabric wraps it for several GPUs, whose processes `torchrun` starts.
 """
 
 from __future__ import annotations
@@ -59,10 +58,7 @@ def launch(options: DeviceOptions) -> Fabric:
 
 
 class Engine:
-    """A network on its device, with precision and compilation as chosen.
-
-    The network is moved, and stays the same object (with the same state).
-    """
+    """A network, the same object, moved to its device, with precision and compilation as chosen."""
 
     def __init__(self, network: nn.Module, options: DeviceOptions, fabric: Fabric) -> None:
         kind = options.accelerator

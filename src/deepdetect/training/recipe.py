@@ -166,10 +166,8 @@ class TrainingOptions:
             raise OptionError("`pos_weight_uncertain` needs a `pos_weight` other than 1")
 
     def _check_sizes(self) -> None:
-        if not self.stages:
-            raise OptionError("`stages` must name at least one stage")
-        if not self.short_sides or min(self.short_sides) < 16:
-            raise OptionError("`short_sides` must be at least 16 pixels")
+        if not self.stages or not self.short_sides or min(self.short_sides) < 16:
+            raise OptionError("give `stages`, and `short_sides` of at least 16 pixels")
         for side in (side for stage in self.stages for side in stage.sides):
             if side not in self.short_sides:
                 raise OptionError(

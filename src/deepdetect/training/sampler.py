@@ -1,7 +1,6 @@
-"""The steps of a run, and a sampler of their batches: pure functions of the seed and the step.
+"""The steps of a run, and their batches: pure functions of the seed and the step.
 
-Nothing is remembered from one step to the next, so an interrupted run resumes with exactly the
-batches it would have seen.
+So an interrupted run resumes with exactly the batches it would have seen.
 """
 
 from __future__ import annotations

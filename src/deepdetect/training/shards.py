@@ -1,8 +1,7 @@
 """Images with their labels in shards, for sets much larger than the memory or on slow disks.
 
-A shard is a tar file in the layout of WebDataset: of every image the file as it was, its name,
-and the labels of its views. Nothing in it is compressed, so any image can be read by itself; the
-sampler reads a few shards at a time, so that a disk or a network delivers each of them in one go.
+A shard is an uncompressed tar file in the layout of WebDataset: of every image the file, its name,
+and the labels of its views. The sampler reads a few shards at a time.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""The validation metric: what a ranking is judged and chosen by, on images not trained on.
+"""The validation metric, on images not trained on, by the functions of the benchmark.
 
-One-to-one repeatability at fixed budgets, and correct matches by upright descriptors, on a fixed,
-seeded set of synthetic pairs, as many of each kind, by the functions of the benchmark. Points
-outside the image are dropped before the best are taken, for every detector alike.
+One-to-one repeatability at fixed budgets, and correct matches by upright descriptors, on a fixed
+set of synthetic pairs. Points outside the image are dropped before the best are taken.
 """
 
 from __future__ import annotations

@@ -20,11 +20,7 @@ INITIAL_OUTPUT = 0.01
 
 
 class RankerModule(nn.Module):
-    """A perceptron of the features, added to the first of them.
-
-    Args:
-        mean, deviation: (F,) of the features.
-    """
+    """A perceptron of the features, added to the first of them; made from their statistics (F,)."""
 
     mean: Tensor
     deviation: Tensor
