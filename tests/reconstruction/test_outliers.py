@@ -7,13 +7,12 @@ from hypothesis import strategies as st
 
 from deepdetect import OptionError
 from deepdetect.reconstruction.outliers import (
-    SOR_WINDOW_PX,
     PointFilterOptions,
     disparity_space,
     mean_neighbor_distances,
     sor_inliers,
-    sor_inliers_on_grid,
 )
+from deepdetect.reconstruction.pipeline import SOR_WINDOW_PX, sor_inliers_on_grid
 
 
 def street() -> tuple[np.ndarray, np.ndarray]:

@@ -139,32 +139,26 @@ def test_a_second_signal_ends_all_at_once(numbers, error, camera, tmp_path: Path
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="signals of POSIX")
-def test_a_closed_terminal_does_not_end_what_ignores_it(camera, tmp_path: Path) -> None:
-    """As nohup has it."""
-    camera(signal.SIGHUP)
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        assert track(0, tmp_path / "t.mp4", options=FEW, max_frames=4).frames == 4
-        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGHUP, before)
+def test_signals_that_the_caller_handles_or_ignores_are_left_to_it(camera, tmp_path: Path) -> None:
+    """As nohup ignores that of a closed terminal."""
 
-
-def test_sigterm_that_the_caller_handles_is_left_to_it(camera, tmp_path: Path) -> None:
     class Ended(Exception):
         pass
 
     def end(*_: object) -> None:
         raise Ended
 
-    camera(signal.SIGTERM)
-    before = signal.signal(signal.SIGTERM, end)
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN), signal.signal(signal.SIGTERM, end)
     try:
+        camera(signal.SIGHUP)
+        assert track(0, tmp_path / "t.mp4", options=FEW, max_frames=4).frames == 4
+        camera(signal.SIGTERM)
         with pytest.raises(Ended):
             track(0, tmp_path / "t.mp4", options=FEW)
         assert signal.getsignal(signal.SIGTERM) is end
     finally:
-        signal.signal(signal.SIGTERM, before)
+        signal.signal(signal.SIGHUP, before[0])
+        signal.signal(signal.SIGTERM, before[1])
 
 
 def test_an_interrupt_of_a_video_leaves_nothing(frame_folder, tmp_path: Path) -> None:

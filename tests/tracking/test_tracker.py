@@ -72,21 +72,14 @@ def test_a_point_that_is_covered_is_lost(moving_photo) -> None:
     assert np.count_nonzero(found.xy[:, 0] < 140) < 0.05 * np.count_nonzero(found.xy[:, 0] > 180)
 
 
-def test_points_of_deepdetect(moving_photo) -> None:
+def test_a_black_frame_loses_all_points_of_deepdetect_and_is_no_error(moving_photo) -> None:
     options = TrackingOptions(max_keypoints=200)
     tracker = Tracker(point_candidates(options), options)
-    first = tracker.update(moving_photo(0))
-    second = tracker.update(moving_photo(1))
+    first, second = (tracker.update(moving_photo(k)) for k in range(2))
     assert 100 < len(first) <= 200
     assert np.isin(second.tracks, first.tracks).mean() > 0.8
-
-
-def test_a_black_frame_loses_all_and_is_no_error(moving_photo) -> None:
-    options = TrackingOptions(max_keypoints=100)
-    tracker = Tracker(point_candidates(options), options)
-    assert len(tracker.update(moving_photo(0)))
     assert len(tracker.update(np.zeros((240, 320, 3), np.uint8))) == 0
-    again = tracker.update(moving_photo(1))
+    again = tracker.update(moving_photo(2))
     assert len(again)
     assert (again.ages == 0).all()
 

@@ -17,13 +17,9 @@ import numpy as np
 
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
-from ..geometry.images import window_sums
 
 FLANN_INDEX_KDTREE_SINGLE = 4
 """FLANN's number of the kd-tree that is exact in few dimensions."""
-
-SOR_WINDOW_PX = 9
-"""Side of the window of pixels that SOR compares with in rectified pairs."""
 
 SOR_DISPARITY_WEIGHT = 2.0
 """Distance of 1 px of disparity in `disparity_space`, in pixels of the image."""
@@ -73,45 +69,6 @@ def sor_inliers(
         limit = distances.mean() + point_filter.sor_std_ratio * distances.std()
         inliers[inliers] = distances <= limit
     return inliers
-
-
-def sor_inliers_on_grid(
-    pixels: np.ndarray,
-    disparity: np.ndarray,
-    size: tuple[int, int],
-    point_filter: PointFilterOptions = PointFilterOptions(),
-) -> np.ndarray:
-    """Return which whole pixels (N, 2) of a rectified pair have about the depth of those around.
-
-    As `sor_inliers`, with all in a window as neighbors and the root mean square of the differences
-    of disparity as distance: three box filters. A pixel alone in its window is an outlier only
-    where most are not.
-
-    Example:
-        >>> pixels = np.argwhere(np.ones((20, 20)))
-        >>> disparity = np.full(400, 7.0)
-        >>> disparity[210] = 9
-        >>> np.flatnonzero(~sor_inliers_on_grid(pixels, disparity, (20, 20))).tolist()
-        [210]
-    """
-    if not len(pixels):
-        return np.ones(0, bool)
-    places = np.rint(pixels).astype(np.int64)
-    middle = float(np.median(disparity))  # float32 squares of large numbers lose the differences
-    centred = (disparity - middle).astype(np.float64)
-    others, total, squares = (
-        window_sums(places, values, size[::-1], SOR_WINDOW_PX)
-        for values in (1.0, centred, centred**2)
-    )
-    others = others - 1
-    differences = squares - 2 * centred * total + (others + 1) * centred**2
-    distances = np.sqrt(np.maximum(differences, 0) / np.maximum(others, 1))
-    accompanied = others > 0.5
-    if not accompanied.any():
-        return np.ones(len(pixels), bool)
-    near = distances[accompanied]
-    isolated = ~accompanied & (accompanied.mean() > 0.5)
-    return (distances <= near.mean() + point_filter.sor_std_ratio * near.std() + 1e-6) & ~isolated
 
 
 def mean_neighbor_distances(points: np.ndarray, neighbors: int) -> np.ndarray:

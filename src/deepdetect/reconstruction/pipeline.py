@@ -23,12 +23,13 @@ from ..detector.image_lists import Images, ignore_masks
 from ..features.keypoints import Keypoints
 from ..features.selection import SelectionOptions
 from ..geometry.camera import Calibration, Camera, read_calibration
+from ..geometry.images import window_sums
 from ..io.exif import calibration_from_exif
 from ..io.image import load_image, luma
 from ..matching.options import MatchingOptions
 from ..matching.pipeline import match_images
 from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity
-from .outliers import PointFilterOptions, sor_inliers_on_grid
+from .outliers import PointFilterOptions
 from .rectification import (
     check_cameras,
     check_depths,
@@ -48,6 +49,9 @@ MAX_DIFFERENCE_LEVELS, DIFFERENCE_QUANTILE = 8.0, 0.999
 MAX_DIFFERENCE_TO_GRADIENT = 0.5
 """The same, as a multiple of what the image differs from itself shifted by a pixel: dark views
 differ by few levels."""
+
+SOR_WINDOW_PX = 9
+"""Side of the window of pixels that SOR compares with in rectified pairs."""
 
 MIN_UNIQUE_FRACTION = 0.1
 """Of the keypoints with a match on their row, where only unique matches count: unrelated images
@@ -263,6 +267,45 @@ def _from_disparities(
         "matches": len(found),
         "dropped": dropped,
     }
+
+
+def sor_inliers_on_grid(
+    pixels: np.ndarray,
+    disparity: np.ndarray,
+    size: tuple[int, int],
+    point_filter: PointFilterOptions = PointFilterOptions(),
+) -> np.ndarray:
+    """Return which whole pixels (N, 2) of a rectified pair have about the depth of those around.
+
+    As `sor_inliers`, with all in a window as neighbors and the root mean square of the differences
+    of disparity as distance: three box filters. A pixel alone in its window is an outlier only
+    where most are not.
+
+    Example:
+        >>> pixels = np.argwhere(np.ones((20, 20)))
+        >>> disparity = np.full(400, 7.0)
+        >>> disparity[210] = 9
+        >>> np.flatnonzero(~sor_inliers_on_grid(pixels, disparity, (20, 20))).tolist()
+        [210]
+    """
+    if not len(pixels):
+        return np.ones(0, bool)
+    places = np.rint(pixels).astype(np.int64)
+    middle = float(np.median(disparity))  # float32 squares of large numbers lose the differences
+    centred = (disparity - middle).astype(np.float64)
+    others, total, squares = (
+        window_sums(places, values, size[::-1], SOR_WINDOW_PX)
+        for values in (1.0, centred, centred**2)
+    )
+    others = others - 1
+    differences = squares - 2 * centred * total + (others + 1) * centred**2
+    distances = np.sqrt(np.maximum(differences, 0) / np.maximum(others, 1))
+    accompanied = others > 0.5
+    if not accompanied.any():
+        return np.ones(len(pixels), bool)
+    near = distances[accompanied]
+    isolated = ~accompanied & (accompanied.mean() > 0.5)
+    return (distances <= near.mean() + point_filter.sor_std_ratio * near.std() + 1e-6) & ~isolated
 
 
 def _calibration(

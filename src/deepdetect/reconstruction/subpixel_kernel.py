@@ -69,12 +69,7 @@ def align(  # type: ignore[no-untyped-def]
         x0, y0 = pixels0[k, 0], pixels0[k, 1]
         refined[k, 0], refined[k, 1] = points1[k, 0], points1[k, 1]
         converged[k] = False
-        if (
-            x0 < radius + 1
-            or y0 < radius + 1
-            or x0 > width0 - radius - 2
-            or y0 > height0 - radius - 2
-        ):
+        if not (radius < x0 < width0 - radius - 1 and radius < y0 < height0 - radius - 1):
             continue
         mean, mean_x, mean_y = np.float32(0), np.float32(0), np.float32(0)
         j = 0
@@ -111,22 +106,14 @@ def align(  # type: ignore[no-untyped-def]
         determinant = xx * yy - xy * xy
         if determinant <= np.float32(1e-6) * (xx + yy) * (xx + yy) or xx + yy <= 0:
             continue
-        a, b, c, d = (
-            affinities[k, 0, 0],
-            affinities[k, 0, 1],
-            affinities[k, 1, 0],
-            affinities[k, 1, 1],
-        )
+        affinity = affinities[k]
+        a, b, c, d = affinity[0, 0], affinity[0, 1], affinity[1, 0], affinity[1, 1]
         spread_x = radius * (abs(a) + abs(b)) + 2
         spread_y = radius * (abs(c) + abs(d)) + 2
+        most_x, most_y = width1 - 1 - spread_x, height1 - 1 - spread_y
         x1, y1 = points1[k, 0], points1[k, 1]
         for _ in range(iterations):
-            if (
-                x1 < spread_x
-                or y1 < spread_y
-                or x1 > width1 - 1 - spread_x
-                or y1 > height1 - 1 - spread_y
-            ):
+            if x1 < spread_x or y1 < spread_y or x1 > most_x or y1 > most_y:
                 break
             mean = np.float32(0)
             j = 0
