@@ -1,12 +1,7 @@
 """Which points of a cloud are kept: enough parallax, and statistical outlier removal (SOR).
 
 Rusu et al., "Towards 3D point cloud based object maps for household environments", 2008, as in PCL
-and Open3D: a point is removed when its mean distance to its nearest neighbors is above the mean of
-all by more than some standard deviations.
-
-One threshold for all needs one spacing. Points of a stereo pair have it in the image and in
-disparity, not in space, where the far ones would be removed first (Motorcycle with 3 % random
-disparities: 0.2 % of the good lost and 93 % of the wild found, against 0.4 % and 88 % in space).
+and Open3D; but in `disparity_space`, where the spacing of the points of a stereo pair is one.
 """
 
 from __future__ import annotations

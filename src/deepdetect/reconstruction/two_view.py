@@ -1,9 +1,8 @@
 """Points from the matches of two calibrated images that need not be rectified.
 
-Sub-pixel matches -> relative pose -> triangulation -> points, and in between checks that say why
-there is no depth. The pose is that of matches that were refined: all those on whole pixels; of
-matches on rectified rows, which know no more of it than what rectified the pair, a sample of
-corners, while the points are those of the matches as they are.
+Refined matches give the pose: all those on whole pixels; of matches on rectified rows, which know
+no more of it than what rectified the pair, a sample of corners, while the points are those of the
+matches as they are. Checks in between say why there is no depth.
 """
 
 from __future__ import annotations

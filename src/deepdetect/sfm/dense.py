@@ -1,8 +1,7 @@
 """Dense points from images with known cameras.
 
 Each image in turn is the reference. It is rectified with its best neighbours, and matched with
-them row by row (`matching.guided.rectified`). A pixel becomes a point where enough views agree with
-one position in space; it is the position that projects nearest to all of their matches.
+them row by row. A pixel becomes a point where enough views agree with one position in space.
 """
 
 from __future__ import annotations
@@ -213,14 +212,9 @@ def fuse_matches(
         (N, 3) points, (N,) errors as of `DensePoints`, and (N,) number of views that agree, the
         reference among them; 0 where too few do, and there is no point.
     """
-    points = np.full((len(xy), 3), np.nan)
-    errors = np.full(len(xy), np.nan)
-    counts = np.zeros(len(xy), np.int64)
-    for start in range(0, len(xy) if views else 0, BLOCK):
-        part = slice(start, start + BLOCK)
-        points[part], errors[part], counts[part] = _fuse_block(
-            reference, xy[part], views, [places[part] for places in matches]
-        )
+    parts = [slice(start, start + BLOCK) for start in range(0, len(xy), BLOCK)]
+    blocks = [_fuse_block(reference, xy[k], views, [each[k] for each in matches]) for k in parts]
+    points, errors, counts = (np.concatenate(values) for values in zip(*blocks, strict=True))
     return points, errors, counts
 
 
