@@ -93,7 +93,7 @@ def test_tiles_of_a_given_size(
             return np.zeros(rgb.shape[:2], np.float32)
 
     monkeypatch.setattr(heatmap, "MIN_TILE_MEGAPIXELS", 0.01)
-    monkeypatch.setattr("deepdetect.detector.tiling.open_tiled", lambda path, threads: Tiled())
+    monkeypatch.setattr(heatmap, "open_tiled", lambda path, threads: Tiled())
     for size, expected in ((0.1, [0.1]), (1.0, [])):
         areas.clear()
         options = HeatmapOptions("native", tile_megapixels=size)
@@ -130,7 +130,7 @@ def test_images_in_bfloat16_are_run_whole(
     small, whole = photo[:96, :128], DeepDetect(**options)
     expected = whole.heatmap(small)
     monkeypatch.setattr(heatmap, "available_memory", lambda: 0)
-    monkeypatch.setattr(tiling, "open_tiled", None)
+    monkeypatch.setattr(heatmap, "open_tiled", None)
     np.testing.assert_array_equal(whole.heatmap(small), expected)
 
 

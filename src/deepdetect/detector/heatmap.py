@@ -18,9 +18,7 @@ from .._shared.opencv import cv2, is_lack_of_memory
 from .._shared.options import check_ranges, suggest_keywords
 from ..features.selection import Maps, Rows, bands, sigmoid
 from .backends import Network
-
-STRIDE = 8
-"""The network halves an image three times, so its sides must be multiples of 8."""
+from .tiling import STRIDE, fill_planes, open_tiled
 
 MAX_AUTO_PIXELS = 2_000_000
 """Of an image that the resolution "auto" takes as it is."""
@@ -59,18 +57,11 @@ class HeatmapOptions:
     tile_megapixels: float | Literal["auto"] = "auto"
 
     def __post_init__(self) -> None:
-        if isinstance(self.resolution, str):
-            if self.resolution not in ("auto", "native"):
-                known = ["auto", "native", "a number of pixels"]
-                raise unknown_name("resolution", self.resolution, known)
-        elif (
-            not isinstance(self.resolution, (int, np.integer))
-            or self.resolution < 16
-            or self.resolution % STRIDE
-        ):
+        number = self.resolution if isinstance(self.resolution, (int, np.integer)) else 0
+        if self.resolution not in ("auto", "native") and (number < 16 or number % STRIDE):
             raise OptionError(
                 f"the resolution must be 'auto', 'native' or a multiple of {STRIDE} from 16 on, "
-                f"not {self.resolution}"
+                f"not {self.resolution!r}"
             )
         check_channels(self.network_channels)
         if self.tta not in ("none", "flip"):
@@ -190,8 +181,6 @@ def _tiled(network: Network, shape: tuple[int, ...], options: HeatmapOptions) ->
     most = available_memory() / network.bytes_per_pixel if area is None else area * 1e6  # type: ignore[attr-defined]
     if shape[0] * shape[1] <= most:
         return None
-    from .tiling import open_tiled
-
     tiled = None if path is None else open_tiled(path, network.threads)  # type: ignore[attr-defined]
     if tiled is not None:
         return lambda images: [tiled(rgb, area) for rgb in images]
@@ -208,16 +197,12 @@ def _is_constant(rgb: np.ndarray) -> bool:
 
 
 def _run(network: Network, images: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return the (H, W) logits of images of one size.
-
-    The last row and column of each are repeated until both sides are multiples of 8.
-    """
+    """Return the (H, W) logits of images of one size, padded to multiples of 8."""
     height, width = images[0].shape[:2]
-    below, right = -height % STRIDE, -width % STRIDE
-    planes = np.empty((len(images), 3, height + below, width + right), np.float32)
+    full = (height + -height % STRIDE, width + -width % STRIDE)
+    planes = np.empty((len(images), 3, *full), np.float32)
     for rgb, into in zip(images, planes, strict=True):
-        padded = np.pad(rgb, ((0, below), (0, right), (0, 0)), "edge") if below or right else rgb
-        np.multiply(padded.transpose(2, 0, 1), np.float32(1 / 255), out=into)
+        fill_planes(rgb, into)
     return [np.ascontiguousarray(logits[0, :height, :width]) for logits in network(planes)]
 
 

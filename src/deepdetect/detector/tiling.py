@@ -24,6 +24,7 @@ from .backends.onnx_parts import cut_onnx
 from .backends.onnxruntime_backend import start_session
 
 STRIDE = 8
+"""The network halves an image three times, so its sides must be multiples of 8."""
 
 BLOCKS = 9
 """Pyramids at an eighth of the size."""
@@ -218,11 +219,16 @@ def _reader(features: np.ndarray, scale: int = 1) -> Reader:
 
 
 def _planes(rgb: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
-    """Return (1, 3, H, W) float32 of a tile; beyond the image its last row and column go on."""
+    """Return (1, 3, H, W) float32 of a tile."""
     height, width = STRIDE * (rows.stop - rows.start), STRIDE * (columns.stop - columns.start)
-    tile = rgb[_times(rows, STRIDE), _times(columns, STRIDE)]
-    below, right = height - tile.shape[0], width - tile.shape[1]
-    tile = np.pad(tile, ((0, below), (0, right), (0, 0)), mode="edge")
     planes = np.empty((1, 3, height, width), np.float32)
-    np.multiply(tile.transpose(2, 0, 1), np.float32(1 / 255), out=planes[0])
+    fill_planes(rgb[_times(rows, STRIDE), _times(columns, STRIDE)], planes[0])
     return planes
+
+
+def fill_planes(rgb: np.ndarray, planes: np.ndarray) -> None:
+    """Write (H, W, 3) uint8 to larger (3, H, W) float32: the last row and column are repeated."""
+    below, right = planes.shape[1] - rgb.shape[0], planes.shape[2] - rgb.shape[1]
+    if below or right:
+        rgb = np.pad(rgb, ((0, below), (0, right), (0, 0)), mode="edge")
+    np.multiply(rgb.transpose(2, 0, 1), np.float32(1 / 255), out=planes)

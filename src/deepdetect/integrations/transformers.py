@@ -15,8 +15,9 @@ import numpy as np
 from .._shared.errors import OptionError
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
-from ..detector.heatmap import MAX_AUTO_PIXELS, STRIDE
+from ..detector.heatmap import MAX_AUTO_PIXELS
 from ..detector.pretrained import resolve_weights
+from ..detector.tiling import STRIDE
 from ..features.selection import Maps, SelectionOptions, select_from_maps
 from ..io.image import load_image
 from .packages import base_class, import_package

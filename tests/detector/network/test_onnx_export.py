@@ -160,14 +160,8 @@ def test_metadata(tmp_path: Path) -> None:
     )
     read = session_of(tmp_path / "one.onnx").get_modelmeta().custom_metadata_map
     assert read == found
-    assert {name: read[name] for name in ("channels", "range", "stride", "licence", "size")} == {
-        "channels": "RGB",
-        "range": "0 to 1",
-        "stride": "8",
-        "licence": "CC0",
-        "size": "48x64",
-    }
-    assert read["precision"] == "fp16"
+    expected = {"channels": "RGB", "range": "0 to 1", "stride": "8", "precision": "fp16"}
+    assert read.items() >= {**expected, "licence": "CC0", "size": "48x64"}.items()
 
 
 @pytest.mark.parametrize("size", [None, (123, 157), (64, 96)])

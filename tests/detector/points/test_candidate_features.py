@@ -56,7 +56,3 @@ def test_a_quarter_turn_changes_nothing() -> None:
     # Rounding and ties move some points of the rings by a pixel.
     close = np.abs(first[a] - second[b]) < 0.02
     assert close.mean() > 0.97
-
-
-def test_a_flat_image_has_no_features() -> None:
-    assert features(np.full((40, 40), 7, np.uint8))[1].shape == (0, FEATURES)
