@@ -5,7 +5,7 @@ import os
 import pickle
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +25,6 @@ from deepdetect.features.sift import root_sift_descriptors
 OneLine = Callable[[BaseException], str]
 MakeOnnx = Callable[..., Path]
 FREE_MAP = ("n", 1, "h", "w")
-INSTALLED = {
-    name: importlib.util.find_spec(name) is not None
-    for name in ("onnx", "onnxruntime", "openvino", "safetensors", "torch")
-}
-needs = {
-    name: pytest.mark.skipif(not there, reason=f"needs {name}, which is not installed")
-    for name, there in INSTALLED.items()
-}
 TORCH_WEIGHTS = pretrained_weights().with_suffix(".safetensors")
 
 
@@ -41,17 +33,10 @@ def detector() -> DeepDetect:
     return DeepDetect(backend="onnxruntime")
 
 
-@pytest.fixture
-def torch_threads() -> Iterator[None]:
-    """Give torch its number of threads back, which a detector sets for the whole process."""
-    if not INSTALLED["torch"]:
-        yield
-        return
-    import torch
-
-    before = torch.get_num_threads()
-    yield
-    torch.set_num_threads(before)
+@pytest.fixture(params=["onnxruntime", "openvino"])
+def backend(request: pytest.FixtureRequest) -> str:
+    pytest.importorskip(request.param)
+    return str(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -135,28 +120,25 @@ def test_detection_is_selection_from_the_map(
 # Backends.
 
 
-def open_backends() -> list[Any]:
-    weights = {"onnxruntime": pretrained_weights(), "openvino": pretrained_weights()}
-    weights["torch"] = TORCH_WEIGHTS
-    return [pytest.param(name, path, id=name, marks=needs[name]) for name, path in weights.items()]
-
-
-@pytest.mark.usefixtures("torch_threads")
-@pytest.mark.parametrize(("backend", "weights"), open_backends())
-def test_backends_agree(
-    backend: str, weights: Path, detector: DeepDetect, image: np.ndarray
-) -> None:
-    other = DeepDetect(weights, backend=backend, threads=1)
-    assert other.backend == backend
+@pytest.mark.parametrize("other", ["onnxruntime", "openvino", "torch"])
+def test_backends_agree(other: str, detector: DeepDetect, image: np.ndarray) -> None:
+    library = pytest.importorskip(other)
+    threads = library.get_num_threads() if other == "torch" else None
+    weights = TORCH_WEIGHTS if other == "torch" else "default"
+    second = DeepDetect(weights, backend=other, threads=1)
+    assert second.backend == other
     pieces = (image, image[8:, :], image[:17, :23])
     # All first: a map is not to be overwritten by the next.
-    for piece, heatmap in zip(pieces, [other.heatmap(piece) for piece in pieces], strict=True):
+    for piece, heatmap in zip(pieces, [second.heatmap(piece) for piece in pieces], strict=True):
         assert heatmap.dtype == np.float32
         assert np.abs(heatmap - detector.heatmap(piece)).max() < 1e-3
+    if threads is not None:
+        library.set_num_threads(threads)  # the detector sets it for the whole process
 
 
 def test_the_automatic_backend(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert DeepDetect().backend == ("openvino" if INSTALLED["openvino"] else "onnxruntime")
+    pytest.importorskip("openvino")
+    assert DeepDetect().backend == "openvino"
     assert DeepDetect(device="CPUExecutionProvider").backend == "onnxruntime"
     find = importlib.util.find_spec
     monkeypatch.setattr(
@@ -216,7 +198,6 @@ BAD_WEIGHTS = {
 }
 
 
-@pytest.mark.parametrize("backend", ["auto", "onnxruntime"])
 @pytest.mark.parametrize("name", BAD_WEIGHTS)
 def test_wrong_weights(
     name: str,
@@ -259,12 +240,10 @@ BAD_NETWORKS: dict[str, tuple[Sequence[tuple[str, str]], dict[str, Any], str]] =
 }
 
 
-@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
 @pytest.mark.parametrize("name", BAD_NETWORKS)
 def test_a_network_that_does_not_fit(
     name: str, backend: str, onnx_file: MakeOnnx, one_line: OneLine
 ) -> None:
-    pytest.importorskip(backend)
     nodes, options, words = BAD_NETWORKS[name]
     path = onnx_file(*nodes, **options)
     with pytest.raises(WeightsError) as caught:
@@ -273,12 +252,10 @@ def test_a_network_that_does_not_fit(
     assert str(path) in str(caught.value)
 
 
-@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
 def test_a_network_that_answers_wrongly_later(
     backend: str, onnx_file: MakeOnnx, one_line: OneLine
 ) -> None:
     """Finite on what a network is tried on, which is never black."""
-    pytest.importorskip(backend)
     detector = DeepDetect(onnx_file(("Div", "mean"), ("Mul", "mean")), backend=backend)
     image = np.random.default_rng(0).integers(1, 256, (48, 64, 3), np.uint8)
     assert detector.heatmap(image).shape == (48, 64)
@@ -288,9 +265,7 @@ def test_a_network_that_answers_wrongly_later(
     assert "not finite" in one_line(caught.value)
 
 
-@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
 def test_threads_get_their_own_images(backend: str) -> None:
-    pytest.importorskip(backend, reason=f"needs {backend}")
     from concurrent.futures import ThreadPoolExecutor
 
     detector = DeepDetect(backend=backend, threads=1)
@@ -328,9 +303,7 @@ for megabytes in (10, 80):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs a limit on memory that holds")
-@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
 def test_too_little_memory_is_one_sentence(backend: str) -> None:
-    pytest.importorskip(backend)
     environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-c", SHORT_OF_MEMORY, backend],
@@ -345,7 +318,6 @@ def test_too_little_memory_is_one_sentence(backend: str) -> None:
     assert all("not enough memory" in line and "1600x1200" in line for line in lines)
 
 
-@needs["openvino"]
 def test_bfloat16_moves_few_keypoints(image: np.ndarray) -> None:
     openvino = pytest.importorskip("openvino")
     if "BF16" not in openvino.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"):
