@@ -19,7 +19,13 @@ from ..features.selection import Maps, SelectionOptions, select_from_maps, selec
 from ..features.sift import describe_keypoints
 from ..io.image import load_image, luma
 from .backends import RuntimeOptions, open_network
-from .heatmap import HeatmapOptions, compute_maps, compute_maps_of_batch, memory_named
+from .heatmap import (
+    HeatmapOptions,
+    compute_maps,
+    compute_maps_of_batch,
+    memory_named,
+    seen_size,
+)
 from .image_lists import Images, ignore_masks, image_named, load_each
 from .pretrained import PRETRAINED, resolve_weights
 
@@ -343,10 +349,10 @@ class DeepDetect:
         if not isinstance(batch_size, (int, np.integer)) or batch_size < 1:
             raise OptionError(f"`batch_size` must be a whole number from 1 on, not {batch_size!r}")
 
-        def seen_size(loaded: tuple[int, np.ndarray]) -> tuple[int, int]:
-            return self.heatmap_options.seen_size(loaded[1].shape)
+        def size(loaded: tuple[int, np.ndarray]) -> tuple[int, int]:
+            return seen_size(loaded[1].shape, self.heatmap_options)
 
-        for _, group in itertools.groupby(load_each(images, channels), seen_size):
+        for _, group in itertools.groupby(load_each(images, channels), size):
             while batch := list(itertools.islice(group, batch_size)):
                 places = [(number, rgb.shape) for number, rgb in batch]
                 loaded = [rgb for _, rgb in batch]

@@ -39,11 +39,12 @@ class HeatmapOptions:
     """How an image is shown to the network: the options of `DeepDetect` of these names.
 
     Attributes:
-        resolution: larger images are scaled down by "auto" since their finest pixels show blur and
-            noise more than structure, and the network needs seconds and gigabytes for them.
-        network_channels: "bgr" is what the paper's published code feeds, though the weights were
-            trained on RGB. It says nothing of the images that are given.
-        tta: test-time augmentation by the mean of the logits in eight flips and quarter turns.
+        resolution: "native", a number of pixels, or "auto", which scales larger images down since
+            their finest pixels show blur and noise more than structure, and the network needs
+            seconds and gigabytes for them.
+        network_channels: "rgb"; "bgr" is what the paper's published code feeds, though the weights
+            were trained on RGB. It says nothing of the images that are given.
+        tta: "none"; "flip" takes the mean of the logits in eight flips and quarter turns.
         tile_megapixels: from 1.5 on; "auto": 2.7 where the image is too large for the free memory.
             Only weights of this package's training in ONNX files can be tiled.
 
@@ -71,21 +72,23 @@ class HeatmapOptions:
             if self.resolution != "native":
                 raise OptionError("`tile_megapixels` needs `resolution='native'`: give both")
 
-    def is_native(self, shape: tuple[int, ...]) -> bool:
-        """Return whether the network sees an image of a shape (H, W, ...) at its own size."""
-        small = shape[0] * shape[1] <= MAX_AUTO_PIXELS
-        return self.resolution == "native" or (self.resolution == "auto" and small)
 
-    def seen_size(self, shape: tuple[int, ...]) -> tuple[int, int]:
-        """Return the width and height at which the network sees an image of a shape (H, W, ...)."""
-        height, width = shape[:2]
-        if self.is_native(shape):
-            return width, height
-        if self.resolution != "auto":
-            return int(self.resolution), int(self.resolution)
-        scale = (MAX_AUTO_PIXELS / (height * width)) ** 0.5
-        width, height = (max(1, round(side * scale / STRIDE)) for side in (width, height))
-        return STRIDE * width, STRIDE * height
+def is_native(shape: tuple[int, ...], options: HeatmapOptions) -> bool:
+    """Return whether the network sees an image of a shape (H, W, ...) at its own size."""
+    small = shape[0] * shape[1] <= MAX_AUTO_PIXELS
+    return options.resolution == "native" or (options.resolution == "auto" and small)
+
+
+def seen_size(shape: tuple[int, ...], options: HeatmapOptions) -> tuple[int, int]:
+    """Return the width and height at which the network sees an image of a shape (H, W, ...)."""
+    height, width = shape[:2]
+    if is_native(shape, options):
+        return width, height
+    if options.resolution != "auto":
+        return int(options.resolution), int(options.resolution)
+    scale = (MAX_AUTO_PIXELS / (height * width)) ** 0.5
+    width, height = (max(1, round(side * scale / STRIDE)) for side in (width, height))
+    return STRIDE * width, STRIDE * height
 
 
 def compute_maps(
@@ -119,7 +122,7 @@ def compute_maps_of_batch(
         logits.update(zip(together, found, strict=True))
         shapes = [images[number].shape for number in together]
         large = max(height * width for height, width, _ in shapes) > RELEASE_PIXELS
-        if large and not options.is_native(shapes[0]) and hasattr(network, "release_memory"):
+        if large and not is_native(shapes[0], options) and hasattr(network, "release_memory"):
             network.release_memory()
             release_freed_memory()
     return [
@@ -151,10 +154,10 @@ def memory_named(shape: tuple[int, ...], images: int = 1) -> Iterator[None]:
 def _seen(rgb: np.ndarray, options: HeatmapOptions) -> np.ndarray:
     """Return an image with the size and the order of channels that the network sees."""
     seen = rgb if options.network_channels == "rgb" else rgb[:, :, ::-1]
-    if options.is_native(rgb.shape):
+    if is_native(rgb.shape, options):
         return seen
     kind = cv2.INTER_AREA if options.resolution == "auto" else cv2.INTER_CUBIC
-    size = options.seen_size(rgb.shape)
+    size = seen_size(rgb.shape, options)
     scaled: np.ndarray = cv2.resize(np.ascontiguousarray(seen), size, interpolation=kind)
     return scaled
 
@@ -176,7 +179,7 @@ def _tiled(network: Network, shape: tuple[int, ...], options: HeatmapOptions) ->
     """Return what runs the network in tiles, or None for an image that is run whole."""
     path = getattr(network, "onnx_path", None)  # torch, bfloat16 and others run whole
     area = None if options.tile_megapixels == "auto" else float(options.tile_megapixels)
-    if not options.is_native(shape) or (area is None and path is None):
+    if not is_native(shape, options) or (area is None and path is None):
         return None
     most = available_memory() / network.bytes_per_pixel if area is None else area * 1e6  # type: ignore[attr-defined]
     if shape[0] * shape[1] <= most:
