@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import ImageError, Keypoints, Matches
-from deepdetect.features.display import GREEN, PICTURE_SIDE_PX, RED
+from deepdetect.features.display import GREEN, RED
 
 
 def keypoints(count: int, size: tuple[int, int] = (256, 256), **columns: Any) -> Keypoints:
@@ -85,13 +85,6 @@ def test_the_lower_image_is_enlarged_with_its_matches() -> None:
     assert picture.any(axis=2).all()
 
 
-def test_large_images_are_reduced() -> None:
-    rgb = np.zeros((1500, 2000, 3), np.uint8)
-    none = np.empty((0, 2))
-    picture = matches(none, none, [], ((2000, 1500),) * 2).draw(rgb, rgb)
-    assert picture.shape == (750, PICTURE_SIDE_PX, 3)
-
-
 def test_matches_have_the_colour_of_their_position() -> None:
     black = np.zeros((60, 80, 3), np.uint8)
     points0, points1 = (
@@ -106,8 +99,8 @@ def test_matches_have_the_colour_of_their_position() -> None:
     assert tuple(colors[2]) == RED
 
 
-@pytest.mark.parametrize("size", [(640, 480), (6000, 4000), (20, 3000)])
-@pytest.mark.parametrize("count", [0, 1, 200_000])
+@pytest.mark.parametrize("size", [(640, 480), (20, 3000)])
+@pytest.mark.parametrize("count", [0, 200_000])
 def test_what_a_notebook_shows_is_small(size: tuple[int, int], count: int) -> None:
     points = keypoints(count, size)
     good = np.arange(count) % 4 > 0

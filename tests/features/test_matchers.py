@@ -82,24 +82,13 @@ def test_known_answer(name: str) -> None:
     assert pairs(both) == {(0, 1), (1, 0), (2, 2)}
 
 
-@pytest.mark.parametrize("name", ["flann", "exact"])
 @pytest.mark.parametrize("mutual", [False, True])
-@pytest.mark.parametrize(("count0", "count1"), [(0, 0), (0, 5), (5, 0), (5, 1), (1, 1), (0, 1)])
-def test_without_a_second_best_nothing_matches(
-    name: str, mutual: bool, count0: int, count1: int
-) -> None:
-    matches = match_descriptors(
-        random_descriptors(0, count0),
-        random_descriptors(1, count1),
-        get_matcher(name),
-        ratio=1.0,
-        mutual=mutual,
-    )
-    assert len(matches) == 0
+@pytest.mark.parametrize(("count0", "count1"), [(0, 0), (0, 5), (5, 0), (5, 1)])
+def test_without_a_second_best_nothing_matches(mutual: bool, count0: int, count1: int) -> None:
+    first, second = random_descriptors(0, count0), random_descriptors(1, count1)
+    matches = match_descriptors(first, second, get_matcher("exact"), ratio=1.0, mutual=mutual)
     assert matches.indices0.shape == matches.indices1.shape == matches.ratios.shape == (0,)
-    assert np.issubdtype(matches.indices0.dtype, np.integer)
-    assert np.issubdtype(matches.indices1.dtype, np.integer)
-    assert matches.ratios.dtype == np.float32
+    assert matches.indices0.dtype == matches.indices1.dtype == np.int32
 
 
 seeds = st.integers(0, 10_000)

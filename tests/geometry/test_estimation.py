@@ -156,16 +156,6 @@ def test_inliers_are_exactly_the_matches_under_the_threshold(
         np.testing.assert_array_equal(geometry.inliers[clear], (errors < threshold)[clear])
 
 
-@every_way
-def test_few_matches_do_no_harm(model: str, estimator: str) -> None:
-    for count in (0, 1, 2, 3, 4, 5, 7, 8, 14, 15):
-        scene = make_scene(model, count, count, outliers=0.3, noise=0.3)
-        geometry = estimate_geometry(scene.points0, scene.points1, **make_options(model, estimator))
-        assert geometry.model == model
-        assert geometry.matrix is None or count > 3
-        assert_consistent(geometry, count)
-
-
 def degenerate(count: int = 40) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     ramp = np.arange(count, dtype=float)
     rng = np.random.default_rng(0)
@@ -190,10 +180,14 @@ def degenerate(count: int = 40) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 @every_way
-def test_degenerate_input_does_no_harm(model: str, estimator: str) -> None:
+def test_few_and_degenerate_matches_do_no_harm(model: str, estimator: str) -> None:
     options = make_options(model, estimator, iterations=500)
-    for points0, points1 in degenerate().values():
-        assert_consistent(estimate_geometry(points0, points1, **options), len(points0))
+    few = [make_scene(model, count, count) for count in (0, 1, 3, 4, 5, 7, 8, 14, 15)]
+    pairs = [(scene.points0, scene.points1) for scene in few]
+    for points0, points1 in (*pairs, *degenerate().values()):
+        geometry = estimate_geometry(points0, points1, **options)
+        assert geometry.matrix is None or len(points0) > 3
+        assert_consistent(geometry, len(points0))
 
 
 @pytest.mark.parametrize("model", [*MODELS, "none"])

@@ -112,14 +112,13 @@ def choose_model(
     if model != "fundamental":
         threshold_px = GUIDING_THRESHOLDS_PX["homography"]
         plane = fit_model(points0, points1, "homography", sizes[1], threshold_px, seed)
-    if plane.trusted and plane.matrix is not None:
         if model == "homography":
             return plane
-        plane = replace(plane, parallax=measure_parallax(points0, points1, plane.matrix, seed))
-        if plane.parallax is None or not plane.parallax.shows_depth:
-            return plane
-    if model == "homography":
-        return plane
+        if plane.matrix is not None and plane.trusted:
+            parallax = measure_parallax(points0, points1, plane.matrix, seed)
+            plane = replace(plane, parallax=parallax)
+            if not parallax.shows_depth:
+                return plane
     threshold_px = GUIDING_THRESHOLDS_PX["fundamental"]
     depth = fit_model(points0, points1, "fundamental", sizes[1], threshold_px, seed)
     if semi_calibrated:
