@@ -64,19 +64,12 @@ def draw_matches(
     *,
     by_position: bool = False,
 ) -> np.ndarray:
-    """Draw the two images side by side, with lines between a sample of the matches.
+    """Draw the two images side by side, with lines between a random sample of the matches.
 
     The lower image is enlarged to the height of the other, and both are scaled down where the
-    picture would be wider or higher than `PICTURE_SIDE_PX`.
-
-    Args:
-        rgb0, rgb1: the images, (H, W, 3) uint8 RGB.
-        points0, points1: (M, 2) matched positions.
-        good: (M,) bool: green lines, the others red.
-        lines: number of lines; the sample is random, so green and red have the proportions of all
-            matches.
-        by_position: colour good matches by where they are in the first image, and draw more of
-            them as dots than as lines, so that one sees what was matched where.
+    picture would be wider or higher than `PICTURE_SIDE_PX`. Good matches are green, the others red;
+    by position the good ones are coloured by where they are in the first image, and more are dots
+    than lines.
     """
     height = max(rgb0.shape[0], rgb1.shape[0])
     width = sum(rgb.shape[1] * height / len(rgb) for rgb in (rgb0, rgb1))

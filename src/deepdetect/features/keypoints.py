@@ -330,15 +330,10 @@ def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def nearest_keypoints(
     positions: np.ndarray, xy: np.ndarray, image_size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the keypoint nearest to each position, of those in the 3x3 pixels around it.
+    """Find the keypoint nearest to each of (N, 2) positions, of those in the 3x3 pixels around it.
 
-    Args:
-        positions: (N, 2).
-        xy: (M, 2) keypoints of the same image. Of several on one pixel the first counts.
-        image_size: (width, height) of the image.
-
-    Returns:
-        (N,) int32 rows of `xy`, and (N,) distances in pixels: -1 and infinite where none is near.
+    Of several keypoints on one pixel the first counts. Returns (N,) int32 rows of `xy`, and (N,)
+    distances in pixels: -1 and infinite where none is near.
     """
     from .kernels import nearest_of_nine
 

@@ -309,13 +309,9 @@ def match_descriptors(
 ) -> DescriptorMatches:
     """Match by nearest neighbour and ratio test (Lowe, 2004), by ascending row of the first set.
 
-    Args:
-        descriptors0, descriptors1: (N, D) and (M, D), uint8 or float32.
-        matcher: finds the neighbours.
-        ratio: the ratio of a match must be below this (paper's code: 0.99).
-        mutual: keep only mutual nearest neighbours.
-        seed: of a matcher that is random.
-        positions: of the keypoints, as of `Matcher`.
+    The (N, D) and (M, D) descriptors are uint8 or float32; ratios must be below `ratio` (paper's
+    code: 0.99); `mutual` keeps only mutual nearest neighbours. `seed` and `positions` are of the
+    matcher.
     """
     if len(descriptors0) == 0 or len(descriptors1) < 2:  # there is no second-best neighbour
         none = np.empty(0, np.int32)

@@ -63,10 +63,9 @@ class GuidedMatches:
 
     Attributes:
         indices0: (M,) int64 keypoints of the first image, rising, each once.
-        points1: (M, 2) float64 positions in the second image: keypoints of it where a homography
-            guided, sub-pixel positions where the pair was rectified.
+        points1: (M, 2) float64 positions in the second image.
         scores: (M,) float32 in [0, 1], higher is better.
-        subpixel: whether the positions in the second image are sub-pixel.
+        subpixel: whether the positions are sub-pixel ones, of a rectified pair.
         indices1: (M,) int64 keypoints of the second image; None where the positions are others.
     """
 

@@ -77,21 +77,13 @@ SAMPLES_AT_ONCE = 1 << 16
 
 
 def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return the dominant orientation of keypoints, as OpenCV's SIFT assigns it.
+    """Return the dominant orientation of keypoints, as OpenCV's SIFT assigns it, (N,) float32.
 
-    The gradients in a Gaussian window of 1.5 sigma around a keypoint, at the scale of the
-    keypoint, vote for 36 directions; the histogram is smoothed, and a parabola through its highest
-    bin and the two beside it gives the angle. SIFT has more than one keypoint where other
-    directions have nearly as many votes; here it is always the highest.
-
-    Args:
-        gray: (H, W) uint8 luma.
-        xy: (N, 2) positions, centre of the first pixel (0, 0).
-        sizes: (N,) diameters in pixels: twice sigma, as of OpenCV's keypoints of SIFT.
-
-    Returns:
-        (N,) float32 in [0, 360): degrees from x towards y, which points down, as
-        `cv2.KeyPoint.angle`. 0 where the image is flat.
+    The gradients in a Gaussian window of 1.5 sigma around a keypoint, at its scale, vote for 36
+    directions; the histogram is smoothed, and a parabola through its highest bin and the two beside
+    it gives the angle: degrees in [0, 360) from x towards y, which points down; 0 where the image
+    is flat. Sizes are diameters, twice sigma. SIFT has further keypoints for directions with nearly
+    as many votes; here it is always the highest.
     """
     xy = np.asarray(xy, np.float64).reshape(-1, 2)
     sizes = np.broadcast_to(np.asarray(sizes, np.float64), len(xy))

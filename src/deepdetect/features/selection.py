@@ -31,11 +31,7 @@ class Maps:
     """A heat map and the logits by which its pixels are ranked, each made when it is asked for.
 
     Of a large image either takes more memory than most of its keypoints: one is held at a time.
-
-    Attributes:
-        shape: (H, W).
-        heatmap: makes the map, (H, W) float32, and gives its rows.
-        logits: makes the logits, (H, W) float32.
+    Both are (H, W) float32; `heatmap` makes the map and gives its rows, `logits` makes the logits.
     """
 
     shape: tuple[int, ...]
@@ -396,15 +392,10 @@ def spread_over_grid(
 def suppress_neighbors(
     xy: np.ndarray, scores: np.ndarray, radius_px: float | np.ndarray
 ) -> np.ndarray:
-    """Go through points from the best to the worst; keep those that are not near a kept one.
+    """Go through points from the best; return the rows that are not near a kept one, best first.
 
-    Args:
-        xy: (N, 2) positions.
-        scores: (N,), the higher the better; of equal scores the first row comes first.
-        radius_px: near is strictly closer; (N,) radii: than the smaller one of both points.
-
-    Returns:
-        (K,) rows that are kept, best first.
+    Near is strictly closer than the radius, or of (N,) radii than the smaller one of both points.
+    Of equal scores the first row comes first.
 
     Example:
         >>> xy = np.array([[0.0, 0], [1, 0], [2, 0], [9, 9]])

@@ -75,13 +75,8 @@ def dense_sift(
 
     OpenCV sums the gradients around each keypoint separately. Where all keypoints are upright and
     of one size, the sums are a filter: bilinear times Gaussian, along rows and then along columns.
-
-    Args:
-        gray: (H, W) uint8 luma.
-        xy: (N, 2) positions on whole pixels within the image.
-        size: diameter of the keypoints in pixels, within `DENSE_SIZES_PX`.
-        step_px: the positions lie on every so many-th row and column, which saves time.
-        gradient: of the image, where `sift_gradient` has computed it already.
+    The positions are whole pixels within the image, on every `step_px`-th row and column, which
+    saves time; sizes within `DENSE_SIZES_PX`. The gradient is that of `sift_gradient`.
     """
     from .kernels import TILE_COLUMNS, TILE_HEIGHT, describe_tiles
 

@@ -150,16 +150,10 @@ def rectified_frame(
     size0: Size,
     size1: Size,
 ) -> RectifiedFrame | None:
-    """Choose a frame in which the matches of two views lie on rows.
+    """Choose a frame in which (N, 2) matches that fit a fundamental matrix lie on rows.
 
-    Args:
-        points0, points1: (N, 2) matches that fit the fundamental matrix.
-        fundamental: (3, 3) with x1^T F x0 = 0.
-        size0, size1: (width, height) of the views.
-
-    Returns:
-        A planar frame where one distorts the views little, else a polar one; None where neither is
-        possible.
+    A planar frame where one distorts the views, of these (width, height), little, else a polar one;
+    None where neither is possible.
     """
     points0, points1 = (np.asarray(points, np.float64) for points in (points0, points1))
     if len(points0) < 8:

@@ -260,12 +260,8 @@ def log10_nfa(
 ) -> float:
     """Return the decimal logarithm of the number of false alarms, infinite with too few inliers.
 
-    Args:
-        inliers: (M,) bool, which of all matches are near the model.
-        model: "homography", "fundamental" or "essential".
-        inlier_threshold: that they are nearer than, in pixels of the second image.
-        image_size: (width, height) of the second image.
-        models_per_sample: that were tried for each minimal sample.
+    The (M,) inliers are the matches within the threshold in pixels of the second image, of a size
+    (width, height); so many models were tried for each minimal sample.
 
     Example:
         >>> log10_nfa(np.arange(100) < 30, "homography", 3, (640, 480)) < -50

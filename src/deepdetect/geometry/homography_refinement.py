@@ -69,12 +69,8 @@ Fit = Callable[[np.ndarray], "np.ndarray | None"]
 def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Refine a homography, keeping what holds on parts of the image that it was not fitted to.
 
-    Args:
-        gray0, gray1: (H, W) uint8 luma.
-        homography: (3, 3) from the first to the second, right within some ten pixels.
-
-    Returns:
-        (3, 3), its last element 1; the initial one where nothing better was found.
+    The images are (H, W) uint8, the homography is right within some ten pixels. It is returned with
+    1 as its last element, and as it was where nothing better was found.
     """
     size = (gray0.shape[1], gray0.shape[0])
     blurred = gaussian_blur(gray0, BLUR_SIGMA_PX)

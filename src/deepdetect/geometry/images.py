@@ -62,15 +62,9 @@ def local_zncc(
 ) -> np.ndarray:
     """Compute the zero-mean normalised cross-correlation of the windows around each pixel.
 
-    Args:
-        first, second: (H, W) images in the same frame, any dtype.
-        valid_mask: (H, W) bool; windows must lie within it.
-        window_px: side of the square windows, an odd multiple of `step_px`.
-        step_px: between the centres of the windows, which are those of the squares of this side
-            from the first pixel on.
-
-    Returns:
-        (H // step_px, W // step_px) float32 in [-1, 1], NaN where a window is not valid or is flat.
+    The windows must lie within the mask, and have an odd multiple of `step_px` as their side; they
+    are centred on the squares of that side. (H // step_px, W // step_px) float32 in [-1, 1], NaN
+    where a window is not valid or is flat.
     """
     side = window_px // step_px
     shape = (first.shape[0] // step_px, first.shape[1] // step_px)
@@ -147,18 +141,11 @@ def window_sums(
     at: np.ndarray | None = None,
     dtype: type[np.floating[Any]] | None = None,
 ) -> np.ndarray:
-    """Sum the values of the pixels in the square window around each pixel.
+    """Sum the values of the pixels in the square window around each pixel, (M,).
 
-    Args:
-        pixels: (N, 2) int64 pixels (x, y), each once.
-        values: (N,) a value for each, or one for all.
-        shape: (H, W, ...) of the image.
-        window_px: side of the window, odd.
-        at: (M, 2) int64 centres of the windows; None: the pixels themselves.
-        dtype: of the sums; None: that of the values.
-
-    Returns:
-        (M,) sums, 0 where there is no pixel in the window.
+    There are (N, 2) int64 pixels (x, y), each once, with a value each or one for all, in an image
+    of a shape (H, W, ...). The windows are centred `at` (M, 2) pixels, or at the pixels themselves.
+    The sums have the `dtype` of the values unless another is given.
     """
     image = _scatter(pixels, values, shape, dtype)
     window = (window_px, window_px)
@@ -202,22 +189,13 @@ def track_round_trip(
     expected: np.ndarray | None = None,
     back_to_start: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Track points forth and back (Lucas-Kanade).
+    """Track (N, 2) points from one (H, W) uint8 image to the other and back (Lucas-Kanade).
 
-    Args:
-        first, second: (H, W) uint8 images.
-        points: (N, 2) positions in the first.
-        window_px: side of the tracked windows.
-        levels: of the pyramid above the image; each doubles how far a track can move.
-        iterations: of each track and level, at most.
-        step_px: a track that moves by less than this has arrived.
-        min_eigenvalue: of the gradients in a window, per pixel, below which a track is lost.
-        expected: (N, 2) positions in the second, where the search begins; None: in the same place.
-        back_to_start: whether the way back begins at the start itself.
-
-    Returns:
-        (N, 2) float32 positions in the second, and (N,) distances from the start after the way
-        back, infinite where a track was lost.
+    Each of the `levels` of the pyramid above the image doubles how far a track can move; one that
+    moves by less than `step_px` has arrived. The search begins at the `expected` (N, 2) positions,
+    or in the same place; on the way back at the start itself, if asked for. Returns (N, 2) float32
+    positions in the second image, and (N,) distances from the start after the way back, infinite
+    where a track was lost.
     """
     settings = {
         "winSize": (window_px, window_px),

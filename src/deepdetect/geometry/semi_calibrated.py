@@ -68,16 +68,10 @@ def estimate_semi_calibrated(
     inlier_threshold: float = 1.5,
     seed: int = 0,
 ) -> TwoViewModel | None:
-    """Estimate a fundamental matrix from matches, many of which may be wrong.
+    """Estimate a fundamental matrix from (M, 2) matches, many of which may be wrong.
 
-    Args:
-        points0, points1: (M, 2) matched positions, centre of the first pixel (0, 0).
-        sizes: (width, height) of both images.
-        inlier_threshold: Sampson distance in pixels.
-        seed: of the random samples.
-
-    Returns:
-        The geometry; None with too few matches, or where nothing could be estimated.
+    The images have these (width, height); the threshold is a Sampson distance in pixels. None with
+    too few matches, or where nothing could be estimated.
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -132,15 +126,8 @@ def refine_fundamental(
     """Fit a fundamental matrix to matches that are mostly right, and to what cameras usually are.
 
     Where the matches say little, as about the focal length or at the borders, the usual decides.
-
-    Args:
-        points0, points1: (M, 2) matched positions.
-        fundamental: (3, 3) with x1^T F x0 = 0, to begin with.
-        sizes: (width, height) of both images.
-        match_sigmas_px: (M,) standard deviations of the matches from their epipolar lines.
-
-    Returns:
-        (3, 3) fundamental matrix of norm 1; that at the beginning with fewer than 6 matches.
+    They have (M,) standard deviations from their epipolar lines. The matrix has norm 1; with fewer
+    than six matches it is the one that was given.
     """
     if len(points0) < MIN_MATCHES:
         return fundamental

@@ -97,16 +97,11 @@ def choose_model(
     seed: int = 0,
     semi_calibrated: bool = True,
 ) -> TwoViewModel:
-    """Return the model that may guide matching, trusted or not.
+    """Return the model that may guide matching, trusted or not; many matches may be wrong.
 
-    Args:
-        points0, points1: (M, 2) matched positions, many of which may be wrong.
-        sizes: (width, height) of both images.
-        model: "homography", "fundamental", or "auto": the homography, but the fundamental matrix
-            where the matches alone show depth.
-        seed: of the random samples.
-        semi_calibrated: whether a fundamental matrix may be one of cameras as most are
-            (`semi_calibrated`), which few matches show but which takes longer.
+    "auto" is the homography, but the fundamental matrix where the matches alone show depth. This
+    may be one of cameras as most are (`semi_calibrated`), which few matches show but which takes
+    longer.
     """
     plane = TwoViewModel("none", None, np.zeros(len(points0), bool), float("inf"))
     if model != "fundamental":
