@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -7,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from deepdetect._shared.errors import OptionError
+from deepdetect.features import selection
 from deepdetect.features.selection import (
     SelectionOptions,
     grid_subsample,
@@ -229,8 +232,13 @@ def test_as_a_search_among_all_kept_ones(radius: float, seed: int) -> None:
     assert suppress_neighbors(xy, scores, radius).tolist() == kept
 
 
+@pytest.mark.parametrize("least", [0, 10**9], ids=["compiled", "not compiled"])
 @pytest.mark.parametrize("seed", range(3))
-def test_of_two_radii_the_smaller_one_counts(seed: int) -> None:
+def test_of_two_radii_the_smaller_one_counts(
+    seed: int, least: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(selection, "MIN_COMPILED_POINTS", least)
+    monkeypatch.setattr(selection, "sys", SimpleNamespace(modules={}))
     generator = np.random.default_rng(seed)
     xy = generator.uniform(-3, 30, (300, 2))
     scores, radii = generator.uniform(size=300), generator.uniform(0.5, 6, 300)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -358,6 +359,9 @@ def grid_subsample(xy: np.ndarray, grid_size_px: int, seed: int = 0) -> np.ndarr
     return np.sort(order[first])
 
 
+MIN_COMPILED_POINTS = 30_000
+"""From which the import of numba takes less time than it saves, where nothing else has done it."""
+
 DISTANCE_STEP_PX = 0.25
 """To which the distance of `spread_by_distance` is found."""
 
@@ -402,8 +406,6 @@ def suppress_neighbors(
         >>> suppress_neighbors(xy, np.array([1.0, 2, 3, 0]), 2).tolist()
         [2, 0, 3]
     """
-    from .kernels import keep_distant
-
     order = np.argsort(-np.asarray(scores), kind="stable")
     if not len(order):
         return order
@@ -411,10 +413,36 @@ def suppress_neighbors(
     positions = positions - positions.min(0)
     radii = np.broadcast_to(np.asarray(radius_px, np.float64), len(order))[order]
     cell = float(radii.min())
+    if len(order) < MIN_COMPILED_POINTS and "numba" not in sys.modules:
+        return order[_keep_distant(positions, radii, cell)]
+    from .kernels import keep_distant
+
     columns, rows = (int(side) + 1 for side in positions.max(0) / cell)
     x, y = (np.ascontiguousarray(axis) for axis in positions.T)
     kept: np.ndarray = keep_distant(x, y, radii, cell, columns, rows)
     return order[kept]
+
+
+def _keep_distant(positions: np.ndarray, radii: np.ndarray, cell: float) -> list[int]:
+    """Return which points are kept, as the compiled function does, by cells of a grid."""
+    squares = (radii * radii).tolist()
+    reaches = np.ceil(radii / cell).astype(np.int64).tolist()
+    columns, rows = (positions / cell).astype(np.int64).T.tolist()
+    cells: dict[tuple[int, int], list[int]] = {}
+    kept = []
+    x, y = positions.T.tolist()
+
+    def is_near(k: int, other: int) -> bool:
+        across, down = x[other] - x[k], y[other] - y[k]
+        return bool(across * across + down * down < min(squares[k], squares[other]))
+
+    for k, (column, row, reach) in enumerate(zip(columns, rows, reaches, strict=True)):
+        around = range(-reach, reach + 1)
+        near = (cells.get((column + i, row + j), ()) for i in around for j in around)
+        if not any(is_near(k, other) for members in near for other in members):
+            kept.append(k)
+            cells.setdefault((column, row), []).append(k)
+    return kept
 
 
 def spread_by_distance(xy: np.ndarray, scores: np.ndarray, count: int) -> np.ndarray:
@@ -423,6 +451,8 @@ def spread_by_distance(xy: np.ndarray, scores: np.ndarray, count: int) -> np.nda
     Adaptive non-maximal suppression (Brown, Szeliski and Winder, 2005), by bisection of the
     distance (Bailo et al., 2018).
     """
+    from . import kernels  # noqa: F401 (each of the many passes then finds it imported)
+
     best = np.argsort(-np.asarray(scores), kind="stable")
     if count >= len(best):
         return best
