@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -10,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.datasets.oxford import SCENES, load_oxford
+from deepdetect.datasets.oxford import SCENES
 from deepdetect.datasets.types import PlanarPair, read_homography
 from deepdetect.io.image import luma
 
@@ -70,54 +69,12 @@ def test_true_homographies_are_left_alone(refined: tuple[list, Path]) -> None:
 
 
 @pytest.mark.slow
-def test_the_data_set_finds_the_files(folder: Path, refined: tuple[list, Path]) -> None:
-    copy = refined[1] / "copy"
-    shutil.copytree(folder, copy)
-    for path in refined[1].glob("graf/*.refined"):
-        shutil.copy(path, copy / "graf")
-    scene = next(scene for scene in load_oxford(copy, "refined") if scene.name == "graf")
-    expected = read_homography(refined[1] / "graf" / "H1to2p.refined")
-    np.testing.assert_array_equal(scene.homographies[0], expected)
-
-
-@pytest.mark.slow
 def test_the_table_tells_what_moved(script: ModuleType, refined: tuple[list, Path]) -> None:
     table = script.refinement_table(refined[0])
     rows = {row["pair"]: row for row in table.rows}
     assert len(rows) == 40
     assert rows["graf 1-2"]["moved, median px"] == pytest.approx(2, abs=0.4)
     assert rows["bark 1-2"]["moved, median px"] == pytest.approx(0, abs=0.05)
-
-
-@pytest.mark.slow
-def test_a_file_that_is_there_already_is_compared(
-    script: ModuleType, folder: Path, refined: tuple[list, Path], tmp_path: Path
-) -> None:
-    shutil.copytree(folder, tmp_path / "oxford")
-    shutil.copy(refined[1] / "graf" / "H1to2p.refined", tmp_path / "oxford" / "graf")
-    # Written over the very file that it is compared with.
-    results = script.refine_oxford(tmp_path / "oxford", tmp_path / "oxford")
-    found = {row["pair"]: row for row in script.refinement_table(results).rows}
-    title = "from the file there, largest px"
-    assert found["graf 1-2"][title] == pytest.approx(0, abs=1e-6)
-    assert title not in found["graf 1-3"]
-
-
-@pytest.mark.slow
-def test_the_script_writes_the_files_and_a_report(
-    script: ModuleType,
-    folder: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.setattr(sys, "argv", ["refine_oxford", str(folder), str(tmp_path)])
-    script.main()
-    assert (tmp_path / "refinement" / "report.md").exists()
-    assert (tmp_path / "graf" / "H1to2p.refined").exists()
-    printed = capsys.readouterr().out
-    assert "graf 1-2" in printed
-    assert "files written to" in printed
 
 
 @pytest.mark.parametrize(

@@ -17,10 +17,9 @@ from deepdetect.training.views import list_images, render
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "validation_photographs.py"
 
 
-@pytest.mark.parametrize("side", [480, 320])
-def test_scores_both_lights_against_their_own_labels(photo_path: Path, side: int) -> None:
-    size = ["--short-side", str(side)] if side != 480 else []
-    command = [sys.executable, str(BENCHMARK), str(photo_path.parent), *size]
+def test_scores_both_lights_against_their_own_labels(photo_path: Path) -> None:
+    side = 320
+    command = [sys.executable, str(BENCHMARK), str(photo_path.parent), "--short-side", str(side)]
     printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     rows = [line.strip("| ").split(" | ") for line in printed.splitlines()[2:]]
     assert [row[0] for row in rows] == ["normal", "darkened"]

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from deepdetect import DeepDetect, ImageError, MissingExtraError, OptionError
 from deepdetect.evaluation import benchmarks
-from deepdetect.evaluation.baselines.method import BaselineError, LocalFeature
+from deepdetect.evaluation.baselines.method import LocalFeature
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.evaluation.benchmarks import BENCHMARKS, run_benchmarks
 from deepdetect.evaluation.metrics import repeatability
@@ -187,18 +184,6 @@ def test_correct_matches_equal_a_count_of_all_bits(
     assert row["graf 1-6, precision"] is None
 
 
-def test_of_two_equal_images_every_match_is_correct(runs: Runs) -> None:
-    rows = table(runs.first, "oxford_matches")
-    for title in (
-        "DeepDetect, threshold 0.5",
-        ALL_PIXELS,
-    ):
-        assert rows[title]["ubc 1-6"] > 100
-        assert rows[title]["ubc 1-6, precision"] == 1
-    repeated = table(runs.first, "oxford_repeatability")
-    assert repeated[ALL_PIXELS]["ubc"] == 1
-
-
 def test_the_papers_numbers_are_beside_ours(runs: Runs) -> None:
     density = table(runs.first, "oxford_density")
     assert density["FAST"]["mean without trees, in the paper"] == 0.0270
@@ -237,30 +222,6 @@ def test_one_more_method_makes_only_its_own_results(runs: Runs, oxford_folder: P
         assert before == after
 
 
-@pytest.mark.slow
-def test_a_method_that_fails_is_skipped_and_the_others_stay(
-    low_visibility_folder: Path, options: BenchmarkOptions
-) -> None:
-    few = dataclasses.replace(options, classical=("fast", "fast-low"))
-    broken = broken_feature(BaselineError("it fails, as others' code does"))
-    alone, both = (
-        run_benchmarks(["low-visibility"], low_visibility_folder, chosen)
-        for chosen in (few, dataclasses.replace(few, others=(broken,)))
-    )
-    assert alone.skipped == ()
-    for key in ("density", "repeatability", "matches"):
-        before, after = (table(r, f"low_visibility_{key}") for r in (alone, both))
-        blank = after.pop("Broken")
-        assert set(list(blank.values())[1:]) == {None}
-        assert before == after
-    assert both.skipped
-    for note in both.skipped:
-        assert "Broken" in note
-        assert "it fails," in note
-        assert len(note.splitlines()) == 1
-    assert len(set(both.skipped)) == len(both.skipped)
-
-
 @pytest.mark.parametrize("error", [ZeroDivisionError("a bug"), OptionError("a bug")])
 def test_a_bug_of_ours_ends_the_run(
     low_visibility_folder: Path, options: BenchmarkOptions, error: Exception
@@ -270,50 +231,21 @@ def test_a_bug_of_ours_ends_the_run(
         run_benchmarks(["low-visibility"], low_visibility_folder, buggy)
 
 
-@pytest.fixture
-def write_few(tmp_path: Path, write_scene) -> Callable[[str], Path]:
-    """Write the smallest data set of a benchmark."""
-
-    def write(name: str) -> Path:
-        folder = tmp_path / name
-        if name == "hpatches":
-            for scene in ("i_dc", "v_small"):
-                write_scene(folder / scene, (24, 20), np.eye(3), ("{}.ppm", "H_1_{}"))
-        elif name == "middlebury":
-            write_scene(folder / "cones", (64, 48), np.eye(3), ("{}.png", "H{}"), 2)
-            (folder / "cones" / "1.png").rename(folder / "cones" / "left.png")
-            (folder / "cones" / "2.png").rename(folder / "cones" / "right.png")
-            calibration = {"focal_px": 60, "width": 64, "height": 48}
-            (folder / "cones" / "calib.json").write_text(json.dumps(calibration))
-        else:
-            write_scene(folder, (48, 40), np.eye(3), ("{}.png", "H{}"), 2)
-            for number in (1, 2):
-                mask = np.zeros((40, 48), np.uint8)
-                mask[:, : 10 * number] = 255
-                Image.fromarray(mask).save(folder / f"{number}_mask.png")
-        return tmp_path
-
-    return write
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param("hpatches", marks=pytest.mark.slow), "middlebury", "foreground"]
-)
-def test_every_benchmark_does_all_its_tasks(
-    name: str,
-    write_few: Callable[[str], Path],
-    options: BenchmarkOptions,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+@pytest.mark.slow
+def test_hpatches_has_the_tables_of_all_protocols(
+    options: BenchmarkOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write_scene
 ) -> None:
     monkeypatch.setattr(repeatability, "CHANCE_POINTS", 200)
-    all_protocols = dataclasses.replace(
-        options, protocols=(*DEFAULT_PROTOCOLS, "degraded"), classical=()
-    )
-    report = run_benchmarks([name], write_few(name), all_protocols, cache=tmp_path / "cache")
+    for scene in ("i_dc", "v_small"):
+        write_scene(tmp_path / "hpatches" / scene, (24, 20), np.eye(3), ("{}.ppm", "H_1_{}"))
+    protocols = (*DEFAULT_PROTOCOLS, "degraded")
+    all_protocols = dataclasses.replace(options, protocols=protocols, classical=())
+    report = run_benchmarks(["hpatches"], tmp_path, all_protocols)
     keys = [table.key for table in report.tables()]
-    assert keys
-    assert len(set(keys)) == len(keys)
+    assert len(set(keys)) == len(keys) > 10
+    rows = table(report, "hpatches_table3")
+    assert list(rows[ALL_PIXELS]) == ["method", "illumination, 1 scenes", "viewpoint, 1 scenes"]
+    assert rows[ALL_PIXELS]["viewpoint, 1 scenes"] == 1
 
 
 def test_the_speed_reads_nothing_from_the_cache(

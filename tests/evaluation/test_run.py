@@ -1,8 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -12,13 +11,11 @@ from PIL import Image
 from scipy.spatial.distance import cdist
 
 from deepdetect import DeepDetectError, ImageError
-from deepdetect.evaluation import run as run_module
 from deepdetect.evaluation.baselines.method import BaselineError, LocalFeature
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
-from deepdetect.evaluation.profiling import Profile
 from deepdetect.evaluation.run import STAGES, CacheError, MatchSettings, Run
 from deepdetect.features.keypoints import Keypoints
-from deepdetect.io.image import load_image, luma
+from deepdetect.io.image import load_image
 
 Pair = tuple[Path, Path]
 FAST = CLASSICAL["fast"]
@@ -118,25 +115,6 @@ def test_matches_from_the_cache_equal_fresh_ones(
     assert (found.match, found.describe) == (made.match, made.describe)
 
 
-def test_matches_of_binary_descriptors_equal_a_count_of_all_bits(pair: Pair) -> None:
-    grays = [luma(load_image(path)) for path in pair]
-    keypoints, described = zip(
-        *(cv2.ORB_create().detectAndCompute(gray, None) for gray in grays), strict=True
-    )
-    bits = [np.unpackbits(rows, axis=1).astype(float) for rows in described]
-    every = cdist(*bits, "cityblock")
-    ordered = np.sort(every, axis=1)
-    kept = ordered[:, 0] < 0.8 * ordered[:, 1]
-    found = Run(Path()).matches(CLASSICAL["orb"], pair, MatchSettings(ratio=0.8))
-    positions = [np.array([p.pt for p in part], np.float32) for part in keypoints]
-    np.testing.assert_array_equal(found.points0, positions[0][kept])
-    np.testing.assert_array_equal(found.points1, positions[1][every.argmin(1)[kept]])
-    assert len(found.keypoints1) == len(positions[1])
-    # The crops are (6, 4) apart.
-    gaps = np.linalg.norm(found.points0 - (6, 4) - found.points1, axis=1)
-    assert (gaps < 2).mean() > 0.8
-
-
 def test_matches_by_euclid_equal_a_search_of_all_distances(pair: Pair) -> None:
     images = [load_image(path) for path in pair]
     method = CLASSICAL["sift"]
@@ -220,29 +198,6 @@ def test_few_keypoints_are_no_error(pair: Pair, matcher: str, count: int) -> Non
     assert found.points0.shape == found.points1.shape
     assert len(found.keypoints0) == count
     assert count == 2 or len(found.points0) == 0
-
-
-def test_no_stage_is_timed_while_files_are_read(
-    pair: Pair, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Detecting and describing stand beside each other, so they must mean the same."""
-    timing = []
-    read_while_timing = []
-
-    @contextmanager
-    def watched() -> Iterator[Profile]:
-        timing.append(True)
-        yield Profile()
-        timing.pop()
-
-    def load(path: Path) -> np.ndarray:
-        read_while_timing.extend(timing)
-        return load_image(path)
-
-    monkeypatch.setattr(run_module, "profiled", watched)
-    monkeypatch.setattr(run_module, "load_image", load)
-    Run(Path()).matches(FAST, pair, MatchSettings())
-    assert read_while_timing == []
 
 
 ARRAYS = {"rows": np.arange(50, dtype=np.int16), "one": np.array(3)}

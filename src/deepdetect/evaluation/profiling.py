@@ -53,6 +53,11 @@ class StageProfiler:
         self._begin()
         self._first = self._before
 
+    @property
+    def seconds(self) -> float:
+        """Of all stages."""
+        return sum(profile.seconds for profile in self.stages.values())
+
     def record(self, name: str) -> None:
         """End a stage, and begin the next one."""
         seconds = time.perf_counter() - self._started

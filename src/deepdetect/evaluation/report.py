@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -101,16 +101,6 @@ def _shown(cell: Cell, style: str) -> str:
     return cell if isinstance(cell, str) else format(cell, style)
 
 
-class Titled(Protocol):
-    """What a row of a table is named after."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def title(self) -> str: ...
-
-
 Measure = Callable[[Rows], Cell]
 """What makes a cell of the rows of one method."""
 
@@ -124,9 +114,9 @@ def average(style: str, name: Any, **wanted: Any) -> tuple[str, Measure]:
 
 
 def tabulate(
-    key: str, title: str, methods: Sequence[Titled], rows: Rows, columns: Columns, note: str = ""
+    key: str, title: str, methods: Sequence[Any], rows: Rows, columns: Columns, note: str = ""
 ) -> Table:
-    """Make a table with a line for each method, of the rows of `Run.rows`."""
+    """Make a table with a line for each method, by its title, of the rows of `Run.rows`."""
     lines = []
     for method in methods:
         own = where(rows, method=method.name)

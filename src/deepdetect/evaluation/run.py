@@ -23,11 +23,9 @@ from ..io.image import load_image
 from ..matching.unguided import check_memory
 from .baselines.method import BaselineError, LocalFeature
 from .profiling import Profile, profiled
-from .report import Row, Rows, Titled
+from .report import Row, Rows
 
 Result = TypeVar("Result")
-AnyMethod = TypeVar("AnyMethod", bound=Titled)
-Item = TypeVar("Item")
 
 STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
     "keypoints": (1, ()),
@@ -155,11 +153,11 @@ class Run:
     def rows(
         self,
         what: str,
-        methods: Sequence[AnyMethod],
-        items: Mapping[str, Item],
-        measure: Callable[[AnyMethod, Item], Row],
+        methods: Sequence[Any],
+        items: Mapping[str, Any],
+        measure: Callable[[Any, Any], Row],
     ) -> Rows:
-        """Measure each method on each item by its name.
+        """Measure each method, which has a name and a title, on each item by its name.
 
         `what` is the beginning of what the progress bar shows and of the reason of a failure. The
         rows have the names as "method" and "item"; those that failed are missing.

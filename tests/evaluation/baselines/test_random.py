@@ -5,7 +5,6 @@ import pytest
 from scipy.spatial import KDTree
 
 from deepdetect import match_images
-from deepdetect.evaluation.baselines.method import LocalFeature
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.evaluation.baselines.random import (
     AllPixels,
@@ -14,7 +13,6 @@ from deepdetect.evaluation.baselines.random import (
     random_feature,
 )
 from deepdetect.evaluation.metrics.repeatability import coverage
-from deepdetect.features.keypoints import Keypoints
 from deepdetect.features.sift import sift_descriptors
 from deepdetect.io.image import luma
 
@@ -74,17 +72,6 @@ def test_random_points_are_the_same_again_and_others_in_another_image(crop: np.n
 def test_random_points_of_nothing_are_nothing() -> None:
     found = random_feature(CLASSICAL["fast"]).detect(blank(40, 30))
     assert (len(found), found.image_size) == (0, (40, 30))
-
-
-def test_random_points_follow_the_version_of_their_method() -> None:
-    def nothing(rgb: np.ndarray) -> Keypoints:
-        return Keypoints.empty((1, 1))
-
-    def made(version: str, seed: int) -> str:
-        like = LocalFeature("like", "Like", nothing, lambda rgb, features: rgb, version=version)
-        return random_feature(like, seed).detection
-
-    assert len({made("1", 0), made("2", 0), made("1", 1)}) == 3
 
 
 @pytest.mark.parametrize(("width", "height"), [(17, 16), (150, 131)])

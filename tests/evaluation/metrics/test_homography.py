@@ -111,22 +111,3 @@ def test_beyond_the_horizon_nothing_is_seen(scale: float) -> None:
     np.testing.assert_allclose(
         project_visible(np.array([[50.0, 0]]), homography, (1000, 10)), [[100, 0]]
     )
-
-
-@given(
-    angle=st.floats(-3, 3),
-    scale=st.floats(0.5, 2),
-    shift=st.tuples(st.floats(-30, 30), st.floats(-30, 30)),
-    tilt=st.floats(-1e-3, 1e-3),
-)
-def test_what_is_seen_there_is_found_back(
-    angle: float, scale: float, shift: tuple[float, float], tilt: float
-) -> None:
-    c, s = scale * np.cos(angle), scale * np.sin(angle)
-    homography = np.array([[c, -s, shift[0]], [s, c, shift[1]], [tilt, 0, 1]])
-    points = np.stack(np.meshgrid(np.arange(0, 64, 7), np.arange(0, 48, 7)), -1).reshape(-1, 2)
-    there = project_visible(points, homography, (64, 48))
-    seen = np.isfinite(there[:, 0])
-    assert inside(there[seen], (64, 48)).all()
-    back = project_visible(there[seen], np.linalg.inv(homography), (64, 48))
-    np.testing.assert_allclose(back, points[seen], atol=1e-6)

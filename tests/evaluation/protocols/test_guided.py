@@ -14,7 +14,6 @@ from deepdetect.evaluation.benchmarks import run_benchmarks
 from deepdetect.evaluation.options import BenchmarkOptions
 from deepdetect.evaluation.protocols.guided import (
     SEEDS,
-    GuidedPair,
     _guided_cells,
     guided_section,
     match_guided,
@@ -106,8 +105,8 @@ def test_a_second_run_reads_what_the_first_has_kept(
     made = run.made
     again = match_guided(run, options.deepdetect_480(), pair, 0)
     assert run.made == made
-    np.testing.assert_array_equal(first.points1, again.points1)
-    np.testing.assert_array_equal(first.matrix, again.matrix)
+    np.testing.assert_array_equal(first["points1"], again["points1"])
+    np.testing.assert_array_equal(first["matrix"], again["matrix"])
     match_guided(run, options.deepdetect_480(), pair, 1)
     assert run.made == made + 1
 
@@ -134,8 +133,8 @@ def test_unrelated_images_are_said_to_be_unguided(
         given = match_images(pair.first, pair.second, options.detector, seed=seed)
         assert not given.guided
         assert len(given) == 0
-        np.testing.assert_array_equal(counted.points0, given.points0)
-        np.testing.assert_array_equal(counted.points1, given.points1)
+        np.testing.assert_array_equal(counted["points0"], given.points0)
+        np.testing.assert_array_equal(counted["points1"], given.points1)
 
 
 @pytest.mark.parametrize(
@@ -162,7 +161,9 @@ def test_seeds_that_fall_back_count(
     for kind, right in found:
         points1 = points0 + np.where(np.arange(10) < right, 0, 5)[:, None]
         matrix = np.eye(3) if kind == "homography" else None
-        seeds.append(GuidedPair(kind, matrix, points0, points1, 1.0))
+        seeds.append(
+            {"model": kind, "matrix": matrix, "points0": points0, "points1": points1, "seconds": 1}
+        )
     cells = list(_guided_cells(seeds, still, 20, (240, 200)).values())
     assert cells[0] == (f"{said} seeds guided" if "of" in said.split() else said)
     assert cells[1] == middle

@@ -145,7 +145,7 @@ def test_voxels_of_cones(shared: Path) -> None:
 def test_voxels_of_cones_by_sift(shared: Path) -> None:
     """The paper prints 14,128 for SIFT with low settings, by an older OpenCV."""
     scene = load_calibrated_pair(shared / "data" / "middlebury" / "cones")
-    points, _ = paper_points(self_described("sift-low", "SIFT"), scene, StageProfiler())
+    points, _ = paper_points(self_described("sift-low"), scene, StageProfiler())
     assert len(points) == pytest.approx(FIGURE_8["SIFT, low settings"]["cones"], rel=0.05)
 
 

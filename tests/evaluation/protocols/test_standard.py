@@ -21,7 +21,6 @@ from deepdetect.evaluation.benchmarks import run_benchmarks
 from deepdetect.evaluation.metrics import repeatability
 from deepdetect.evaluation.metrics.repeatability import mutual_nn_repeatability
 from deepdetect.evaluation.options import BenchmarkOptions
-from deepdetect.evaluation.protocols import standard
 from deepdetect.evaluation.protocols.standard import (
     BUDGETS,
     median_seconds,
@@ -210,27 +209,6 @@ def test_the_figures_are_of_repeatability_accuracy_and_time(report: Report) -> N
         *(f"low_visibility_repeatability_{radius}px" for radius in (1, 3)),
         "low_visibility_time",
     ]
-
-
-def test_rows_with_the_same_keypoints_are_one_line(
-    pairs: list[PlanarPair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn = []
-    monkeypatch.setattr(standard, "line_chart", lambda lines, *_, **__: drawn.append(lines) or b"")
-    monkeypatch.setattr(standard, "BUDGETS", (32, 64, None))
-    features = [FAST, dataclasses.replace(FAST, name="again", title="Described otherwise")]
-    run = Run(tmp_path)
-    rows = [
-        {"method": f.name, **pair_row(run, f, pair, (32, 64, None))}
-        for f in features
-        for pair in pairs
-    ]
-    for radius in (1.0, 3.0):
-        standard.repeatability_figure(features, rows, radius, "key", "pairs")
-        (numbers, values) = drawn[-1]["FAST"]
-        assert list(drawn[-1]) == ["FAST"]
-        assert numbers == [32, 64]
-        assert values == pytest.approx([repeated(rows[:2], n, radius) for n in numbers])
 
 
 def test_a_method_that_never_works_has_dashes(report: Report) -> None:

@@ -101,14 +101,6 @@ def test_ours_is_exact_and_the_baselines_are_there(section: Section) -> None:
 
 
 @pytest.mark.slow
-def test_what_the_right_image_cannot_show_is_counted(section: Section) -> None:
-    for name in ("all pixels, --density 1", "OpenCV's SGBM"):
-        row = rows(section, "middlebury_cones")[name]
-        assert row["half-occluded, with a point"] > 0
-        assert 0 < row["of these within 1 px"] <= 1
-
-
-@pytest.mark.slow
 def test_every_pipeline_tells_what_its_stages_took(section: Section) -> None:
     for name, row in rows(section, "middlebury_cones").items():
         seconds = [row[f"{stage}, s"] for stage in STAGES]
@@ -148,13 +140,6 @@ def test_the_weights_are_named_in_rows_of_their_own(data: Path) -> None:
     assert len(set(titles)) == len(titles)
 
 
-def test_the_weights_for_stereo_are_run_as_the_others() -> None:
-    detector = DeepDetect(backend="onnxruntime", threads=1)
-    found = BenchmarkOptions(detector, ("paper",), ()).stereo_detectors()["dense"]
-    assert found.backend == "onnxruntime"
-    assert found.weights == DeepDetect("dense").weights
-
-
 def test_voxels_are_cubes_with_a_point() -> None:
     camera = Camera((101, 101), 100.0)
     calibration = Calibration(camera, camera, baseline_mm=10)
@@ -170,19 +155,19 @@ def test_sgbm_finds_a_shift() -> None:
     left, right = texture[:, :180], texture[:, 9:189]
     camera = Camera((180, 80), 100.0)
 
-    found = sgbm(
+    pixels, disparity, *_ = sgbm(
         CalibratedStereoPair(
             "shift", left, right, np.full(left.shape[:2], np.nan), Calibration(camera, camera)
         )
     )
-    assert (np.abs(found.disparity - 9) < 0.5).mean() > 0.98
-    assert len(found.pixels) > 0.9 * 80 * 171
+    assert (np.abs(disparity - 9) < 0.5).mean() > 0.98
+    assert len(pixels) > 0.9 * 80 * 171
 
 
 def test_the_papers_pipeline_keeps_what_lies_on_a_row(data: Path) -> None:
     scene = load_calibrated_pair(data / "middlebury" / "cones")
     profiler = StageProfiler()
-    points0, points1 = paper_points(self_described("sift-low", "SIFT"), scene, profiler)
+    points0, points1 = paper_points(self_described("sift-low"), scene, profiler)
     assert list(profiler.stages) == list(STAGES)
     assert len(points0) == len(points1) > 1_000
     assert (np.abs(points0[:, 1] - points1[:, 1]) <= 1).mean() > 0.98

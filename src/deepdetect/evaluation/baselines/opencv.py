@@ -20,32 +20,42 @@ KD_TREES = "bytes by kd-trees"
 AGAST_7_12D = 1
 """AgastFeatureDetector::AGAST_7_12d, the type of the paper's low settings."""
 
-OPENCV_SETTINGS: dict[str, tuple[str, Mapping[str, Any]]] = {
+OPENCV_SETTINGS: dict[str, tuple[str, str, Mapping[str, Any]]] = {
     # Lowe 2004; Rublee et al. 2011; Leutenegger et al. 2011.
-    "sift": ("SIFT_create", {}),
+    "sift": ("SIFT", "SIFT_create", {}),
     "sift-low": (
+        "SIFT, low settings",
         "SIFT_create",
         {"nOctaveLayers": 4, "contrastThreshold": 1e-9, "edgeThreshold": 100, "sigma": 0.7},
     ),
-    "orb": ("ORB_create", {}),
-    "orb-many": ("ORB_create", {"nfeatures": 10_000}),
-    "orb-low": ("ORB_create", {"nfeatures": 1_000_000, "fastThreshold": 1}),
-    "brisk": ("BRISK_create", {}),
-    "brisk-low": ("BRISK_create", {"thresh": 1, "octaves": 4}),
+    "orb": ("ORB", "ORB_create", {}),
+    "orb-many": ("ORB", "ORB_create", {"nfeatures": 10_000}),  # the default stops at 500
+    "orb-low": (
+        "ORB, low settings",
+        "ORB_create",
+        {"nfeatures": 1_000_000, "fastThreshold": 1},
+    ),
+    "brisk": ("BRISK", "BRISK_create", {}),
+    "brisk-low": ("BRISK, low settings", "BRISK_create", {"thresh": 1, "octaves": 4}),
     # Rosten and Drummond 2006 (9-16); Mair et al. 2010.
-    "fast": ("FastFeatureDetector_create", {}),
-    "fast-low": ("FastFeatureDetector_create", {"threshold": 1, "nonmaxSuppression": False}),
-    "agast": ("AgastFeatureDetector_create", {}),
+    "fast": ("FAST", "FastFeatureDetector_create", {}),
+    "fast-low": (
+        "FAST, low settings",
+        "FastFeatureDetector_create",
+        {"threshold": 1, "nonmaxSuppression": False},
+    ),
+    "agast": ("AGAST", "AgastFeatureDetector_create", {}),
     "agast-low": (
+        "AGAST, low settings",
         "AgastFeatureDetector_create",
         {"threshold": 1, "nonmaxSuppression": False, "type": AGAST_7_12D},
     ),
 }
-"""OpenCV's factory and its settings by name; all others have its defaults."""
+"""Title, OpenCV's factory and its settings by name; all others have its defaults."""
 
 
 def _make(name: str) -> cv2.Feature2D:
-    factory, settings = OPENCV_SETTINGS[name]
+    _, factory, settings = OPENCV_SETTINGS[name]
     return opencv_factory(factory)(**settings)
 
 
@@ -67,31 +77,33 @@ def describe_with(descriptor: cv2.Feature2D, rgb: np.ndarray, features: Keypoint
 
 
 def _feature(
-    name: str,
-    title: str,
-    detect: Callable[[np.ndarray], Keypoints] | None = None,
-    descriptor: str = "SIFT_create",
+    name: str, title: str, detect: Callable[[np.ndarray], Keypoints], descriptor: str
 ) -> LocalFeature:
-    """Make a local feature, by default of `OPENCV_SETTINGS`; as in the paper described by SIFT."""
-
-    def from_settings(rgb: np.ndarray) -> Keypoints:
-        found = _make(name).detect(luma(rgb), None)
-        return Keypoints.from_opencv(found, (rgb.shape[1], rgb.shape[0]))
-
     def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:
         return describe_with(opencv_factory(descriptor)(), rgb, features)
 
-    binary = descriptor != "SIFT_create"
-    return LocalFeature(name, title, detect or from_settings, describe, binary=binary)
+    return LocalFeature(name, title, detect, describe, binary=descriptor != "SIFT_create")
 
 
-def self_described(name: str, title: str) -> LocalFeature:
+def _opencv(name: str) -> LocalFeature:
+    """Make a local feature of `OPENCV_SETTINGS`; all but ORB and BRISK are described by SIFT."""
+
+    def detect(rgb: np.ndarray) -> Keypoints:
+        found = _make(name).detect(luma(rgb), None)
+        return Keypoints.from_opencv(found, (rgb.shape[1], rgb.shape[0]))
+
+    title, factory, _ = OPENCV_SETTINGS[name]
+    binary = factory in ("ORB_create", "BRISK_create")
+    return _feature(name, title, detect, factory if binary else "SIFT_create")
+
+
+def self_described(name: str) -> LocalFeature:
     """Make a local feature of `OPENCV_SETTINGS` whose descriptors have these settings, too."""
 
     def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:
         return describe_with(_make(name), rgb, features)
 
-    return replace(_feature(name, title), name=f"{name}-self-described", describe=describe)
+    return replace(_opencv(name), name=f"{name}-self-described", describe=describe)
 
 
 def _harris(
@@ -106,7 +118,7 @@ def _harris(
         response = cv2.dilate(cv2.cornerHarris(luma(rgb), block_size, aperture, k), None)
         return _pixels(response, response > quality * max(float(response.max()), 0.0))
 
-    return _feature(name, title, detect)
+    return _feature(name, title, detect, "SIFT_create")
 
 
 def _harris_maxima(rgb: np.ndarray) -> Keypoints:
@@ -130,7 +142,7 @@ def _shi_tomasi(name: str, title: str, quality: float, k: float) -> LocalFeature
         )
         return _corners(rgb, corners, scores)
 
-    return _feature(name, title, detect)
+    return _feature(name, title, detect, "SIFT_create")
 
 
 def _shi_tomasi_eigenvalue(rgb: np.ndarray) -> Keypoints:
@@ -156,37 +168,24 @@ def _corners(rgb: np.ndarray, corners: np.ndarray | None, scores: np.ndarray) ->
 
 
 CLASSICAL: dict[str, LocalFeature] = {
-    feature.name: feature
-    for feature in (
-        replace(_feature("sift", "SIFT"), own_scale=OwnScaleDescriptor()),
-        _feature("sift-low", "SIFT, low settings"),
-        _feature("orb", "ORB", descriptor="ORB_create"),
-        _feature("orb-low", "ORB, low settings", descriptor="ORB_create"),
-        _feature("brisk", "BRISK", descriptor="BRISK_create"),
-        _feature("brisk-low", "BRISK, low settings", descriptor="BRISK_create"),
-        _feature("fast", "FAST"),
-        _feature("fast-low", "FAST, low settings"),
-        _feature("agast", "AGAST"),
-        _feature("agast-low", "AGAST, low settings"),
-        _harris("harris", "Harris", 2, 3, 0.04, 0.04),
-        _harris("harris-low", "Harris, low settings", 3, 5, 0.001, 0.001),
-        _shi_tomasi("shi-tomasi", "Shi-Tomasi", 0.01, 0.04),
-        _shi_tomasi("shi-tomasi-low", "Shi-Tomasi, low settings", 1e-6, 0.001),
-    )
+    **{name: _opencv(name) for name in OPENCV_SETTINGS if name != "orb-many"},
+    "sift": replace(_opencv("sift"), own_scale=OwnScaleDescriptor()),
+    "harris": _harris("harris", "Harris", 2, 3, 0.04, 0.04),
+    "harris-low": _harris("harris-low", "Harris, low settings", 3, 5, 0.001, 0.001),
+    "shi-tomasi": _shi_tomasi("shi-tomasi", "Shi-Tomasi", 0.01, 0.04),
+    "shi-tomasi-low": _shi_tomasi("shi-tomasi-low", "Shi-Tomasi, low settings", 1e-6, 0.001),
 }
 """The paper's classical detectors, as its tables have them."""
 
 STANDARD: dict[str, LocalFeature] = {
     "sift": CLASSICAL["sift"],
-    "orb": _feature(
-        "orb-many", "ORB", descriptor="ORB_create"
-    ),  # the default stops at 500 keypoints
+    "orb": _opencv("orb-many"),
     "brisk": CLASSICAL["brisk"],
     "fast": CLASSICAL["fast"],
     "agast": CLASSICAL["agast"],
-    "harris": _feature("harris-maxima", "Harris, local maxima", _harris_maxima),
+    "harris": _feature("harris-maxima", "Harris, local maxima", _harris_maxima, "SIFT_create"),
     "shi-tomasi": _feature(
-        "shi-tomasi-eigenvalue", "Shi-Tomasi, sub-pixel", _shi_tomasi_eigenvalue
+        "shi-tomasi-eigenvalue", "Shi-Tomasi, sub-pixel", _shi_tomasi_eigenvalue, "SIFT_create"
     ),
 }
 """By the names of the default settings, what replaces them where detectors are compared by their

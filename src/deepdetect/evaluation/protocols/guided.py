@@ -7,7 +7,6 @@ only beside them does a count say something.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from ..baselines.method import LocalFeature
 from ..metrics.homography import corner_error
 from ..options import BenchmarkOptions
 from ..profiling import profiled
-from ..report import Cell, Row, Section, Table, where
+from ..report import Row, Section, Table, where
 from ..run import Run
 from .paper import CORRECT_PX, PAPER_MATCHING
 
@@ -55,24 +54,6 @@ NOTE = (
     "the seeds that a homography guided. Seconds: median of the guided matching alone, of the run "
     "that made them."
 )
-
-
-@dataclass(frozen=True, eq=False)
-class GuidedPair:
-    """The matches of a pair by one seed, as `match_images` gives them.
-
-    Attributes:
-        model: what guided: "homography", "fundamental" or "none", with which there are no matches.
-        matrix: the geometry, or None.
-        points0, points1: (M, 2) matched positions.
-        seconds: of the guided matching alone: heat map and keypoints are not included.
-    """
-
-    model: str
-    matrix: np.ndarray | None
-    points0: np.ndarray
-    points1: np.ndarray
-    seconds: float
 
 
 def guided_section(
@@ -144,16 +125,16 @@ def guided_row(run: Run, feature: LocalFeature, by_truth: Mapping[str, PlanarPai
 
 
 def _guided_cells(
-    guided: Sequence[GuidedPair], pair: PlanarPair, matchable: int, size: tuple[int, int]
-) -> dict[str, Cell]:
-    correct = [_correct(found.points0, found.points1, pair) for found in guided]
+    guided: Sequence[Row], pair: PlanarPair, matchable: int, size: tuple[int, int]
+) -> Row:
+    correct = [_correct(found["points0"], found["points1"], pair) for found in guided]
     counts = [int(one.sum()) for one in correct]
     middle = int(np.argsort(counts, kind="stable")[(len(counts) - 1) // 2])
-    unique = np.unique(guided[middle].points1[correct[middle]], axis=0)
-    planes = [found.matrix for found in guided if found.model == "homography"]
+    unique = np.unique(guided[middle]["points1"][correct[middle]], axis=0)
+    planes = [found["matrix"] for found in guided if found["model"] == "homography"]
     corners = [corner_error(matrix, pair.homography, size) for matrix in planes]
     return {
-        "guided by": guided_by([found.model for found in guided]),
+        "guided by": guided_by([found["model"] for found in guided]),
         "guided: correct": counts[middle],
         "± of correct": float(np.std(counts, ddof=1)),
         "guided: precision": float(correct[middle].mean()) if len(correct[middle]) else None,
@@ -161,7 +142,7 @@ def _guided_cells(
         "lowest": min(counts) / matchable if matchable else None,
         "guided: unique": len(unique),
         "guided: corner error, px": float(np.median(corners)) if corners else None,
-        "guided: seconds": float(np.median([found.seconds for found in guided])),
+        "guided: seconds": float(np.median([found["seconds"] for found in guided])),
     }
 
 
@@ -178,8 +159,13 @@ def _correct(points0: np.ndarray, points1: np.ndarray, pair: PlanarPair) -> np.n
     return transfer_errors(points0, points1, pair.homography) < CORRECT_PX
 
 
-def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -> GuidedPair:
-    """Match a pair guided, or read that; its homography is not used."""
+def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -> Row:
+    """Match a pair guided, or read that; its homography is not used.
+
+    Returns "model", what guided: "homography", "fundamental" or "none", with which there are no
+    matches, "matrix", the geometry, "points0" and "points1", (M, 2), and "seconds" of the guided
+    matching alone: heat map and keypoints are not included.
+    """
     images = (pair.first, pair.second)
     first, second = (run.keypoints(feature, image)[0].xy for image in images)
 
@@ -196,10 +182,5 @@ def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -
         }
 
     found = run.cached("guided", (feature.detection, images, seed), make)
-    return GuidedPair(
-        str(found["model"]),
-        found["matrix"] if len(found["matrix"]) else None,
-        first[found["rows0"]],
-        found["points1"],
-        float(found["profile"][0]),
-    )
+    seconds, model = float(found["profile"][0]), str(found["model"])
+    return {**found, "model": model, "points0": first[found["rows0"]], "seconds": seconds}

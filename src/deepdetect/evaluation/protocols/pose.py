@@ -62,6 +62,9 @@ CURVE_DEG = tuple(0.5 * step for step in range(41))
 
 STRAIGHT_AHEAD = "no matches: straight ahead"
 
+DISTANCE, ERROR = "frame distance", "pose error, °"
+AGREEING = f"agreeing within {EPIPOLAR_THRESHOLD_PX:g} px"
+
 TEXT = (
     "Two images are matched, and the relative pose of their cameras is estimated from the matches "
     f"alone, the same way for all methods: OpenCV's MAGSAC at {THRESHOLD_PX:g} px with the true "
@@ -118,7 +121,8 @@ def pose(run: Run, options: BenchmarkOptions) -> list[Section]:
     def measure(method: PoseMethod, item: tuple[PosedScene, PosedPair]) -> Row:
         scene, pair = item
         values = pose_row(run, method, pair)
-        return {"scene": scene.name, "distance": pair.frame_distance, "pair": pair.name, **values}
+        distance = pair.frame_distance
+        return {"scene": scene.name, DISTANCE: distance, "pair": pair.name, **values}
 
     rows = run.rows("pose of ", methods, items, measure)
     sequences = [scene for scene in scenes if scene.pairs[0].frame_distance is not None]
@@ -130,7 +134,7 @@ def pose(run: Run, options: BenchmarkOptions) -> list[Section]:
     figures = []
     for scene in scenes:
         own = where(rows, scene=scene.name)
-        errors = {m.title: [r["error"] for r in where(own, method=m.name)] for m in methods}
+        errors = {m.title: [r[ERROR] for r in where(own, method=m.name)] for m in methods}
         title = f"Relative poses in {scene.name}: fraction of the pairs up to each error"
         png = error_chart(errors, CURVE_DEG, "pose error up to, °")
         figures.append(Figure(f"pose_{file_name(scene.name)}", title, png))
@@ -185,20 +189,15 @@ def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
 def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
     """Measure a method on a pair, or read the result from the cache.
 
-    By name "rotation" and "translation", the errors in degrees, infinite without a pose, "error",
-    the larger of both, "matches", "agreeing", the fraction of them that agree with the true pose,
-    "seconds" and "guided by"; all but errors None of the control.
+    By the titles of `PAIR_COLUMNS`: errors in degrees are infinite without a pose, and all but
+    errors is None of the control.
     """
     match = method.match
-    if match is None:
-        rotation, translation = _errors((np.eye(3), np.array([0.0, 0.0, -1.0])), pair)
-        rest = dict.fromkeys(("matches", "agreeing", "seconds", "guided by"))
-        error = max(rotation, translation)
-        return {"rotation": rotation, "translation": translation, "error": error, **rest}
     images = (pair.first.path, pair.second.path)
     cameras = (pair.first.intrinsics, pair.second.intrinsics)
 
     def make() -> Arrays:
+        assert match is not None
         points0, points1, seconds, guided_by = match(images)
         agreeing = epipolar_inlier_ratio(points0, points1, pair.fundamental)
         errors = _errors(estimate_pose(points0, points1, *cameras), pair)
@@ -207,19 +206,18 @@ def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
             "guided_by": np.array(guided_by),
         }
 
-    truth = (*cameras, pair.rotation, pair.translation)
-    estimate = (THRESHOLD_PX, CONFIDENCE, EPIPOLAR_THRESHOLD_PX)
-    kept = run.cached("pose", (method.name, method.version, images, truth, estimate), make)
-    rotation, translation, matches, agreeing, seconds = kept["numbers"].tolist()
-    return {
-        "rotation": rotation,
-        "translation": translation,
-        "error": max(rotation, translation),
-        "matches": int(matches),
-        "agreeing": agreeing,
-        "seconds": seconds,
-        "guided by": str(kept["guided_by"]) or None,
-    }
+    values: Row = dict.fromkeys(("matches", AGREEING, "seconds", "guided by"))
+    if match is None:
+        rotation, translation = _errors((np.eye(3), np.array([0.0, 0.0, -1.0])), pair)
+    else:
+        truth = (*cameras, pair.rotation, pair.translation)
+        estimate = (THRESHOLD_PX, CONFIDENCE, EPIPOLAR_THRESHOLD_PX)
+        kept = run.cached("pose", (method.name, method.version, images, truth, estimate), make)
+        rotation, translation, matches, agreeing, seconds = kept["numbers"].tolist()
+        values = {"matches": int(matches), AGREEING: agreeing, "seconds": seconds}
+        values["guided by"] = str(kept["guided_by"]) or None
+    errors = {"rotation error, °": rotation, "translation error, °": translation}
+    return {**errors, ERROR: max(rotation, translation), **values}
 
 
 def _errors(pose: tuple[np.ndarray, np.ndarray] | None, pair: PosedPair) -> tuple[float, float]:
@@ -281,21 +279,19 @@ def _median(style: str, name: str) -> tuple[str, Measure]:
 
 
 def _auc(own: Rows, threshold: float) -> Cell:
-    return pose_auc([row["error"] for row in own], threshold) if own else None
+    return pose_auc([row[ERROR] for row in own], threshold) if own else None
 
-
-AGREEING = f"agreeing within {EPIPOLAR_THRESHOLD_PX:g} px"
 
 SUMMARY: Columns = {
     "pairs": (",d", len),
-    "failed": (",d", lambda own: sum(row["error"] == float("inf") for row in own)),
+    "failed": (",d", lambda own: sum(row[ERROR] == float("inf") for row in own)),
     **{
         f"AUC at {threshold:g}°": (".3f", partial(_auc, threshold=threshold))
         for threshold in POSE_THRESHOLDS_DEG
     },
-    "median error, °": _median(".2f", "error"),
+    "median error, °": _median(".2f", ERROR),
     "matches": _median(",.0f", "matches"),
-    AGREEING: average(".1%", "agreeing"),
+    AGREEING: average(".1%", AGREEING),
 }
 
 
@@ -318,11 +314,11 @@ def _grouped(
 
 def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], rows: Rows) -> Table:
     """Tabulate each method on each scene, losses to SIFT beside wins."""
-    sift = {row["item"]: row["error"] < GOOD_DEG for row in where(rows, method="sift")}
+    sift = {row["item"]: row[ERROR] < GOOD_DEG for row in where(rows, method="sift")}
 
     def against_sift(own: Rows, only_sift: bool) -> Cell:
         compared = [row for row in own if row["item"] in sift and row["method"] != "sift"]
-        right = [(row["error"] < GOOD_DEG, sift[row["item"]]) for row in compared]
+        right = [(row[ERROR] < GOOD_DEG, sift[row["item"]]) for row in compared]
         return right.count((not only_sift, only_sift)) if right else None
 
     def guided(own: Rows, guide: str) -> Cell:
@@ -350,37 +346,38 @@ def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], row
 def distance_table(scene: PosedScene, methods: Sequence[PoseMethod], rows: Rows) -> Table:
     """Tabulate each method at each frame distance of a sequence."""
     distances = sorted({pair.frame_distance or 0 for pair in scene.pairs})
-    groups = [(each, where(rows, scene=scene.name, distance=each)) for each in distances]
+    groups = [
+        (each, where(where(rows, scene=scene.name), **{DISTANCE: each})) for each in distances
+    ]
     title = f"Relative poses in {scene.name}, by frame distance"
     key = f"pose_{file_name(scene.name)}_distances"
-    return _grouped(key, title, "frame distance", groups, methods, SUMMARY)
+    return _grouped(key, title, DISTANCE, groups, methods, SUMMARY)
 
 
 PAIR_COLUMNS = {
-    "pair": ("pair", ""),
-    "method": ("title", ""),
-    "frame distance": ("distance", "d"),
-    "rotation error, °": ("rotation", ".3f"),
-    "translation error, °": ("translation", ".3f"),
-    "pose error, °": ("error", ".3f"),
-    "matches": ("matches", ",d"),
-    AGREEING: ("agreeing", ".1%"),
-    "guided by": ("guided by", ""),
-    "seconds": ("seconds", ".2f"),
+    "pair": "",
+    "method": "",
+    DISTANCE: "d",
+    "rotation error, °": ".3f",
+    "translation error, °": ".3f",
+    ERROR: ".3f",
+    "matches": ",d",
+    AGREEING: ".1%",
+    "guided by": "",
+    "seconds": ".2f",
 }
-"""Name of the value, and style, by the column's title."""
 
 
 def pair_table(items: Sequence[str], methods: Sequence[PoseMethod], rows: Rows) -> Table:
     """Tabulate each method on each pair."""
     lines = [
-        {title: (row | {"title": method.title})[name] for title, (name, _) in PAIR_COLUMNS.items()}
+        {**row, "method": method.title}
         for item in items
         for method in methods
         for row in where(rows, item=item, method=method.name)
     ]
-    styles = {title: style for title, (_, style) in PAIR_COLUMNS.items()}
-    return Table("pose_pairs", "Relative poses, all pairs", styles, lines, NOTE, in_text=False)
+    title = "Relative poses, all pairs"
+    return Table("pose_pairs", title, PAIR_COLUMNS, lines, NOTE, in_text=False)
 
 
 def error_chart(

@@ -86,28 +86,9 @@ SHIFTED_NOTE = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class StereoPoints:
-    """The points of a scene.
-
-    Attributes:
-        pixels: (N, 2) float32 positions in the left image.
-        disparity: (N,) float32 in pixels.
-        filled: how many of them were not matched, but filled in.
-        profiles: of each of `STAGES` that the pipeline has.
-        memory: bytes that the process grew by at most, over all stages.
-    """
-
-    pixels: np.ndarray
-    disparity: np.ndarray
-    filled: int
-    profiles: Mapping[str, Profile]
-    memory: int
-
-    @property
-    def seconds(self) -> float:
-        """Of all stages."""
-        return sum(profile.seconds for profile in self.profiles.values())
+Points = tuple[np.ndarray, np.ndarray, int, StageProfiler]
+"""(N, 2) float32 pixels of the left image, (N,) float32 disparities, how many of them were not
+matched but filled in, and what the stages took."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +105,7 @@ class Pipeline:
     """
 
     title: str
-    run: Callable[[CalibratedStereoPair], StereoPoints]
+    run: Callable[[CalibratedStereoPair], Points]
     version: str = ""
     rounds: int = ROUNDS
     drawn: str = ""
@@ -146,14 +127,11 @@ def middlebury(run: Run, options: BenchmarkOptions) -> list[Section]:
         )
     compared = pipelines(options)
 
-    def measure(pipeline: Pipeline, scene: Path) -> Row:
-        return {"points": reconstruct_points(run, pipeline, scene)}
-
-    rows = run.rows("", compared, scenes, measure)
+    rows = run.rows("", compared, scenes, partial(reconstruct_points, run))
     tables: list[Table] = []
     figures: list[Figure] = []
     for name, scene in scenes.items():
-        found = {row["method"]: row["points"] for row in where(rows, item=name)}
+        found = {row["method"]: row for row in where(rows, item=name)}
         if not found:
             continue
         pair = load_calibrated_pair(scene)
@@ -165,32 +143,45 @@ def middlebury(run: Run, options: BenchmarkOptions) -> list[Section]:
     return [Section("Middlebury stereo, and Figure 8", (TEXT,), tables, figures)]
 
 
-def reconstruct_points(run: Run, pipeline: Pipeline, scene: Path) -> StereoPoints:
-    """Reconstruct a scene, the run of median time, or read it from the cache."""
+def reconstruct_points(run: Run, pipeline: Pipeline, scene: Path) -> Row:
+    """Reconstruct a scene, the run of median time, or read it from the cache.
+
+    Returns the "pixels", their "disparity", and what does not depend on the truth by the titles of
+    the columns.
+    """
 
     def make() -> Arrays:
         pair = load_calibrated_pair(scene)
         runs = [pipeline.run(pair) for _ in range(pipeline.rounds)]
-        middle = sorted(runs, key=lambda one: one.seconds)[len(runs) // 2]
+        runs = sorted(runs, key=lambda points: points[3].seconds)
+        pixels, disparity, filled, profiler = runs[len(runs) // 2]
         return {
-            "pixels": middle.pixels,
-            "disparity": middle.disparity,
-            "filled": np.array(middle.filled),
-            "memory": np.array(max(one.memory for one in runs)),
-            **{name: profile.packed() for name, profile in middle.profiles.items()},
+            "pixels": pixels,
+            "disparity": disparity,
+            "filled": np.array(filled),
+            "memory": np.array(max(profiler.memory for *_, profiler in runs)),
+            **{name: profile.packed() for name, profile in profiler.stages.items()},
         }
 
     files = [scene / name for name in ("left.png", "right.png", "calib.json")]
     kept = run.cached("stereo", (pipeline.name, pipeline.version, files), make)
-    profiles = {stage: Profile(*kept[stage].tolist()) for stage in STAGES if stage in kept}
-    points = kept["pixels"], kept["disparity"]
-    return StereoPoints(*points, int(kept["filled"]), profiles, int(kept["memory"]))
+    stages = {stage: Profile(*kept[stage].tolist()) for stage in STAGES if stage in kept}
+    return {
+        "pixels": kept["pixels"],
+        "disparity": kept["disparity"],
+        "points": len(kept["pixels"]),
+        "of them filled": int(kept["filled"]),
+        **{f"{stage}, s": profile.seconds for stage, profile in stages.items()},
+        "seconds": sum(profile.seconds for profile in stages.values()),
+        **{f"{stage}, MB": profile.memory / 1e6 for stage, profile in stages.items()},
+        "all, MB": int(kept["memory"]) / 1e6,
+    }
 
 
 def points_table(
     pair: CalibratedStereoPair,
     compared: Sequence[Pipeline],
-    found: Mapping[str, StereoPoints],
+    found: Mapping[str, Row],
     which: str,
     truth: np.ndarray | None,
 ) -> Table:
@@ -210,21 +201,11 @@ def points_table(
     }
     lines: list[Row] = []
     for pipeline in compared:
-        lines.append({"pipeline": pipeline.title})
-        points = found.get(pipeline.name)
-        if points is None:
-            continue
-        lines[-1] |= {
-            "points": len(points.pixels),
-            "of them filled": points.filled,
-            voxels: count_voxels(pair.calibration, points.pixels, points.disparity, edge),
-            "seconds": points.seconds,
-            "all, MB": points.memory / 1e6,
-        }
-        for stage, profile in points.profiles.items():
-            lines[-1] |= {f"{stage}, s": profile.seconds, f"{stage}, MB": profile.memory / 1e6}
-        if truth is not None:
-            lines[-1] |= disparity_scores(points.pixels, points.disparity, truth)
+        lines.append({"pipeline": pipeline.title, **found.get(pipeline.name, {})})
+        if pipeline.name in found:
+            points = lines[-1]["pixels"], lines[-1]["disparity"]
+            lines[-1][voxels] = count_voxels(pair.calibration, *points, edge)
+            lines[-1] |= {} if truth is None else disparity_scores(*points, truth)
     key = f"middlebury_{pair.name}" + ("_shifted" if which == SHIFTED else "")
     paper = {p.title: p.paper[pair.name] for p in compared if pair.name in p.paper}
     title = f"{pair.name}, {which}" if which else pair.name
@@ -258,7 +239,7 @@ def _triangulate(
 
 
 def clouds_figure(
-    pair: CalibratedStereoPair, compared: Sequence[Pipeline], found: Mapping[str, StereoPoints]
+    pair: CalibratedStereoPair, compared: Sequence[Pipeline], found: Mapping[str, Row]
 ) -> Figure | None:
     """Draw Figure 8: the points of the pipelines that the paper draws; None without any."""
     clouds = {}
@@ -268,8 +249,8 @@ def clouds_figure(
         points = found.get(pipeline.name)
         if not pipeline.drawn or points is None:
             continue
-        space, kept = _triangulate(pair.calibration, points.pixels, points.disparity)
-        columns, rows = np.rint(points.pixels[kept]).astype(np.int64).T
+        space, kept = _triangulate(pair.calibration, points["pixels"], points["disparity"])
+        columns, rows = np.rint(points["pixels"][kept]).astype(np.int64).T
         clouds[pipeline.drawn] = PointCloud(space, pair.left[rows, columns], unit)
     if not any(map(len, clouds.values())):
         return None
@@ -333,12 +314,10 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
         squashed = detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX, "bgr"))
         feature = deepdetect_feature(squashed, title=f"the paper's pipeline, weights {name}")
         found.append(_paper(feature, paper=FIGURE_8["DeepDetect"]))
-    for name, title, drawn in (
-        ("sift", "SIFT", "SIFT default"),
-        ("sift-low", "SIFT, low settings", "SIFT low"),
-    ):
+    for name, drawn in (("sift", "SIFT default"), ("sift-low", "SIFT low")):
         if name in options.classical:
-            found.append(_paper(self_described(name, title), drawn, FIGURE_8[title]))
+            feature = self_described(name)
+            found.append(_paper(feature, drawn, FIGURE_8[feature.title]))
     random = partial(_random, like=next(iter(detectors.values())))
     every = partial(_ours, detector=AllPixels())
     return [
@@ -352,7 +331,7 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
 
 def _ours(
     scene: CalibratedStereoPair, *, detector: AnyDetector, density: float | None = None
-) -> StereoPoints:
+) -> Points:
     """Reconstruct as `deepdetect reconstruct --rectified`."""
     _compile_kernels()
     profiler = StageProfiler()
@@ -368,10 +347,10 @@ def _ours(
     profiler.record("geometry")
     assert found.disparity is not None
     filled = int(np.count_nonzero(~found.matched))
-    return StereoPoints(found.pixels, found.disparity, filled, profiler.stages, profiler.memory)
+    return found.pixels, found.disparity, filled, profiler
 
 
-def _random(scene: CalibratedStereoPair, *, like: DeepDetect) -> StereoPoints:
+def _random(scene: CalibratedStereoPair, *, like: DeepDetect) -> Points:
     """Reconstruct as many random pixels as a detector finds keypoints."""
     density = float((like.heatmap(scene.left) > 0.5).mean())
     return _ours(scene, detector=RandomDetector(), density=density)
@@ -380,13 +359,12 @@ def _random(scene: CalibratedStereoPair, *, like: DeepDetect) -> StereoPoints:
 def _paper(feature: LocalFeature, drawn: str = "", paper: Mapping[str, float] = {}) -> Pipeline:
     """Make the paper's pipeline with the keypoints and descriptors of a local feature."""
 
-    def run(scene: CalibratedStereoPair) -> StereoPoints:
+    def run(scene: CalibratedStereoPair) -> Points:
         feature.detect(scene.left)  # the first run of a size takes longer
         profiler = StageProfiler()
         points0, points1 = paper_points(feature, scene, profiler)
         disparity = (points0[:, 0] - points1[:, 0]).astype(np.float32)
-        pixels = points0.astype(np.float32)
-        return StereoPoints(pixels, disparity, 0, profiler.stages, profiler.memory)
+        return points0.astype(np.float32), disparity, 0, profiler
 
     return Pipeline(feature.title, run, feature.version, 1, drawn, paper)
 
@@ -450,7 +428,7 @@ def essential_inliers(
     return points0, points1
 
 
-def sgbm(scene: CalibratedStereoPair) -> StereoPoints:
+def sgbm(scene: CalibratedStereoPair) -> Points:
     """Run OpenCV's semi-global matching on every pixel.
 
     With the range that ours finds, from 0 or below, made a multiple of 16. Both views are extended
@@ -466,7 +444,7 @@ def sgbm(scene: CalibratedStereoPair) -> StereoPoints:
     rows, columns = np.nonzero(np.isfinite(disparity))
     profiler.record("matching")
     pixels = np.column_stack([columns, rows]).astype(np.float32)
-    return StereoPoints(pixels, disparity[rows, columns], 0, profiler.stages, profiler.memory)
+    return pixels, disparity[rows, columns], 0, profiler
 
 
 def sgbm_disparity(
