@@ -24,6 +24,7 @@ from urllib.parse import urlsplit
 from .._shared.errors import DeepDetectError, MissingExtraError
 from .._shared.opencv import cv2
 from .._shared.progress import progress
+from .._shared.records import file_state
 from ..io.image import IMAGE_SUFFIXES, find_images
 
 CHUNK_BYTES = 1 << 16
@@ -145,7 +146,7 @@ def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = Tru
         every = zip(dataset.files, paths, strict=True)
         missing = [(file, path) for file, path in every if not path.exists()]
         # Twice the size: for the archives, and for what is unpacked.
-        done = sum(_size(_part(path)) for _, path in missing)
+        done = sum(file_state(_part(path))[0] for _, path in missing)
         _require_space(store, dataset.size + sum(file.size for file, _ in missing) - done)
         for file, path in missing:
             download(file, path, quiet=quiet)
@@ -168,7 +169,7 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
     Until then the bytes are in `path` with ".part" added, where the next call resumes. Where every
     host fails, the error is that of the last one.
     """
-    from requests import HTTPError, RequestException
+    from requests import RequestException
 
     part = _part(path)
     failure = DeepDetectError(f"{path.name} has no address")
@@ -189,15 +190,13 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
             return
         except DeepDetectError as error:
             failure = error
-        except HTTPError as error:
-            status = error.response.status_code if error.response is not None else "an error"
-            failure = DeepDetectError(
-                f"{url} cannot be downloaded (the server answers {status}): try again later"
-            )
         except RequestException as error:
+            answer = error.response
+            what = type(error).__name__
+            if answer is not None:
+                what = f"the server answers {answer.status_code}"
             failure = DeepDetectError(
-                f"{url} cannot be downloaded ({error.__class__.__name__}): "
-                "give the same command again to resume"
+                f"{url} cannot be downloaded ({what}): give the same command again to resume"
             )
     raise failure
 
@@ -234,15 +233,11 @@ def _part(path: Path) -> Path:
     return path.with_name(f"{path.name}.part")
 
 
-def _size(path: Path) -> int:
-    return path.stat().st_size if path.exists() else 0
-
-
 def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> str | None:
     """Append what is missing to a partial file; return the checksum that the host states."""
     import requests
 
-    have = _size(part)
+    have = file_state(part)[0]
     headers = {"Range": f"bytes={have}-"} if have else {}
     with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT_SECONDS) as response:
         if response.status_code == 416:  # nothing is missing, which the checksum confirms
@@ -263,7 +258,7 @@ def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> str | None:
             for chunk in response.iter_content(CHUNK_BYTES):
                 target.write(chunk)
                 bar.update(len(chunk))
-    if length and _size(part) < total:
+    if length and file_state(part)[0] < total:
         raise requests.ConnectionError("the connection broke off")
     if file.checksum is None:
         # Hugging Face's hub states that of a large file in a header of its redirection
