@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
@@ -32,6 +33,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     left, right, _ = data.stereo_motorcycle()
     for name, view in (("left", left), ("right", right)):
         Image.fromarray(view[100:260, 300:500]).save(tmp_path / f"{name}.png")
+    calibration = {"focal_px": 994.978, "baseline_mm": 193.001, "disparity_offset_px": 31.086}
+    (tmp_path / "calib.json").write_text(json.dumps(calibration))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -105,7 +105,7 @@ class Result:
     """
 
     values: Any
-    text: str = ""
+    text: str | None = None
     failures: Sequence[str] = ()
     total: int = 0
     what: str = "images"
@@ -117,8 +117,8 @@ class Result:
             return self.exit_code
         if as_json:
             print(json.dumps(self.values, indent=2, default=str))
-        else:
-            print(self.text or table(self.values))
+        elif text := table(self.values) if self.text is None else self.text:
+            print(text)
         if self.failures and self.total == 1:
             raise DeepDetectError(self.failures[0])
         if self.failures:

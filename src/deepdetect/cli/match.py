@@ -292,7 +292,7 @@ def stitch(
     for number, reason in panorama.unregistered.items():
         cli.note(f"not in the panorama: {images[number]}, as {reason}")
     numbers = {**_numbers(panorama, images, file), "failures": failures}
-    return cli.Result(numbers, "", failures, len(paths))
+    return cli.Result(numbers, None, failures, len(paths))
 
 
 def _readable(images: Sequence[Path]) -> tuple[list[Path], list[str]]:

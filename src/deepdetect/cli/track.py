@@ -69,4 +69,4 @@ def track(
     total = report.frames + len(report.failures)
     if report.expected is not None and total < report.expected:
         cli.note(f"the file states {report.expected:,} frames, and may be cut off")
-    return cli.Result(vars(report), "", report.failures, total, "frames")
+    return cli.Result(vars(report), None, report.failures, total, "frames")
