@@ -58,54 +58,57 @@ def test_a_dead_worker_is_one_sentence() -> None:
         list(map_in_processes(os._exit, [9, 9, 9], 2))
 
 
-def test_workers_end_when_the_parent_is_killed(tmp_path: Path) -> None:
-    """Nobody should have to look for left-over processes."""
-    (tmp_path / "endless.py").write_text(
-        "import time\n"
-        "from pathlib import Path\n"
-        "from deepdetect._shared.parallel import map_in_processes\n"
-        "def work(task):\n"
-        "    import os\n"
-        "    Path(f'pid{task}').write_text(str(os.getpid()))\n"
-        "    time.sleep(600)\n"
-        "if __name__ == '__main__':\n"
-        "    list(map_in_processes(work, [0, 1], 2))\n"
+ENDLESS = """
+import os, sys, time
+from pathlib import Path
+from deepdetect._shared import parallel
+
+def work(task):
+    Path(f"pid{task}").write_text(str(os.getpid()))
+    time.sleep(SECONDS)
+
+if __name__ == "__main__":
+    try:
+        list(parallel.map_in_processes(work, range(100), 2))
+    except KeyboardInterrupt:
+        sys.exit(130)
+"""
+SLOW_OPENCV = """
+import os, time
+from pathlib import Path
+Path(f"import{os.getpid()}").touch()
+time.sleep(1)
+__version__ = "5.0.0"
+setNumThreads = print
+"""
+
+
+def start_endless_work(folder: Path, seconds: float = 600) -> subprocess.Popen[str]:
+    (folder / "endless.py").write_text(ENDLESS.replace("SECONDS", f"{seconds}"))
+    return subprocess.Popen(
+        [sys.executable, "endless.py"],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *sys.path])},
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )
-    process = subprocess.Popen([sys.executable, "endless.py"], cwd=tmp_path)
-    pids = [tmp_path / "pid0", tmp_path / "pid1"]
-    _wait_until(lambda: all(path.exists() and path.read_text() for path in pids))
-    process.kill()
-    process.wait()
-    _wait_until(lambda: not any(_runs(int(path.read_text())) for path in pids))
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs signals")
-def test_an_interrupt_of_the_parent_alone_ends_all_processes(tmp_path: Path) -> None:
-    """As `timeout -s INT` and process managers send it: the workers are in endless tasks."""
-    (tmp_path / "endless.py").write_text(
-        "import os, time\n"
-        "from pathlib import Path\n"
-        "from deepdetect._shared import parallel\n"
-        "def work(task):\n"
-        "    Path(f'pid{task}').write_text(str(os.getpid()))\n"
-        "    time.sleep(600)\n"
-        "if __name__ == '__main__':\n"
-        "    parallel.UNWANTED_TASK_S = 0.5\n"
-        "    list(parallel.map_in_processes(work, range(9), 2))\n"
-    )
-    process = subprocess.Popen(
-        [sys.executable, "endless.py"],
-        cwd=tmp_path,
-        stderr=subprocess.DEVNULL,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_workers_end_with_their_parent(number: int, tmp_path: Path) -> None:
+    """Nobody should have to look for left-over processes."""
+    process = start_endless_work(tmp_path)
     pids = [tmp_path / "pid0", tmp_path / "pid1"]
     _wait_until(lambda: all(path.exists() and path.read_text() for path in pids))
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)  # to it alone, as of process managers
     try:
         assert process.wait(timeout=60) != 0
     finally:
         process.kill()
+        process.communicate()
     _wait_until(lambda: not any(_runs(int(path.read_text())) for path in pids))
 
 
@@ -113,41 +116,10 @@ def test_an_interrupt_of_the_parent_alone_ends_all_processes(tmp_path: Path) -> 
 @pytest.mark.parametrize("moment", ["while a worker starts", "while it works"])
 def test_ctrl_c_ends_all_processes_without_a_word_of_theirs(moment: str, tmp_path: Path) -> None:
     starting = moment == "while a worker starts"
-    (tmp_path / "endless.py").write_text(
-        "import sys, time\n"
-        "from pathlib import Path\n"
-        "from deepdetect._shared.parallel import map_in_processes\n"
-        "def work(task):\n"
-        "    Path(f'at{task}').touch()\n"
-        f"    time.sleep({0 if starting else 600})\n"
-        "if __name__ == '__main__':\n"
-        "    try:\n"
-        "        list(map_in_processes(work, range(100), 2))\n"
-        "    except KeyboardInterrupt:\n"
-        "        sys.exit(130)\n"
-    )
     if starting:  # the initializer imports it
-        (tmp_path / "cv2.py").write_text(
-            "import time\n"
-            "from pathlib import Path\n"
-            "import os\n"
-            "Path(f'import{os.getpid()}').touch()\n"
-            "time.sleep(1)\n"
-            "__version__ = '5.0.0'\n"
-            "setNumThreads = print\n"
-        )
-    paths = os.pathsep.join([str(tmp_path), *sys.path])
-    process = subprocess.Popen(
-        [sys.executable, "endless.py"],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": paths},
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )
-    found = "import*" if starting else "at*"
-    _wait_until(lambda: len(list(tmp_path.glob(found))) == 2)
+        (tmp_path / "cv2.py").write_text(SLOW_OPENCV)
+    process = start_endless_work(tmp_path, 0 if starting else 600)
+    _wait_until(lambda: len(list(tmp_path.glob("import*" if starting else "pid*"))) == 2)
     os.killpg(process.pid, signal.SIGINT)
     try:
         _, told = process.communicate(timeout=60)
@@ -155,7 +127,7 @@ def test_ctrl_c_ends_all_processes_without_a_word_of_theirs(moment: str, tmp_pat
         process.kill()
     assert process.returncode == 130
     assert told == ""
-    assert len(list(tmp_path.glob("at*"))) < 100
+    assert len(list(tmp_path.glob("pid*"))) < 100
 
 
 def _runs(pid: int) -> bool:

@@ -48,27 +48,6 @@ def test_patches_are_what_sift_describes(views: Views) -> None:
         assert np.corrcoef(patch.ravel(), expected.ravel())[0, 1] > 0.9, row
 
 
-def test_sizes_and_angles_are_as_of_kornias_sift(views: Views) -> None:
-    """Where OpenCV's and kornia's SIFT find a place, the frames made by our rule agree."""
-    gray = luma(views.first)
-    with torch.inference_mode():
-        image = torch.from_numpy(gray)[None, None] / 255
-        lafs = kornia_feature.SIFTFeatureScaleSpace(300)(image)[0]
-    keypoints = cv2.SIFT_create(300, enable_precise_upscale=True).detect(gray, None)
-    xy = np.array([k.pt for k in keypoints])
-    distances = np.linalg.norm(
-        xy[:, None] - kornia_feature.get_laf_center(lafs)[0].numpy()[None], axis=2
-    )
-    rows0, rows1 = np.nonzero(distances < 0.5)
-    assert len(rows0) > 40
-    scales = kornia_feature.get_laf_scale(lafs)[0, rows1, 0, 0].numpy()
-    sizes = np.array([keypoints[row].size for row in rows0])
-    assert np.median(scales / sizes) == pytest.approx(3, rel=0.05)
-    angles = kornia_feature.get_laf_orientation(lafs)[0, rows1, 0].numpy()
-    turned = np.array([keypoints[row].angle for row in rows0]) + angles
-    assert np.median(np.abs((turned + 180) % 360 - 180)) < 10
-
-
 @pytest.mark.parametrize("descriptor", ["ours", "kornia"])
 def test_matches_of_two_views(views: Views, descriptor: str) -> None:
     local_feature = DeepDetectFeature(PointDetector(500))

@@ -61,13 +61,6 @@ def test_we_describe_sifts_keypoints_as_it_does(bgr: np.ndarray) -> None:
     assert np.median(near) < 0.05 * np.median(unrelated)
 
 
-def test_keypoints_without_angles_get_one(bgr: np.ndarray) -> None:
-    feature = DeepDetectFeature2D(PointDetector(50))
-    keypoints, expected = feature.detectAndCompute(bgr, None)
-    unset = [cv2.KeyPoint(*k.pt, k.size, -1) for k in keypoints]
-    assert np.array_equal(feature.compute(bgr, unset)[1], expected)
-
-
 def test_matches_of_two_views(views: Views, bgr: np.ndarray) -> None:
     feature = DeepDetectFeature2D(PointDetector(500))
     second = np.ascontiguousarray(views.second[:, :, ::-1])

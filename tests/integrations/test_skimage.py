@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -61,21 +63,12 @@ def test_keypoints_of_scikit_images_corners_are_described(views: Views) -> None:
     corners = feature.corner_peaks(feature.corner_harris(gray), min_distance=5)
     features = DeepDetectFeatures()
     features.extract(gray, corners, scales=4.0)
-    points = Keypoints(
-        corners[:, ::-1], np.ones(len(corners)), (256, 200), sizes=np.full(len(corners), 8.0)
-    )
     turned = feature.corner_orientations(gray, corners, np.ones((3, 3)))
     features_turned = DeepDetectFeatures()
     features_turned.extract(gray, corners, 4.0, turned)
-    expected = describe_keypoints(
-        np.rint(gray * 255).astype(np.uint8),
-        Keypoints(
-            points.xy,
-            points.scores,
-            points.image_size,
-            sizes=points.sizes,
-            angles=np.rad2deg(turned) % 360,
-        ),
-    )
+    count = len(corners)
+    points = Keypoints(corners[:, ::-1], np.ones(count), (256, 200), sizes=np.full(count, 8.0))
+    points = replace(points, angles=np.rad2deg(turned) % 360)
+    expected = describe_keypoints(luma(views.first), points)
     assert features.descriptors.shape == (len(corners), 128)
     assert np.array_equal(features_turned.descriptors, expected.descriptors)

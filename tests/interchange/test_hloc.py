@@ -91,31 +91,6 @@ def test_two_pairs_of_one_group_are_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_it_is_mapped(fountain, fountain_collection, map_database, tmp_path: Path) -> None:
-    """As `hloc.reconstruction.main`: keypoints with hloc's half pixel, matches, verification."""
-    pytest.importorskip("pycolmap", reason="needs pycolmap")
-    from deepdetect.sfm.colmap import quiet_pycolmap
-
-    features, matches, pairs = write_hloc(fountain_collection, tmp_path / "hloc")
-    database = tmp_path / "d.db"
-    with quiet_pycolmap() as pycolmap:
-        with pycolmap.Database.open(database):
-            pass
-        pycolmap.import_images(database, fountain, camera_mode=pycolmap.CameraMode.SINGLE)
-        with pycolmap.Database.open(database) as opened:
-            ids = {image.name: image.image_id for image in opened.read_all_images()}
-            for name, number in ids.items():
-                opened.write_keypoints(number, hloc_keypoints(features, name) + np.float32(0.5))
-            for line in pairs.read_text().splitlines():
-                name0, name1 = line.split()
-                rows, _ = hloc_matches(matches, name0, name1)
-                opened.write_matches(ids[name0], ids[name1], rows.astype(np.uint32))
-        pycolmap.verify_matches(database, pairs)
-    model = map_database(database, fountain, tmp_path / "sparse")
-    assert model.num_reg_images() == 4
-    assert model.num_points3D() > 300
-
-
 @pytest.mark.filterwarnings("ignore")  # of its own
 def test_hloc_itself_maps_the_files(fountain, fountain_collection, tmp_path: Path) -> None:
     """`reconstruction`, and `triangulation` with the poses that it has found."""
@@ -157,23 +132,6 @@ def test_hloc_itself_maps_the_files(fountain, fountain_collection, tmp_path: Pat
     )
     assert again.num_points3D() > 300
     assert again.compute_mean_reprojection_error() < 1
-
-
-@pytest.mark.filterwarnings("ignore")
-def test_hloc_itself_matches_the_features(fountain_collection, tmp_path: Path) -> None:
-    """Its mutual nearest neighbours find our matches again."""
-    pytest.importorskip("torch", reason="needs torch")
-    pytest.importorskip("hloc", reason="needs hloc, which is not on PyPI")
-    from hloc import match_features
-    from hloc.utils.io import get_matches
-
-    features, _, pairs = write_hloc(fountain_collection, tmp_path / "hloc")
-    conf = {"output": "its", "model": match_features.confs["NN-ratio"]["model"]}
-    its = match_features.main(conf, pairs, features, matches=tmp_path / "its.h5")
-    for pair, ours in fountain_collection.matches.items():
-        theirs = set(map(tuple, get_matches(its, *pair)[0].tolist()))
-        both = len(theirs & set(map(tuple, ours.rows.tolist())))
-        assert both > 0.9 * min(len(theirs), len(ours)) > 9
 
 
 def test_keypoints_without_an_angle_stay_without_one(tmp_path: Path) -> None:

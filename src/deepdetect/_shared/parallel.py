@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from .errors import DeepDetectError, OptionError
 from .memory import disable_malloc_trim
@@ -40,17 +40,8 @@ _max_threads: int | None = None
 """Of this process, in `parallel_for`; None: one per processor."""
 
 
-class TaskMap(Protocol):
-    """Applies a function to many tasks: `map_in_processes`, or what does the same on a cluster."""
-
-    def __call__(
-        self,
-        function: Callable[[Task], Outcome],
-        tasks: Sequence[Task],
-        workers: int | None = None,
-    ) -> Iterator[Outcome]:
-        """Yield the outcome of each task once, in the order in which they are ready."""
-        ...
+TaskMap = Callable[..., Iterator[Any]]
+"""`map_in_processes`, or what does the same on a cluster."""
 
 
 def processor_count() -> int:

@@ -2,9 +2,9 @@
 
 from .engines import ENGINES, get_engine
 from .extraction import extract_features
+from .hdf5 import BatchReport
 from .pair_list import pair_name, read_pairs
 from .pair_matching import PairMatchingOptions, match_pairs
-from .report import BatchReport
 
 __all__ = [
     "ENGINES",

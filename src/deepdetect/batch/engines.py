@@ -1,13 +1,182 @@
-"""What runs the tasks of a collection: the processes of this machine, or a cluster.
+"""What runs the tasks of a collection: the processes of this machine, or a cluster by Ray Data.
 
-To add an engine, write a function of the signature of `TaskMap` and add it to `ENGINES`.
+To add an engine, write a function of the signature of `map_in_processes` and add it to `ENGINES`.
+Ray starts a worker that dies again, and repeats its tasks: each outcome arrives once, but a
+function may run twice. So a function must write files under temporary names, and rename them.
 """
 
 from __future__ import annotations
 
-from .._shared.parallel import TaskMap, map_in_processes
+import contextlib
+import logging
+import os
+import pickle
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from .._shared.errors import DeepDetectError, MissingExtraError, OptionError
+from .._shared.memory import disable_malloc_trim
+from .._shared.parallel import (
+    Outcome,
+    Task,
+    TaskMap,
+    map_in_processes,
+    processor_count,
+    use_one_thread,
+)
 from .._shared.registry import look_up
-from .ray_engine import map_on_ray
+
+MAX_BLOCKS = 4096
+"""Parts of the work that Ray schedules: each costs a few milliseconds, and is repeated as a whole
+where its worker dies."""
+
+PROCESSORS_PER_WORKER = 0.5
+"""That are reserved. A worker uses one; when half of the machines are lost, those that are left
+have room for all workers. (Tasks wait for their worker, and would wait for ever.)"""
+
+OBJECT_STORE_BYTES = 200_000_000
+"""Shared memory of a cluster that is started here: outcomes are small, results go to files."""
+
+SETTINGS = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_BACKEND_LOG_LEVEL": "fatal",
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # else it warns
+}
+
+DATA_SETTINGS = {"enable_progress_bars": False, "print_on_execution_start": False}
+
+
+def map_on_ray(
+    function: Callable[[Task], Outcome], tasks: Sequence[Task], workers: int | None = None
+) -> Iterator[Outcome]:
+    """Apply a function to every task on a Ray cluster, in workers of one processor each.
+
+    The cluster is the one to which this process is connected, else the one that RAY_ADDRESS names
+    or that runs on this machine (`ray start`), else, or with RAY_ADDRESS=local, one that is started
+    here and ends with the work. All its machines need this package, and the files under the same
+    paths.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+        OptionError: `workers` is below 1.
+        DeepDetectError: the cluster failed, or is what the function raised.
+    """
+    if workers is not None and workers < 1:
+        raise OptionError(f"`workers` must be at least 1, not {workers}")
+    ray = _import_ray()
+    if not len(tasks):
+        return
+    # Ray prints what befalls its workers, up to its end: standard output is for results.
+    with contextlib.redirect_stdout(sys.stderr), _connected(ray, workers):
+        count = min(workers or int(ray.cluster_resources().get("CPU", 1)), len(tasks))
+        rows = ray.data.from_items(
+            [{"task": pickle.dumps(task)} for task in tasks],
+            override_num_blocks=min(len(tasks), MAX_BLOCKS),
+        )
+        outcomes = rows.map(
+            _Worker,
+            fn_constructor_args=(function, os.getcwd()),
+            compute=ray.data.ActorPoolStrategy(size=count),
+            num_cpus=PROCESSORS_PER_WORKER,
+        )
+        try:
+            for row in outcomes.iter_rows():
+                outcome = pickle.loads(row["outcome"])
+                if isinstance(outcome, DeepDetectError):
+                    raise outcome
+                yield outcome
+        except (ray.exceptions.RayActorError, ray.exceptions.RaySystemError) as error:
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            raise DeepDetectError(
+                f"the Ray cluster failed ({reason}): look at its machines, then run this again"
+            ) from error
+
+
+class _Worker:
+    """An actor, which does tasks one by one."""
+
+    def __init__(self, function: Callable[[Any], Any], folder: str) -> None:
+        self.function = function
+        with contextlib.suppress(OSError):  # relative paths mean what they mean to the caller
+            os.chdir(folder)
+        use_one_thread()
+        disable_malloc_trim()
+
+    def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
+        try:
+            outcome = self.function(pickle.loads(row["task"]))
+        except DeepDetectError as error:  # Ray would wrap it in a traceback
+            outcome = error
+        return {"outcome": pickle.dumps(outcome)}
+
+
+def _import_ray() -> Any:
+    for name, value in SETTINGS.items():
+        os.environ.setdefault(name, value)
+    try:
+        import ray
+        import ray.data
+        import ray.exceptions
+    except ImportError:
+        raise MissingExtraError(
+            "the engine ray needs Ray: run pip install 'ray[data]', or use the engine processes"
+        ) from None
+    return ray
+
+
+def _start_cluster(ray: Any, processors: int, quiet: dict[str, Any]) -> None:
+    try:
+        ray.init(
+            address="local",
+            num_cpus=processors,
+            include_dashboard=False,
+            object_store_memory=OBJECT_STORE_BYTES,
+            **quiet,
+        )
+    except Exception as error:  # it waits half a minute for its parts, and raises many kinds
+        ray.shutdown()
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise DeepDetectError(
+            f"Ray does not start ({reason}): wait until the machine is less busy, or use the "
+            "engine processes"
+        ) from error
+
+
+@contextmanager
+def _connected(ray: Any, workers: int | None) -> Iterator[None]:
+    """Connect to a cluster unless this process is, or start one; and make Ray Data quiet."""
+    before = ray.is_initialized()
+    quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
+    if not before:
+        address = os.environ.get("RAY_ADDRESS")
+        try:
+            if address == "local":
+                raise ConnectionError
+            ray.init(address="auto", **quiet)
+        except ConnectionError as error:
+            if address not in (None, "local"):
+                raise DeepDetectError(
+                    f"there is no Ray cluster at {address}: start it, or unset RAY_ADDRESS"
+                ) from error
+            _start_cluster(ray, workers or processor_count(), quiet)
+    context = ray.data.DataContext.get_current()
+    usual = {name: getattr(context, name) for name in DATA_SETTINGS}
+    for name, value in DATA_SETTINGS.items():
+        setattr(context, name, value)
+    logger = logging.getLogger("ray.data")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+        for name, value in usual.items():
+            setattr(context, name, value)
+        if not before:
+            ray.shutdown()
+
 
 ENGINES: dict[str, TaskMap] = {"processes": map_in_processes, "ray": map_on_ray}
 

@@ -29,8 +29,7 @@ from ..features.sift import describe_keypoints
 from ..io.image import find_images, load_image, luma
 from ..io.image_file import megapixel_limit
 from .engines import get_engine
-from .hdf5 import Group, ShardedWriter, State, write_groups
-from .report import BatchReport
+from .hdf5 import BatchReport, Group, ShardedWriter, State, write_groups
 
 IMAGES_PER_SHARD = 16
 """At most: what a killed worker loses, against the number of files."""
@@ -97,8 +96,9 @@ def extract_features(
     check_selection(detector, selection)
     root, target = Path(folder).absolute(), Path(path).absolute()
     names = [image.relative_to(root).as_posix() for image in find_images(root)]
-    failures = [f"{name}: its name is not UTF-8: rename it" for name in names if not _is_utf8(name)]
-    states = {name: file_state(root / name) for name in names if _is_utf8(name)}
+    utf8 = [name for name in names if name == name.encode("utf-8", "ignore").decode()]
+    states = {name: file_state(root / name) for name in utf8}
+    failures = [f"{name}: its name is not UTF-8: rename it" for name in names if name not in states]
     settings = {
         **detector.settings,
         **({} if selection is None else vars(selection)),
@@ -123,14 +123,6 @@ def extract_features(
         file.merge(quiet, {*done, *counts}.__contains__)
     told = tuple(sorted([*failures, *failed]))
     return BatchReport(Path(path), dict(sorted(counts.items())), len(done), told, "images")
-
-
-def _is_utf8(name: str) -> bool:
-    try:
-        name.encode("utf-8")
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _extract_shard(

@@ -27,6 +27,7 @@ from .engines import get_engine
 from .extraction import DESCRIPTOR, keypoints_of
 from .hdf5 import (
     SETTINGS,
+    BatchReport,
     Group,
     ShardedWriter,
     State,
@@ -37,7 +38,6 @@ from .hdf5 import (
     write_groups,
 )
 from .pair_list import Pair, check_pairs, pair_name, read_pairs, sequential_pairs
-from .report import BatchReport
 
 PAIRS_PER_SHARD = 64
 """At most."""

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from ..batch.extraction import extract_features
+from ..batch.hdf5 import BatchReport
 from ..batch.pair_matching import MATCHERS_OF_FLOATS, PairMatchingOptions, match_pairs
-from ..batch.report import BatchReport
 from . import _options as cli
 from ._detection import NETWORK, POINTS, SELECTION, Detector, chosen_detector
 

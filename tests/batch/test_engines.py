@@ -14,7 +14,7 @@ import pytest
 
 from deepdetect import ImageError, MissingExtraError, OptionError, PointDetector, load_image
 from deepdetect.batch import ENGINES, extract_features, get_engine
-from deepdetect.batch.ray_engine import map_on_ray
+from deepdetect.batch.engines import map_on_ray
 
 
 def test_the_engines() -> None:
