@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -20,9 +19,7 @@ pytestmark = pytest.mark.slow
 
 BARS = {
     ("graf", 6): (0.80, 0.95),
-    ("leuven", 6): (0.88, 0.95),
     ("ubc", 6): (0.90, 0.93),
-    ("boat", 6): (0.80, 0.97),
     ("bark", 6): (0.85, 0.97),
 }
 """Share of the ceiling, and precision; of all nine: `deepdetect benchmark --protocol guided`."""
@@ -45,30 +42,3 @@ def test_most_of_what_can_be_matched_is(shared: Path, scene: str, number: int) -
     assert np.count_nonzero(errors < 1) >= share * ceiling
     assert (errors < 1).mean() >= precision
     assert corner_error(found.matrix, pair.homography, rgb[0].shape[1::-1]) <= 1.5
-
-
-@pytest.mark.parametrize(("scene", "photograph"), [("ubc", "chelsea"), ("leuven", "astronaut")])
-def test_hardly_anything_is_matched_under_a_strange_photograph(
-    shared: Path, scene: str, photograph: str
-) -> None:
-    """It covers a quarter of the second image, its middle; the bar is 2 %."""
-    data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
-    pair = list(
-        next(one for one in load_oxford(shared / "data" / "oxford") if one.name == scene).pairs()
-    )[4]
-    first, second = (load_image(image) for image in (pair.first, pair.second))
-    height, width = second.shape[0] // 2, second.shape[1] // 2
-    top, left = height // 2, width // 2
-    strange = cv2.resize(getattr(data, photograph)(), (width, height), interpolation=cv2.INTER_AREA)
-    second = second.copy()
-    second[top : top + height, left : left + width] = strange
-    found = match_images(first, second, DeepDetect().configured(HeatmapOptions(480)))
-    assert found.guided
-
-    def under(points: np.ndarray) -> int:
-        x, y = (transform_points(points, pair.homography) + 0.5).T
-        inside = (x > left) & (x < left + width) & (y > top) & (y < top + height)
-        return int(np.count_nonzero(inside))
-
-    assert under(found.keypoints0.xy) > 10_000
-    assert under(found.points0) < 0.02 * under(found.keypoints0.xy)

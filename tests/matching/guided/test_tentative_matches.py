@@ -11,7 +11,7 @@ from deepdetect.geometry import transform_points
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import guided_matches
 from deepdetect.matching.guided import initial_geometry as module
-from deepdetect.matching.guided.initial_geometry import find_tentative_matches, matches_of_points
+from deepdetect.matching.guided.initial_geometry import matches_of_points
 
 TURNED = np.vstack([cv2.getRotationMatrix2D((128, 128), 30, 1.2), [0, 0, 1]])
 
@@ -87,9 +87,3 @@ def test_where_points_give_nothing_sift_is_tried(pair, points) -> None:
     plain, _ = guided_matches(*grays, *places)
     assert found is not None
     np.testing.assert_array_equal(guide.matrix, plain.matrix)
-
-
-def test_sparse_matches_of_sift_are_at_the_images_own_size(pair) -> None:
-    found = find_tentative_matches(luma(pair[0]), luma(pair[1]), max_side_px=200)
-    errors = np.linalg.norm(transform_points(found.points0, TURNED) - found.points1, axis=1)
-    assert np.median(errors) < 1
