@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from deepdetect import DeepDetect, MatchingOptions, PointDetector, SelectionOptions, match_images
-from deepdetect._shared.parallel import use_one_thread
+from deepdetect._shared.machine import use_one_thread
 from deepdetect.datasets.oxford import load_oxford
 from deepdetect.datasets.types import PlanarPair
 from deepdetect.geometry import transform_points

@@ -15,7 +15,7 @@ from functools import cache, partial
 from pathlib import Path
 
 from deepdetect import DeepDetect
-from deepdetect._shared.parallel import processor_count
+from deepdetect._shared.machine import processor_count
 from deepdetect.evaluation.metrics.masks import Measured, mean_score, measure_heatmap
 from deepdetect.io.image import load_image
 from deepdetect.labels import LabelOptions

@@ -7,6 +7,7 @@ import math
 import pkgutil
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,15 @@ import pytest
 
 import deepdetect
 from deepdetect._shared.errors import OptionError
-from deepdetect._shared.options import check_ranges, suggest_keywords
+from deepdetect._shared.options import (
+    check_ranges,
+    is_path,
+    look_up,
+    resolve_name_or_path,
+    suggest_keywords,
+)
+
+REGISTRY = {"default": 1, "dense": 2}
 
 
 def test_a_decorated_function_suggests_the_right_keyword() -> None:
@@ -130,3 +139,20 @@ def test_an_unknown_keyword_of_anything_public_is_an_option_error(name: str) -> 
 def test_an_unknown_field_of_any_options_is_an_option_error(kind: type) -> None:
     with pytest.raises(OptionError, match=r"unknown option 'seeed'.*\(known: "):
         kind(seeed=1)
+
+
+def test_a_name_gives_its_entry() -> None:
+    assert look_up("weights", "dense", REGISTRY) == 2
+    assert resolve_name_or_path("weights", "dense", REGISTRY) == 2
+
+
+@pytest.mark.parametrize("value", ["mine.onnx", "./dense", "runs/dense", Path("a/b.onnx")])
+def test_a_path_stays_a_path(value: str | Path) -> None:
+    assert is_path(value)
+    assert resolve_name_or_path("weights", value, REGISTRY) == Path(value)
+
+
+@pytest.mark.parametrize("find", [look_up, resolve_name_or_path])
+def test_an_unknown_name_suggests_the_nearest(find) -> None:
+    with pytest.raises(OptionError, match="unknown weights 'dens': did you mean 'dense'"):
+        find("weights", "dens", REGISTRY)

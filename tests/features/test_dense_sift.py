@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from deepdetect._shared import parallel
+from deepdetect._shared import machine
 from deepdetect.features.sift import dense_sift, opencv_sift_descriptors, to_root_sift
 from deepdetect.io.image import luma
 
@@ -62,6 +62,6 @@ def test_does_not_depend_on_the_number_of_threads(
     xy = every_pixel(gray)
     found = []
     for count in (1, 7):
-        monkeypatch.setattr(parallel, "processor_count", lambda count=count: count)
+        monkeypatch.setattr(machine, "processor_count", lambda count=count: count)
         found.append(to_root_sift(dense_sift(gray, xy)))
     np.testing.assert_array_equal(found[0], found[1])

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from deepdetect import OptionError
-from deepdetect._shared import parallel
+from deepdetect._shared import machine
 from deepdetect.features.matchers import exact_neighbours, match_descriptors, patchmatch_neighbours
 from deepdetect.features.sift import dense_sift
 from deepdetect.io.image import luma
@@ -48,7 +48,7 @@ def test_the_result_does_not_depend_on_threads_and_is_the_seeds(
     (queries, base), positions = pair
     found = []
     for count in (1, 2, 5):
-        monkeypatch.setattr(parallel, "processor_count", lambda count=count: count)
+        monkeypatch.setattr(machine, "processor_count", lambda count=count: count)
         found.append(patchmatch_neighbours(queries, base, 2, 4, positions))
     for other in found[1:]:
         np.testing.assert_array_equal(found[0][0], other[0])

@@ -14,7 +14,7 @@ import pytest
 
 import deepdetect
 from deepdetect import DeepDetect, PointDetector, ReconstructionError, SelectionOptions
-from deepdetect._shared import parallel
+from deepdetect._shared import machine
 from deepdetect._shared.errors import ImageError
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.evaluation.baselines.random import AllPixels
@@ -229,7 +229,7 @@ def test_is_the_same_for_any_number_of_threads(
     before = cv2.getNumThreads()
     try:
         for count in (1, 3):
-            monkeypatch.setattr(parallel, "processor_count", lambda count=count: count)
+            monkeypatch.setattr(machine, "processor_count", lambda count=count: count)
             cv2.setNumThreads(count)
             results.append(
                 [

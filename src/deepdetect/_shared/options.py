@@ -1,18 +1,21 @@
-"""Options are frozen dataclasses; an unknown name is an error that suggests the right one."""
+"""Options, and entries by name: an unknown name is an error that suggests the right one."""
 
 from __future__ import annotations
 
 import functools
 import inspect
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from .errors import OptionError, unknown_name
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
+Entry = TypeVar("Entry")
 
 
 def suggest_keywords(
@@ -92,3 +95,40 @@ def _numbers(value: object) -> list[Any]:
     if isinstance(value, tuple):
         return [number for one in value for number in _numbers(one)]
     return [value if isinstance(value, Real) else math.nan]
+
+
+def look_up(kind: str, name: str, registry: Mapping[str, Entry]) -> Entry:
+    """Return the entry of this name; `kind` says what the entries are, as "matcher".
+
+    Raises:
+        OptionError: the name is unknown (the nearest right one is named).
+    """
+    if name not in registry:
+        raise unknown_name(kind, name, registry)
+    return registry[name]
+
+
+def resolve_name_or_path(
+    kind: str, value: str | Path, registry: Mapping[str, Entry]
+) -> Entry | Path:
+    """Return the path that was given, or the entry of a registry whose name was given.
+
+    Raises:
+        OptionError: it is neither a path nor a known name (the nearest right one is named).
+    """
+    if is_path(value):
+        return Path(value)
+    if value not in registry:
+        raise unknown_name(kind, value, (*registry, "or the path of a file"))
+    return registry[str(value)]
+
+
+def is_path(value: str | Path) -> bool:
+    """Return whether a value is a path, not a name: it has a suffix or a separator.
+
+    Example:
+        >>> [is_path(text) for text in ("dense", "dense.onnx", "./dense")]
+        [False, True, True]
+    """
+    text = str(value)
+    return bool(Path(text).suffix) or any(mark in text for mark in (os.sep, os.altsep) if mark)

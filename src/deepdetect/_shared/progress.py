@@ -1,8 +1,9 @@
-"""The progress bar of long tasks."""
+"""How far long tasks are: progress bars, and the times of stages."""
 
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -43,3 +44,29 @@ def say(text: str) -> None:
     from tqdm import tqdm
 
     tqdm.write(text, file=sys.stderr)
+
+
+class StageTimer:
+    """Measures the stages of a computation in seconds, and reports each one as it ends.
+
+    Example:
+        >>> timer = StageTimer(progress=print)
+        >>> with timer.stage("matching"):
+        ...     pass
+        matching
+        >>> list(timer.seconds)
+        ['matching']
+    """
+
+    def __init__(self, progress: Callable[[str], object] | None = None) -> None:
+        self.seconds: dict[str, float] = {}
+        self._progress = progress
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time what runs inside as the stage of this name."""
+        started = time.perf_counter()
+        yield
+        self.seconds[name] = time.perf_counter() - started
+        if self._progress is not None:
+            self._progress(name)

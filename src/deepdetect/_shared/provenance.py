@@ -10,8 +10,8 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
+from .machine import processor_count
 from .opencv import DISTRIBUTIONS
-from .parallel import processor_count
 
 PACKAGES = ("numpy", *DISTRIBUTIONS, "pillow", "torch", "lightning-fabric")
 """The packages that results depend on."""

@@ -17,16 +17,16 @@ from contextlib import contextmanager
 from typing import Any
 
 from .._shared.errors import DeepDetectError, MissingExtraError, OptionError
-from .._shared.memory import disable_malloc_trim
-from .._shared.parallel import (
+from .._shared.machine import (
     Outcome,
     Task,
     TaskMap,
+    disable_malloc_trim,
     map_in_processes,
     processor_count,
     use_one_thread,
 )
-from .._shared.registry import look_up
+from .._shared.options import look_up
 
 MAX_BLOCKS = 4096
 """Parts of the work that Ray schedules: each costs a few milliseconds, and is repeated as a whole

@@ -16,8 +16,8 @@ import numpy as np
 
 from .. import __version__
 from .._shared.errors import DeepDetectError, MissingExtraError, WeightsError
+from .._shared.machine import TaskMap
 from .._shared.options import suggest_keywords
-from .._shared.parallel import TaskMap
 from .._shared.progress import progress
 from .._shared.records import file_state
 from ..detector.detector import DeepDetect, check_selection, find_keypoints

@@ -13,11 +13,10 @@ from natsort import natsorted, ns
 
 from .. import __version__
 from .._shared.errors import InvalidFileError, OptionError
-from .._shared.options import check_ranges, suggest_keywords
-from .._shared.parallel import TaskMap
+from .._shared.machine import TaskMap
+from .._shared.options import check_ranges, look_up, suggest_keywords
 from .._shared.progress import progress
 from .._shared.records import key
-from .._shared.registry import look_up
 from ..features.keypoints import Keypoints
 from ..features.matchers import MATCHERS
 from ..geometry import GeometryOptions, estimate_geometry

@@ -11,7 +11,7 @@ import numpy as np
 from cyclopts import Parameter
 
 from .._shared.errors import DeepDetectError, OptionError
-from .._shared.registry import look_up
+from .._shared.options import look_up
 from ..datasets import StereoPair, load_stereo_pair
 from ..datasets.middlebury import load_middlebury
 from ..datasets.oxford import load_oxford

@@ -6,7 +6,7 @@ from functools import cache, partial
 from importlib import resources
 from typing import Any
 
-from .._shared.registry import look_up
+from .._shared.options import look_up
 from . import photographs
 from .download import RemoteDataset, RemoteFile, get_dataset
 from .middlebury import load_motorcycle

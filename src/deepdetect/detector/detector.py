@@ -17,7 +17,7 @@ from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
 from ..features.selection import Maps, SelectionOptions, select_from_maps, select_keypoints
 from ..features.sift import describe_keypoints
-from ..io.image import load_image, luma
+from ..io.image import Images, ignore_masks, image_named, load_each, load_image, luma
 from .backends import RuntimeOptions, open_network
 from .heatmap import (
     HeatmapOptions,
@@ -26,7 +26,6 @@ from .heatmap import (
     memory_named,
     seen_size,
 )
-from .image_lists import Images, ignore_masks, image_named, load_each
 from .pretrained import PRETRAINED, resolve_weights
 
 CHANNELS_OF_IMAGES = (

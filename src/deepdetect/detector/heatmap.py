@@ -13,7 +13,7 @@ import numpy as np
 
 from .._shared.errors import DeepDetectError, OptionError, unknown_name
 from .._shared.image_array import Channels, check_channels
-from .._shared.memory import available_memory, release_freed_memory
+from .._shared.machine import available_memory, release_freed_memory
 from .._shared.opencv import cv2, is_lack_of_memory
 from .._shared.options import check_ranges, suggest_keywords
 from ..features.selection import Maps, Rows, bands, sigmoid

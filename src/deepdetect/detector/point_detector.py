@@ -16,9 +16,8 @@ from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
 from ..features.selection import check_ignore, check_max_keypoints
 from ..features.sift import describe_keypoints
-from ..io.image import load_image, luma
+from ..io.image import Images, ignore_masks, image_named, load_each, load_image, luma
 from .heatmap import MAX_AUTO_PIXELS, memory_named
-from .image_lists import Images, ignore_masks, image_named, load_each
 from .points.detection import SPREADS, Spread, detect_points
 from .points.ranker import load_ranker
 from .pretrained import RANKER

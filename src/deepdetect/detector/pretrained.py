@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .._shared.registry import look_up, resolve_name_or_path
+from .._shared.options import look_up, resolve_name_or_path
 
 FOLDER = Path(__file__).parent / "weights"
 

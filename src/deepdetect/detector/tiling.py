@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from .._shared.errors import DeepDetectError
-from .._shared.memory import release_freed_memory
+from .._shared.machine import release_freed_memory
 from .._shared.progress import progress
 from .backends.onnx_parts import cut_onnx
 from .backends.onnxruntime_backend import start_session

@@ -12,9 +12,9 @@ from importlib import import_module
 from pathlib import Path
 
 from .._shared.errors import ImageError, MissingExtraError
+from .._shared.options import look_up
 from .._shared.provenance import provenance
 from .._shared.records import file_digest
-from .._shared.registry import look_up
 from ..detector.pretrained import resolve_weights
 from .options import BenchmarkOptions
 from .profiling import peak_memory

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from .._shared.errors import DeepDetectError
-from .._shared.parallel import start_child
+from .._shared.machine import start_child
 
 Outcome = TypeVar("Outcome")
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from .._shared.errors import MissingExtraError, OptionError, install_command, unknown_name
 from .._shared.image_array import Channels
+from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
-from .._shared.parallel import parallel_for
 
 SIZES_PER_SCALE = {"diameter": 1.0, "sigma": 2.0}
 """Of a keypoint of SIFT, by what a scale is."""

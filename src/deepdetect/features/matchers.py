@@ -12,9 +12,9 @@ from typing import Any, Protocol
 import numpy as np
 
 from .._shared.errors import MissingExtraError, OptionError
+from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
-from .._shared.parallel import parallel_for
-from .._shared.registry import look_up
+from .._shared.options import look_up
 from .keypoints import on_pixels
 
 BLOCK_SIZE = 4_000_000

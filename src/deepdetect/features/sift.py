@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
-from .._shared.parallel import parallel_for
-from .._shared.registry import look_up
+from .._shared.options import look_up
 from .keypoints import UNSET_ANGLE, Keypoints, on_pixels
 from .scale_space import BASE_SIGMA_PX, CAMERA_SIGMA_PX, LAYERS, dominant_angles, nearest_layers
 from .selection import spread_over_grid

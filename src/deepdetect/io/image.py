@@ -1,21 +1,25 @@
-"""Reading images of any usual kind as 8-bit RGB or as luma.
+"""Reading images of any usual kind, one or several, as 8-bit RGB or as luma.
 
 Pixel convention everywhere: x right, y down, centre of the first pixel (0, 0).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .._shared.errors import ImageError, MissingImageError
+from .._shared.errors import ImageError, MissingImageError, OptionError
 from .._shared.image_array import Channels, array_to_rgb, check_channels
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .image_file import damaged_image, file_name, is_file, open_image
+
+Images = list[Any] | tuple[Any, ...] | np.ndarray
+"""Several images: a list, a tuple, or a batch in an array of four dimensions."""
 
 MINIMUM_SIDE = 16
 """Smallest width and height of an image, in pixels."""
@@ -92,6 +96,38 @@ def load_image(
             f"both sides must be at least {MINIMUM_SIDE}, use a larger image"
         )
     return rgb
+
+
+def load_each(images: Images, channels: Channels) -> Iterator[tuple[int, np.ndarray]]:
+    """Load images when they are asked for, each with its place in the list, tuple or batch."""
+    if not isinstance(images, (list, tuple)) and getattr(images, "ndim", 0) != 4:
+        raise OptionError(
+            "a batch is a list of images, or an array of four dimensions: of one image use the "
+            "method without _batch"
+        )
+    for number, image in enumerate(images):
+        with image_named(number):
+            rgb = load_image(image, channels=channels)
+        yield number, rgb
+        del rgb
+
+
+@contextmanager
+def image_named(number: int) -> Iterator[None]:
+    """Let errors of an image say which of a list it is."""
+    try:
+        yield
+    except (ImageError, OptionError) as error:
+        raise type(error)(f"images[{number}]: {error}") from None
+
+
+def ignore_masks(ignore: Any, images: int) -> list[Any]:
+    """Return the ignore mask of each image: one for all, or as many as there are images."""
+    if not (isinstance(ignore, (list, tuple)) or getattr(ignore, "ndim", 2) == 3):
+        return [ignore] * images
+    if len(ignore) != images:
+        raise OptionError(f"`ignore` holds {len(ignore)} masks for {images} images: give one each")
+    return list(ignore)
 
 
 def luma(rgb: np.ndarray) -> np.ndarray:

@@ -7,8 +7,7 @@ from numbers import Real
 from pathlib import Path
 
 from .._shared.atomic import atomic_path
-from .._shared.options import suggest_keywords
-from .._shared.registry import look_up
+from .._shared.options import look_up, suggest_keywords
 from ..geometry.point_cloud import PointCloud, require_points
 from .glb import write_glb
 from .html_viewer import write_html_page

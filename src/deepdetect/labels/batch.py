@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from .._shared.errors import DeepDetectError, MissingExtraError
-from .._shared.parallel import TaskMap, map_in_processes
+from .._shared.machine import TaskMap, map_in_processes
 from .._shared.records import Outputs
 from ..io.image import load_image, luma
 from ..io.masks import save_mask

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from .._shared.errors import OptionError, unknown_name
-from .._shared.options import suggest_keywords
-from .._shared.registry import resolve_name_or_path
+from .._shared.options import resolve_name_or_path, suggest_keywords
 from .._shared.text_files import read_toml
 from .detectors import DETECTOR_NAMES, DETECTORS, Value, select_detectors
 from .visibility import Visibility, VisibilityChoice

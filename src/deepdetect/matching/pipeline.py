@@ -13,16 +13,15 @@ import numpy as np
 from .._shared.errors import OptionError
 from .._shared.image_array import Channels
 from .._shared.options import suggest_keywords
-from .._shared.timing import StageTimer
+from .._shared.progress import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_keypoints
-from ..detector.image_lists import Images, ignore_masks
 from ..features.keypoints import Keypoints
 from ..features.matches import Matches, TwoViewGeometry, lazy
 from ..features.selection import SelectionOptions
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
 from ..geometry.transforms import epipolar_errors, transfer_errors
-from ..io.image import load_image, luma
+from ..io.image import Images, ignore_masks, load_image, luma
 from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .options import MatchingOptions
 from .unguided import check_memory, describe, match_features

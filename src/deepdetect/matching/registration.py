@@ -13,11 +13,10 @@ from .._shared.image_array import Channels
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.detector import AnyDetector
-from ..detector.image_lists import Images
 from ..features.selection import SelectionOptions
 from ..geometry.images import downscale, median_local_zncc, warp_to_reference
 from ..geometry.transforms import scaled_homography
-from ..io.image import load_image, luma
+from ..io.image import Images, load_image, luma
 from .pipeline import match_images
 
 SQUARES = 8

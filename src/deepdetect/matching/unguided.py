@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from .._shared.errors import OptionError
-from .._shared.memory import require_memory
+from .._shared.machine import require_memory
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
 from ..features.matchers import get_matcher, match_descriptors

@@ -17,15 +17,14 @@ from .._shared.errors import NoDepthError, ReconstructionError
 from .._shared.image_array import Channels
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
-from .._shared.timing import StageTimer
+from .._shared.progress import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, find_keypoints
-from ..detector.image_lists import Images, ignore_masks
 from ..features.keypoints import Keypoints
 from ..features.selection import SelectionOptions
 from ..geometry.camera import Calibration, Camera, read_calibration
 from ..geometry.images import window_sums
 from ..io.exif import calibration_from_exif
-from ..io.image import load_image, luma
+from ..io.image import Images, ignore_masks, load_image, luma
 from ..matching.options import MatchingOptions
 from ..matching.pipeline import match_images
 from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity

@@ -12,8 +12,8 @@ from itertools import pairwise
 import numpy as np
 
 from .._shared.errors import OptionError
+from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
-from .._shared.parallel import parallel_for
 from ..geometry.images import window_sums
 
 PATCH_RADIUS_PX = 4

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import NoDepthError, ReconstructionError
-from .._shared.timing import StageTimer
+from .._shared.progress import StageTimer
 from ..features.matches import Matches
 from ..features.selection import grid_subsample
 from ..geometry import epipolar_errors

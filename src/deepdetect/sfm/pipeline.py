@@ -16,7 +16,7 @@ import numpy as np
 from .._shared.atomic import atomic_path
 from .._shared.errors import OptionError, ReconstructionError
 from .._shared.options import suggest_keywords
-from .._shared.timing import StageTimer
+from .._shared.progress import StageTimer
 from ..batch.hdf5 import open_hdf5
 from ..batch.pair_list import Pair
 from ..detector.detector import DeepDetect

@@ -19,8 +19,7 @@ import numpy as np
 from .. import __version__
 from .._shared.atomic import atomic_path
 from .._shared.errors import MissingImageError, OptionError, ReconstructionError
-from .._shared.memory import available_memory, needed_memory
-from .._shared.parallel import map_in_processes, processor_count
+from .._shared.machine import available_memory, map_in_processes, needed_memory, processor_count
 from .._shared.progress import progress
 from .._shared.records import file_state, key, load_arrays, save_arrays
 from ..batch.extraction import extract_features

@@ -14,9 +14,8 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from .._shared.errors import BatchError, DeepDetectError, ImageError
-from .._shared.memory import available_memory
+from .._shared.machine import available_memory, map_in_processes
 from .._shared.opencv import cv2
-from .._shared.parallel import map_in_processes
 from .._shared.progress import progress
 from .._shared.records import key
 from ..io.image import load_image

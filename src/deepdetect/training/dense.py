@@ -14,7 +14,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits, pad
 from torch.utils.data import DataLoader
 
 from .._shared.errors import OptionError, WeightsError
-from .._shared.registry import look_up
+from .._shared.options import look_up
 from ..detector.network.espnet import ESPNet
 from ..detector.network.onnx_export import export_onnx
 from ..detector.network.weights import (

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from .._shared.errors import OptionError
-from .._shared.memory import disable_malloc_trim
+from .._shared.machine import disable_malloc_trim
 from .recipe import DeviceOptions
 
 if TYPE_CHECKING:

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from .._shared.errors import OptionError, unknown_name
-from .._shared.options import check_ranges, suggest_keywords
-from .._shared.parallel import processor_count
-from .._shared.registry import look_up
+from .._shared.machine import processor_count
+from .._shared.options import check_ranges, look_up, suggest_keywords
 from ..labels import LABEL_SETTINGS, LabelOptions
 
 OPTIMIZERS = ("adam", "soap")

@@ -23,8 +23,8 @@ import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import BatchError, ImageError, OptionError
+from .._shared.machine import TaskMap, map_in_processes
 from .._shared.options import suggest_keywords
-from .._shared.parallel import TaskMap, map_in_processes
 from .._shared.progress import progress
 from .._shared.records import check_same, key, plain
 from .._shared.text_files import read_json

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deepdetect import ImageError, OptionError
-from deepdetect._shared import parallel
+from deepdetect._shared import machine
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.matching.stereo import DENSE, DisparityOptions, disparity_map, matching
 from deepdetect.matching.stereo.matching import (
@@ -162,7 +162,7 @@ def test_the_result_does_not_depend_on_threads(
     left, right, _ = two_surfaces
     found = []
     for count in (1, 2, 5):
-        monkeypatch.setattr(parallel, "processor_count", lambda count=count: count)
+        monkeypatch.setattr(machine, "processor_count", lambda count=count: count)
         found.append(disparity_map(left, right, DENSE))
     for other in found[1:]:
         np.testing.assert_array_equal(found[0].disparity, other.disparity)

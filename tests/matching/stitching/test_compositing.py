@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetectError, OptionError
-from deepdetect._shared import memory
+from deepdetect._shared import machine
 from deepdetect.geometry.images import downscale
 from deepdetect.matching.stitching.bundle_adjustment import RotatingCamera
 from deepdetect.matching.stitching.compositing import (
@@ -76,7 +76,7 @@ def test_a_canvas_too_large_is_refused(monkeypatch: pytest.MonkeyPatch, one_line
         canvas.check_size(3.1)
     one_line(error.value)
     canvas.check_size(3.13)
-    monkeypatch.setattr(memory, "available_memory", lambda: 10_400 * 300 * 22)
+    monkeypatch.setattr(machine, "available_memory", lambda: 10_400 * 300 * 22)
     with pytest.raises(OptionError, match="GB of memory, more than is free") as error:
         canvas.check_size(3.13)
     one_line(error.value)

@@ -15,11 +15,11 @@ from .interface import (
     RuntimeOptions,
     as_logits,
     failed_run,
+    import_onnxruntime,
     output_to_read,
     unreadable,
 )
 from .onnx_parts import leave_out_outputs
-from .without_telemetry import import_onnxruntime
 
 CPU = "CPUExecutionProvider"
 PROVIDERS = {"cpu": CPU, "cuda": "CUDAExecutionProvider"}

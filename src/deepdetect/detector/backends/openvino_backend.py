@@ -17,10 +17,10 @@ from .interface import (
     RuntimeOptions,
     as_logits,
     failed_run,
+    import_openvino,
     output_to_read,
     unreadable,
 )
-from .without_telemetry import import_openvino
 
 PADDED_IMAGE = "padded_image"
 """Name of the tensor that holds the image, padded to multiples of 8, in files that pad it."""

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..._shared.memory import require_memory
+from ..._shared.machine import require_memory
 from ...features.keypoints import Keypoints
 from ...features.scale_space import dominant_angles
 from ...features.selection import (

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..._shared.machine import parallel_for
 from ..._shared.opencv import cv2
-from ..._shared.parallel import parallel_for
 
 NMS_RADIUS = 2
 """A candidate is the maximum of a window of 5x5 in its level."""

@@ -26,8 +26,8 @@ import numpy as np
 
 from ..._shared.errors import DeepDetectError, OptionError, WeightsError
 from ..._shared.opencv import cv2
-from ..._shared.registry import look_up
-from ...detector.backends.without_telemetry import import_onnxruntime
+from ..._shared.options import look_up
+from ...detector.backends.interface import import_onnxruntime
 from ...features.keypoints import Keypoints
 from .hessian import HESSIAN
 from .method import COMMON_DESCRIPTOR, BaselineError, LocalFeature

@@ -13,8 +13,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..._shared.machine import processor_count
 from ..._shared.opencv import cv2
-from ..._shared.parallel import processor_count
 from ...features.keypoints import Keypoints
 from ...features.sift import detect_sift
 

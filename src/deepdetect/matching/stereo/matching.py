@@ -13,9 +13,9 @@ import numpy as np
 
 from ..._shared.errors import ImageError, OptionError
 from ..._shared.image_array import Channels
+from ..._shared.machine import parallel_for
 from ..._shared.opencv import cv2
 from ..._shared.options import check_ranges, suggest_keywords
-from ..._shared.parallel import parallel_for
 from ...features.keypoints import Keypoints
 from ...io.image import load_image, luma
 from .sgm import (

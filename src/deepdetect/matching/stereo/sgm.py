@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..._shared.machine import parallel_for
 from ..._shared.opencv import cv2
-from ..._shared.parallel import parallel_for
 
 CENSUS_RADIUS_X = 4
 CENSUS_RADIUS_Y = 3

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from ..._shared.errors import OptionError, RegistrationError
-from ..._shared.memory import require_memory
+from ..._shared.machine import require_memory
 from ..._shared.opencv import cv2
 from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography, transform_points

@@ -11,7 +11,7 @@ import numpy as np
 from ..._shared.errors import OptionError, unknown_name
 from ..._shared.image_array import Channels
 from ..._shared.options import check_ranges, suggest_keywords
-from ..._shared.timing import StageTimer
+from ..._shared.progress import StageTimer
 from ...detector.detector import AnyDetector, DeepDetect
 from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -14,11 +15,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect._shared import parallel
-from deepdetect._shared.errors import DeepDetectError, ImageError
-from deepdetect._shared.parallel import (
+from deepdetect._shared import machine
+from deepdetect._shared.errors import DeepDetectError, ImageError, OptionError
+from deepdetect._shared.machine import (
+    available_memory,
     map_in_processes,
     parallel_for,
+    require_memory,
 )
 from deepdetect.io.image import load_image
 
@@ -28,8 +31,8 @@ PROBE = "(__import__('os').getpid(), __import__('cv2').getNumThreads())"
 
 def test_outcomes_equal_serial_ones() -> None:
     tasks = list(range(25))  # more than the workers are given at first
-    parallel = map_in_processes(math.factorial, tasks, workers=2)
-    assert sorted(parallel) == [math.factorial(task) for task in tasks]
+    outcomes = map_in_processes(math.factorial, tasks, workers=2)
+    assert sorted(outcomes) == [math.factorial(task) for task in tasks]
 
 
 def test_workers_are_other_processes_with_one_thread() -> None:
@@ -61,7 +64,7 @@ def test_a_dead_worker_is_one_sentence() -> None:
 ENDLESS = """
 import os, sys, time
 from pathlib import Path
-from deepdetect._shared import parallel
+from deepdetect._shared import machine
 
 def work(task):
     Path(f"pid{task}").write_text(str(os.getpid()))
@@ -69,7 +72,7 @@ def work(task):
 
 if __name__ == "__main__":
     try:
-        list(parallel.map_in_processes(work, range(100), 2))
+        list(machine.map_in_processes(work, range(100), 2))
     except KeyboardInterrupt:
         sys.exit(130)
 """
@@ -153,7 +156,7 @@ def test_each_number_is_done_once(count: int) -> None:
 
 
 def test_several_threads_work_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parallel, "processor_count", lambda: 3)
+    monkeypatch.setattr(machine, "processor_count", lambda: 3)
     together = threading.Barrier(3, timeout=20)
     waited: list[int] = []
 
@@ -172,3 +175,44 @@ def test_an_error_in_a_part_is_the_callers() -> None:
 
     with pytest.raises(ZeroDivisionError, match="as it happens"):
         parallel_for(5, work)
+
+
+ARRAYS = """
+import resource
+import sys
+from deepdetect._shared.machine import disable_malloc_trim
+
+def make_and_free():
+    for _ in range(20):
+        blocks = [bytearray(3_000_000) for _ in range(10)]
+
+if sys.argv[1] == "keep":
+    disable_malloc_trim()
+make_and_free()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+make_and_free()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+def page_faults(mode: str) -> int:
+    done = subprocess.run(
+        [sys.executable, "-c", ARRAYS, mode], check=True, capture_output=True, text=True
+    )
+    return int(done.stdout)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
+def test_freed_memory_is_used_again_without_new_pages() -> None:
+    assert page_faults("keep") < 0.1 * page_faults("give")
+
+
+def test_there_is_memory_but_not_endlessly() -> None:
+    assert 0 < available_memory() < 2**50
+
+
+def test_a_step_that_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine, "available_memory", lambda: 1.5e9)
+    require_memory("a million keypoints", "take fewer", matched_keypoint=1e6)
+    with pytest.raises(OptionError, match=r"need about 1.6 GB .*, more than is free: take"):
+        require_memory("many keypoints", "take fewer", matched_keypoint=1.1e6)
