@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deepdetect.app.options import AppOptions
+from deepdetect.app.jobs import AppOptions
 from deepdetect.app.server import STATIC, AppServer
 
 

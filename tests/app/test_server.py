@@ -19,8 +19,7 @@ from PIL import Image
 from deepdetect import DeepDetect, PointDetector
 from deepdetect._shared.errors import OptionError
 from deepdetect.app import jobs
-from deepdetect.app.jobs import Job
-from deepdetect.app.options import AppOptions
+from deepdetect.app.jobs import AppOptions, Job
 from deepdetect.app.server import AppServer
 
 from .conftest import Client, packed

@@ -15,6 +15,7 @@ import deepdetect
 from deepdetect import load_image, load_matches, register
 from deepdetect._shared.errors import DeepDetectError
 from deepdetect.app.tasks import TASKS, SentImage, TaskResult
+from deepdetect.reconstruction.files import ENDINGS
 
 EXAMPLES = Path(deepdetect.__path__[0]) / "app/static/examples"
 
@@ -69,7 +70,7 @@ def test_a_model(tmp_path: Path) -> None:
     names = ["motorcycle-left.jpg", "motorcycle-right.jpg"]
     result, _ = run("reconstruct", names, tmp_path, focal_px=995)
     assert result.shown == "model.html"
-    assert set(result.files) >= {"model.ply", "model.glb", "model.html", "depth.jpg", "model.json"}
+    assert {*result.files} == {f"model{ending}" for ending in ENDINGS}
     assert result.numbers["Pair"] == "rectified"
     assert int(result.numbers["Points"].replace(",", "")) > 50_000
 

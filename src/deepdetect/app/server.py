@@ -34,8 +34,7 @@ from starlette.staticfiles import StaticFiles
 from .. import __version__
 from .._shared.errors import DeepDetectError, OptionError, unknown_name
 from ..detector.pretrained import RANKER
-from .jobs import Jobs
-from .options import AppOptions
+from .jobs import AppOptions, Jobs
 from .tasks import TASKS, SentImage
 
 HOST = "127.0.0.1"

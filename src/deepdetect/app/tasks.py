@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
-import json
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -170,9 +169,8 @@ def run_reconstruct(images: Images, options: Options, folder: Path, report: Repo
     from ..detector.detector import DeepDetect
     from ..io.exif import calibration_from_exif
     from ..io.image import load_image
-    from ..io.point_cloud import POINT_CLOUD_WRITERS, save_point_cloud
+    from ..reconstruction.files import ENDINGS, save_reconstruction
     from ..reconstruction.pipeline import reconstruct
-    from ..viz.draw import draw_depth, save_picture
 
     done = itertools.count(1)
     report("starting", 0, MODEL_STAGES)
@@ -192,22 +190,17 @@ def run_reconstruct(images: Images, options: Options, folder: Path, report: Repo
         progress=lambda name: report(f"after {name}", next(done), MODEL_STAGES),
     )
     report("files", MODEL_STAGES - 1, MODEL_STAGES)
-    title = " and ".join(one.name for one in images)
-    names = [f"model{ending}" for ending in POINT_CLOUD_WRITERS]
-    for name in names:
-        save_point_cloud(found.cloud, folder / name, {"title": title})
-    save_picture(draw_depth(found.depth_map(), found.unit), folder / "depth.jpg")
-    summary = json.dumps(found.summary(), indent=2, default=str)
-    (folder / "model.json").write_text(summary + "\n", encoding="utf-8")
+    files = {ending: folder / f"model{ending}" for ending in ENDINGS}
+    values = save_reconstruction(found, files, " and ".join(one.name for one in images))
     focal = f"assumed: {focal_px:.0f} px" if assumed else found.calibration.source
     numbers = {
         "Points": f"{len(found):,}",
         "Matches": f"{found.matches:,}",
         "Pair": "rectified" if found.rectified else "not rectified",
         "Focal length": focal,
-        "Scale": str(found.summary()["scale"]),
+        "Scale": values["scale"],
     }
-    return TaskResult(numbers, "model.html", (*names, "depth.jpg", "model.json"))
+    return TaskResult(numbers, "model.html", [path.name for path in files.values()])
 
 
 def run_reconstruct_many(

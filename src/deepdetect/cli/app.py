@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from .._shared.errors import MissingExtraError, install_command
 from .._shared.signals import endings_interrupt
-from ..app.options import AppOptions
+from ..app.jobs import AppOptions
 from ._options import From, command, note
 
 

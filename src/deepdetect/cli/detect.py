@@ -73,12 +73,11 @@ def detect(
     failures: list[str] = []
     with progress(len(paths), "detecting", "image", quiet=len(paths) == 1) as bar:
         for path, files in outputs.items():
-            try:
-                results.append(work.detect(path, files))
-            except _Failure as failure:
-                failures.append(str(failure))
-            except MemoryError:
-                failures.append(f"{path}: there is not enough memory for it: use a smaller image")
+            outcome = work.detect(path, files)
+            if isinstance(outcome, str):
+                failures.append(outcome)
+            else:
+                results.append(outcome)
             bar.update(1)
     nothing = not failures and not any(result["keypoints"] for result in results)
     if nothing:
@@ -97,10 +96,6 @@ def _line(result: dict[str, Any]) -> str:
     how = "already done" if result["skipped"] else f"{result['seconds']:.2f} s"
     found = f"{result['keypoints']:,} keypoint{'' if result['keypoints'] == 1 else 's'}"
     return f"{result['image']}: {found}, density {result['density']:.3f}, {how} -> {result['file']}"
-
-
-class _Failure(Exception):
-    """One image cannot be worked on; whatever else is raised concerns all of them."""
 
 
 class _Work:
@@ -135,8 +130,11 @@ class _Work:
             whose = str(changed[0]) if len(changed) == 1 else f"{len(changed)} images"
             cli.note(f"replacing the results of {whose} with other options ({flags})")
 
-    def detect(self, path: Path, files: dict[str, Path]) -> dict[str, Any]:
-        """Detect, save and draw the keypoints of one image; return its numbers."""
+    def detect(self, path: Path, files: dict[str, Path]) -> dict[str, Any] | str:
+        """Detect, save and draw the keypoints of one image; return its numbers, or what failed.
+
+        What is raised concerns all images.
+        """
         shown = {"file": files["file"], "pictures": {n: files[n] for n in files if n != "file"}}
         outputs = Outputs([*files.values()], [path], overwrite=self.overwrite)
         done = outputs.find()  # another command may have done it meanwhile
@@ -156,8 +154,9 @@ class _Work:
         except (MissingExtraError, WeightsError):  # concern all images
             raise
         except DeepDetectError as error:
-            named = str(error) if str(path) in str(error) else f"{path}: {error}"
-            raise _Failure(named) from error
+            return str(error) if str(path) in str(error) else f"{path}: {error}"
+        except MemoryError:
+            return f"{path}: there is not enough memory for it: use a smaller image"
         numbers = {
             "width": keypoints.image_size[0],
             "height": keypoints.image_size[1],

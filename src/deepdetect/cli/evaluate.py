@@ -24,13 +24,14 @@ from ..evaluation.metrics.stereo import TOLERANCE_PX, score_errors
 from ..evaluation.options import PAPER_RESOLUTION_PX, BenchmarkOptions
 from ..evaluation.protocols.masks import LabelDetector
 from ..evaluation.protocols.stereo_matches import match_random_points, score_stereo_matches
+from ..evaluation.report import Table
 from ..evaluation.weights import Evaluation, OxfordScore, evaluate_oxford
 from ..evaluation.weights import evaluate as run
 from ..features.display import draw_matches
 from ..geometry import disparity_errors
 from ..labels import find_label_settings
 from ..matching.pipeline import match_images
-from ..viz.draw import add_caption, draw_heatmap, save_picture
+from ..viz.draw import add_caption, draw_dense_keypoints, draw_heatmap, save_picture
 from . import _options as cli
 from ._detection import NETWORK
 
@@ -128,6 +129,12 @@ def _failures(found: Sequence[Evaluation], on_oxford: Sequence[OxfordScore]) -> 
     return list(dict.fromkeys(failure for listed in parts for failure in listed))
 
 
+STEREO_COLUMNS = {
+    **{"source": "", "pair": "", "density": ".3f"},
+    **{"matches": ",d", "correct": ",d", "precision": ".3f"},
+}
+
+
 @cli.command()
 def evaluate_stereo(
     *scenes: Annotated[
@@ -166,20 +173,8 @@ def evaluate_stereo(
     for name in weights or (() if label_settings else PRETRAINED):
         sources[f"weights {name}"] = DeepDetect(name)
     rows = score_stereo_matches(sources, pairs, quiet=False)
-    width = max(len(row["source"]) for row in rows)
-    heading = f"{'keypoints':<{width}}  {'pair':<12}{'density':>8}{'matches':>10}"
-    lines = [
-        f"{row['source']:<{width}}  {row['pair']:<12}{row['density']:>8.3f}"
-        f"{row['score']['matches']:>10,}{row['score']['correct']:>10,}{row['precision']:>11.3f}"
-        for row in rows
-    ]
-    return cli.Result(
-        rows,
-        "\n".join([f"{heading}{'correct':>10}{'precision':>11}", *lines]),
-        failures,
-        len(scenes),
-        "scenes",
-    )
+    table = Table("stereo", "", STEREO_COLUMNS, [{**row, **row["score"]} for row in rows])
+    return cli.Result(rows, table.to_markdown(), failures, len(scenes), "scenes")
 
 
 OPTIONS = cli.From(BenchmarkOptions, "degraded_images max_pairs max_images", more="ranker")
@@ -288,10 +283,7 @@ def run_demo(pair: StereoPair, detector: HeatmapDetector, folder: Path) -> dict[
     )
     heatmap = draw_heatmap(detector.heatmap(pair.left))
     pictures = {
-        f"{side}_keypoints": add_caption(
-            keypoints.draw(rgb),
-            f"{len(keypoints):,} keypoints, density {keypoints.density:.3f}",
-        )
+        f"{side}_keypoints": draw_dense_keypoints(rgb, keypoints)
         for side, rgb, keypoints in zip(
             ("left", "right"), (pair.left, pair.right), both, strict=True
         )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
@@ -13,15 +12,13 @@ from typing import Any
 from .._shared.errors import OptionError
 from .._shared.progress import progress
 from .._shared.records import Outputs, check_not_made
-from ..io.depth import save_depth_npz, save_depth_png
-from ..io.point_cloud import POINT_CLOUD_WRITERS, find_writer, save_point_cloud
+from ..io.point_cloud import find_writer
+from ..reconstruction.files import ENDINGS, save_reconstruction
 from ..reconstruction.pipeline import reconstruct as reconstruct_pair
-from ..reconstruction.result import Reconstruction
 from ..sfm.colmap import import_pycolmap
 from ..sfm.options import MultiViewOptions
 from ..sfm.pipeline import MAX_KEYPOINTS, check_output_folder, output_files, reconstruct_many
 from ..sfm.stages import check_images
-from ..viz.draw import draw_depth, save_picture
 from . import _options as cli
 from ._detection import NETWORK, POINTS, SELECTION, Detector, Kind, chosen_detector
 
@@ -92,8 +89,7 @@ def reconstruct(
         raise OptionError(f"`{name}` is for more than two images")
     model = cli.output_file(output, "model.ply")
     find_writer(model)
-    endings = (*POINT_CLOUD_WRITERS, "_depth.png", "_depth.npz", "_depth.jpg", ".json")
-    files = {ending: model.with_name(model.stem + ending) for ending in endings}
+    files = {ending: model.with_name(model.stem + ending) for ending in ENDINGS}
     files[model.suffix.lower()] = model
     if "calibration" in values:
         cli.check_inputs_survive(files.values(), [values["calibration"]])
@@ -110,34 +106,9 @@ def reconstruct(
 
         left, right = images
         found = reconstruct_pair(left, right, chosen, selection=selection, progress=done, **values)
-        return cli.Result(_write(found, made, files, images))
-
-
-def _write(
-    found: Reconstruction, made: dict[str, Path], files: dict[str, Path], images: Sequence[Path]
-) -> dict[str, Any]:
-    """Write all files; return what the JSON holds."""
-    started = time.perf_counter()
-    values = found.summary()
-    notes = {
-        "title": f"{images[0].name} and {images[1].name}",
-        "pair": "rectified" if found.rectified else "not rectified",
-        "calibration": found.calibration.source,
-        "scale": values["scale"],
-    }
-    for ending in POINT_CLOUD_WRITERS:
-        save_point_cloud(found.cloud, made[ending], notes)
-    depth = found.depth_map()
-    stored = save_depth_png(depth, made["_depth.png"], found.unit)
-    arrays = {} if found.disparity is None else {"disparity": found.disparity_map()}
-    save_depth_npz(depth, made["_depth.npz"], found.unit, matched=found.matched_map(), **arrays)
-    save_picture(draw_depth(depth, found.unit), made["_depth.jpg"])
-    values["seconds"]["files"] = round(time.perf_counter() - started, 4)
-    named = {"left": images[0], "right": images[1]}
-    numbers = {**named, **values, "depth_png": stored, "files": [*files.values()]}
-    text = json.dumps(numbers, indent=2, default=str) + "\n"
-    made[".json"].write_text(text, encoding="utf-8")
-    return numbers
+        title = f"{left.name} and {right.name}"
+        named = {"left": left, "right": right, "files": [*files.values()]}
+        return cli.Result(save_reconstruction(found, made, title, **named))
 
 
 def _reconstruct_many(
