@@ -200,16 +200,16 @@ def test_few_keypoints_are_no_error(pair: Pair, matcher: str, count: int) -> Non
     assert count == 2 or len(found.points0) == 0
 
 
-ARRAYS = {"rows": np.arange(50, dtype=np.int16), "one": np.array(3)}
+ROW = {"rows": np.arange(50, dtype=np.int16), "number": 3, "text": "three"}
 
 
 def is_made(run: Run, stage: str, depends: object) -> bool:
     """Ask for a result; return whether it had to be made."""
     before = run.made
-    found = run.cached(stage, depends, lambda: ARRAYS)
-    for name, array in ARRAYS.items():
-        assert found[name].dtype == array.dtype
-        np.testing.assert_array_equal(found[name], array)
+    found = run.cached(stage, depends, lambda: ROW)
+    assert (found["number"], found["text"]) == (3, "three")
+    assert found["rows"].dtype == ROW["rows"].dtype
+    np.testing.assert_array_equal(found["rows"], ROW["rows"])
     return run.made > before
 
 

@@ -30,13 +30,13 @@ Result = TypeVar("Result")
 STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
     "keypoints": (1, ()),
     "matches": (1, ("keypoints",)),
-    "guided": (4, ("keypoints",)),
-    "stereo": (1, ()),
+    "guided": (5, ("keypoints",)),
+    "stereo": (2, ()),
     "repeatability_paper": (1, ("keypoints",)),
     "repeatability_mutual_nn": (1, ("keypoints",)),
     "corner_errors": (1, ("matches",)),
-    "pose": (1, ("matches", "guided")),
-    "sfm": (1, ()),
+    "pose": (2, ("matches", "guided")),
+    "sfm": (2, ()),
 }
 """Version of each stage, and the stages it is made from.
 
@@ -174,25 +174,25 @@ class Run:
                     bar.update(1)
         return rows
 
-    def cached(self, stage: str, depends: object, make: Callable[[], Arrays]) -> Arrays:
-        """Find a result of one of `STAGES`, or make and keep it.
+    def cached(self, stage: str, depends: object, make: Callable[[], Row]) -> Row:
+        """Find a result of one of `STAGES`, or make and keep it: arrays, numbers and texts.
 
         It depends on the values of `depends`, as for `records.key`: of a path on its content.
         """
         path = None
+        kept: Arrays | None = None
         if self.cache is not None:
             path = self.cache / stage / f"{key(stage_versions(stage), depends)}.npz"
-            found = load_arrays(path)
-            if found is not None:
-                return found
-        made = make()
-        self.made += 1
-        if path is not None:
-            try:
-                save_arrays(path, made)
-            except DeepDetectError as error:
-                raise CacheError(str(error)) from None
-        return made
+            kept = load_arrays(path)
+        if kept is None:
+            kept = {name: np.asarray(value) for name, value in make().items()}
+            self.made += 1
+            if path is not None:
+                try:
+                    save_arrays(path, kept)
+                except DeepDetectError as error:
+                    raise CacheError(str(error)) from None
+        return {name: value if value.ndim else value.item() for name, value in kept.items()}
 
     def keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, Profile]:
         """Find the keypoints of an image, or read them and what it took from the cache."""
@@ -205,7 +205,7 @@ class Run:
         return self._recent[name]
 
     def _keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, Profile]:
-        def make() -> Arrays:
+        def make() -> Row:
             rgb = load_image(image)
             with profiled() as profile:
                 found = feature.detect(rgb)
@@ -213,12 +213,12 @@ class Run:
             return {
                 "xy": found.xy,
                 "scores": found.scores,
-                "image_size": np.array(found.image_size),
+                "image_size": found.image_size,
                 **optional,
                 "profile": profile.packed(),
             }
 
-        kept: dict[str, Any] = dict(self.cached("keypoints", (feature.detection, image), make))
+        kept = self.cached("keypoints", (feature.detection, image), make)
         profile = Profile(*kept.pop("profile").tolist())
         width, height = kept.pop("image_size").tolist()
         return Keypoints(image_size=(width, height), **kept), profile
@@ -231,7 +231,7 @@ class Run:
         if settings.budget is not None:
             both = [keypoints.best(settings.budget) for keypoints in both]
 
-        def make() -> Arrays:
+        def make() -> Row:
             check_memory([len(keypoints) for keypoints in both])
             descriptors, describe = self._descriptors(feature, images, both)
             matcher = get_matcher("hamming" if feature.binary else settings.matcher)
@@ -245,7 +245,7 @@ class Run:
                     seed=settings.seed,
                     positions=(both[0].xy, both[1].xy),
                 )
-            profiles = np.array([describe.packed(), match.packed()])
+            profiles = describe.packed(), match.packed()
             return {"rows0": found.indices0, "rows1": found.indices1, "profiles": profiles}
 
         kept = self.cached("matches", (*feature.key, images, settings), make)

@@ -14,6 +14,7 @@ from deepdetect.datasets.types import PlanarPair
 from deepdetect.evaluation.baselines.method import BaselineError, with_common_descriptor
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.evaluation.metrics import repeatability
+from deepdetect.evaluation.protocols import degraded
 from deepdetect.evaluation.protocols.degraded import (
     BUDGETS,
     degraded_copy,
@@ -53,22 +54,27 @@ def test_a_copy_is_made_once_and_outside_the_data(pairs: list[PlanarPair], tmp_p
     assert path.stat().st_mtime_ns == made
     newer = degraded_copy(image, dataclasses.replace(one, version=2), tmp_path)
     assert newer != path
+    both = degraded_pair(pairs[0], one, tmp_path, "both")
+    assert (both.first != pairs[0].first, both.second) == (True, path)
+    assert both.homography is pairs[0].homography
 
 
 def test_tables_have_scores_and_their_fraction_of_daylight(
-    pairs: list[PlanarPair], tmp_path: Path
+    pairs: list[PlanarPair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    lights = {name: DEGRADATIONS[name] for name in ("dark-8", "blur-2")}
+    monkeypatch.setattr(degraded, "DEGRADATIONS", lights)
     run = Run(tmp_path, tmp_path / "cache")
     rows = degraded_rows(run, [FAST], pairs)
-    assert len(rows) == len(DEGRADATIONS) * len(pairs)
+    made = run.made
+    assert len(rows) == len(lights) * len(pairs)
     overview, *tables = degraded_tables([FAST], rows, "key", "pairs")
-    assert [table.key for table in tables] == [f"key_{name}" for name in DEGRADATIONS]
-    for table, one in zip(tables, DEGRADATIONS.values(), strict=True):
+    assert [table.key for table in tables] == [f"key_{name}" for name in lights]
+    daylight = [pair_row(run, FAST, pair, BUDGETS) for pair in pairs]
+    for table, one in zip(tables, lights.values(), strict=True):
         (row,) = table.rows
         dark = [degraded_pair(pair, one, run.files_folder()) for pair in pairs]
-        scores = [
-            [pair_row(run, FAST, pair, BUDGETS) for pair in chosen] for chosen in (dark, pairs)
-        ]
+        scores = [pair_row(run, FAST, pair, BUDGETS) for pair in dark], daylight
         now, then = (np.mean([p["repeated", 512, 1.0] for p in two]) for two in scores)
         assert row["@1 px, 512"] == pytest.approx(now)
         assert row["@1 px, 512: of daylight"] == pytest.approx(now / then)
@@ -79,18 +85,7 @@ def test_tables_have_scores_and_their_fraction_of_daylight(
         assert row["correct at 1 px, 2,048: of daylight"] == pytest.approx(correct[0] / correct[1])
         left = overview.rows[0][f"{one.title}: correct at 1 px"]
         assert left == row["correct at 1 px, 2,048: of daylight"]
-    made = run.made
-    degraded_rows(run, [FAST], pairs)
     assert run.made == made, "all of it is cached"
-
-
-def test_both_images_are_degraded_when_that_is_asked_for(
-    pairs: list[PlanarPair], tmp_path: Path
-) -> None:
-    found = degraded_pair(pairs[1], DEGRADATIONS["blur-2"], tmp_path, "both")
-    assert (found.homography is pairs[1].homography, found.name) == (True, pairs[1].name)
-    assert found.first != pairs[1].first
-    assert found.second != pairs[1].second
 
 
 def test_pairs_that_could_not_be_measured_in_both_ways_are_left_out(

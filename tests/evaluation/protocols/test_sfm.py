@@ -14,12 +14,7 @@ from deepdetect.datasets.posed_images import PosedImage, PosedPair, PosedScene, 
 from deepdetect.evaluation.benchmarks import run_benchmarks
 from deepdetect.evaluation.options import BenchmarkOptions
 from deepdetect.evaluation.protocols import sfm
-from deepdetect.evaluation.protocols.sfm import (
-    SfmScene,
-    camera_table,
-    choose_images,
-    cost_table,
-)
+from deepdetect.evaluation.protocols.sfm import SfmScene, camera_table, choose_images
 from deepdetect.evaluation.run import Run
 from deepdetect.geometry.camera import PosedView
 
@@ -30,13 +25,12 @@ POINTS, SIFT, RANDOM = (
 )
 
 
-def model(views: dict, points=0, track_length=float("nan"), error=float("nan"), seconds=1.5):
+def model(views: dict, points=0, track_length=float("nan"), error=float("nan")):
     return {
         "views": views,
         "sparse points": points,
         "track length": track_length,
         "reprojection error, px": error,
-        "cpu seconds": seconds,
     }
 
 
@@ -72,11 +66,10 @@ def rows(scene: SfmScene) -> list:
         for name, view in list(scene.truth.items())[:4]
         for c in (view.centre,)
     }
-    good = model(own, 1000, 3.5, 0.25, 3.0)
-    cost = {"keypoints": 800, "matches": 5000, "seconds": 10.0, "cpu seconds": 12.0, "memory": 4e8}
+    good = model(own, 1000, 3.5, 0.25)
     return [
-        {"scene": scene, "method": POINTS, "true": good, "estimated": NOTHING, **cost},
-        {"scene": scene, "method": RANDOM, "true": NOTHING, "estimated": NOTHING, **cost},
+        {"scene": scene, "method": POINTS, "true": good, "estimated": NOTHING},
+        {"scene": scene, "method": RANDOM, "true": NOTHING, "estimated": NOTHING},
     ]
 
 
@@ -123,18 +116,12 @@ def test_models_are_compared_with_the_first_in_the_unit_of_the_truth(
         )
         for (name, view), move in zip(first["views"].items(), (0.03, 0, 0, 0), strict=True)
     }
-    other = model(half, 1, 2.0, 0.1, 1.0)
+    other = model(half, 1, 2.0, 0.1)
     rows.insert(1, {"scene": scene, "method": SIFT, "true": other, "estimated": first})
     column = "from the first row's, unit of the truth"
     values = [row.get(column) for row in camera_table(rows).rows]
     assert values[0] is values[1] is values[3] is values[4] is None
     assert 0.005 < values[2] < 0.03
-
-
-def test_costs_are_those_of_the_process(scene: SfmScene, rows: list) -> None:
-    table = cost_table(rows)
-    assert [*table.rows[0].values()] == ["arc", POINTS, 800, 5000, 10, 12, 3, 1.5, 400]
-    assert list(table.rows[0]) == list(table.columns)
 
 
 def test_images_of_a_sequence_are_its_first(tmp_path: Path) -> None:
@@ -179,7 +166,7 @@ def test_what_cannot_be_reconstructed_is_a_result(
     chosen = choose_images(load_posed_scenes(folder)[0], 20)
     found = sfm.measure_scene(Run(folder), unmatched, chosen)
     assert found["true"]["views"] == found["estimated"]["views"] == {}
-    assert found["memory"] > 1e7
+    assert found["memory, MB"] > 10
 
 
 @pytest.mark.slow
@@ -190,7 +177,8 @@ def test_a_whole_run_on_small_images(write_posed_fountain, tmp_path: Path) -> No
     options = BenchmarkOptions(DeepDetect())
     report = run_benchmarks(["sfm"], folder, options, cache=tmp_path / "cache")
     assert report.failures == ()
-    cameras, _ = report.tables()
+    cameras, costs = report.tables()
+    assert all(cost > 0 for row in costs.values() for cost in [*row.values()][2:])
     lines = cameras.values()
     given = {row["keypoints"]: row for row in lines if row["intrinsics"] == "true"}
     assert given[POINTS]["registered"] == given[SIFT]["registered"] == 6

@@ -16,18 +16,7 @@ from ...datasets.types import PlanarPair
 from ...io.image import load_image
 from ..baselines.method import LocalFeature
 from ..metrics.homography import accuracy_at
-from ..report import (
-    Cell,
-    Columns,
-    Measure,
-    Row,
-    Rows,
-    Table,
-    average,
-    mean_of,
-    tabulate,
-    where,
-)
+from ..report import Cell, Columns, Measure, Row, Rows, Table, average, mean_of, tabulate, where
 from ..run import Run
 from .standard import MATCHING_BUDGET, PAIRS, RADII_PX, budget_name, correct, pair_row, repeated
 
@@ -36,22 +25,15 @@ HOMOGRAPHY_THRESHOLD_PX = 3.0
 DAYLIGHT = "daylight"
 
 TEXT = (
-    "Dark and blurred copies of the same images, made at run time in linear light, with the "
-    "same random numbers every time. In 1/4 or 1/8 of the light (same exposure and gain) white "
-    "gives 2,500 or 1,250 electrons instead of 10,000; shot noise is Poisson's, reading adds 3 "
-    "electrons (standard deviation), and the result has 8 bits. Motion blur goes in a direction "
-    "drawn for each image. The true homographies are those of the images."
+    "Dark and blurred copies of the same images, made in linear light with the same random numbers "
+    "every time. In 1/4 or 1/8 of the light white gives 2,500 or 1,250 electrons instead of "
+    "10,000; shot noise is Poisson's, reading adds 3 electrons (standard deviation), the result "
+    "has 8 bits. Motion blur has a direction drawn for each image."
 )
 
 WHICH_TEXT = {
-    "second": (
-        "The second image of each pair is degraded, the first is not: what is found must be found "
-        "in spite of the change, as when a place is recognised at dusk by a map made at noon."
-    ),
-    "both": (
-        "Both images of each pair are degraded alike, with different noise: there is less change, "
-        "but less to see."
-    ),
+    "second": "The second image of each pair is degraded, the first is not.",
+    "both": "Both images of each pair are degraded alike, with different noise.",
 }
 
 OVERVIEW_NOTE = (
@@ -60,12 +42,13 @@ OVERVIEW_NOTE = (
 )
 
 NOTE = (
-    "Mutual-NN repeatability and correct matches as in the standard protocol; of daylight: over "
-    "the score of the same pairs in daylight. A budget that a method does not fill is a dash. "
-    "Keypoints: in the image that has fewer."
+    "As in the standard protocol; of daylight: over the score of the same pairs in daylight. "
+    "A budget that is not filled is a dash. Keypoints: in the image that has fewer."
 )
 
-VALUES: tuple[tuple[str, int | None, str, Callable[[Rows], float | None]], ...] = (
+Score = Callable[[Rows], float | None]
+
+VALUES: tuple[tuple[str, int, str, Score], ...] = (
     *(
         (f"@{radius:g} px", budget, ".3f", partial(repeated, budget=budget, radius=radius))
         for radius in (RADII_PX[0], RADII_PX[-1])
@@ -87,18 +70,14 @@ def degraded_rows(
     Returns the rows of `standard.pair_row` with "light" and "daylight", the row of the same pair in
     daylight; those of pairs that could not be measured in both are missing.
     """
-    items = {
-        f"{pair.name}, {light}": (light, pair)
-        for light in (DAYLIGHT, *DEGRADATIONS)
-        for pair in pairs
-    }
+    lights = (DAYLIGHT, *DEGRADATIONS)
+    items = {f"{pair.name}, {light}": (light, pair) for light in lights for pair in pairs}
 
     def measure(feature: LocalFeature, item: tuple[str, PlanarPair]) -> Row:
         light, pair = item
-        seen = pair
         if light != DAYLIGHT:
-            seen = degraded_pair(pair, DEGRADATIONS[light], run.files_folder(), images)
-        return {"light": light, "pair": pair.name, **pair_row(run, feature, seen, BUDGETS)}
+            pair = degraded_pair(pair, DEGRADATIONS[light], run.files_folder(), images)
+        return {"light": light, "pair": pair.name, **pair_row(run, feature, pair, BUDGETS)}
 
     rows = run.rows("", features, items, measure)
     daylight = {(r["method"], r["pair"]): r for r in rows if r["light"] == DAYLIGHT}
@@ -116,10 +95,8 @@ def degraded_pair(
     images: Literal["second", "both"] = "second",
 ) -> PlanarPair:
     """Return a pair whose second image, or both, are degraded copies in a folder."""
-    second = degraded_copy(pair.second, degradation, folder)
-    if images == "second":
-        return replace(pair, second=second)
-    return replace(pair, first=degraded_copy(pair.first, degradation, folder), second=second)
+    first = degraded_copy(pair.first, degradation, folder) if images == "both" else pair.first
+    return replace(pair, first=first, second=degraded_copy(pair.second, degradation, folder))
 
 
 def degraded_copy(image: Path, degradation: Degradation, folder: Path) -> Path:
@@ -164,7 +141,7 @@ def _homography_accuracy(own: Rows) -> Cell:
     return mean_of(accuracy_at(row["corner errors"], HOMOGRAPHY_THRESHOLD_PX) for row in own)
 
 
-def _relative(rows: Rows, light: str, value: Callable[[Rows], float | None]) -> Cell:
+def _relative(rows: Rows, light: str, value: Score) -> Cell:
     """Return a score in a light over that of the same pairs in daylight."""
     own = where(rows, light=light)
     degraded, daylight = value(own), value([row["daylight"] for row in own])

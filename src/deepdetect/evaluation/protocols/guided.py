@@ -1,16 +1,15 @@
 """Matches by descriptors alone and guided ones, each with its precision, beside chance.
 
-Guided matching multiplies the matches of any points, those that know nothing about the image too:
-only beside them does a count say something.
+Guided matching multiplies the matches of any points: only beside chance does a count say something.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
-from ..._shared.records import Arrays
 from ...datasets.types import PlanarPair
 from ...features.keypoints import nearest_keypoints
 from ...geometry import transform_points
@@ -45,14 +44,13 @@ COLUMNS = {
 }
 
 NOTE = (
-    f"Correct: strictly under {CORRECT_PX:g} px by the true homography; each point of the first "
-    "image counts once. Matchable: points of the first image with any point of the second this "
-    "near to their true place. Unique: correct matches, each point of the second image once. "
-    f"Guided: the seed of the median count, the lower of two, of {SEEDS} seeds; ± is the counts' "
-    "standard deviation, lowest the smallest of them as a fraction of the matchable. A seed by "
-    "which no geometry is trusted has no matches, as from match_images. Corner error: median over "
-    "the seeds that a homography guided. Seconds: median of the guided matching alone, of the run "
-    "that made them."
+    f"Correct: under {CORRECT_PX:g} px by the true homography, each point of the first image once. "
+    "Matchable: points of the first image with any point of the second this near to their true "
+    "place. Unique: correct matches, each point of the second image once. Guided: the seed of the "
+    f"median count, the lower of two, of {SEEDS}; ±: standard deviation of the counts; lowest: the "
+    "smallest as a fraction of the matchable. Without a trusted geometry a seed has no matches, as "
+    "from match_images. Corner error: median over the seeds guided by a homography. Seconds: "
+    "median of the guided matching alone, of the run that made them."
 )
 
 
@@ -73,10 +71,7 @@ def guided_section(
         for of_truth in zip(*truths.values(), strict=True)
     }
 
-    def measure(feature: LocalFeature, by_truth: Mapping[str, PlanarPair]) -> Row:
-        return guided_row(run, feature, by_truth)
-
-    rows = run.rows("guided matches of ", features, pairs, measure)
+    rows = run.rows("guided matches of ", features, pairs, partial(guided_row, run))
     tables = [
         Table(
             f"{key}_{truth}",
@@ -94,10 +89,8 @@ def guided_section(
     ]
     text = (
         "By descriptors alone: the paper's matching (SIFT of size 3, FLANN, ratio 0.99). Guided: "
-        "the default of `match_images`: a geometry from a few of OpenCV's SIFT keypoints proposes, "
-        "and a pair is kept when both places look the same. The true homography is used for "
-        "evaluation only. DeepDetect sees images squashed to 480x480 as "
-        f"{options.channels.upper()}."
+        "the default of `match_images`; the true homography only evaluates. DeepDetect sees "
+        f"images squashed to 480x480 as {options.channels.upper()}."
     )
     return Section(f"{title}, descriptors alone and guided", (text,), tables)
 
@@ -162,25 +155,22 @@ def _correct(points0: np.ndarray, points1: np.ndarray, pair: PlanarPair) -> np.n
 def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -> Row:
     """Match a pair guided, or read that; its homography is not used.
 
-    Returns "model", what guided: "homography", "fundamental" or "none", with which there are no
-    matches, "matrix", the geometry, "points0" and "points1", (M, 2), and "seconds" of the guided
-    matching alone: heat map and keypoints are not included.
+    Returns "model", what guided ("none": there are no matches), "matrix", the geometry, "points0"
+    and "points1", (M, 2), and "seconds" of the guided matching alone.
     """
     images = (pair.first, pair.second)
     first, second = (run.keypoints(feature, image)[0].xy for image in images)
 
-    def make() -> Arrays:
+    def make() -> Row:
         gray0, gray1 = (luma(load_image(image)) for image in images)
         with profiled() as profile:
             guide, found = guided_matches(gray0, gray1, first, second, seed=seed)
         return {
-            "model": np.array(guide.model),
+            "model": guide.model,
             "matrix": np.empty((0, 3)) if guide.matrix is None else guide.matrix,
-            "rows0": np.empty(0, np.int32) if found is None else found.indices0.astype(np.int32),
+            "points0": np.empty((0, 2)) if found is None else first[found.indices0],
             "points1": np.empty((0, 2)) if found is None else found.points1,
-            "profile": profile.packed(),
+            "seconds": profile.seconds,
         }
 
-    found = run.cached("guided", (feature.detection, images, seed), make)
-    seconds, model = float(found["profile"][0]), str(found["model"])
-    return {**found, "model": model, "points0": first[found["rows0"]], "seconds": seconds}
+    return run.cached("guided", (feature.detection, images, seed), make)

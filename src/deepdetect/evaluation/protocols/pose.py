@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from ..._shared.opencv import cv2
-from ..._shared.records import Arrays
 from ...datasets.posed_images import PosedPair, PosedScene, load_posed_scenes
 from ...detector.detector import DeepDetect
 from ...matching.options import MatchingOptions
@@ -66,31 +65,29 @@ DISTANCE, ERROR = "frame distance", "pose error, °"
 AGREEING = f"agreeing within {EPIPOLAR_THRESHOLD_PX:g} px"
 
 TEXT = (
-    "Two images are matched, and the relative pose of their cameras is estimated from the matches "
-    f"alone, the same way for all methods: OpenCV's MAGSAC at {THRESHOLD_PX:g} px with the true "
-    f"intrinsics (confidence {CONFIDENCE:g}), then the one of four poses with most points in front "
-    "of both cameras. The error of a pair is the larger of two angles: of the rotation, and "
-    "between the directions of the translation; its length cannot be known. DeepDetect: "
+    "The relative pose of two cameras from matches alone, the same way for all methods: OpenCV's "
+    f"MAGSAC at {THRESHOLD_PX:g} px with the true intrinsics (confidence {CONFIDENCE:g}), then the "
+    "one of four poses with most points in front of both cameras. The error is the larger of two "
+    "angles: of the rotation, and between the directions of the translation. DeepDetect: "
     "`match_images` with its defaults (guided), and by descriptors alone (patchmatch, mutual "
-    f"nearest neighbours). SIFT, ORB and further methods: the best {BUDGET:,} keypoints, exact "
-    f"mutual nearest neighbours, ratio {RATIO:g} (none for learned descriptors).",
-    f'"{STRAIGHT_AHEAD}" is a control that sees no image: no rotation, and the second camera in '
-    "front of the first. In a clip from a moving car that is a strong guess.",
+    f"nearest neighbours). Further methods: the best {BUDGET:,} keypoints, exact mutual nearest "
+    f"neighbours, ratio {RATIO:g} (none for learned descriptors).",
+    f'"{STRAIGHT_AHEAD}" sees no image: no rotation, the second camera in front of the first. In a '
+    "clip from a moving car that is a strong guess.",
     "The thresholds by which guided matching chooses between plane and depth were chosen on "
-    "images of Strecha's fountain and of a KITTI clip: on these two the figures are no test of "
-    "that choice.",
+    "Strecha's fountain and a KITTI clip: on these the figures are no test of that choice.",
 )
 
 NOTE = (
-    "Failed: pairs without a pose; their error counts as infinite. AUC: area under the curve of "
-    "the pairs' errors up to a threshold, as SuperGlue and glue-factory compute it, but an "
-    "opposite translation is wrong here. Matches: median. Agreeing: fraction of the matches whose "
-    f"Sampson distance from the true epipolar geometry is under {EPIPOLAR_THRESHOLD_PX:g} px, mean "
-    "over the pairs, where no matches count as 0."
+    "Failed: pairs without a pose; their error is infinite. AUC: area under the curve of the "
+    "errors up to a threshold, as SuperGlue and glue-factory compute it, but an opposite "
+    "translation is wrong here. Matches: median. Agreeing: fraction of the matches whose Sampson "
+    f"distance from the true epipolar geometry is under {EPIPOLAR_THRESHOLD_PX:g} px, mean over "
+    "the pairs; no matches count as 0."
 )
 
-Match = Callable[[tuple[Path, Path]], tuple[np.ndarray, np.ndarray, float, str]]
-"""Finds the (M, 2) matched positions of two images, the seconds that it took, and what guided:
+Found = tuple[np.ndarray, np.ndarray, float, str]
+"""The (M, 2) matched positions of two images, the seconds that it took, and what guided:
 "homography", "fundamental" or "none"; "" for methods that are never guided."""
 
 
@@ -98,15 +95,13 @@ Match = Callable[[tuple[Path, Path]], tuple[np.ndarray, np.ndarray, float, str]]
 class PoseMethod:
     """A row of the tables.
 
-    Attributes:
-        name, title: how the cache and the tables name it.
-        match: finds the matches of two images; None: the pose is always straight ahead.
-        version: what the matches depend on besides the images, for the cache.
+    `match` finds the matches of two images (None: the pose is always straight ahead), which
+    depend on `name` and `version`.
     """
 
     name: str
     title: str
-    match: Match | None = None
+    match: Callable[[tuple[Path, Path]], Found] | None = None
     version: tuple[Any, ...] = ()
 
 
@@ -120,9 +115,8 @@ def pose(run: Run, options: BenchmarkOptions) -> list[Section]:
 
     def measure(method: PoseMethod, item: tuple[PosedScene, PosedPair]) -> Row:
         scene, pair = item
-        values = pose_row(run, method, pair)
-        distance = pair.frame_distance
-        return {"scene": scene.name, DISTANCE: distance, "pair": pair.name, **values}
+        row = {"scene": scene.name, DISTANCE: pair.frame_distance, "pair": pair.name}
+        return row | pose_row(run, method, pair)
 
     rows = run.rows("pose of ", methods, items, measure)
     sequences = [scene for scene in scenes if scene.pairs[0].frame_distance is not None]
@@ -161,9 +155,7 @@ def pose_methods(run: Run, options: BenchmarkOptions) -> list[PoseMethod]:
     ]
 
 
-def _match_images(
-    detector: DeepDetect, way: dict[str, Any], images: tuple[Path, Path]
-) -> tuple[np.ndarray, np.ndarray, float, str]:
+def _match_images(detector: DeepDetect, way: dict[str, Any], images: tuple[Path, Path]) -> Found:
     options = MatchingOptions(matcher="patchmatch")
     found = match_images(*images, detector, model="none", options=options, **way)
     guided_by = found.two_view_geometry.model if found.two_view_geometry is not None else ""
@@ -172,11 +164,10 @@ def _match_images(
 
 def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
     """Match exactly, with the ratio test; learned descriptors without it."""
-    ratio = 1.0 if feature.learned else RATIO
+    ratio, test = (1.0, "no ratio test") if feature.learned else (RATIO, f"ratio {RATIO:g}")
     settings = MatchSettings("exact", ratio, mutual=True, budget=BUDGET)
-    test = "no ratio test" if feature.learned else f"ratio {RATIO:g}"
 
-    def match(images: tuple[Path, Path]) -> tuple[np.ndarray, np.ndarray, float, str]:
+    def match(images: tuple[Path, Path]) -> Found:
         detect = [run.keypoints(feature, image)[1].seconds for image in images]
         found = run.matches(feature, images, settings)
         seconds = sum(detect) + found.describe.seconds + found.match.seconds
@@ -187,54 +178,49 @@ def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
 
 
 def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
-    """Measure a method on a pair, or read the result from the cache.
+    """Measure a method on a pair, or read the result from the cache, by the titles of the columns.
 
-    By the titles of `PAIR_COLUMNS`: errors in degrees are infinite without a pose, and all but
-    errors is None of the control.
+    Errors in degrees are infinite without a pose; of the control there is nothing else.
     """
     match = method.match
     images = (pair.first.path, pair.second.path)
     cameras = (pair.first.intrinsics, pair.second.intrinsics)
 
-    def make() -> Arrays:
+    def make() -> Row:
         assert match is not None
         points0, points1, seconds, guided_by = match(images)
-        agreeing = epipolar_inlier_ratio(points0, points1, pair.fundamental)
-        errors = _errors(estimate_pose(points0, points1, *cameras), pair)
         return {
-            "numbers": np.array([*errors, len(points0), agreeing, seconds]),
-            "guided_by": np.array(guided_by),
+            **_errors(estimate_pose(points0, points1, *cameras), pair),
+            "matches": len(points0),
+            AGREEING: epipolar_inlier_ratio(points0, points1, pair.fundamental),
+            "seconds": seconds,
+            "guided by": guided_by,
         }
 
-    values: Row = dict.fromkeys(("matches", AGREEING, "seconds", "guided by"))
     if match is None:
-        rotation, translation = _errors((np.eye(3), np.array([0.0, 0.0, -1.0])), pair)
-    else:
-        truth = (*cameras, pair.rotation, pair.translation)
-        estimate = (THRESHOLD_PX, CONFIDENCE, EPIPOLAR_THRESHOLD_PX)
-        kept = run.cached("pose", (method.name, method.version, images, truth, estimate), make)
-        rotation, translation, matches, agreeing, seconds = kept["numbers"].tolist()
-        values = {"matches": int(matches), AGREEING: agreeing, "seconds": seconds}
-        values["guided by"] = str(kept["guided_by"]) or None
+        nothing: Row = dict.fromkeys(("matches", AGREEING, "seconds", "guided by"))
+        return _errors((np.eye(3), np.array([0.0, 0.0, -1.0])), pair) | nothing
+    truth = (*cameras, pair.rotation, pair.translation)
+    estimate = (THRESHOLD_PX, CONFIDENCE, EPIPOLAR_THRESHOLD_PX)
+    row = run.cached("pose", (method.name, method.version, images, truth, estimate), make)
+    return row | {"guided by": row["guided by"] or None}
+
+
+def _errors(pose: tuple[np.ndarray, np.ndarray] | None, pair: PosedPair) -> Row:
+    rotation = translation = float("inf")
+    if pose is not None:
+        rotation = rotation_error(pose[0], pair.rotation)
+        translation = translation_error(pose[1], pair.translation)
     errors = {"rotation error, °": rotation, "translation error, °": translation}
-    return {**errors, ERROR: max(rotation, translation), **values}
-
-
-def _errors(pose: tuple[np.ndarray, np.ndarray] | None, pair: PosedPair) -> tuple[float, float]:
-    if pose is None:
-        return float("inf"), float("inf")
-    rotation, translation = pose
-    return rotation_error(rotation, pair.rotation), translation_error(translation, pair.translation)
+    return {**errors, ERROR: max(rotation, translation)}
 
 
 def estimate_pose(
     points0: np.ndarray, points1: np.ndarray, intrinsics0: np.ndarray, intrinsics1: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Estimate the relative pose of two cameras from (M, 2) matches, the same way for all methods.
+    """Estimate the relative pose of two cameras from (M, 2) matches; None where there is none.
 
-    An essential matrix by OpenCV's MAGSAC at `THRESHOLD_PX`, then that of its four poses with most
-    points in front of both cameras: (3, 3) rotation and (3,) translation of length 1, X1 = rotation
-    @ X0 + translation. None with too few matches, or where there is none.
+    Returns the (3, 3) rotation and (3,) translation of length 1: X1 = rotation @ X0 + translation.
     """
     if len(points0) < MIN_MATCHES:
         return None
@@ -298,18 +284,20 @@ SUMMARY: Columns = {
 def _grouped(
     key: str,
     title: str,
-    first: str,
-    groups: Sequence[tuple[Cell, Rows]],
+    name: str,
+    groups: Sequence[Cell],
     methods: Sequence[PoseMethod],
+    rows: Rows,
     columns: Columns,
     note: str = NOTE,
 ) -> Table:
-    """Tabulate all methods in each group, whose value is the first column."""
-    parts = [(value, tabulate(key, title, methods, own, columns, note)) for value, own in groups]
-    lines = [{first: value, **line} for value, part in parts for line in part.rows]
-    table = parts[0][1]
-    style = "" if isinstance(groups[0][0], str) else "d"
-    return replace(table, columns={first: style, **table.columns}, rows=lines)
+    """Tabulate all methods in each group of the rows, by a value that is the first column."""
+    lines: Rows = []
+    for group in groups:
+        part = tabulate(key, title, methods, where(rows, **{name: group}), columns, note)
+        lines += [{name: group, **line} for line in part.rows]
+    style = "" if isinstance(groups[0], str) else "d"
+    return replace(part, columns={name: style, **part.columns}, rows=lines)
 
 
 def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], rows: Rows) -> Table:
@@ -335,23 +323,21 @@ def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], row
         "seconds": _median(".2f", "seconds"),
     }
     note = (
-        f"{NOTE} Guided by: in how many pairs which geometry guided. Worse than SIFT: pairs with "
-        f"an error of {GOOD_DEG:g}° or more where SIFT's is under it; better: the other way round. "
+        f"{NOTE} Guided by: pairs by the geometry that guided. Worse than SIFT: pairs with an "
+        f"error of {GOOD_DEG:g}° or more where SIFT's is under it; better: the other way round. "
         "Seconds: median, from the images to the matches, of the run that made them."
     )
-    groups = [(scene.name, where(rows, scene=scene.name)) for scene in scenes]
-    return _grouped("pose", "Relative poses", "scene", groups, methods, columns, note)
+    names = [scene.name for scene in scenes]
+    return _grouped("pose", "Relative poses", "scene", names, methods, rows, columns, note)
 
 
 def distance_table(scene: PosedScene, methods: Sequence[PoseMethod], rows: Rows) -> Table:
     """Tabulate each method at each frame distance of a sequence."""
     distances = sorted({pair.frame_distance or 0 for pair in scene.pairs})
-    groups = [
-        (each, where(where(rows, scene=scene.name), **{DISTANCE: each})) for each in distances
-    ]
     title = f"Relative poses in {scene.name}, by frame distance"
     key = f"pose_{file_name(scene.name)}_distances"
-    return _grouped(key, title, DISTANCE, groups, methods, SUMMARY)
+    own = where(rows, scene=scene.name)
+    return _grouped(key, title, DISTANCE, distances, methods, own, SUMMARY)
 
 
 PAIR_COLUMNS = {

@@ -10,13 +10,13 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..._shared.errors import NoDepthError
-from ..._shared.records import Arrays
 from ...batch.extraction import feature_group
 from ...batch.hdf5 import Group, import_h5py, open_hdf5, write_groups
 from ...datasets.pair_selection import evenly_spaced
@@ -58,6 +58,8 @@ SFM_POINTS = PointDetector(MAX_KEYPOINTS)
 KINDS = ("true", "estimated")
 """Intrinsics that models are made with."""
 
+MODEL_COLUMNS = {"sparse points": ",d", "track length": ".2f", "reprojection error, px": ".3f"}
+
 CAMERA_COLUMNS = {
     **{"scene": "", "keypoints": "", "intrinsics": "", "images": "d", "registered": "d"},
     **{f"AUC at {threshold:g}°": ".3f" for threshold in POSE_THRESHOLDS_DEG},
@@ -65,10 +67,10 @@ CAMERA_COLUMNS = {
     "centres, ‰ of the extent": ".2f",
     "from the first row's, unit of the truth": ".5f",
     "rotations, °": ".3f",
-    "sparse points": ",d",
-    "track length": ".2f",
-    "reprojection error, px": ".3f",
+    **MODEL_COLUMNS,
 }
+
+MAPPING_CPU = "mapping, {} intrinsics, CPU s"
 
 COST_COLUMNS = {
     "scene": "",
@@ -77,67 +79,59 @@ COST_COLUMNS = {
     "matches": ",d",
     "keypoints and matches, s": ".1f",
     "keypoints and matches, CPU s": ".1f",
-    **{f"mapping, {kind} intrinsics, CPU s": ".1f" for kind in KINDS},
+    **{MAPPING_CPU.format(kind): ".1f" for kind in KINDS},
     "memory, MB": ",.0f",
 }
 
 TEXT = (
-    "The cameras of all images of a scene and sparse points are reconstructed from nothing but the "
-    "images, as by `reconstruct_many`: every pair is matched, COLMAP verifies and maps, and a last "
-    "adjustment with a robust loss follows. All methods go through the same stages with the same "
-    "options, once with the true intrinsics and once with estimated ones; the true poses only "
-    "judge. What differs are the keypoints: the ranked points of DeepDetect; as many random points "
-    "with their sizes, described and matched as they are; and pycolmap's own SIFT with its own "
-    "matcher, at as many places at most, some of them at two angles.",
+    "The cameras of all images of a scene and sparse points, as by `reconstruct_many`: every pair "
+    "is matched, COLMAP verifies and maps, and a last adjustment with a robust loss follows. All "
+    "methods have the same stages and options, once with the true intrinsics and once with "
+    "estimated ones; the true poses only evaluate. What differs are the keypoints: the ranked "
+    "points of DeepDetect; as many random points with their sizes; and pycolmap's own SIFT with "
+    "its own matcher, at as many places at most, some of them at two angles.",
 )
 
 CAMERA_NOTE = (
-    "AUC: of the relative poses of all pairs of images, the error of a pair being the larger of "
-    "the angle of the rotation and the angle between the directions of translation; pairs with an "
-    "image that is not registered count as infinite. Centres and rotations: mean errors of the "
-    "registered cameras after the alignment of their centres (rotation, shift and scale); extent: "
-    "the largest distance of two true cameras. From the first row's: mean distance of the centres "
-    "from those of the first method; where that is much less than the errors of both, these are "
-    "the truth's, or common to both. Of cameras on a straight line the alignment leaves a rotation "
-    "open: take the AUC. Track length: mean number of images that see a point. Reprojection error: "
-    "mean; the points are the method's own, so it is no error of the cameras."
+    "AUC: of the relative poses of all pairs of images, the error being the larger of the angle of "
+    "the rotation and that between the directions of translation, infinite where an image is not "
+    "registered. Centres and rotations: mean errors of the registered cameras after the alignment "
+    "of their centres; extent: the largest distance of two true cameras. From the first row's: "
+    "mean distance of the centres from the first method's; where that is much less than the errors "
+    "of both, these are the truth's, or common to both. Of cameras on a straight line the "
+    "alignment leaves a rotation open: take the AUC. Track length: mean number of images that see "
+    "a point. Reprojection error: mean over the method's own points, so no error of the cameras."
 )
 
 COST_NOTE = (
-    "Of one process, which has no other work: keypoints, descriptors and matches on one thread, "
+    "Of one process without other work: keypoints, descriptors and matches on one thread, "
     "verification and mapping on as many as COLMAP takes. Memory: the most that the process held, "
-    "with Python and all libraries. Random points take the places of ranked ones, which are found "
-    "first: that is in their memory, not in their seconds. On a busy machine compare CPU seconds."
+    "with Python and all libraries. The ranked points, whose places random ones take, are in the "
+    "memory of these, not in their seconds. On a busy machine compare CPU seconds."
 )
 
 
 Pair = tuple[str, str]
-Finder = Callable[[Stages, Path], None]
-Matcher = Callable[[Stages, Sequence[Pair]], dict[Pair, np.ndarray]]
 
 
 @dataclass(frozen=True)
 class SfmMethod:
-    """A row of the tables.
+    """A row of the tables; `name` is also the title.
 
-    Attributes:
-        title: how tables name it.
-        find: writes the keypoints of the images in a folder; a function of a module.
-        match: returns the matches of pairs, a function of a module; None: as `reconstruct_many`.
-        depends: what results depend on besides the code, the images and the options.
-        chance: the time it takes to find the points means nothing.
+    `find` writes the keypoints of the images in a folder, `match` returns the matches of pairs
+    (None: as `reconstruct_many`); both are functions of a module. Results depend on `depends`
+    besides. With `chance` the time it takes to find the points means nothing.
     """
 
-    title: str
-    find: Finder
-    match: Matcher | None = None
+    name: str
+    find: Callable[[Stages, Path], None]
+    match: Callable[[Stages, Sequence[Pair]], dict[Pair, np.ndarray]] | None = None
     depends: str = ""
     chance: bool = False
 
     @property
-    def name(self) -> str:
-        """By which the rows know it."""
-        return self.title
+    def title(self) -> str:
+        return self.name
 
 
 @dataclass(eq=False)
@@ -174,7 +168,7 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
     for feature in options.others:
         run.skipped.append(f"sfm: {feature.title}: this benchmark runs no further methods")
     methods = sfm_methods(options)
-    rows = run.rows("", methods, chosen, lambda method, scene: measure_scene(run, method, scene))
+    rows = run.rows("", methods, chosen, partial(measure_scene, run))
     rows = [row for name in chosen for row in where(rows, item=name)]
     tables = [camera_table(rows), cost_table(rows)]
     figures = []
@@ -193,10 +187,9 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
 
 
 def choose_images(scene: PosedScene, most: int) -> SfmScene:
-    """Return the images of a scene: all, the first of a sequence, or evenly spaced ones.
+    """Return all images of a scene, the first of a sequence, or evenly spaced ones.
 
-    A sequence is one whose pairs have frame distances: between evenly spaced frames of a long one
-    there would be nothing in common.
+    Between evenly spaced frames of a long sequence there would be nothing in common.
     """
     sequence = scene.pairs[0].frame_distance is not None
     images = scene.images[:most] if sequence else evenly_spaced(scene.images, most)
@@ -217,33 +210,25 @@ def measure_scene(run: Run, method: SfmMethod, scene: SfmScene) -> Row:
     """Reconstruct a scene by a method, or read the result from the cache.
 
     Returns the values of `run_method`, the "scene", and for each kind of intrinsics the registered
-    "views" with the values of the tables' columns.
+    "views" and the `MODEL_COLUMNS`.
     """
     images = tuple(image.path for image in scene.images)
     cameras = {name: view.camera for name, view in scene.truth.items()}
     depends = (
-        (method.title, method.depends),
+        (method.name, method.depends),
         [(image.path, image.path.name, image.intrinsics) for image in scene.images],
         repr(vars(OPTIONS)),
         import_pycolmap().__version__,
     )
-    kept: Arrays = run.cached(
-        "sfm", depends, lambda: run_in_child(run_method, method, images, cameras)
-    )
-    row: Row = {"scene": scene} | {name: value.tolist() for name, value in kept.items()}
+    row = run.cached("sfm", depends, lambda: run_in_child(run_method, method, images, cameras))
+    row["scene"] = scene
     for kind in KINDS:
-        names, poses = row[f"{kind} names"], kept[f"{kind} poses"]
-        points, track_length, error_px, cpu_seconds = row[f"{kind} numbers"]
-        row[kind] = {
-            "views": {
-                name: PosedView(name, cameras[name], pose[:9].reshape(3, 3), pose[9:])
-                for name, pose in zip(names, poses, strict=True)
-            },
-            "sparse points": int(points),
-            "track length": track_length,
-            "reprojection error, px": error_px,
-            "cpu seconds": cpu_seconds,
+        poses = zip(row[f"{kind} names"].tolist(), row[f"{kind} poses"], strict=True)
+        views = {
+            name: PosedView(name, cameras[name], pose[:9].reshape(3, 3), pose[9:])
+            for name, pose in poses
         }
+        row[kind] = {"views": views, **{name: row[f"{kind} {name}"] for name in MODEL_COLUMNS}}
     return row
 
 
@@ -297,19 +282,7 @@ def _extent(truth: Views) -> float:
 
 def cost_table(rows: Rows) -> Table:
     """Tabulate what each method takes."""
-    lines = [
-        {
-            "scene": row["scene"].name,
-            "keypoints": row["method"],
-            "keypoints an image": row["keypoints"],
-            "matches": row["matches"],
-            "keypoints and matches, s": row["seconds"],
-            "keypoints and matches, CPU s": row["cpu seconds"],
-            **{f"mapping, {kind} intrinsics, CPU s": row[kind]["cpu seconds"] for kind in KINDS},
-            "memory, MB": row["memory"] / 1e6,
-        }
-        for row in rows
-    ]
+    lines = [{**row, "scene": row["scene"].name, "keypoints": row["method"]} for row in rows]
     return Table("sfm_cost", "Seconds and memory", COST_COLUMNS, lines, COST_NOTE)
 
 
@@ -319,11 +292,7 @@ def find_points(stages: Stages, folder: Path) -> None:
 
 
 def find_random_points(stages: Stages, folder: Path) -> None:
-    """Put as many random points in place of the ranked ones.
-
-    They get the sizes of these in another order, the dominant angle of the gradients there, and the
-    same descriptor.
-    """
+    """Put as many random points in place of the ranked ones, with their sizes in another order."""
     find_points(stages, folder)
     with import_h5py().File(stages.work / FEATURES, "r+") as file:
         for number, name in enumerate(sorted(path.name for path in folder.iterdir())):
@@ -334,13 +303,8 @@ def find_random_points(stages: Stages, folder: Path) -> None:
             xy = rng.uniform(0, (width - 1, height - 1), (count, 2)).astype(np.float32)
             gray = luma(load_image(folder / name))
             sizes = rng.permutation(2 * group["scales"][()])
-            points = Keypoints(
-                xy,
-                rng.random(count, np.float32),
-                (width, height),
-                sizes=sizes,
-                angles=dominant_angles(gray, xy, sizes),
-            )
+            scores, angles = rng.random(count, np.float32), dominant_angles(gray, xy, sizes)
+            points = Keypoints(xy, scores, (width, height), sizes=sizes, angles=angles)
             made = feature_group(name, describe_keypoints(gray, points)).arrays
             for kind in ("keypoints", "descriptors", "scores", "scales", "oris"):
                 group[kind][...] = made[kind]
@@ -389,14 +353,10 @@ def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
     }
 
 
-def run_method(
-    method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, Camera]
-) -> dict[str, np.ndarray]:
+def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, Camera]) -> Row:
     """Reconstruct images by a method; to be called in a process of its own.
 
-    Returns by name "keypoints", mean number in an image, "matches", of all pairs together,
-    "seconds" and "cpu seconds" of both, "memory", the most bytes that the process held; for each
-    kind of intrinsics the "names", "poses" and "numbers" of `_map`.
+    Returns the `COST_COLUMNS`, and those of `_unpacked` after "true " and "estimated ".
     """
     with tempfile.TemporaryDirectory(prefix="deepdetect-sfm-") as scratch:
         stages = Stages(Path(scratch) / "model", OPTIONS, 1, True)
@@ -412,17 +372,22 @@ def run_method(
         pairs = stages.choose_pairs(list(sizes))
         matches = method.match(stages, pairs) if method.match else stages.match(pairs)
         took = (0 if method.chance else took) + _times() - start
-        values = {
-            "keypoints": np.mean(counts),
+        row = {
+            "keypoints an image": float(np.mean(counts)),
             "matches": sum(len(rows) for rows in matches.values()),
-            "seconds": took[0],
-            "cpu seconds": took[1],
+            "keypoints and matches, s": took[0],
+            "keypoints and matches, CPU s": took[1],
         }
         for kind, known in zip(KINDS, (cameras, {}), strict=True):
-            model = _map(stages, folder, sizes, matches, known)
-            values |= {f"{kind} {name}": array for name, array in model.items()}
-        values["memory"] = peak_memory()
-        return {name: np.asarray(value) for name, value in values.items()}
+            intrinsics = initial_intrinsics(folder, sizes, known)
+            cpu = time.process_time()
+            try:
+                model = stages.map(folder, intrinsics, matches, bool(known))[0]
+            except NoDepthError:
+                model = None  # a result, too
+            row[MAPPING_CPU.format(kind)] = time.process_time() - cpu
+            row |= {f"{kind} {name}": value for name, value in _unpacked(model).items()}
+        return row | {"memory, MB": peak_memory() / 1e6}
 
 
 def _times() -> np.ndarray:
@@ -430,30 +395,21 @@ def _times() -> np.ndarray:
     return np.array([time.perf_counter(), time.process_time()])
 
 
-def _map(
-    stages: Stages,
-    folder: Path,
-    sizes: Mapping[str, tuple[int, int]],
-    matches: Mapping[Pair, np.ndarray],
-    known: Mapping[str, Camera],
-) -> dict[str, object]:
-    """Map with known cameras, or with those that are estimated; no model is a result, too.
+def _unpacked(model: Any) -> Row:
+    """Return of a model of pycolmap or None what is kept.
 
-    Returns the "names" of the registered images, (N, 12) "poses", rotation and translation, and
-    "numbers": sparse points, mean track length, mean reprojection error and CPU seconds.
+    The "names" of the registered images, (N, 12) "poses", rotation and translation, and the
+    `MODEL_COLUMNS`.
     """
-    intrinsics = initial_intrinsics(folder, sizes, known)
-    start = time.process_time()
-    try:
-        model, _, _ = stages.map(folder, intrinsics, matches, bool(known))
-    except NoDepthError:
-        numbers = (0, np.nan, np.nan, time.process_time() - start)
-        return {"names": np.empty(0, np.str_), "poses": np.empty((0, 12)), "numbers": numbers}
-    seconds = time.process_time() - start
+    if model is None:
+        nothing = {"names": np.empty(0, np.str_), "poses": np.empty((0, 12))}
+        return {**nothing, **dict.fromkeys(MODEL_COLUMNS, np.nan), "sparse points": 0}
     sparse = read_sparse_model(model)
     views = sorted(sparse.views.values(), key=lambda view: view.name)
     return {
         "names": [view.name for view in views],
         "poses": [[*view.rotation.ravel(), *np.ravel(view.translation)] for view in views],
-        "numbers": (len(sparse.points), sparse.tracks.mean(), sparse.errors.mean(), seconds),
+        "sparse points": len(sparse.points),
+        "track length": sparse.tracks.mean(),
+        "reprojection error, px": sparse.errors.mean(),
     }

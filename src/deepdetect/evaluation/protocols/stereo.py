@@ -1,8 +1,6 @@
-"""Stereo pairs with known disparity: reconstructions by several pipelines.
+"""Stereo pairs with known disparity reconstructed by several pipelines: Figure 8 of the paper.
 
-Figure 8 of the paper, and what it lacks: the true disparity, a peer, and chance baselines. A
-pipeline is a function from a scene to its points; it profiles the stages keypoints, matching and
-geometry.
+Beside it the true disparity, a peer, and chance baselines.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ import numpy as np
 
 from ..._shared.errors import ImageError
 from ..._shared.opencv import cv2
-from ..._shared.records import Arrays, file_digest
+from ..._shared.records import file_digest
 from ...datasets.middlebury import load_calibrated_pair, load_middlebury
 from ...datasets.types import CalibratedStereoPair
 from ...detector.detector import AnyDetector, DeepDetect
@@ -35,7 +33,7 @@ from ..baselines.random import AllPixels, RandomDetector
 from ..charts import picture
 from ..metrics.stereo import DISPARITY_TOLERANCES_PX, disparity_scores
 from ..options import PAPER_RESOLUTION_PX, BenchmarkOptions
-from ..profiling import Profile, StageProfiler
+from ..profiling import StageProfiler
 from ..report import Figure, Row, Section, Table, where
 from ..run import Run
 from .paper_numbers import FIGURE_8, with_paper_column
@@ -43,9 +41,6 @@ from .paper_numbers import FIGURE_8, with_paper_column
 STAGES = ("keypoints", "matching", "geometry")
 ROUNDS = 3
 """Runs of what takes seconds; the one of median time is reported."""
-
-VOXEL_EDGES = {"mm": 2.0, "baseline": 0.05}
-"""Edge of a voxel by unit."""
 
 TRUTH_OFFSETS = {"dolls": 2}
 """Baselines by which the view of a ground truth lies to the left of the left image.
@@ -57,32 +52,26 @@ AS_IT_IS = ""
 SHIFTED = "ground truth shifted to its photographs"
 
 TEXT = (
-    "Ours: `deepdetect reconstruct --rectified`: keypoints of the left view at its own size, sub- "
-    "pixel matches along the rows, depth; strict, so what lies at a disparity discontinuity is "
-    "left out. With --density 1 every pixel is asked for, and what only the left view shows is "
-    "filled in from the surface beside it (reported as filled). The paper's pipeline: images "
-    "squashed to 480x480 as BGR, SIFT, FLANN (10 trees, 100 checks), a ratio for each scene "
-    "(cones, rocks, cloth 0.9, dolls 0.85, moebius 0.77; 0.9 elsewhere), essential matrix by "
-    "RANSAC at 0.5 px, all as in the authors' notebooks. SIFT: the same with its own keypoints. "
-    "SGBM: block 5, three ways, uniqueness 10, speckle filter; every pixel, both views extended by "
-    "what the disparities reach beyond them."
+    "Ours: `deepdetect reconstruct --rectified`: strict, so what lies at a disparity discontinuity "
+    "is left out; --density 1 asks for every pixel and fills what only the left view shows. The "
+    "paper's pipeline, as in the authors' notebooks: images squashed to 480x480 as BGR, SIFT, "
+    "FLANN (10 trees, 100 checks), a ratio for each scene (cones, rocks, cloth 0.9, dolls 0.85, "
+    "moebius 0.77; others 0.9), essential matrix by RANSAC at 0.5 px. SIFT: the same with its own "
+    "keypoints. SGBM: block 5, three ways, uniqueness 10, speckle filter, both views extended."
 )
 
 NOTE = (
-    "1 - bad-t: fraction of the points whose true disparity is known that are at most t px "
-    "off; EPE: their mean error; completeness: fraction of the pixels with known truth, hidden "
-    "ones too, with a point at most 1 px off; the F-score is the harmonic mean of both. "
-    "Half-occluded: pixels whose true counterpart lies outside the right image. "
-    "Voxels: cubes that hold a point; the paper calls the matches left by the essential matrix "
-    f"voxels. Seconds: median of {ROUNDS} runs for ours and SGBM, one run for the others; from "
-    "images in memory. Memory: the growth of the process during the stage; all: the most that "
-    "it had grown by since the first stage began, the largest of the runs."
+    "1 - bad-t: fraction of the points with known truth at most t px off; EPE: their mean error; "
+    "completeness: fraction of the pixels with known truth, hidden ones too, with a point at most "
+    "1 px off; F-score: harmonic mean of both. Half-occluded: the true counterpart lies outside "
+    "the right image. Voxels: cubes that hold a point; the paper means the matches left by the "
+    f"essential matrix. Seconds: median of {ROUNDS} runs (ours, SGBM) or one, from images in "
+    "memory. Memory: growth of the process in the stage; all: since the first began, largest run."
 )
 
 SHIFTED_NOTE = (
-    "The true disparity in the file belongs to another view than the photographs: shifted by whole "
-    "baselines it fits them far better. Here it is shifted, and what is hidden from the left view "
-    "left out."
+    "The true disparity belongs to another view than the photographs; here it is shifted by whole "
+    "baselines, which fits them far better, without what the left view does not see."
 )
 
 
@@ -93,18 +82,13 @@ matched but filled in, and what the stages took."""
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """What turns two images into points.
+    """What turns two images into points; `name` is also the title in tables.
 
-    Attributes:
-        title: how tables name it.
-        run: reconstructs a scene.
-        version: what results depend on besides the title.
-        rounds: how often it is run for its time.
-        drawn: its title in Figure 8; empty: not drawn.
-        paper: the points in the paper by scene.
+    Results depend on `version` besides the name. `drawn` is the title in Figure 8 (empty: not
+    drawn), `paper` the number of points in the paper by scene.
     """
 
-    title: str
+    name: str
     run: Callable[[CalibratedStereoPair], Points]
     version: str = ""
     rounds: int = ROUNDS
@@ -112,9 +96,8 @@ class Pipeline:
     paper: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def name(self) -> str:
-        """By which the cache and the rows know it."""
-        return self.title
+    def title(self) -> str:
+        return self.name
 
 
 def middlebury(run: Run, options: BenchmarkOptions) -> list[Section]:
@@ -146,36 +129,28 @@ def middlebury(run: Run, options: BenchmarkOptions) -> list[Section]:
 def reconstruct_points(run: Run, pipeline: Pipeline, scene: Path) -> Row:
     """Reconstruct a scene, the run of median time, or read it from the cache.
 
-    Returns the "pixels", their "disparity", and what does not depend on the truth by the titles of
-    the columns.
+    Returns the "pixels", their "disparity", and the columns that do not depend on the truth.
     """
 
-    def make() -> Arrays:
+    def make() -> Row:
         pair = load_calibrated_pair(scene)
         runs = [pipeline.run(pair) for _ in range(pipeline.rounds)]
         runs = sorted(runs, key=lambda points: points[3].seconds)
         pixels, disparity, filled, profiler = runs[len(runs) // 2]
+        stages = profiler.stages.items()
         return {
             "pixels": pixels,
             "disparity": disparity,
-            "filled": np.array(filled),
-            "memory": np.array(max(profiler.memory for *_, profiler in runs)),
-            **{name: profile.packed() for name, profile in profiler.stages.items()},
+            "points": len(pixels),
+            "of them filled": filled,
+            **{f"{stage}, s": profile.seconds for stage, profile in stages},
+            "seconds": profiler.seconds,
+            **{f"{stage}, MB": profile.memory / 1e6 for stage, profile in stages},
+            "all, MB": max(profiler.memory for *_, profiler in runs) / 1e6,
         }
 
     files = [scene / name for name in ("left.png", "right.png", "calib.json")]
-    kept = run.cached("stereo", (pipeline.name, pipeline.version, files), make)
-    stages = {stage: Profile(*kept[stage].tolist()) for stage in STAGES if stage in kept}
-    return {
-        "pixels": kept["pixels"],
-        "disparity": kept["disparity"],
-        "points": len(kept["pixels"]),
-        "of them filled": int(kept["filled"]),
-        **{f"{stage}, s": profile.seconds for stage, profile in stages.items()},
-        "seconds": sum(profile.seconds for profile in stages.values()),
-        **{f"{stage}, MB": profile.memory / 1e6 for stage, profile in stages.items()},
-        "all, MB": int(kept["memory"]) / 1e6,
-    }
+    return run.cached("stereo", (pipeline.name, pipeline.version, files), make)
 
 
 def points_table(
@@ -186,8 +161,7 @@ def points_table(
     truth: np.ndarray | None,
 ) -> Table:
     """Tabulate number, accuracy, time and memory of the points of all pipelines."""
-    unit = _unit(pair)
-    edge = VOXEL_EDGES[unit]
+    unit, edge = _voxel(pair)
     voxels = f"voxels of {edge:g} {unit}"
     columns = {
         **{"pipeline": "", "points": ",d", "of them filled": ",d", voxels: ",d"},
@@ -201,24 +175,23 @@ def points_table(
     }
     lines: list[Row] = []
     for pipeline in compared:
-        lines.append({"pipeline": pipeline.title, **found.get(pipeline.name, {})})
+        line = {"pipeline": pipeline.name, **found.get(pipeline.name, {})}
         if pipeline.name in found:
-            points = lines[-1]["pixels"], lines[-1]["disparity"]
-            lines[-1][voxels] = count_voxels(pair.calibration, *points, edge)
-            lines[-1] |= {} if truth is None else disparity_scores(*points, truth)
+            points = line["pixels"], line["disparity"]
+            line[voxels] = count_voxels(pair.calibration, *points, edge)
+            line |= {} if truth is None else disparity_scores(*points, truth)
+        lines.append(line)
     key = f"middlebury_{pair.name}" + ("_shifted" if which == SHIFTED else "")
-    paper = {p.title: p.paper[pair.name] for p in compared if pair.name in p.paper}
+    paper = {p.name: p.paper[pair.name] for p in compared if pair.name in p.paper}
     title = f"{pair.name}, {which}" if which else pair.name
-    note = NOTE
-    if truth is None:
-        note = f"There is no true disparity: nothing is evaluated. {note}"
-    elif which == SHIFTED:
-        note = f"{SHIFTED_NOTE} {note}"
+    unknown = "" if truth is not None else "There is no true disparity: nothing is evaluated. "
+    note = f"{SHIFTED_NOTE} {NOTE}" if which == SHIFTED else unknown + NOTE
     return with_paper_column(Table(key, title, columns, lines, note), "points", paper)
 
 
-def _unit(pair: CalibratedStereoPair) -> str:
-    return "mm" if pair.calibration.baseline_mm else "baseline"
+def _voxel(pair: CalibratedStereoPair) -> tuple[str, float]:
+    """Return the unit of a scene, and the edge of its voxels."""
+    return ("mm", 2.0) if pair.calibration.baseline_mm else ("baseline", 0.05)
 
 
 def count_voxels(
@@ -243,7 +216,6 @@ def clouds_figure(
 ) -> Figure | None:
     """Draw Figure 8: the points of the pipelines that the paper draws; None without any."""
     clouds = {}
-    unit = _unit(pair)
     # Ours come last, as in the paper.
     for pipeline in sorted(compared, key=lambda pipeline: pipeline.drawn == "ours"):
         points = found.get(pipeline.name)
@@ -251,7 +223,7 @@ def clouds_figure(
             continue
         space, kept = _triangulate(pair.calibration, points["pixels"], points["disparity"])
         columns, rows = np.rint(points["pixels"][kept]).astype(np.int64).T
-        clouds[pipeline.drawn] = PointCloud(space, pair.left[rows, columns], unit)
+        clouds[pipeline.drawn] = PointCloud(space, pair.left[rows, columns], _voxel(pair)[0])
     if not any(map(len, clouds.values())):
         return None
     counts = ", ".join(f"{name} {len(cloud):,}" for name, cloud in clouds.items())
@@ -293,23 +265,18 @@ PAPER_SETTINGS: dict[str, tuple[float, float, float, float]] = {
 
 PAPER_FLANN_TREES = 10
 PAPER_FLANN_CHECKS = 100
-PAPER_RANSAC_CONFIDENCE = 0.99999
-PAPER_RANSAC_THRESHOLD_PX = 0.5
-PAPER_RANSAC_ITERATIONS = 100_000
 
 
 def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
     """Return what is compared, chance baselines last."""
     detectors = options.stereo_detectors()
-    versions = [
-        f"{file_digest(each.weights)[:16]} {each.runtime} {each.heatmap_options}"
-        for each in detectors.values()
-    ]
     found: list[Pipeline] = []
-    for (name, detector), version in zip(detectors.items(), versions, strict=True):
-        reconstruct_ours = partial(_ours, detector=detector)
+    for name, detector in detectors.items():
+        weights = file_digest(detector.weights)[:16]
+        version = f"{weights} {detector.runtime} {detector.heatmap_options}"
         drawn = "" if found else "ours"
-        found.append(Pipeline(f"ours, weights {name}", reconstruct_ours, version, drawn=drawn))
+        ours = partial(_ours, detector=detector)
+        found.append(Pipeline(f"ours, weights {name}", ours, version, drawn=drawn))
     for name, detector in detectors.items():
         squashed = detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX, "bgr"))
         feature = deepdetect_feature(squashed, title=f"the paper's pipeline, weights {name}")
@@ -323,7 +290,7 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
     return [
         *found,
         Pipeline("OpenCV's SGBM", sgbm),
-        Pipeline("baseline: as many random pixels as ours", random, versions[0], 1),
+        Pipeline("baseline: as many random pixels as ours", random, found[0].version, 1),
         Pipeline("baseline: all pixels", every),
         Pipeline("all pixels, --density 1", partial(every, density=1)),
     ]
@@ -372,11 +339,7 @@ def _paper(feature: LocalFeature, drawn: str = "", paper: Mapping[str, float] = 
 def paper_points(
     feature: LocalFeature, scene: CalibratedStereoPair, profiler: StageProfiler
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match a stereo pair and keep what the essential matrix leaves: the paper's "voxels".
-
-    FLANN with 10 trees and 100 checks, a ratio chosen for each scene, and RANSAC; pose and
-    triangulation are computed for the time they take. Returns (M, 2) and (M, 2) float64.
-    """
+    """Match a stereo pair; return the (M, 2) points that the essential matrix leaves ("voxels")."""
     images = scene.left, scene.right
     ratio, camera_matrix = paper_settings(scene)
     features = [feature.detect(rgb) for rgb in images]
@@ -414,9 +377,9 @@ def essential_inliers(
         points1,
         camera_matrix,
         method=cv2.RANSAC,
-        prob=PAPER_RANSAC_CONFIDENCE,
-        threshold=PAPER_RANSAC_THRESHOLD_PX,
-        maxIters=PAPER_RANSAC_ITERATIONS,
+        prob=0.99999,
+        threshold=0.5,
+        maxIters=100_000,
     )
     if essential is None:
         return points0[:0], points1[:0]
@@ -429,10 +392,9 @@ def essential_inliers(
 
 
 def sgbm(scene: CalibratedStereoPair) -> Points:
-    """Run OpenCV's semi-global matching on every pixel.
+    """Run OpenCV's semi-global matching on every pixel, in the range that ours finds.
 
-    With the range that ours finds, from 0 or below, made a multiple of 16. Both views are extended
-    by what it reaches beyond them, so that it gives values at the margins, too.
+    From 0 or below; both views are extended by it, so that there are values at the margins, too.
     """
     profiler = StageProfiler()
     gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
@@ -454,10 +416,9 @@ def sgbm_disparity(
     borders_px: tuple[int, int] = (0, 0),
     min_disparity: int = 0,
 ) -> np.ndarray:
-    """Run OpenCV's semi-global matching: block 5, three ways, uniqueness 10, speckle filter.
+    """Run OpenCV's semi-global matching on RGB views, extended by borders on the left and right.
 
-    A multiple of 16 of disparities is tried; both (H, W, 3) uint8 RGB views are extended by the
-    borders on the left and on the right. Returns (H, W) float32 in pixels, NaN where there is none.
+    A multiple of 16 of disparities is tried. Returns (H, W) float32 in pixels, NaN without one.
     """
     matcher = cv2.StereoSGBM_create(
         minDisparity=min_disparity,

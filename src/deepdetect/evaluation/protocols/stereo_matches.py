@@ -20,44 +20,35 @@ def score_stereo_matches(
 ) -> list[dict[str, Any]]:
     """Match rectified pairs with several sources of keypoints, and evaluate the matches.
 
-    By descriptors alone over the whole image (SIFT, FLANN, ratio 0.99): neither the rows nor the
-    true disparity are used. A source's rows are followed by those of random points at its density,
-    since more keypoints always find more; all pixels come last.
+    By descriptors alone over the whole image: neither the rows nor the true disparity are used. A
+    source's rows are followed by those of random points at its density, since more keypoints always
+    find more; all pixels come last.
     """
+    rows: list[dict[str, Any]] = []
     with progress(len(pairs) * (2 * len(sources) + 1), "matching", "pair", quiet) as bar:
 
-        def evaluated(source: str, pair: StereoPair, found: Matches) -> dict[str, Any]:
-            bar.update(1)
+        def evaluate(source: str, pair: StereoPair, found: Matches) -> None:
             score = stereo_score(found.points0, found.points1, pair.disparity)
-            return {
-                "source": source,
-                "pair": pair.name,
-                "density": (found.keypoints0.density + found.keypoints1.density) / 2,
-                "score": vars(score),
-                "precision": score.precision,
-            }
+            density = (found.keypoints0.density + found.keypoints1.density) / 2
+            row = {"source": source, "pair": pair.name, "density": density}
+            rows.append({**row, "score": vars(score), "precision": score.precision})
+            bar.update(1)
 
-        rows: list[dict[str, Any]] = []
         for name, detector in sources.items():
-            own = [evaluated(name, pair, match_stereo(pair, detector)) for pair in pairs]
-            rows += own
-            rows += [
-                evaluated(f"random, as {name}", pair, match_random_points(pair, row["density"]))
-                for pair, row in zip(pairs, own, strict=True)
-            ]
-        every = AllPixels()
-        return rows + [evaluated("all pixels", pair, match_stereo(pair, every)) for pair in pairs]
+            for pair in pairs:
+                evaluate(name, pair, match_stereo(pair, detector))
+            for pair, row in zip(pairs, rows[-len(pairs) :], strict=True):
+                evaluate(f"random, as {name}", pair, match_random_points(pair, row["density"]))
+        for pair in pairs:
+            evaluate("all pixels", pair, match_stereo(pair, AllPixels()))
+    return rows
 
 
 def match_stereo(pair: StereoPair, detector: AnyDetector, density: float | None = None) -> Matches:
     """Match both views by descriptors alone and without estimating their geometry."""
+    selection = SelectionOptions(density=density)
     return match_images(
-        pair.left,
-        pair.right,
-        detector,
-        selection=SelectionOptions(density=density),
-        guided_matching=False,
-        model="none",
+        pair.left, pair.right, detector, selection=selection, guided_matching=False, model="none"
     )
 
 
