@@ -7,7 +7,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
 
 from deepdetect.detector.network.espnet import ESPNet  # noqa: E402
-from deepdetect.training.optim import Soap, make_optimizers, state_shapes  # noqa: E402
+from deepdetect.training.optim import Soap, make_optimizers  # noqa: E402
 
 
 def ill_conditioned(size: int = 6) -> tuple[torch.Tensor, torch.Tensor]:
@@ -80,17 +80,3 @@ def test_every_parameter_of_the_network_is_moved_by_one_optimiser(name: str) -> 
     optimizers = make_optimizers(name, network)
     held = [p for o in optimizers for group in o.param_groups for p in group["params"]]
     assert sorted(map(id, held)) == sorted(map(id, network.parameters()))
-
-
-@pytest.mark.parametrize("name", ["adam", "soap"])
-def test_the_shapes_of_the_state_are_known(name: str) -> None:
-    """A checkpoint is compared with them before an optimiser gets it."""
-    network = torch.nn.Sequential(torch.nn.Conv2d(3, 4, 3), torch.nn.PReLU(4))
-    optimizers = make_optimizers(name, network)
-    network(torch.rand(1, 3, 8, 8)).sum().backward()
-    for optimizer in optimizers:
-        optimizer.step()
-        for parameter, state in optimizer.state.items():
-            found = {moment: tuple(value.shape) for moment, value in state.items()}
-            assert found == state_shapes(optimizer, parameter)
-            assert {value.dtype for value in state.values()} == {torch.float32}

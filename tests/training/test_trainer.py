@@ -17,9 +17,9 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
 
-from safetensors.torch import load_file, save_file  # noqa: E402
+from safetensors.torch import load_file  # noqa: E402
 
-from deepdetect import DeepDetect, OptionError  # noqa: E402
+from deepdetect import DeepDetect, OptionError, WeightsError  # noqa: E402
 from deepdetect.detector.network.espnet import ESPNet  # noqa: E402
 from deepdetect.detector.network.weights import (  # noqa: E402
     average_weights,
@@ -138,7 +138,7 @@ def test_the_best_weights_say_where_they_come_from(run: Path) -> None:
     assert "torch 2." in notes["versions"]
     assert len(notes["images_digest"]) == 16
     assert json.loads(notes["options"])["seed"] == 0
-    metadata = read_checkpoint(run / "checkpoint.safetensors").metadata
+    metadata = read_checkpoint(run / "checkpoint.safetensors")[1]
     assert {"command", "commit", "versions", "machine", "images"} <= metadata.keys()
     card = (run / "MODEL_CARD.md").read_text()
     for name in ("command", "commit", "versions", "images_digest", "initial_weights"):
@@ -153,7 +153,7 @@ def test_an_interrupted_run_ends_with_the_same_weights(
 ) -> None:
     with monkeypatch.context() as patch, interrupted(patch, method, count):
         fit(tmp_path)
-    step = read_checkpoint(tmp_path / "checkpoint.safetensors").metadata["step"]
+    step = read_checkpoint(tmp_path / "checkpoint.safetensors")[1]["step"]
     assert 0 < step < STEPS
     fit(tmp_path)
     assert same_run(tmp_path, run)
@@ -192,32 +192,11 @@ def test_another_run_in_the_same_folder_is_refused(
         one_line(caught.value)
 
 
-def _not_finite(path: Path) -> None:
-    tensors = {
-        name: torch.full_like(value, float("nan")) if value.is_floating_point() else value
-        for name, value in load_file(path).items()
-    }
-    save_file(tensors, path, metadata=read_notes(path))
-
-
-def _without_notes(path: Path) -> None:
-    save_file(load_file(path), path)
-
-
-@pytest.mark.parametrize("change", [Path.unlink, _not_finite, _without_notes])
-def test_damaged_best_weights_of_a_finished_run_are_replaced_by_the_last(
-    change: Any, run: Path, tmp_path: Path, fit
-) -> None:
-    shutil.copytree(run, tmp_path, dirs_exist_ok=True)
-    change(tmp_path / "best.safetensors")
-    lines: list[str] = []
-    result = fit(tmp_path, log=lines.append)
-    assert [line for line in lines if "missing or damaged" in line and "last weights" in line]
-    assert result.best == result.points[-1]
-    last = load_file(run / "checkpoint.safetensors")
-    for name, value in load_file(tmp_path / "best.safetensors").items():
-        assert torch.equal(value, last[f"network.{name}"])
-    assert DeepDetect(tmp_path / "deepdetect.onnx").backend
+def test_missing_best_weights_are_told(run: Path, tmp_path: Path, fit, one_line) -> None:
+    shutil.copy(run / "checkpoint.safetensors", tmp_path)
+    with pytest.raises(WeightsError, match=r"best\.safetensors") as caught:
+        fit(tmp_path)
+    one_line(caught.value)
 
 
 @pytest.mark.slow
@@ -317,8 +296,8 @@ def test_a_killed_run_ends_with_the_same_weights(
     process.send_signal(signal.SIGKILL)
     process.communicate()
     assert process.returncode == -signal.SIGKILL, "the run must be killed before its end"
-    last = read_checkpoint(tmp_path / "whole" / "checkpoint.safetensors").metadata["step"]
-    assert 0 < read_checkpoint(checkpoint).metadata["step"] < last
+    last = read_checkpoint(tmp_path / "whole" / "checkpoint.safetensors")[1]["step"]
+    assert 0 < read_checkpoint(checkpoint)[1]["step"] < last
     subprocess.run(arguments, check=True, capture_output=True)
     assert same_run(tmp_path / "killed", tmp_path / "whole")
 

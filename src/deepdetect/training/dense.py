@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, pad
 from torch.utils.data import DataLoader
 
-from .._shared.errors import OptionError, WeightsError
+from .._shared.errors import OptionError
 from .._shared.options import look_up
 from ..detector.network.espnet import ESPNet
 from ..detector.network.onnx_export import export_onnx
@@ -117,11 +117,9 @@ class DenseTask(Task):
         )
 
     def pixels(self, batch: tuple[Tensor, Tensor]) -> int:
-        """Return the number of pixels in a batch, over all processes."""
         return batch[1].numel() * self.fabric.world_size
 
     def learning_rate(self, step: int) -> float:
-        """Return the learning rate of a step."""
         return self.schedule.learning_rate(step)
 
     def loss(self, batch: tuple[Tensor, Tensor]) -> Tensor:
@@ -185,24 +183,17 @@ class DenseTask(Task):
         return torch.sigmoid(logits.float()).cpu().numpy()
 
     def save(self, path: Path, notes: Mapping[str, Any]) -> None:
-        """Write the weights."""
         save_weights(self.network, path, dict(notes))
 
     def read_notes(self, path: Path) -> Mapping[str, Any]:
-        """Read the notes of whole, finite weights of this network."""
-        tensors = load_network(path, NETWORKS[self.options.network]).state_dict().values()
-        if not all(value.isfinite().all() for value in tensors):
-            raise WeightsError(f"{path} is not finite")
         return read_notes(path)
 
     def export(self, folder: Path) -> Path:
-        """Write the best weights as ONNX."""
         best = load_network(folder / self.weights_file, NETWORKS[self.options.network])
         export_onnx(best, folder / ONNX)
         return folder / ONNX
 
     def card(self, best: Point) -> tuple[str, list[str]]:
-        """Say in the model card what the network is, and how good it is."""
         count = sum(parameter.numel() for parameter in self.network.parameters())
         network = (
             f"{type(self.network).__name__}, {count:,} parameters. Input: RGB in [0, 1]; output: "

@@ -47,7 +47,7 @@ def write_model_card(
     """
     network, quality = describe(json.loads(notes["point"]))
     options = json.loads(notes["options"])
-    known = ("command", "options", "point", "run")
+    known = ("command", "options", "point")
     lines = [
         "# Model card",
         "",

@@ -34,21 +34,6 @@ def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:
     return [Soap(kernels), torch.optim.Adam(vectors, fused=True)]
 
 
-def state_shapes(optimizer: Optimizer, parameter: Tensor) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of what an optimiser of `make_optimizers` keeps of a parameter."""
-    if isinstance(optimizer, Soap):
-        rows, columns = len(parameter), parameter[0].numel()
-        return {
-            "step": (),
-            "exp_avg": (rows, columns),
-            "exp_avg_sq": (rows, columns),
-            **dict.fromkeys(("left", "left_basis"), (rows, rows)),
-            **dict.fromkeys(("right", "right_basis"), (columns, columns)),
-        }
-    shape = tuple(parameter.shape)
-    return {"step": (), "exp_avg": shape, "exp_avg_sq": shape}
-
-
 class Soap(Optimizer):
     """SOAP (arXiv:2409.11321): Adam in the eigenbasis of Shampoo's preconditioner.
 

@@ -8,7 +8,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +17,11 @@ from torch.nn.utils import clip_grad_norm_
 from torch.optim import Optimizer
 from torch.utils.data import DataLoader
 
-from .._shared.errors import OptionError, WeightsError
+from .._shared.errors import OptionError
 from .._shared.progress import progress
 from .._shared.provenance import provenance
-from .._shared.records import check_same, key, plain
-from .checkpoint import Point, TrainingState, read_checkpoint, save_checkpoint
+from .._shared.records import check_same, plain
+from .checkpoint import Point, read_checkpoint, restore, save_checkpoint
 from .dataset import loading
 from .model_card import save_curves, write_model_card
 
@@ -93,7 +93,7 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def read_notes(self, path: Path) -> Mapping[str, Any]:
-        """Read the notes of a file of weights; a WeightsError where it is missing or damaged."""
+        """Read the notes of a file of weights; a WeightsError where it is missing."""
 
     @abc.abstractmethod
     def card(self, best: Point) -> tuple[str, list[str]]:
@@ -131,6 +131,16 @@ class Task(abc.ABC):
         return value
 
 
+@dataclass
+class TrainingState:
+    """The steps done, the curves, and the losses of the batches since their last point."""
+
+    step: int = 0
+    loss_sum: float = 0.0
+    loss_count: int = 0
+    points: list[Point] = field(default_factory=list)
+
+
 @dataclass(frozen=True)
 class TrainingResult:
     """The results of a run.
@@ -155,7 +165,7 @@ class Trainer:
 
     Raises:
         OptionError: the folder holds a run with other options, images or initial weights.
-        WeightsError: its checkpoint is damaged.
+        WeightsError: its checkpoint is damaged, or its best weights are missing.
     """
 
     def __init__(self, task: Task, folder: Path, log: Callable[[str], None] | None = None) -> None:
@@ -167,23 +177,21 @@ class Trainer:
         self.notes = {"options": recipe, **task.origin, **task.notes}
         self.weights = folder / task.weights_file
         self.state = TrainingState()
-        self.best: Point | None = None
         if (folder / CHECKPOINT).exists():
             self._resume()
+
+    @property
+    def best(self) -> Point | None:
+        """The point of the best weights so far."""
+        name, sign = self.task.objective, self.task.sign
+        return min(self.state.points, key=lambda point: sign * point[name], default=None)
 
     def fit(self) -> TrainingResult:
         """Train to the last step."""
         task, state = self.task, self.state
         measured = {point["step"] for point in state.points}
         if state.step in task.milestones and state.step not in measured:
-            self._validate()  # a run of no steps, or one that was interrupted while it validated
-        if self.best is None and state.points:
-            at_end = state.step == task.steps
-            when = "with the last weights" if at_end else "at the next validation"
-            if self.log is not None:
-                self.log(f"{self.weights} is missing or damaged: it is written again {when}")
-            if at_end:
-                self._keep(state.points[-1])
+            self._validate()  # the start, or a run that was interrupted while it validated
         started, pixels = time.monotonic(), 0
         saved = started
         bar = progress(task.steps, "training", "step", self.log is None, state.step)
@@ -196,8 +204,10 @@ class Trainer:
                 bar.update(1)
                 speed = pixels / FULL_IMAGE_PIXELS / (time.monotonic() - started)
                 loss = state.loss_sum / state.loss_count
-                best = "" if self.best is None else f"best {self.best[task.objective]:.4f}, "
-                bar.set_postfix_str(f"loss {loss:.4f}, {best}{speed:.1f} images/s", False)
+                text = f"loss {loss:.4f}, {speed:.1f} images/s"
+                if best := self.best:
+                    text += f", best {best[task.objective]:.4f}"
+                bar.set_postfix_str(text, False)
                 if state.step in task.milestones:
                     self._save()  # the validation takes its time, too
                     self._validate()
@@ -205,13 +215,14 @@ class Trainer:
                     self._save()
                     saved = time.monotonic()
         speed = pixels / FULL_IMAGE_PIXELS / max(time.monotonic() - started, 1e-9)
-        assert self.best is not None  # the last step is a milestone
+        best = self.best
+        assert best is not None  # the last step is a milestone
         onnx = None
         if task.is_main:
             onnx = task.export(self.folder)
             notes = task.read_notes(self.weights)
             write_model_card(self.folder / CARD, self.weights, task.card, notes, state.points)
-        return TrainingResult(self.weights, onnx, state.points, self.best, speed)
+        return TrainingResult(self.weights, onnx, state.points, best, speed)
 
     def _validate(self) -> None:
         """Measure the weights, keep them if they are the best so far, and save the state."""
@@ -220,19 +231,12 @@ class Trainer:
         point = {"step": state.step, "training_loss": loss, **task.validate(state.step)}
         state.loss_sum, state.loss_count = 0.0, 0
         state.points.append(point)
-        name, sign = task.objective, task.sign
-        if self.best is None or sign * point[name] < sign * self.best[name]:
-            self._keep(point)
         if task.is_main:
+            if self.best is point:
+                notes = {**self.notes, **provenance(), "point": json.dumps(point)}
+                task.save(self.weights, notes)
             save_curves(state.points, self.columns, self.folder)
         self._save()
-
-    def _keep(self, point: Point) -> None:
-        """Write the weights as the best so far."""
-        self.best = point
-        if self.task.is_main:
-            notes = {**self.notes, **provenance(), "run": key(self.inputs)}
-            self.task.save(self.weights, notes | {"point": json.dumps(point)})
 
     def _save(self) -> None:
         if self.task.is_main:
@@ -242,16 +246,11 @@ class Trainer:
             save_checkpoint(path, self.task.network, self.task.optimizers, metadata)
 
     def _resume(self) -> None:
-        found = read_checkpoint(self.folder / CHECKPOINT)
+        tensors, metadata = read_checkpoint(self.folder / CHECKPOINT)
         advice = "use the same to resume the run, or another `output`"
-        check_same(self.folder, found.metadata.get("inputs"), self.inputs, advice)
-        self.state = found.state(self.task.steps, self.columns)
-        if self.state.step:  # before the first step optimisers have no moments
-            found.restore(self.task.network, self.task.optimizers)
-        try:
-            notes = self.task.read_notes(self.weights)
-        except (WeightsError, ValueError):  # they are written again
-            return
-        if notes.get("run") == key(self.inputs):
-            of_weights = (p for p in self.state.points if json.dumps(p) == notes.get("point"))
-            self.best = next(of_weights, None)
+        check_same(self.folder, metadata.get("inputs"), self.inputs, advice)
+        names = [each.name for each in dataclasses.fields(TrainingState)]
+        self.state = TrainingState(**{name: metadata[name] for name in names})
+        restore(tensors, self.task.network, self.task.optimizers)
+        if self.state.points:
+            self.task.read_notes(self.weights)  # an error now rather than at the end

@@ -95,7 +95,6 @@ class RankerTask(Task):
         )
 
     def pixels(self, batch: Sequence[CandidatePair]) -> int:
-        """Return the number of pixels in a batch."""
         return 2 * len(batch) * self.options.side**2
 
     def loss(self, batch: Sequence[CandidatePair]) -> Tensor:
@@ -131,15 +130,12 @@ class RankerTask(Task):
         return measure(partial(detect_points, ranker=self.average.export({})), self.pairs)
 
     def save(self, path: Path, notes: Mapping[str, Any]) -> None:
-        """Write the average of the weights."""
         save_ranker(self.average.export(dict(notes)), path)
 
     def read_notes(self, path: Path) -> Mapping[str, Any]:
-        """Read the notes of a whole ranker."""
         return notes_of(load_ranker(path))
 
     def card(self, best: Point) -> tuple[str, list[str]]:
-        """Say in the model card what the ranker is, and how good it is."""
         count = sum(parameter.numel() for parameter in self.ranker.parameters())
         network = (
             f"a perceptron of {count:,} parameters that ranks maxima of |det Hessian| in a scale\n"
