@@ -13,7 +13,7 @@ from deepdetect.interchange.collection import check_upright
 from deepdetect.interchange.colmap import write_colmap_text
 from deepdetect.interchange.hloc import write_hloc
 from deepdetect.io.image import ORIENTATION_TAG, luma
-from deepdetect.sfm.database import sift_bytes
+from deepdetect.sfm.colmap import sift_bytes
 
 
 def test_each_keypoint_is_matched_once() -> None:

@@ -12,8 +12,7 @@ pytest.importorskip("pycolmap", reason="needs pycolmap")
 from deepdetect import Camera, Keypoints, OptionError
 from deepdetect.interchange import Collection
 from deepdetect.interchange.colmap import write_colmap, write_colmap_text
-from deepdetect.sfm.colmap import import_pycolmap
-from deepdetect.sfm.intrinsics import CameraIntrinsics
+from deepdetect.sfm.colmap import CameraIntrinsics, import_pycolmap
 
 INTRINSICS = CameraIntrinsics.of_camera(Camera((120, 110), 100.0))
 

@@ -7,6 +7,7 @@ import pytest
 
 from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.sfm import dense
+from deepdetect.sfm.colmap import CameraIntrinsics
 from deepdetect.sfm.dense import (
     DensePoints,
     find_references,
@@ -14,7 +15,6 @@ from deepdetect.sfm.dense import (
     limited_view,
     merge_dense_points,
 )
-from deepdetect.sfm.intrinsics import CameraIntrinsics
 from deepdetect.sfm.mapping import RegisteredImage, SparseModel
 
 SIZE = (320, 240)

@@ -10,8 +10,7 @@ import pytest
 
 from deepdetect import Camera, Keypoints
 from deepdetect.sfm import mapping
-from deepdetect.sfm.database import write_database
-from deepdetect.sfm.intrinsics import CameraIntrinsics
+from deepdetect.sfm.colmap import CameraIntrinsics, write_database
 from deepdetect.sfm.mapping import (
     adjust,
     camera_spacing,

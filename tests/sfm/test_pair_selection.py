@@ -6,8 +6,8 @@ import pytest
 
 from deepdetect import OptionError
 from deepdetect.features.sift import to_root_sift
-from deepdetect.sfm.options import MultiViewOptions
 from deepdetect.sfm.pair_selection import similar_pairs, vlad_vectors
+from deepdetect.sfm.stages import MultiViewOptions
 
 
 def test_small_sets_are_matched_exhaustively_and_large_ones_by_likeness() -> None:

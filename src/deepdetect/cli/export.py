@@ -27,8 +27,7 @@ from ..interchange import (
 )
 from ..interchange.collection import check_names, check_upright
 from ..io.image import find_images
-from ..sfm.colmap import import_pycolmap
-from ..sfm.intrinsics import initial_intrinsics, known_cameras
+from ..sfm.colmap import import_pycolmap, initial_intrinsics, known_cameras
 from ..sfm.pipeline import reconstruct_many
 from . import _options as cli
 from .reconstruct import MANY

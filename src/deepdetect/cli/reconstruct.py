@@ -16,9 +16,8 @@ from ..io.point_cloud import find_writer
 from ..reconstruction.files import ENDINGS, save_reconstruction
 from ..reconstruction.pipeline import reconstruct as reconstruct_pair
 from ..sfm.colmap import import_pycolmap
-from ..sfm.options import MultiViewOptions
 from ..sfm.pipeline import MAX_KEYPOINTS, check_output_folder, output_files, reconstruct_many
-from ..sfm.stages import check_images
+from ..sfm.stages import MultiViewOptions, check_images
 from . import _options as cli
 from ._detection import NETWORK, POINTS, SELECTION, Detector, Kind, chosen_detector
 

@@ -1,4 +1,4 @@
-"""COLMAP: a database, or its text files of features and matches; `sfm.database` has the units."""
+"""COLMAP: a database, or its text files of features and matches; `sfm.colmap` has the units."""
 
 from __future__ import annotations
 
@@ -10,9 +10,14 @@ import numpy as np
 from .._shared.atomic import atomic_path
 from .._shared.errors import OptionError
 from .._shared.options import suggest_keywords
-from ..sfm.colmap import PIXEL_CENTRE, import_pycolmap
-from ..sfm.database import orientations_of, sift_bytes, write_database
-from ..sfm.intrinsics import CameraIntrinsics
+from ..sfm.colmap import (
+    PIXEL_CENTRE,
+    CameraIntrinsics,
+    import_pycolmap,
+    orientations_of,
+    sift_bytes,
+    write_database,
+)
 from ..sfm.mapping import verify_pairs
 from .collection import Collection, check_names
 

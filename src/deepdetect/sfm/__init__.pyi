@@ -1,3 +1,3 @@
-from .options import MultiViewOptions as MultiViewOptions
+from .stages import MultiViewOptions as MultiViewOptions
 from .pipeline import reconstruct_many as reconstruct_many
 from .result import MultiViewReconstruction as MultiViewReconstruction

@@ -1,27 +1,42 @@
-"""pycolmap: imported in the right order, and quiet."""
+"""COLMAP: pycolmap, its camera models, and its database.
+
+COLMAP's centre of the first pixel is (0.5, 0.5), ours (0, 0): half a pixel is added to positions.
+Its scale is sigma, half of OpenCV's diameter, and its orientation is in radians, clockwise as
+OpenCV's.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from .._shared.errors import MissingExtraError
-from .._shared.opencv import import_opencv
+import numpy as np
+
+from .._shared.errors import MissingExtraError, ReconstructionError
+from .._shared.opencv import cv2, import_opencv
 from .._shared.signals import sigterm_kept
+from ..batch.extraction import ROOT_SIFT_NORM
+from ..batch.pair_list import Pair
+from ..features.keypoints import UNSET_ANGLE, Keypoints
+from ..geometry.camera import Calibration, Camera, read_calibration
+from ..io.exif import camera_from_exif
 
 PIXEL_CENTRE = 0.5
 """COLMAP's position of the centre of the first pixel; ours is 0."""
+
+SIFT_NUMBERS = 128
+
+ESTIMATED_FOCAL_FACTOR = 1.2
+"""Focal length over the longer side, where nothing is known: where its estimation begins."""
 
 
 def import_pycolmap(purpose: str = "a reconstruction from many images") -> Any:
     """Import pycolmap, after OpenCV: the other way round some versions of both crash.
 
-    Args:
-        purpose: what it is needed for.
-
-    Raises:
-        MissingExtraError: it is not installed, or h5py is not.
+    A MissingExtraError says that it, or h5py, is not installed, and what it is needed for.
     """
     import_opencv()
     with sigterm_kept():  # or a process that is ended would print a stack trace
@@ -45,3 +60,212 @@ def quiet_pycolmap() -> Iterator[Any]:
         yield pycolmap
     finally:
         pycolmap.logging.minloglevel = before
+
+
+@dataclass(frozen=True)
+class CameraIntrinsics:
+    """One of COLMAP's camera models with its parameters; focal lengths and centre come first.
+
+    Attributes:
+        model: name, as "PINHOLE" or "SIMPLE_RADIAL".
+        size: (width, height) in pixels.
+        params: as COLMAP has them, where the centre of the first pixel is (0.5, 0.5).
+        source: where they come from: "given", "focal_px", "EXIF", or "estimated".
+    """
+
+    model: str
+    size: tuple[int, int]
+    params: tuple[float, ...]
+    source: str = "given"
+
+    @classmethod
+    def of_camera(cls, camera: Camera) -> CameraIntrinsics:
+        """Return the intrinsics of a known pinhole camera."""
+        centre = (camera.centre[0] + PIXEL_CENTRE, camera.centre[1] + PIXEL_CENTRE)
+        return cls("PINHOLE", camera.size, (*camera.focal_px, *centre))
+
+    @classmethod
+    def initial(
+        cls, size: tuple[int, int], focal_px: float | None = None, source: str = "EXIF"
+    ) -> CameraIntrinsics:
+        """Return intrinsics to be estimated, with one parameter of radial distortion.
+
+        The estimation begins with `focal_px`, or a guess; `source` is that of the focal length.
+        """
+        if focal_px is None:
+            focal_px, source = ESTIMATED_FOCAL_FACTOR * max(size), "estimated"
+        return cls("SIMPLE_RADIAL", size, (focal_px, size[0] / 2, size[1] / 2, 0.0), source)
+
+    @classmethod
+    def of_colmap(cls, camera: Any, source: str = "given") -> CameraIntrinsics:
+        """Return the intrinsics of a camera of pycolmap."""
+        size = (int(camera.width), int(camera.height))
+        return cls(camera.model_name, size, tuple(map(float, camera.params)), source)
+
+    def colmap_camera(self) -> Any:
+        """Return the camera of pycolmap."""
+        pycolmap = import_pycolmap()
+        camera = pycolmap.Camera(
+            model=self.model, width=self.size[0], height=self.size[1], params=list(self.params)
+        )
+        camera.has_prior_focal_length = self.source != "estimated"
+        return camera
+
+    @property
+    def distorts(self) -> bool:
+        """Whether its images differ from those of a pinhole camera."""
+        return self.model not in ("PINHOLE", "SIMPLE_PINHOLE")
+
+    @property
+    def pinhole(self) -> Camera:
+        """The camera without the distortion."""
+        camera = self.colmap_camera()
+        focal = (float(camera.focal_length_x), float(camera.focal_length_y))
+        centre = (float(camera.principal_point_x), float(camera.principal_point_y))
+        return Camera(self.size, focal, (centre[0] - PIXEL_CENTRE, centre[1] - PIXEL_CENTRE))
+
+    def to_pinhole(self, xy: np.ndarray) -> np.ndarray:
+        """Return where the pinhole camera has positions (N, 2) of the image."""
+        if not self.distorts or not len(xy):
+            return xy
+        pinhole = self.pinhole
+        rays = self.colmap_camera().cam_from_img(np.ascontiguousarray(xy + PIXEL_CENTRE))
+        return np.asarray(rays * pinhole.focal_px + np.array(pinhole.centre))
+
+    def from_pinhole(self, xy: np.ndarray) -> np.ndarray:
+        """Return where the image has positions (N, 2) of the pinhole camera."""
+        if not self.distorts or not len(xy):
+            return xy
+        found = self.colmap_camera().img_from_cam(self.pinhole.rays(xy))
+        return np.asarray(found - PIXEL_CENTRE)
+
+    def undistort(self, image: np.ndarray) -> np.ndarray:
+        """Return an image (H, W) or (H, W, 3) as the pinhole camera would have taken it."""
+        if not self.distorts:
+            return image
+        width, height = self.size
+        y, x = np.indices((height, width))
+        places = self.from_pinhole(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
+        column, row = places.T.astype(np.float32).reshape(2, height, width)
+        return cv2.remap(image, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
+
+
+def known_cameras(
+    calibration: Camera | Calibration | str | Path, sizes: Mapping[str, tuple[int, int]]
+) -> dict[str, Camera]:
+    """Return the cameras of the images, by name, that have the size of a calibration.
+
+    A ReconstructionError says that it is wrong, or for none of them.
+    """
+    known: dict[str, Camera] = {}
+    problem: ReconstructionError | None = None
+    for name, size in sizes.items():
+        try:
+            if isinstance(calibration, (str, Path)):
+                camera = read_calibration(calibration, size, size).camera0
+            else:
+                camera = calibration if isinstance(calibration, Camera) else calibration.camera0
+                Calibration(camera, camera).check_sizes(size, size)
+            known[name] = camera
+        except ReconstructionError as error:
+            problem = error
+    if problem is not None and not known:
+        raise problem
+    return known
+
+
+def initial_intrinsics(
+    folder: Path,
+    sizes: Mapping[str, tuple[int, int]],
+    known: Mapping[str, Camera] = {},
+    focal_px: float | None = None,
+    single_camera: bool | None = None,
+) -> dict[str, CameraIntrinsics]:
+    """Return the known intrinsics of each image, or where their estimation begins.
+
+    `focal_px` is of the images whose camera is not known; None: of their EXIF, or a guess. Images
+    that share a camera, by `MultiViewOptions.single_camera`, get the same object.
+    """
+    shared: dict[Any, CameraIntrinsics] = {}
+    intrinsics = {}
+    for name, size in sizes.items():
+        if name in known:
+            begin = CameraIntrinsics.of_camera(known[name])
+        elif focal_px is not None:
+            focal = Camera(size, focal_px).focal_px[0]
+            begin = CameraIntrinsics.initial(size, focal, "focal_px")
+        else:
+            try:
+                exif = camera_from_exif(folder / name, size)
+                begin = CameraIntrinsics.initial(size, float(np.mean(exif.focal_px)))
+            except ReconstructionError:
+                begin = CameraIntrinsics.initial(size)
+        key = {None: begin, True: size, False: name}[single_camera]
+        intrinsics[name] = shared.setdefault(key, begin)
+    return intrinsics
+
+
+def write_database(
+    path: Path,
+    images: Mapping[str, tuple[Keypoints, CameraIntrinsics]],
+    matches: Mapping[Pair, np.ndarray],
+) -> None:
+    """Write a new database of COLMAP to a file that does not exist, or is empty.
+
+    Images with the same object of intrinsics share a camera. Keypoints with sizes have four columns
+    (x, y, scale, orientation), others two; only SIFT's descriptors are written. Matches are (K, 2)
+    rows of keypoints.
+    """
+    with quiet_pycolmap() as pycolmap, pycolmap.Database.open(path) as database:
+        cameras: dict[int, tuple[int, int]] = {}  # camera and rig by the object
+        numbers: dict[str, int] = {}
+        for name, (points, intrinsics) in images.items():
+            if id(intrinsics) not in cameras:
+                camera = intrinsics.colmap_camera()
+                camera.camera_id = database.write_camera(camera)
+                rig = pycolmap.Rig()
+                rig.add_ref_sensor(camera.sensor_id)
+                cameras[id(intrinsics)] = camera.camera_id, database.write_rig(rig)
+            camera_id, rig_id = cameras[id(intrinsics)]
+            row = pycolmap.Image(name=name, camera_id=camera_id)
+            row.image_id = numbers[name] = database.write_image(row)
+            frame = pycolmap.Frame()
+            frame.rig_id = rig_id
+            frame.add_data_id(row.data_id)
+            database.write_frame(frame)
+            columns = [points.xy + PIXEL_CENTRE]
+            if points.sizes is not None:
+                columns += [points.sizes[:, None] / 2, orientations_of(points)[:, None]]
+            keypoints = np.ascontiguousarray(np.hstack(columns), np.float32)
+            database.write_keypoints(row.image_id, keypoints)
+            descriptors = sift_bytes(points)
+            if descriptors is not None:
+                described = pycolmap.FeatureDescriptors(
+                    pycolmap.FeatureExtractorType.SIFT, np.ascontiguousarray(descriptors)
+                )
+                database.write_descriptors(row.image_id, described)
+        for (name0, name1), rows in matches.items():
+            found = np.ascontiguousarray(rows, np.uint32).reshape(-1, 2)
+            database.write_matches(numbers[name0], numbers[name1], found)
+
+
+def orientations_of(points: Keypoints) -> np.ndarray:
+    """Return (N,) orientations in radians, clockwise; 0 where there are none."""
+    if points.angles is None:
+        return np.zeros(len(points), np.float32)
+    return np.deg2rad(np.where(points.angles == UNSET_ANGLE, 0, points.angles))
+
+
+def sift_bytes(keypoints: Keypoints) -> np.ndarray | None:
+    """Return descriptors as SIFT's (N, 128) uint8, or None where they are of another kind.
+
+    Those of length 1 are multiplied by 512, as SIFT does it.
+    """
+    found = keypoints.descriptors
+    if found is None or found.shape[1] != SIFT_NUMBERS:
+        return None
+    if found.dtype == np.uint8:
+        return found
+    if found.size and found.min() < 0:
+        return None
+    return np.rint(found * ROOT_SIFT_NORM).clip(0, 255).astype(np.uint8)

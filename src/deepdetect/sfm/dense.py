@@ -19,7 +19,7 @@ from ..geometry.camera import Camera, PosedView, relative_fundamental
 from ..geometry.transforms import scaled_points
 from ..io.image import load_image, luma
 from ..matching.guided.rectified import match_by_rectification
-from .intrinsics import CameraIntrinsics
+from .colmap import CameraIntrinsics
 from .mapping import RegisteredImage, SparseModel
 
 NEIGHBOURS = 4
@@ -61,14 +61,10 @@ DUPLICATE_DEPTH = 0.01
 
 @dataclass(frozen=True, eq=False)
 class DensePoints:
-    """Points that several images agree on.
+    """Points (N, 3) float32 that several images agree on, with uint8 sRGB colours.
 
-    Attributes:
-        points: (N, 3) float32.
-        colors: (N, 3) uint8 sRGB.
-        errors: (N,) float32 distance of the projections from the matches in pixels, the root mean
-            square of all images that agree.
-        views: (N,) uint8, how many these are.
+    Errors (N,) float32 are distances of the projections from the matches in pixels, the root mean
+    square of all images that agree; `views` (N,) uint8 is how many these are.
     """
 
     points: np.ndarray
@@ -160,31 +156,28 @@ def dense_points(folder: Path, images: Sequence[RegisteredImage], stride_px: int
 def _prepared(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, PosedView, float]:
     """Return an image without its distortion at most `MAX_SIDE_PX` long, its view, its scale."""
     path, view = folder / image.view.name, limited_view(image.view)
-    rgb = _prepared_image(path, file_state(path), image.intrinsics)
+    rgb = _prepared_image(path, file_state(path), image.intrinsics, view.camera.size)
     return rgb, view, view.camera.size[0] / image.view.camera.size[0]
 
 
 @lru_cache(maxsize=CACHED_IMAGES)
-def _prepared_image(path: Path, state: tuple[int, int], intrinsics: CameraIntrinsics) -> np.ndarray:
-    """Read an image of this `file_state` without its distortion, at most `MAX_SIDE_PX` long."""
+def _prepared_image(
+    path: Path, state: tuple[int, int], intrinsics: CameraIntrinsics, size: tuple[int, int]
+) -> np.ndarray:
+    """Read an image of this `file_state` without its distortion, of a size."""
     rgb = intrinsics.undistort(load_image(path))
-    size = _limited_size(intrinsics.size)
     if size != intrinsics.size:
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
     return rgb
 
 
-def _limited_size(size: tuple[int, int]) -> tuple[int, int]:
-    scale = min(1.0, MAX_SIDE_PX / max(size))
-    return round(size[0] * scale), round(size[1] * scale)
-
-
 def limited_view(view: PosedView) -> PosedView:
     """Return a view of at most `MAX_SIDE_PX`."""
     width, height = view.camera.size
-    size = _limited_size(view.camera.size)
-    if size == view.camera.size:
+    scale = MAX_SIDE_PX / max(width, height)
+    if scale >= 1:
         return view
+    size = round(width * scale), round(height * scale)
     across, down = size[0] / width, size[1] / height
     (fx, fy), (cx, cy) = view.camera.focal_px, view.camera.centre
     centre = ((cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5)
@@ -206,11 +199,8 @@ def fuse_matches(
     """Find the points that the matches (N, 2) of several views agree on; NaN where there is none.
 
     The match of each view in turn gives a point, with which those of other views agree or not. The
-    point with most agreement is triangulated again from all that agree.
-
-    Returns:
-        (N, 3) points, (N,) errors as of `DensePoints`, and (N,) number of views that agree, the
-        reference among them; 0 where too few do, and there is no point.
+    point with most agreement is triangulated again from all that agree. Returns points, errors as
+    of `DensePoints`, and the number of views that agree, 0 where there is no point.
     """
     parts = [slice(start, start + BLOCK) for start in range(0, len(xy), BLOCK)]
     blocks = [_fuse_block(reference, xy[k], views, [each[k] for each in matches]) for k in parts]

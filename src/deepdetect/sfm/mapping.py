@@ -16,8 +16,7 @@ import numpy as np
 from .._shared.errors import NoDepthError
 from ..batch.pair_list import Pair
 from ..geometry.camera import PosedView
-from .colmap import PIXEL_CENTRE, quiet_pycolmap
-from .intrinsics import CameraIntrinsics
+from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
 from .pair_selection import largest_component
 
 MIN_VERIFIED = 15
@@ -52,12 +51,8 @@ it is in the middle."""
 class RegisteredImage:
     """An image whose pose is known, and the points that it sees.
 
-    Attributes:
-        view: its pose and pinhole camera.
-        intrinsics: of the same camera, with its distortion.
-        points: (K,) int64 rows of the points, rising.
-        xy: (K, 2) float64 where it sees them, in pixels of the pinhole camera.
-        keypoints: (K,) int64 rows of its keypoints.
+    `points` (K,) are their rows, rising, `xy` (K, 2) where it sees them in pixels of the pinhole
+    camera of `view`, and `keypoints` (K,) rows of its keypoints.
     """
 
     view: PosedView
@@ -71,11 +66,8 @@ class RegisteredImage:
 class SparseModel:
     """Cameras and sparse points, in the frame and unit of the model.
 
-    Attributes:
-        images: by name, in COLMAP's order.
-        points: (P, 3) float64.
-        errors: (P,) float64 mean reprojection error in pixels.
-        tracks: (P,) number of images that each point is seen in.
+    Images are in COLMAP's order, points (P, 3), their mean reprojection errors (P,) in pixels, and
+    `tracks` (P,) the number of images that each is seen in.
     """
 
     images: Mapping[str, RegisteredImage]
@@ -117,19 +109,10 @@ def map_images(
     seed: int = 0,
     registered: Callable[[int], object] = lambda count: None,
 ) -> tuple[Any, list[frozenset[str]]]:
-    """Estimate the poses of as many images as hang together.
+    """Estimate the poses of as many images as hang together, from a database of verified pairs.
 
-    Args:
-        database: with verified matches.
-        folder: of the images.
-        workspace: an empty folder, for COLMAP's own files.
-        verified: pairs with enough matches that agree with a geometry.
-        known_cameras: whether the intrinsics stay as they are.
-        seed: of all random choices.
-        registered: called with the number of images that were added.
-
-    Returns:
-        The largest model of pycolmap, and the names of the images in each other component.
+    Known cameras stay as they are; `registered` is called with the number of images that were
+    added. Returns the largest model of pycolmap, and the names in each other component.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.IncrementalPipelineOptions()

@@ -26,13 +26,11 @@ from ..geometry.camera import Calibration, Camera
 from ..geometry.point_cloud import PointCloud
 from ..io.html_viewer import write_html_page
 from ..io.point_cloud import save_point_cloud
-from .colmap import import_pycolmap
+from .colmap import import_pycolmap, initial_intrinsics, known_cameras
 from .dense import DensePoints
-from .intrinsics import initial_intrinsics, known_cameras
 from .mapping import MIN_VIEWS, SparseModel, read_sparse_model
-from .options import MultiViewOptions
 from .result import MultiViewReconstruction
-from .stages import WORK, Stages
+from .stages import WORK, MultiViewOptions, Stages
 
 MAX_KEYPOINTS = 8192
 """Of an image, where nothing else is asked for."""

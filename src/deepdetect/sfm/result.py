@@ -12,7 +12,7 @@ import numpy as np
 from .._shared.options import suggest_keywords
 from ..geometry.camera import PosedView
 from ..geometry.point_cloud import PointCloud
-from .intrinsics import CameraIntrinsics
+from .colmap import CameraIntrinsics
 
 SCALE = "lengths are in spacings, the median distance from a camera to the nearest other one: the \
 true scale is not known"

@@ -10,16 +10,18 @@ import itertools
 import json
 import shutil
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from .. import __version__
 from .._shared.atomic import atomic_path
-from .._shared.errors import MissingImageError, OptionError, ReconstructionError
+from .._shared.errors import MissingImageError, OptionError, ReconstructionError, unknown_name
 from .._shared.machine import available_memory, map_in_processes, needed_memory, processor_count
+from .._shared.options import check_ranges, suggest_keywords
 from .._shared.progress import progress
 from .._shared.records import file_state, key, load_arrays, save_arrays
 from ..batch.extraction import extract_features
@@ -31,8 +33,7 @@ from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
 from ..features.selection import SelectionOptions
 from ..io.image import find_images
-from .colmap import import_pycolmap
-from .database import write_database
+from .colmap import CameraIntrinsics, import_pycolmap, write_database
 from .dense import (
     DensePoints,
     dense_points,
@@ -40,10 +41,13 @@ from .dense import (
     limited_view,
     merge_dense_points,
 )
-from .intrinsics import CameraIntrinsics
 from .mapping import RegisteredImage, SparseModel, adjust, map_images, normalise_model, verify_pairs
-from .options import MultiViewOptions
 from .pair_selection import COMPARED_KEYPOINTS, SIMILAR, similar_pairs, vlad_vectors
+
+PairChoice = Literal["auto", "all", "sequential", "similar"]
+
+MAX_EXHAUSTIVE = 50
+"""Images of which "auto" matches all pairs."""
 
 WORK = "work"
 """Folder of what the stages made, within that of the results."""
@@ -51,6 +55,49 @@ WORK = "work"
 LINKS = ".images"
 """Folder of links to listed images, within `WORK`. It is hidden, so that they are no further images
 of a folder that holds the results."""
+
+
+@suggest_keywords
+@dataclass(frozen=True)
+class MultiViewOptions:
+    """How many images become cameras and points.
+
+    Attributes:
+        pairs: which images are matched: "all", "sequential" (neighbours in the order of their
+            names), "similar" (the most alike), or "auto": all of up to 50, else the most alike.
+        sequential: number of following images that each one is matched with.
+        ratio: of the ratio test: the best distance must be below this share of the second-best.
+        dense: whether dense points are made.
+        stride_px: a dense point is sought at every so many pixels of a row and of a column.
+        single_camera: whether images of one size were taken by one camera; None: where their EXIF
+            gives one focal length, or none.
+
+    Raises:
+        OptionError: a value is unknown or out of its range.
+    """
+
+    pairs: PairChoice = "auto"
+    sequential: int = 10
+    ratio: float = 0.85
+    dense: bool = True
+    stride_px: int = 2
+    single_camera: bool | None = None
+
+    def __post_init__(self) -> None:
+        if self.pairs not in get_args(PairChoice):
+            raise unknown_name("way to choose pairs", self.pairs, get_args(PairChoice))
+        check_ranges(
+            self,
+            positive=("sequential",),
+            fractions=("ratio",),
+            between={"stride_px": (1, np.inf)},
+        )
+
+    def pair_choice(self, count: int) -> str:
+        """Return how the pairs of so many images are chosen."""
+        if self.pairs != "auto":
+            return self.pairs
+        return "all" if count <= MAX_EXHAUSTIVE else "similar"
 
 
 def check_images(images: str | Path | Sequence[str | Path]) -> dict[str, Path]:
@@ -171,17 +218,10 @@ class Stages:
         matches: Mapping[Pair, np.ndarray],
         known: bool,
     ) -> tuple[Any, dict[Pair, int], list[frozenset[str]]]:
-        """Map, or read what an earlier run has mapped.
+        """Map, or read what an earlier run has mapped; known intrinsics stay as they are.
 
-        Args:
-            folder: of the images.
-            intrinsics: by the name of the image, the same object for those that share a camera.
-            matches: (K, 2) rows of keypoints of each pair.
-            known: whether the intrinsics stay as they are.
-
-        Returns:
-            The model of pycolmap; the number of matches of each pair that agree with its geometry;
-            and the names of the images in each other component.
+        Returns the model of pycolmap; the number of matches of each pair that agree with its
+        geometry; and the names of the images in each other component.
         """
         pycolmap = import_pycolmap()
         images = {}

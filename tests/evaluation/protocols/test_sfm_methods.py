@@ -20,8 +20,7 @@ from deepdetect.evaluation.protocols.sfm import (
 )
 from deepdetect.features.sift import describe_keypoints
 from deepdetect.io.image import luma
-from deepdetect.sfm.options import MultiViewOptions
-from deepdetect.sfm.stages import Stages
+from deepdetect.sfm.stages import MultiViewOptions, Stages
 
 NAMES = ("0004", "0005", "0006")
 MAX_KEYPOINTS = 800

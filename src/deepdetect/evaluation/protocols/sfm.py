@@ -27,12 +27,10 @@ from ...features.scale_space import dominant_angles
 from ...features.sift import describe_keypoints
 from ...geometry.camera import Camera, PosedView
 from ...io.image import load_image, luma
-from ...sfm.colmap import PIXEL_CENTRE, import_pycolmap, quiet_pycolmap
-from ...sfm.intrinsics import initial_intrinsics
+from ...sfm.colmap import PIXEL_CENTRE, import_pycolmap, initial_intrinsics, quiet_pycolmap
 from ...sfm.mapping import read_sparse_model
-from ...sfm.options import MultiViewOptions
 from ...sfm.pipeline import MAX_KEYPOINTS
-from ...sfm.stages import Stages
+from ...sfm.stages import MultiViewOptions, Stages
 from ..metrics.pose import camera_errors, pose_auc, relative_pose_errors
 from ..options import BenchmarkOptions
 from ..profiling import peak_memory, run_in_child
