@@ -8,11 +8,17 @@ import numpy as np
 import pytest
 
 from deepdetect._shared.errors import OptionError
+from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.geometry.point_cloud import PointCloud
 from deepdetect.viz.draw import CAPTION_HEIGHT
-from deepdetect.viz.render import ViewCamera, draw_clouds, orbit_camera, render
+from deepdetect.viz.render import draw_clouds, orbit_camera, render
 
-PLAIN = ViewCamera(np.zeros(3), np.eye(3), 50.0, np.array([39.5, 29.5]), (80, 60))
+
+def left_camera(size: tuple[int, int], focal_px: float, centre: tuple[float, float]) -> PosedView:
+    return PosedView("left", Camera(size, focal_px, centre), np.eye(3), np.zeros(3))
+
+
+PLAIN = left_camera((80, 60), 50.0, (39.5, 29.5))
 
 
 @pytest.fixture(scope="module")
@@ -27,27 +33,18 @@ def cloud(photo: np.ndarray) -> PointCloud:
 def test_projection_is_opencv_s(cloud: PointCloud) -> None:
     camera = orbit_camera(cloud, 30, -20, (320, 240))
     xy, depth = camera.project(cloud.points)
-    matrix = np.array(
-        [
-            [camera.focal, 0, camera.principal_point[0]],
-            [0, camera.focal, camera.principal_point[1]],
-            [0, 0, 1],
-        ]
-    )
-    turn = cv2.Rodrigues(camera.axes)[0]
-    expected = cv2.projectPoints(cloud.points, turn, -camera.axes @ camera.position, matrix, None)[
-        0
-    ]
+    turn, matrix = cv2.Rodrigues(camera.rotation)[0], camera.camera.matrix
+    expected = cv2.projectPoints(cloud.points, turn, camera.translation, matrix, None)[0]
     np.testing.assert_allclose(xy, expected[:, 0], atol=1e-6)
     assert (depth > 0).all()
-    np.testing.assert_allclose(camera.axes @ camera.axes.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(camera.axes) == pytest.approx(1)
+    np.testing.assert_allclose(camera.rotation @ camera.rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(camera.rotation) == pytest.approx(1)
 
 
 def test_from_the_left_camera_the_photograph_comes_back(
     cloud: PointCloud, photo: np.ndarray
 ) -> None:
-    camera = ViewCamera(np.zeros(3), np.eye(3), 300.0, np.array([127.5, 127.5]), (256, 256))
+    camera = left_camera((256, 256), 300.0, (127.5, 127.5))
     np.testing.assert_array_equal(render(cloud, camera, point_width=1), photo)
 
 
@@ -67,9 +64,9 @@ def test_the_cloud_fills_the_picture(
 
 def test_angles_turn_the_viewer_to_the_right_and_up(cloud: PointCloud) -> None:
     # x right, y down: the viewer on the right has a larger x, the one above a smaller y.
-    front = orbit_camera(cloud, 0, 0).position
-    assert orbit_camera(cloud, 30, 0).position[0] > front[0] + 100
-    assert orbit_camera(cloud, 0, 30).position[1] < front[1] - 100
+    front = orbit_camera(cloud, 0, 0).centre
+    assert orbit_camera(cloud, 30, 0).centre[0] > front[0] + 100
+    assert orbit_camera(cloud, 0, 30).centre[1] < front[1] - 100
     np.testing.assert_allclose(front, 0, atol=80)  # near the left camera
 
 
@@ -118,7 +115,7 @@ def test_the_width_is_in_pixels_and_centred() -> None:
 
 def test_points_become_wider_as_the_viewer_comes_nearer() -> None:
     cloud = PointCloud([[0.5, 0, 5], [-2.0, 0, 10]], np.zeros((2, 3), np.uint8), "mm")
-    near = dataclasses.replace(PLAIN, position=np.array([0.0, 0, 3]))
+    near = dataclasses.replace(PLAIN, translation=np.array([0.0, 0, -3]))
     ink = (255 - render(cloud, near)[..., 0].astype(float)) / 255
     # 50 pixels of focal length, 0.02 for few points, 1.4 of overlap; in half pixels.
     assert ink[:, 40:].sum() == pytest.approx((round(2 * 1.4 * 5 / 2) / 2) ** 2, rel=0.01)
@@ -144,7 +141,7 @@ def test_a_real_scene_looks_like_its_photograph(shared: Path) -> None:
     y, x = np.nonzero(known)
     ray = np.column_stack([x - 224.5, y - 187.0, np.full(len(x), 360.0)])
     cloud = PointCloud(ray / scene.disparity[known][:, None], scene.left[known], "baseline")
-    camera = ViewCamera(np.zeros(3), np.eye(3), 360.0, np.array([224.5, 187.0]), (450, 375))
+    camera = left_camera((450, 375), 360.0, (224.5, 187.0))
     picture = render(cloud, camera, point_width=1)
     np.testing.assert_array_equal(picture[known], scene.left[known])
     assert (picture[~known] == 255).all()

@@ -19,7 +19,7 @@ from ..features.keypoints import unit_length
 from ..features.matchers import get_matcher, match_descriptors
 from ..matching.pipeline import match_images
 from .packages import base_class, import_package
-from .tensors import image_from_tensor
+from .tensors import load_tensor
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -88,7 +88,7 @@ class DeepDetectExtractor(BaseModel):
         import torch
 
         image = data["image"]
-        points = self._detector.extract(image_from_tensor(image[0]))
+        points = self._detector.extract(load_tensor(image[0]))
         assert points.angles is not None
         assert points.descriptors is not None
         arrays = {
@@ -162,7 +162,7 @@ class DeepDetectDenseMatcher(BaseModel):
         import torch
 
         # Hloc wants the positions in the first image to be the refined ones; ours are the second's.
-        second, first = (image_from_tensor(data[name][0]) for name in ("image1", "image0"))
+        second, first = (load_tensor(data[name][0]) for name in ("image1", "image0"))
         matches = match_images(second, first, self._detector)
         arrays = {
             "keypoints0": matches.points1,

@@ -10,7 +10,7 @@ from .._shared.options import suggest_keywords
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints, unit_length
 from .packages import base_class, import_package
-from .tensors import image_from_tensor
+from .tensors import load_tensor, padded
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -61,10 +61,8 @@ class DeepDetectDetector(Module):
 
     def _frames(self, found: list[Keypoints], img: Tensor) -> tuple[Tensor, Tensor]:
         """Return the LAFs and the scores of a batch."""
-        import torch
-
         lafs = [self._lafs(points) for points in found]
-        return _padded(lafs, img), _padded([torch.from_numpy(one.scores) for one in found], img)
+        return padded(lafs, img.device), padded([points.scores for points in found], img.device)
 
     def _lafs(self, points: Keypoints) -> Tensor:
         """Return (N, 2, 3) frames."""
@@ -102,20 +100,18 @@ class DeepDetectFeature(DeepDetectDetector):
             (B, N, 2, 3) LAFs and (B, N) scores as of `DeepDetectDetector`, and (B, N, 128)
             descriptors of length 1.
         """
-        import torch
-
         found = _found(self._detector.extract, img, mask)
         descriptors = [
-            torch.from_numpy(unit_length(points.descriptors))
+            unit_length(points.descriptors)
             for points in found
             if points.descriptors is not None  # always
         ]
-        return *self._frames(found, img), _padded(descriptors, img)
+        return *self._frames(found, img), padded(descriptors, img.device)
 
 
 def _found(find: Callable[..., Keypoints], img: Tensor, mask: Tensor | None) -> list[Keypoints]:
     """Return the keypoints of each image, where the mask is above 0."""
-    images = [image_from_tensor(one) for one in img]
+    images = [load_tensor(one) for one in img]
     if mask is None:
         return [find(image) for image in images]
     if mask.shape != (len(img), 1, *img.shape[-2:]):
@@ -125,10 +121,3 @@ def _found(find: Callable[..., Keypoints], img: Tensor, mask: Tensor | None) -> 
         )
     hidden = [(one[0] <= 0).cpu().numpy() for one in mask]
     return [find(image, ignore=where) for image, where in zip(images, hidden, strict=True)]
-
-
-def _padded(rows: list[Tensor], img: Tensor) -> Tensor:
-    """Return tensors of unequal lengths as one, filled with zeros, where the images are."""
-    from torch.nn.utils.rnn import pad_sequence
-
-    return pad_sequence(rows, batch_first=True).to(img.device)

@@ -12,9 +12,8 @@ from .._shared.errors import OptionError, unknown_name
 from .._shared.options import suggest_keywords
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import SIZES_PER_SCALE
-from ..io.image import load_image
 from .packages import base_class
-from .tensors import image_from_tensor
+from .tensors import load_tensor
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -68,15 +67,10 @@ class DeepDetectExtractor(Module):
         Raises:
             ImageError: the image is not fit.
         """
-        import torch
-
-        if not isinstance(img, torch.Tensor):
-            return self._detector.extract(load_image(img)).to_lightglue(scale=self._scale)
-        if img.ndim == 4 and len(img) != 1:
-            raise OptionError(f"extract takes one image, not {len(img)}: call it for each")
-        rgb = image_from_tensor(img[0] if img.ndim == 4 else img)
-        features = self._detector.extract(rgb).to_lightglue(scale=self._scale)
-        return {name: value.to(img.device) for name, value in features.items()}
+        one = img[0] if getattr(img, "ndim", 0) == 4 and len(img) == 1 else img
+        features = self._detector.extract(load_tensor(one)).to_lightglue(scale=self._scale)
+        device = getattr(img, "device", "cpu")
+        return {name: value.to(device) for name, value in features.items()}
 
     def forward(self, data: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return the features of data["image"], as of `extract`."""

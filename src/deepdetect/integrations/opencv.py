@@ -64,8 +64,7 @@ class DeepDetectFeature2D:
             ImageError: the image is not fit.
             OptionError: the mask has another size than the image.
         """
-        rgb = self._load(image)
-        return _to_opencv(self._detector.detect(rgb, ignore=_ignored(mask, rgb)))
+        return _to_opencv(self._detector.detect(self._load(image), ignore=_ignored(mask)))
 
     def compute(
         self, image: Any, keypoints: Sequence[cv2.KeyPoint], descriptors: None = None
@@ -101,8 +100,7 @@ class DeepDetectFeature2D:
         """
         if useProvidedKeypoints:
             raise OptionError("`useProvidedKeypoints` is not supported: use the method compute")
-        rgb = self._load(image)
-        points = self._detector.extract(rgb, ignore=_ignored(mask, rgb))
+        points = self._detector.extract(self._load(image), ignore=_ignored(mask))
         return _to_opencv(points), _as_float(points) if len(points) else None
 
     def descriptorSize(self) -> int:
@@ -129,16 +127,9 @@ class DeepDetectFeature2D:
         return load_image(image, channels=self._channels)
 
 
-def _ignored(mask: np.ndarray | None, image: np.ndarray) -> np.ndarray | None:
+def _ignored(mask: np.ndarray | None) -> np.ndarray | None:
     """Turn OpenCV's mask of what is wanted into one of what is not."""
-    if mask is None:
-        return None
-    if np.shape(mask) != image.shape[:2]:
-        raise OptionError(
-            f"`mask` has the shape {np.shape(mask)}, the image {image.shape[:2]}: they must be "
-            "equal"
-        )
-    return np.asarray(mask) == 0
+    return None if mask is None else np.asarray(mask) == 0
 
 
 def _to_opencv(points: Keypoints) -> tuple[cv2.KeyPoint, ...]:

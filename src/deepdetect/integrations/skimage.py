@@ -96,24 +96,14 @@ class DeepDetectFeatures:
         if scales is None:
             raise OptionError("keypoints need scales to be described: give their sigmas in pixels")
         rgb = load_image(image)
-        points = np.asarray(keypoints, np.float32)
-        if points.size and (points.ndim != 2 or points.shape[1] != 2):
-            raise OptionError(
-                f"`keypoints` has the shape {points.shape}: give (N, 2) positions (row, column)"
-            )
-        xy = points.reshape(-1, 2)[:, ::-1]
-        for name, values in (("scales", scales), ("orientations", orientations)):
-            if values is not None and np.shape(values) not in ((), (len(xy),)):
-                raise OptionError(
-                    f"`{name}` has the shape {np.shape(values)}: give one number for each of the "
-                    f"{len(xy)} keypoints"
-                )
-        angles = None
-        if orientations is not None:
-            angles = np.broadcast_to(np.rad2deg(np.asarray(orientations)) % 360, len(xy))
-        sizes = np.broadcast_to(np.asarray(scales) * SIZE_PER_SIGMA, len(xy))
+        xy = np.asarray(keypoints, np.float32)[..., ::-1]
+        sizes = np.asarray(scales) * SIZE_PER_SIGMA
         given = Keypoints(
-            xy, np.zeros(len(xy)), (rgb.shape[1], rgb.shape[0]), sizes=sizes, angles=angles
+            xy,
+            np.zeros(len(xy)),
+            (rgb.shape[1], rgb.shape[0]),
+            sizes=np.full(len(xy), sizes) if sizes.ndim == 0 else sizes,
+            angles=None if orientations is None else np.rad2deg(np.asarray(orientations)) % 360,
         )
         self.descriptors = describe_keypoints(luma(rgb), given).descriptors
 

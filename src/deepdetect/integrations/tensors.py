@@ -1,7 +1,8 @@
-"""Images from tensors."""
+"""Images from tensors, and tensors of arrays."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,9 +16,18 @@ OVERSHOOT = 0.25
 """Of the values of tensors beyond [0, 1] that is cut off: bicubic filters leave some."""
 
 
-def image_from_tensor(image: torch.Tensor) -> np.ndarray:
-    """Return a (C, H, W) tensor of 1 or 3 channels, red first, in [0, 1], as (H, W, 3) uint8."""
-    values: Any = image.detach().float().cpu().numpy()
-    if values.size and values.min() >= -OVERSHOOT and values.max() <= 1 + OVERSHOOT:
-        values = np.clip(values, 0, 1)
-    return load_image(values.transpose(1, 2, 0))
+def load_tensor(image: Any) -> np.ndarray:
+    """Read an image as `load_image` does; tensors may overshoot [0, 1] a little."""
+    if hasattr(image, "detach") and image.is_floating_point():
+        image = image.detach().float().cpu().numpy()
+        if image.size and image.min() >= -OVERSHOOT and image.max() <= 1 + OVERSHOOT:
+            image = np.clip(image, 0, 1)
+    return load_image(image)
+
+
+def padded(rows: Sequence[Any], device: torch.device) -> torch.Tensor:
+    """Return arrays or tensors of unequal lengths as one tensor, filled with zeros."""
+    import torch
+
+    tensors = [torch.as_tensor(values) for values in rows]
+    return torch.nn.utils.rnn.pad_sequence(tensors, batch_first=True).to(device)

@@ -17,11 +17,10 @@ from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.heatmap import MAX_AUTO_PIXELS
 from ..detector.pretrained import resolve_weights
-from ..detector.tiling import STRIDE
+from ..detector.tiling import STRIDE, fill_planes
 from ..features.selection import Maps, SelectionOptions, select_from_maps
-from ..io.image import load_image
 from .packages import base_class, import_package
-from .tensors import image_from_tensor
+from .tensors import load_tensor, padded
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -199,9 +198,9 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
         output = DeepDetectKeypointOutput(
             loss=loss,
             logits=logits,
-            keypoints=_padded(relative).to(logits),
-            scores=_padded([points.scores for points in found]).to(logits),
-            mask=_padded([np.ones(len(points), np.int32) for points in found]).to(logits.device),
+            keypoints=padded(relative, logits.device).to(logits.dtype),
+            scores=padded([points.scores for points in found], logits.device).to(logits.dtype),
+            mask=padded([np.ones(len(points), np.int32) for points in found], logits.device),
         )
         if return_dict is None:
             return_dict = getattr(self.config, "return_dict", True)
@@ -261,15 +260,13 @@ class DeepDetectImageProcessor(BaseImageProcessor):
             ImageError: an image cannot be read or is not fit.
         """
         batch_feature = import_package("transformers").BatchFeature
-        loaded = [self._shrunk(_load(image)) for image in _listed(images)]
+        loaded = [self._shrunk(load_tensor(image)) for image in _listed(images)]
         height, width = (max(rgb.shape[axis] for rgb in loaded) for axis in (0, 1))
         height, width = height + -height % STRIDE, width + -width % STRIDE
         values = np.empty((len(loaded), 3, height, width), np.float32)
         mask = np.zeros((len(loaded), height, width), np.int64)
         for row, rgb in enumerate(loaded):
-            below, right = height - rgb.shape[0], width - rgb.shape[1]
-            filled = np.pad(rgb, ((0, below), (0, right), (0, 0)), mode="edge")
-            np.multiply(filled.transpose(2, 0, 1), np.float32(1 / 255), out=values[row])
+            fill_planes(rgb, values[row])
             mask[row, : rgb.shape[0], : rgb.shape[1]] = 1
         return batch_feature({"pixel_values": values, "pixel_mask": mask}, return_tensors)
 
@@ -335,14 +332,6 @@ def register() -> None:
     )
 
 
-def _padded(arrays: list[np.ndarray]) -> Tensor:
-    """Return arrays of unequal lengths as one tensor, filled with zeros."""
-    import torch
-
-    tensors = [torch.from_numpy(array) for array in arrays]
-    return torch.nn.utils.rnn.pad_sequence(tensors, batch_first=True)
-
-
 def _sizes(pixel_values: Tensor, pixel_mask: Tensor | None) -> list[tuple[int, int]]:
     """Return the height and width of each image of a batch."""
     if pixel_mask is None:
@@ -360,8 +349,3 @@ def _listed(images: Any) -> list[Any]:
             raise OptionError("there are no images: give one or more")
         return list(images)
     return [images]
-
-
-def _load(image: Any) -> np.ndarray:
-    is_tensor = hasattr(image, "detach") and image.ndim == 3 and image.shape[0] in (1, 3)
-    return image_from_tensor(image) if is_tensor else load_image(image)

@@ -8,7 +8,7 @@ from ..detector.detector import AnyDetector, DeepDetect
 from ..detector.point_detector import PointDetector
 from ..matching.pipeline import match_images
 from .packages import base_class
-from .tensors import image_from_tensor
+from .tensors import load_tensor
 
 if TYPE_CHECKING:
     import numpy as np
@@ -52,6 +52,6 @@ class DeepDetectMatcher(BaseMatcher):
         self, img0: Tensor, img1: Tensor
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, None, None, np.ndarray]:
         """Return matched points, all keypoints, no descriptors, and the scores of the matches."""
-        matches = match_images(image_from_tensor(img0), image_from_tensor(img1), self._detector)
+        matches = match_images(load_tensor(img0), load_tensor(img1), self._detector)
         all0, all1 = matches.keypoints0.xy, matches.keypoints1.xy
         return matches.points0, matches.points1, all0, all1, None, None, matches.scores

@@ -14,6 +14,7 @@ from .._shared.opencv import cv2
 from ..features.display import PICTURE_SIDE_PX, draw_circle, line_scale
 from ..features.keypoints import Keypoints
 from ..features.selection import spread_over_grid
+from ..geometry.transforms import scaled_points
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 MAX_JPEG_SIDE_PX = 65_500
@@ -38,6 +39,9 @@ CAPTION_MARGIN = 6
 
 CAPTION_SCALE = 0.5
 """Of OpenCV's font."""
+
+GAP_PX = 6
+"""Between pictures that are joined."""
 
 WHITE = (255, 255, 255)
 
@@ -114,7 +118,9 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     """
     shown = fit_picture(rgb)
     factor = shown.shape[1] / rgb.shape[1]
-    canvas = _dimmed(shown)
+    # A grey, darker copy, on which colours are seen.
+    gray = cv2.convertScaleAbs(cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY), alpha=0.6)
+    canvas = cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB)
     values = keypoints.scores if keypoints.logits is None else keypoints.logits
     name = "score" if keypoints.logits is None else "logit"
     unit = line_scale(canvas)
@@ -134,7 +140,7 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     radii = np.full(len(rows), 3 * unit)
     if keypoints.sizes is not None:
         radii = np.maximum(keypoints.sizes[rows] * factor / 2, 2 * unit)
-    centres = _placed(keypoints.xy[rows], factor)
+    centres = scaled_points(keypoints.xy[rows], factor)
     # The best on top, and a dark rim, so that each is seen before any colour.
     for k in np.argsort(values[rows]):
         draw_circle(canvas, centres[k], radii[k], (0, 0, 0), max(2, round(2.5 * unit)))
@@ -166,17 +172,6 @@ def fit_picture(picture: np.ndarray) -> np.ndarray:
         return picture
     size = max(1, round(width * factor)), max(1, round(height * factor))
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-
-
-def _dimmed(rgb: np.ndarray) -> np.ndarray:
-    """Return a grey, darker copy, on which colours are seen."""
-    gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    return cv2.cvtColor(cv2.convertScaleAbs(gray, alpha=0.6), cv2.COLOR_GRAY2RGB)
-
-
-def _placed(xy: np.ndarray, factor: float) -> np.ndarray:
-    """Return where positions of an image are in a picture that is so many times as large."""
-    return (np.asarray(xy, np.float64) + 0.5) * factor - 0.5
 
 
 def _viridis(levels: np.ndarray) -> np.ndarray:
@@ -259,24 +254,18 @@ def _caption_width(text: str, unit: float) -> int:
     return int(width) + round(2 * CAPTION_MARGIN * unit)
 
 
-def hstack(panels: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
-    """Join pictures from left to right, with a white gap, and black below lower ones."""
-    height = max(panel.shape[0] for panel in panels)
-    joined: list[np.ndarray] = []
-    for panel in panels:
-        if joined:
-            joined.append(np.full((height, gap, 3), 255, np.uint8))
-        joined.append(np.pad(panel, ((0, height - panel.shape[0]), (0, 0), (0, 0))))
-    return np.concatenate(joined, axis=1)
+def hstack(panels: Sequence[np.ndarray]) -> np.ndarray:
+    """Join pictures from left to right, with a white gap, and white below lower ones."""
+    turned = vstack([panel.transpose(1, 0, 2) for panel in panels])
+    return np.ascontiguousarray(turned.transpose(1, 0, 2))
 
 
-def vstack(rows: Sequence[np.ndarray], gap: int = 6) -> np.ndarray:
+def vstack(rows: Sequence[np.ndarray]) -> np.ndarray:
     """Join pictures from top to bottom, with a white gap, and white beside narrower ones."""
     width = max(row.shape[1] for row in rows)
-    joined: list[np.ndarray] = []
-    for row in rows:
-        if joined:
-            joined.append(np.full((gap, width, 3), 255, np.uint8))
-        padding = ((0, 0), (0, width - row.shape[1]), (0, 0))
-        joined.append(np.pad(row, padding, constant_values=255))
-    return np.concatenate(joined)
+    gaps = [GAP_PX] * (len(rows) - 1) + [0]
+    padded = [
+        np.pad(row, ((0, gap), (0, width - row.shape[1]), (0, 0)), constant_values=255)
+        for row, gap in zip(rows, gaps, strict=True)
+    ]
+    return np.concatenate(padded)

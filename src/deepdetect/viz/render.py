@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.opencv import cv2
+from ..geometry.camera import Camera, PosedView
 from ..geometry.point_cloud import (
     BOX_PERCENTILE,
     PointCloud,
@@ -31,33 +32,12 @@ MAX_POINT_WIDTH_PX = 5
 """No point is drawn wider by default, so that a sparse cloud looks sparse."""
 
 
-@dataclass(frozen=True, eq=False)
-class ViewCamera:
-    """A perspective camera that looks at a cloud.
-
-    The rows of `axes` are its right, down and forward; the rest is in pixels, the size (W, H).
-    """
-
-    position: np.ndarray
-    axes: np.ndarray
-    focal: float
-    principal_point: np.ndarray
-    size: tuple[int, int]
-
-    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return (N, 2) pixel positions and (N,) depths, where these are not above 0 undefined."""
-        seen = (points - self.position) @ self.axes.T
-        depth = seen[:, 2]
-        scale = self.focal / np.where(depth > 0, depth, np.inf)
-        return seen[:, :2] * scale[:, None] + self.principal_point, depth
-
-
 def orbit_camera(
     cloud: PointCloud,
     azimuth: float = 12.0,
     elevation: float = 8.0,
     size: tuple[int, int] = (800, 600),
-) -> ViewCamera:
+) -> PosedView:
     """Place a camera that looks at the robust centre of a cloud, which fills its picture.
 
     Its distance from the centre is that of the left camera, so that small angles give a picture
@@ -67,13 +47,11 @@ def orbit_camera(
         >>> rng = np.random.default_rng(0)
         >>> cloud = PointCloud(rng.normal((0, 0, 9), 1, (500, 3)), np.zeros((500, 3), int), "mm")
         >>> camera = orbit_camera(cloud, azimuth=90, elevation=0)
-        >>> camera.axes[2].round(6).tolist()  # it stands on the right and looks to the left
+        >>> camera.rotation[2].round(6).tolist()  # it stands on the right and looks to the left
         [-1.0, 0.0, 0.0]
     """
     if not -90 <= elevation <= 90:
         raise OptionError(f"the elevation must lie in [-90, 90] degrees, not {elevation}")
-    if min(size) < 1:
-        raise OptionError(f"a picture must have at least one pixel, not {size}")
     a, e = np.deg2rad([azimuth, elevation])
     right = [np.cos(a), 0, np.sin(a)]
     down = [np.sin(e) * np.sin(a), np.cos(e), -np.sin(e) * np.cos(a)]
@@ -81,18 +59,18 @@ def orbit_camera(
     axes = np.array([right, down, forward])
     box = robust_box(cloud)
     distance = max(float(np.linalg.norm(box.centre)), box.radius)
-    position = box.centre - distance * axes[2]
+    translation = distance * np.array([0, 0, 1.0]) - axes @ box.centre
     # With a focal length of 1 and the axis at 0, to see what the cloud covers.
-    plain = ViewCamera(position, axes, 1.0, np.zeros(2), size)
+    plain = PosedView("", Camera(size, 1.0, (0, 0)), axes, translation)
     xy, depth = plain.project(cloud.points)
     low, high = np.percentile(xy[depth > 0], (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0)
     wanted = FILL_RATIO * np.array(size) / np.maximum(high - low, 1e-6)
     focal = float(wanted.min())
-    principal_point = (np.array(size) - 1) / 2 - focal * (low + high) / 2
-    return ViewCamera(position, axes, focal, principal_point, size)
+    centre = (np.array(size) - 1) / 2 - focal * (low + high) / 2
+    return replace(plain, camera=Camera(size, focal, centre))
 
 
-def render(cloud: PointCloud, camera: ViewCamera, point_width: float | None = None) -> np.ndarray:
+def render(cloud: PointCloud, camera: PosedView, point_width: float | None = None) -> np.ndarray:
     """Draw a cloud on white, (H, W, 3) uint8, each point as a square that hides what is behind it.
 
     Without a width in pixels each is as wide as a closed surface needs at its spacing and depth.
@@ -141,27 +119,27 @@ def draw_clouds(
     return vstack([hstack(row) for row in rows])
 
 
-def _finer(camera: ViewCamera) -> ViewCamera:
-    times = SUPERSAMPLING
+def _finer(camera: PosedView) -> PosedView:
+    coarse, times = camera.camera, SUPERSAMPLING
+    size = coarse.size[0] * times, coarse.size[1] * times
     # The centre of the first fine pixel lies before that of the first pixel.
-    principal_point = camera.principal_point * times + (times - 1) / 2
-    size = (camera.size[0] * times, camera.size[1] * times)
-    return replace(camera, focal=camera.focal * times, principal_point=principal_point, size=size)
+    centre = np.array(coarse.centre) * times + (times - 1) / 2
+    return replace(camera, camera=Camera(size, coarse.focal_px[0] * times, centre))
 
 
-def _nearest_points(cloud: PointCloud, camera: ViewCamera, point_width: float | None) -> np.ndarray:
+def _nearest_points(cloud: PointCloud, camera: PosedView, point_width: float | None) -> np.ndarray:
     """Find which point each pixel shows: (H, W) int64 index, -1 for none."""
-    width, height = camera.size
+    width, height = camera.camera.size
     xy, depth = camera.project(cloud.points)
     if point_width is None:
-        spread = camera.focal * POINT_OVERLAP * angular_spacing(cloud)
+        spread = camera.camera.focal_px[0] * POINT_OVERLAP * angular_spacing(cloud)
         sides = spread * np.maximum(cloud.points[:, 2], 0) / np.where(depth > 0, depth, np.inf)
         sides = np.minimum(sides, MAX_POINT_WIDTH_PX * SUPERSAMPLING)
     else:
         sides = np.full(len(cloud), point_width * SUPERSAMPLING)
     sides = np.maximum(np.rint(sides), 1).astype(np.int64)
     corners = np.rint(xy - (sides[:, None] - 1) / 2)
-    visible = (depth > 0) & (corners > -sides[:, None]).all(1) & (corners < camera.size).all(1)
+    visible = (depth > 0) & (corners > -sides[:, None]).all(1) & (corners < (width, height)).all(1)
     # From here on a point is its rank by depth, and the smallest rank is what a pixel shows.
     order = np.flatnonzero(visible)
     order = order[np.argsort(depth[order].astype(np.float32), kind="stable")]
