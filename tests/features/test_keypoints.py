@@ -183,24 +183,6 @@ def test_features_for_lightglue() -> None:
     assert points.to_lightglue(scale="sigma")["scales"].tolist() == (found["scales"] / 2).tolist()
 
 
-def test_lightglue_takes_them() -> None:
-    """The network of kornia, without its weights: names, shapes and types fit."""
-    kornia = pytest.importorskip("kornia.feature", reason="needs kornia for its LightGlue")
-    torch = pytest.importorskip("torch", reason="needs torch")
-    matcher = kornia.LightGlue(None, input_dim=128, add_scale_ori=True).eval()
-    rng = np.random.default_rng(0)
-    features = [
-        Keypoints(
-            *(rng.uniform(0, 99, (40, 2)), np.ones(40), (100, 100)),
-            descriptors=rng.random((40, 128)).astype(np.float32),
-        ).to_lightglue()
-        for _ in range(2)
-    ]
-    with torch.inference_mode():
-        found = matcher({"image0": features[0], "image1": features[1]})
-    assert found["matches0"].shape == (1, 40)
-
-
 def test_lightglue_gets_no_angle_that_is_unset() -> None:
     pytest.importorskip("torch")
     points = Keypoints([[3, 4], [5, 6]], [1, 1], (9, 9), angles=np.array([-1, 90], np.float32))

@@ -209,11 +209,7 @@ def test_a_given_homography_is_judged_and_not_estimated(model: str) -> None:
     [
         ({"estimator": "ransack"}, "unknown estimator 'ransack': did you mean 'ransac'?"),
         ({"inlier_threshold": 0}, "`inlier_threshold` must be above 0, not 0"),
-        ({"inlier_threshold": float("nan")}, "not nan"),
         ({"confidence": 0.0}, "confidence must lie between 0 and 1, not 0.0"),
-        ({"confidence": float("nan")}, "not nan"),
-        ({"iterations": 0}, "`iterations` must be above 0, not 0"),
-        ({"homography": np.eye(2)}, "homography must be a (3, 3) matrix"),
         ({"homography": np.diag([1, 1, np.nan])}, "of finite numbers"),
         ({"camera0": np.ones((3, 4))}, "camera0 must be a (3, 3) matrix"),
     ],
@@ -229,7 +225,6 @@ def test_wrong_options_say_what_is_wrong(values: dict[str, Any], message: str) -
     [
         ("homografy", {}, "unknown model 'homografy': did you mean 'homography'?"),
         ("essential", {}, "needs both cameras"),
-        ("essential", {"camera1": CAMERA1}, "needs both cameras"),
     ],
 )
 def test_a_model_that_cannot_be_estimated(

@@ -38,6 +38,12 @@ def nearest_layers(sizes: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarra
     return octaves, step - LAYERS * octaves
 
 
+def packed_octaves(sizes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return where SIFT describes keypoints of (N,) sizes, as OpenCV notes octave and layer."""
+    octaves, layers = nearest_layers(sizes, shape)
+    return (octaves & 255) | (layers << 8)
+
+
 def gaussian_layers(
     gray: np.ndarray, first_octave: int, last_octave: int
 ) -> Iterator[tuple[int, int, np.ndarray]]:

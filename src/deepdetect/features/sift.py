@@ -16,7 +16,7 @@ from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
 from .._shared.options import look_up
 from .keypoints import UNSET_ANGLE, Keypoints, on_pixels
-from .scale_space import BASE_SIGMA_PX, CAMERA_SIGMA_PX, LAYERS, dominant_angles, nearest_layers
+from .scale_space import BASE_SIGMA_PX, CAMERA_SIGMA_PX, LAYERS, dominant_angles, packed_octaves
 from .selection import spread_over_grid
 
 ROOT_SIFT = "rootsift"
@@ -158,16 +158,12 @@ def scaled_sift_descriptors(
     """
     if not len(xy):
         return np.empty((0, 128), np.uint8)
-    octaves, layers = nearest_layers(sizes, gray.shape)
-    packed = (octaves & 255) | (layers << 8)  # as SIFT itself notes where a keypoint is from
-    columns = (*np.asarray(xy, np.float32).T.tolist(), list(sizes), list(angles), packed.tolist())
-    keypoints = [
-        cv2.KeyPoint(x, y, float(size), float(angle), 0.0, octave)
-        for x, y, size, angle, octave in zip(*columns, strict=True)
-    ]
+    octaves = packed_octaves(sizes, gray.shape)
+    size, scores = (gray.shape[1], gray.shape[0]), np.zeros(len(xy))
+    keypoints = Keypoints(xy, scores, size, sizes=sizes, angles=angles, octaves=octaves)
     # Without precise upscaling octave -1 is a quarter of a pixel off.
     sift = cv2.SIFT_create(nOctaveLayers=LAYERS, enable_precise_upscale=True)
-    return _compute(sift, gray, keypoints)
+    return _compute(sift, gray, keypoints.to_opencv())
 
 
 def _compute(sift: cv2.SIFT, gray: np.ndarray, keypoints: list[cv2.KeyPoint]) -> np.ndarray:

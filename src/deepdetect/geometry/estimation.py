@@ -326,20 +326,14 @@ class Parallax:
 
 
 @dataclass(frozen=True, eq=False)
-class TwoViewModel:
-    """The model of a pair, and the evidence for it.
+class TwoViewModel(Geometry):
+    """A geometry, and the evidence for it: its model is "none" where none could be estimated.
 
     Attributes:
-        model: "homography", "fundamental", or "none" where nothing could be estimated.
-        matrix: (3, 3) float64, or None.
-        inliers: (M,) bool, the matches that agree with it.
         log10_nfa: decimal logarithm of its number of false alarms.
         parallax: of a homography that was chosen, not asked for: what it leaves.
     """
 
-    model: str
-    matrix: np.ndarray | None
-    inliers: np.ndarray
     log10_nfa: float
     parallax: Parallax | None = None
 

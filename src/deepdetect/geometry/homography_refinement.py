@@ -176,8 +176,6 @@ def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray 
 
     Its last element is 1; None when the points do not determine it.
     """
-    if len(points0) < 4:
-        return None
     middle = points0.mean(axis=0)
     spread = float(np.abs(points0 - middle).mean())
     if not spread > 0:

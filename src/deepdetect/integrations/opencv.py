@@ -14,7 +14,7 @@ from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
-from ..features.scale_space import nearest_layers
+from ..features.scale_space import packed_octaves
 from ..features.sift import describe_keypoints
 from ..io.image import load_image, luma
 
@@ -135,10 +135,8 @@ def _ignored(mask: np.ndarray | None) -> np.ndarray | None:
 def _to_opencv(points: Keypoints) -> tuple[cv2.KeyPoint, ...]:
     """Convert keypoints with sizes, and note where in its scale space SIFT describes them."""
     assert points.sizes is not None
-    width, height = points.image_size
-    octaves, layers = nearest_layers(points.sizes, (height, width))
-    packed = (octaves & 255) | (layers << 8)
-    return tuple(dataclasses.replace(points, octaves=packed).to_opencv())
+    octaves = packed_octaves(points.sizes, points.image_size)
+    return tuple(dataclasses.replace(points, octaves=octaves).to_opencv())
 
 
 def _as_float(points: Keypoints) -> np.ndarray:

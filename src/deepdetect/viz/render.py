@@ -66,7 +66,7 @@ def orbit_camera(
     low, high = np.percentile(xy[depth > 0], (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0)
     wanted = FILL_RATIO * np.array(size) / np.maximum(high - low, 1e-6)
     focal = float(wanted.min())
-    centre = (np.array(size) - 1) / 2 - focal * (low + high) / 2
+    centre = ((np.array(size) - 1) / 2 - focal * (low + high) / 2).tolist()
     return replace(plain, camera=Camera(size, focal, centre))
 
 
@@ -123,7 +123,7 @@ def _finer(camera: PosedView) -> PosedView:
     coarse, times = camera.camera, SUPERSAMPLING
     size = coarse.size[0] * times, coarse.size[1] * times
     # The centre of the first fine pixel lies before that of the first pixel.
-    centre = np.array(coarse.centre) * times + (times - 1) / 2
+    centre = [times * middle + (times - 1) / 2 for middle in coarse.centre]
     return replace(camera, camera=Camera(size, coarse.focal_px[0] * times, centre))
 
 
