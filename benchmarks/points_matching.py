@@ -21,8 +21,7 @@ import numpy as np
 
 from deepdetect import DeepDetect, MatchingOptions, PointDetector, SelectionOptions, match_images
 from deepdetect._shared.machine import use_one_thread
-from deepdetect.datasets.oxford import load_oxford
-from deepdetect.datasets.types import PlanarPair
+from deepdetect.datasets.planar import PlanarPair, load_oxford
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import load_image
 
@@ -52,7 +51,7 @@ def main() -> None:
     seconds: dict[str, list[float]] = {name: [] for name in ways}
     print("pair     " + "".join(f"{name:>28}" for name in ways))
     for scene, number in PAIRS.items():
-        pair = list(scenes[scene].pairs())[number - 2]
+        pair = scenes[scene].pairs[number - 2]
         cells = []
         for name, options in ways.items():
             took, count, right = measure(pair, lambda a, b, o=options: match_images(a, b, **o))
@@ -63,7 +62,7 @@ def main() -> None:
     for name, values in seconds.items():
         ratio = np.exp(np.log(np.array(values) / dense).mean())
         print(f"{name}: {ratio:.2f} times the CPU seconds of dense (geometric mean)")
-    image = load_image(next(scenes["graf"].pairs()).first)
+    image = load_image(scenes["graf"].images[0])
     ratio = points_beside_heatmap(image, arguments.keypoints)
     print(f"points of graf 1: {ratio:.2f} times the CPU seconds of its heat map, one thread")
 

@@ -30,9 +30,13 @@ from deepdetect import (
     match_images,
     reconstruct,
 )
-from deepdetect.datasets.middlebury import load_calibrated_pair, load_middlebury
-from deepdetect.datasets.oxford import load_oxford
-from deepdetect.datasets.types import CalibratedStereoPair, PlanarPair, StereoPair
+from deepdetect.datasets.middlebury import (
+    CalibratedStereoPair,
+    StereoPair,
+    load_calibrated_pair,
+    load_middlebury,
+)
+from deepdetect.datasets.planar import PlanarPair, load_oxford
 from deepdetect.detector import HeatmapOptions
 from deepdetect.detector.pretrained import PRETRAINED
 from deepdetect.evaluation.profiling import profiled

@@ -21,8 +21,7 @@ import numpy as np
 from deepdetect._shared.atomic import atomic_path
 from deepdetect._shared.progress import progress
 from deepdetect._shared.provenance import provenance
-from deepdetect.datasets.oxford import load_oxford
-from deepdetect.datasets.types import PlanarPair, read_homography
+from deepdetect.datasets.planar import PlanarPair, load_oxford, read_homography
 from deepdetect.evaluation.metrics.homography import project_visible
 from deepdetect.evaluation.report import Report, Row, Section, Table
 from deepdetect.features.matchers import get_matcher, match_descriptors
@@ -136,7 +135,7 @@ def refine_oxford(folder: Path, output: Path, *, quiet: bool = True) -> list[Ref
         DeepDetectError: a file cannot be written.
     """
     results = []
-    pairs = [pair for scene in load_oxford(folder) for pair in scene.pairs()]
+    pairs = [pair for scene in load_oxford(folder) for pair in scene.pairs]
     with progress(len(pairs), "refining", "pair", quiet) as bar:
         for pair in pairs:
             results.append(_refine(pair, output / pair.scene / f"H1to{pair.number}p.refined"))

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from deepdetect import DeepDetect
-from deepdetect.datasets.oxford import load_oxford
+from deepdetect.datasets.planar import load_oxford
 from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.evaluation.profiling import peak_memory, run_in_child
 from deepdetect.evaluation.report import Cell, Table
@@ -60,7 +60,7 @@ def main() -> None:
     parser.add_argument("--projection", default="plane", choices=PROJECTIONS)
     arguments = parser.parse_args()
     how = arguments.weights, arguments.projection
-    pair = next(next(one for one in load_oxford(arguments.oxford) if one.name == "boat").pairs())
+    pair = next(one for one in load_oxford(arguments.oxford) if one.name == "boat").pairs[0]
     boat = [Path(pair.first), Path(pair.second)]
     with tempfile.TemporaryDirectory() as name:
         views = render_views(load_image(arguments.image), SIZE_PX, FOCAL_PX)

@@ -26,7 +26,7 @@ from deepdetect import (
     match_images,
     reconstruct,
 )
-from deepdetect.datasets import load_stereo_pair
+from deepdetect.datasets import load_motorcycle
 from deepdetect.datasets.degradation import DEGRADATIONS, degrade
 from deepdetect.features.display import draw_circle
 from deepdetect.geometry import disparity_errors
@@ -60,7 +60,7 @@ QUALITY = 66
 def main() -> None:
     """Write the picture."""
     others = {DEGRADATIONS[name].title: name for name in sys.argv[1:]}
-    pair = load_stereo_pair("motorcycle")
+    pair = load_motorcycle()
     detector = DeepDetect()
     rows = [header(COLUMNS, CELL[0])]
     for title, name in (others or LIGHTS).items():

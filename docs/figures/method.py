@@ -15,7 +15,7 @@ from day_dark_blurred import POINTS, draw_points
 from layout import caption, write_jpeg
 
 from deepdetect import DeepDetect, Matches, PointDetector, match_images
-from deepdetect.datasets import StereoPair, load_stereo_pair
+from deepdetect.datasets import StereoPair, load_motorcycle
 from deepdetect.features.display import draw_matches
 from deepdetect.geometry import disparity_errors
 from deepdetect.labels import LabelOptions, fuse
@@ -35,7 +35,7 @@ def main() -> None:
 
     photograph = data.astronaut()[:360, 60:420]
     write_jpeg(draw_labels(photograph), FOLDER / "method-labels.jpg", QUALITY)
-    pair = load_stereo_pair("motorcycle")
+    pair = load_motorcycle()
     write_jpeg(draw_kinds(pair.left), FOLDER / "method-kinds.jpg", QUALITY)
     write_jpeg(draw_guidance(pair), FOLDER / "method-guided.jpg", QUALITY)
 

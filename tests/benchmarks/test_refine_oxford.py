@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.datasets.oxford import SCENES
-from deepdetect.datasets.types import PlanarPair, read_homography
+from deepdetect.datasets.planar import OXFORD_KINDS, PlanarPair, read_homography
 from deepdetect.io.image import luma
 
 MOVE = np.array([[1.01, 0.02, 3.0], [-0.02, 0.99, 2.0], [1e-4, 0, 1.0]])
@@ -22,7 +21,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, write_scene: Callable[..., 
     """Eight scenes, whose published homographies are 2 px off in graf and true elsewhere."""
     root = tmp_path_factory.mktemp("refine") / "oxford"
     write_scene(root / "graf", (180, 140), MOVE, fading=0.03)
-    for scene in SCENES:
+    for scene in OXFORD_KINDS:
         if scene != "graf":
             write_scene(root / scene, (48, 40), np.eye(3))
     for number in range(2, 7):

@@ -138,9 +138,9 @@ def test_a_rectified_pair_becomes_metric_files(run, folder: Path) -> None:
 
 def test_the_depth_is_true(run, folder: Path) -> None:
     pytest.importorskip("skimage.data")
-    from deepdetect.datasets import load_stereo_pair
+    from deepdetect.datasets import load_motorcycle
 
-    true = load_stereo_pair("motorcycle").disparity[60:360, 250:650]
+    true = load_motorcycle().disparity[60:360, 250:650]
     true = FOCAL * BASELINE / (true + OFFSET)
     arguments = folder / "left.png", folder / "right.png", "--calibration", folder / "calib.json"
     for more, least, share in ((["--density", 1], 0.85, 0.85), ([], 0.3, 0.96)):

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import ImageError, OptionError, ReconstructionError
-from deepdetect.datasets import load_stereo_pair
+from deepdetect.datasets import load_motorcycle
 from deepdetect.datasets.middlebury import load_calibrated_pair, load_middlebury
 
 
@@ -43,7 +43,7 @@ LARGE = [
 def test_the_truth_fits_the_photographs(shared: Path, name: str) -> None:
     """The right view, sampled at x - disparity, looks like the left view; at x + it does not."""
     scene = shared / "data" / "middlebury" / name
-    pair = load_stereo_pair(name) if name == "motorcycle" else load_middlebury(scene)
+    pair = load_motorcycle(name) if name == "motorcycle" else load_middlebury(scene)
     height, width = pair.disparity.shape
     assert pair.left.shape == pair.right.shape == (height, width, 3)
     known = np.isfinite(pair.disparity)
@@ -100,7 +100,7 @@ def test_what_is_missing_or_wrong_is_named(scene: Path, one_line) -> None:
 
 def test_an_unknown_pair_names_the_nearest() -> None:
     with pytest.raises(OptionError, match="did you mean 'motorcycle'"):
-        load_stereo_pair("motorcicle")
+        load_motorcycle("motorcicle")
 
 
 def test_a_calibrated_pair_may_lack_the_ground_truth(scene: Path) -> None:

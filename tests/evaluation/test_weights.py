@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect, ImageError, OptionError, match_images
-from deepdetect.datasets.oxford import SCENES, load_oxford
+from deepdetect.datasets.planar import OXFORD_KINDS, load_oxford
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.evaluation.baselines.method import deepdetect_feature
 from deepdetect.evaluation.options import PAPER_RESOLUTION_PX, THRESHOLDS
@@ -45,7 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     root = tmp_path_factory.mktemp("oxford")
     image = cv2.resize(data.astronaut(), (384, 384), interpolation=cv2.INTER_AREA)
-    for index, scene in enumerate(SCENES):
+    for index, scene in enumerate(OXFORD_KINDS):
         (root / scene).mkdir()
         for number in range(1, 7):
             left, top = 8 * index + 2 * (number - 1), 40 + number - 1
@@ -64,7 +64,7 @@ def test_shifted_images_repeat_and_match(folder: Path) -> None:
     densities = [found.density[threshold] for threshold in THRESHOLDS]
     assert densities == sorted(densities, reverse=True)
     assert 0.1 < densities[0] < 0.9
-    assert set(found.repeatability) == set(SCENES)
+    assert set(found.repeatability) == set(OXFORD_KINDS)
     assert min(found.repeatability.values()) > 0.7
     assert set(found.correct) == {f"{scene} 1-{number}" for scene, number in OXFORD_PAIRS}
     for pair, correct in found.correct.items():
@@ -170,7 +170,7 @@ def test_counts_are_those_of_the_published_matching(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(paper, "MANY_SEEDS", 2)
-    pair = next(iter(load_oxford(folder)[0].pairs()))
+    pair = load_oxford(folder)[0].pairs[0]
     labels = LabelDetector(heatmap_options=HeatmapOptions(PAPER_RESOLUTION_PX))
     feature = deepdetect_feature(labels, version="1")
     counts = []

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect.datasets.types import read_homography
+from deepdetect.datasets.planar import read_homography
 from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.geometry import transform_points
 from deepdetect.geometry.homography_refinement import fit_homography_irls, refine_homography

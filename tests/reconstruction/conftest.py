@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, Matches, match_images
-from deepdetect.datasets import load_stereo_pair
+from deepdetect.datasets import load_motorcycle
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.io.image import luma
 
@@ -85,7 +85,7 @@ def halved(image: np.ndarray) -> np.ndarray:
 
 def make(turn0: np.ndarray, turn1: np.ndarray) -> Turned:
     pytest.importorskip("skimage.data", reason="needs scikit-image for the Motorcycle pair")
-    pair = load_stereo_pair("motorcycle")
+    pair = load_motorcycle()
     left, right = halved(pair.left[:, :740]), halved(pair.right[:, :740])
     size = (370, 250)
     # Half size: the centre of the first pixel moves by a quarter of a new one.

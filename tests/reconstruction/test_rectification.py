@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from deepdetect._shared.errors import ReconstructionError
-from deepdetect.datasets import load_stereo_pair
+from deepdetect.datasets import load_motorcycle
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift import detect_sift
@@ -151,7 +151,7 @@ def test_the_figures_are_those_of_the_pair() -> None:
 @pytest.fixture(scope="module")
 def motorcycle() -> tuple[np.ndarray, np.ndarray]:
     pytest.importorskip("skimage.data", reason="needs scikit-image for the Motorcycle pair")
-    pair = load_stereo_pair("motorcycle")
+    pair = load_motorcycle()
     return luma(pair.left), luma(pair.right)
 
 

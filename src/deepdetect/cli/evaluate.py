@@ -12,9 +12,9 @@ from cyclopts import Parameter
 
 from .._shared.errors import DeepDetectError, OptionError
 from .._shared.options import look_up
-from ..datasets import StereoPair, load_stereo_pair
+from ..datasets import StereoPair, load_motorcycle
 from ..datasets.middlebury import load_middlebury
-from ..datasets.oxford import load_oxford
+from ..datasets.planar import load_oxford
 from ..detector.detector import DeepDetect, HeatmapDetector
 from ..detector.heatmap import HeatmapOptions
 from ..detector.pretrained import PRETRAINED
@@ -257,7 +257,7 @@ def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Resu
     """
     detector = DeepDetect(**values)
     folder = cli.output_folder(output)
-    numbers = run_demo(load_stereo_pair("motorcycle"), detector, folder)
+    numbers = run_demo(load_motorcycle(), detector, folder)
     values = {"weights": detector.weights, "backend": detector.runtime, **numbers}
     return cli.Result(values, cli.table(values, "Correct: within 1 px of the true disparity."))
 

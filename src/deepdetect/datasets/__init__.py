@@ -9,13 +9,10 @@ from typing import Any
 from .._shared.options import look_up
 from . import photographs
 from .download import RemoteDataset, RemoteFile, get_dataset
-from .middlebury import load_motorcycle
+from .middlebury import StereoPair, load_motorcycle
 from .posed_images import PosedImage, PosedScene, load_posed_scenes
-from .types import StereoPair
 
-STEREO_PAIRS: dict[str, Callable[[], StereoPair]] = {
-    "motorcycle": load_motorcycle,
-}
+STEREO_PAIRS: dict[str, Callable[[], StereoPair]] = {"motorcycle": load_motorcycle}
 
 
 @cache
@@ -44,7 +41,7 @@ def find_remote_dataset(name: str) -> RemoteDataset:
     return look_up("data set", name, remote_datasets())
 
 
-def load_stereo_pair(name: str) -> StereoPair:
+def load_motorcycle(name: str) -> StereoPair:
     """Load a stereo pair by name.
 
     Raises:
@@ -62,7 +59,7 @@ __all__ = [
     "StereoPair",
     "find_remote_dataset",
     "get_dataset",
+    "load_motorcycle",
     "load_posed_scenes",
-    "load_stereo_pair",
     "remote_datasets",
 ]

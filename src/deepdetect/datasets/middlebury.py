@@ -12,16 +12,40 @@ the width of the map over that of the image.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from .._shared.errors import ImageError, MissingExtraError, MissingImageError
 from .._shared.text_files import read_json
-from ..geometry.camera import MAX_FILE_BYTES, read_calibration
+from ..geometry.camera import MAX_FILE_BYTES, Calibration, read_calibration
 from ..io.image import load_image
 from ..io.image_file import open_image
-from .types import CalibratedStereoPair, StereoPair
+
+
+@dataclass(frozen=True, eq=False)
+class StereoPair:
+    """Two rectified views: the match of the left (x, y) is the right (x - disparity, y).
+
+    Attributes:
+        name: the scene's name.
+        left, right: (H, W, 3) uint8 RGB.
+        disparity: (H, W) float32 true disparity of the left view in pixels, NaN where it is
+            unknown.
+    """
+
+    name: str
+    left: np.ndarray
+    right: np.ndarray
+    disparity: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedStereoPair(StereoPair):
+    """A rectified pair with the calibration of its cameras."""
+
+    calibration: Calibration
 
 
 def load_middlebury(folder: str | Path) -> StereoPair:

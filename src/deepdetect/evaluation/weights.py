@@ -11,8 +11,7 @@ from .._shared.errors import ImageError, OptionError
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
 from ..datasets.foreground import MaskedPhotograph, load_foreground
-from ..datasets.oxford import load_oxford
-from ..datasets.types import PlanarPair, PlanarScene
+from ..datasets.planar import PlanarPair, PlanarScene, load_oxford
 from ..detector.detector import DeepDetect
 from ..features.selection import SelectionOptions
 from ..io.image import find_images, load_image

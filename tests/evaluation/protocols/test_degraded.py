@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from deepdetect.datasets.degradation import DEGRADATIONS, degrade
-from deepdetect.datasets.low_visibility import load_low_visibility
-from deepdetect.datasets.types import PlanarPair
+from deepdetect.datasets.planar import PlanarPair, load_low_visibility
 from deepdetect.evaluation.baselines.method import BaselineError, with_common_descriptor
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.evaluation.metrics import repeatability
@@ -39,7 +38,7 @@ def few_random_points():
 
 @pytest.fixture(scope="module")
 def pairs(low_visibility_folder: Path) -> list[PlanarPair]:
-    return [pair for s in load_low_visibility(low_visibility_folder) for pair in s.pairs()]
+    return [pair for s in load_low_visibility(low_visibility_folder) for pair in s.pairs]
 
 
 def test_a_copy_is_made_once_and_outside_the_data(pairs: list[PlanarPair], tmp_path: Path) -> None:

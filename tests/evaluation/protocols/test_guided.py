@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect, match_images
-from deepdetect.datasets.types import PlanarPair
+from deepdetect.datasets.planar import PlanarPair
 from deepdetect.evaluation.options import BenchmarkOptions
 from deepdetect.evaluation.protocols.guided import (
     SEEDS,

@@ -9,8 +9,7 @@ import pytest
 
 from deepdetect import DeepDetect
 from deepdetect.datasets.middlebury import load_calibrated_pair
-from deepdetect.datasets.oxford import load_oxford
-from deepdetect.datasets.types import PlanarScene
+from deepdetect.datasets.planar import PlanarScene, load_oxford
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.evaluation.baselines.method import LocalFeature, deepdetect_feature
 from deepdetect.evaluation.baselines.opencv import (

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect
-from deepdetect.datasets.low_visibility import load_low_visibility
-from deepdetect.datasets.types import PlanarPair
+from deepdetect.datasets.planar import PlanarPair, load_low_visibility
 from deepdetect.evaluation.baselines.method import (
     BaselineError,
     LocalFeature,
@@ -39,7 +38,7 @@ FAST = with_common_descriptor(CLASSICAL["fast"])
 
 @pytest.fixture(scope="module")
 def pairs(low_visibility_folder: Path) -> list[PlanarPair]:
-    return [pair for s in load_low_visibility(low_visibility_folder) for pair in s.pairs()]
+    return [pair for s in load_low_visibility(low_visibility_folder) for pair in s.pairs]
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deepdetect.datasets.types import StereoPair
+from deepdetect.datasets.middlebury import StereoPair
 from deepdetect.evaluation.protocols.masks import LabelDetector
 from deepdetect.evaluation.protocols.stereo_matches import score_stereo_matches
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, match_images
-from deepdetect.datasets.oxford import load_oxford
+from deepdetect.datasets.planar import load_oxford
 from deepdetect.detector import HeatmapOptions
 from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.features.keypoints import nearest_keypoints
@@ -28,7 +28,7 @@ BARS = {
 @pytest.mark.parametrize(("scene", "number"), BARS)
 def test_most_of_what_can_be_matched_is(shared: Path, scene: str, number: int) -> None:
     scenes = load_oxford(shared / "data" / "oxford", "refined")
-    pair = list(next(one for one in scenes if one.name == scene).pairs())[number - 2]
+    pair = next(one for one in scenes if one.name == scene).pairs[number - 2]
     rgb = [load_image(image) for image in (pair.first, pair.second)]
     found = match_images(*rgb, DeepDetect().configured(HeatmapOptions(480)))
     assert found.guided

@@ -12,7 +12,7 @@ from ..._shared.atomic import atomic_path
 from ..._shared.opencv import cv2
 from ..._shared.records import file_digest
 from ...datasets.degradation import DEGRADATIONS, Degradation, degrade
-from ...datasets.types import PlanarPair
+from ...datasets.planar import PlanarPair
 from ...io.image import load_image
 from ..baselines.method import LocalFeature
 from ..metrics.homography import accuracy_at

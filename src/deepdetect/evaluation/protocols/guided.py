@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from ...datasets.types import PlanarPair
+from ...datasets.planar import PlanarPair
 from ...features.keypoints import nearest_keypoints
 from ...geometry import transform_points
 from ...geometry.transforms import transfer_errors

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..._shared.errors import ImageError
 from ...datasets.foreground import MaskedPhotograph, load_foreground
-from ...datasets.types import PlanarPair, PlanarScene
+from ...datasets.planar import PlanarPair, PlanarScene
 from ...features.display import draw_matches
 from ...features.keypoints import Keypoints
 from ...geometry.transforms import transfer_errors
@@ -113,7 +113,7 @@ def repeatability_table(
     def over_scenes(own: Rows) -> Cell:
         return mean_of(mean(where(own, scene=s.name), "repeatability") for s in scenes)
 
-    pairs = {pair.name: pair for scene in scenes for pair in scene.pairs()}
+    pairs = {pair.name: pair for scene in scenes for pair in scene.pairs}
     rows = run.rows("repeatability of ", features, pairs, measure)
     columns: Columns = {
         "mean": (".4f", over_scenes),

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from ...datasets.hpatches import in_d2net_subset, is_illumination, load_hpatches
-from ...datasets.low_visibility import load_low_visibility
-from ...datasets.oxford import SCENES, load_oxford
-from ...datasets.types import PlanarPair, PlanarScene
+from ...datasets.planar import (
+    OXFORD_KINDS,
+    PlanarPair,
+    PlanarScene,
+    in_d2net_subset,
+    is_illumination,
+    load_hpatches,
+    load_low_visibility,
+    load_oxford,
+)
 from ..baselines.method import LocalFeature
 from ..baselines.opencv import CLASSICAL, with_kd_trees
 from ..charts import bar_chart
@@ -54,7 +60,7 @@ def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
     for truth, of_truth in by_truth.items():
         by_truth[truth] = [scene.with_max_pairs(options.max_pairs) for scene in of_truth]
     scenes = by_truth["published"]
-    if missing := [name for name in SCENES if name not in {scene.name for scene in scenes}]:
+    if missing := [name for name in OXFORD_KINDS if name not in {scene.name for scene in scenes}]:
         run.skipped.append(f"Oxford's {', '.join(missing)}: not in {folder}")
     pairs = pairs_of(scenes)
     unrefined = [
@@ -155,7 +161,7 @@ def hpatches(run: Run, options: BenchmarkOptions) -> list[Section]:
     """Table III and Figure 7, and the other protocols on 116 scenes and on the D2-Net subset."""
     found = load_hpatches(run.folder("hpatches"))
     scenes = [scene.with_max_pairs(options.max_pairs) for scene in found]
-    last = [list(scene.pairs())[-1] for scene in scenes]
+    last = [scene.pairs[-1] for scene in scenes]
     sections = []
     if "paper" in options.protocols:
         sections.append(_hpatches_paper(run, options, scenes, last))
@@ -303,7 +309,7 @@ def _degraded(
 
 def pairs_of(scenes: Sequence[PlanarScene]) -> list[PlanarPair]:
     """Return the pairs of all scenes."""
-    return [pair for scene in scenes for pair in scene.pairs()]
+    return [pair for scene in scenes for pair in scene.pairs]
 
 
 def select_pairs(

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from ..._shared.errors import ImageError
-from ...datasets.oxford import load_oxford
-from ...datasets.types import PlanarPair
+from ...datasets.planar import PlanarPair, load_oxford
 from ..baselines.method import LocalFeature
 from ..options import BenchmarkOptions
 from ..report import Cell, Columns, Row, Rows, Section, tabulate

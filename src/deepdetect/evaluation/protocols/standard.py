@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from ...datasets.types import PlanarPair
+from ...datasets.planar import PlanarPair
 from ...features.keypoints import Keypoints
 from ...geometry import GeometryOptions, estimate_geometry
 from ..baselines.method import LocalFeature

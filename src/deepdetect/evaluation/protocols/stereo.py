@@ -15,8 +15,7 @@ import numpy as np
 from ..._shared.errors import ImageError
 from ..._shared.opencv import cv2
 from ..._shared.records import file_digest
-from ...datasets.middlebury import load_calibrated_pair, load_middlebury
-from ...datasets.types import CalibratedStereoPair
+from ...datasets.middlebury import CalibratedStereoPair, load_calibrated_pair, load_middlebury
 from ...detector.detector import AnyDetector, DeepDetect
 from ...detector.heatmap import HeatmapOptions
 from ...features.matchers import flann_neighbours, match_descriptors

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..._shared.progress import progress
-from ...datasets.types import StereoPair
+from ...datasets.middlebury import StereoPair
 from ...detector.detector import AnyDetector
 from ...features.matches import Matches
 from ...features.selection import SelectionOptions

@@ -1,0 +1,179 @@
+"""Planar scenes with true homographies: Oxford, HPatches, and the paper's badly visible pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from .._shared.errors import ImageError
+from .pair_selection import evenly_spaced
+
+OXFORD_KINDS = {
+    "bark": "zoom and rotation",
+    "bikes": "blur",
+    "boat": "zoom and rotation",
+    "graf": "viewpoint",
+    "leuven": "light and JPEG",
+    "trees": "blur",
+    "ubc": "light and JPEG",
+    "wall": "viewpoint",
+}
+"""What changes between the images of each scene of Oxford Affine Covariant Regions."""
+
+OXFORD_LAYOUT = (
+    f"the data set has the scenes {', '.join(OXFORD_KINDS)} with img1 to img6 and H1to2p to H1to6p"
+)
+
+NOT_IN_D2NET_SUBSET = {
+    *("i_contruction", "i_crownnight", "i_dc", "i_pencils", "i_whitebuilding"),
+    *("v_artisans", "v_astronautis", "v_talent"),
+}
+"""The eight scenes of HPatches beyond 1600x1200, which most papers leave out (D2-Net's list)."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlanarPair:
+    """Two images of a plane, or from one point of view; the first one's number is 1.
+
+    The (3, 3) homography takes columns (x, y, 1) of the first image to the second; centre of the
+    first pixel (0, 0). `kind` is what changes between them, "" where the data set does not say.
+    """
+
+    scene: str
+    number: int
+    first: Path
+    second: Path
+    homography: np.ndarray
+    kind: str = ""
+
+    @property
+    def name(self) -> str:
+        """As papers write it: "graf 1-6"."""
+        return f"{self.scene} 1-{self.number}"
+
+
+@dataclass(frozen=True, eq=False)
+class PlanarScene:
+    """A scene: the pairs of its first image with each other one."""
+
+    name: str
+    pairs: tuple[PlanarPair, ...]
+
+    @property
+    def images(self) -> list[Path]:
+        """All of its images."""
+        return [self.pairs[0].first, *(pair.second for pair in self.pairs)]
+
+    def with_max_pairs(self, max_pairs: int) -> PlanarScene:
+        """Return the scene with evenly spaced ones of its pairs, at most so many; one: the last."""
+        kept = self.pairs[-1:] if max_pairs == 1 else evenly_spaced(self.pairs, max_pairs)
+        return replace(self, pairs=tuple(kept))
+
+
+def load_oxford(
+    folder: str | Path, truth: Literal["published", "refined"] = "published"
+) -> list[PlanarScene]:
+    """List the eight scenes (Mikolajczyk et al., 2005), or those of them that are there.
+
+    The "published" truth is in H1toKp; "refined" reads H1toKp.refined where there is one.
+    """
+    root = Path(folder)
+    there = [root / name for name in OXFORD_KINDS if (root / name).is_dir()]
+    if not there:
+        raise ImageError(f"there are no Oxford scenes in {folder}: {OXFORD_LAYOUT}")
+    images = [f"img{number}" for number in range(1, 7)]
+    scenes = []
+    for scene in there:
+        homographies = [f"H1to{number}p" for number in range(2, 7)]
+        if truth == "refined":
+            refined = [f"{name}.refined" for name in homographies]
+            choices = zip(homographies, refined, strict=True)
+            homographies = [new if (scene / new).exists() else name for name, new in choices]
+        suffixes, kind = (".png", ".ppm", ".pgm"), OXFORD_KINDS[scene.name]
+        scenes.append(_load_scene(scene, images, homographies, suffixes, OXFORD_LAYOUT, kind))
+    return scenes
+
+
+def load_hpatches(folder: str | Path) -> list[PlanarScene]:
+    """List the scenes that are there (Balntas et al., 2017): 116 in the whole set.
+
+    The folders i_NAME change the light, v_NAME the viewpoint; they hold 1.ppm (or .png) to 6, and
+    H_1_2 to H_1_6.
+    """
+    root = Path(folder)
+    found = [*sorted(root.glob("i_*")), *sorted(root.glob("v_*"))]
+    scenes = [path for path in found if path.is_dir()]
+    if not scenes:
+        raise ImageError(
+            f"there are no HPatches scenes in {folder}: it must hold folders i_NAME and v_NAME"
+        )
+    images = [f"{number}" for number in range(1, 7)]
+    homographies = [f"H_1_{number}" for number in range(2, 7)]
+    layout = "a scene has images 1 to 6"
+    loaded = []
+    for path in scenes:
+        kind = "illumination" if path.name.startswith("i_") else "viewpoint"
+        loaded.append(_load_scene(path, images, homographies, (".ppm", ".png"), layout, kind))
+    return loaded
+
+
+def is_illumination(scene: PlanarScene) -> bool:
+    """Whether a scene of HPatches changes the light; the others change the viewpoint."""
+    return scene.name.startswith("i_")
+
+
+def in_d2net_subset(scene: PlanarScene) -> bool:
+    """Whether a scene is one of the 108 of the D2-Net subset, on which most papers report."""
+    return scene.name not in NOT_IN_D2NET_SUBSET
+
+
+def load_low_visibility(folder: str | Path) -> list[PlanarScene]:
+    """List the paper's dusty and smoky scenes: SCENE/img1, SCENE/img2 (.png or .bmp), H1to2p."""
+    layout = "the folder must hold dusty and smoky"
+    return [
+        _load_scene(Path(folder) / name, ("img1", "img2"), ("H1to2p",), (".png", ".bmp"), layout)
+        for name in ("dusty", "smoky")
+    ]
+
+
+def read_homography(path: Path) -> np.ndarray:
+    """Read nine numbers from a text file as a (3, 3) float64 matrix."""
+    try:
+        matrix = np.array(path.read_text().split(), np.float64).reshape(3, 3)
+    except OSError as error:
+        raise ImageError(f"{path} cannot be read ({error.strerror}): check the folder") from None
+    except ValueError:
+        raise ImageError(f"{path} holds no 3x3 matrix: nine numbers are expected") from None
+    if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
+        raise ImageError(f"{path} holds no homography: the matrix cannot be inverted")
+    return matrix
+
+
+def _load_scene(
+    folder: Path,
+    images: Sequence[str],
+    homographies: Sequence[str],
+    suffixes: Sequence[str],
+    layout: str,
+    kind: str = "",
+) -> PlanarScene:
+    """Load images, named without their suffixes, and the homographies from the first to the others.
+
+    The suffixes are looked for in this order; `layout` says what the folder must hold.
+    """
+    files = []
+    for name in images:
+        found = [path for end in suffixes if (path := folder / f"{name}{end}").exists()]
+        if not found:
+            raise ImageError(f"there is no image {name} in {folder}: {layout}")
+        files.append(found[0])
+    others = enumerate(zip(files[1:], homographies, strict=True), start=2)
+    pairs = [
+        PlanarPair(folder.name, number, files[0], file, read_homography(folder / name), kind)
+        for number, (file, name) in others
+    ]
+    return PlanarScene(folder.name, tuple(pairs))
