@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import ImageError, OptionError, ReconstructionError
+from deepdetect import ImageError, ReconstructionError
 from deepdetect.datasets import load_motorcycle
 from deepdetect.datasets.middlebury import load_calibrated_pair, load_middlebury
 
@@ -43,7 +43,7 @@ LARGE = [
 def test_the_truth_fits_the_photographs(shared: Path, name: str) -> None:
     """The right view, sampled at x - disparity, looks like the left view; at x + it does not."""
     scene = shared / "data" / "middlebury" / name
-    pair = load_motorcycle(name) if name == "motorcycle" else load_middlebury(scene)
+    pair = load_motorcycle() if name == "motorcycle" else load_middlebury(scene)
     height, width = pair.disparity.shape
     assert pair.left.shape == pair.right.shape == (height, width, 3)
     known = np.isfinite(pair.disparity)
@@ -96,11 +96,6 @@ def test_what_is_missing_or_wrong_is_named(scene: Path, one_line) -> None:
     Image.fromarray(np.zeros((16, 30, 3), np.uint8)).save(scene / "right.png")
     with pytest.raises(ImageError, match="differ in size"):
         load_middlebury(scene)
-
-
-def test_an_unknown_pair_names_the_nearest() -> None:
-    with pytest.raises(OptionError, match="did you mean 'motorcycle'"):
-        load_motorcycle("motorcicle")
 
 
 def test_a_calibrated_pair_may_lack_the_ground_truth(scene: Path) -> None:

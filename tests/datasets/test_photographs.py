@@ -76,7 +76,7 @@ def test_there_are_8000_photographs_and_more() -> None:
 
 def test_crops_replace_the_repositories(unpacked: tuple[Path, list[Crop]]) -> None:
     folder, crops = unpacked
-    write_crops(folder, crops)
+    write_crops(folder, True, crops)
     assert not (folder / "sources").exists()
     with (folder / "licences.csv").open() as file:
         head, *rows = csv.reader(file)
@@ -106,10 +106,10 @@ def test_what_is_not_listed_is_refused(unpacked: tuple[Path, list[Crop]]) -> Non
     file = folder / "sources" / "osie" / crops[2].path
     file.write_bytes(file.read_bytes() + b"more")
     with pytest.raises(DeepDetectError, match="is not the picture that is listed"):
-        write_crops(folder, crops)
+        write_crops(folder, True, crops)
     file.unlink()
     with pytest.raises(DeepDetectError, match=r"osie has no data/stimuli/1\.png"):
-        write_crops(folder, crops)
+        write_crops(folder, True, crops)
 
 
 @pytest.mark.parametrize(

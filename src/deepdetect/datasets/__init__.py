@@ -1,7 +1,6 @@
 """Data sets with ground truth, and those on the web (`known/datasets.json`)."""
 
 import json
-from collections.abc import Callable
 from functools import cache, partial
 from importlib import resources
 from typing import Any
@@ -11,8 +10,6 @@ from . import photographs
 from .download import RemoteDataset, RemoteFile, get_dataset
 from .middlebury import StereoPair, load_motorcycle
 from .posed_images import PosedImage, PosedScene, load_posed_scenes
-
-STEREO_PAIRS: dict[str, Callable[[], StereoPair]] = {"motorcycle": load_motorcycle}
 
 
 @cache
@@ -25,8 +22,9 @@ def remote_datasets() -> dict[str, RemoteDataset]:
 def _remote_dataset(name: str, files: Any = (), texts: Any = None, **values: Any) -> RemoteDataset:
     if name.startswith("photographs"):
         free = name.endswith("free")
-        prepare = partial(photographs.prepare, free=free)
-        return RemoteDataset(name, files=photographs.archives(free), prepare=prepare, **values)
+        crops = [crop for crop in photographs.listed_crops() if crop.is_free or not free]
+        prepare = partial(photographs.write_crops, crops=crops)
+        return RemoteDataset(name, files=photographs.archives(crops), prepare=prepare, **values)
     made = tuple(RemoteFile(**{**file, "urls": tuple(file["urls"])}) for file in files)
     written = {path: json.dumps(value, indent=1) + "\n" for path, value in (texts or {}).items()}
     return RemoteDataset(name, files=made, texts=written, **values)
@@ -41,17 +39,7 @@ def find_remote_dataset(name: str) -> RemoteDataset:
     return look_up("data set", name, remote_datasets())
 
 
-def load_motorcycle(name: str) -> StereoPair:
-    """Load a stereo pair by name.
-
-    Raises:
-        OptionError: the name is unknown.
-    """
-    return look_up("stereo pair", name, STEREO_PAIRS)()
-
-
 __all__ = [
-    "STEREO_PAIRS",
     "PosedImage",
     "PosedScene",
     "RemoteDataset",

@@ -43,8 +43,6 @@ RESTRICTED = re.compile(r"\b(n[cd]|non-?commercial|no-?deriv\w*)\b", re.IGNORECA
 LIST_FILE = "photographs.csv.gz"
 LICENCES_FILE = "licences.csv"
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
-
-
 SOURCES_FOLDER = "sources"
 
 
@@ -121,7 +119,7 @@ def listed_crops() -> tuple[Crop, ...]:
     )
 
 
-def write_crops(folder: Path, crops: Sequence[Crop], quiet: bool = True) -> None:
+def write_crops(folder: Path, quiet: bool, crops: Sequence[Crop]) -> None:
     """Replace the repositories below `sources` by crops in `train` and `val`, and licences.csv.
 
     Crops of a picture come one after the other.
@@ -176,12 +174,7 @@ def cut(picture: Image.Image, short_side_px: int, x: int, y: int) -> Image.Image
     )
 
 
-def archives(free: bool) -> tuple[RemoteFile, ...]:
-    """Return the archives that the crops, or those that are free, are cut from."""
-    used = {crop.source for crop in listed_crops() if crop.is_free or not free}
+def archives(crops: Sequence[Crop]) -> tuple[RemoteFile, ...]:
+    """Return the archives that crops are cut from."""
+    used = {crop.source for crop in crops}
     return tuple(source.archive for source in listed_sources() if source.name in used)
-
-
-def prepare(folder: Path, quiet: bool, free: bool) -> None:
-    """Replace unpacked repositories by the crops, or by those that are free."""
-    write_crops(folder, [crop for crop in listed_crops() if crop.is_free or not free], quiet)
