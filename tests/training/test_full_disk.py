@@ -17,7 +17,7 @@ from deepdetect.detector.network.onnx_export import export_onnx  # noqa: E402
 from deepdetect.detector.network.weights import save_weights  # noqa: E402
 from deepdetect.detector.points.ranker import load_ranker  # noqa: E402
 from deepdetect.training.checkpoint import save_checkpoint  # noqa: E402
-from deepdetect.training.points.model import save_ranker  # noqa: E402
+from deepdetect.training.points.task import save_ranker  # noqa: E402
 
 
 @contextmanager

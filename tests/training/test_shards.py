@@ -3,7 +3,6 @@ from __future__ import annotations
 import json
 import shutil
 import tarfile
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -126,8 +125,8 @@ def test_an_unreadable_photograph_can_be_mended(photographs: Path, tmp_path: Pat
     assert len(made.training) + len(made.validation) == len(left) + 1
 
 
-@pytest.mark.parametrize("damage", ["cut", "missing", "other", "index"])
-def test_damaged_shards_are_told(damage: str, shards: Shards, tmp_path: Path) -> None:
+@pytest.mark.parametrize("damage", ["cut", "missing", "other", "{", "[1]", "[" * 100_000])
+def test_damaged_shards_are_told(damage: str, shards: Shards, tmp_path: Path, one_line) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(shards.folder, folder)
     path = folder / shards.training[0][0].name
@@ -139,9 +138,10 @@ def test_damaged_shards_are_told(damage: str, shards: Shards, tmp_path: Path) ->
         with tarfile.open(path, "w"):
             pass
     else:
-        (folder / "shards.json").write_text("{")
-    with pytest.raises(ImageError, match="write the shards again"):
+        (folder / "shards.json").write_text(damage)
+    with pytest.raises(ImageError, match="write the shards again") as caught:
         read_first(folder)
+    one_line(caught.value)
 
 
 def read_first(folder: Path) -> None:
@@ -173,13 +173,3 @@ def test_an_index_cannot_name_files_elsewhere(shards: Shards, tmp_path: Path) ->
     path.write_text(json.dumps(index))
     with pytest.raises(ImageError, match="copy/passwd is missing"):
         Shards.open(tmp_path / "copy", OPTIONS)
-
-
-@pytest.mark.parametrize("content", ["[" * 100_000, '{"training": ', "[1]"])
-def test_an_index_that_is_none_is_one_sentence(
-    content: str, shards: Shards, tmp_path: Path, one_line: Callable[[BaseException], str]
-) -> None:
-    (tmp_path / "shards.json").write_text(content)
-    with pytest.raises(ImageError) as caught:
-        Shards.open(tmp_path, OPTIONS)
-    assert "shards.json is damaged" in one_line(caught.value)

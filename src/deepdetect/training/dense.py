@@ -139,7 +139,6 @@ class DenseTask(Task):
         return binary_cross_entropy_with_logits(logits, truth, pos_weight=weight)
 
     def backward(self, loss: Tensor) -> float:
-        """Compute the gradients, and return the mean loss over all processes."""
         self.fabric.backward(loss)
         return float(self.fabric.all_reduce(loss.detach(), reduce_op="mean").item())
 

@@ -59,8 +59,8 @@ class Shards:
     training: Files
     validation: Files
 
-    @classmethod
-    def open(cls, folder: Path, options: TrainingOptions) -> Shards | None:
+    @staticmethod
+    def open(folder: Path, options: TrainingOptions) -> Shards | None:
         """Read the index of a folder of shards for a recipe; None where there are none.
 
         Raises:
@@ -71,18 +71,11 @@ class Shards:
             if any(folder.glob("training-*-*.tar")):
                 raise ImageError(f"the shards in {folder} are not complete: write them again")
             return None
-        index = _read_index(folder, options)
-        try:
-            training, validation = (
-                tuple((folder / Path(row["file"]).name, int(row["images"])) for row in index[kind])
-                for kind in ("training", "validation")
-            )
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise _damaged(folder / INDEX, error) from None
-        for path, _ in training + validation:
+        found = _read_index(folder, options)
+        for path, _ in found.training + found.validation:
             if not path.is_file():
                 raise ImageError(f"the shard {path} is missing: write the shards again")
-        return cls(folder, training, validation)
+        return found
 
 
 class ShardSource:
@@ -285,15 +278,19 @@ def _read(path: Path, place: tuple[int, int]) -> bytes:
         raise _damaged(path, error) from None
 
 
-def _read_index(folder: Path, options: TrainingOptions) -> dict[str, Any]:
+def _read_index(folder: Path, options: TrainingOptions) -> Shards:
     """Read the index of shards; an OptionError where they were made with other options."""
     try:
         index = dict(read_json(folder / INDEX, MAX_INDEX_BYTES))
-    except (OSError, ValueError, TypeError) as error:
+        training, validation = (
+            tuple((folder / Path(row["file"]).name, int(row["images"])) for row in index[kind])
+            for kind in ("training", "validation")
+        )
+    except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise _damaged(folder / INDEX, error) from None
     advice = "make the shards and train with the same, or write to another folder"
     check_same(folder / INDEX, index.get("options"), _fixed_options(options), advice)
-    return index
+    return Shards(folder, training, validation)
 
 
 def _damaged(path: Path, reason: object) -> ImageError:

@@ -12,6 +12,7 @@ from torch.utils.data import Dataset
 from ...detector.points.candidate_features import describe_candidates
 from ...detector.points.hessian_scales import build_scale_space, find_candidates
 from ...features.sift import root_sift_descriptors
+from ...geometry.transforms import transform_points
 from ...io.image import load_image, luma
 from ..recipe import PointsTrainingOptions
 from .views import KINDS, ViewPair, draw_pair
@@ -134,7 +135,7 @@ class PairDataset(Dataset[CandidatePair]):
     def __getitem__(self, index: tuple[int, int]) -> CandidatePair:
         options = self.options
         generator = np.random.default_rng([options.seed, 3, *index])
-        kind = KINDS[int(generator.choice(len(KINDS), p=np.full(len(KINDS), 1 / len(KINDS))))]
+        kind = str(generator.choice(KINDS, p=np.full(len(KINDS), 1 / len(KINDS))))
         for _ in range(ATTEMPTS):
             file = self.files[int(generator.integers(len(self.files)))]
             gray = luma(load_image(file))
@@ -154,7 +155,6 @@ def overlaps(pair: ViewPair) -> tuple[float, float]:
     grid = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)
     found = []
     for matrix in (pair.homography, np.linalg.inv(pair.homography)):
-        mapped = np.column_stack([grid, np.ones(len(grid))]) @ matrix.T
-        xy = mapped[:, :2] / mapped[:, 2:]
+        xy = transform_points(grid, matrix)
         found.append(float(((xy > 0) & (xy < side - 1)).all(1).mean()))
     return found[0], found[1]
