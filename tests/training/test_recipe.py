@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import pytest
@@ -45,11 +44,6 @@ def test_bad_stages_are_refused(text: str) -> None:
 def test_bad_options_are_refused(bad: dict) -> None:
     with pytest.raises(OptionError):
         TrainingOptions(**bad)
-
-
-def test_an_unknown_option_names_the_nearest() -> None:
-    with pytest.raises(OptionError, match="did you mean 'learning_rate'"):
-        dataclasses.replace(TrainingOptions(), learning_rat=1)
 
 
 def test_the_papers_recipe() -> None:

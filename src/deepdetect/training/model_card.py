@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,15 +37,12 @@ def save_curves(points: Sequence[Point], columns: Sequence[str], folder: Path) -
 def write_model_card(
     path: Path,
     weights: Path,
-    describe: Callable[[Point], tuple[str, list[str]]],
+    network: str,
+    quality: Sequence[str],
     notes: Mapping[str, Any],
     points: Sequence[Point],
 ) -> None:
-    """Write a model card of a file of weights, with its notes and the curves, as Markdown.
-
-    `describe` says of the point of these weights what the network is, and how good it is.
-    """
-    network, quality = describe(json.loads(notes["point"]))
+    """Write a model card of a file of weights, with its notes and the curves, as Markdown."""
     options = json.loads(notes["options"])
     known = ("command", "options", "point")
     lines = [

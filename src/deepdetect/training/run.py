@@ -220,11 +220,11 @@ def profile(
     task = _dense_task(images, output, options, init_weights, device, log is None, **data)
     steps_of_stage = task.schedule.steps_of_stage
     lengths = [min(n, TIMED_STEPS + WARM_UP_STEPS) for n in steps_of_stage]
-    quiet = log is None or not task.is_main
-    if not quiet and log is not None:
+    log = log if task.is_main else None
+    if log is not None:
         log(f"timing {task.engine.describe()}")
     profiles, first = [], 0
-    with progress(sum(lengths), "timing", "step", quiet) as bar:
+    with progress(sum(lengths), "timing", "step", log is None) as bar:
         for length, whole in zip(lengths, steps_of_stage, strict=True):
             profiles.append(_time_steps(task, first, first + length, bar.update))
             first += whole

@@ -221,7 +221,8 @@ class Trainer:
         if task.is_main:
             onnx = task.export(self.folder)
             notes = task.read_notes(self.weights)
-            write_model_card(self.folder / CARD, self.weights, task.card, notes, state.points)
+            card = self.folder / CARD
+            write_model_card(card, self.weights, *task.card(best), notes, state.points)
         return TrainingResult(self.weights, onnx, state.points, best, speed)
 
     def _validate(self) -> None:

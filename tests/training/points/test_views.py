@@ -8,9 +8,8 @@ from deepdetect.training.points.views import KINDS, degrade, draw_pair, render, 
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", range(2))
-def test_the_homography_takes_one_view_onto_the_other(photo, kind: str, seed: int) -> None:
-    pair = draw_pair(photo, kind, 128, np.random.default_rng(seed))
+def test_the_homography_takes_one_view_onto_the_other(photo, kind: str) -> None:
+    pair = draw_pair(photo, kind, 128, np.random.default_rng(0))
     warped = cv2.warpPerspective(pair.images[0], pair.homography, (128, 128))
     shown = cv2.warpPerspective(
         pair.valid[0].astype(np.uint8), pair.homography, (128, 128), flags=cv2.INTER_NEAREST
