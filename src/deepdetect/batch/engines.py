@@ -56,12 +56,7 @@ def map_on_ray(
     The cluster is the one to which this process is connected, else the one that RAY_ADDRESS names
     or that runs on this machine (`ray start`), else, or with RAY_ADDRESS=local, one that is started
     here and ends with the work. All its machines need this package, and the files under the same
-    paths.
-
-    Raises:
-        MissingExtraError: Ray is not installed.
-        OptionError: `workers` is below 1.
-        DeepDetectError: the cluster failed, or is what the function raised.
+    paths. A DeepDetectError says that the cluster failed, or is what the function raised.
     """
     if workers is not None and workers < 1:
         raise OptionError(f"`workers` must be at least 1, not {workers}")

@@ -192,8 +192,7 @@ def feature_group(
 def keypoints_of(group: Any, descriptor_type: str | None = None) -> Keypoints:
     """Return the keypoints in hloc's group of an image; "rootsift" descriptors become bytes again.
 
-    Raises:
-        ValueError, TypeError, KeyError, or what h5py raises: it holds something else.
+    Where it holds something else, this is a ValueError, TypeError, KeyError, or what h5py raises.
     """
     arrays = {name: group[name][()] for name in group if name != "colors"}
     xy = np.asarray(arrays["keypoints"], np.float32)

@@ -105,11 +105,7 @@ def import_h5py() -> Any:
 
 @contextmanager
 def open_hdf5(path: Path) -> Iterator[Any]:
-    """Open an HDF5 file to read it.
-
-    Raises:
-        DeepDetectError: it is missing or damaged, which may be found while it is read.
-    """
+    """Open an HDF5 file to read it; that it is damaged may be found while it is read."""
     h5py = import_h5py()
     if path.is_dir():
         raise InvalidFileError(f"{path} is a folder: name a file of features or matches")
@@ -161,9 +157,6 @@ def write_groups(path: Path, groups: Iterable[Group]) -> None:
     """Write a file of groups, whole or not at all; without any there is no file.
 
     They are written one by one: an iterator needs the memory of one.
-
-    Raises:
-        DeepDetectError: it cannot be written.
     """
     groups = iter(groups)
     first = next(groups, None)
@@ -200,10 +193,8 @@ class ShardedWriter:
     def opened(self) -> Iterator[ShardedWriter]:
         """Hold the file for this process.
 
-        Raises:
-            OptionError: the file was made with other settings, by another program, or is being made
-                by another process.
-            DeepDetectError: the folder cannot be written, or the file is damaged.
+        An OptionError says that it was made with other settings or by another program, or is being
+        made by another process.
         """
         import_h5py()
         if self.path.is_dir():
@@ -260,8 +251,7 @@ class ShardedWriter:
     def merge(self, quiet: bool = True, stays: Callable[[str], bool] = lambda name: True) -> None:
         """Merge all shards into the file, and remove them; `stays` says which groups may be in it.
 
-        Raises:
-            DeepDetectError: the file cannot be written; the shards stay.
+        Where the file cannot be written the shards stay.
         """
         shards, removed = self._shard_files(), []
         if self.keep:

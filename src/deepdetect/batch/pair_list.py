@@ -64,11 +64,7 @@ def sequential_pairs(names: Sequence[str], following: int) -> list[Pair]:
 
 
 def check_pairs(pairs: Sequence[Pair]) -> list[Pair]:
-    """Return pairs that were given from Python, once each.
-
-    Raises:
-        OptionError: one is no pair of two names.
-    """
+    """Return pairs that were given from Python, once each; an OptionError says which is none."""
     for pair in pairs:
         names = () if isinstance(pair, str) else tuple(pair)
         if len(names) != 2 or names[0] == names[1] or not all(names):
