@@ -43,20 +43,6 @@ RECTIFIED = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]], float)
 """The fundamental matrix of a rectified pair: matches lie in the same row."""
 
 
-@pytest.mark.parametrize(
-    ("homography", "point", "expected"),
-    [
-        ([[1, 0, 5], [0, 1, -2], [0, 0, 1]], (3, 4), (8, 2)),
-        (2 * np.eye(3), (3, 4), (3, 4)),  # the scale of the matrix plays no part
-        ([[1, 0, 0], [0, 1, 0], [0.5, 0, 1]], (2, 4), (1, 2)),  # divided by x / 2 + 1
-        ([[1, 0, 0], [0, 1, 0], [0, 0, 2]], (3, 4), (1.5, 2)),
-    ],
-)
-def test_transform_known_answers(homography, point, expected) -> None:
-    mapped = transform_points([point], np.array(homography, float))
-    np.testing.assert_allclose(mapped, [expected], atol=1e-12)
-
-
 def test_transform_equals_scikit_image() -> None:
     points = np.random.default_rng(0).uniform(0, 500, (100, 2))
     expected = ProjectiveTransform(HOMOGRAPHY)(points)

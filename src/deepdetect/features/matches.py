@@ -84,13 +84,9 @@ class GuidedMatches:
         best_first = np.lexsort((self.indices0, -self.scores))
         _, first = np.unique(pixels[best_first], axis=0, return_index=True)
         kept = np.sort(best_first[first])
-        return GuidedMatches(
-            self.indices0[kept],
-            self.points1[kept],
-            self.scores[kept],
-            self.subpixel,
-            None if self.indices1 is None else self.indices1[kept],
-        )
+        columns = self.indices0[kept], self.points1[kept], self.scores[kept]
+        indices1 = None if self.indices1 is None else self.indices1[kept]
+        return GuidedMatches(*columns, self.subpixel, indices1)
 
 
 class _Lazy:
