@@ -36,80 +36,57 @@ def folders(temporary: Path) -> list[Path]:
     return [task for server in temporary.iterdir() for task in server.iterdir()]
 
 
-def test_it_is_bound_to_the_loopback_address(serve: Any) -> None:
+def test_the_page_is_served_with_a_strict_policy_at_the_loopback_address(serve: Any) -> None:
     client, _ = serve()
     assert client.server._socket.getsockname()[0] == "127.0.0.1"
     assert client.server.address.startswith(f"http://{client.host}/#key=")
+    for path in ("/", "/config.json", "/js/main.js", "/examples/coffee.jpg", "/model/ranker.npz"):
+        answer = client.ask("GET", path, headers={"Authorization": None})
+        assert answer.status == 200
+        policy = answer.headers["Content-Security-Policy"]
+        assert "default-src 'none'" in policy
+        assert "http" not in policy
+        assert "unsafe-inline" not in policy
+        assert "Access-Control-Allow-Origin" not in answer.headers
+        assert answer.headers["X-Content-Type-Options"] == "nosniff"
+    outside = ("/../server.py", "/js/../../server.py", "/%2e%2e/server.py", "//etc/passwd")
+    for path in (*outside, "/js", "/x"):
+        assert client.ask("GET", path).status == 404
 
 
-@pytest.mark.parametrize(
-    "path",
-    ["/", "/config.json", "/js/main.js", "/examples/coffee.jpg", "/model/ranker.npz"],
-)
-def test_the_page_is_served_with_a_strict_policy(path: str, serve: Any) -> None:
+def test_other_hosts_and_origins_are_refused(serve: Any) -> None:
+    """What DNS rebinding and other pages would send."""
     client, _ = serve()
-    answer = client.ask("GET", path, headers={"Authorization": None})
-    assert answer.status == 200
-    policy = answer.headers["Content-Security-Policy"]
-    assert "default-src 'none'" in policy
-    assert "http" not in policy
-    assert "unsafe-inline" not in policy
-    assert "Access-Control-Allow-Origin" not in answer.headers
-    assert answer.headers["X-Content-Type-Options"] == "nosniff"
-
-
-@pytest.mark.parametrize(
-    "host", ["example.org", "127.0.0.1", "127.0.0.1:1", "127.0.0.1.example.org:{port}", "", None]
-)
-def test_another_host_is_refused(host: str | None, serve: Any) -> None:
-    """What DNS rebinding would send."""
-    client, _ = serve()
-    given = None if host is None else host.format(port=client.server.port)
-    for path in ("/", "/config.json", "/api/jobs/x"):
-        # That HTTP demands one is uvicorn's to say.
-        status = 400 if given is None else 421
-        assert client.ask("GET", path, headers={"Host": given}).status == status
-
-
-@pytest.mark.parametrize(
-    "origin", ["http://example.org", "null", "https://{host}", "http://127.0.0.1"]
-)
-def test_another_origin_is_refused(origin: str, serve: Any) -> None:
-    client, _ = serve()
-    headers = {"Origin": origin.format(host=client.host)}
-    assert client.ask("POST", "/api/jobs?kind=match", b"", headers).status == 403
-    assert client.ask("GET", "/config.json", headers=headers).status == 403
+    hosts = (
+        "example.org",
+        "127.0.0.1",
+        "127.0.0.1:1",
+        f"127.0.0.1.example.org:{client.server.port}",
+    )
+    for host in (*hosts, ""):
+        for path in ("/", "/config.json", "/api/jobs/x"):
+            assert client.ask("GET", path, headers={"Host": host}).status == 421
+    assert client.ask("GET", "/", headers={"Host": None}).status == 400  # by uvicorn
+    for origin in ("http://example.org", "null", f"https://{client.host}", "http://127.0.0.1"):
+        headers = {"Origin": origin}
+        assert client.ask("POST", "/api/jobs?kind=match", b"", headers).status == 403
+        assert client.ask("GET", "/config.json", headers=headers).status == 403
     right = {"Origin": f"http://{client.host}"}
     assert client.ask("GET", "/config.json", headers=right).status == 200
 
 
-@pytest.mark.parametrize(
-    "key", [None, "Bearer ", "Bearer wrong", "Bearer ü".encode().decode("latin1")]
-)
-def test_the_key_is_needed(key: str | None, serve: Any) -> None:
+def test_the_key_is_needed_and_a_request_of_the_page(serve: Any) -> None:
     client, temporary = serve()
-    headers = {"Authorization": key}
-    answer = client.ask("POST", "/api/jobs?kind=match", b"abc", headers)
-    assert answer.status == 401
-    assert "open the address that it has printed" in answer.values["error"]
-    assert client.ask("POST", "/api/heatmap?width=16&height=16", b"", headers).status == 401
-    assert folders(temporary) == []
-
-
-def test_a_request_of_another_site_is_refused_even_with_the_key(serve: Any) -> None:
-    client, _ = serve()
+    for key in (None, "Bearer ", "Bearer wrong", "Bearer ü".encode().decode("latin1")):
+        headers = {"Authorization": key}
+        answer = client.ask("POST", "/api/jobs?kind=match", b"abc", headers)
+        assert answer.status == 401
+        assert "open the address that it has printed" in answer.values["error"]
+        assert client.ask("POST", "/api/heatmap?width=16&height=16", b"", headers).status == 401
     for site in ("cross-site", "same-site", "none"):
         headers = {"Sec-Fetch-Site": site}
         assert client.ask("POST", "/api/jobs?kind=match", b"", headers).status == 403
-
-
-@pytest.mark.parametrize(
-    "path",
-    ["/../server.py", "/js/../../server.py", "/%2e%2e/server.py", "//etc/passwd", "/js", "/x"],
-)
-def test_only_the_files_of_the_page_are_served(path: str, serve: Any) -> None:
-    client, _ = serve()
-    assert client.ask("GET", path).status == 404
+    assert folders(temporary) == []
 
 
 def test_a_body_that_nobody_reads_is_no_request(serve: Any) -> None:

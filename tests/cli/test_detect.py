@@ -150,10 +150,8 @@ def test_an_image_that_has_changed_is_done_again(run, photos: Path) -> None:
 @pytest.mark.parametrize(
     ("more", "told"),
     [
-        (["--threshold", 0.6], "--threshold"),
         (["--weights", "dense"], "--weights"),
-        (["--resolution", 240], "--resolution"),
-        (["--ignore", "ignore.png"], "--ignore"),
+        (["--threshold", 0.6, "--ignore", "ignore.png"], "--ignore, --threshold"),
     ],
 )
 def test_what_was_made_with_other_settings_is_replaced_and_named(
@@ -226,24 +224,20 @@ def test_outputs_of_something_else_are_never_replaced_silently(
     assert "0.npz exists" in result.stderr
     assert len(result.stderr.splitlines()) == 1
     assert contents(Path("out")) == before
-    detect(run, Path("in"), "--overwrite")
 
 
-@pytest.mark.parametrize("output", ["in", "link"])
-def test_pictures_of_an_earlier_run_are_no_inputs(run, photos: Path, output: str) -> None:
+def test_pictures_of_an_earlier_run_are_no_inputs(run, photos: Path) -> None:
     folder = copies(photos, Path("in"))
     Path("link").symlink_to("in")
     for skipped in (False, True):
-        result = run("detect", folder, "-o", output, "--json")
+        result = run("detect", folder, "-o", "link", "--json")
         assert result.exit_code == 0, result.output
         images = json.loads(result.stdout)["images"]
         assert [Path(image["image"]).name for image in images] == ["0.jpg", "1.jpg"]
         assert [image["skipped"] for image in images] == [skipped] * 2
-    other = json.loads(run("detect", folder, "-o", "other", "--json").stdout)["images"]
-    assert len(other) == 8, "elsewhere they are images as any"
     for name in ("0.jpg", "1.jpg"):
         (folder / name).unlink()
-    result = run("detect", folder, "-o", output)
+    result = run("detect", folder, "-o", "link")
     assert result.exit_code == 2
     assert "results of earlier runs" in result.stderr
 
@@ -268,7 +262,7 @@ def start(folder: Path, output: Path) -> subprocess.Popen[bytes]:
 
 
 def test_a_killed_run_goes_on_where_it_stopped(run, photos: Path) -> None:
-    folder = copies(photos, Path("in"), 30)
+    folder = copies(photos, Path("in"), 20)
     process = start(folder, Path("out"))
     deadline = time.monotonic() + 120
     while not list(Path().glob("out/*.npz")):
@@ -278,10 +272,10 @@ def test_a_killed_run_goes_on_where_it_stopped(run, photos: Path) -> None:
     process.kill()
     process.wait()
     done = len(contents(Path("out")))
-    assert done < 30, "it was killed too late for this test"
+    assert done < 20, "it was killed too late for this test"
     skipped = sum(image["skipped"] for image in detect(run, folder))
-    assert 0 < skipped + 1 <= done + 1 <= 30
-    assert sorted(contents(Path("out"))) == sorted(f"{k}.npz" for k in range(30))
+    assert 0 < skipped + 1 <= done + 1 <= 20
+    assert sorted(contents(Path("out"))) == sorted(f"{k}.npz" for k in range(20))
     assert len({*contents(Path("out")).values()}) == 1
 
 

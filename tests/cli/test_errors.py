@@ -116,14 +116,13 @@ def test_a_process_of_its_own_ends_the_same_way(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
-@pytest.mark.parametrize("content", ["text", "half"])
 def test_bad_weights_make_no_noise_of_native_code(
-    photos: Path, tmp_path: Path, backend: str, content: str
+    photos: Path, tmp_path: Path, backend: str
 ) -> None:
     pytest.importorskip(backend, reason=f"needs {backend}")
     whole = pretrained_weights().read_bytes()
     path = tmp_path / "weights.onnx"
-    path.write_bytes(b"no network" if content == "text" else whole[: len(whole) // 2])
+    path.write_bytes(whole[: len(whole) // 2])
     command = [sys.executable, "-m", "deepdetect", "detect", str(photos / "cat.jpg")]
     command += ["--weights", str(path), "--backend", backend]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)

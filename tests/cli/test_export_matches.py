@@ -70,19 +70,21 @@ def test_saved_files_in_all_formats(
 
 def test_straight_from_photographs(run, photos: Path, tmp_path: Path) -> None:
     pytest.importorskip("pycolmap", reason="needs pycolmap")
-    words = ("export", "colmap", photos, "-o", "d.db", "--max-keypoints", 500, "--workers", 1)
-    made = summary(run(*words, "--focal", 995, "--json"))
-    assert (made["images"], made["pairs"]) == (3, 3)
+    Path("in").mkdir()
+    for name in ("left.png", "right.png"):
+        shutil.copy(photos / name, "in")
+    words = ("export", "colmap", "in", "--max-keypoints", 300, "--workers", 1, "-o")
+    made = summary(run(*words, "d.db", "--focal", 995, "--json"))
+    assert (made["images"], made["pairs"]) == (2, 1)
     with import_pycolmap().Database.open(tmp_path / "d.db") as database:
         assert {camera.params[0] for camera in database.read_all_cameras()} == {995}
-        assert database.num_verified_image_pairs() >= 1
-        assert max(len(database.read_keypoints(k)) for k in (1, 2, 3)) <= 500
-    assert run(*words).exit_code == 0  # the same again
-    result = run("export", "colmap", photos, "-o", "e.db", "--no-verify", "--sequential", 1)
+        assert database.num_verified_image_pairs() == 1
+        assert max(len(database.read_keypoints(k)) for k in (1, 2)) <= 300
+    result = run(*words, "e.db", "--no-verify", "--sequential", 1)
     assert result.exit_code == 0, result.output
     with import_pycolmap().Database.open(tmp_path / "e.db") as database:
         assert database.num_verified_image_pairs() == 0
-        assert database.num_matched_image_pairs() == 2
+        assert database.num_matched_image_pairs() == 1
 
 
 def test_text_files_of_colmap(run, saved: Path, photos: Path) -> None:
@@ -139,7 +141,8 @@ def test_a_mistake_is_one_sentence(
 
 def test_a_bad_photograph_does_not_stop_the_export(run, photos: Path, tmp_path: Path) -> None:
     """The others are written; it is named at the end, with exit code 1."""
-    shutil.copytree(photos, tmp_path / "photos")
+    (tmp_path / "photos").mkdir()
+    shutil.copy(photos / "left.png", "photos")
     (tmp_path / "photos" / "broken.jpg").write_bytes(b"no image")
     words = ("photos", "--max-keypoints", 200, "--workers", 1)
     result = run("export", "hloc", *words, "-o", "made", "--json")
@@ -147,7 +150,7 @@ def test_a_bad_photograph_does_not_stop_the_export(run, photos: Path, tmp_path: 
     assert "1 of the images and pairs failed" in result.stderr
     assert "broken.jpg is not an image" in result.stderr
     made = json.loads(result.stdout)
-    assert (made["images"], made["pairs"], len(made["failures"])) == (3, 3, 1)
+    assert (made["images"], made["pairs"], len(made["failures"])) == (1, 0, 1)
     assert (tmp_path / "made" / "features.h5").is_file()
     result = run("export", "hloc", *words, "-o", "small", "--max-megapixels", 0.001)
     assert result.exit_code == 1

@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
 
 from deepdetect import load_image
@@ -23,21 +22,18 @@ def test_writes_one_bit_masks(run, photos: Path) -> None:
     assert "3 labelled, 0 already done" in result.stdout
 
 
-def test_several_processes_give_the_same(run, photos: Path) -> None:
-    run("label", photos, "-o", "one", "--workers", 1)
-    run("label", photos, "-o", "two", "--workers", 2)
+def test_several_processes_give_the_same_and_what_is_done_is_skipped(run, photos: Path) -> None:
+    words = ("label", photos, "--detectors", "fast,sobel", "--json", "-o")
+    for output, workers in (("one", 1), ("two", 2)):
+        assert len(json.loads(run(*words, output, "--workers", workers).stdout)["labelled"]) == 3
     for path in Path("one").glob("*.png"):
         assert path.read_bytes() == (Path("two") / path.name).read_bytes()
-
-
-def test_what_is_done_is_skipped(run, photos: Path) -> None:
-    run("label", photos, "-o", "masks", "--workers", 1)
-    Path("masks/cat.png").unlink()
-    kept = Path("masks/left.png").stat().st_mtime_ns
-    report = json.loads(run("label", photos, "-o", "masks", "--workers", 1, "--json").stdout)
+    Path("one/cat.png").unlink()
+    kept = Path("one/left.png").stat().st_mtime_ns
+    report = json.loads(run(*words, "one", "--workers", 1).stdout)
     assert [Path(entry["image"]).name for entry in report["labelled"]] == ["cat.jpg"]
     assert report["skipped"] == 2
-    assert Path("masks/left.png").stat().st_mtime_ns == kept
+    assert Path("one/left.png").stat().st_mtime_ns == kept
 
 
 def test_masks_of_other_settings_are_not_passed_off(run, photos: Path) -> None:
@@ -64,13 +60,12 @@ def test_visualize_draws_four_panels(run, photos: Path) -> None:
         np.testing.assert_array_equal(panels[:150, left : left + 200, 0] > 0, mask)
 
 
-@pytest.mark.parametrize("visibility", ["normal", "low"])
-def test_subset_and_override(run, photos: Path, visibility: str) -> None:
+def test_subset_and_override(run, photos: Path) -> None:
     run(
         *("label", photos / "cat.jpg", "-o", "masks", "--detectors", "sobel, fast"),
-        *("--visibility", visibility, "--workers", 1),
+        *("--visibility", "low", "--workers", 1),
     )
-    options = LabelOptions(("fast", "sobel"), visibility)
+    options = LabelOptions(("fast", "sobel"), "low")
     expected = fuse(luma(load_image(photos / "cat.jpg")), options).mask
     np.testing.assert_array_equal(np.asarray(Image.open("masks/cat.png")), expected)
 

@@ -65,30 +65,20 @@ def test_the_preset_is_changed_by_given_options_only(run, photos: Path) -> None:
     assert report["model"] == "none"
 
 
-def test_a_given_homography_judges(run, photos: Path) -> None:
+def test_a_given_homography_judges_and_csv(run, photos: Path) -> None:
     np.savetxt("H", np.eye(3))
     result = run(
         *("match", photos / "cat.jpg", photos / "cat.jpg", "--homography", "H", "--json"),
-        "--no-pictures",
+        *("--no-pictures", "--format", "csv", "--unguided", "--max-keypoints", 300, "-o", "out"),
     )
     report = json.loads(result.stdout)
     assert report["model"] == "homography"
     assert report["inliers"] > 0.9 * report["matches"] > 0
-
-
-def test_csv(run, photos: Path) -> None:
-    run(
-        *("match", photos / "left.png", photos / "right.png", "-o", "out", "--format", "csv"),
-        *("--no-pictures", "--density", "0.02"),
-    )
-    lines = Path("out/left_right_matches.csv").read_text().splitlines()
-    assert lines[0] == "x0,y0,x1,y1,score,inlier"
-    table = np.loadtxt(lines[1:], delimiter=",", ndmin=2)
-    expected = match_images(
-        photos / "left.png", photos / "right.png", selection=SelectionOptions(density=0.02)
-    )
-    np.testing.assert_allclose(table[:, :2], expected.points0)
-    assert set(table[:, 5]) <= {0.0, 1.0}
+    header, *lines = Path("out/cat_cat_matches.csv").read_text().splitlines()
+    assert header == "x0,y0,x1,y1,score,inlier"
+    table = np.loadtxt(lines, delimiter=",", ndmin=2)
+    assert len(table) == report["matches"]
+    assert table[:, 5].sum() == report["inliers"]
 
 
 def test_images_without_a_match_have_an_exit_code_of_their_own(run, tmp_path: Path) -> None:
@@ -108,19 +98,17 @@ def test_a_failed_estimate_is_said(run, photos: Path) -> None:
     assert "no fundamental could be estimated" in result.stderr
 
 
-@pytest.mark.parametrize("more", [[], ["--json"]])
-def test_a_pair_without_a_geometry_has_its_own_exit_code(run, tmp_path: Path, more) -> None:
+def test_a_pair_without_a_geometry_has_its_own_exit_code(run, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     for name in "ab":
-        noise = rng.integers(0, 256, (96, 128), np.uint8)
+        noise = rng.integers(0, 256, (64, 80), np.uint8)
         Image.fromarray(noise).save(tmp_path / f"{name}.png")
-    result = run("match", "a.png", "b.png", "-o", "out", *more)
+    result = run("match", "a.png", "b.png", "-o", "out", "--json")
     assert result.exit_code == 3
     assert result.stderr.count("no geometry between these images can be trusted") == 1
     assert len(load_matches(Path("out/a_b_matches.npz"))) == 0
-    if more:
-        report = json.loads(result.stdout)
-        assert (report["matches"], report["success"]) == (0, False)
+    report = json.loads(result.stdout)
+    assert (report["matches"], report["success"]) == (0, False)
 
 
 def test_matches_of_other_images_are_not_written_over(run, photos: Path) -> None:
@@ -141,4 +129,3 @@ def test_matches_of_other_images_are_not_written_over(run, photos: Path) -> None
     assert run(*first, "--no-pictures").exit_code == 0, "the same images again"
     assert run(*other, "--overwrite").exit_code == 0
     assert Path("out/left_right_matches.npz").read_bytes() != written
-    assert run(*first).exit_code == 2
