@@ -9,22 +9,21 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from .errors import DeepDetectError, OptionError
 from .opencv import cv2
-from .signals import release_interrupt, signals_held
+from .signals import end_by_interrupt, end_worker_by_signals, signals_held
 
 if TYPE_CHECKING:
     from concurrent.futures import Future, ProcessPoolExecutor
+    from multiprocessing.process import BaseProcess
 
 Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
@@ -151,19 +150,10 @@ def _one_thread_inherited() -> Iterator[None]:
 
 def _run_task(function: Callable[[Task], Outcome], task: Task) -> Outcome:
     try:
-        for name in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(name, _exit_worker)
-        release_interrupt()
+        end_worker_by_signals()
         return function(task)
     except SystemExit:  # the pool would go on with the next task
         os._exit(1)
-
-
-def _exit_worker(number: int, frame: FrameType | None) -> None:
-    """End a worker, which cleans up what its task holds open."""
-    for name in (signal.SIGINT, signal.SIGTERM):  # both may come
-        signal.signal(name, signal.SIG_IGN)
-    raise SystemExit
 
 
 def _start_worker() -> None:
@@ -173,9 +163,9 @@ def _start_worker() -> None:
 
 def start_child() -> None:
     """Prepare a process that has been started: one thread, and it ends with its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    end_by_interrupt()
     use_one_thread()
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
 
 
 def use_one_thread() -> None:
@@ -185,13 +175,17 @@ def use_one_thread() -> None:
     _max_threads = 1
 
 
-def _end_with_parent() -> None:
+def end_with_parent(end: Callable[[], object] = lambda: None) -> None:
+    """End this process when the one that started it has ended, after a last call."""
     import multiprocessing
 
-    parent = multiprocessing.parent_process()
-    if parent is not None:
+    def wait(parent: BaseProcess) -> None:
         parent.join()
+        end()
         os._exit(1)
+
+    if parent := multiprocessing.parent_process():
+        threading.Thread(target=wait, args=[parent], daemon=True).start()
 
 
 @contextmanager

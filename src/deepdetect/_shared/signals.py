@@ -78,7 +78,7 @@ def sigterm_kept() -> Iterator[None]:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Let Ctrl-C wait while the block starts processes, and in these until `release_interrupt`."""
+    """Let Ctrl-C wait while the block starts processes, in them for `end_worker_by_signals`."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -93,8 +93,25 @@ def signals_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def release_interrupt() -> None:
-    """Let Ctrl-C come that `signals_held` holds in a process that has been started."""
+def end_by_interrupt() -> None:
+    """Let Ctrl-C end this process at once, without KeyboardInterrupt."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def end_worker_by_signals() -> None:
+    """Let Ctrl-C, which `signals_held` has held, and SIGTERM end a worker by SystemExit.
+
+    It cleans up what its task holds open.
+    """
+    both = (signal.SIGINT, signal.SIGTERM)
+
+    def end(number: int, frame: FrameType | None) -> None:
+        for name in both:  # both may come
+            signal.signal(name, signal.SIG_IGN)
+        raise SystemExit
+
+    for name in both:
+        signal.signal(name, end)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
 

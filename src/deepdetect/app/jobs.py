@@ -18,6 +18,7 @@ from typing import Any
 
 from .._shared.atomic import private_folder
 from .._shared.errors import DeepDetectError, OptionError
+from .._shared.machine import end_with_parent
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.signals import kill_group, signals_held
 from .tasks import TASKS, SentImage
@@ -196,7 +197,7 @@ def run_task(
         os.setsid()  # so that all it starts can be ended
     for stream in (1, 2):  # what libraries print
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
-    threading.Thread(target=_end_with_the_server, daemon=True).start()
+    end_with_parent(kill_group)
     (folder / "results").mkdir()
 
     def report(stage: str, done: int, total: int) -> None:
@@ -224,11 +225,3 @@ def _for_the_page(message: str, images: Sequence[SentImage], folder: Path) -> st
     for path in (folder / "results", folder):
         message = message.replace(f"{path}{os.sep}", "")
     return message.replace("`max_megapixels`", "--max-megapixels")
-
-
-def _end_with_the_server() -> None:
-    server = multiprocessing.parent_process()
-    if server is not None:
-        server.join()
-        kill_group()
-        os._exit(1)
