@@ -9,12 +9,15 @@ from PIL import Image
 
 from deepdetect import DeepDetect, MatchingOptions, SelectionOptions, load_matches, match_images
 from deepdetect.matching import PUBLISHED_MATCHING
+from deepdetect.matching.pipeline import GUIDED_STAGES
 
 
 def test_writes_matches_and_a_picture(run, photos: Path) -> None:
     result = run("match", photos / "left.png", photos / "right.png", "-o", "out")
     assert result.exit_code == 0, result.output
-    expected = match_images(photos / "left.png", photos / "right.png")
+    stages: list[str] = []
+    expected = match_images(photos / "left.png", photos / "right.png", progress=stages.append)
+    assert tuple(stages) == GUIDED_STAGES
     with np.load("out/left_right_matches.npz", allow_pickle=False) as file:
         np.testing.assert_array_equal(file["points0"], expected.points0)
         np.testing.assert_array_equal(file["points1"], expected.points1)

@@ -137,12 +137,12 @@ def install_command(*packages: str) -> str:
 
 def require_packages(what: str, *packages: str) -> None:
     """Raise a MissingExtraError where something needs a package that is not installed."""
-    for package in packages:
-        if importlib.util.find_spec(package) is None:
-            raise MissingExtraError(
-                f"{what} needs the package {package}, which is not installed: "
-                f"run {install_command(package)}"
-            )
+    missing = [package for package in packages if importlib.util.find_spec(package) is None]
+    if missing:
+        raise MissingExtraError(
+            f"{what} needs the package {' and '.join(missing)}, which is not installed: "
+            f"run {install_command(*missing)}"
+        )
 
 
 for _error in (

@@ -18,8 +18,6 @@ from .._shared.errors import DeepDetectError, OptionError, ReconstructionError, 
 FOLDER_KEYPOINTS = 2048
 """Best keypoints of each image of a folder."""
 
-MATCHING_STAGES = ("initial geometry", "keypoints", "guided matching", "geometry", "files")
-
 MODEL_STAGES = 9
 """Of a 3D model at most, with its files."""
 
@@ -95,10 +93,10 @@ def run_match(images: Images, options: Options, folder: Path, report: Report) ->
     """Match two images, guided by a geometry."""
     from ..io.image import load_image
     from ..io.tables import save_matches
-    from ..matching.pipeline import match_images
+    from ..matching.pipeline import GUIDED_STAGES, match_images
     from ..viz.draw import add_caption, save_picture
 
-    stages = _stages(MATCHING_STAGES, report)
+    stages = _stages(GUIDED_STAGES, report)
     first, second = (load_image(one.path) for one in images)
     matches = match_images(first, second, progress=stages)
     if not matches.success:
@@ -123,10 +121,11 @@ def run_register(images: Images, options: Options, folder: Path, report: Report)
     """Warp the second image into the frame of the first."""
     import numpy as np
 
+    from ..matching.pipeline import GUIDED_STAGES
     from ..matching.registration import register
     from ..viz.draw import save_picture
 
-    stages = _stages(MATCHING_STAGES, report)
+    stages = _stages(GUIDED_STAGES, report)
     found = register(images[0].path, images[1].path, progress=stages)
     pictures = {
         "checkerboard.png": found.checkerboard(),
@@ -149,7 +148,7 @@ def run_stitch(images: Images, options: Options, folder: Path, report: Report) -
     from ..matching.stitching import STAGES, stitch
     from ..viz.draw import save_picture
 
-    stages = _stages((*STAGES, "files"), report)
+    stages = _stages(STAGES, report)
     panorama = stitch([one.path for one in images], progress=stages)
     save_picture(panorama.image, folder / "panorama.jpg")
     height, width = panorama.image.shape[:2]
@@ -275,12 +274,12 @@ def _entry_name(name: str, others: Sequence[str]) -> str:
 
 
 def _stages(names: Sequence[str], report: Report) -> Callable[[str], None]:
-    """Report the first stage; return what is called when a stage ends."""
-    done = itertools.count()
+    """Report the first stage; return what is called when a stage ends. The last one are files."""
+    all_names, done = [*names, "files"], itertools.count()
 
     def ended(_: str) -> None:
-        number = min(next(done), len(names) - 1)
-        report(names[number], number, len(names))
+        number = next(done)
+        report(all_names[number], number, len(all_names))
 
     ended("")
     return ended

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from .._shared.errors import MissingExtraError, install_command
+from .._shared.errors import require_packages
 from .._shared.signals import endings_interrupt
 from ..app.jobs import AppOptions
 from ._options import From, command, note
@@ -30,12 +30,9 @@ def app(
     Args:
         open_browser: Open the page in the browser.
     """
-    try:
-        from ..app.server import AppServer
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            f"deepdetect app needs {error.name}: run {install_command('starlette', 'uvicorn')}"
-        ) from None
+    require_packages("deepdetect app", "starlette", "uvicorn")
+    from ..app.server import AppServer
+
     # Any signal to end is Ctrl+C, so that tasks are ended and their files removed.
     with endings_interrupt(), AppServer(AppOptions(**values)) as server:
         try:

@@ -27,13 +27,13 @@ from ..matching.options import (
     UNGUIDED_ONLY,
     MatchingOptions,
 )
-from ..matching.pipeline import match_images
+from ..matching.pipeline import GUIDED_STAGES, UNGUIDED_STAGES, match_images
 from ..matching.registration import register as register_images
 from ..matching.stitching import STAGES, Panorama, StitchingOptions
 from ..matching.stitching import stitch as stitch_images
 from ..viz.draw import add_caption, picture_suffix, save_picture
 from . import _options as cli
-from ._detection import NETWORK, POINTS, SELECTION, Detector, chosen_detector
+from ._detection import NETWORK, POINTS, SELECTION, Detector, Kind, chosen_detector
 
 PAIR = cli.From(
     match_images,
@@ -60,10 +60,6 @@ GEOMETRY = cli.From(
 PANORAMA = cli.From(stitch_images, "projection crop", more="seed")
 OPTIONS = cli.From(StitchingOptions)
 STITCH_KEYPOINTS = cli.From(PointDetector, more="max_keypoints")
-
-
-GUIDED_STAGES = ("keypoints", "guided matching", "geometry")
-UNGUIDED_STAGES = ("keypoints", "descriptors", "matching", "geometry")
 
 
 @cli.command(PAIR, SELECTION, MATCHING, GEOMETRY, POINTS, NETWORK, cli.MEGAPIXELS)
@@ -124,8 +120,9 @@ def match(
         "selection": selection,
         "options": replace(start, geometry=geometry, **changes),
     }
-    stages = GUIDED_STAGES if values.get("guided_matching", True) else UNGUIDED_STAGES
+    guided = values.get("guided_matching", True)
     with cli.writing(files, [image0, image1], overwrite) as made:
+        stages = _guided_stages(detector) if guided else UNGUIDED_STAGES
         with stage_progress("matching", stages) as done:
             matches = match_images(rgb0, rgb1, chosen, progress=done, **how, **values)
         save_matches(matches, made["file"])
@@ -164,6 +161,10 @@ def match(
     }
     found = len(matches) > 0 and matches.success
     return cli.Result(numbers, exit_code=0 if found else cli.NOTHING_FOUND)
+
+
+def _guided_stages(detector: Kind) -> tuple[str, ...]:
+    return GUIDED_STAGES[1:] if detector == "points" else GUIDED_STAGES
 
 
 def _two_view_numbers(matches: Matches) -> dict[str, Any] | None:
@@ -218,7 +219,7 @@ def register(
     files = {ending: stem.with_name(stem.name + ending) for ending in endings}
     chosen, selection = chosen_detector(detector, values)
     with cli.writing(files, [image0, image1], overwrite) as made:
-        with stage_progress("registering", GUIDED_STAGES) as done:
+        with stage_progress("registering", _guided_stages(detector)) as done:
             found = register_images(image0, image1, chosen, selection=selection, progress=done)
         pictures = (found.warped, found.checkerboard(), found.difference())
         for ending, picture in zip(endings, pictures, strict=False):

@@ -26,6 +26,11 @@ from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .options import MatchingOptions
 from .unguided import check_memory, describe, match_features
 
+GUIDED_STAGES = ("initial geometry", "keypoints", "guided matching", "geometry")
+"""A `PointDetector` has no first of them: its points give the geometry."""
+
+UNGUIDED_STAGES = ("keypoints", "descriptors", "matching", "geometry")
+
 Points = tuple[np.ndarray, np.ndarray]
 Item = TypeVar("Item")
 
