@@ -113,13 +113,9 @@ def test_what_fails_is_listed_and_the_rest_is_there(made, folder: Path, run) -> 
     [
         ("oxfort", "'oxford'"),
         ("foreground --protocol papers", "'paper'"),
-        ("foreground --degraded-images secondd", "'second'"),
         ("foreground --baselines siift", "'sift'"),
-        ("foreground --method shi-tomas", "'shi-tomasi'"),
         ("foreground --method none.onnx", "none.onnx"),
         ("foreground --method no_such_module:find", "no_such_module"),
-        ("foreground --preset publishd", "'published'"),
-        ("foreground --weights dens", "'dense'"),
         ("oxford", "img1"),
         ("hpatches", "HPatches"),
         ("pose", "no images with cameras"),
