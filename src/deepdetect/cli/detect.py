@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import time
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -98,21 +100,20 @@ def _line(result: dict[str, Any]) -> str:
     return f"{result['image']}: {found}, density {result['density']:.3f}, {how} -> {result['file']}"
 
 
+@dataclass(frozen=True)
 class _Work:
     """Detects keypoints in images, each unless it is done."""
 
-    def __init__(
-        self,
-        detector: DeepDetect | PointDetector,
-        selection: SelectionOptions | None,
-        mask: np.ndarray | None,
-        overwrite: bool,
-    ) -> None:
-        self.detector, self.selection, self.mask = detector, selection, mask
-        self.overwrite = overwrite
-        options = vars(selection or SelectionOptions())
-        noted = {"ignore": mask, "version": __version__}
-        self.settings = plain(detector.settings | options | noted)
+    detector: DeepDetect | PointDetector
+    selection: SelectionOptions | None
+    mask: np.ndarray | None
+    overwrite: bool
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        options = vars(self.selection or SelectionOptions())
+        noted = {"ignore": self.mask, "version": __version__}
+        return dict(plain(self.detector.settings | options | noted))
 
     def say_what_is_replaced(self, outputs: dict[Path, dict[str, Path]]) -> None:
         """Refuse outputs of other images; name the options in which earlier ones differ."""

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from .._shared.errors import MissingWeightsError, OptionError
+from .._shared.errors import OptionError
 from .._shared.progress import progress
 from .._shared.provenance import provenance
 from ..batch.engines import get_engine
@@ -285,9 +285,6 @@ def average(
     if len(weights) < 2:
         raise OptionError("give at least two weights: the mean of one is itself")
     paths = [resolve_weights(name, ".safetensors") for name in weights]
-    for path in paths:  # before torch is imported, which takes a second
-        if not path.exists():
-            raise MissingWeightsError(f"there is no weights file {path}: check the path")
     folder = cli.output_folder(output)
     files = {"weights": folder / "best.safetensors", "onnx": folder / "deepdetect.onnx"}
 
