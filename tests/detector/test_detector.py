@@ -13,12 +13,13 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, SelectionOptions, match_images
+from deepdetect import DeepDetect, PointDetector, SelectionOptions, match_images
 from deepdetect._shared.errors import OptionError, WeightsError
 from deepdetect.detector import HeatmapOptions
 from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.features import select_keypoints
 from deepdetect.features.sift import root_sift_descriptors
+from deepdetect.io import image as io_image
 
 # The bundled weights change, so nothing here depends on the values that they give.
 
@@ -385,3 +386,25 @@ def test_extracted_keypoints_are_the_detected_ones_described(image: np.ndarray) 
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     np.testing.assert_array_equal(found.descriptors, root_sift_descriptors(gray, found.xy))
     assert found.descriptor_type == found[:3].descriptor_type == "rootsift"
+
+
+def test_images_are_read_once(
+    detector: DeepDetect, image: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = [tmp_path / "first.png", tmp_path / "second.png"]
+    for path in paths:
+        cv2.imwrite(str(path), image)
+    opened: list[Any] = []
+    read_file = io_image._read_file
+
+    def counted(source: Any, max_megapixels: float | None) -> np.ndarray:
+        opened.append(source)
+        return read_file(source, max_megapixels)
+
+    monkeypatch.setattr(io_image, "_read_file", counted)
+    detector.detect(paths[0])
+    PointDetector(50).extract(paths[0])
+    assert opened == [paths[0]] * 2
+    opened.clear()
+    match_images(*paths, PointDetector(300))
+    assert opened == paths

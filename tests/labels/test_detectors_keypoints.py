@@ -9,18 +9,6 @@ import pytest
 from deepdetect.labels import DETECTORS
 
 
-def sift_blob(x: float, y: float, sigma: float) -> np.ndarray:
-    rows, columns = np.mgrid[:64, :90]
-    bump = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * sigma**2))
-    return np.rint(200 * bump).astype(np.uint8)
-
-
-@pytest.mark.parametrize(("x", "y", "sigma"), [(40, 22, 4), (31, 40, 3), (61, 33, 5)])
-def test_sift_a_blob_is_marked_at_its_centre(x: int, y: int, sigma: float) -> None:
-    mask = DETECTORS["sift"].mask(sift_blob(x, y, sigma))
-    assert mask[y, x]
-
-
 def test_sift_equals_opencv_with_the_published_settings(
     gray: np.ndarray, naive_mask: Callable
 ) -> None:

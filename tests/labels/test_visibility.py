@@ -5,10 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from PIL import Image, ImageEnhance
 
 from deepdetect._shared.errors import OptionError
-from deepdetect.io.image import luma
 from deepdetect.labels.visibility import LOW_VISIBILITY_RANGE, luma_range, visibility_of
 
 
@@ -16,13 +14,6 @@ def two_levels(low: int, high: int) -> np.ndarray:
     gray = np.full((20, 20), low, np.uint8)
     gray[:, 10:] = high
     return gray
-
-
-def test_a_photograph_and_its_darkened_form(photo: np.ndarray) -> None:
-    dim = ImageEnhance.Brightness(Image.fromarray(photo)).enhance(0.3)
-    dark = np.asarray(ImageEnhance.Contrast(dim).enhance(0.4))
-    assert visibility_of(luma(photo)) == "normal"
-    assert visibility_of(luma(dark)) == "low"
 
 
 @pytest.mark.parametrize(
