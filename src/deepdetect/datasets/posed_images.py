@@ -19,7 +19,7 @@ import numpy as np
 
 from .._shared.errors import ImageError
 from ..geometry.camera import cross_matrix
-from ..io.image import load_image
+from ..io.image import ORIENTATION_TAG, load_image
 from ..io.image_file import open_image
 from .pair_selection import FRAME_DISTANCES, sequence_pairs, unordered_pairs
 
@@ -33,9 +33,6 @@ MAX_ASPECT_ERROR = 0.01
 
 COLMAP_MODELS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}
 """Number of the parameters: focal length, or two, and the principal point."""
-
-ORIENTATION_TAG = 0x0112
-"""Of EXIF."""
 
 
 @dataclass(frozen=True, eq=False)

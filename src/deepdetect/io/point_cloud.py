@@ -6,15 +6,59 @@ from collections.abc import Callable, Mapping
 from numbers import Real
 from pathlib import Path
 
+import numpy as np
+
 from .._shared.atomic import atomic_path
 from .._shared.options import look_up, suggest_keywords
 from ..geometry.point_cloud import PointCloud, require_points
 from .glb import write_glb
 from .html_viewer import write_html_page
-from .ply import write_ply
 
 Metadata = Mapping[str, str | int | float]
 PointCloudWriter = Callable[[PointCloud, Path, Mapping[str, str]], None]
+
+VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
+
+PLY_UNITS = {
+    "mm": "millimetres",
+    "baseline": "baselines (1 = the distance of the two cameras)",
+    "spacing": "spacings (1 = the median distance from a camera to the nearest other one)",
+}
+
+
+def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> None:
+    """Write binary PLY (Turk, 1994): float x y z, uchar red green blue; 15 bytes per point.
+
+    Frame, unit and metadata are comments, which the writers of libraries lack; what is not ASCII
+    becomes "?".
+    """
+    vertices = np.empty(len(cloud), VERTEX)
+    vertices["xyz"] = cloud.points
+    vertices["rgb"] = cloud.colors
+    with path.open("wb") as file:
+        file.write(_ply_header(cloud, metadata).encode("ascii", "replace"))
+        vertices.tofile(file)
+
+
+def _ply_header(cloud: PointCloud, metadata: Mapping[str, str]) -> str:
+    comments = [
+        "written by deepdetect",
+        f"unit: {PLY_UNITS[cloud.unit]}",
+        f"frame: {cloud.frame}, x right, y down, z forward, origin at its centre",
+        *(f"{name}: {text}" for name, text in metadata.items()),
+    ]
+    return "\n".join(
+        [
+            "ply",
+            "format binary_little_endian 1.0",
+            *(f"comment {comment}" for comment in comments),
+            f"element vertex {len(cloud)}",
+            *(f"property float {axis}" for axis in "xyz"),
+            *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
+            "end_header\n",
+        ]
+    )
+
 
 POINT_CLOUD_WRITERS: dict[str, PointCloudWriter] = {
     ".ply": write_ply,
