@@ -113,6 +113,16 @@ def average(style: str, name: Any, **wanted: Any) -> tuple[str, Measure]:
     return style, lambda rows: mean(where(rows, **wanted), name)
 
 
+def median(style: str, name: Any) -> tuple[str, Measure]:
+    """Make the column of the median of a value, over the rows where it is not None."""
+
+    def cell(rows: Rows) -> Cell:
+        known = [row[name] for row in rows if row[name] is not None]
+        return float(np.median(known)) if known else None
+
+    return style, cell
+
+
 def tabulate(
     key: str, title: str, methods: Sequence[Any], rows: Rows, columns: Columns, note: str = ""
 ) -> Table:

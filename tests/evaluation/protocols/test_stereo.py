@@ -11,10 +11,11 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect
-from deepdetect.datasets.middlebury import load_calibrated_pair, load_middlebury
+from deepdetect.datasets.middlebury import StereoPair, load_calibrated_pair, load_middlebury
 from deepdetect.evaluation.baselines.opencv import self_described
 from deepdetect.evaluation.options import BenchmarkOptions
 from deepdetect.evaluation.profiling import StageProfiler
+from deepdetect.evaluation.protocols.masks import LabelDetector
 from deepdetect.evaluation.protocols.stereo import (
     AS_IT_IS,
     SHIFTED,
@@ -24,6 +25,7 @@ from deepdetect.evaluation.protocols.stereo import (
     middlebury,
     paper_points,
     pipelines,
+    score_stereo_matches,
     sgbm_disparity,
     shift_view,
 )
@@ -99,6 +101,10 @@ def test_ours_is_exact_and_the_baselines_are_there(section: Section) -> None:
     assert found["SIFT, low settings"]["points"] > found["SIFT"]["points"]
     published = found["the paper's pipeline, weights dense"]
     assert published["points, in the paper"] == 49_979
+    assert [each.key for each in section.figures] == ["figure8_cones", "figure8_nothing-known"]
+    assert f"ours {ours['points']:,}" in section.figures[0].title
+    drawn = cv2.imdecode(np.frombuffer(section.figures[0].png, np.uint8), cv2.IMREAD_COLOR)
+    assert drawn.std() > 20
 
 
 @pytest.mark.slow
@@ -109,17 +115,6 @@ def test_without_a_truth_nothing_is_evaluated(section: Section) -> None:
         assert row["F-score"] is None
         if name.startswith(("ours", "all", "baseline: all", "OpenCV")):
             assert row["points"] == known[name]["points"]
-
-
-@pytest.mark.slow
-def test_figure_8_is_a_picture_with_counts(section: Section) -> None:
-    figures = {figure.key: figure for figure in section.figures}
-    assert list(figures) == ["figure8_cones", "figure8_nothing-known"]
-    figure = figures["figure8_cones"]
-    points = rows(section, "middlebury_cones")["ours, weights dense"]["points"]
-    assert f"ours {points:,}" in figure.title
-    picture = cv2.imdecode(np.frombuffer(figure.png, np.uint8), cv2.IMREAD_COLOR)
-    assert picture.std() > 20
 
 
 def test_the_weights_are_named_in_rows_of_their_own(data: Path) -> None:
@@ -182,3 +177,28 @@ def test_the_nearest_place_hides_the_others() -> None:
     row = np.array([[np.nan, 0.0, 0.0, 2.0, 1.0]])
     np.testing.assert_array_equal(shift_view(row, 1), [[np.nan, 2.0, 0.0, 1.0, np.nan]])
     np.testing.assert_array_equal(shift_view(row, 0), row)
+
+
+@pytest.fixture
+def shifted_pair(photo: np.ndarray) -> StereoPair:
+    """A photograph and itself, moved by 6 pixels: the truth is exact."""
+    left, right = photo[:100, :194], photo[:100, 6:200]
+    return StereoPair("moved", left, right, np.full(left.shape[:2], 6.0, np.float32))
+
+
+@pytest.mark.slow
+def test_each_source_is_beside_its_chance_level(shifted_pair: StereoPair) -> None:
+    pair = shifted_pair
+    rows = score_stereo_matches({"labels": LabelDetector()}, [pair, pair])
+    sources = ("labels", "random, as labels", "all pixels")
+    assert [row["source"] for row in rows] == [source for source in sources for _ in range(2)]
+    labels, _, chance, _, every, _ = rows
+    assert chance["density"] == pytest.approx(labels["density"], abs=0.001)
+    assert every["density"] == 1
+    assert labels["precision"] > 0.9
+    assert chance["precision"] < labels["precision"]
+    assert labels["score"]["evaluated"] == labels["score"]["matches"]
+    wrong = StereoPair(pair.name, pair.left, pair.right, pair.disparity + 3)
+    found = score_stereo_matches({"labels": LabelDetector()}, [wrong])
+    assert found[0]["precision"] < 0.1
+    assert found[0]["score"]["matches"] == labels["score"]["matches"]

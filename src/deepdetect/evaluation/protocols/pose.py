@@ -28,19 +28,7 @@ from ..metrics.pose import (
     translation_error,
 )
 from ..options import BenchmarkOptions, without_repeats
-from ..report import (
-    Cell,
-    Columns,
-    Figure,
-    Measure,
-    Row,
-    Rows,
-    Section,
-    Table,
-    average,
-    tabulate,
-    where,
-)
+from ..report import Columns, Figure, Row, Rows, Section, Table, average, median, tabulate, where
 from ..run import MatchSettings, Run
 
 THRESHOLD_PX = 1.0
@@ -256,15 +244,7 @@ def _of_camera(points: np.ndarray, intrinsics: np.ndarray, camera: np.ndarray) -
     return np.ascontiguousarray((homogeneous @ (camera @ np.linalg.inv(intrinsics)).T)[:, :2])
 
 
-def _median(style: str, name: str) -> tuple[str, Measure]:
-    def cell(own: Rows) -> Cell:
-        known = [row[name] for row in own if row[name] is not None]
-        return float(np.median(known)) if known else None
-
-    return style, cell
-
-
-def _auc(own: Rows, threshold: float) -> Cell:
+def _auc(own: Rows, threshold: float) -> float | None:
     return pose_auc([row[ERROR] for row in own], threshold) if own else None
 
 
@@ -275,8 +255,8 @@ SUMMARY: Columns = {
         f"AUC at {threshold:g}°": (".3f", partial(_auc, threshold=threshold))
         for threshold in POSE_THRESHOLDS_DEG
     },
-    "median error, °": _median(".2f", ERROR),
-    "matches": _median(",.0f", "matches"),
+    "median error, °": median(".2f", ERROR),
+    "matches": median(",.0f", "matches"),
     AGREEING: average(".1%", AGREEING),
 }
 
@@ -285,7 +265,7 @@ def _grouped(
     key: str,
     title: str,
     name: str,
-    groups: Sequence[Cell],
+    groups: Sequence[str | int],
     methods: Sequence[PoseMethod],
     rows: Rows,
     columns: Columns,
@@ -304,12 +284,12 @@ def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], row
     """Tabulate each method on each scene, losses to SIFT beside wins."""
     sift = {row["item"]: row[ERROR] < GOOD_DEG for row in where(rows, method="sift")}
 
-    def against_sift(own: Rows, only_sift: bool) -> Cell:
+    def against_sift(own: Rows, only_sift: bool) -> int | None:
         compared = [row for row in own if row["item"] in sift and row["method"] != "sift"]
         right = [(row[ERROR] < GOOD_DEG, sift[row["item"]]) for row in compared]
         return right.count((not only_sift, only_sift)) if right else None
 
-    def guided(own: Rows, guide: str) -> Cell:
+    def guided(own: Rows, guide: str) -> int | None:
         guides = [row["guided by"] for row in own]
         return guides.count(guide) if set(guides) - {None} else None
 
@@ -320,7 +300,7 @@ def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], row
         "unguided": (",d", partial(guided, guide="none")),
         "worse than SIFT": (",d", partial(against_sift, only_sift=True)),
         "better than SIFT": (",d", partial(against_sift, only_sift=False)),
-        "seconds": _median(".2f", "seconds"),
+        "seconds": median(".2f", "seconds"),
     }
     note = (
         f"{NOTE} Guided by: pairs by the geometry that guided. Worse than SIFT: pairs with an "

@@ -172,11 +172,10 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
     figures = []
     for name, scene in chosen.items():
         errors = {
-            f"{row['method']}, {kind} intrinsics": relative_pose_errors(
-                row[kind]["views"], scene.truth
-            )
+            f"{row['method']}, {kind} intrinsics": relative_pose_errors(views, scene.truth)
             for row in where(rows, item=name)
             for kind in KINDS
+            for views in [row[kind]["views"]]
         }
         title = f"Relative poses of all pairs of {name}: fraction up to each error"
         png = error_chart(errors, CURVE_DEG, "error of the relative pose up to, °")
@@ -197,11 +196,10 @@ def choose_images(scene: PosedScene, most: int) -> SfmScene:
 def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
     """Return the ranked points, SIFT where it is among the baselines, and random points."""
     digest = str(SFM_POINTS.settings)
-    methods = [SfmMethod("DeepDetect, points", find_points, depends=digest)]
-    if "sift" in options.classical:
-        methods.append(SfmMethod("SIFT, pycolmap", find_sift, match_sift))
-    title = "baseline: as many random points"
-    return [*methods, SfmMethod(title, find_random_points, depends=digest, chance=True)]
+    ours = SfmMethod("DeepDetect, points", find_points, depends=digest)
+    sift = SfmMethod("SIFT, pycolmap", find_sift, match_sift)
+    chance = SfmMethod("baseline: as many random points", find_random_points, None, digest, True)
+    return [ours, sift, chance] if "sift" in options.classical else [ours, chance]
 
 
 def measure_scene(run: Run, method: SfmMethod, scene: SfmScene) -> Row:

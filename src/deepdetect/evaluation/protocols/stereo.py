@@ -9,19 +9,28 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ..._shared.errors import ImageError
 from ..._shared.opencv import cv2
+from ..._shared.progress import progress
 from ..._shared.records import file_digest
-from ...datasets.middlebury import CalibratedStereoPair, load_calibrated_pair, load_middlebury
+from ...datasets.middlebury import (
+    CalibratedStereoPair,
+    StereoPair,
+    load_calibrated_pair,
+    load_middlebury,
+)
 from ...detector.detector import AnyDetector, DeepDetect
 from ...detector.heatmap import HeatmapOptions
 from ...features.matchers import flann_neighbours, match_descriptors
+from ...features.matches import Matches
 from ...features.selection import SelectionOptions
 from ...geometry.camera import Calibration
 from ...geometry.point_cloud import PointCloud
+from ...matching.pipeline import match_images
 from ...matching.stereo.matching import find_disparity_range
 from ...matching.unguided import check_memory
 from ...reconstruction.pipeline import reconstruct
@@ -30,7 +39,7 @@ from ..baselines.method import LocalFeature, deepdetect_feature
 from ..baselines.opencv import self_described
 from ..baselines.random import AllPixels, RandomDetector
 from ..charts import picture
-from ..metrics.stereo import DISPARITY_TOLERANCES_PX, disparity_scores
+from ..metrics.stereo import DISPARITY_TOLERANCES_PX, disparity_scores, stereo_score
 from ..options import PAPER_RESOLUTION_PX, BenchmarkOptions
 from ..profiling import StageProfiler
 from ..report import Figure, Row, Section, Table, where
@@ -449,3 +458,45 @@ def _compile_kernels() -> None:
     column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in (160, 96)))
     right = cv2.remap(scene, column + 4 + row / 12, row, cv2.INTER_LINEAR)
     reconstruct(scene, right, AllPixels(), focal_px=100, rectified=True)
+
+
+def score_stereo_matches(
+    sources: Mapping[str, AnyDetector], pairs: Sequence[StereoPair], *, quiet: bool = True
+) -> list[dict[str, Any]]:
+    """Match rectified pairs with several sources of keypoints, and evaluate the matches.
+
+    By descriptors alone over the whole image: neither the rows nor the true disparity are used. A
+    source's rows are followed by those of random points at its density, since more keypoints always
+    find more; all pixels come last.
+    """
+    rows: list[dict[str, Any]] = []
+    with progress(len(pairs) * (2 * len(sources) + 1), "matching", "pair", quiet) as bar:
+
+        def evaluate(source: str, pair: StereoPair, found: Matches) -> None:
+            score = stereo_score(found.points0, found.points1, pair.disparity)
+            density = (found.keypoints0.density + found.keypoints1.density) / 2
+            row = {"source": source, "pair": pair.name, "density": density}
+            rows.append({**row, "score": vars(score), "precision": score.precision})
+            bar.update(1)
+
+        for name, detector in sources.items():
+            for pair in pairs:
+                evaluate(name, pair, match_stereo(pair, detector))
+            for pair, row in zip(pairs, rows[-len(pairs) :], strict=True):
+                evaluate(f"random, as {name}", pair, match_random_points(pair, row["density"]))
+        for pair in pairs:
+            evaluate("all pixels", pair, match_stereo(pair, AllPixels()))
+    return rows
+
+
+def match_stereo(pair: StereoPair, detector: AnyDetector, density: float | None = None) -> Matches:
+    """Match both views by descriptors alone and without estimating their geometry."""
+    selection = SelectionOptions(density=density)
+    return match_images(
+        pair.left, pair.right, detector, selection=selection, guided_matching=False, model="none"
+    )
+
+
+def match_random_points(pair: StereoPair, density: float) -> Matches:
+    """Match random points of a density, in keypoints per pixel: the chance baseline."""
+    return match_stereo(pair, RandomDetector(), max(density, 1e-6))
