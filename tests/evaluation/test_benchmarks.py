@@ -45,7 +45,6 @@ class Runs:
     """One cache, filled by one run after the other."""
 
     first: Report
-    again: Report
     more: Report
 
 
@@ -67,7 +66,7 @@ def runs(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Runs:
     cache = tmp_path_factory.mktemp("cache")
-    chosen = (options, options, more_options)
+    chosen = (options, more_options)
     return Runs(*(run_benchmarks(["oxford"], oxford_folder, one, cache=cache) for one in chosen))
 
 
@@ -184,24 +183,6 @@ def test_correct_matches_equal_a_count_of_all_bits(
     assert row["graf 1-6, precision"] is None
 
 
-def test_the_papers_numbers_are_beside_ours(runs: Runs) -> None:
-    density = table(runs.first, "oxford_density")
-    assert density["FAST"]["mean without trees, in the paper"] == 0.0270
-    assert density[OURS[0]]["mean without trees, in the paper"] == 0.5143
-    assert density[RANDOM]["mean without trees, in the paper"] is None
-    paper = table(runs.first, "oxford_matches")[f"{OURS[0]}, in the paper"]
-    assert paper["graf 1-6"] == 102
-    assert paper["boat 1-2"] == 47_447
-    assert paper["graf 1-6, precision"] is None
-    assert table(runs.first, "oxford_repeatability")["R2D2, in the paper"]["wall"] == 0.71
-
-
-def test_a_second_run_makes_nothing_and_says_the_same(runs: Runs) -> None:
-    assert int(runs.first.metadata[MADE]) > 0
-    assert runs.again.metadata[MADE] == "0"
-    assert runs.again.sections == runs.first.sections
-
-
 def test_one_more_method_makes_only_its_own_results(runs: Runs, oxford_folder: Path) -> None:
     def digest(path: Path) -> str:
         return hashlib.sha256(path.read_bytes()).hexdigest()
@@ -214,7 +195,7 @@ def test_one_more_method_makes_only_its_own_results(runs: Runs, oxford_folder: P
         for k in range(2, 7)
     }
     expected = len(keypoints) + len(repeatability) + len(PAIRS)
-    assert int(runs.more.metadata[MADE]) == expected
+    assert int(runs.more.metadata[MADE]) == expected < int(runs.first.metadata[MADE])
     # What was there before is as it was.
     for key in ("oxford_density", "oxford_repeatability", "oxford_matches"):
         before, after = table(runs.first, key), table(runs.more, key)

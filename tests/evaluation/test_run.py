@@ -66,7 +66,7 @@ def assert_same(first: Keypoints, second: Keypoints) -> None:
     assert first.image_size == second.image_size
 
 
-@pytest.mark.parametrize("name", ["sift", "orb", "shi-tomasi"])
+@pytest.mark.parametrize("name", ["orb", "shi-tomasi"])
 def test_keypoints_from_the_cache_equal_fresh_ones(tmp_path: Path, pair: Pair, name: str) -> None:
     method, asked = counted(CLASSICAL[name])
     fresh = method.detect(load_image(pair[0]))

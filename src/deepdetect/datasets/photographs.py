@@ -1,8 +1,8 @@
 """Photographs to train on: crops of pictures in public repositories, each with its licence.
 
-The list of them, `known/photographs.csv.gz`, is made by `benchmarks/list_photographs.py`. Pictures
-that are nearly the same as another, and all of the data sets that the network is measured on, are
-left out of it.
+Their list, `known/photographs.csv.gz`, was made by `benchmarks/list_photographs.py` of commit
+81b8253, without pictures that are nearly the same as another and without the data sets that the
+network is measured on.
 """
 
 from __future__ import annotations

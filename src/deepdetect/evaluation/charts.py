@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import MissingExtraError
+from .._shared.errors import require_packages
 from .._shared.opencv import cv2
 
 MARKERS = ("o", "s", "^", "x")
@@ -75,13 +75,9 @@ def picture(rgb: np.ndarray) -> bytes:
 
 
 def _figure(width: float, height: float) -> Any:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise MissingExtraError(
-            "the report's charts need the package matplotlib, which is not installed: "
-            "run pip install matplotlib"
-        ) from None
+    require_packages("a chart of the report", "matplotlib")
+    from matplotlib.figure import Figure
+
     return Figure(figsize=(width, height), layout="constrained")
 
 

@@ -152,8 +152,6 @@ def make(tmp_path: Path) -> Make:
         leading: bool = False,
         descriptors: bool = False,
         integers: bool = False,
-        channels: int = 3,
-        rank: int = 4,
         rename: str = "keypoints",
         name: str = "bright.onnx",
     ) -> Path:
@@ -184,7 +182,7 @@ def make(tmp_path: Path) -> Make:
         graph = helper.make_graph(
             nodes,
             "bright",
-            [helper.make_tensor_value_info("image", types.FLOAT, [1, channels, *size][:rank])],
+            [helper.make_tensor_value_info("image", types.FLOAT, [1, 3, *size])],
             [
                 helper.make_tensor_value_info(output, kind, None)
                 for output, kind in zip(outputs, kinds, strict=True)
@@ -286,13 +284,8 @@ def test_what_is_no_network_is_said(make: Make, tmp_path: Path, one_line) -> Non
     text.write_text("no network")
     half = tmp_path / "half.onnx"
     half.write_bytes(make().read_bytes()[:200])
-    for path in (tmp_path / "none.onnx", tmp_path, text, half):
+    other = make(rename="points", name="other.onnx")
+    for path in (tmp_path / "none.onnx", tmp_path, text, half, other):
         with pytest.raises(WeightsError) as caught:
             onnx_feature(path)
         assert str(path) in one_line(caught.value)
-
-
-def test_other_outputs_are_said_when_the_file_is_opened(make: Make, one_line) -> None:
-    with pytest.raises(WeightsError, match="keypoints and scores") as caught:
-        onnx_feature(make(rename="points"))
-    one_line(caught.value)

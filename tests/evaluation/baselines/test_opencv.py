@@ -133,7 +133,7 @@ def test_shi_tomasi_corners_equal_those_of_opencv(
     assert found.scores[-1] > 0.99 * quality * found.scores[0]
 
 
-@pytest.mark.parametrize("name", CLASSICAL)
+@pytest.mark.parametrize("name", ["sift", "orb-low", "harris-low", "shi-tomasi"])
 def test_a_picture_of_one_colour_has_no_keypoints(name: str) -> None:
     flat = np.full((70, 80, 3), 128, np.uint8)
     found = CLASSICAL[name].detect(flat)
@@ -143,11 +143,6 @@ def test_a_picture_of_one_colour_has_no_keypoints(name: str) -> None:
     assert described.ndim == 2
 
 
-@pytest.fixture(scope="module")
-def large(photo: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(photo[60:180, 60:200])
-
-
 def grid(size: tuple[int, int], step: int) -> np.ndarray:
     """Points from corner to corner, by columns, so that no descriptor's own order is theirs."""
     columns, rows = np.meshgrid(np.arange(0, size[0], step), np.arange(0, size[1], step))
@@ -155,18 +150,18 @@ def grid(size: tuple[int, int], step: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["orb", "brisk", "sift"])
-def test_each_keypoint_keeps_its_row_also_near_the_border(large: np.ndarray, name: str) -> None:
+def test_each_keypoint_keeps_its_row_also_near_the_border(crop: np.ndarray, name: str) -> None:
     make = {"orb": cv2.ORB_create, "brisk": HOME.BRISK_create, "sift": cv2.SIFT_create}[name]
-    xy = grid((140, 120), 9)
+    xy = grid((160, 150), 9)
     octaves = (np.arange(len(xy)) % 3).astype(np.int32) if name == "orb" else None
     sizes = np.full(len(xy), 12, np.float32)
     angles = (np.arange(len(xy)) * 7 % 360).astype(np.float32)
-    features = Keypoints(xy, np.ones(len(xy)), (140, 120), None, sizes, angles, octaves)
-    rows = describe_with(make(), large, features)
+    features = Keypoints(xy, np.ones(len(xy)), (160, 150), None, sizes, angles, octaves)
+    rows = describe_with(make(), crop, features)
     assert len(rows) == len(features)
     kept, opened = 0, make()
     for row, keypoint in zip(rows, features.to_opencv(), strict=True):
-        _, alone = opened.compute(luma(large), [keypoint])
+        _, alone = opened.compute(luma(crop), [keypoint])
         if alone is None or not len(alone):
             assert not row.any()
         else:

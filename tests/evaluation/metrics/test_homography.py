@@ -13,6 +13,7 @@ from deepdetect.evaluation.metrics.homography import (
     area_under_curve,
     corner_error,
     inside,
+    match_accuracy,
     project_visible,
 )
 
@@ -37,11 +38,6 @@ def test_agrees_with_opencv() -> None:
     moved = cv2.perspectiveTransform(corners[None], homography)[0]
     expected = np.linalg.norm(moved - corners, axis=1).mean()
     assert corner_error(homography, np.eye(3), (640, 480)) == pytest.approx(expected)
-
-
-def test_a_corner_at_infinity_is_infinitely_far() -> None:
-    homography = np.array([[1.0, 0, 0], [0, 1, 0], [-0.1, 0, 1]])  # x = 10 goes to infinity
-    assert corner_error(homography, np.eye(3), (11, 5)) == math.inf
 
 
 def test_shares_and_areas_of_known_errors() -> None:
@@ -111,3 +107,51 @@ def test_beyond_the_horizon_nothing_is_seen(scale: float) -> None:
     np.testing.assert_allclose(
         project_visible(np.array([[50.0, 0]]), homography, (1000, 10)), [[100, 0]]
     )
+
+
+POINTS = np.array([[2.0, 2], [8, 2], [2, 8], [8, 8]])
+SIZES = ((16, 16), (16, 16))
+
+
+def accuracy(moved: np.ndarray, matched: int = 4, homography: np.ndarray = np.eye(3)):
+    return match_accuracy(POINTS[:matched], moved[:matched], POINTS, moved, homography, SIZES)
+
+
+def counts(found: dict) -> list[int]:
+    return [found["correct", px] for px in range(1, 11)]
+
+
+def test_identity_is_all_right() -> None:
+    found = accuracy(POINTS)
+    assert counts(found) == [4] * 10
+    assert found["precision", 3] == found["score", 3] == 1
+
+
+def test_the_matching_score_counts_the_keypoints_seen_in_both() -> None:
+    found = accuracy(POINTS, matched=1)
+    assert found["precision", 3] == 1
+    assert found["score", 3] == 0.25
+    # Moved by 10 px, only the two at x = 2 stay in the image.
+    shift = np.array([[1.0, 0, 10], [0, 1, 0], [0, 0, 1]])
+    assert accuracy(POINTS + [10, 0], 1, shift)["score", 3] == 0.5
+
+
+def test_no_matches_count_as_nothing_right() -> None:
+    none = accuracy(POINTS, matched=0)
+    assert none["precision", 3] == none["score", 3] == 0
+
+
+@given(
+    shift=st.tuples(st.floats(-12, 12), st.floats(-12, 12)),
+    noise=st.lists(st.floats(0, 15), min_size=4, max_size=4),
+)
+def test_matches_off_by_known_distances_count_as_such(
+    shift: tuple[float, float], noise: list[float]
+) -> None:
+    homography = np.array([[1.0, 0, shift[0]], [0, 1, shift[1]], [0, 0, 1]])
+    moved = POINTS + shift + np.column_stack([noise, np.zeros(4)])
+    found = accuracy(moved, homography=homography)
+    errors = np.linalg.norm(moved - (POINTS + shift), axis=1)
+    assert counts(found) == [int((errors <= t).sum()) for t in range(1, 11)]
+    for threshold in (1, 3, 10):
+        assert 0 <= found["score", threshold] <= 1

@@ -31,7 +31,6 @@ from deepdetect.evaluation.protocols.standard import (
 from deepdetect.evaluation.report import Report, Rows, where
 from deepdetect.evaluation.run import Run
 from deepdetect.features.keypoints import Keypoints
-from deepdetect.io.image import load_image
 
 FAST = with_common_descriptor(CLASSICAL["fast"])
 
@@ -138,25 +137,6 @@ def test_the_time_of_a_pair_is_that_of_all_stages(pairs: list[PlanarPair], tmp_p
     assert chance["match, s"] > 0
 
 
-def test_a_pair_that_fails_is_skipped_and_the_others_count(
-    pairs: list[PlanarPair], tmp_path: Path
-) -> None:
-    bad = load_image(pairs[1].second)
-
-    def detect(rgb: np.ndarray) -> Keypoints:
-        if np.array_equal(rgb, bad):
-            raise BaselineError("not this one")
-        return CLASSICAL["fast"].detect(rgb)
-
-    feature = dataclasses.replace(FAST, detect=detect, detection="fails")
-    run = Run(tmp_path)
-    rows = standard_rows(run, [feature], pairs)
-    assert all(t.rows[0]["pairs"] == 1 for t in standard_tables([feature], rows, "key", "pairs"))
-    (note,) = run.skipped
-    assert "smoky 1-2" in note
-    assert "not this one" in note
-
-
 def test_a_pair_without_keypoints_counts_as_wrong_and_is_no_error(
     pairs: list[PlanarPair], tmp_path: Path
 ) -> None:
@@ -198,23 +178,10 @@ def test_all_tables_of_the_section_have_all_methods(report: Report) -> None:
         rows = [row["method"] for row in table.rows]
         assert len(rows) == 8
         assert [title for title in titles if title in rows] == titles
+        assert set(table.rows[rows.index("Never works")].values()) <= {"Never works", None, 0}
     assert len(tables["low_visibility_repeatability_1px"].columns) == 2 + 3 * len(BUDGETS) + 2
     assert any("Never works" in note for note in report.skipped)
-
-
-def test_the_figures_are_of_repeatability_accuracy_and_time(report: Report) -> None:
-    assert [figure.key for figure in report.sections[0].figures] == [
-        "low_visibility_accuracy",
-        *(f"low_visibility_repeatability_{radius}px" for radius in (1, 3)),
-        "low_visibility_time",
-    ]
-
-
-def test_a_method_that_never_works_has_dashes(report: Report) -> None:
-    for table in report.tables():
-        for row in table.rows:
-            if row["method"] == "Never works":
-                assert set(row.values()) <= {"Never works", None, 0}
+    assert len(report.sections[0].figures) == 4
 
 
 def test_baselines_are_worth_what_chance_is(report: Report) -> None:

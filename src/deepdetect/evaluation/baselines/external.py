@@ -83,9 +83,6 @@ def onnx_feature(path: str | Path, name: str | None = None) -> LocalFeature:
     file = Path(path)
     try:
         data = file.read_bytes()
-    except OSError as error:
-        raise WeightsError(f"{file} cannot be read ({error.strerror}): check the path") from None
-    try:
         session = import_onnxruntime().InferenceSession(data, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exceptions have no common base
         reason = str(error).splitlines()[0]

@@ -31,22 +31,22 @@ class AllPixels:
         return np.ones(load_image(image).shape[:2], np.float32)
 
 
-def random_feature(like: LocalFeature, seed: int = 0, *, name: str = "random") -> LocalFeature:
+def random_feature(like: LocalFeature, name: str = "random") -> LocalFeature:
     """Make the baseline of random pixels, in each image as many as another feature finds there."""
 
     def detect(rgb: np.ndarray) -> Keypoints:
-        # The image decides too, so that both images of a pair do not get the same pixels.
-        own = int.from_bytes(hashlib.sha256(rgb.tobytes()).digest()[:4], "little")
+        # The image is the seed, so that both images of a pair do not get the same pixels.
+        seed = int.from_bytes(hashlib.sha256(rgb.tobytes()).digest()[:4], "little")
         count = len(like.detect(rgb))
         size = (rgb.shape[1], rgb.shape[0])
         if not count:
             return Keypoints.empty(size)
         options = SelectionOptions(threshold=0, max_keypoints=count)
-        points = select_keypoints(RandomDetector(seed + own).heatmap(rgb), options)
+        points = select_keypoints(RandomDetector(seed).heatmap(rgb), options)
         return Keypoints(points.xy, points.scores, size)
 
     title = f"baseline: as many random points as {like.title}"
-    version = f"{like.name} {like.version} {seed}"
+    version = f"{like.name} {like.version} 0"
     return LocalFeature(
         name, title, detect, PAPER_DESCRIPTOR.describe, chance=True, version=version
     )

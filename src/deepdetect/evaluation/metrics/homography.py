@@ -1,14 +1,18 @@
-"""Points under a homography, and the accuracy of an estimated one: corner error and its AUC."""
+"""What a true homography says: of points, of matches, and of an estimated homography."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from ...geometry.transforms import transform_points
+from ...geometry.transforms import transfer_errors, transform_points
 
 CORNER_THRESHOLDS_PX = (1.0, 3.0, 5.0)
+
+MATCH_THRESHOLDS_PX = tuple(range(1, 11))
+"""Of the mean matching accuracy."""
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 """(width, height) of both images."""
@@ -35,6 +39,40 @@ def project_visible(
     mapped = transform_points(points, homography)
     visible = inside(mapped, size) & (depth * np.linalg.det(homography) > 0)
     return np.where(visible[:, None], mapped, np.nan)
+
+
+def match_accuracy(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    keypoints0: np.ndarray,
+    keypoints1: np.ndarray,
+    homography: np.ndarray,
+    sizes: Sizes,
+) -> dict[Any, Any]:
+    """Evaluate (M, 2) matched positions of two images beside all (N, 2) keypoints of both.
+
+    Returns "matches", their number; by distance of 1 to 10 px in the second image ("correct", px),
+    how many are at most that far off, ("precision", px), their fraction (D2-Net's matching
+    accuracy), and ("score", px), those that both images show over the keypoints that could have a
+    match (Mikolajczyk's matching score).
+    """
+    errors = transfer_errors(points0, points1, homography)
+    back = np.linalg.inv(homography)
+
+    def visible(points: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        return np.isfinite(project_visible(points, matrix, size)[:, 0])
+
+    fewest = min(
+        visible(keypoints0, homography, sizes[1]).sum(), visible(keypoints1, back, sizes[0]).sum()
+    )
+    both = visible(points0, homography, sizes[1]) & visible(points1, back, sizes[0])
+    found: dict[Any, Any] = {"matches": len(errors)}
+    for px in MATCH_THRESHOLDS_PX:
+        correct = errors <= px
+        found["correct", px] = int(correct.sum())
+        found["precision", px] = int(correct.sum()) / len(errors) if len(errors) else 0.0
+        found["score", px] = int(correct[both].sum()) / int(fewest) if fewest else 0.0
+    return found
 
 
 def corner_error(estimated: np.ndarray | None, true: np.ndarray, size: tuple[int, int]) -> float:

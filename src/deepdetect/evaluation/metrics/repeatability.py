@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._shared.errors import MissingExtraError
+from ..._shared.errors import require_packages
 from ...geometry.transforms import transform_points
 from .homography import Sizes, project_visible
 
@@ -51,39 +51,27 @@ def mutual_nn_repeatability(
     homography: np.ndarray,
     sizes: Sizes,
     radii_px: Sequence[float] = (1.0, 2.0, 3.0),
-    seed: int = 0,
+    with_chance: bool = True,
 ) -> list[tuple[float, float, float]]:
     """Measure the repeatability by mutual nearest neighbours in the overlap, beside chance.
 
     Returns for each radius the fraction of the fewer keypoints in the overlap that are repeated,
-    the one that as many random points reach (pixels, where the keypoints are pixels), and the mean
-    distance of the partners in px, NaN without any.
+    the one that as many random points reach (pixels, where the keypoints are pixels; NaN where it
+    is not wanted), and the mean distance of the partners in px, NaN without any.
     """
     visible = _in_overlap(points0, points1, homography, sizes)
     distances = _mutual_distances(*visible, max(radii_px))
-    on_pixels = all(bool((np.rint(points) == points).all()) for points in (points0, points1))
     counts = (len(visible[0]), len(visible[1]))
-    chances = _chance(counts, homography, sizes, radii_px, seed, on_pixels)
+    chances = [float("nan")] * len(radii_px)
+    if with_chance:
+        on_pixels = all(bool((np.rint(points) == points).all()) for points in (points0, points1))
+        chances = _chance(counts, homography, sizes, radii_px, on_pixels)
     results = []
     for radius, chance in zip(radii_px, chances, strict=True):
         near = distances[distances <= radius]
         value = len(near) / min(counts) if min(counts) else 0.0
         results.append((value, chance, float(near.mean()) if len(near) else float("nan")))
     return results
-
-
-def repeated_fractions(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    homography: np.ndarray,
-    sizes: Sizes,
-    radii_px: Sequence[float] = (1.0, 3.0),
-) -> list[float]:
-    """Return the values of `mutual_nn_repeatability` alone, without chance."""
-    visible = _in_overlap(points0, points1, homography, sizes)
-    fewest = min(map(len, visible))
-    distances = _mutual_distances(*visible, max(radii_px))
-    return [float((distances <= r).sum() / fewest) if fewest else 0.0 for r in radii_px]
 
 
 def _in_overlap(
@@ -97,12 +85,9 @@ def _in_overlap(
 
 
 def _kd_tree(points: np.ndarray) -> Any:
-    try:
-        from scipy.spatial import KDTree
-    except ImportError:
-        raise MissingExtraError(
-            "repeatability needs the package scipy, which is not installed: run pip install scipy"
-        ) from None
+    require_packages("repeatability", "scipy")
+    from scipy.spatial import KDTree
+
     return KDTree(np.asarray(points, np.float64).reshape(-1, 2))
 
 
@@ -130,7 +115,6 @@ def _chance(
     homography: np.ndarray,
     sizes: Sizes,
     radii_px: Sequence[float],
-    seed: int,
     on_pixels: bool,
 ) -> list[float]:
     """Return the values of random points of the same number in the overlap of each image.
@@ -142,7 +126,7 @@ def _chance(
     if not fewest:
         return [0.0] * len(radii_px)
     grids = _overlapping_grids(np.asarray(homography, np.float64).tobytes(), sizes)
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     draws = min(-(-CHANCE_POINTS // fewest), MAX_DRAWS)
     found = np.zeros(len(radii_px))
     for _ in range(draws):

@@ -114,17 +114,14 @@ def _oxford_paper(run: Run, options: BenchmarkOptions, scenes: Sequence[PlanarSc
         with_paper_rows(matches, MATCHES),
         figure_6,
     ]
-    figures = [_repeatability_figure(repeatability), *figures, *filter(None, [masks])]
-    return Section("Oxford, the paper's protocol", (text,), tables, figures)
-
-
-def _repeatability_figure(table: Table) -> Figure:
-    values = {row["method"]: row["mean"] for row in table.rows if row["mean"] is not None}
+    values = {row["method"]: row["mean"] for row in repeatability.rows if row["mean"] is not None}
     ours = [name for name in values if name.startswith("DeepDetect")]
     png = bar_chart(values, "repeatability as in the paper, mean of the scenes", ours)
     mean = OXFORD_REPEATABILITY[DEEPDETECT]["mean"]
     title = f"Figure 1: average repeatability, with baselines; in the paper DeepDetect has {mean}"
-    return Figure("oxford_repeatability", title, png)
+    figure_1 = Figure("oxford_repeatability", title, png)
+    figures = [figure_1, *figures, *filter(None, [masks])]
+    return Section("Oxford, the paper's protocol", (text,), tables, figures)
 
 
 def _figures(
@@ -167,20 +164,15 @@ def hpatches(run: Run, options: BenchmarkOptions) -> list[Section]:
         sections.append(_hpatches_paper(run, options, scenes, last))
     if "standard" in options.protocols:
         text = "Evaluated by its own files."
-        for name, subset in hpatches_subsets(scenes):
-            key, title = f"hpatches_{len(subset)}", f"HPatches, {name}"
-            sections.append(_standard(run, options, subset, key, title, text))
+        subsets = {f"all {len(scenes)} scenes": scenes}
+        subset = [scene for scene in scenes if in_d2net_subset(scene)]
+        if 0 < len(subset) < len(scenes):
+            subsets[f"the {len(subset)} scenes of D2-Net"] = subset
+        for name, chosen in subsets.items():
+            key, title = f"hpatches_{len(chosen)}", f"HPatches, {name}"
+            sections.append(_standard(run, options, chosen, key, title, text))
     sections += _guided(run, options, {"published": last}, "hpatches", "HPatches")
     return sections + _degraded(run, options, scenes, "hpatches", "HPatches")
-
-
-def hpatches_subsets(scenes: Sequence[PlanarScene]) -> list[tuple[str, list[PlanarScene]]]:
-    """Return all scenes, and the D2-Net subset of them where it is smaller."""
-    subset = [scene for scene in scenes if in_d2net_subset(scene)]
-    subsets = [(f"all {len(scenes)} scenes", list(scenes))]
-    if 0 < len(subset) < len(scenes):
-        subsets.append((f"the {len(subset)} scenes of D2-Net", subset))
-    return subsets
 
 
 def _hpatches_paper(
@@ -210,17 +202,14 @@ def _hpatches_paper(
 
 def table_3(by_scene: Table, light: Mapping[str, bool]) -> Table:
     """Average the repeatability by kind of scene; `light` says which change in illumination."""
-    scenes = {
-        kind: [name for name in light if light[name] is wanted]
-        for kind, wanted in (("illumination", True), ("viewpoint", False))
-    }
-    titles = {kind: f"{kind}, {len(names)} scenes" for kind, names in scenes.items()}
-    rows: Rows = []
-    for row in by_scene.rows:
-        rows.append({"method": row["method"]})
-        for kind, names in scenes.items():
-            known = [row[name] for name in names if row[name] is not None]
-            rows[-1][titles[kind]] = sum(known) / len(known) if known else None
+    titles = {}
+    rows: Rows = [{"method": row["method"]} for row in by_scene.rows]
+    for kind, wanted in (("illumination", True), ("viewpoint", False)):
+        scenes = [name for name in light if light[name] is wanted]
+        titles[kind] = f"{kind}, {len(scenes)} scenes"
+        for cells, row in zip(rows, by_scene.rows, strict=True):
+            known = [row[name] for name in scenes if row[name] is not None]
+            cells[titles[kind]] = sum(known) / len(known) if known else None
     table = Table(
         "hpatches_table3",
         "Table III: repeatability as in the paper, by kind of scene",

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Container, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Literal
 
 import numpy as np
 
 from ...datasets.planar import PlanarPair
-from ...features.keypoints import Keypoints
 from ...geometry import GeometryOptions, estimate_geometry
 from ..baselines.method import LocalFeature
 from ..charts import line_chart
 from ..metrics.homography import (
     CORNER_THRESHOLDS_PX,
+    MATCH_THRESHOLDS_PX,
     Sizes,
     accuracy_at,
     area_under_curve,
     corner_error,
+    match_accuracy,
 )
-from ..metrics.matching import THRESHOLDS_PX, MatchAccuracy, match_accuracy
 from ..metrics.repeatability import coverage, mutual_nn_repeatability
 from ..report import (
     Cell,
@@ -36,7 +37,7 @@ from ..report import (
     tabulate,
     where,
 )
-from ..run import MatchSettings, PairMatches, Run
+from ..run import MatchSettings, Run
 
 BUDGETS: tuple[int | None, ...] = (512, 1024, 2048, 4096, 8192, None)
 """Numbers of keypoints; None: all."""
@@ -90,59 +91,42 @@ def pair_row(
     ratio = 1.0 if feature.learned else RATIO
     settings = MatchSettings("exact", ratio, mutual=True, budget=MATCHING_BUDGET)
     matches = run.matches(feature, images, settings)
-    unfiltered = MatchSettings("exact", 1.0, mutual=True, budget=MATCHING_BUDGET)
-    accuracy = _accuracy(matches, pair, sizes)
-    without_ratio = _accuracy(run.matches(feature, images, unfiltered), pair, sizes)
+    unfiltered = run.matches(feature, images, replace(settings, ratio=1.0))
+    accuracy, without_ratio = (
+        match_accuracy(
+            *(found.points0, found.points1, found.keypoints0, found.keypoints1),
+            *(pair.homography, sizes),
+        )
+        for found in (matches, unfiltered)
+    )
+
+    def corner_errors() -> dict[str, np.ndarray]:
+        options = GeometryOptions(inlier_threshold=INLIER_THRESHOLD_PX)
+        points = matches.points0, matches.points1
+        estimated = [
+            estimate_geometry(*points, "homography", seed=seed, options=options).matrix
+            for seed in range(SEEDS)
+        ]
+        errors = [corner_error(matrix, pair.homography, sizes[0]) for matrix in estimated]
+        return {"errors": np.array(errors)}
+
+    depends = (*feature.key, images, pair.homography, settings, (INLIER_THRESHOLD_PX, SEEDS))
     row: Row = {
         "kind": pair.kind,
-        "matches": accuracy.matches,
-        "all matches": without_ratio.matches,
-        "corner errors": _corner_errors(run, feature, pair, matches, settings, sizes[0]),
+        **accuracy,
+        "all matches": without_ratio["matches"],
+        **{("accuracy", px): without_ratio["precision", px] for px in MATCH_THRESHOLDS_PX},
+        "corner errors": run.cached("corner_errors", depends, corner_errors)["errors"].tolist(),
     }
     for budget in {*budgets, MATCHING_BUDGET}:
         row["keypoints", budget] = fewest if budget is None else min(fewest, budget)
     for budget in budgets:
-        row |= _repeatability(run, feature, pair, sizes, places, budget)
-        row["coverage", budget] = coverage(_best(places[0], budget), sizes[0])
-    for px in THRESHOLDS_PX:
-        row["correct", px] = accuracy.correct[px - 1]
-        row["precision", px] = accuracy.precision(px)
-        row["score", px] = accuracy.matching_score(px)
-        row["accuracy", px] = without_ratio.precision(px)
+        xy = [(each if budget is None else each.best(budget)).xy for each in places]
+        row |= _repeatability(run, feature, pair, sizes, xy, budget)
+        row["coverage", budget] = coverage(xy[0], sizes[0])
     for stage, profile in zip(STAGES, (detected, matches.describe, matches.match), strict=True):
         row["seconds", stage], row["memory", stage] = profile.seconds, profile.memory
     return row
-
-
-def _accuracy(matches: PairMatches, pair: PlanarPair, sizes: Sizes) -> MatchAccuracy:
-    points = matches.points0, matches.points1, matches.keypoints0, matches.keypoints1
-    return match_accuracy(*points, pair.homography, sizes)
-
-
-def _corner_errors(
-    run: Run,
-    feature: LocalFeature,
-    pair: PlanarPair,
-    matches: PairMatches,
-    settings: MatchSettings,
-    size: tuple[int, int],
-) -> list[float]:
-    """Return the corner error of the homography that each seed of MAGSAC gives."""
-    options = GeometryOptions(inlier_threshold=INLIER_THRESHOLD_PX)
-
-    def error(seed: int) -> float:
-        points = matches.points0, matches.points1
-        estimated = estimate_geometry(*points, "homography", seed=seed, options=options).matrix
-        return corner_error(estimated, pair.homography, size)
-
-    images = (pair.first, pair.second)
-    found = run.cached(
-        "corner_errors",
-        (*feature.key, images, pair.homography, settings, (INLIER_THRESHOLD_PX, SEEDS)),
-        lambda: {"errors": np.array([error(seed) for seed in range(SEEDS)])},
-    )
-    errors: list[float] = found["errors"].tolist()
-    return errors
 
 
 def _repeatability(
@@ -150,12 +134,11 @@ def _repeatability(
     feature: LocalFeature,
     pair: PlanarPair,
     sizes: Sizes,
-    places: Sequence[Keypoints],
+    xy: Sequence[np.ndarray],
     budget: int | None,
 ) -> Row:
     def make() -> dict[str, np.ndarray]:
-        first, second = (_best(keypoints, budget) for keypoints in places)
-        found = mutual_nn_repeatability(first, second, pair.homography, sizes, RADII_PX)
+        found = mutual_nn_repeatability(xy[0], xy[1], pair.homography, sizes, RADII_PX)
         return {"rows": np.array(found)}
 
     depends = (feature.detection, (pair.first, pair.second), pair.homography, budget, RADII_PX)
@@ -166,10 +149,6 @@ def _repeatability(
         for radius, values in zip(RADII_PX, rows, strict=True)
         for name, value in zip(names, values, strict=True)
     }
-
-
-def _best(keypoints: Keypoints, budget: int | None) -> np.ndarray:
-    return (keypoints if budget is None else keypoints.best(budget)).xy
 
 
 def repeated(rows: Rows, budget: int | None, radius: float, name: str = "repeated") -> float | None:
@@ -320,7 +299,7 @@ MATCHING_COLUMNS: Columns = {
 
 ACCURACY_COLUMNS: Columns = {
     "matches": average(",.0f", "all matches"),
-    **{f"{px} px": average(".3f", ("accuracy", px)) for px in THRESHOLDS_PX},
+    **{f"{px} px": average(".3f", ("accuracy", px)) for px in MATCH_THRESHOLDS_PX},
 }
 
 REPEATABILITY_NOTE = (
@@ -374,17 +353,26 @@ def standard_figures(
     measured = [(feature, own) for feature in features if (own := where(rows, method=feature.name))]
     accuracy = {
         feature.title: (
-            THRESHOLDS_PX,
-            [mean(own, ("accuracy", px)) or 0.0 for px in THRESHOLDS_PX],
+            MATCH_THRESHOLDS_PX,
+            [mean(own, ("accuracy", px)) or 0.0 for px in MATCH_THRESHOLDS_PX],
         )
         for feature, own in measured
     }
     png = line_chart(accuracy, "error up to, px", "mean matching accuracy")
     figures = [Figure(f"{key}_accuracy", f"Mean matching accuracy, {what}", png)]
-    figures += [
-        repeatability_figure(features, rows, radius, key, what)
-        for radius in (RADII_PX[0], RADII_PX[-1])
-    ]
+    budgets = [budget for budget in BUDGETS if budget is not None]
+    # Of rows with the same keypoints, which differ in their descriptors, the first one is drawn.
+    first = {feature.detection: feature for feature in reversed(features)}
+    for radius in (RADII_PX[0], RADII_PX[-1]):
+        lines = {}
+        for feature, own in measured:
+            values = [repeated(own, budget, radius) for budget in budgets]
+            if first[feature.detection] is feature and any(v is not None for v in values):
+                lines[feature.title] = budgets, [math.nan if v is None else v for v in values]
+        label = f"mutual-NN repeatability within {radius:g} px"
+        png = line_chart(lines, "keypoints per image", label, logarithmic=True, ticks=budgets)
+        title = f"Repeatability within {radius:g} px against the number of keypoints, {what}"
+        figures.append(Figure(f"{key}_repeatability_{radius:g}px", title, png))
     points = {
         feature.title: ([seconds], [count])
         for feature, own in measured
@@ -396,27 +384,3 @@ def standard_figures(
     x_label = "detecting, describing and matching a pair, s"
     png = line_chart(points, x_label, label, logarithmic=True)
     return [*figures, Figure(f"{key}_time", f"Time against correct matches, {what}", png)]
-
-
-def repeatability_figure(
-    features: Sequence[LocalFeature], rows: Rows, radius: float, key: str, what: str
-) -> Figure:
-    """Draw the repeatability at a radius against the number of keypoints.
-
-    Of rows with the same keypoints, which differ in their descriptors, the first one is drawn.
-    """
-    numbers = [budget for budget in BUDGETS if budget is not None]
-    lines = {}
-    drawn: set[str] = set()
-    for feature in features:
-        if feature.detection in drawn:
-            continue
-        drawn.add(feature.detection)
-        own = where(rows, method=feature.name)
-        values = [repeated(own, budget, radius) for budget in numbers]
-        if any(value is not None for value in values):
-            lines[feature.title] = numbers, [math.nan if v is None else v for v in values]
-    label = f"mutual-NN repeatability within {radius:g} px"
-    png = line_chart(lines, "keypoints per image", label, logarithmic=True, ticks=numbers)
-    title = f"Repeatability within {radius:g} px against the number of keypoints, {what}"
-    return Figure(f"{key}_repeatability_{radius:g}px", title, png)

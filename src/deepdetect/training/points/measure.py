@@ -11,9 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...evaluation.metrics.homography import Sizes
-from ...evaluation.metrics.matching import match_accuracy
-from ...evaluation.metrics.repeatability import repeated_fractions
+from ...evaluation.metrics.homography import Sizes, match_accuracy
+from ...evaluation.metrics.repeatability import mutual_nn_repeatability
 from ...features.keypoints import Keypoints
 from ...features.matchers import get_matcher, match_descriptors
 from ...features.sift import root_sift_descriptors
@@ -67,7 +66,10 @@ def measure(detect: Detect, pairs: Sequence[ViewPair]) -> dict[str, float]:
             count = max(1, round(budget * width * height / IMAGE_PIXELS))
             best = [each.best(count) for each in points]
             first, second = (each.xy for each in best)
-            rows.append(repeated_fractions(first, second, pair.homography, sizes, RADII_PX))
+            by_radius = mutual_nn_repeatability(
+                first, second, pair.homography, sizes, RADII_PX, with_chance=False
+            )
+            rows.append([fraction for fraction, _, _ in by_radius])
             if budget == MATCHING_BUDGET:
                 correct[pair.kind].append(_correct(pair, best, sizes) / count)
         repeated[pair.kind].append(rows)
@@ -95,7 +97,8 @@ def _correct(pair: ViewPair, points: Sequence[Keypoints], sizes: Sizes) -> int:
     )
     first, second = points[0].xy[matches.indices0], points[1].xy[matches.indices1]
     found = match_accuracy(first, second, points[0].xy, points[1].xy, pair.homography, sizes)
-    return int(found.correct[0])
+    correct: int = found["correct", 1]
+    return correct
 
 
 def _valid(points: Keypoints, valid: np.ndarray) -> Keypoints:
