@@ -15,8 +15,13 @@ import hypothesis
 import numpy as np
 import pytest
 
+from deepdetect._shared import memory
+
 # Some tests import ONNX Runtime by themselves.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+
+# Training keeps what it frees, for speed; a process of tests goes on with others.
+memory.disable_malloc_trim = lambda: None
 
 # The same examples on every run, no files left behind, no limit on time.
 for _name, _examples in (("quick", 10), ("thorough", 60)):
@@ -53,6 +58,7 @@ def _memory_given_back() -> Iterator[None]:
     """Give the memory of a file's tests back to the system: there is a process beside this one."""
     yield
     gc.collect()
+    gc.freeze()  # the modules, which need not be looked through again
     if platform.libc_ver()[0] == "glibc":
         ctypes.CDLL(None).malloc_trim(0)
 
