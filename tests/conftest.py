@@ -15,13 +15,13 @@ import hypothesis
 import numpy as np
 import pytest
 
-from deepdetect._shared import memory
+from deepdetect._shared import machine
 
 # Some tests import ONNX Runtime by themselves.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 # Training keeps what it frees, for speed; a process of tests goes on with others.
-memory.disable_malloc_trim = lambda: None
+machine.disable_malloc_trim = lambda: None
 
 # The same examples on every run, no files left behind, no limit on time.
 for _name, _examples in (("quick", 10), ("thorough", 60)):
