@@ -24,11 +24,10 @@ from .io.tables import (
     save_matches as save_matches,
 )
 from .matching.options import MatchingOptions as MatchingOptions
-from .matching.pipeline import match_images as match_images
+from .matching.pipeline import match_features as match_features, match_images as match_images
 from .matching.registration import register as register
 from .matching.stereo.matching import disparity_map as disparity_map
 from .matching.stitching import stitch as stitch
-from .matching.unguided import match_features as match_features
 from .reconstruction.pipeline import reconstruct as reconstruct
 from .sfm.pipeline import reconstruct_many as reconstruct_many
 

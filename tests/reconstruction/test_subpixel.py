@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import Matches, OptionError
+from deepdetect import Matches
 from deepdetect.io.image import luma
 from deepdetect.reconstruction import subpixel
 from deepdetect.reconstruction.subpixel import (
@@ -100,10 +100,6 @@ def test_what_cannot_be_aligned_stays_and_says_so(gray: np.ndarray) -> None:
     stripes = np.broadcast_to(np.uint8(100 + 80 * np.sin(np.arange(256) / 3)), (220, 256)).copy()
     for images in ((flat, gray), (gray, flat), (flat, flat), (stripes, stripes)):
         assert not refine_matches(*images, pixels, start)[1].any()
-    outside = np.array([[1e6, 5.0], [-50, 3], [np.nan, 3], [100, np.inf]])
-    assert not refine_matches(gray, gray, pixels, outside)[1].any()
-    with pytest.raises(OptionError, match="whole pixels"):
-        refine_matches(gray, gray, pixels + 0.5, start)
 
 
 def test_bands_of_rows_do_not_matter(

@@ -8,8 +8,16 @@ import pytest
 
 from deepdetect import Matches
 from deepdetect._shared.errors import ReconstructionError
+from deepdetect._shared.progress import StageTimer
 from deepdetect.reconstruction.outliers import PointFilterOptions
 from deepdetect.reconstruction.two_view import reconstruct_two_view
+
+
+def reconstruct(
+    turned: Any, matches: Matches, calibration: Any = None, keep: Any = PointFilterOptions()
+) -> dict[str, Any]:
+    calibration = calibration or turned.calibration
+    return reconstruct_two_view(matches, turned.grays, calibration, keep, 0, StageTimer())
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +28,7 @@ def whole(turned_matches: Matches) -> Matches:
 
 @pytest.fixture(scope="module")
 def found(turned: Any, whole: Matches) -> dict[str, Any]:
-    return reconstruct_two_view(whole, turned.grays, turned.calibration)
+    return reconstruct(turned, whole)
 
 
 def depth_errors(turned: Any, found: dict[str, Any]) -> np.ndarray:
@@ -33,7 +41,7 @@ def test_matches_of_rectified_rows_are_taken_as_they_are(
     turned: Any, turned_matches: Matches, found: Any
 ) -> None:
     """Their pose is that of corners refined alone: across their lines they are as the rows."""
-    made = reconstruct_two_view(turned_matches, turned.grays, turned.calibration)
+    made = reconstruct(turned, turned_matches)
     assert "not refined" not in made["dropped"]
     assert len(made["points"]) + sum(made["dropped"].values()) == len(turned_matches)
     assert len(made["points"]) > 1.1 * len(found["points"])
@@ -58,7 +66,7 @@ def test_points_lie_where_their_pixels_look(turned: Any, whole: Matches, found: 
 
 def test_a_known_baseline_gives_millimetres(turned: Any, whole: Matches, found: Any) -> None:
     calibration = replace(turned.calibration, baseline_mm=193.001)
-    metric = reconstruct_two_view(whole, turned.grays, calibration)
+    metric = reconstruct(turned, whole, calibration)
     np.testing.assert_array_equal(metric["pixels"], found["pixels"])
     np.testing.assert_allclose(metric["points"], found["points"] * 193.001, rtol=1e-5)
 
@@ -68,7 +76,7 @@ def test_wrong_matches_are_taken_out(turned: Any, whole: Matches, found: Any) ->
     wrong = generator.random(len(whole)) < 0.3
     points1 = whole.points1.copy()
     points1[wrong] = generator.integers((0, 0), (370, 250), (wrong.sum(), 2))
-    other = reconstruct_two_view(replace(whole, points1=points1), turned.grays, turned.calibration)
+    other = reconstruct(turned, replace(whole, points1=points1))
     assert turned.rotation_error(other["pose"].rotation) < 0.1
     bad = {tuple(pixel) for pixel in whole.points0[wrong].tolist()}
     assert np.mean([tuple(pixel) in bad for pixel in other["pixels"].tolist()]) < 0.02
@@ -77,12 +85,11 @@ def test_wrong_matches_are_taken_out(turned: Any, whole: Matches, found: Any) ->
 
 def test_the_point_filter_reaches_its_stages(turned: Any, whole: Matches) -> None:
     keep = PointFilterOptions(sor_neighbors=0, min_parallax_px=0)
-    arguments = whole, turned.grays, turned.calibration
-    made = reconstruct_two_view(*arguments, keep)
+    made = reconstruct(turned, whole, keep=keep)
     assert "statistical outlier" not in made["dropped"]
     assert made["dropped"]["parallax"] == 0
-    far = reconstruct_two_view(*arguments, replace(keep, min_parallax_px=40))
+    far = reconstruct(turned, whole, keep=replace(keep, min_parallax_px=40))
     assert len(far["points"]) < len(made["points"])
     assert far["dropped"]["parallax"] > 0
     with pytest.raises(ReconstructionError, match="parallax: "):
-        reconstruct_two_view(*arguments, replace(keep, min_parallax_px=1e4))
+        reconstruct(turned, whole, keep=replace(keep, min_parallax_px=1e4))

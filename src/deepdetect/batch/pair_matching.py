@@ -21,7 +21,7 @@ from ..features.keypoints import Keypoints
 from ..features.matchers import MATCHERS
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
-from ..matching.unguided import match_features
+from ..matching.pipeline import match_features
 from .engines import get_engine
 from .extraction import DESCRIPTOR, keypoints_of
 from .hdf5 import (

@@ -20,7 +20,7 @@ from .._shared.records import Arrays, file_digest, key, load_arrays, save_arrays
 from ..features.keypoints import Keypoints
 from ..features.matchers import get_matcher, match_descriptors
 from ..io.image import load_image
-from ..matching.unguided import check_memory
+from ..matching.pipeline import check_memory
 from .baselines.method import BaselineError, LocalFeature
 from .profiling import Profile, profiled
 from .report import Row, Rows

@@ -6,7 +6,7 @@ from .options import (
     PUBLISHED_MATCHING as PUBLISHED_MATCHING,
     MatchingOptions as MatchingOptions,
 )
-from .pipeline import match_images as match_images
+from .pipeline import match_features as match_features, match_images as match_images
 from .registration import Registration as Registration, register as register
 from .stereo import (
     DisparityMap as DisparityMap,
@@ -18,4 +18,3 @@ from .stitching import (
     StitchingOptions as StitchingOptions,
     stitch as stitch,
 )
-from .unguided import match_features as match_features

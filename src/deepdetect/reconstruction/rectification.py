@@ -308,21 +308,17 @@ def check_cameras(calibration: Calibration) -> None:
 
 
 def check_disparities(disparity: np.ndarray) -> None:
-    """Refuse disparities of a rectified pair that are all one value, or of which none is known."""
-    known = np.asarray(disparity)[np.isfinite(disparity)]
-    if not len(known):
-        raise NoDepthError("no disparity was found: the images do not overlap")
-    if is_static(known):
+    """Refuse disparities of a rectified pair that are all one value."""
+    if is_static(disparity):
         raise NoDepthError(
             "all disparities are 0: both images were taken from one place, without a baseline"
         )
-    low, middle, high = np.quantile(known, [0.05, 0.5, 0.95])
-    if high - low >= MIN_DEPTH_SPREAD_PX:
-        return
-    raise NoDepthError(
-        f"all disparities are {middle:.3g} px: one image is the other shifted sideways, or both "
-        "show one plane, and there is no depth"
-    )
+    low, middle, high = np.quantile(disparity, [0.05, 0.5, 0.95])
+    if high - low < MIN_DEPTH_SPREAD_PX:
+        raise NoDepthError(
+            f"all disparities are {middle:.3g} px: one image is the other shifted sideways, or "
+            "both show one plane, and there is no depth"
+        )
 
 
 def check_pure_rotation(

@@ -10,7 +10,7 @@ import numpy as np
 
 from .._shared.errors import ReconstructionError
 from .._shared.options import suggest_keywords
-from ..geometry.camera import Calibration
+from ..geometry.camera import Calibration, Camera
 from ..geometry.point_cloud import PointCloud
 from ..geometry.relative_pose import RelativePose
 from .rectification import Rectification
@@ -125,8 +125,8 @@ class Reconstruction:
         NaN becomes None.
         """
         errors, disparity = self.reprojection_errors, self.disparity
-        error = None if errors is None else round(float(np.median(errors)), 4)
-        angle = round(float(np.median(self.triangulation_angles())), 4)
+        rows, pose, calibration = self.rectification, self.pose, self.calibration
+        cameras = {"left": calibration.camera0, "right": calibration.camera1}
         return {
             "points": len(self),
             "filled": int(np.count_nonzero(~self.matched)),
@@ -138,17 +138,27 @@ class Reconstruction:
             "density": round(len(self) / (self.size[0] * self.size[1]), 6),
             "rectified": self.rectified,
             "rectified_why": self._why(),
-            "rectification": None
-            if self.rectification is None
-            else {k: _finite(v) for k, v in dataclasses.asdict(self.rectification).items()},
+            "rectification": None if rows is None else _finite(dataclasses.asdict(rows)),
             "unit": self.unit,
             "scale": SCALE[self.unit],
             "depth": _percentiles(self.points[:, 2]),
             "disparity": None if disparity is None else _percentiles(disparity),
-            "median_triangulation_angle_degrees": angle,
-            "median_reprojection_error_px": error,
-            "pose": None if self.pose is None else _pose_values(self.pose),
-            "calibration": _calibration_values(self.calibration),
+            "median_triangulation_angle_degrees": _median(self.triangulation_angles()),
+            "median_reprojection_error_px": None if errors is None else _median(errors),
+            "pose": None
+            if pose is None
+            else {
+                "rotation": pose.rotation.tolist(),
+                "translation": pose.translation.tolist(),
+                "angle_degrees": round(pose.angle, 4),
+                "in_front": round(pose.cheirality_ratio, 4),
+            },
+            "calibration": {
+                "source": calibration.source,
+                "baseline_mm": calibration.baseline_mm,
+                "disparity_offset_px": round(calibration.disparity_offset_px, 6),
+            }
+            | {side: _camera_values(camera) for side, camera in cameras.items()},
             "seconds": {stage: round(value, 4) for stage, value in self.seconds.items()},
         }
 
@@ -168,30 +178,14 @@ class Reconstruction:
         return result
 
 
-def _pose_values(pose: RelativePose) -> dict[str, Any]:
-    return {
-        "rotation": pose.rotation.tolist(),
-        "translation": pose.translation.tolist(),
-        "angle_degrees": round(pose.angle, 4),
-        "in_front": round(pose.cheirality_ratio, 4),
-    }
+def _camera_values(camera: Camera) -> dict[str, Any]:
+    (width, height), (cx, cy) = camera.size, camera.centre
+    focal_px = list(camera.focal_px)
+    return {"width": width, "height": height, "focal_px": focal_px, "cx": cx, "cy": cy}
 
 
-def _calibration_values(calibration: Calibration) -> dict[str, Any]:
-    cameras = {
-        side: {
-            **dict(zip(("width", "height"), camera.size, strict=True)),
-            "focal_px": list(camera.focal_px),
-            **dict(zip(("cx", "cy"), camera.centre, strict=True)),
-        }
-        for side, camera in (("left", calibration.camera0), ("right", calibration.camera1))
-    }
-    return {
-        "source": calibration.source,
-        "baseline_mm": calibration.baseline_mm,
-        "disparity_offset_px": round(calibration.disparity_offset_px, 6),
-        **cameras,
-    }
+def _median(values: np.ndarray) -> float:
+    return round(float(np.median(values)), 4)
 
 
 def _percentiles(values: np.ndarray) -> dict[str, float]:
@@ -204,6 +198,8 @@ def _percentiles(values: np.ndarray) -> dict[str, float]:
 
 def _finite(value: Any) -> Any:
     """Replace what is not finite, which JSON does not have, by None."""
-    if isinstance(value, (tuple, list)):
+    if isinstance(value, dict):
+        return {name: _finite(part) for name, part in value.items()}
+    if isinstance(value, tuple):
         return [_finite(part) for part in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value

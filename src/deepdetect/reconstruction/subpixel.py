@@ -11,7 +11,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from .._shared.errors import OptionError
 from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
 from ..geometry.images import window_sums
@@ -63,8 +62,7 @@ def refine_matches(
     """Refine the second positions (N, 2) of matches of whole pixels, accurate to a pixel or two.
 
     Returns (N, 2) float64 positions, and (N,) bool which converged: not flat patches, those that
-    extend over the border, move too far, or remain too different; they stay where they are. The
-    result does not depend on the number of threads.
+    extend over the border, move too far, or remain too different; they stay where they are.
 
     Example:
         >>> image = np.random.default_rng(0).integers(0, 256, (60, 60)).astype(np.uint8)
@@ -74,22 +72,14 @@ def refine_matches(
         >>> refine_matches(image, moved, point, point)[0].round(1).tolist()
         [[30.4, 30.0]]
     """
-    pixels0 = np.rint(np.asarray(points0, np.float64)).reshape(-1, 2)
-    inside = (pixels0 >= 0).all() and (pixels0 < (gray0.shape[1], gray0.shape[0])).all()
-    if not inside or (pixels0 != np.asarray(points0).reshape(-1, 2)).any():
-        raise OptionError(
-            "points0 must be whole pixels of the image: detect keypoints with subpixel=False"
-        )
-    pixels0 = pixels0.astype(np.int64)
-    start = np.array(points1, np.float64, order="C").reshape(-1, 2)
-    known = np.asarray(np.isfinite(start).all(1))
-    known[known] = ((start[known] >= 0) & (start[known] < gray1.shape[::-1])).all(1)
-    if not known.all():
-        found = refine_matches(gray0, gray1, pixels0[known], start[known])
-        start[known], known[known] = found
-        return start, known
+    pixels0 = np.rint(points0).astype(np.int64)
+    start = np.array(points1, np.float64, order="C")
+    inside = ((start >= 0) & (start < gray1.shape[::-1])).all(axis=1)
+    if not inside.all():
+        start[inside], inside[inside] = refine_matches(gray0, gray1, pixels0[inside], start[inside])
+        return start, inside
     if not len(pixels0):
-        return start, known
+        return start, inside
     images = gray0.astype(np.float32), gray1.astype(np.float32)
     overall = similarity(pixels0, start)
     refined, converged = start.copy(), np.zeros(len(start), bool)

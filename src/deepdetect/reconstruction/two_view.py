@@ -72,16 +72,15 @@ def reconstruct_two_view(
     matches: Matches,
     images: tuple[np.ndarray, np.ndarray],
     calibration: Calibration,
-    point_filter: PointFilterOptions = PointFilterOptions(),
-    seed: int = 0,
-    timer: StageTimer | None = None,
+    point_filter: PointFilterOptions,
+    seed: int,
+    timer: StageTimer,
 ) -> dict[str, Any]:
     """Reconstruct the points of a pair; return what `Reconstruction` says of them.
 
     Matches that are not sub-pixel are refined, from whole pixels of the left image; `images` are
     (H, W) uint8 luma.
     """
-    timer = StageTimer() if timer is None else timer
     points0, points1 = matches.points0.astype(np.float64), matches.points1.astype(np.float64)
     indices = pose_indices = np.arange(len(points0))
     dropped: dict[str, int] = {}
@@ -216,11 +215,11 @@ def check_focal(
         return
     best, best_factor = MAX_FOCAL_ERROR_RATIO * given, 1.0
     for factor in FOCAL_FACTORS:
-        scaled = replace(
-            calibration,
-            camera0=_with_focal(calibration.camera0, factor),
-            camera1=_with_focal(calibration.camera1, factor),
+        camera0, camera1 = (
+            Camera(camera.size, [factor * focal for focal in camera.focal_px], camera.centre)
+            for camera in (calibration.camera0, calibration.camera1)
         )
+        scaled = replace(calibration, camera0=camera0, camera1=camera1)
         found = estimate_relative_pose(points0, points1, scaled, MAX_SCENE_DISTANCE_PX, seed)
         if found is None or found.cheirality_ratio < MIN_IN_FRONT_FRACTION:
             continue
@@ -240,8 +239,3 @@ def _wrong_focal(calibration: Calibration) -> str:
         f"the focal length of {calibration.camera0.focal_px[0]:.0f} px ({calibration.source}) is "
         "probably wrong for these images"
     )
-
-
-def _with_focal(camera: Camera, factor: float) -> Camera:
-    fx, fy = camera.focal_px
-    return replace(camera, focal_px=(fx * factor, fy * factor))

@@ -82,7 +82,8 @@ def track_frames(
         OptionError: `max_side` is too small.
         BatchError: no frame of a folder can be read.
     """
-    _check_side(max_side)
+    if max_side is not None and not max_side >= MIN_SIDE_PX:
+        raise OptionError(f"`max_side` must be at least {MIN_SIDE_PX} pixels, not {max_side}")
     for frame in source:
         height, width = frame.rgb.shape[:2]
         if max_side is None or max(height, width) <= max_side:
@@ -138,7 +139,6 @@ def track(
         >>> track("drive.mp4", "tracks.mp4")  # doctest: +SKIP
     """
     video, table = output_files(output)
-    _check_side(max_side)
     if tail < 1:
         raise OptionError(f"`tail` must be at least 1, not {tail}")
     frames = tracks = positions = 0
@@ -177,11 +177,6 @@ def track(
         opened.count,
         tuple(opened.failures),
     )
-
-
-def _check_side(max_side: int | None) -> None:
-    if max_side is not None and not max_side >= MIN_SIDE_PX:
-        raise OptionError(f"`max_side` must be at least {MIN_SIDE_PX} pixels, not {max_side}")
 
 
 def output_files(output: str | Path) -> tuple[Path | None, Path]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import colorsys
-import os
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,9 +17,6 @@ from .tracks import TrackedFrame
 
 CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
 """Of the files, by their suffix."""
-
-SPARE_BYTES = 1 << 16
-"""That must fit behind a video: encoders write what they have left in smaller blocks."""
 
 READABLE_WIDTH_PX = 800
 """Lines and letters grow with frames that are wider than this."""
@@ -90,16 +86,6 @@ def write_video(path: str | Path, fps: float) -> Iterator[Callable[[np.ndarray],
                 f"cannot write {path} ({found} of {len(sizes)} frames are in the file): free "
                 "some space, or choose another place"
             )
-        _check_space(temporary)
-
-
-def _check_space(path: Path) -> None:
-    """Raise an OSError where a file cannot grow: then its own end may be missing, too."""
-    with path.open("r+b") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.write(bytes(SPARE_BYTES))
-        file.flush()
-        file.truncate(size)
 
 
 class TrackDrawer:
@@ -125,13 +111,10 @@ class TrackDrawer:
             end = (int(line[-1, 0, 0]), int(line[-1, 0, 1]))
             cv2.circle(canvas, end, round(2 * unit), colors[track], -1, cv2.LINE_AA)
         if caption:
-            place, size = (round(8 * unit), round(22 * unit)), 0.6 * unit
+            place, font = (round(8 * unit), round(22 * unit)), cv2.FONT_HERSHEY_SIMPLEX
             for color, width in (((0, 0, 0), 4), ((255, 255, 255), 1)):
-                cv2.putText(
-                    *(canvas, caption, place, cv2.FONT_HERSHEY_SIMPLEX, size, color),
-                    round(width * unit),
-                    cv2.LINE_AA,
-                )
+                style = font, 0.6 * unit, color, round(width * unit), cv2.LINE_AA
+                cv2.putText(canvas, caption, place, *style)
         return canvas
 
 

@@ -30,9 +30,8 @@ from ...features.matches import Matches
 from ...features.selection import SelectionOptions
 from ...geometry.camera import Calibration
 from ...geometry.point_cloud import PointCloud
-from ...matching.pipeline import match_images
+from ...matching.pipeline import check_memory, match_images
 from ...matching.stereo.matching import find_disparity_range
-from ...matching.unguided import check_memory
 from ...reconstruction.pipeline import reconstruct
 from ...viz.render import draw_clouds
 from ..baselines.method import LocalFeature, deepdetect_feature
