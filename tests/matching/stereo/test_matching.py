@@ -15,7 +15,6 @@ from deepdetect.matching.stereo import DENSE, DisparityOptions, disparity_map, m
 from deepdetect.matching.stereo.matching import (
     extrapolate_disparity,
     fill_occlusions,
-    filter_speckles,
     find_disparity_range,
     near_discontinuity,
     on_occluding_edge,
@@ -291,20 +290,6 @@ def smooth_pair(rectified_pair):
     return make
 
 
-def test_speckles_are_removed_by_their_size() -> None:
-    disparity = np.full((30, 40), -3.25, np.float32)
-    disparity[5:9, 5:9] = 9  # 16 pixels
-    disparity[20:25, 20:30] = 9  # 50
-    known = np.ones(disparity.shape, bool)
-    known[0] = False
-    kept = filter_speckles(disparity, known, 20)
-    assert not kept[5:9, 5:9].any()
-    assert not kept[0].any()
-    assert kept[20:25, 20:30].all()
-    assert kept.sum() == known.sum() - 16
-    assert disparity[5, 5] == 9
-
-
 def test_discontinuities_extend_along_rows_and_columns() -> None:
     disparity = np.zeros((30, 40), np.float32)
     disparity[10:20, 10:20] = 5
@@ -314,16 +299,6 @@ def test_discontinuities_extend_along_rows_and_columns() -> None:
     expected[7, [7, 22]] = expected[22, [7, 22]] = False  # its corners see no jump
     expected[13:17, 13:17] = False
     np.testing.assert_array_equal(near, expected)
-
-
-def test_across_a_gap_there_is_a_discontinuity_where_the_depth_jumps() -> None:
-    disparity = np.zeros((5, 30), np.float32)
-    disparity[:, 20:] = 6
-    known = np.ones(disparity.shape, bool)
-    known[:, 14:20] = False
-    near = near_discontinuity(disparity, known, 3)
-    assert near[:, 16:23].all()
-    assert not near[:, :15].any()
 
 
 def test_occlusions_are_filled_from_the_farther_side() -> None:
