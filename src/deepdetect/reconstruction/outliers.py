@@ -50,14 +50,7 @@ class PointFilterOptions:
 def sor_inliers(
     points: np.ndarray, point_filter: PointFilterOptions = PointFilterOptions()
 ) -> np.ndarray:
-    """Return which points (N, 3) have others around them; those that are not finite have not.
-
-    Example:
-        >>> row = np.column_stack([np.arange(100.0), np.zeros(100), np.zeros(100)])
-        >>> row[50, 1] = 30
-        >>> np.flatnonzero(~sor_inliers(row, PointFilterOptions(sor_neighbors=4))).tolist()
-        [50]
-    """
+    """Return which points (N, 3) have others around them; those that are not finite have not."""
     inliers = np.isfinite(points).all(1)
     if np.count_nonzero(inliers) > 1:
         distances = mean_neighbor_distances(points[inliers], point_filter.sor_neighbors)

@@ -279,13 +279,6 @@ def sor_inliers_on_grid(
     As `sor_inliers`, with all in a window as neighbors and the root mean square of the differences
     of disparity as distance: three box filters. A pixel alone in its window is an outlier only
     where most are not.
-
-    Example:
-        >>> pixels = np.argwhere(np.ones((20, 20)))
-        >>> disparity = np.full(400, 7.0)
-        >>> disparity[210] = 9
-        >>> np.flatnonzero(~sor_inliers_on_grid(pixels, disparity, (20, 20))).tolist()
-        [210]
     """
     if not len(pixels):
         return np.ones(0, bool)

@@ -190,16 +190,7 @@ def detect_rectification(
     offset_px: float = 0.0,
     seed: int = 0,
 ) -> Rectification:
-    """Decide from matches (M, 2) whether a pair is rectified; sizes are (width, height).
-
-    Example:
-        >>> left = np.random.default_rng(0).uniform(0, (640, 480), (900, 2))
-        >>> right = left - np.column_stack([20 + 5 * np.sin(left[:, 1] / 30), np.zeros(900)])
-        >>> detect_rectification(left, right, (640, 480), (640, 480)).rectified
-        True
-        >>> detect_rectification(left, right + [0, 3], (640, 480), (640, 480)).rectified
-        False
-    """
+    """Decide from matches (M, 2) whether a pair is rectified; sizes are (width, height)."""
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
     indices = grid_subsample(points0, GRID_SIZE_PX, seed)

@@ -63,14 +63,6 @@ def refine_matches(
 
     Returns (N, 2) float64 positions, and (N,) bool which converged: not flat patches, those that
     extend over the border, move too far, or remain too different; they stay where they are.
-
-    Example:
-        >>> image = np.random.default_rng(0).integers(0, 256, (60, 60)).astype(np.uint8)
-        >>> image = cv2.GaussianBlur(image, (0, 0), 2)
-        >>> moved = cv2.warpAffine(image, np.float32([[1, 0, 0.4], [0, 1, 0]]), (60, 60))
-        >>> point = np.array([[30, 30]])
-        >>> refine_matches(image, moved, point, point)[0].round(1).tolist()
-        [[30.4, 30.0]]
     """
     pixels0 = np.rint(points0).astype(np.int64)
     start = np.array(points1, np.float64, order="C")
@@ -122,12 +114,6 @@ def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarr
     """Choose whole pixels (N, 2) that can be aligned well; (M,) int64 rows of them, rising.
 
     Each of `count` cells of the image gives its best corner (Shi and Tomasi, 1994).
-
-    Example:
-        >>> square = np.zeros((60, 60), np.uint8)
-        >>> square[20:40, 20:40] = 200
-        >>> spread_corners(square, np.array([[5, 5], [30, 20], [20, 20]]), 1).tolist()
-        [2]
     """
     column, row = np.asarray(points, np.int64).reshape(-1, 2).T
     strength = cv2.cornerMinEigenVal(gray, CORNER_WINDOW_PX)[row, column]

@@ -191,11 +191,6 @@ def free_keypoints(
     """Choose up to `count` keypoints, the best first, far from (M, 2) positions and each other.
 
     Returns (K,) rows of the keypoints; distances are those of the nearest pixels.
-
-    Example:
-        >>> points = Keypoints([[2, 2], [3, 2], [9, 2], [15, 2]], [0.5, 0.9, 0.8, 0.7], (20, 5))
-        >>> free_keypoints(points, np.array([[14, 2]]), 3, 10).tolist()
-        [1, 2]
     """
     width, height = keypoints.image_size
     radius = int(distance_px)
