@@ -48,12 +48,6 @@ def test_points_astray_are_found_near_and_far_in_disparity_space_only() -> None:
     assert (~sor_inliers(points)[astray]).mean() < 0.5
 
 
-def test_pixels_and_disparities_are_the_space() -> None:
-    points = np.array([[1.0, -2, 4]])
-    np.testing.assert_allclose(disparity_space(points, 100, 0.5), [[25, -50, 2 * 12.5]])
-    np.testing.assert_allclose(disparity_space(points * 10, 100, 5), [[25, -50, 25]])
-
-
 def test_few_equal_and_infinite_points_raise_nothing() -> None:
     for count in (0, 1, 2, 3):
         assert sor_inliers(np.arange(3.0 * count).reshape(-1, 3)).all()
