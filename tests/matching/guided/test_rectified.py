@@ -13,7 +13,7 @@ from deepdetect.features.matches import GuidedMatches
 from deepdetect.geometry import epipolar_errors, transform_points
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import rectified
-from deepdetect.matching.guided.initial_geometry import find_initial_geometry
+from deepdetect.matching.guided.initial_geometry import InitialGeometry, find_initial_geometry
 from deepdetect.matching.guided.rectified import match_by_rectification
 
 TURNED = cv2.getRotationMatrix2D((225, 190), 30, 1.0)
@@ -25,8 +25,14 @@ def cones(shared: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return luma(pair.left), luma(pair.right), pair.disparity
 
 
-def match(gray0: np.ndarray, gray1: np.ndarray, xy0: np.ndarray) -> GuidedMatches | None:
-    first = find_initial_geometry(gray0, gray1, "fundamental")
+@pytest.fixture(scope="module")
+def first(cones) -> InitialGeometry:
+    return find_initial_geometry(*cones[:2], "fundamental")
+
+
+def match(
+    gray0: np.ndarray, gray1: np.ndarray, xy0: np.ndarray, first: InitialGeometry
+) -> GuidedMatches | None:
     assert first.matrix is not None
     found = match_by_rectification(gray0, gray1, xy0, first.points0, first.points1, first.matrix)
     return None if found is None else found[1]
@@ -60,7 +66,7 @@ def test_most_keypoints_are_matched_and_right(cones, move: np.ndarray, precision
     size = (right.shape[1], right.shape[0])
     second = cv2.warpAffine(right, move, size, flags=cv2.INTER_CUBIC)
     xy0 = every_second(left)
-    found = match(left, second, xy0)
+    found = match(left, second, xy0, find_initial_geometry(left, second, "fundamental"))
     assert found is not None
     assert len(found) > 0.35 * len(xy0)
     assert within(found, xy0, cones, move) > precision
@@ -68,13 +74,13 @@ def test_most_keypoints_are_matched_and_right(cones, move: np.ndarray, precision
     assert (np.diff(found.indices0) > 0).all()
 
 
-def test_low_correlation_is_kept_where_little_is_found_by_chance(cones, monkeypatch) -> None:
+def test_low_correlation_is_kept_where_little_is_found_by_chance(cones, first, monkeypatch) -> None:
     """Smooth surfaces: what is kept beyond the bounds is right nearly as often."""
     left, right, _ = cones
     xy0 = every_second(left)
-    lenient = match(left, right, xy0)
+    lenient = match(left, right, xy0, first)
     monkeypatch.setattr(rectified, "FALSE_DISCOVERY_RATE", 0.0)
-    strict = match(left, right, xy0)
+    strict = match(left, right, xy0, first)
     assert strict is not None
     assert lenient is not None
     assert set(strict.indices0) < set(lenient.indices0)
@@ -82,21 +88,22 @@ def test_low_correlation_is_kept_where_little_is_found_by_chance(cones, monkeypa
     assert within(lenient, xy0, cones, np.eye(2, 3)) > 0.97
 
 
-def test_a_pair_with_too_much_to_search_is_matched_on_smaller_copies(cones, monkeypatch) -> None:
+def test_a_pair_with_too_much_to_search_is_matched_on_smaller_copies(
+    cones, first, monkeypatch
+) -> None:
     left, right, _ = cones
     xy0 = every_second(left)
     monkeypatch.setattr(rectified, "MAX_VOLUME", 3e6)
-    found = match(left, right, xy0)
+    found = match(left, right, xy0, first)
     assert found is not None
     assert len(found) > 0.25 * len(xy0)
     move = np.float64([[1, 0, 0], [0, 1, 0]])
     assert within(found, xy0, cones, move) > 0.85
 
 
-def test_a_matrix_that_is_off_is_corrected(cones) -> None:
+def test_a_matrix_that_is_off_is_corrected(cones, first) -> None:
     """One that is turned by a third of a degree about the middle of the image."""
     left, right, _ = cones
-    first = find_initial_geometry(left, right, "fundamental")
     turn = np.vstack([cv2.getRotationMatrix2D((225, 190), 0.3, 1), [0, 0, 1]])
     assert first.matrix is not None
     wrong = np.linalg.inv(turn).T @ first.matrix
@@ -115,10 +122,9 @@ def test_a_matrix_that_is_off_is_corrected(cones) -> None:
     assert counts[1] > counts[0]
 
 
-def test_matches_that_the_sparse_ones_contradict_do_not_count(cones) -> None:
+def test_matches_that_the_sparse_ones_contradict_do_not_count(cones, first) -> None:
     """Sparse matches that lie on the right lines, but at other places of them."""
     left, right, _ = cones
-    first = find_initial_geometry(left, right, "fundamental")
     assert first.matrix is not None
     astray = first.points1.copy()
     astray[::2, 0] -= 8
@@ -127,9 +133,9 @@ def test_matches_that_the_sparse_ones_contradict_do_not_count(cones) -> None:
     assert match_by_rectification(*given, exact=True) is not None
 
 
-def test_without_tracked_corners_no_match_counts(cones, monkeypatch) -> None:
+def test_without_tracked_corners_no_match_counts(cones, first, monkeypatch) -> None:
     gray0, gray1, _ = cones
     xy = every_second(gray0)
-    assert match(gray0, gray1, xy) is not None
+    assert match(gray0, gray1, xy, first) is not None
     monkeypatch.setattr(rectified, "MIN_TRACKS", 1_000_000)
-    assert match(gray0, gray1, xy) is None
+    assert match(gray0, gray1, xy, first) is None
