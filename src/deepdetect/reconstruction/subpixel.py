@@ -66,7 +66,7 @@ def refine_matches(
     """
     pixels0 = np.rint(points0).astype(np.int64)
     start = np.array(points1, np.float64, order="C")
-    inside = ((start >= 0) & (start < gray1.shape[::-1])).all(axis=1)
+    inside = np.asarray(((start >= 0) & (start < gray1.shape[::-1])).all(axis=1))
     if not inside.all():
         start[inside], inside[inside] = refine_matches(gray0, gray1, pixels0[inside], start[inside])
         return start, inside
