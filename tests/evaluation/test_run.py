@@ -260,14 +260,20 @@ def raises(error: BaseException) -> Callable[[], None]:
     return work
 
 
-@pytest.mark.parametrize(
-    "error", [ImageError("reason"), DeepDetectError("reason"), cv2.error("reason")]
-)
+@pytest.mark.parametrize("error", [ImageError("reason"), DeepDetectError("reason")])
 def test_what_cannot_be_done_is_skipped_with_its_reason(tmp_path: Path, error: Exception) -> None:
     run = Run(tmp_path)
     assert run.attempt("matches of Mine", raises(error)) is None
     assert run.skipped == run.failures == ["matches of Mine: reason"]
     assert run.attempt("sum", lambda one, other: one + other, 2, 3) == 5
+
+
+def test_what_opencv_refuses_is_skipped_with_its_reason(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    assert run.attempt("blur", cv2.medianBlur, np.zeros((8, 8), np.uint8), 4) is None
+    assert len(run.skipped) == 1
+    assert run.skipped[0].startswith("blur: ")
+    assert "cpp" not in run.skipped[0]
 
 
 @pytest.mark.parametrize(

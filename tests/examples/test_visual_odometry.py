@@ -71,19 +71,15 @@ def test_drawn_tracks_give_the_path(
     example: ModuleType, how: dict, end_percent: float, end_deg_per_m: float
 ) -> None:
     frames, truth = draw_drive(**how)
-    paths = []
-    for _ in range(2):
-        found = example.VisualOdometry(CAMERA)
-        for frame in frames:
-            found.update(frame)
-        assert found.lost is None
-        numbers, poses = found.trajectory()
-        paths.append(poses)
-        np.testing.assert_array_equal(numbers, np.arange(len(frames)))
+    found = example.VisualOdometry(CAMERA)
+    for frame in frames:
+        found.update(frame)
+    assert found.lost is None
+    numbers, poses = found.trajectory()
+    np.testing.assert_array_equal(numbers, np.arange(len(frames)))
     errors = example.trajectory_errors(poses, truth)
     assert errors["end_percent"] < end_percent
     assert errors["end_deg_per_m"] < end_deg_per_m
-    np.testing.assert_allclose(*paths, rtol=1e-6, atol=1e-6)
 
 
 def test_it_says_where_it_was_lost(example: ModuleType) -> None:
@@ -140,7 +136,7 @@ def test_the_errors_are_below_those_that_the_page_promises(shared: Path, tmp_pat
     assert (tmp_path / "trajectory.jpg").stat().st_size > 10_000
 
 
-def test_mistakes_are_one_sentence_and_black_frames_give_no_path(tmp_path: Path) -> None:
+def test_mistakes_are_one_sentence(tmp_path: Path) -> None:
     missing = run_example(tmp_path)
     assert missing.returncode == 2
     assert one_sentence(missing.stderr)
@@ -152,6 +148,14 @@ def test_mistakes_are_one_sentence_and_black_frames_give_no_path(tmp_path: Path)
     assert short.returncode == 2
     assert "poses.txt has 2 lines" in short.stderr
     assert one_sentence(short.stderr)
-    done = run_example(tmp_path, "--frames", "2", "-o", tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_black_frames_give_no_path(tmp_path: Path) -> None:
+    for k in range(2):
+        Image.new("RGB", (160, 100)).save(tmp_path / f"{k:06d}.png")
+    (tmp_path / "calib.txt").write_text("P0: 150 0 80 0 0 150 50 0 0 0 1 0\n")
+    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
+    done = run_example(tmp_path, "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("no path was found") == 3

@@ -75,8 +75,8 @@ def track_frames(
         tracker: a new one.
         max_side: longer sides of frames are scaled down to this for the tracker, in pixels.
 
-    Yields:
-        Each frame, (H, W, 3) uint8 RGB, and its tracks, in pixels of this frame.
+    Returns:
+        Iterator over each frame, (H, W, 3) uint8 RGB, and its tracks, in pixels of this frame.
 
     Raises:
         OptionError: `max_side` is too small.
@@ -84,6 +84,12 @@ def track_frames(
     """
     if max_side is not None and not max_side >= MIN_SIDE_PX:
         raise OptionError(f"`max_side` must be at least {MIN_SIDE_PX} pixels, not {max_side}")
+    return _followed(source, tracker, max_side)
+
+
+def _followed(
+    source: FrameSource, tracker: Tracker, max_side: int | None
+) -> Iterator[tuple[np.ndarray, TrackedFrame]]:
     for frame in source:
         height, width = frame.rgb.shape[:2]
         if max_side is None or max(height, width) <= max_side:
@@ -151,8 +157,9 @@ def track(
         write = stack.enter_context(write_tracks(table))
         draw = None if video is None else stack.enter_context(write_video(video, opened.fps))
         drawer, ticks = TrackDrawer(tail), deque([begun], RATE_FRAMES + 1)
+        tracked = track_frames(opened, tracker, max_side=max_side)
         bar = stack.enter_context(progress(opened.count, "tracking", "frame", quiet))
-        for rgb, frame in track_frames(opened, tracker, max_side=max_side):
+        for rgb, frame in tracked:
             write(frame)
             ticks.append(time.perf_counter())
             rate = (len(ticks) - 1) / max(1e-9, ticks[-1] - ticks[0])
