@@ -4,12 +4,12 @@
 
 AdamW, batches of 32 views of 480 pixels or as many pixels of others, one cosine; the weights are an
 exponential average. `h100.safetensors` are those of 465 s of a third of an NVIDIA H100, by an
-earlier form of this script, on the 2,705 photographs of photos/train (10,929 steps, 349,728 images' worth of 480x480, from random numbers,
-AdamW at .004; `h100.csv`: step, images, seconds, rate, loss, and of every fourth photograph of
-photos/val BCE and IoU in normal light and darkened; views made so far, scale of float16). The last
-line is of all of photos/val: .0888 / .885 and .1102 / .770. Two other networks were trained beside
-it and lost there, one with two gains (.0928 / .873, .1162 / .762), one that halves the size once
-more (.0976 / .864, .1170 / .761).
+earlier form of this script, on the 2,705 photographs of photos/train: 10,929 steps from random
+numbers at a rate of .004, 349,728 images' worth of 480x480. `h100.csv` has step, images, seconds,
+rate, loss, BCE and IoU of every fourth photograph of photos/val in normal light and darkened, views
+made so far, and the scale of float16. On all of photos/val they have .0888 / .885 and .1102 / .770.
+Two other networks were trained beside it and lost there, one with two gains (.0928 / .873 and
+.1162 / .762), one that halves the size once more (.0976 / .864 and .1170 / .761).
 """
 
 from __future__ import annotations
