@@ -230,6 +230,6 @@ def run_evaluate(tmp_path: Path) -> Callable[..., str]:
         given = [pretrained_weights() if str(a).endswith(".onnx") else a for a in arguments]
         result = run_command(["evaluate", str(tmp_path), *map(str, given)])
         assert result.exit_code == 0, result.output
-        return result.output
+        return result.stdout
 
     return run

@@ -88,7 +88,7 @@ def test_no_module_imports_opencv_itself() -> None:
     [
         "detect left.png",
         "detect left.png --max-keypoints 50",
-        "detect left.png --max-keypoints 50 --spread anms",
+        "detect left.png --detector points --max-keypoints 50 --spread anms",
         "match left.png right.png",
         "match left.png right.png --unguided --max-keypoints 200",
         "register left.png right.png",

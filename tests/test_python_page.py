@@ -19,8 +19,6 @@ def test_the_page_runs(
 ) -> None:
     data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
     pytest.importorskip("torch", reason="needs torch for the features of LightGlue")
-    matplotlib = pytest.importorskip("matplotlib", reason="needs matplotlib for the plots")
-    matplotlib.use("agg")
     left, right, _ = data.stereo_motorcycle()
     for name, view in (("left", left), ("right", right)):
         Image.fromarray(view[100:420, 220:620]).save(tmp_path / f"{name}.png")
@@ -28,17 +26,10 @@ def test_the_page_runs(
     names: dict[str, Any] = {}
     for number, block in enumerate(BLOCKS):
         exec(compile(block, f"block {number} of {PAGE.name}", "exec"), names)
-    from matplotlib import pyplot
-
-    pyplot.close("all")
-    assert len(BLOCKS) > 10
+    assert len(BLOCKS) >= 10
     assert len(names["keypoints"]) > len(names["points"]) == 500
-    assert len(names["tracks"]) > 100
     assert names["matches"].subpixel
-    assert (tmp_path / "matches.png").stat().st_size > 10_000
     printed = capsys.readouterr().out.splitlines()
-    share = int(re.match(r"(\d+)% of the matches", printed[0])[1])
-    assert 80 < share <= 100
     # What the comments say is printed.
     for line in re.findall(r"print\(error\)  # (.*?)(?: \.\.\.)?$", "\n".join(BLOCKS), re.M):
         assert any(text.startswith(line) for text in printed)

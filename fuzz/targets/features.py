@@ -73,7 +73,7 @@ def _match(path: Path, listed: bytes, folder: Path) -> None:
     report = match_pairs(path, folder / "pairs.txt", folder / "matches.h5", workers=1)
     report.check()
     with h5py.File(folder / "matches.h5") as file:
-        for pair in report.matches:
+        for pair in report.counts:
             group = file["/".join(pair)]
             matches, scores = group["matches0"][()], group["matching_scores0"][()]
             expect(matches.dtype == np.int32 and matches.min() >= -1, "rows that cannot be")

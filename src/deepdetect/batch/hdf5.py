@@ -292,8 +292,8 @@ def _copy_groups(shard: Path, merged: Any, stays: Callable[[str], bool]) -> None
 
 def _leaves(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the groups that this package has written, with their paths."""
-    for name, member in group.items():
-        if STATE in member.attrs:
+    for name, member in group.items():  # None: a link that leads nowhere, of a damaged file
+        if member is not None and STATE in member.attrs:
             yield prefix + name, member
         elif hasattr(member, "items"):
             yield from _leaves(member, f"{prefix}{name}/")
