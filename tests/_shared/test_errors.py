@@ -22,6 +22,7 @@ from deepdetect._shared.errors import (
     ReconstructionError,
     RegistrationError,
     WeightsError,
+    first_line,
     unknown_name,
 )
 
@@ -72,6 +73,14 @@ def test_errors_are_the_built_in_ones_too(
     copy = pickle.loads(pickle.dumps(error))
     assert type(copy) is kind
     assert str(copy) == str(error)
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [(ValueError(" a\nb"), "a"), (ValueError(), "ValueError"), (KeyError("\n"), "'\\n'")],
+)
+def test_the_first_line_of_an_error_is_never_missing(error: Exception, line: str) -> None:
+    assert first_line(error) == line
 
 
 def missing_files() -> dict[str, Callable[[Path], object]]:

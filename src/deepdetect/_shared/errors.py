@@ -91,6 +91,16 @@ class BatchError(DeepDetectError):
         return type(self), (self.summary, self.failures)
 
 
+def first_line(error: object) -> str:
+    r"""Return the first line of the message of an error, its type where it has none.
+
+    Example:
+        >>> first_line(ValueError("no number\nin line 3")), first_line(MemoryError())
+        ('no number', 'MemoryError')
+    """
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+
+
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
     """Return the error for an unknown name, which suggests the nearest known one.
 
@@ -116,6 +126,7 @@ WITHOUT_GPU = (
 DISTRIBUTIONS = {
     "cv2": "opencv-python-headless",
     "faiss": "faiss-cpu",
+    "hloc": "git+https://github.com/cvg/Hierarchical-Localization",
     "lightning_fabric": "lightning-fabric",
     "ray": "'ray[data]'",
     "skimage": "scikit-image",

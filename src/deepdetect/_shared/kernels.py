@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from .errors import MissingExtraError
+from .errors import MissingExtraError, first_line
 
 _announcement: list[Callable[[], object]] = []
 
@@ -50,9 +50,8 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
     try:
         import numba
     except ImportError as error:
-        reason = str(error).partition("\n")[0]
         raise MissingExtraError(
-            f"numba cannot be imported ({reason}): run pip install --upgrade numba"
+            f"numba cannot be imported ({first_line(error)}): run pip install --upgrade numba"
         ) from None
     if _announcement:
         _listen()

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from .errors import MissingExtraError
+from .errors import MissingExtraError, first_line
 
 LOWEST_VERSION = "4.10"
 """The first one that works with NumPy 2."""
@@ -51,11 +51,10 @@ def import_opencv() -> ModuleType:
     try:
         found = importlib.import_module("cv2")
     except ImportError as error:
-        reason = str(error).partition("\n")[0]
         raise MissingExtraError(
-            f"OpenCV cannot be imported ({reason}): run pip install opencv-python-headless, which "
-            f"needs no libraries of a screen, or any other package of OpenCV {LOWEST_VERSION} or "
-            "later"
+            f"OpenCV cannot be imported ({first_line(error)}): run pip install "
+            "opencv-python-headless, which needs no libraries of a screen, or any other package "
+            f"of OpenCV {LOWEST_VERSION} or later"
         ) from None
     version = getattr(found, "__version__", None)
     if version is None:  # a folder `cv2` that another package of OpenCV has left behind

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from .._shared.errors import DeepDetectError, MissingExtraError, OptionError
+from .._shared.errors import DeepDetectError, OptionError, first_line, require_packages
 from .._shared.machine import (
     Outcome,
     Task,
@@ -83,9 +83,9 @@ def map_on_ray(
                     raise outcome
                 yield outcome
         except (ray.exceptions.RayActorError, ray.exceptions.RaySystemError) as error:
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
             raise DeepDetectError(
-                f"the Ray cluster failed ({reason}): look at its machines, then run this again"
+                f"the Ray cluster failed ({first_line(error)}): "
+                "look at its machines, then run this again"
             ) from error
 
 
@@ -110,14 +110,11 @@ class _Worker:
 def _import_ray() -> Any:
     for name, value in SETTINGS.items():
         os.environ.setdefault(name, value)
-    try:
-        import ray
-        import ray.data
-        import ray.exceptions
-    except ImportError:
-        raise MissingExtraError(
-            "the engine ray needs Ray: run pip install 'ray[data]', or use the engine processes"
-        ) from None
+    require_packages("the engine ray", "ray")
+    import ray
+    import ray.data
+    import ray.exceptions
+
     return ray
 
 
@@ -132,10 +129,9 @@ def _start_cluster(ray: Any, processors: int, quiet: dict[str, Any]) -> None:
         )
     except Exception as error:  # it waits half a minute for its parts, and raises many kinds
         ray.shutdown()
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise DeepDetectError(
-            f"Ray does not start ({reason}): wait until the machine is less busy, or use the "
-            "engine processes"
+            f"Ray does not start ({first_line(error)}): wait until the machine is less busy, or "
+            "use the engine processes"
         ) from error
 
 

@@ -27,9 +27,10 @@ from .._shared.errors import (
     BatchError,
     DeepDetectError,
     InvalidFileError,
-    MissingExtraError,
     MissingFileError,
     OptionError,
+    first_line,
+    require_packages,
 )
 from .._shared.progress import progress
 from .._shared.records import check_same, key, lock, plain
@@ -94,12 +95,9 @@ class BatchReport:
 
 def import_h5py() -> Any:
     """Import h5py, or raise a MissingExtraError."""
-    try:
-        import h5py
-    except ImportError:
-        raise MissingExtraError(
-            "files of features and matches need h5py: pip install h5py"
-        ) from None
+    require_packages("a file of features or matches", "h5py")
+    import h5py
+
     return h5py
 
 
@@ -116,7 +114,7 @@ def open_hdf5(path: Path) -> Iterator[Any]:
         file = h5py.File(path, "r", locking=False)
     except OSError as error:
         raise DeepDetectError(
-            f"{path} is no HDF5 file, or is damaged ({str(error).splitlines()[0]}): write it again"
+            f"{path} is no HDF5 file, or is damaged ({first_line(error)}): write it again"
         ) from error
     with file:
         try:
@@ -136,8 +134,7 @@ def feature_names(file: Any) -> list[str]:
 
 def damaged(path: Path, error: Exception) -> InvalidFileError:
     """Return the error of a file, or of a part of it, that cannot be read."""
-    reason = (str(error).splitlines() or [type(error).__name__])[0]
-    return InvalidFileError(f"{path} is damaged ({reason}): write it again")
+    return InvalidFileError(f"{path} is damaged ({first_line(error)}): write it again")
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
-from .._shared.errors import DeepDetectError, install_command
+from .._shared.errors import DeepDetectError, first_line, install_command
 from ._options import Result, command, table
 
 PURPOSES = {
@@ -52,8 +52,8 @@ def doctor() -> Result:
             findings += check()
         except Exception as error:  # a broken installation raises anything
             kind = "" if isinstance(error, DeepDetectError) else f"{type(error).__name__}: "
-            line = (str(error).splitlines() or [""])[0]
-            findings.append(Finding(check.__name__, "problem", "does not work", kind + line))
+            reason = kind + first_line(error)
+            findings.append(Finding(check.__name__, "problem", "does not work", reason))
     healthy = not any(finding.status == "problem" for finding in findings)
     marks = {"ok": "", "problem": "PROBLEM: ", "missing": "not installed: "}
     remedies = {each.name: each.remedy for each in findings if each.remedy}

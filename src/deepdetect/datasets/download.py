@@ -16,12 +16,12 @@ import tarfile
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import resources, util
+from importlib import resources
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from .._shared.errors import DeepDetectError, MissingExtraError
+from .._shared.errors import DeepDetectError, first_line, require_packages
 from .._shared.opencv import cv2
 from .._shared.progress import progress
 from .._shared.records import file_state
@@ -130,11 +130,7 @@ def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = Tru
         DeepDetectError: the download fails, a checksum is wrong, the disk is full, or the
             folder holds something else.
     """
-    if util.find_spec("requests") is None:
-        raise MissingExtraError(
-            "downloading data sets needs the package requests, which is not installed: "
-            "run pip install requests"
-        )
+    require_packages("downloading data sets", "requests")
     final = Path(folder)
     if final.is_dir() and any(final.iterdir()):
         _check(dataset, final, f"{final} exists and")
@@ -342,9 +338,8 @@ def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
     except Exception as error:  # zip, tar and their compressions raise many kinds
         if isinstance(error, OSError) and error.errno in WRITE_ERRORS:
             raise
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise DeepDetectError(
-            f"{file.urls[0]} is no archive that can be unpacked ({reason}): try again"
+            f"{file.urls[0]} is no archive that can be unpacked ({first_line(error)}): try again"
         ) from None
     if file.inside and (target / file.inside).is_dir():
         for entry in sorted((target / file.inside).iterdir()):

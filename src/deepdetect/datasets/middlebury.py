@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._shared.errors import ImageError, MissingExtraError, MissingImageError
+from .._shared.errors import ImageError, MissingImageError, require_packages
 from .._shared.text_files import read_json
 from ..geometry.camera import MAX_FILE_BYTES, Calibration, read_calibration
 from ..io.image import load_image
@@ -92,13 +92,9 @@ def load_motorcycle() -> StereoPair:
 
     It is part of the scikit-image wheel, so nothing is downloaded.
     """
-    try:
-        from skimage import data
-    except ImportError:
-        raise MissingExtraError(
-            "the Motorcycle pair needs the package scikit-image, which is not installed: "
-            "run pip install scikit-image"
-        ) from None
+    require_packages("the Motorcycle pair", "skimage")
+    from skimage import data
+
     left, right, disparity = data.stereo_motorcycle()
     disparity = np.asarray(disparity, np.float32).squeeze()
     unknown = ~np.isfinite(disparity)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._shared.errors import DeepDetectError
+from .._shared.errors import DeepDetectError, first_line
 from .._shared.machine import release_freed_memory
 from .._shared.progress import progress
 from .backends.onnx_parts import cut_onnx
@@ -116,7 +116,7 @@ def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwo
                 found: list[np.ndarray] = session.run(None, dict(zip(inputs, given, strict=True)))
             except Exception as error:  # its exceptions share no base class
                 raise DeepDetectError(
-                    f"the network failed on a tile ({str(error).splitlines()[0]}), most likely for "
+                    f"the network failed on a tile ({first_line(error)}), most likely for "
                     "lack of memory: use a smaller `tile_megapixels`, or `resolution='auto'`"
                 ) from None
             return found

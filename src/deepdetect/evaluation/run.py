@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from .._shared.errors import DeepDetectError, OptionError
+from .._shared.errors import DeepDetectError, OptionError, first_line
 from .._shared.opencv import cv2
 from .._shared.progress import progress
 from .._shared.records import Arrays, file_digest, key, load_arrays, save_arrays
@@ -142,7 +142,7 @@ class Run:
             raise
         except (DeepDetectError, cv2.error) as error:
             reason = getattr(error, "err", None) or error  # what OpenCV says without its files
-            self.fail(f"{name}: {reason}".splitlines()[0])
+            self.fail(f"{name}: {first_line(reason)}")
             return None
 
     def fail(self, reason: str) -> None:

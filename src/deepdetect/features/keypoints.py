@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .._shared.errors import MissingExtraError, OptionError, install_command, unknown_name
+from .._shared.errors import OptionError, require_packages, unknown_name
 from .._shared.image_array import Channels
 from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
@@ -194,13 +194,9 @@ class Keypoints:
         """
         if scale not in SIZES_PER_SCALE:
             raise unknown_name("scale", scale, SIZES_PER_SCALE)
-        try:
-            import torch
-        except ImportError:
-            raise MissingExtraError(
-                "features for LightGlue need the package torch, which is not installed: "
-                f"run {install_command('torch')}"
-            ) from None
+        require_packages("LightGlue", "torch")
+        import torch
+
         count = len(self)
         sizes = np.full(count, size, np.float32) if self.sizes is None else self.sizes
         angles = np.full(count, angle, np.float32) if self.angles is None else self.angles

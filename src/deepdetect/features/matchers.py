@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from .._shared.errors import MissingExtraError, OptionError
+from .._shared.errors import OptionError, require_packages
 from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
 from .._shared.options import look_up
@@ -164,12 +164,9 @@ def faiss_neighbours(
     The file holds quantised descriptors (Johnson, Douze and Jégou, "Billion-scale similarity search
     with GPUs", 2017); bytes lose nothing. About one neighbour in fifty is missed.
     """
-    try:
-        import faiss
-    except ImportError:
-        raise MissingExtraError(
-            "the matcher faiss needs faiss: run pip install faiss-cpu, or use flann"
-        ) from None
+    require_packages("the matcher faiss", "faiss")
+    import faiss
+
     quantizer = faiss.ScalarQuantizer
     kind = quantizer.QT_8bit_direct if base.dtype == np.uint8 else quantizer.QT_8bit
     queries, base = (np.ascontiguousarray(part, np.float32) for part in (queries, base))

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import MissingCalibrationError, ReconstructionError
+from .._shared.errors import MissingCalibrationError, ReconstructionError, first_line
 from .._shared.options import suggest_keywords
 from .._shared.text_files import read_json
 
@@ -193,8 +193,7 @@ def read_calibration(path: str | Path, size0: Size, size1: Size) -> Calibration:
         raise kind(f"{path} cannot be read ({error.strerror}): check the path") from None
     except ValueError as error:
         raise ReconstructionError(
-            f"{path} is not valid JSON ({str(error).splitlines()[0]}): "
-            "correct it, or give the focal length"
+            f"{path} is not valid JSON ({first_line(error)}): correct it, or give the focal length"
         ) from None
     try:
         return _calibration(values, size0, size1, str(path))

@@ -6,7 +6,7 @@ import importlib
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
-from .._shared.errors import MissingExtraError, install_command
+from .._shared.errors import require_packages
 
 if TYPE_CHECKING:
 
@@ -18,21 +18,9 @@ if TYPE_CHECKING:
         def __getattr__(self, name: str) -> Any: ...
 
 
-HOW_TO_INSTALL = {
-    "hloc": "pip install git+https://github.com/cvg/Hierarchical-Localization",
-}
-"""Of packages that are not on PyPI under their name."""
-
-
-def missing_package(module: str) -> MissingExtraError:
-    """Return the error for a package that is not installed, for the caller to raise."""
+def _require(module: str) -> None:
     package = module.partition(".")[0]
-    install = HOW_TO_INSTALL.get(package, install_command(package))
-    program = "PyTorch" if package == "torch" else package
-    return MissingExtraError(
-        f"the drop-in for {program} needs the package {package}, which is not installed: "
-        f"run {install}"
-    )
+    require_packages(f"the drop-in for {package}", package)
 
 
 def import_package(module: str) -> Any:
@@ -41,8 +29,7 @@ def import_package(module: str) -> Any:
     Raises:
         MissingExtraError: the package is not installed.
     """
-    if importlib.util.find_spec(module.partition(".")[0]) is None:
-        raise missing_package(module)
+    _require(module)
     return importlib.import_module(module)
 
 
@@ -52,12 +39,12 @@ class _Missing(type):
     module: str
 
     def __call__(cls, *args: object, **keywords: object) -> Any:
-        raise missing_package(cls.module)
+        _require(cls.module)
 
     def __getattr__(cls, name: str) -> Any:
-        if name.startswith("_"):  # Python looks for many of these
-            raise AttributeError(name)
-        raise missing_package(cls.module)
+        if not name.startswith("_"):  # Python looks for many of these
+            _require(cls.module)
+        raise AttributeError(name)
 
 
 def base_class(module: str, name: str) -> type:

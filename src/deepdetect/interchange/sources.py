@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .._shared.errors import InvalidFileError, OptionError
+from .._shared.errors import InvalidFileError, OptionError, first_line
 from .._shared.options import suggest_keywords
 from ..batch.extraction import extract_features, keypoints_of
 from ..batch.hdf5 import feature_names, import_h5py, open_hdf5
@@ -82,9 +82,8 @@ def read_features_file(path: Path) -> dict[str, Keypoints]:
             try:
                 found[name] = keypoints_of(file[name])
             except (OptionError, ValueError, TypeError) as error:
-                reason = str(error).splitlines()[0]
                 raise InvalidFileError(
-                    f"{path} holds no features of {name} ({reason}): extract them again"
+                    f"{path} holds no features of {name} ({first_line(error)}): extract them again"
                 ) from None
     if not found:
         raise InvalidFileError(f"{path} holds no features: give a file of deepdetect extract")

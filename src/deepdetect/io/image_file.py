@@ -19,6 +19,7 @@ from .._shared.errors import (
     MissingExtraError,
     MissingImageError,
     OptionError,
+    first_line,
 )
 
 FORMATS = (
@@ -135,8 +136,7 @@ def damaged_image(name: str, error: Exception | str) -> ImageError:
         )
     if isinstance(error, MemoryError):
         return ImageError(f"there is not enough memory to read {name}: use a smaller image")
-    reason = (str(error).splitlines() or [type(error).__name__])[0]
-    return ImageError(f"{name} is damaged or truncated ({reason}): get it again")
+    return ImageError(f"{name} is damaged or truncated ({first_line(error)}): get it again")
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from typing import BinaryIO
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import InvalidFileError, MissingFileError, OptionError
+from .._shared.errors import InvalidFileError, MissingFileError, OptionError, first_line
 from .._shared.options import suggest_keywords
 from ..features.keypoints import Keypoints
 from ..features.matches import Matches, TwoViewGeometry
@@ -194,7 +194,7 @@ def _building(path: str | Path, content: str) -> Iterator[None]:
 
 
 def _holds_none(path: str | Path, content: str, error: Exception) -> InvalidFileError:
-    reason = (str(error).splitlines() or [type(error).__name__])[0]
+    reason = first_line(error)
     if isinstance(error, KeyError):
         reason = f"it has no array {reason}"
     return InvalidFileError(f"{path} holds no {content} ({reason}): write the file again")

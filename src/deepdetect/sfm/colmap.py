@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import MissingExtraError, ReconstructionError
+from .._shared.errors import ReconstructionError, require_packages
 from .._shared.opencv import cv2, import_opencv
 from .._shared.signals import sigterm_kept
 from ..batch.extraction import ROOT_SIFT_NORM
@@ -39,14 +39,9 @@ def import_pycolmap(purpose: str = "a reconstruction from many images") -> Any:
     A MissingExtraError says that it, or h5py, is not installed, and what it is needed for.
     """
     import_opencv()
+    require_packages(purpose, "pycolmap", "h5py")
     with sigterm_kept():  # or a process that is ended would print a stack trace
-        try:
-            import h5py  # noqa: F401
-            import pycolmap
-        except ImportError:
-            raise MissingExtraError(
-                f"{purpose} needs pycolmap and h5py: run pip install pycolmap h5py"
-            ) from None
+        import pycolmap
     return pycolmap
 
 

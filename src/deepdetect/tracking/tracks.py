@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import InvalidFileError, MissingFileError, OptionError
+from .._shared.errors import InvalidFileError, MissingFileError, OptionError, first_line
 from .._shared.options import suggest_keywords
 
 HEADER = "frame,track,x,y,score"
@@ -117,8 +117,9 @@ def load_tracks(path: str | Path) -> list[TrackedFrame]:
     except FileNotFoundError:
         raise MissingFileError(f"there is no file {path}: check the path") from None
     except (OSError, ValueError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise InvalidFileError(f"{path} holds no tracks ({reason}): write the file again") from None
+        raise InvalidFileError(
+            f"{path} holds no tracks ({first_line(error)}): write the file again"
+        ) from None
     if not len(table):
         return []
     table = table[np.lexsort((table[:, 1], table[:, 0]))]

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import WeightsError
+from .._shared.errors import WeightsError, first_line
 from .._shared.records import key
 
 Point = dict[str, float]
@@ -49,9 +49,9 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         if header["digest"] != _digest(tensors, header["state"]):
             raise ValueError("its content is not what was written")
     except (SafetensorError, OSError, KeyError, ValueError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise WeightsError(
-            f"{path} is not a whole checkpoint ({reason}): delete it, or train into another folder"
+            f"{path} is not a whole checkpoint ({first_line(error)}): "
+            "delete it, or train into another folder"
         ) from None
     return tensors, json.loads(header["state"])
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from .._shared.errors import OptionError
+from .._shared.errors import OptionError, first_line
 from .._shared.machine import disable_malloc_trim
 from .recipe import DeviceOptions
 
@@ -102,9 +102,8 @@ class Engine:
         except torch._dynamo.exc.TorchDynamoException as error:
             # A compiler on the path may still lack headers, and CUDA its Triton.
             if not self._may_fall_back:
-                reason = str(error).strip().splitlines()[0]
                 raise OptionError(
-                    f"torch.compile does not work here ({reason}): set `compile=False`"
+                    f"torch.compile does not work here ({first_line(error)}): set `compile=False`"
                 ) from None
             self.compiled = False
             self._forward = self._set_up()

@@ -6,14 +6,13 @@ Their module imports no torch, so that the package can offer them where it is mi
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .._shared.errors import MissingExtraError, install_command
+from .._shared.errors import require_packages
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
 from .recipe import DeviceOptions, InitWeights, PointsTrainingOptions, Stage, TrainingOptions
@@ -119,7 +118,7 @@ def train_points(
         ImageError: a folder is missing or empty.
         OptionError: the folder holds a run with other options or images.
     """
-    require_packages()
+    require_packages("training", *TRAINING_PACKAGES)
     from .points.task import RankerTask
     from .trainer import Trainer
 
@@ -137,7 +136,7 @@ def _dense_task(
     **data: Any,
 ) -> DenseTask:
     """Make the labels, and what is trained on them; arguments of `train` and `prepare_data`."""
-    require_packages()
+    require_packages("training", *TRAINING_PACKAGES)
     from .dataset import prepare_data
     from .dense import DenseTask, initial_network
     from .engine import launch
@@ -271,13 +270,3 @@ def _time_steps(
 
 
 TRAINING_PACKAGES = ("torch", "lightning_fabric", "matplotlib", "safetensors", "onnx")
-
-
-def require_packages() -> None:
-    """Raise a MissingExtraError that says what to install where training cannot run."""
-    for package in TRAINING_PACKAGES:
-        if importlib.util.find_spec(package) is None:
-            raise MissingExtraError(
-                f"training needs the package {package.replace('_', '-')}, which is not installed: "
-                f"run {install_command(*TRAINING_PACKAGES)}"
-            )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._shared.errors import OptionError, unknown_name
+from ..._shared.errors import OptionError, first_line, unknown_name
 from .interface import (
     KEYPOINT_OUTPUTS,
     PROBE_SHAPE,
@@ -98,7 +98,7 @@ def start_session(
 
 def _not_started(device: str, reason: object) -> OptionError:
     return OptionError(
-        f"the device {device} could not start ({str(reason).splitlines()[0]}): check its driver "
+        f"the device {device} could not start ({first_line(reason)}): check its driver "
         "and libraries, or leave it out"
     )
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..._shared.errors import MissingWeightsError, WeightsError
+from ..._shared.errors import MissingWeightsError, WeightsError, first_line
 from ..pretrained import RANKER
 from .candidate_features import FEATURES
 
@@ -70,8 +70,9 @@ def _load(path: Path, state: int) -> Ranker:
                 for k in range(3)
             )
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        reason = (str(error).splitlines() or ["it is empty"])[0]
-        raise WeightsError(f"{path} does not hold weights of the ranker ({reason})") from None
+        raise WeightsError(
+            f"{path} does not hold weights of the ranker ({first_line(error)})"
+        ) from None
     inputs = (FEATURES, *(len(bias) for _, bias in layers[:-1]))
     fits = (
         mean.shape == deviation.shape == (FEATURES,)

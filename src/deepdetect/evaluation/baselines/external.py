@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._shared.errors import DeepDetectError, OptionError, WeightsError
+from ..._shared.errors import DeepDetectError, OptionError, WeightsError, first_line
 from ..._shared.opencv import cv2
 from ..._shared.options import look_up
 from ...detector.backends.interface import import_onnxruntime
@@ -59,9 +59,8 @@ def plugin_feature(target: str) -> LocalFeature:
     try:
         function = getattr(importlib.import_module(module), name)
     except Exception as error:  # the module's own code runs here
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise OptionError(
-            f"{target} cannot be imported ({reason}): name it as package.module:function"
+            f"{target} cannot be imported ({first_line(error)}): name it as package.module:function"
         ) from None
     finally:
         sys.path.remove(here)
@@ -85,8 +84,9 @@ def onnx_feature(path: str | Path, name: str | None = None) -> LocalFeature:
         data = file.read_bytes()
         session = import_onnxruntime().InferenceSession(data, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exceptions have no common base
-        reason = str(error).splitlines()[0]
-        raise WeightsError(f"{file} is no ONNX file that can be run ({reason})") from None
+        raise WeightsError(
+            f"{file} is no ONNX file that can be run ({first_line(error)})"
+        ) from None
     outputs = [output.name for output in session.get_outputs()]
     shapes = [entry.shape for entry in session.get_inputs()]
     if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
@@ -132,8 +132,7 @@ def _external_feature(
         except DeepDetectError:
             raise
         except Exception as error:  # anyone's code
-            reason = (str(error).splitlines() or ["it failed"])[0]
-            raise BaselineError(f"{name}: {reason} ({type(error).__name__})") from error
+            raise BaselineError(f"{name}: {type(error).__name__}: {first_line(error)}") from error
         if not isinstance(found, Mapping) or not {"keypoints", "scores"} <= set(found):
             raise BaselineError(f"{name} must return a dict with 'keypoints' and 'scores'")
         size = (rgb.shape[1], rgb.shape[0])
