@@ -9,7 +9,7 @@ from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.sfm import dense
 from deepdetect.sfm.colmap import CameraIntrinsics
 from deepdetect.sfm.dense import (
-    DensePoints,
+    DENSE_POINT,
     find_references,
     fuse_matches,
     limited_view,
@@ -42,7 +42,7 @@ def scene() -> tuple[PosedView, list[PosedView], np.ndarray, np.ndarray]:
 def test_exact_matches_give_the_points(scene) -> None:
     reference, others, xy, points = scene
     matches = [other.project(points)[0] for other in others]
-    found, errors, counts = fuse_matches(reference, xy, others, matches)
+    found, errors, counts = fuse_matches([reference, *others], np.stack([xy, *matches]))
     np.testing.assert_allclose(found, points, atol=1e-6)
     assert errors.max() < 1e-6
     assert (counts == 5).all()
@@ -52,9 +52,9 @@ def test_noise_is_averaged_over_the_views(scene, monkeypatch: pytest.MonkeyPatch
     reference, others, xy, points = scene
     rng = np.random.default_rng(1)
     matches = [other.project(points)[0] + rng.normal(0, 0.1, xy.shape) for other in others]
-    several, errors, counts = fuse_matches(reference, xy, others, matches)
+    several, errors, counts = fuse_matches([reference, *others], np.stack([xy, *matches]))
     monkeypatch.setattr(dense, "MIN_VIEWS", 2)
-    single, _, _ = fuse_matches(reference, xy, others[2:3], matches[2:3])
+    single, _, _ = fuse_matches([reference, *others[2:3]], np.stack([xy, *matches[2:3]]))
     good = counts > 0
     assert good.mean() > 0.95
     assert 0.05 < np.median(errors[good]) < 0.15
@@ -69,7 +69,7 @@ def test_a_wrong_match_is_outvoted(scene) -> None:
     matches = [other.project(points)[0] for other in others]
     matches[1] = matches[1] + (40, 0)
     matches[3] = matches[3] - (25, 0)
-    found, errors, counts = fuse_matches(reference, xy, others, matches)
+    found, errors, counts = fuse_matches([reference, *others], np.stack([xy, *matches]))
     np.testing.assert_allclose(found, points, atol=1e-6)
     assert (counts == 3).all()
     assert errors.max() < 1e-6
@@ -80,10 +80,10 @@ def test_two_views_are_not_enough(scene, monkeypatch: pytest.MonkeyPatch) -> Non
     matches = [other.project(points)[0] for other in others[:2]]
     matches[1][:250] = np.nan  # there is no match
     matches[1][250:] += (30, 0)  # a match that contradicts
-    _, _, counts = fuse_matches(reference, xy, others[:2], matches)
+    _, _, counts = fuse_matches([reference, *others[:2]], np.stack([xy, *matches]))
     assert not counts.any()
     monkeypatch.setattr(dense, "MIN_VIEWS", 2)
-    _, _, counts = fuse_matches(reference, xy, others[:2], matches)
+    _, _, counts = fuse_matches([reference, *others[:2]], np.stack([xy, *matches]))
     assert (counts >= 2).all()
 
 
@@ -92,23 +92,21 @@ def test_points_without_parallax_or_behind_the_cameras_are_left_out(scene) -> No
     near = [view(x) for x in (0.01, 0.02, 0.03)]
     far = reference.camera.rays(xy) * 6
     matches = [other.project(far)[0] for other in near]
-    assert not fuse_matches(reference, xy, near, matches)[2].any()
+    assert not fuse_matches([reference, *near], np.stack([xy, *matches]))[2].any()
     wide = [view(x) for x in (-1.0, 1.0, 0.5)]
     behind = [other.project(-far)[0] for other in wide]
     assert np.isfinite(behind[0]).all()
-    assert not fuse_matches(reference, xy, wide, behind)[2].any()
+    assert not fuse_matches([reference, *wide], np.stack([xy, *behind]))[2].any()
 
 
-def surface(reference: PosedView, depth: float = 6.0, stride: int = 2) -> DensePoints:
+def surface(reference: PosedView, depth: float = 6.0, stride: int = 2) -> np.ndarray:
     """Return the points of a plane in the world that a view shows, one at each second pixel."""
     y, x = np.mgrid[0 : SIZE[1] : stride, 0 : SIZE[0] : stride]
     rays = reference.camera.rays(np.column_stack([x.ravel(), y.ravel()])) @ reference.rotation
     points = reference.centre + rays * ((depth - reference.centre[2]) / rays[:, 2:])
-    count = len(points)
-    ones = np.ones(count, np.float32)
-    return DensePoints(
-        points.astype(np.float32), np.zeros((count, 3), np.uint8), ones, ones.astype(np.uint8)
-    )
+    made = np.ones(len(points), DENSE_POINT)
+    made["points"] = points
+    return made
 
 
 def test_what_two_references_show_is_kept_once() -> None:
@@ -116,7 +114,7 @@ def test_what_two_references_show_is_kept_once() -> None:
     parts = [(first, surface(first)), (second, surface(second))]
     merged = merge_dense_points(parts, 2)
     new = len(merged) - len(parts[0][1])
-    projected, _ = first.project(parts[1][1].points)
+    projected, _ = first.project(parts[1][1]["points"])
     outside = (~((projected > -1) & (projected < SIZE)).all(axis=1)).sum()
     assert outside > 300
     assert outside <= new < 1.3 * outside + 600

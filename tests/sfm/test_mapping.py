@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from deepdetect import Camera, Keypoints
+from deepdetect.geometry.camera import camera_spacing
 from deepdetect.sfm import mapping
 from deepdetect.sfm.colmap import CameraIntrinsics, write_database
 from deepdetect.sfm.mapping import (
     adjust,
-    camera_spacing,
     map_images,
     normalise_model,
     read_sparse_model,
@@ -65,9 +65,9 @@ def test_the_world_becomes_the_frame_of_one_camera(model) -> None:
     reference = min(views, key=lambda view: np.linalg.norm(view.centre))
     np.testing.assert_allclose(reference.rotation, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(reference.centre, 0, atol=1e-9)
-    assert camera_spacing(views) == pytest.approx(1)
+    assert camera_spacing(np.array([view.centre for view in views])) == pytest.approx(1)
     assert after.errors.max() < 1e-6
-    scale = camera_spacing(list(before.views.values()))
+    scale = camera_spacing(np.array([view.centre for view in before.views.values()]))
     distances = [np.linalg.norm(sparse.points[0] - sparse.points[1]) for sparse in (before, after)]
     assert distances[0] / distances[1] == pytest.approx(scale)
 

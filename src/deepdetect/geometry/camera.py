@@ -281,6 +281,12 @@ def cross_matrix(vector: np.ndarray) -> np.ndarray:
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
+def angles_between(vectors0: np.ndarray, vectors1: np.ndarray) -> np.ndarray:
+    """Return the angles between vectors (N, 3) in radians, accurate for small ones, too."""
+    across = np.linalg.norm(np.cross(vectors0, vectors1), axis=1)
+    return np.asarray(np.arctan2(across, np.einsum("ij,ij->i", vectors0, vectors1)))
+
+
 @dataclass(frozen=True, eq=False)
 class PosedView:
     """An image whose camera is known.
@@ -326,3 +332,10 @@ def relative_fundamental(first: PosedView, second: PosedView) -> np.ndarray:
     translation = second.translation - rotation @ first.translation
     inverses = [np.linalg.inv(view.camera.matrix) for view in (first, second)]
     return np.asarray(inverses[1].T @ cross_matrix(translation) @ rotation @ inverses[0])
+
+
+def camera_spacing(centres: np.ndarray) -> float:
+    """Return the median distance from each of (V, 3) centres of cameras to the nearest other."""
+    distances = np.linalg.norm(centres[:, None] - centres, axis=2)
+    np.fill_diagonal(distances, np.inf)
+    return float(np.median(distances.min(axis=1)))

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..geometry.camera import PosedView
+from ..geometry.camera import PosedView, camera_spacing
 from ..geometry.point_cloud import PointCloud, angular_spacing, robust_box
 
 DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
@@ -115,9 +115,7 @@ def camera_lines(cameras: Sequence[PosedView]) -> np.ndarray:
     if not len(cameras):
         return np.empty((0, 2, 3))
     centres = np.array([camera.centre for camera in cameras])
-    distances = np.linalg.norm(centres[:, None] - centres, axis=2)
-    np.fill_diagonal(distances, np.inf)
-    spacing = float(np.median(distances.min(axis=1))) if len(cameras) > 1 else 1.0
+    spacing = camera_spacing(centres) if len(cameras) > 1 else 1.0
     lines = []
     for camera, centre in zip(cameras, centres, strict=True):
         corners = camera.corners(CAMERA_SIZE * spacing)

@@ -10,7 +10,7 @@ import numpy as np
 
 from .._shared.errors import ReconstructionError
 from .._shared.options import suggest_keywords
-from ..geometry.camera import Calibration, Camera
+from ..geometry.camera import Calibration, Camera, angles_between
 from ..geometry.point_cloud import PointCloud
 from ..geometry.relative_pose import RelativePose
 from .rectification import Rectification
@@ -97,9 +97,7 @@ class Reconstruction:
     def triangulation_angles(self) -> np.ndarray:
         """Return the angle at each point between both cameras, (N,) float64 in degrees."""
         points = self.points.astype(np.float64)
-        from_right = points - self.baseline_vector
-        across = np.linalg.norm(np.cross(points, from_right), axis=1)
-        return np.degrees(np.arctan2(across, np.einsum("ij,ij->i", points, from_right)))
+        return np.degrees(angles_between(points, points - self.baseline_vector))
 
     def depth_map(self) -> np.ndarray:
         """Return the depth at each pixel of the left image, (H, W) float32; NaN where unknown."""

@@ -7,7 +7,7 @@ them row by row. A pixel becomes a point where enough views agree with one posit
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from .._shared.opencv import cv2
 from .._shared.records import file_state
-from ..geometry.camera import Camera, PosedView, relative_fundamental
+from ..geometry.camera import Camera, PosedView, angles_between, relative_fundamental
 from ..geometry.transforms import scaled_points
 from ..io.image import load_image, luma
 from ..matching.guided.rectified import match_by_rectification
@@ -59,33 +59,16 @@ DUPLICATE_DEPTH = 0.01
 """Of a point that another reference has given already, the relative difference of the depths."""
 
 
-@dataclass(frozen=True, eq=False)
-class DensePoints:
-    """Points (N, 3) float32 that several images agree on, with uint8 sRGB colours.
-
-    Errors (N,) float32 are distances of the projections from the matches in pixels, the root mean
-    square of all images that agree; `views` (N,) uint8 is how many these are.
-    """
-
-    points: np.ndarray
-    colors: np.ndarray
-    errors: np.ndarray
-    views: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def __getitem__(self, index: np.ndarray) -> DensePoints:
-        return DensePoints(*(values[index] for values in vars(self).values()))
-
-    @classmethod
-    def joined(cls, parts: Sequence[DensePoints]) -> DensePoints:
-        """Return all points of several."""
-        if not parts:
-            empty = np.empty((0, 3), np.float32)
-            return cls(empty, empty.astype(np.uint8), empty[:, 0], empty[:, 0].astype(np.uint8))
-        columns = zip(*(vars(part).values() for part in parts), strict=True)
-        return cls(*(np.concatenate(values) for values in columns))
+DENSE_POINT = np.dtype(
+    [
+        ("points", np.float32, 3),
+        ("errors", np.float32),
+        ("colors", np.uint8, 3),
+        ("views", np.uint8),
+    ]
+)
+"""A point that several images agree on, its distance in pixels from their matches (root mean square
+of all of them), its sRGB colour, and how many these are."""
 
 
 def find_references(sparse: SparseModel) -> list[list[RegisteredImage]]:
@@ -113,8 +96,8 @@ def find_references(sparse: SparseModel) -> list[list[RegisteredImage]]:
     return found
 
 
-def dense_points(folder: Path, images: Sequence[RegisteredImage], stride_px: int) -> DensePoints:
-    """Match the first image with the others, and return the points that enough of them agree on.
+def dense_points(folder: Path, images: Sequence[RegisteredImage], stride_px: int) -> np.ndarray:
+    """Match the first image with the others, and return what enough of them agree on (DENSE_POINT).
 
     A point is sought at every `stride_px` pixels of a row and of a column.
     """
@@ -124,7 +107,7 @@ def dense_points(folder: Path, images: Sequence[RegisteredImage], stride_px: int
     height, width = gray.shape
     y, x = np.mgrid[0:height:stride_px, 0:width:stride_px]
     xy = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
-    views, matches = [], []
+    views, positions = [view], [xy]
     for neighbour in neighbours:
         other, its_view, its_scale = _prepared(folder, neighbour)
         _, own, its = np.intersect1d(reference.points, neighbour.points, return_indices=True)
@@ -139,18 +122,18 @@ def dense_points(folder: Path, images: Sequence[RegisteredImage], stride_px: int
         )
         if found is None:
             continue
-        places = np.full((len(xy), 2), np.nan)
-        places[found[1].indices0] = found[1].points1
+        matched = np.full((len(xy), 2), np.nan)
+        matched[found[1].indices0] = found[1].points1
         views.append(its_view)
-        matches.append(places)
-    points, errors, counts = fuse_matches(view, xy, views, matches)
+        positions.append(matched)
+    stacked = np.stack(positions)
+    blocks = [fuse_matches(views, stacked[:, k : k + BLOCK]) for k in range(0, len(xy), BLOCK)]
+    points, errors, counts = (np.concatenate(values) for values in zip(*blocks, strict=True))
     kept = np.flatnonzero(counts)
-    return DensePoints(
-        points[kept].astype(np.float32),
-        rgb[y.ravel()[kept], x.ravel()[kept]],
-        errors[kept].astype(np.float32),
-        counts[kept].astype(np.uint8),
-    )
+    made = np.empty(len(kept), DENSE_POINT)
+    made["points"], made["errors"], made["views"] = points[kept], errors[kept], counts[kept]
+    made["colors"] = rgb[y.ravel()[kept], x.ravel()[kept]]
+    return made
 
 
 def _prepared(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, PosedView, float]:
@@ -178,68 +161,45 @@ def limited_view(view: PosedView) -> PosedView:
     if scale >= 1:
         return view
     size = round(width * scale), round(height * scale)
-    across, down = size[0] / width, size[1] / height
-    (fx, fy), (cx, cy) = view.camera.focal_px, view.camera.centre
-    centre = ((cx + 0.5) * across - 0.5, (cy + 0.5) * down - 0.5)
-    return replace(view, camera=Camera(size, (fx * across, fy * down), centre))
-
-
-def angles_between(rays0: np.ndarray, rays1: np.ndarray) -> np.ndarray:
-    """Return the angles between vectors (N, 3) in radians."""
-    across = np.linalg.norm(np.cross(rays0, rays1), axis=1)
-    return np.asarray(np.arctan2(across, np.einsum("ij,ij->i", rays0, rays1)))
+    ratio = np.divide(size, view.camera.size)
+    centre = (np.array(view.camera.centre) + 0.5) * ratio - 0.5
+    focal = ratio * view.camera.focal_px
+    return replace(view, camera=Camera(size, focal.tolist(), centre.tolist()))
 
 
 def fuse_matches(
-    reference: PosedView,
-    xy: np.ndarray,
-    views: Sequence[PosedView],
-    matches: Sequence[np.ndarray],
+    views: Sequence[PosedView], places: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the points that the matches (N, 2) of several views agree on; NaN where there is none.
+    """Find the points (N, 3) that positions (V, N, 2) in views, NaN where unknown, agree on.
 
-    The match of each view in turn gives a point, with which those of other views agree or not. The
-    point with most agreement is triangulated again from all that agree. Returns points, errors as
-    of `DensePoints`, and the number of views that agree, 0 where there is no point.
+    The match of each view in turn gives a point with the position in the first one, with which
+    those of other views agree or not. The point with most agreement is triangulated again from all
+    that agree. Returns points, errors as of `DENSE_POINT`, and the number of views that agree, 0
+    where there is no point.
     """
-    parts = [slice(start, start + BLOCK) for start in range(0, len(xy), BLOCK)]
-    blocks = [_fuse_block(reference, xy[k], views, [each[k] for each in matches]) for k in parts]
-    points, errors, counts = (np.concatenate(values) for values in zip(*blocks, strict=True))
-    return points, errors, counts
-
-
-def _fuse_block(
-    reference: PosedView,
-    xy: np.ndarray,
-    views: Sequence[PosedView],
-    matches: Sequence[np.ndarray],
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    all_views = [reference, *views]
-    places = np.stack([xy, *matches])
     known = np.isfinite(places).all(axis=2)
     agreeing = np.zeros(known.shape, bool)
-    most = np.zeros(len(xy), np.int64)
-    for k in range(1, len(all_views)):
+    most = np.zeros(places.shape[1], np.int64)
+    for k in range(1, len(views)):
         if not known[k].any():
             continue
         alone = np.zeros(known.shape, bool)
         alone[0] = alone[k] = known[k]
-        points = _triangulate(all_views, places, alone)
-        distance, _ = _distances(all_views, places, points)
+        points = _triangulate(views, places, alone)
+        distance, _ = _distances(views, places, points)
         agree = known & known[k] & (distance < MAX_ERROR_PX)
         number = agree.sum(axis=0)
         better = agree[0] & agree[k] & (number > most)
         agreeing[:, better], most[better] = agree[:, better], number[better]
-    points = _triangulate(all_views, places, agreeing)
-    distance, depth = _distances(all_views, places, points)
+    points = _triangulate(views, places, agreeing)
+    distance, depth = _distances(views, places, points)
     number = agreeing.sum(axis=0)
     squares = np.where(agreeing, distance**2, 0).sum(axis=0)
     errors = np.sqrt(squares / np.maximum(number, 1))
     ahead = np.where(agreeing, depth > 0, True).all(axis=0)
-    angle = np.zeros(len(xy))
-    for k, view in enumerate(views, 1):
-        between = np.degrees(angles_between(points - reference.centre, points - view.centre))
-        angle = np.maximum(angle, np.where(agreeing[k], between, 0))
+    rays = [points - view.centre for view in views]
+    angles = [np.degrees(angles_between(rays[0], other)) for other in rays]
+    angle = np.where(agreeing, angles, 0).max(axis=0)
     good = (
         (number >= MIN_VIEWS)
         & np.isfinite(points).all(axis=1)
@@ -290,34 +250,26 @@ def _distances(
     return distances, depths
 
 
-def merge_dense_points(
-    parts: Sequence[tuple[PosedView, DensePoints]], stride_px: int
-) -> DensePoints:
+def merge_dense_points(parts: Sequence[tuple[PosedView, np.ndarray]], stride_px: int) -> np.ndarray:
     """Join the points of all references, without those that an earlier one has given already."""
-    kept: list[DensePoints] = []
+    kept = [np.empty(0, DENSE_POINT)]
     for view, own in parts:
         seen = _nearest_depths(view, kept, stride_px)
-        projected, depth = view.project(own.points)
+        projected, depth = view.project(own["points"])
         cells = np.rint(projected / stride_px).astype(np.int64)
-        cells = cells.clip(0, np.array(seen.shape[::-1]) - 1)
-        before = seen[cells[:, 1], cells[:, 0]]
-        again = np.abs(before - depth) <= DUPLICATE_DEPTH * depth
-        kept.append(own[np.flatnonzero(~again)])
-    return DensePoints.joined(kept)
+        column, row = cells.clip(0, np.array(seen.shape[::-1]) - 1).T
+        kept.append(own[np.abs(seen[row, column] - depth) > DUPLICATE_DEPTH * depth])
+    return np.concatenate(kept)
 
 
-def _nearest_depths(view: PosedView, parts: Sequence[DensePoints], stride: int) -> np.ndarray:
+def _nearest_depths(view: PosedView, parts: Sequence[np.ndarray], stride_px: int) -> np.ndarray:
     """Return the depth of the nearest point in each cell of a view, infinite without any."""
-    columns, rows = (-(-side // stride) for side in view.camera.size)
-    nearest = np.full(columns * rows, np.inf)
+    columns, rows = (-(-side // stride_px) for side in view.camera.size)
+    nearest = np.full((rows, columns), np.inf)
     for part in parts:
-        projected, depth = view.project(part.points)
-        cells = np.rint(np.where(depth[:, None] > 0, projected, -1e6) / stride)
+        projected, depth = view.project(part["points"])
+        cells = np.rint(np.where(depth[:, None] > 0, projected, -1e6) / stride_px)
         inside = ((cells >= 0) & (cells < (columns, rows))).all(axis=1)
         column, row = cells[inside].astype(np.int64).T
-        order = np.argsort(-depth[inside], kind="stable")  # the last that is written stays
-        cell = (row * columns + column)[order]
-        there = np.full(columns * rows, np.inf)
-        there[cell] = depth[inside][order]
-        nearest = np.minimum(nearest, there)
-    return nearest.reshape(rows, columns)
+        np.minimum.at(nearest, (row, column), depth[inside])
+    return nearest

@@ -6,7 +6,7 @@ Schönberger and Frahm, "Structure-from-Motion Revisited", 2016.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 
 from .._shared.errors import NoDepthError
 from ..batch.pair_list import Pair
-from ..geometry.camera import PosedView
+from ..geometry.camera import PosedView, camera_spacing
 from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
 from .pair_selection import largest_component
 
@@ -223,18 +223,11 @@ def normalise_model(model: Any) -> None:
     """
     sparse = read_sparse_model(model)
     view = max(sparse.images.values(), key=lambda image: len(image.points)).view
-    scale = 1 / (camera_spacing(list(sparse.views.values())) or 1.0)
+    centres = np.array([each.centre for each in sparse.views.values()])
+    scale = 1 / (camera_spacing(centres) or 1.0)
     with quiet_pycolmap() as pycolmap:
         model.transform(
             pycolmap.Sim3d(
                 scale, pycolmap.Rotation3d(view.rotation), scale * np.asarray(view.translation)
             )
         )
-
-
-def camera_spacing(views: Sequence[PosedView]) -> float:
-    """Return the median distance from a camera to the nearest other one."""
-    centres = np.array([view.centre for view in views])
-    distances = np.linalg.norm(centres[:, None] - centres, axis=2)
-    np.fill_diagonal(distances, np.inf)
-    return float(np.median(distances.min(axis=1)))

@@ -27,7 +27,7 @@ from ..geometry.point_cloud import PointCloud
 from ..io.html_viewer import write_html_page
 from ..io.point_cloud import save_point_cloud
 from .colmap import import_pycolmap, initial_intrinsics, known_cameras
-from .dense import DensePoints
+from .dense import DENSE_POINT
 from .mapping import MIN_VIEWS, SparseModel, read_sparse_model
 from .result import MultiViewReconstruction
 from .stages import WORK, MultiViewOptions, Stages
@@ -133,7 +133,7 @@ def reconstruct_many(
         if name not in sparse.images:
             unregistered[name] = _why_unregistered(name, verified, components)
     with timer.stage("dense points"):
-        dense = stages.dense(folder, sparse) if options.dense else DensePoints.joined([])
+        dense = stages.dense(folder, sparse) if options.dense else np.empty(0, DENSE_POINT)
     with timer.stage("files"):
         views = dict(sorted(sparse.views.items()))
         reference = min(views, key=lambda name: float(np.linalg.norm(views[name].centre)))
@@ -147,9 +147,9 @@ def reconstruct_many(
             sparse=PointCloud(sparse.points, _sparse_colors(stages.features, sparse), *unit),
             sparse_errors=sparse.errors.astype(np.float32),
             sparse_views=sparse.tracks.astype(np.int32),
-            dense=PointCloud(dense.points, dense.colors, *unit),
-            dense_errors=dense.errors,
-            dense_views=dense.views,
+            dense=PointCloud(dense["points"].copy(), dense["colors"].copy(), *unit),
+            dense_errors=dense["errors"].copy(),
+            dense_views=dense["views"].copy(),
             keypoints=keypoints,
             matched=verified,
             pairs=len(pairs),

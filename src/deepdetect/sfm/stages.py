@@ -35,7 +35,6 @@ from ..features.selection import SelectionOptions
 from ..io.image import find_images
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
 from .dense import (
-    DensePoints,
     dense_points,
     find_references,
     limited_view,
@@ -276,8 +275,8 @@ class Stages:
             path.write_text(json.dumps(noted), encoding="utf-8")
         return model, verified, components
 
-    def dense(self, folder: Path, sparse: SparseModel) -> DensePoints:
-        """Make the dense points that earlier runs have not made, and join all."""
+    def dense(self, folder: Path, sparse: SparseModel) -> np.ndarray:
+        """Make the dense points that earlier runs have not made, and join all (`DENSE_POINT`)."""
         store, stride = self.work / "dense", self.options.stride_px
         paths: dict[Path, list[RegisteredImage]] = {}
         for images in find_references(sparse):
@@ -286,15 +285,16 @@ class Stages:
         for old in store.glob("*.npz"):
             if old not in paths:
                 old.unlink()
-        tasks = [(path, images) for path, images in paths.items() if not path.exists()]
+        # Those of a damaged file are made again.
+        made = {path: arrays["dense"] for path in paths if (arrays := load_arrays(path))}
+        tasks = [(path, images) for path, images in paths.items() if path not in made]
         work = partial(_dense_task, folder=folder.absolute(), stride_px=stride)
-        done = len(paths) - len(tasks)
-        with progress(len(paths), "dense points", "image", self.quiet, done) as bar:
-            for _ in map_in_processes(work, tasks, self._dense_workers(sparse)):
+        with progress(len(paths), "dense points", "image", self.quiet, len(made)) as bar:
+            for path, points in map_in_processes(work, tasks, self._dense_workers(sparse)):
+                made[path] = points
                 bar.update()
-        parts = [DensePoints(**(load_arrays(path) or {})) for path in paths]
-        views = [limited_view(images[0].view) for images in paths.values()]
-        return merge_dense_points(list(zip(views, parts, strict=True)), stride)
+        parts = [(limited_view(images[0].view), made[path]) for path, images in paths.items()]
+        return merge_dense_points(parts, stride)
 
     def _dense_workers(self, sparse: SparseModel) -> int:
         sizes = [limited_view(image.view).camera.size for image in sparse.images.values()]
@@ -303,7 +303,11 @@ class Stages:
         return min(self.workers or processor_count(), fitting)
 
 
-def _dense_task(task: tuple[Path, list[RegisteredImage]], folder: Path, stride_px: int) -> None:
-    """Write the dense points of one image."""
+def _dense_task(
+    task: tuple[Path, list[RegisteredImage]], folder: Path, stride_px: int
+) -> tuple[Path, np.ndarray]:
+    """Write the dense points of one image, and return them."""
     path, images = task
-    save_arrays(path, vars(dense_points(folder, images, stride_px)), compress=False)
+    points = dense_points(folder, images, stride_px)
+    save_arrays(path, {"dense": points}, compress=False)
+    return path, points
