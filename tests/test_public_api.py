@@ -99,7 +99,7 @@ def test_importing_does_no_work() -> None:
 @pytest.mark.parametrize(
     "module",
     [
-        "deepdetect.cli.main",
+        "deepdetect.cli",
         "deepdetect.labels",
         "deepdetect.detector.detector",
         "deepdetect.io.image",

@@ -34,8 +34,7 @@ def make_page() -> str:
 
 def walk() -> Iterator[tuple[str, Any]]:
     """Yield all commands that can be run, with their whole names."""
-    from deepdetect.cli._app import make_app
-    from deepdetect.cli._commands import COMMANDS
+    from deepdetect.cli._app import COMMANDS, make_app
 
     for word in (word for group in COMMANDS.values() for word in group):
         app = make_app()[word]

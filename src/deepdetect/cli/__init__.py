@@ -1,5 +1,5 @@
 """The command line `deepdetect`: one module a command."""
 
-from .main import main
+from ._app import main
 
 __all__ = ["main"]

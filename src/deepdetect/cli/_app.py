@@ -1,83 +1,109 @@
-"""The commands as an application of cyclopts, and how their help is shown."""
+"""The command `deepdetect`: its subcommands, their help, and how errors are reported."""
 
 from __future__ import annotations
 
 import functools
 import importlib
 import re
-import textwrap
+import sys
 from collections.abc import Sequence
-from itertools import zip_longest
 from typing import Annotated, Any, Literal
 
-from cyclopts import App, CycloptsError, Parameter
-from cyclopts.help import PlainFormatter
+from cyclopts import App, CycloptsError, Group, Parameter
+from cyclopts.help import DefaultFormatter
 
-from ._commands import COMMANDS
-from ._options import MORE
+from .. import __version__
+from .._shared.errors import BatchError, DeepDetectError, NoDepthError, RegistrationError
 
-__all__ = ["CycloptsError", "call", "make_app", "with_flags"]
+NOTHING_FOUND = 3
+"""Exit code where all went well and nothing was found."""
+
+MORE = Group("More options")
+"""Shown by --help-all."""
+
+INTRODUCTION = """\
+Dense keypoints from a tiny network, and their matches.
+
+`deepdetect COMMAND --help` shows the common options of a command, --help-all shows all.
+
+    deepdetect detect photo.jpg
+    deepdetect match left.jpg right.jpg
+    deepdetect reconstruct left.jpg right.jpg --focal 1250
+"""
+
+COMMANDS = {
+    "Images": {
+        "detect": ("detect", "keypoints of images"),
+        "match": ("match", "matches between two images"),
+        "register": ("match", "one image registered to another"),
+        "stitch": ("match", "a panorama of overlapping images"),
+        "reconstruct": ("reconstruct", "a 3D reconstruction of two images, or of many"),
+    },
+    "Many images": {
+        "extract": ("features", "features of a collection of images"),
+        "match-many": ("features", "matches of many pairs of images"),
+        "track": ("track", "points followed through a video"),
+        "export": ("export", "files for other programs"),
+    },
+    "DeepDetect itself": {
+        "app": ("app", "a page in the browser, on this computer"),
+        "demo": ("evaluate", "match a real stereo pair, and evaluate the matches"),
+        "doctor": ("doctor", "check the installation, and say what to do about it"),
+        "completion": ("_app", "completion of commands and options by Tab"),
+    },
+    "Development": {
+        "datasets": ("datasets", "download data sets"),
+        "label": ("train", "training masks from nine classical detectors"),
+        "shards": ("train", "pack images for training on large sets"),
+        "train": ("train", "train the network on images"),
+        "train-points": ("train", "train the ranker of keypoints on images"),
+        "average": ("train", "the mean of several weights"),
+        "evaluate": ("evaluate", "how good weights are"),
+        "evaluate-stereo": ("evaluate", "correct stereo matches of weights and of label settings"),
+        "benchmark": ("evaluate", "the tables and figures of the paper, with baselines"),
+    },
+}
+"""All commands by their group, with the module of the function or group, and what they do."""
 
 
-class HelpFormatter(PlainFormatter):
-    """Help in two columns; the group `MORE` only when all options are asked for."""
+class HelpFormatter(DefaultFormatter):
+    """Help of cyclopts; of the group `MORE` the number, unless all options are asked for."""
 
     shows_all = False
 
     def __call__(self, console: Any, options: Any, panel: Any) -> None:
         if panel.title == MORE.name and not self.shows_all:
-            self._print_plain(console, f"{len(panel.entries)} more options: --help-all")
+            console.print(f"{len(panel.entries)} more options: --help-all")
         else:
             super().__call__(console, options, panel)
 
     def render_description(self, console: Any, options: Any, description: Any) -> None:
-        console.width = 110
-        super().render_description(console, options, description)
-
-    def _print_plain(self, console: Any, text: str) -> None:
-        print(text)  # as wide as it is, wherever it goes
-
-    def _format_parameter_entry(
-        self, options: tuple[str, ...], desc: str, console: Any, entry: Any
-    ) -> None:
-        # Of several names the first and the short one.
-        names = [*entry.positive_shorts, *entry.positive_names[:1], *entry.negative_names]
-        value = (entry.metavar or "").replace("CHOICE", "|".join(entry.choices or ()))
-        label = f"{', '.join(names)} {value}" if names else entry.display_labels[0]
-        default = {"True": "yes", "False": None}.get(entry.default, entry.default)
-        shown = f"  [default: {default}]" if default is not None and "[default:" not in desc else ""
-        self._format_command_entry((label.strip(),), (), f"{desc}{shown}", console)
-
-    def _format_command_entry(
-        self, names: tuple[str, ...], shorts: tuple[str, ...], desc: str, console: Any
-    ) -> None:
-        lines = textwrap.wrap(" ".join(desc.split()).replace(" [", "  ["), 70) or [""]
-        lines = lines if len(names[0]) <= 26 else ["", *lines]
-        print(
-            "\n".join(
-                f"  {a:<27} {b}".rstrip() for a, b in zip_longest(names[:1], lines, fillvalue="")
-            )
-        )
+        console.print(description, soft_wrap=True)  # in the lines of the docstring
 
 
 FORMATTER = HelpFormatter()
 
 
 @functools.cache
-def make_app() -> App:
-    """Return the application; a command is imported when it is called."""
-    last_wins = Parameter(allow_repeating=True)
+def make_app(summaries: bool = False) -> App:
+    """Return the application, whose commands are imported when they are called.
+
+    With summaries it lists them without; else each says itself what it does.
+    """
     app = App(
         "deepdetect",
+        help=INTRODUCTION,
         help_format="plaintext",
         help_formatter=FORMATTER,
-        version_flags=(),
-        default_parameter=last_wins,
+        version=f"deepdetect {__version__}",
+        default_parameter=Parameter(allow_repeating=True),  # the last one wins
     )
-    app["--help"].group = ()
-    for group in COMMANDS.values():
-        for name, (module, _) in group.items():
-            app.command(f"{__package__}.{module}:{name.replace('-', '_')}", name=name)
+    for title, commands in COMMANDS.items():
+        group = Group.create_ordered(title)
+        for number, (name, (module, does)) in enumerate(commands.items()):
+            path = f"{__package__}.{module}:{name.replace('-', '_')}"
+            shown: dict[str, Any] = {"help": does, "group": group, "sort_key": number}
+            app.command(path, name=name, **(shown if summaries else {}))
     return app
 
 
@@ -96,18 +122,47 @@ def completion(
     print(make_app().generate_completion(shell=shell))
 
 
-def call(words: Sequence[str]) -> int:
-    """Run a command, and return its exit code.
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command, and return the exit code that the README documents."""
+    from .._shared.kernels import announce_compilation
+    from .._shared.progress import say
 
-    Raises:
-        CycloptsError: the command or an option is unknown, or a value cannot be read.
-    """
-    (module,) = (group[words[0]][0] for group in COMMANDS.values() if words[0] in group)
-    importlib.import_module(f".{module}", __package__)  # with its own errors
+    announce_compilation(
+        lambda: say("compiling for the first time, about 10 seconds; it is kept for later runs")
+    )
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        return _call(words)
+    except CycloptsError as error:
+        return _failed(" ".join(str(error).split()), 2)
+    except BatchError as error:
+        lines = [f"{error.summary}:", *(f"  {with_flags(each, words)}" for each in error.failures)]
+        return _failed("\n".join(lines), 1)
+    except DeepDetectError as error:
+        nothing_found = isinstance(error, NoDepthError | RegistrationError)
+        return _failed(with_flags(str(error), words), NOTHING_FOUND if nothing_found else 2)
+    except KeyboardInterrupt:
+        return _failed("stopped; what was written stays", 130)
+    except BrokenPipeError:
+        sys.stderr.close()
+        return 1
+
+
+def _call(words: Sequence[str]) -> int:
+    modules = {name: module for group in COMMANDS.values() for name, (module, _) in group.items()}
+    module = modules.get(words[0]) if words else None
+    if module is not None:
+        importlib.import_module(f".{module}", __package__)  # with its own errors
     FORMATTER.shows_all = "--help-all" in words
     words = ["--help" if word == "--help-all" else word for word in words]
-    command, bound, _ = make_app().parse_args(words, print_error=False, exit_on_error=False)
+    app = make_app(summaries=module is None)
+    command, bound, _ = app.parse_args(words, print_error=False, exit_on_error=False)
     return command(*bound.args, **bound.kwargs) or 0
+
+
+def _failed(text: str, code: int) -> int:
+    print(f"deepdetect: {text}", file=sys.stderr)
+    return code
 
 
 def with_flags(message: str, words: Sequence[str]) -> str:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from cyclopts import Group, Parameter
+from cyclopts import Parameter
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import BatchError, DeepDetectError, OptionError
@@ -23,10 +23,8 @@ from .._shared.records import Outputs, check_not_made, outputs_in
 from .._shared.signals import exit_by_signal, handle_signals
 from ..io.image import load_image
 from ..io.image_file import MAX_MEGAPIXELS, limit_megapixels
-from ._commands import NOTHING_FOUND as NOTHING_FOUND
-
-MORE = Group("More options")
-"""Shown by --help-all."""
+from ._app import MORE
+from ._app import NOTHING_FOUND as NOTHING_FOUND
 
 ALIASES = {"max_keypoints": ("--num-keypoints", "--top-k", "--max-num-keypoints")}
 """What people type."""
