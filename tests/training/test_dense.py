@@ -10,18 +10,18 @@ from deepdetect import OptionError  # noqa: E402
 from deepdetect.detector.network.espnet import ESPNet  # noqa: E402
 from deepdetect.training import dense  # noqa: E402
 from deepdetect.training.dataset import TrainingData  # noqa: E402
-from deepdetect.training.dense import DenseTask, initial_network  # noqa: E402
+from deepdetect.training.dense import DenseTrainer, initial_network  # noqa: E402
 from deepdetect.training.engine import launch  # noqa: E402
 from deepdetect.training.recipe import DeviceOptions, Stage, TrainingOptions  # noqa: E402
 
 PLAIN = DeviceOptions("cpu", "float32", compile=False, threads=1)
 
 
-def make_task(network: torch.nn.Module, **options: object) -> DenseTask:
-    """A task of 150 steps without warm-up, at a learning rate of 0.1 falling to nothing."""
+def make_trainer(network: torch.nn.Module, **options: object) -> DenseTrainer:
+    """A trainer of 150 steps without warm-up, at a learning rate of 0.1 falling to nothing."""
     values = {"stages": (Stage(16, 1, 150),), "learning_rate": 0.1, **options}
     data = TrainingData([None], [None], "")
-    return DenseTask(network, TrainingOptions(**values), data, PLAIN, launch(PLAIN))
+    return DenseTrainer(network, TrainingOptions(**values), data, PLAIN, launch(PLAIN))
 
 
 class Constant(torch.nn.Module):
@@ -38,30 +38,30 @@ class Constant(torch.nn.Module):
 @pytest.mark.parametrize("weight", [1.0, 1.3])
 def test_a_marked_pixel_counts_by_its_weight(weight: float) -> None:
     """The least loss of a constant is at the odds of the marked pixels times the weight."""
-    task = make_task(Constant(), pos_weight=weight)
+    trainer = make_trainer(Constant(), pos_weight=weight)
     rgb = torch.zeros((2, 16, 16, 3), dtype=torch.uint8)
     masks = torch.zeros((2, 16, 16), dtype=torch.bool)
     masks[:, :4] = True
-    first = task.training_step((rgb, masks), 0)
+    first = trainer.training_step((rgb, masks), 0)
     assert first == pytest.approx(math.log(2) * (0.75 + 0.25 * weight), rel=1e-5)
     for step in range(1, 150):
-        task.training_step((rgb, masks), step)
-    assert task.network.logit.item() == pytest.approx(math.log(weight / 3), abs=0.01)
+        trainer.training_step((rgb, masks), step)
+    assert trainer.network.logit.item() == pytest.approx(math.log(weight / 3), abs=0.01)
 
 
 @pytest.mark.parametrize(("marked_rows", "weight"), [(4, 3.0), (12, 2.0)])
 def test_only_doubtful_marks_may_count_more(marked_rows: int, weight: float) -> None:
     """The least loss is where odds are those of the marked pixels times the weight *there*."""
-    task = make_task(Constant(), pos_weight=weight, pos_weight_uncertain=True)
+    trainer = make_trainer(Constant(), pos_weight=weight, pos_weight_uncertain=True)
     rgb = torch.zeros((2, 16, 16, 3), dtype=torch.uint8)
     masks = torch.zeros((2, 16, 16), dtype=torch.bool)
     masks[:, :marked_rows] = True
     share = marked_rows / 16
-    first = task.training_step((rgb, masks), 0)
+    first = trainer.training_step((rgb, masks), 0)
     assert first == pytest.approx(math.log(2) * (1 - share + share * weight), rel=1e-5)
     for step in range(1, 150):
-        task.training_step((rgb, masks), step)
-    logit = task.network.logit.item()
+        trainer.training_step((rgb, masks), step)
+    logit = trainer.network.logit.item()
     probability = 1 / (1 + math.exp(-logit))
     there = 1 + (weight - 1) * 4 * probability * (1 - probability)
     assert logit == pytest.approx(math.log(there * share / (1 - share)), abs=0.01)
@@ -70,32 +70,32 @@ def test_only_doubtful_marks_may_count_more(marked_rows: int, weight: float) -> 
 
 def test_dark_images_have_a_weight_of_their_own() -> None:
     """Half of the crops are dark: the first loss is the mean of both kinds."""
-    task = make_task(Constant(), pos_weight=3.0, low_light_pos_weight=1.0)
+    trainer = make_trainer(Constant(), pos_weight=3.0, low_light_pos_weight=1.0)
     rgb = torch.zeros((2, 16, 16, 3), dtype=torch.uint8)
     rgb[:, 8:] = torch.tensor([200, 40], dtype=torch.uint8)[
         :, None, None, None
     ]  # grey levels spanned
     masks = torch.zeros((2, 16, 16), dtype=torch.bool)
     masks[0, :8] = True
-    only_in_normal = task.training_step((rgb, masks), 0)
+    only_in_normal = trainer.training_step((rgb, masks), 0)
     assert only_in_normal == pytest.approx(math.log(2) * (2.0 + 1.0) / 2, rel=1e-5)
-    only_in_dark = task.training_step((rgb, masks.flip(0)), 1)
+    only_in_dark = trainer.training_step((rgb, masks.flip(0)), 1)
     assert only_in_dark == pytest.approx(math.log(2), rel=1e-5)
 
 
 def test_a_loss_that_is_not_finite_is_an_error() -> None:
-    task = make_task(Constant())
+    trainer = make_trainer(Constant())
     with torch.no_grad():
-        task.network.logit.fill_(float("inf"))
+        trainer.network.logit.fill_(float("inf"))
     rgb = torch.zeros((1, 16, 16, 3), dtype=torch.uint8)
     masks = torch.zeros((1, 16, 16), dtype=torch.bool)
     with pytest.raises(OptionError, match=r"not finite at step 7: .*`learning_rate`"):
-        task.training_step((rgb, masks), 7)
+        trainer.training_step((rgb, masks), 7)
 
 
 @pytest.mark.parametrize("size", [(16, 16), (21, 30)])
 def test_a_heatmap_of_any_size(size: tuple[int, int]) -> None:
-    heatmap = make_task(Constant()).heatmap(torch.zeros((*size, 3), dtype=torch.uint8))
+    heatmap = make_trainer(Constant()).heatmap(torch.zeros((*size, 3), dtype=torch.uint8))
     assert heatmap.shape == size
     assert (heatmap == 0.5).all()
 
@@ -113,9 +113,9 @@ def test_a_frozen_encoder_stays_as_it_is(frozen_batch_norm: bool) -> None:
     torch.manual_seed(0)
     network = ESPNet()
     before = {name: value.clone() for name, value in network.state_dict().items()}
-    task = make_task(network, freeze_encoder=True, frozen_batch_norm=frozen_batch_norm)
+    trainer = make_trainer(network, freeze_encoder=True, frozen_batch_norm=frozen_batch_norm)
     rgb = torch.randint(0, 256, (2, 32, 32, 3), dtype=torch.uint8)
-    task.training_step((rgb, rgb[..., 0] > 128), 0)
+    trainer.training_step((rgb, rgb[..., 0] > 128), 0)
     changed = {
         name for name, value in network.state_dict().items() if (value != before[name]).any()
     }

@@ -32,7 +32,7 @@ from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
 from deepdetect.labels import LabelOptions  # noqa: E402
 from deepdetect.training import trainer as trainer_module  # noqa: E402
 from deepdetect.training.checkpoint import read_checkpoint  # noqa: E402
-from deepdetect.training.dense import DenseTask, initial_network  # noqa: E402
+from deepdetect.training.dense import DenseTrainer, initial_network  # noqa: E402
 from deepdetect.training.recipe import DeviceOptions, Stage, TrainingOptions  # noqa: E402
 from deepdetect.training.run import train  # noqa: E402
 from deepdetect.training.trainer import TrainingResult  # noqa: E402
@@ -99,16 +99,16 @@ def same_run(a: Path, b: Path) -> bool:
 
 
 def interrupted(monkeypatch: pytest.MonkeyPatch, method: str, count: int) -> Any:
-    """Let a method of the task fail when it is called again after this many calls."""
+    """Let a method of the trainer fail when it is called again after this many calls."""
     calls = iter(range(count))
-    whole = getattr(DenseTask, method)
+    whole = getattr(DenseTrainer, method)
 
     def step(*arguments: object) -> object:
         if next(calls, None) is None:
             raise KeyboardInterrupt
         return whole(*arguments)
 
-    monkeypatch.setattr(DenseTask, method, step)
+    monkeypatch.setattr(DenseTrainer, method, step)
     return pytest.raises(KeyboardInterrupt)
 
 

@@ -29,7 +29,6 @@ from ..training import (
 )
 from ..training import train as train_network
 from ..training import train_points as train_ranker
-from ..training.run import TRAINING_PACKAGES
 from . import _options as cli
 from .features import EXTRACTION
 
@@ -122,7 +121,6 @@ def train(
         output: Folder of the run.
         profiling: Time 30 steps of each stage and report what limits the speed; train nothing.
     """
-    require_packages("training", *TRAINING_PACKAGES)
     cli.check_folder_not_made(images, output)
     run = RUN.take(values)
     if given := run.pop("init_weights", None):
@@ -160,7 +158,6 @@ def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli
     Args:
         output: Folder of the run.
     """
-    require_packages("training", *TRAINING_PACKAGES)
     cli.check_folder_not_made(images, output)
     run = {**POINTS_RUN.take(values), "output": output, "log": cli.note}
     result = train_ranker(images, options=PointsTrainingOptions(**values), **run)
@@ -281,7 +278,7 @@ def average(
     Args:
         output: Folder for both files.
     """
-    require_packages("training", *TRAINING_PACKAGES)
+    require_packages("averaging weights", "torch", "safetensors", "onnx")
     if len(weights) < 2:
         raise OptionError("give at least two weights: the mean of one is itself")
     paths = [resolve_weights(name, ".safetensors") for name in weights]

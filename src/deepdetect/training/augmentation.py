@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from PIL import Image, ImageEnhance
 
 from .._shared.opencv import cv2
 from ..io.image import luma
@@ -57,18 +58,9 @@ def draw_darkening(generator: np.random.Generator) -> Darkening:
 
 
 def darken(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:
-    """Reduce the brightness, then the contrast (paper, Section III-B), of (H, W, 3) uint8.
-
-    The result is what Pillow's `ImageEnhance` gives.
-    """
-    # One value depends on itself and the mean only, so two tables of 256 entries do it all.
-    # Pillow blends in float32 and truncates.
-    levels = np.arange(256, dtype=np.float32)
-    dimmed = (levels * np.float32(darkening.brightness)).astype(np.uint8)
-    dark = cv2.LUT(rgb, dimmed)
-    mean = np.float32(int(_pillow_luma(dark).mean() + 0.5))
-    flattened = (mean + (levels - mean) * np.float32(darkening.contrast)).astype(np.uint8)
-    return cv2.LUT(dark, flattened)
+    """Reduce the brightness, then the contrast (paper, Section III-B), of (H, W, 3) uint8."""
+    dim = ImageEnhance.Brightness(Image.fromarray(rgb)).enhance(darkening.brightness)
+    return np.asarray(ImageEnhance.Contrast(dim).enhance(darkening.contrast))
 
 
 def flip(image: np.ndarray, mask: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
@@ -185,10 +177,3 @@ def _compress(rgb: np.ndarray, quality: int) -> np.ndarray:
     bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)  # OpenCV's order, so that luma is luma
     _, stored = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return cv2.cvtColor(cv2.imdecode(stored, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
-
-
-def _pillow_luma(rgb: np.ndarray) -> np.ndarray:
-    """Return Pillow's luma; for one colour in 800 it differs from OpenCV's by one level."""
-    # Whole numbers up to 2 ** 24, which float32 holds exactly.
-    weights = np.array([[19595, 38470, 7471, 0x8000]], np.float32)
-    return cv2.transform(rgb.astype(np.float32), weights).astype(np.uint32) >> 16

@@ -34,7 +34,7 @@ from .engine import Engine, freeze_batch_norm
 from .optim import make_optimizers
 from .recipe import DeviceOptions, InitWeights, TrainingOptions
 from .sampler import CropSampler, Schedule, milestones
-from .trainer import Task
+from .trainer import Trainer
 
 NETWORKS: dict[str, Callable[[], nn.Module]] = {"espnet": ESPNet}
 """What can be trained: from (B, 3, H, W) float32 RGB in [0, 1], sides multiples of 8, to logits."""
@@ -64,13 +64,9 @@ def initial_network(
         return dataclasses.replace(options, frozen_batch_norm=False), make()
 
 
-class DenseTask(Task):
+class DenseTrainer(Trainer):
     """A network that maps images to heat maps, with its initial weights, and labelled images."""
 
-    columns = (
-        *("epoch", "images", "learning_rate", "validation_loss"),
-        *("normal_loss", "normal_iou", "dark_loss", "dark_iou"),
-    )
     objective, sign = "validation_loss", 1
     weights_file = "best.safetensors"
 
@@ -98,7 +94,14 @@ class DenseTask(Task):
         self.steps = self.schedule.steps
         self.milestones = milestones(self.steps, options.val_count)
         self.origin = {"images_digest": data.digest, "initial_weights": initial_weights}
-        self.notes = {"images": str(len(data.training)), "run_on": self.engine.describe()}
+        how = self.engine.describe()
+        self.notes = {"images": str(len(data.training)), "run_on": how}
+        self.introduction = [f"training on {how}"]
+        if self.engine.compiled:
+            self.introduction.append(
+                "the first step of each stage compiles the network, which takes minutes on two "
+                "cores; --no-compile starts at once, and each step takes longer"
+            )
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
         """Return the loader of the batches of some steps: (images, masks), see `CropDataset`."""
@@ -166,10 +169,16 @@ class DenseTask(Task):
         sums = self.fabric.all_reduce(sums, reduce_op="sum")
         (normal_loss, normal_iou), (dark_loss, dark_iou) = (sums[:, :2] / sums[:, 2:]).tolist()
         fraction, crops = self.options.dark_fraction, self.schedule.crops_until(step)
-        loss = (1 - fraction) * normal_loss + fraction * dark_loss
-        progress = crops / self.schedule.images, crops, self.learning_rate(step - 1)
-        values = *progress, loss, normal_loss, normal_iou, dark_loss, dark_iou
-        return dict(zip(self.columns, values, strict=True))
+        return {
+            "epoch": crops / self.schedule.images,
+            "images": crops,
+            "learning_rate": self.learning_rate(step - 1),
+            "validation_loss": (1 - fraction) * normal_loss + fraction * dark_loss,
+            "normal_loss": normal_loss,
+            "normal_iou": normal_iou,
+            "dark_loss": dark_loss,
+            "dark_iou": dark_iou,
+        }
 
     @torch.inference_mode()
     def heatmap(self, image: Tensor) -> np.ndarray:

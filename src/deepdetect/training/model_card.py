@@ -13,18 +13,18 @@ from .._shared.records import file_digest
 from .checkpoint import Point
 
 
-def save_curves(points: Sequence[Point], columns: Sequence[str], folder: Path) -> None:
+def save_curves(points: Sequence[Point], folder: Path) -> None:
     """Write curves.csv, and curves.png (paper, Figure 5)."""
     with atomic_path(folder / "curves.csv") as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(columns)
-        writer.writerows([_cell(point[name]) for name in columns] for point in points)
+        writer.writerow(points[0])
+        writer.writerows(map(_cell, point.values()) for point in points)
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
     steps = [point["step"] for point in points]
-    for name in columns:
+    for name in points[0]:
         if name.endswith(("loss", "score", "correct")):
             axes.plot(steps, [point[name] for point in points], label=name.replace("_", " "))
     axes.set_xlabel("step")

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from .._shared.errors import require_packages
 from .._shared.options import suggest_keywords
@@ -18,10 +18,12 @@ from .._shared.progress import progress
 from .recipe import DeviceOptions, InitWeights, PointsTrainingOptions, Stage, TrainingOptions
 
 if TYPE_CHECKING:
-    from .dense import DenseTask
+    from .dense import DenseTrainer
     from .trainer import TrainingResult
 
 Log = Callable[[str], None]
+
+TRAINING_PACKAGES = ("torch", "lightning_fabric", "matplotlib", "safetensors", "onnx")
 
 
 @suggest_keywords
@@ -73,19 +75,10 @@ def train(
         >>> result = train("photos", "run", options, init_weights="default")  # doctest: +SKIP
         >>> detector = DeepDetect(result.onnx)  # doctest: +SKIP
     """
-    data = {"validation": validation, "labels": labels, "workers": workers}
-    task = _dense_task(images, output, options, init_weights, device, log is None, **data)
-    from .trainer import Trainer
-
-    trainer = Trainer(task, Path(output), log)
-    if trainer.log is not None and trainer.state.step < task.steps:
-        trainer.log(f"training on {task.engine.describe()}")
-        if task.engine.compiled:
-            trainer.log(
-                "the first step of each stage compiles the network, which takes minutes on two "
-                "cores; --no-compile starts at once, and each step takes longer"
-            )
-    return trainer.fit()
+    trainer = _dense_trainer(
+        images, output, options, validation, labels, init_weights, device, workers, log
+    )
+    return trainer.fit(Path(output), log)
 
 
 @suggest_keywords
@@ -119,41 +112,44 @@ def train_points(
         OptionError: the folder holds a run with other options or images.
     """
     require_packages("training", *TRAINING_PACKAGES)
-    from .points.task import RankerTask
-    from .trainer import Trainer
+    from .points.task import RankerTrainer
 
-    task = RankerTask(Path(images), Path(validation), options, num_workers)
-    return Trainer(task, Path(output), log).fit()
+    trainer = RankerTrainer(Path(images), Path(validation), options, num_workers)
+    return trainer.fit(Path(output), log)
 
 
-def _dense_task(
+def _dense_trainer(
     images: str | Path,
     output: str | Path,
     options: TrainingOptions,
+    validation: str | Path | None,
+    labels: str | Path | None,
     init_weights: InitWeights | None,
     device: DeviceOptions,
-    quiet: bool,
-    **data: Any,
-) -> DenseTask:
-    """Make the labels, and what is trained on them; arguments of `train` and `prepare_data`."""
+    workers: int | None,
+    log: Log | None,
+) -> DenseTrainer:
+    """Make the labels, and what is trained on them; arguments of `train`."""
     require_packages("training", *TRAINING_PACKAGES)
     from .dataset import prepare_data
-    from .dense import DenseTask, initial_network
+    from .dense import DenseTrainer, initial_network
     from .engine import launch
 
     options, network = initial_network(options, init_weights)  # before the labels, for its errors
     fabric = launch(device)
-    prepared = prepare_data(
-        images,
+    data = prepare_data(
+        Path(images),
         options,
-        output,
+        Path(output),
+        validation=validation,
+        labels=labels,
+        workers=workers,
         processes=fabric.world_size * max(1, device.worker_count),
         make_labels=fabric.local_rank == 0,
-        quiet=quiet or not fabric.is_global_zero,
-        **data,
+        quiet=log is None or not fabric.is_global_zero,
     )
     fabric.barrier()
-    return DenseTask(network, options, prepared, device, fabric)
+    return DenseTrainer(network, options, data, device, fabric)
 
 
 TIMED_STEPS = 30
@@ -215,23 +211,24 @@ def profile(
         >>> profile("photos", "run")[0].images_per_second  # doctest: +SKIP
     """
     options = dataclasses.replace(options, interleave=False)  # each stage by itself
-    data = {"validation": validation, "labels": labels, "workers": workers}
-    task = _dense_task(images, output, options, init_weights, device, log is None, **data)
-    steps_of_stage = task.schedule.steps_of_stage
+    trainer = _dense_trainer(
+        images, output, options, validation, labels, init_weights, device, workers, log
+    )
+    steps_of_stage = trainer.schedule.steps_of_stage
     lengths = [min(n, TIMED_STEPS + WARM_UP_STEPS) for n in steps_of_stage]
-    log = log if task.is_main else None
+    log = log if trainer.is_main else None
     if log is not None:
-        log(f"timing {task.engine.describe()}")
+        log(f"timing {trainer.engine.describe()}")
     profiles, first = [], 0
     with progress(sum(lengths), "timing", "step", log is None) as bar:
         for length, whole in zip(lengths, steps_of_stage, strict=True):
-            profiles.append(_time_steps(task, first, first + length, bar.update))
+            profiles.append(_time_steps(trainer, first, first + length, bar.update))
             first += whole
     return profiles
 
 
 def _time_steps(
-    task: DenseTask, first: int, last: int, done: Callable[[int], object]
+    trainer: DenseTrainer, first: int, last: int, done: Callable[[int], object]
 ) -> StageProfile:
     import torch
 
@@ -239,20 +236,20 @@ def _time_steps(
     from .dataset import loading
     from .trainer import FULL_IMAGE_PIXELS
 
-    stage, warm_up = task.schedule.position(first).stage, min(WARM_UP_STEPS, last - first - 1)
-    on_gpu = task.engine.device.type == "cuda"
+    stage, warm_up = trainer.schedule.position(first).stage, min(WARM_UP_STEPS, last - first - 1)
+    on_gpu = trainer.engine.device.type == "cuda"
     if on_gpu:
         torch.cuda.reset_peak_memory_stats()
     waited = 0.0
     started = time.perf_counter()
-    with loading(task.loader(first, last)) as batches:
+    with loading(trainer.loader(first, last)) as batches:
         for step in range(first, last):
             asked = time.perf_counter()
             if step == first + warm_up:
                 waited, started = 0.0, asked
             batch = next(batches)
             waited += time.perf_counter() - asked
-            task.training_step(batch, step)
+            trainer.training_step(batch, step)
             done(1)
     # Reading the loss has waited for the GPU at each step.
     seconds = time.perf_counter() - started
@@ -267,6 +264,3 @@ def _time_steps(
         memory_bytes=peak_memory(),
         device_memory_bytes=torch.cuda.max_memory_allocated() if on_gpu else None,
     )
-
-
-TRAINING_PACKAGES = ("torch", "lightning_fabric", "matplotlib", "safetensors", "onnx")

@@ -1,4 +1,4 @@
-"""One training run, of whatever is trained: its steps, validations, files, and how it resumes."""
+"""A training run, of whatever is trained: its steps, validations, files, and how it resumes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,8 +33,37 @@ CHECKPOINT_INTERVAL_S = 60.0
 """A killed run loses at most this much time."""
 
 
-class Task(abc.ABC):
-    """What is trained, its loss and how it is measured.
+@dataclass
+class TrainingState:
+    """The steps done, the curves, and the losses of the batches since their last point."""
+
+    step: int = 0
+    loss_sum: float = 0.0
+    loss_count: int = 0
+    points: list[Point] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """The results of a run.
+
+    Attributes:
+        weights: the weights that the validation found best, safetensors or npz.
+        onnx: the same weights as ONNX, for `DeepDetect(weights=...)`; None for a ranker.
+        points: the curves: losses and measures by name, for each validation.
+        best: the point of those weights.
+        images_per_second: mean rate, in 480x480 images' worth of pixels.
+    """
+
+    weights: Path
+    onnx: Path | None
+    points: list[Point]
+    best: Point
+    images_per_second: float
+
+
+class Trainer(abc.ABC):
+    """A training run; a class below it says what is trained, its loss and how it is measured.
 
     Attributes:
         network: all of the state that is trained.
@@ -43,11 +72,11 @@ class Task(abc.ABC):
         origin: digests of the images and of the initial weights: a run is resumed with the same
             recipe and origin only.
         notes: what else is written into the weights.
+        introduction: what the user is told before the first step.
         steps: of the whole run.
         milestones: numbers of steps done after which it is validated.
-        columns: of a point of the curves, besides "step" and "training_loss".
-        objective: the column that the best weights are chosen by.
-        sign: 1 if the lowest value is the best, -1 if the highest.
+        objective: the value of a point of the curves that the best weights are chosen by.
+        sign: 1 if its lowest value is the best, -1 if the highest.
         weights_file: name of the file of the best weights.
         max_gradient_norm: larger gradients are scaled down to it.
         is_main: whether this process writes the files.
@@ -58,9 +87,9 @@ class Task(abc.ABC):
     options: Any
     origin: dict[str, str]
     notes: dict[str, str]
+    introduction: Sequence[str] = ()
     steps: int
     milestones: set[int]
-    columns: tuple[str, ...]
     objective: str
     sign: int
     weights_file: str
@@ -85,7 +114,7 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def validate(self, step: int) -> dict[str, float]:
-        """Measure the weights after a number of steps; by `columns`."""
+        """Measure the weights after a number of steps."""
 
     @abc.abstractmethod
     def save(self, path: Path, notes: Mapping[str, Any]) -> None:
@@ -130,128 +159,89 @@ class Task(abc.ABC):
             optimizer.step()
         return value
 
+    def fit(self, folder: Path, log: Callable[[str], None] | None = None) -> TrainingResult:
+        """Train to the last step in a folder; with a checkpoint there it goes on from it.
 
-@dataclass
-class TrainingState:
-    """The steps done, the curves, and the losses of the batches since their last point."""
-
-    step: int = 0
-    loss_sum: float = 0.0
-    loss_count: int = 0
-    points: list[Point] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class TrainingResult:
-    """The results of a run.
-
-    Attributes:
-        weights: the weights that the validation found best, safetensors or npz.
-        onnx: the same weights as ONNX, for `DeepDetect(weights=...)`; None for a ranker.
-        points: the curves: losses and measures by name, for each validation.
-        best: the point of those weights.
-        images_per_second: mean rate, in 480x480 images' worth of pixels.
-    """
-
-    weights: Path
-    onnx: Path | None
-    points: list[Point]
-    best: Point
-    images_per_second: float
-
-
-class Trainer:
-    """One training run in a folder; with a checkpoint there it goes on from it.
-
-    Raises:
-        OptionError: the folder holds a run with other options, images or initial weights.
-        WeightsError: its checkpoint is damaged, or its best weights are missing.
-    """
-
-    def __init__(self, task: Task, folder: Path, log: Callable[[str], None] | None = None) -> None:
-        self.task, self.folder = task, folder
-        self.log = log if task.is_main else None
-        self.columns = ("step", "training_loss", *task.columns)
-        self.inputs = {**plain(task.options), **task.origin}
-        recipe = json.dumps(dataclasses.asdict(task.options), sort_keys=True)
-        self.notes = {"options": recipe, **task.origin, **task.notes}
-        self.weights = folder / task.weights_file
-        self.state = TrainingState()
-        if (folder / CHECKPOINT).exists():
-            self._resume()
-
-    @property
-    def best(self) -> Point | None:
-        """The point of the best weights so far."""
-        name, sign = self.task.objective, self.task.sign
-        return min(self.state.points, key=lambda point: sign * point[name], default=None)
-
-    def fit(self) -> TrainingResult:
-        """Train to the last step."""
-        task, state = self.task, self.state
+        Raises:
+            OptionError: the folder holds a run with other options, images or initial weights.
+            WeightsError: its checkpoint is damaged, or its best weights are missing.
+        """
+        state = self._resume(folder)
+        quiet = log is None or not self.is_main
+        if log is not None and self.is_main and state.step < self.steps:
+            for line in self.introduction:
+                log(line)
         measured = {point["step"] for point in state.points}
-        if state.step in task.milestones and state.step not in measured:
-            self._validate()  # the start, or a run that was interrupted while it validated
+        if state.step in self.milestones and state.step not in measured:
+            self._validate(state, folder)  # the start, or a validation that was interrupted
         started, pixels = time.monotonic(), 0
         saved = started
-        bar = progress(task.steps, "training", "step", self.log is None, state.step)
-        with bar, loading(task.loader(state.step)) as batches:
+        bar = progress(self.steps, "training", "step", quiet, state.step)
+        with bar, loading(self.loader(state.step)) as batches:
             for batch in batches:
-                state.loss_sum += task.training_step(batch, state.step)
+                state.loss_sum += self.training_step(batch, state.step)
                 state.loss_count += 1
                 state.step += 1
-                pixels += task.pixels(batch)
+                pixels += self.pixels(batch)
                 bar.update(1)
                 speed = pixels / FULL_IMAGE_PIXELS / (time.monotonic() - started)
                 loss = state.loss_sum / state.loss_count
                 text = f"loss {loss:.4f}, {speed:.1f} images/s"
-                if best := self.best:
-                    text += f", best {best[task.objective]:.4f}"
+                if state.points:
+                    text += f", best {self._best(state)[self.objective]:.4f}"
                 bar.set_postfix_str(text, False)
-                if state.step in task.milestones:
-                    self._save()  # the validation takes its time, too
-                    self._validate()
+                if state.step in self.milestones:
+                    self._save(state, folder)  # the validation takes its time, too
+                    self._validate(state, folder)
                 if time.monotonic() - saved >= CHECKPOINT_INTERVAL_S:
-                    self._save()
+                    self._save(state, folder)
                     saved = time.monotonic()
         speed = pixels / FULL_IMAGE_PIXELS / max(time.monotonic() - started, 1e-9)
-        best = self.best
-        assert best is not None  # the last step is a milestone
+        best, weights = self._best(state), folder / self.weights_file
         onnx = None
-        if task.is_main:
-            onnx = task.export(self.folder)
-            notes = task.read_notes(self.weights)
-            card = self.folder / CARD
-            write_model_card(card, self.weights, *task.card(best), notes, state.points)
-        return TrainingResult(self.weights, onnx, state.points, best, speed)
+        if self.is_main:
+            onnx = self.export(folder)
+            notes = self.read_notes(weights)
+            write_model_card(folder / CARD, weights, *self.card(best), notes, state.points)
+        return TrainingResult(weights, onnx, state.points, best, speed)
 
-    def _validate(self) -> None:
+    def _best(self, state: TrainingState) -> Point:
+        return min(state.points, key=lambda point: self.sign * point[self.objective])
+
+    def _validate(self, state: TrainingState, folder: Path) -> None:
         """Measure the weights, keep them if they are the best so far, and save the state."""
-        task, state = self.task, self.state
         loss = state.loss_sum / max(state.loss_count, 1)
-        point = {"step": state.step, "training_loss": loss, **task.validate(state.step)}
+        point = {"step": state.step, "training_loss": loss, **self.validate(state.step)}
         state.loss_sum, state.loss_count = 0.0, 0
         state.points.append(point)
-        if task.is_main:
-            if self.best is point:
-                notes = {**self.notes, **provenance(), "point": json.dumps(point)}
-                task.save(self.weights, notes)
-            save_curves(state.points, self.columns, self.folder)
-        self._save()
+        if self.is_main:
+            if self._best(state) is point:
+                notes = {**self._all_notes(), "point": json.dumps(point)}
+                self.save(folder / self.weights_file, notes)
+            save_curves(state.points, folder)
+        self._save(state, folder)
 
-    def _save(self) -> None:
-        if self.task.is_main:
-            metadata = {**dataclasses.asdict(self.state), "inputs": self.inputs}
-            metadata |= self.notes | provenance()
-            path = self.folder / CHECKPOINT
-            save_checkpoint(path, self.task.network, self.task.optimizers, metadata)
+    def _save(self, state: TrainingState, folder: Path) -> None:
+        if self.is_main:
+            metadata = {**dataclasses.asdict(state), "inputs": self._inputs(), **self._all_notes()}
+            save_checkpoint(folder / CHECKPOINT, self.network, self.optimizers, metadata)
 
-    def _resume(self) -> None:
-        tensors, metadata = read_checkpoint(self.folder / CHECKPOINT)
+    def _resume(self, folder: Path) -> TrainingState:
+        if not (folder / CHECKPOINT).exists():
+            return TrainingState()
+        tensors, metadata = read_checkpoint(folder / CHECKPOINT)
         advice = "use the same to resume the run, or another `output`"
-        check_same(self.folder, metadata.get("inputs"), self.inputs, advice)
+        check_same(folder, metadata.get("inputs"), self._inputs(), advice)
         names = [each.name for each in dataclasses.fields(TrainingState)]
-        self.state = TrainingState(**{name: metadata[name] for name in names})
-        restore(tensors, self.task.network, self.task.optimizers)
-        if self.state.points:
-            self.task.read_notes(self.weights)  # an error now rather than at the end
+        state = TrainingState(**{name: metadata[name] for name in names})
+        restore(tensors, self.network, self.optimizers)
+        if state.points:
+            self.read_notes(folder / self.weights_file)  # an error now rather than at the end
+        return state
+
+    def _inputs(self) -> dict[str, Any]:
+        return {**plain(self.options), **self.origin}
+
+    def _all_notes(self) -> dict[str, Any]:
+        recipe = json.dumps(dataclasses.asdict(self.options), sort_keys=True)
+        return {"options": recipe, **self.origin, **self.notes, **provenance()}

@@ -17,7 +17,7 @@ from deepdetect.features.keypoints import Keypoints
 from deepdetect.training import PointsTrainingOptions, TrainingResult, train_points
 from deepdetect.training.checkpoint import read_checkpoint
 from deepdetect.training.points.measure import MEASURES, measure, validation_pairs
-from deepdetect.training.points.task import RankerTask
+from deepdetect.training.points.task import RankerTrainer
 from deepdetect.training.trainer import CHECKPOINT
 
 OPTIONS = PointsTrainingOptions(steps=4, pairs=1, side=96, val_count=1, val_pairs=1)
@@ -44,14 +44,14 @@ def whole(textures: Path, tmp_path_factory) -> TrainingResult:
 
 def interrupted(monkeypatch: pytest.MonkeyPatch, count: int) -> Any:
     calls = iter(range(count))
-    step = RankerTask.training_step
+    step = RankerTrainer.training_step
 
     def training_step(*arguments: Any) -> float:
         if next(calls, None) is None:
             raise KeyboardInterrupt
         return step(*arguments)
 
-    monkeypatch.setattr(RankerTask, "training_step", training_step)
+    monkeypatch.setattr(RankerTrainer, "training_step", training_step)
     return pytest.raises(KeyboardInterrupt)
 
 
@@ -64,7 +64,7 @@ def test_training_changes_the_weights_and_measures(whole: TrainingResult, textur
     torch.manual_seed(3)
     expected = torch.rand(4)
     torch.manual_seed(3)
-    start = RankerTask(textures, textures, OPTIONS)
+    start = RankerTrainer(textures, textures, OPTIONS)
     assert torch.equal(torch.rand(4), expected), "the caller keeps its random numbers"
     after = load_file(whole.weights.parent / CHECKPOINT)
     assert all(
@@ -98,7 +98,7 @@ def test_the_best_weights_are_those_of_the_best_measure(
 
 
 def test_an_untrained_ranker_ranks_by_the_first_feature(textures: Path) -> None:
-    module = RankerTask(textures, textures, OPTIONS).ranker
+    module = RankerTrainer(textures, textures, OPTIONS).ranker
     features = module.mean + module.deviation * torch.randn(
         200, len(module.mean), generator=torch.Generator().manual_seed(1)
     )

@@ -24,7 +24,7 @@ from ..checkpoint import Point
 from ..model_card import table
 from ..recipe import PointsTrainingOptions
 from ..sampler import milestones
-from ..trainer import Task
+from ..trainer import Trainer
 from .losses import pair_loss
 from .measure import MEASURES, measure, validation_pairs
 from .pairs import CandidatePair, PairDataset
@@ -94,10 +94,9 @@ def save_ranker(ranker: Ranker, path: Path) -> None:
         np.savez(file, allow_pickle=False, notes=np.array(ranker.notes), **arrays)
 
 
-class RankerTask(Task):
+class RankerTrainer(Trainer):
     """A ranker of points, and the folders of images whose views it is trained on."""
 
-    columns = ("score", *(f"{kind} {name}" for kind in KINDS for name in MEASURES))
     objective, sign = "score", -1
     weights_file = "best.npz"
     max_gradient_norm = 1.0
