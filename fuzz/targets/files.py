@@ -141,8 +141,6 @@ def label_settings(generator: np.random.Generator, folder: Path) -> None:
     choice = generator.random()
     if choice < 0.3:
         content = mutate(content, generator)
-    elif choice < 0.33:
-        content = b"a." * 50_000 + b"a = 1"
     elif choice < 0.36:
         content = b"a = " + b"[" * 50_000 + b"]" * 50_000
     path = folder / "settings.toml"

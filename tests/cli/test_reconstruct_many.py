@@ -117,5 +117,5 @@ def test_without_pycolmap_it_says_what_to_install(run, tmp_path: Path, monkeypat
     result = run("reconstruct", tmp_path, "-o", "model")
     assert result.exit_code == 2
     assert one_sentence(result.stderr)
-    assert "run pip install pycolmap h5py" in result.stderr
+    assert "run pip install pycolmap" in result.stderr
     assert not Path("model").exists()

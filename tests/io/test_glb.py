@@ -79,7 +79,7 @@ def test_what_the_specification_asks_for(cones: PointCloud, tmp_path: Path) -> N
     np.testing.assert_array_equal(np.float32(told["max"]), stored.max(0))
     np.testing.assert_array_equal(stored, cones.points * [1, -1, -1])
     assert tree["asset"]["extras"]["notes"] == {"scene": "cônes"}
-    assert "not known" in tree["asset"]["extras"]["unit"]
+    assert "unknown length" in tree["asset"]["extras"]["unit"]
 
 
 def test_the_frame_is_turned_and_not_mirrored(tmp_path: Path) -> None:

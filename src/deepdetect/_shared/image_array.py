@@ -59,6 +59,12 @@ def array_to_rgb(image: Any, channels: Channels = "rgb", name: str = "the image"
     return np.ascontiguousarray(values[:, :, :3] if channels == "rgb" else values[:, :, 2::-1])
 
 
+def srgb_to_linear() -> np.ndarray:
+    """Return the linear light in [0, 1] of each of the 256 levels of sRGB (IEC 61966-2-1)."""
+    value = np.arange(256) / 255
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
 def _channels_last(array: np.ndarray) -> np.ndarray:
     """Return an array as (H, W), (H, W, 3) or (H, W, 4)."""
     shape = array.shape

@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 
+from .._shared.image_array import srgb_to_linear
 from .._shared.opencv import cv2
 
 FULL_WELL = 10_000.0
@@ -63,9 +64,7 @@ def degrade(rgb: np.ndarray, degradation: Degradation, seed: int = 0) -> np.ndar
 
 def to_linear(rgb: np.ndarray) -> np.ndarray:
     """Undo the gamma of sRGB (IEC 61966-2-1): uint8 to float32 in [0, 1]."""
-    value = np.arange(256) / 255
-    table = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    return table.astype(np.float32)[rgb]
+    return srgb_to_linear().astype(np.float32)[rgb]
 
 
 def to_srgb(linear: np.ndarray) -> np.ndarray:

@@ -12,14 +12,14 @@ the width of the map over that of the image.
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from .._shared.errors import ImageError, MissingImageError, require_packages
-from .._shared.text_files import read_json
-from ..geometry.camera import MAX_FILE_BYTES, Calibration, read_calibration
+from ..geometry.camera import Calibration, read_calibration
 from ..io.image import load_image
 from ..io.image_file import open_image
 
@@ -53,14 +53,21 @@ def load_middlebury(folder: str | Path) -> StereoPair:
     root, left, right = _load_views(folder)
     path = root / "calib.json"
     try:
-        truth = read_json(path, MAX_FILE_BYTES).get("ground_truth")
+        truth = json.loads(path.read_bytes()).get("ground_truth")
         if truth is None:
             raise ImageError(f"{root} has no ground truth: take a scene that has one")
         value, unknown = float(truth["value_per_pixel"]), float(truth["unknown"])
         file = root / truth["file"]
     except OSError as error:
         raise ImageError(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except (ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
+    except (
+        ValueError,
+        OverflowError,
+        RecursionError,
+        KeyError,
+        TypeError,
+        AttributeError,
+    ) as error:
         raise ImageError(f"{path} does not say how its ground truth is stored ({error})") from None
     stored = _load_gray(file) if file.is_file() else None
     if stored is None or not value > 0:

@@ -16,6 +16,7 @@ Other keys are ignored. The names follow the calib.txt of Middlebury 2014, where
 
 from __future__ import annotations
 
+import json
 import math
 import reprlib
 from collections.abc import Sequence
@@ -27,15 +28,11 @@ import numpy as np
 
 from .._shared.errors import MissingCalibrationError, ReconstructionError, first_line
 from .._shared.options import suggest_keywords
-from .._shared.text_files import read_json
 
 Size = tuple[int, int]
 
 MAX_OFFSET_ERROR_PX = 0.5
 """By how much cx of both views and the disparity offset may contradict each other."""
-
-MAX_FILE_BYTES = 1 << 20
-"""Longer calib.json files are refused; usual ones have a few hundred bytes."""
 
 
 @suggest_keywords
@@ -186,12 +183,12 @@ def read_calibration(path: str | Path, size0: Size, size1: Size) -> Calibration:
             another size.
     """
     try:
-        values = read_json(path, MAX_FILE_BYTES)
+        values = json.loads(Path(path).read_bytes())
     except OSError as error:
         missing = isinstance(error, FileNotFoundError)
         kind = MissingCalibrationError if missing else ReconstructionError
         raise kind(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ReconstructionError(
             f"{path} is not valid JSON ({first_line(error)}): correct it, or give the focal length"
         ) from None

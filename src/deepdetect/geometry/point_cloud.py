@@ -10,9 +10,12 @@ import numpy as np
 from .._shared.errors import OptionError, unknown_name
 from .._shared.options import suggest_keywords
 
-UNITS = ("mm", "baseline", "spacing")
-"""Millimetres; where the scale is not known, the distance of the two cameras, or the median
-distance from one of many cameras to the nearest other one."""
+UNITS = {
+    "mm": "millimetres",
+    "baseline": "baselines (1 = the distance of the two cameras)",
+    "spacing": "spacings (1 = the median distance from a camera to the nearest other one)",
+}
+"""Of lengths, as files explain them; with the last two the scale is not known."""
 
 BOX_PERCENTILE = 1.0
 """Percent of the points that lie beyond each side of the robust box."""

@@ -8,6 +8,7 @@ import numpy as np
 from PIL import Image, PngImagePlugin
 
 from .._shared.atomic import atomic_path
+from .._shared.records import save_arrays
 
 MAX_UINT16 = 65535
 
@@ -52,8 +53,7 @@ def save_depth_npz(depth: np.ndarray, path: Path, unit: str, **arrays: np.ndarra
     """Write `depth` (H, W) float32, NaN where it is unknown, its `unit`, and further arrays."""
     known = np.isfinite(depth) & (depth > 0)
     stored = np.where(known, depth, np.nan).astype(np.float32)
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, depth=stored, unit=np.array(unit), **arrays)  # type: ignore[arg-type]
+    save_arrays(path, {"depth": stored, "unit": unit, **arrays})
 
 
 def _scale(depths: np.ndarray) -> float:

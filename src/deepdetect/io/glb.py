@@ -15,17 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.point_cloud import PointCloud
-
-METRES_PER_UNIT = {"mm": 1e-3, "baseline": 1.0, "spacing": 1.0}
-"""What has an unknown length becomes one metre, and the file says so."""
-
-SCALE_NOTES = {
-    "mm": "metres",
-    "baseline": "the scale is not known: 1 stands for the distance of the two cameras",
-    "spacing": "the scale is not known: 1 stands for the median distance from a camera to the "
-    "nearest other one",
-}
+from .._shared.image_array import srgb_to_linear
+from ..geometry.point_cloud import UNITS, PointCloud
 
 FLOAT, UNSIGNED_SHORT, ARRAY_BUFFER, POINTS = 5126, 5123, 34962, 0
 
@@ -38,7 +29,7 @@ def write_glb(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> Non
     """
     positions = to_gltf_frame(cloud).astype("<f4")
     colors = np.full((len(cloud), 4), 65535, "<u2")
-    colors[:, :3] = _linear_levels()[cloud.colors]
+    colors[:, :3] = np.rint(65535 * srgb_to_linear()).astype("<u2")[cloud.colors]
     text = json.dumps(_tree(cloud, positions, metadata), separators=(",", ":")).encode("ascii")
     text += b" " * (-len(text) % 4)
     size = positions.nbytes + colors.nbytes  # a multiple of 4
@@ -52,28 +43,25 @@ def write_glb(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> Non
 
 
 def to_gltf_frame(cloud: PointCloud) -> np.ndarray:
-    """Return the points with x right, y up, z backward, in metres: a half turn about the x axis."""
-    return cloud.points * (np.array([1, -1, -1]) * METRES_PER_UNIT[cloud.unit])
+    """Return the points with x right, y up, z backward, in metres: a half turn about the x axis.
 
-
-def _linear_levels() -> np.ndarray:
-    """Return the 16-bit linear level of each of the 256 levels of sRGB (IEC 61966-2-1)."""
-    srgb = np.arange(256) / 255
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    return np.rint(linear * 65535).astype("<u2")
+    Units of unknown length become metres, and the file says so.
+    """
+    return cloud.points * (np.array([1, -1, -1]) * (1e-3 if cloud.unit == "mm" else 1.0))
 
 
 def _tree(cloud: PointCloud, positions: np.ndarray, metadata: Mapping[str, str]) -> dict[str, Any]:
     count = len(cloud)
     box = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
     primitive = {"attributes": {"POSITION": 0, "COLOR_0": 1}, "mode": POINTS, "material": 0}
+    unit = "metres" if cloud.unit == "mm" else f"{UNITS[cloud.unit]}, of unknown length"
     rough = {"metallicFactor": 0, "roughnessFactor": 1}
     return {
         "asset": {
             "version": "2.0",
             "generator": "deepdetect",
             "extras": {
-                "unit": SCALE_NOTES[cloud.unit],
+                "unit": unit,
                 "frame": f"origin at the {cloud.frame}, x right, y up, z backward",
                 "notes": dict(metadata),
             },

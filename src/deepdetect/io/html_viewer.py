@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from ..geometry.camera import PosedView, camera_spacing
-from ..geometry.point_cloud import PointCloud, angular_spacing, robust_box
+from ..geometry.point_cloud import UNITS, PointCloud, angular_spacing, robust_box
 
 DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
 """Tangent of half the field of view, and its range."""
@@ -28,13 +28,6 @@ MAX_LEVEL = 65535
 
 MARGIN = 1.0
 """Points further outside the robust box than this many times its size are left out."""
-
-UNIT_NAMES = {
-    "mm": "mm",
-    "baseline": "baselines (distance of the two cameras; no scale)",
-    "spacing": "spacings (median distance from a camera to the nearest other one; no scale)",
-}
-SHORT_UNITS = {"mm": "mm", "baseline": "baselines", "spacing": "spacings"}
 
 CAMERA_SIZE = 0.35
 """Depth of the pyramid that stands for a camera, over the distance to the nearest other one."""
@@ -72,11 +65,12 @@ def write_html_page(
     entry "title" becomes the heading. Cameras are pyramids, with a line from each to the next.
     """
     stored = page_points(cloud)
+    precision = f"{stored.step.max() / 2:.2g} {UNITS[cloud.unit].split()[0]}"
     caption = {
         "Points": f"{len(stored.levels):,}",
         **({"Left out, far away": f"{stored.left_out:,}"} if stored.left_out else {}),
-        "Unit": UNIT_NAMES[cloud.unit],
-        "Positions to": f"{stored.step.max() / 2:.2g} {SHORT_UNITS[cloud.unit]} (16 bits per axis)",
+        "Unit": UNITS[cloud.unit],
+        "Positions to": f"{precision} (16 bits per axis)",
         **{name: text for name, text in metadata.items() if name != "title"},
     }
     values = {

@@ -10,7 +10,7 @@ import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.options import look_up, suggest_keywords
-from ..geometry.point_cloud import PointCloud, require_points
+from ..geometry.point_cloud import UNITS, PointCloud, require_points
 from .glb import write_glb
 from .html_viewer import write_html_page
 
@@ -18,12 +18,6 @@ Metadata = Mapping[str, str | int | float]
 PointCloudWriter = Callable[[PointCloud, Path, Mapping[str, str]], None]
 
 VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
-
-PLY_UNITS = {
-    "mm": "millimetres",
-    "baseline": "baselines (1 = the distance of the two cameras)",
-    "spacing": "spacings (1 = the median distance from a camera to the nearest other one)",
-}
 
 
 def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> None:
@@ -43,7 +37,7 @@ def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> Non
 def _ply_header(cloud: PointCloud, metadata: Mapping[str, str]) -> str:
     comments = [
         "written by deepdetect",
-        f"unit: {PLY_UNITS[cloud.unit]}",
+        f"unit: {UNITS[cloud.unit]}",
         f"frame: {cloud.frame}, x right, y down, z forward, origin at its centre",
         *(f"{name}: {text}" for name, text in metadata.items()),
     ]

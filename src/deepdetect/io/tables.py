@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-import math
-import os
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any
 
 import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import InvalidFileError, MissingFileError, OptionError, first_line
 from .._shared.options import suggest_keywords
+from .._shared.records import save_arrays
 from ..features.keypoints import Keypoints
 from ..features.matches import Matches, TwoViewGeometry
 
-FORMATS = ("npz", "csv")
 OPTIONAL = ("logits", "sizes", "angles", "descriptors", "descriptor_type")
 """Of keypoints, in npz files where there are any."""
 
-MAX_DEFLATE_RATIO = 1032
-"""By how much zip's usual compression can shrink at most (https://zlib.net/zlib_tech.html)."""
+MATCH_VALUES = (
+    *("points0", "points1", "scores", "inliers", "model", "matrix"),
+    *("subpixel", "indices0", "indices1"),
+)
+"""Of matches, by the names of their attributes, beside keypoints and geometry."""
 
 CSV_ROWS = 100_000
 """Written at a time: a table of all takes as much memory as the keypoints once more."""
@@ -44,19 +45,15 @@ def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
         OptionError: the file's ending is another.
         DeepDetectError: the file cannot be written.
     """
-    if _format(path) == "npz":
+    if _format(path) == ".npz":
+        arrays = {"keypoints": keypoints.xy, "scores": keypoints.scores}
         optional = {name: getattr(keypoints, name) for name in OPTIONAL}
-        _save_npz(
-            path,
-            keypoints=keypoints.xy,
-            scores=keypoints.scores,
-            image_size=np.array(keypoints.image_size),
-            **{name: np.asarray(each) for name, each in optional.items() if each is not None},
-        )
+        known = {name: value for name, value in optional.items() if value is not None}
+        save_arrays(path, arrays | {"image_size": keypoints.image_size} | known)
     else:
         columns = [("x,y", keypoints.xy), ("score", keypoints.scores)]
-        known = (("size", keypoints.sizes), ("angle", keypoints.angles))
-        columns += [(name, values) for name, values in known if values is not None]
+        optional = {"size": keypoints.sizes, "angle": keypoints.angles}
+        columns += [(name, values) for name, values in optional.items() if values is not None]
         header = ",".join(name for name, _ in columns)
         _save_csv(path, header, [values for _, values in columns])
 
@@ -75,16 +72,9 @@ def load_keypoints(path: str | Path) -> Keypoints:
         >>> load_keypoints(path)
         Keypoints(1 keypoint in 20x10 pixels, scores 0.9 to 0.9)
     """
-    arrays = _load_npz(path, "keypoints")
-    with _building(path, "keypoints"):
-        kind = arrays.pop("descriptor_type", None)
-        return Keypoints(
-            arrays["keypoints"],
-            arrays["scores"],
-            _size(arrays["image_size"]),
-            **{name: arrays[name] for name in OPTIONAL if name in arrays},
-            descriptor_type=None if kind is None else str(kind),
-        )
+    with _arrays_in(path, "keypoints") as arrays:
+        optional = {name: arrays[name] for name in OPTIONAL if name in arrays}
+        return Keypoints(arrays["keypoints"], arrays["scores"], arrays["image_size"], **optional)
 
 
 @suggest_keywords
@@ -105,24 +95,20 @@ def save_matches(matches: Matches, path: str | Path) -> None:
         OptionError: the file's ending is another.
         DeepDetectError: the file cannot be written.
     """
-    if _format(path) == "csv":
+    if _format(path) == ".csv":
         columns = [matches.points0, matches.points1, matches.scores, matches.inliers]
         _save_csv(path, "x0,y0,x1,y1,score,inlier", columns)
         return
-    names = ("points0", "points1", "scores", "inliers", "indices0", "indices1")
-    arrays = {name: getattr(matches, name) for name in names}
-    arrays |= {"model": matches.model, "matrix": _or_empty(matches.matrix)}
-    arrays |= {"guided": matches.guided, "subpixel": matches.subpixel}
+    values = {name: getattr(matches, name) for name in (*MATCH_VALUES, "guided")}
     for side, keypoints in enumerate((matches.keypoints0, matches.keypoints1)):
-        arrays[f"keypoints{side}"] = keypoints.xy
-        arrays[f"keypoint_scores{side}"] = keypoints.scores
-        arrays[f"image_size{side}"] = keypoints.image_size
+        values[f"keypoints{side}"] = keypoints.xy
+        values[f"keypoint_scores{side}"] = keypoints.scores
+        values[f"image_size{side}"] = keypoints.image_size
     if matches.two_view_geometry is not None:
-        arrays |= {
-            f"two_view_{name}": value for name, value in vars(matches.two_view_geometry).items()
-        }
-        arrays["two_view_matrix"] = _or_empty(matches.two_view_geometry.matrix)
-    _save_npz(path, **{name: np.asarray(value) for name, value in arrays.items()})
+        for name, value in vars(matches.two_view_geometry).items():
+            values[f"two_view_{name}"] = value
+    none = np.empty((0, 0))
+    save_arrays(path, {name: none if value is None else value for name, value in values.items()})
 
 
 @suggest_keywords
@@ -135,131 +121,57 @@ def load_matches(path: str | Path) -> Matches:
     Raises:
         DeepDetectError: the file is missing or is no such file.
     """
-    arrays = _load_npz(path, "matches")
-    with _building(path, "matches"):
+    with _arrays_in(path, "matches") as arrays:
         keypoints = [
             Keypoints(
                 arrays[f"keypoints{side}"],
                 arrays[f"keypoint_scores{side}"],
-                _size(arrays[f"image_size{side}"]),
+                arrays[f"image_size{side}"],
             )
             for side in (0, 1)
         ]
         geometry = None
         if "two_view_model" in arrays:
-            geometry = TwoViewGeometry(
-                str(arrays["two_view_model"]),
-                _or_none(arrays["two_view_matrix"]),
-                _integer(arrays["two_view_tentative_matches"]),
-                _integer(arrays["two_view_tentative_inliers"]),
-                float(arrays["two_view_log10_nfa"]),
-                _integer(arrays["two_view_simulated_views"]),
-            )
+            names = [field.name for field in fields(TwoViewGeometry)]
+            geometry = TwoViewGeometry(*(arrays[f"two_view_{name}"] for name in names))
         return Matches(
-            arrays["points0"],
-            arrays["points1"],
-            arrays["scores"],
-            arrays["inliers"],
-            str(arrays["model"]),
-            _or_none(arrays["matrix"]),
-            keypoints[0],
-            keypoints[1],
+            keypoints0=keypoints[0],
+            keypoints1=keypoints[1],
             two_view_geometry=geometry,
-            subpixel=bool(arrays["subpixel"]),
-            indices0=arrays["indices0"],
-            indices1=arrays["indices1"],
+            **{name: arrays[name] for name in MATCH_VALUES},
         )
 
 
-def _load_npz(path: str | Path, content: str) -> dict[str, np.ndarray]:
-    """Read all arrays of a npz file; errors say which file and what it should hold."""
+@contextmanager
+def _arrays_in(path: str | Path, content: str) -> Iterator[dict[str, Any]]:
+    """Give the arrays of an npz file, those without a shape as numbers and texts.
+
+    Errors, also of the block, say which file it is and what it should hold.
+    """
     try:
-        with Path(path).open("rb") as file:
-            _check_npz(file)
-            with np.load(file, allow_pickle=False) as arrays:
-                return dict(arrays)
+        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            yield {name: _value(array) for name, array in arrays.items()}
     except FileNotFoundError:
         raise MissingFileError(f"there is no file {path}: check the path") from None
     except Exception as error:  # zip, its compressions and NumPy raise many kinds
-        raise _holds_none(path, content, error) from None
+        missing = "it has no array " if isinstance(error, KeyError) else ""
+        raise InvalidFileError(
+            f"{path} holds no {content} ({missing}{first_line(error)}): write the file again"
+        ) from error
 
 
-@contextmanager
-def _building(path: str | Path, content: str) -> Iterator[None]:
-    """Say of which file the arrays are that do not make the object."""
-    try:
-        yield
-    except (KeyError, ValueError, TypeError) as error:
-        raise _holds_none(path, content, error) from error
-
-
-def _holds_none(path: str | Path, content: str, error: Exception) -> InvalidFileError:
-    reason = first_line(error)
-    if isinstance(error, KeyError):
-        reason = f"it has no array {reason}"
-    return InvalidFileError(f"{path} holds no {content} ({reason}): write the file again")
-
-
-def _size(array: np.ndarray) -> tuple[int, int]:
-    if array.shape != (2,):
-        raise ValueError(f"an image size has two numbers, not shape {array.shape}")
-    return _integer(array[0]), _integer(array[1])
-
-
-def _integer(array: np.ndarray) -> int:
-    if not np.isfinite(array).all():
-        raise ValueError(f"a whole number is {array}")
-    return int(array)
-
-
-def _check_npz(file: BinaryIO) -> None:
-    """Raise a ValueError where arrays have not the sizes they state: NumPy allocates them first."""
-    length = file.seek(0, os.SEEK_END)
-    with zipfile.ZipFile(file) as archive:
-        for entry in archive.infolist():
-            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise ValueError(f"{entry.filename} is compressed in an unknown way")
-            if entry.file_size > MAX_DEFLATE_RATIO * min(entry.compress_size, length):
-                raise ValueError(f"{entry.filename} states a wrong size")
-            with archive.open(entry) as member:
-                version = np.lib.format.read_magic(member)
-                # Version 3.0 is 2.0 with names of columns in UTF-8, which ours do not have.
-                read_header = (
-                    np.lib.format.read_array_header_1_0
-                    if version == (1, 0)
-                    else np.lib.format.read_array_header_2_0
-                )
-                shape, _, dtype = read_header(member)
-                if math.prod(shape) * dtype.itemsize != entry.file_size - member.tell():
-                    raise ValueError(f"{entry.filename} does not have the size that it states")
-    file.seek(0)
-
-
-def _or_empty(matrix: np.ndarray | None) -> np.ndarray:
-    return np.empty((0, 0)) if matrix is None else matrix
-
-
-def _or_none(matrix: np.ndarray) -> np.ndarray | None:
-    return matrix if matrix.size else None
+def _value(array: np.ndarray) -> Any:
+    """Return an array, or the number or text in one without a shape; None for a matrix of none."""
+    if array.shape == (0, 0):
+        return None
+    return array if array.ndim else array.item()
 
 
 def _format(path: str | Path) -> str:
-    suffix = Path(path).suffix.lower().removeprefix(".")
-    if suffix not in FORMATS:
+    suffix = Path(path).suffix.lower()
+    if suffix not in (".npz", ".csv"):
         raise OptionError(f"{path} must end in .npz or .csv")
     return suffix
-
-
-def _save_npz(path: str | Path, **arrays: np.ndarray) -> None:
-    # Coordinates of dense points shrink to a tenth; NumPy's own level takes five times as long for
-    # a twentieth less.
-    with (
-        atomic_path(path) as temporary,
-        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
-    ):
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, np.asanyarray(array), allow_pickle=False)
 
 
 def _save_csv(path: str | Path, header: str, columns: list[np.ndarray]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -9,7 +10,6 @@ from typing import Any
 
 from .._shared.errors import OptionError, unknown_name
 from .._shared.options import resolve_name_or_path, suggest_keywords
-from .._shared.text_files import read_toml
 from .detectors import DETECTOR_NAMES, DETECTORS, Value, select_detectors
 from .visibility import Visibility, VisibilityChoice
 
@@ -17,10 +17,6 @@ Settings = Mapping[str, Mapping[str, Mapping[str, Value]]]
 """Changed settings by detector, section and parameter, as a settings file holds them."""
 
 SECTIONS: dict[Visibility, str] = {"normal": "normal", "low": "low_visibility"}
-
-MAX_FILE_BYTES = 16_000
-"""Longer settings files are refused: all settings of all detectors take 2,000 bytes, and the time
-to read some files of TOML grows with the square of their length."""
 
 
 @suggest_keywords
@@ -157,10 +153,10 @@ def read_label_settings(path: str | Path) -> LabelOptions:
         OptionError: the file cannot be read, or a name or value is wrong.
     """
     try:
-        content = read_toml(path, MAX_FILE_BYTES)
+        content = tomllib.loads(Path(path).read_text("utf-8-sig"))
     except OSError as error:
         raise OptionError(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise OptionError(f"{path} is no valid TOML file ({error})") from None
     detectors = content.pop("detectors", list(DETECTOR_NAMES))
     try:

@@ -27,7 +27,6 @@ from .._shared.machine import TaskMap, map_in_processes
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
 from .._shared.records import check_same, key, plain
-from .._shared.text_files import read_json
 from ..io.image import load_image
 from ..io.masks import encode_mask, load_mask
 from ..labels import LabelOptions
@@ -44,9 +43,6 @@ from .views import (
 )
 
 INDEX = "shards.json"
-
-MAX_INDEX_BYTES = 1 << 26
-"""Longer indices are refused; a line has some 70 bytes, and stands for hundreds of images."""
 
 Files = tuple[tuple[Path, int], ...]
 
@@ -281,12 +277,12 @@ def _read(path: Path, place: tuple[int, int]) -> bytes:
 def _read_index(folder: Path, options: TrainingOptions) -> Shards:
     """Read the index of shards; an OptionError where they were made with other options."""
     try:
-        index = dict(read_json(folder / INDEX, MAX_INDEX_BYTES))
+        index = dict(json.loads((folder / INDEX).read_bytes()))
         training, validation = (
             tuple((folder / Path(row["file"]).name, int(row["images"])) for row in index[kind])
             for kind in ("training", "validation")
         )
-    except (OSError, KeyError, TypeError, ValueError, OverflowError) as error:
+    except (OSError, KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise _damaged(folder / INDEX, error) from None
     advice = "make the shards and train with the same, or write to another folder"
     check_same(folder / INDEX, index.get("options"), _fixed_options(options), advice)
