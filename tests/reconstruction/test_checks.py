@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
 from deepdetect import DeepDetect, Matches, MatchingOptions, match_images
 from deepdetect._shared.errors import DeepDetectError, ReconstructionError
@@ -22,7 +20,6 @@ from deepdetect.geometry.estimation import TwoViewModel
 from deepdetect.geometry.relative_pose import estimate_relative_pose
 from deepdetect.geometry.two_view import fit_model, has_foreground, is_planar
 from deepdetect.io.image import load_image, luma
-from deepdetect.reconstruction.pipeline import check_images
 from deepdetect.reconstruction.subpixel import refine_matches
 from deepdetect.reconstruction.two_view import check_focal, check_matches, check_pose
 
@@ -60,29 +57,6 @@ def refined(turned: Any, turned_matches: Matches) -> tuple[np.ndarray, np.ndarra
     points0 = turned_matches.points0.astype(float)
     points1, converged = refine_matches(*turned.grays, points0, turned_matches.points1)
     return points0[converged], points1[converged]
-
-
-def test_one_picture_twice(photo: np.ndarray, level: Any, one_line) -> None:
-    again = io.BytesIO()
-    Image.fromarray(photo).save(again, "JPEG", quality=100)
-    for other in (photo, load_image(again.getvalue())):
-        with pytest.raises(ReconstructionError, match="images are the same") as error:
-            check_images(luma(photo), luma(other))
-        one_line(error.value)
-    check_images(*level.grays)
-    check_images(luma(photo), luma(photo)[:-1])
-    for grey in (0, 200):
-        with pytest.raises(ReconstructionError, match="images are the same"):
-            check_images(*np.full((2, 40, 40), grey, np.uint8))
-
-
-@pytest.mark.parametrize("mean", [0.5, 3])
-def test_dark_pairs_are_two_pictures(level: Any, photo: np.ndarray, mean: float, one_line) -> None:
-    factor = mean / level.left.mean()
-    dark = [luma(np.rint(view * factor).astype(np.uint8)) for view in (level.left, level.right)]
-    check_images(*dark)
-    with pytest.raises(ReconstructionError, match="images are the same"):
-        check_images(dark[0], dark[0])
 
 
 @pytest.mark.slow

@@ -332,7 +332,9 @@ def test_a_small_rotation_said_to_be_rectified_gives_no_cloud(
 
 def test_what_is_wrong_is_said(level: Any, one_line: Any, tmp_path: Path) -> None:
     pair = level.left, level.right
-    assert "images are the same" in refusal(one_line, level.left, level.left)
+    again = cv2.imdecode(cv2.imencode(".jpg", level.left)[1], cv2.IMREAD_COLOR)
+    assert "nothing moves between the images" in refusal(one_line, level.left, again)
+    assert "without a baseline" in refusal(one_line, level.left, again, rectified=True)
     assert "left and right exchanged" in refusal(one_line, level.right, level.left)
     assert "no focal length (EXIF)" in refusal(one_line, *pair, focal_px=None)
     assert "not both" in refusal(one_line, *pair, calibration=level.calibration)

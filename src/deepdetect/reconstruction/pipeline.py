@@ -15,7 +15,6 @@ import numpy as np
 
 from .._shared.errors import NoDepthError, ReconstructionError
 from .._shared.image_array import Channels
-from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.progress import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, find_keypoints
@@ -38,16 +37,6 @@ from .rectification import (
 )
 from .result import Reconstruction
 from .two_view import reconstruct_two_view
-
-MAX_MEAN_DIFFERENCE_LEVELS = 0.5
-"""Grey levels by which copies of one image differ in the mean."""
-
-MAX_DIFFERENCE_LEVELS, DIFFERENCE_QUANTILE = 8.0, 0.999
-"""Grey levels by which they differ nearly everywhere: at this fraction of the pixels."""
-
-MAX_DIFFERENCE_TO_GRADIENT = 0.5
-"""The same, as a multiple of what the image differs from itself shifted by a pixel: dark views
-differ by few levels."""
 
 SOR_WINDOW_PX = 9
 """Side of the window of pixels that SOR compares with in rectified pairs."""
@@ -138,7 +127,6 @@ def reconstruct(
     grays = luma(rgb[0]), luma(rgb[1])
     sizes = grays[0].shape[::-1], grays[1].shape[::-1]
     known = _calibration(calibration, focal_px, (left, right), sizes)
-    check_images(*grays)
     timer = StageTimer(progress)
     tentative = rectification = None
     if rectified is None:
@@ -184,19 +172,6 @@ def reconstruct(
         calibration=known,
         seconds=timer.seconds,
     )
-
-
-def check_images(gray0: np.ndarray, gray1: np.ndarray) -> None:
-    """Refuse two copies of one image, also when one was saved again without visible loss."""
-    if gray0.shape != gray1.shape:
-        return
-    difference = cv2.absdiff(gray0, gray1)
-    if difference.mean() >= MAX_MEAN_DIFFERENCE_LEVELS:
-        return
-    gradient = cv2.absdiff(gray0[:, 1:], gray0[:, :-1])
-    limit = MAX_DIFFERENCE_TO_GRADIENT * np.quantile(gradient, DIFFERENCE_QUANTILE)
-    if np.quantile(difference, DIFFERENCE_QUANTILE) <= min(MAX_DIFFERENCE_LEVELS, limit):
-        raise NoDepthError("both images are the same: depth needs two images from two places")
 
 
 def _from_disparities(

@@ -97,8 +97,6 @@ class Rectification:
         matches: number of matches that were used.
         vertical_offset: median of y in the second less y in the first image, in pixels, of those
             that the fundamental matrix explains.
-        line_angle: largest angle between a row and an epipolar line, in degrees, at the corners
-            of the second image; NaN without a fundamental matrix.
         disparities: 5th percentile, median and 95th percentile of those on rows, in pixels; NaN
             when there are none.
     """
@@ -111,7 +109,6 @@ class Rectification:
     by_other_rows: int
     matches: int
     vertical_offset: float
-    line_angle: float
     disparities: tuple[float, float, float]
 
 
@@ -238,7 +235,6 @@ def detect_rectification(
         by_other_rows=by_other_rows,
         matches=len(indices),
         vertical_offset=vertical_offset,
-        line_angle=_line_angle(epipolar.matrix, size0),
         disparities=(float(spread[0]), float(spread[1]), float(spread[2])),
     )
 
@@ -270,32 +266,21 @@ def _best_other_rows(
     return best
 
 
-def _line_angle(fundamental: np.ndarray | None, size: tuple[int, int]) -> float:
-    """Return the largest angle between a row and an epipolar line at the corners, in degrees."""
-    if fundamental is None:
-        return float("nan")
-    width, height = size
-    corners = np.array([[x, y, 1.0] for x in (0, width - 1) for y in (0, height - 1)])
-    lines = corners @ fundamental.T
-    return float(np.degrees(np.arctan2(np.abs(lines[:, 0]), np.abs(lines[:, 1]))).max())
-
-
 def check_cameras(calibration: Calibration) -> None:
     """Refuse a calibration that no rectified pair has: focal lengths or cy of both views differ."""
     camera0, camera1 = calibration.camera0, calibration.camera1
-    advice = f"fix the calibration ({calibration.source}), or pass `rectified=False`"
-    for focal0, focal1 in zip(camera0.focal_px, camera1.focal_px, strict=True):
-        if abs(focal1 - focal0) > MAX_FOCAL_DIFFERENCE_FRACTION * focal0:
+    pairs = [
+        ("the focal lengths", focal0, focal1, MAX_FOCAL_DIFFERENCE_FRACTION * focal0)
+        for focal0, focal1 in zip(camera0.focal_px, camera1.focal_px, strict=True)
+    ]
+    pairs.append(("cy", camera0.centre[1], camera1.centre[1], MAX_CY_DIFFERENCE_PX))
+    for name, value0, value1, most in pairs:
+        if abs(value1 - value0) > most:
             raise ReconstructionError(
-                f"the focal lengths of the left and the right view are {focal0:g} and {focal1:g} "
-                f"px, those of a rectified pair are one: {advice}"
+                f"{name} of the left and the right view are {value0:g} and {value1:g} px, those of "
+                f"a rectified pair are one: fix the calibration ({calibration.source}), or pass "
+                "`rectified=False`"
             )
-    cy0, cy1 = camera0.centre[1], camera1.centre[1]
-    if abs(cy1 - cy0) > MAX_CY_DIFFERENCE_PX:
-        raise ReconstructionError(
-            f"cy of the left and the right view are {cy0:g} and {cy1:g} px, those of a rectified "
-            f"pair are one: {advice}"
-        )
 
 
 def check_disparities(disparity: np.ndarray) -> None:
