@@ -217,7 +217,6 @@ def test_results_of_other_photographs_are_not_replaced_silently(run, folder: Pat
 
 
 CASES = {
-    "identical images": ("left left --focal 995", "nothing moves between the images", 3),
     "a calibration of another size": (
         "left right --calibration {}/other-size.json",
         "images of 800x",

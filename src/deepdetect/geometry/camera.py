@@ -17,10 +17,9 @@ Other keys are ignored. The names follow the calib.txt of Middlebury 2014, where
 from __future__ import annotations
 
 import json
-import math
 import reprlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,22 +65,20 @@ class Camera:
         focal_px: float | Sequence[float],
         centre: Sequence[float] | None = None,
     ) -> None:
-        width, height = _pair("the image size", size)
+        width, height = _numbers("the image size", size, 2)
         if min(width, height) < 1:
             raise ReconstructionError(f"an image size must be positive, not {size}")
-        single = not isinstance(focal_px, (list, tuple)) and np.ndim(focal_px) == 0
-        focal = _pair("the focal length", (focal_px, focal_px) if single else focal_px)
+        focal = _numbers("the focal length", focal_px, 2)
         if min(focal) <= 0:
             raise ReconstructionError(
                 f"the focal length must be above 0 pixels, not {min(focal):g}: give it in pixels "
                 "of this image"
             )
-        middle = ((width - 1) / 2, (height - 1) / 2)
+        if centre is None:
+            centre = (width - 1) / 2, (height - 1) / 2
         object.__setattr__(self, "size", (int(width), int(height)))
         object.__setattr__(self, "focal_px", focal)
-        object.__setattr__(
-            self, "centre", middle if centre is None else _pair("the principal point", centre)
-        )
+        object.__setattr__(self, "centre", _numbers("the principal point", centre, 2))
 
     @property
     def matrix(self) -> np.ndarray:
@@ -130,7 +127,7 @@ class Calibration:
     def __post_init__(self) -> None:
         if self.baseline_mm is None:
             return
-        baseline = _number("the baseline", self.baseline_mm)
+        (baseline,) = _numbers("the baseline", self.baseline_mm, 1)
         if baseline <= 0:
             raise ReconstructionError(
                 f"the baseline must be above 0 mm, not {baseline:g}: two images from one place "
@@ -165,9 +162,10 @@ class Calibration:
         """Raise `ReconstructionError` unless it is for images of these (width, height)."""
         for name, camera, size in (("left", self.camera0, size0), ("right", self.camera1, size1)):
             if camera.size != tuple(size):
+                known, own = (f"{width}x{height}" for width, height in (camera.size, size))
                 raise ReconstructionError(
-                    f"the calibration is for images of {_text(camera.size)} pixels, the {name} "
-                    f"image has {_text(size)}: give the calibration of this size"
+                    f"the calibration is for images of {known} pixels, the {name} image has {own}: "
+                    "give the calibration of this size"
                 )
 
 
@@ -206,12 +204,13 @@ def _calibration(values: Any, size0: Size, size1: Size, source: str) -> Calibrat
         of_view = values.get(name, {})
         if not isinstance(of_view, dict):
             raise ReconstructionError(f'"{name}" must be an object, as {{"cx": 320}}')
-        views.append({**values, **of_view})
+        together = {**values, **of_view}
+        views.append({key: value for key, value in together.items() if value is not None})
     left, right = views
     camera0 = _camera(left, size0)
     offset = values.get("disparity_offset_px")
     if offset is not None:
-        offset = _number("disparity_offset_px", offset)
+        (offset,) = _numbers("disparity_offset_px", offset, 1)
         if "cx" not in values.get("right", {}):
             right["cx"] = camera0.centre[0] + offset
     calibration = Calibration(camera0, _camera(right, size1), values.get("baseline_mm"), source)
@@ -227,40 +226,24 @@ def _calibration(values: Any, size0: Size, size1: Size, source: str) -> Calibrat
 
 def _camera(view: dict[str, Any], size: Size) -> Camera:
     """Return one view's camera; defaults come from the image."""
-    if view.get("focal_px") is None:
+    if "focal_px" not in view:
         raise ReconstructionError('it has no "focal_px": add the focal length in pixels')
-
-    def number(name: str, default: float) -> float:
-        return default if view.get(name) is None else _number(name, view[name])
-
-    width, height = number("width", size[0]), number("height", size[1])
-    centre = number("cx", (width - 1) / 2), number("cy", (height - 1) / 2)
-    return Camera((width, height), view["focal_px"], centre)
+    own = view.get("width", size[0]), view.get("height", size[1])
+    camera = Camera(own, view["focal_px"])
+    centre = view.get("cx", camera.centre[0]), view.get("cy", camera.centre[1])
+    return replace(camera, centre=centre)
 
 
-def _pair(name: str, value: Any) -> tuple[float, float]:
+def _numbers(name: str, value: Any, count: int) -> tuple[float, ...]:
+    """Return so many finite numbers: those of a value, or one number for all."""
     try:
-        first, second = value
+        numbers = np.broadcast_to(value, count).astype(np.float64, casting="same_kind")
     except (TypeError, ValueError):
-        shown = reprlib.repr(value)
-        raise ReconstructionError(f"{name} must be one or two numbers, not {shown}") from None
-    return _number(name, first), _number(name, second)
-
-
-def _number(name: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
-        raise ReconstructionError(f"{name} must be a number, not {reprlib.repr(value)}")
-    try:
-        number = float(value)
-    except OverflowError:  # an integer of over 308 digits
-        number = math.inf
-    if not math.isfinite(number):
-        raise ReconstructionError(f"{name} must be finite, not {number}")
-    return number
-
-
-def _text(size: Size) -> str:
-    return f"{size[0]}x{size[1]}"
+        numbers = np.full(count, np.nan)
+    if not np.isfinite(numbers).all():
+        wanted = "a finite number" if count == 1 else "one or two finite numbers"
+        raise ReconstructionError(f"{name} must be {wanted}, not {reprlib.repr(value)}")
+    return tuple(numbers.tolist())
 
 
 def fundamental_matrix(

@@ -20,6 +20,7 @@ from .._shared.opencv import cv2
 from .transforms import transform_points
 
 Size = tuple[int, int]
+Both = tuple[np.ndarray, np.ndarray]
 
 MAX_STRETCH = 2.0
 """A planar frame may stretch or shrink a part of a view by this factor, relative to its middle;
@@ -155,66 +156,57 @@ def rectified_frame(
     A planar frame where one distorts the views, of these (width, height), little, else a polar one;
     None where neither is possible.
     """
-    points0, points1 = (np.asarray(points, np.float64) for points in (points0, points1))
+    points = np.asarray(points0, np.float64), np.asarray(points1, np.float64)
     if len(points0) < 8:
         return None
-    pair = points0, points1, fundamental, size0, size1
-    return _planar_frame(*pair) or _polar_frame(*pair)
+    sizes = size0, size1
+    return _planar_frame(points, fundamental, sizes) or _polar_frame(points, fundamental, sizes)
 
 
 def _planar_frame(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    fundamental: np.ndarray,
-    size0: Size,
-    size1: Size,
+    points: Both, fundamental: np.ndarray, sizes: tuple[Size, Size]
 ) -> PlanarFrame | None:
     """Rectify by homographies, or return None where they distort too much."""
-    success, *matrices = cv2.stereoRectifyUncalibrated(
-        points0, points1, fundamental, size0, threshold=0
-    )
+    success, *matrices = cv2.stereoRectifyUncalibrated(*points, fundamental, sizes[0], threshold=0)
     if not success or not all(np.isfinite(matrix).all() for matrix in matrices):
         return None
-    corners = _corners(size0), _corners(size1)
-    middles = np.median(points0, axis=0), np.median(points1, axis=0)
+    corners = [_corners(size) for size in sizes]
+    middles = [np.median(of_view, axis=0) for of_view in points]
     for matrix, border, middle in zip(matrices, corners, middles, strict=True):
         depth = (border @ matrix[2, :2] + matrix[2, 2]) / (middle @ matrix[2, :2] + matrix[2, 2])
         # Lengths across the line at infinity change with the square of this.
         if depth.min() <= 0 or max(depth.max(), 1 / depth.min()) ** 2 > MAX_STRETCH**2:
             return None
-    jacobian = _jacobian(matrices[0], middles[0])
-    if np.linalg.det(jacobian) <= 0 or np.linalg.det(_jacobian(matrices[1], middles[1])) <= 0:
+    jacobians = [_jacobian(*each) for each in zip(matrices, middles, strict=True)]
+    areas = np.linalg.det(jacobians)
+    if areas.min() <= 0:
         return None
-    scale = 1 / np.sqrt(np.linalg.det(jacobian))  # the first view keeps its size
-    if jacobian[0, 0] < 0:  # upside down
+    scale = 1 / np.sqrt(areas[0])  # the first view keeps its size
+    if jacobians[0][0, 0] < 0:  # upside down
         scale = -scale
     first, second = (np.diag([scale, scale, 1]) @ matrix for matrix in matrices)
-    moved = transform_points(points0, first) - transform_points(points1, second)
+    moved = transform_points(points[0], first) - transform_points(points[1], second)
     second = _translation(np.round(np.median(moved[:, 0])), 0) @ second
     borders = np.stack([transform_points(corners[0], first), transform_points(corners[1], second)])
     (left, _), (right, _) = borders.min(axis=(0, 1)), borders.max(axis=(0, 1))
     top, bottom = borders[..., 1].min(axis=1).max(), borders[..., 1].max(axis=1).min()
     width, height = int(np.ceil(right - left)) + 1, int(np.ceil(bottom - top)) + 1
-    if height < 2 or width * height > MAX_AREA * max(np.prod(size0), np.prod(size1)):
+    if height < 2 or width * height > MAX_AREA * np.prod(sizes, axis=1).max():
         return None
     shift = _translation(-np.floor(left), -np.floor(top))
     return PlanarFrame((shift @ first, shift @ second), (width, height))
 
 
 def _polar_frame(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    fundamental: np.ndarray,
-    size0: Size,
-    size1: Size,
+    points: Both, fundamental: np.ndarray, sizes: tuple[Size, Size]
 ) -> PolarFrame | None:
     """Rectify about the epipoles, or return None where one lies at infinity."""
     left, _, right = np.linalg.svd(fundamental)
     if min(abs(right[2, 2]), abs(left[2, 2])) < 1e-12:
         return None
     epipoles = right[2, :2] / right[2, 2], left[:2, 2] / left[2, 2]
-    border = _corners(size0) - epipoles[0]
-    wrapped = bool(((epipoles[0] > 0) & (epipoles[0] < np.array(size0) - 1)).all())
+    border = _corners(sizes[0]) - epipoles[0]
+    wrapped = bool(((epipoles[0] > 0) & (epipoles[0] < np.array(sizes[0]) - 1)).all())
     middle, first_angle, last_angle = 0.0, -np.pi, np.pi
     if not wrapped:
         centre = border.mean(axis=0)
@@ -222,20 +214,21 @@ def _polar_frame(
         angles = np.arctan2(border[:, 1], border[:, 0]) - middle
         relative = (angles + np.pi) % (2 * np.pi) - np.pi
         first_angle, last_angle = float(relative.min()), float(relative.max())
-    pixels = np.mgrid[0 : size0[0] : 16, 0 : size0[1] : 16].reshape(2, -1).T - epipoles[0]
+    width, height = sizes[0]
+    pixels = np.mgrid[0:width:16, 0:height:16].reshape(2, -1).T - epipoles[0]
     radii = np.hypot(*pixels.T)
     step = 1 / max(float(np.quantile(radii, RESOLVED_QUANTILE)), 1.0)
     farthest = max(
         np.hypot(*(_corners(size) - epipole).T).max()
-        for size, epipole in zip((size0, size1), epipoles, strict=True)
+        for size, epipole in zip(sizes, epipoles, strict=True)
     )
     nearest = MIN_RADIUS_PX if wrapped else max(float(radii.min()), MIN_RADIUS_PX)
     width = int(np.ceil(np.log(farthest / nearest) / step)) + 1
     size = width, int(np.ceil((last_angle - first_angle) / step)) + 1
     frame = PolarFrame(fundamental, epipoles, 1.0, middle, first_angle, step, nearest, size)
     # The half-line on which the matches lie.
-    angles = np.arctan2(*(points0 - epipoles[0]).T[::-1])
-    along = (frame._directions(angles, 1) * (points1 - epipoles[1])).sum(axis=1)
+    angles = np.arctan2(*(points[0] - epipoles[0]).T[::-1])
+    along = (frame._directions(angles, 1) * (points[1] - epipoles[1])).sum(axis=1)
     return frame if np.median(np.sign(along)) >= 0 else replace(frame, orientation=-1.0)
 
 

@@ -11,6 +11,9 @@ from .camera import Calibration, fundamental_matrix
 from .estimation import GeometryOptions, estimate_geometry
 from .transforms import epipolar_errors, signed_epipolar_errors
 
+Pose = tuple[np.ndarray, np.ndarray]
+"""Rotation (3, 3) and translation (3,): X1 = rotation @ X0 + translation."""
+
 BLOCK = 100_000
 """Matches that are triangulated at once: a score of arrays of millions would fill the memory."""
 
@@ -207,7 +210,7 @@ def estimate_relative_pose(
     if not kept.any():
         return None
     sample = _evenly(np.flatnonzero(kept))
-    ratio = _cheirality_ratio(points0[sample], points1[sample], calibration, *pose)
+    ratio = _cheirality_ratio(points0[sample], points1[sample], calibration, pose)
     return RelativePose(*pose, inliers=kept, errors=errors, cheirality_ratio=ratio)
 
 
@@ -226,7 +229,7 @@ def refine_pose(
     """
     points0, points1 = _evenly(points0), _evenly(points1)
 
-    def residuals(pose: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    def residuals(pose: Pose) -> np.ndarray:
         return signed_epipolar_errors(points0, points1, fundamental_matrix(calibration, *pose))
 
     def cost(values: np.ndarray) -> float:
@@ -253,9 +256,7 @@ def refine_pose(
     return pose
 
 
-def moved_pose(
-    pose: tuple[np.ndarray, np.ndarray], change: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def moved_pose(pose: Pose, change: np.ndarray) -> Pose:
     """Return a pose near another: a change of 5 angles in radians.
 
     Three rotate the rotation, two move the translation, of length 1, across itself.
@@ -289,18 +290,13 @@ def best_of_four(
         for rotation in (rotation0, rotation1)
         for sign in (1, -1)
     ]
-    return max(poses, key=lambda pose: _cheirality_ratio(points0, points1, calibration, *pose))
+    return max(poses, key=lambda pose: _cheirality_ratio(points0, points1, calibration, pose))
 
 
 def _cheirality_ratio(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    calibration: Calibration,
-    rotation: np.ndarray,
-    translation: np.ndarray,
+    points0: np.ndarray, points1: np.ndarray, calibration: Calibration, pose: Pose
 ) -> float:
-    in_front = triangulate(points0, points1, calibration, rotation, translation).cheirality
-    return float(in_front.mean())
+    return float(triangulate(points0, points1, calibration, *pose).cheirality.mean())
 
 
 def _evenly(rows: np.ndarray) -> np.ndarray:
