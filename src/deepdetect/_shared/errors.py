@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 
 class DeepDetectError(Exception):
@@ -154,6 +155,19 @@ def require_packages(what: str, *packages: str) -> None:
             f"{what} needs the package {' and '.join(missing)}, which is not installed: "
             f"run {install_command(*missing)}"
         )
+
+
+@contextmanager
+def noted_failures(name: str, failures: list[str]) -> Iterator[None]:
+    """Note what is wrong with this one of many inputs; raise what concerns all of them."""
+    try:
+        yield
+    except (MissingExtraError, WeightsError):
+        raise
+    except DeepDetectError as error:
+        failures.append(str(error) if name in str(error) else f"{name}: {error}")
+    except MemoryError:
+        failures.append(f"{name}: there is not enough memory for it: use a smaller image")
 
 
 for _error in (

@@ -15,10 +15,8 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from .._shared.errors import DeepDetectError, MissingExtraError, WeightsError
-from .._shared.machine import TaskMap
+from .._shared.errors import noted_failures
 from .._shared.options import suggest_keywords
-from .._shared.progress import progress
 from .._shared.records import file_state
 from ..detector.detector import DeepDetect, check_selection, find_keypoints
 from ..detector.heatmap import MAX_AUTO_PIXELS
@@ -28,11 +26,7 @@ from ..features.selection import SelectionOptions
 from ..features.sift import describe_keypoints
 from ..io.image import find_images, load_image, luma
 from ..io.image_file import megapixel_limit
-from .engines import get_engine
-from .hdf5 import BatchReport, Group, ShardedWriter, State, write_groups
-
-IMAGES_PER_SHARD = 16
-"""At most: what a killed worker loses, against the number of files."""
+from .hdf5 import BatchReport, Group, Item, State, fill_file
 
 DESCRIPTOR = "rootsift"
 
@@ -92,75 +86,61 @@ def extract_features(
         >>> if __name__ == "__main__":  # doctest: +SKIP
         ...     extract_features("images", "features.h5").check()
     """
-    map_tasks: TaskMap = get_engine(engine)
     check_selection(detector, selection)
-    root, target = Path(folder).absolute(), Path(path).absolute()
+    root = Path(folder).absolute()
     names = [image.relative_to(root).as_posix() for image in find_images(root)]
     utf8 = [name for name in names if name == name.encode("utf-8", "ignore").decode()]
-    states = {name: file_state(root / name) for name in utf8}
-    failures = [f"{name}: its name is not UTF-8: rename it" for name in names if name not in states]
     settings = {
         **detector.settings,
         **({} if selection is None else vars(selection)),
         "descriptor": DESCRIPTOR,
         "version": __version__,
     }
-    work = partial(
-        _extract_shard,
-        root=root,
-        selection=selection,
-        detector=detector,
-        # Other processes do not know that of the command.
-        max_megapixels=megapixel_limit(max_megapixels),
+    report = fill_file(
+        path,
+        settings,
+        {name: {name: file_state(root / name)} for name in utf8},
+        partial(
+            _extract,
+            root=root,
+            selection=selection,
+            detector=detector,
+            # Other processes do not know that of the command.
+            max_megapixels=megapixel_limit(max_megapixels),
+        ),
+        of="images",
+        others_stay=lambda _: False,
+        engine=engine,
+        workers=workers,
+        overwrite=overwrite,
+        quiet=quiet,
     )
-    list(map_tasks(work, [], workers))  # what the engine lacks is said before a file is made
-    with ShardedWriter(target, settings, overwrite).opened() as file:
-        done = file.done(states)
-        left = [(name, state) for name, state in states.items() if name not in done]
-        with progress(len(states), "extracting", "image", quiet, len(done)) as bar:
-            tasks = file.tasks(left, IMAGES_PER_SHARD)
-            counts, failed = file.collect(map_tasks(work, tasks, workers), bar)
-        file.merge(quiet, {*done, *counts}.__contains__)
-    told = tuple(sorted([*failures, *failed]))
-    return BatchReport(Path(path), dict(sorted(counts.items())), len(done), told, "images")
+    unnamed = [f"{n}: its name is not UTF-8: rename it" for n in names if n not in utf8]
+    return replace(report, failures=(*unnamed, *report.failures))
 
 
-def _extract_shard(
-    task: tuple[Path, Sequence[tuple[str, State]]],
+def _extract(
+    images: Sequence[Item],
+    counts: dict[str, int],
+    failures: list[str],
     root: Path,
     detector: DeepDetect | PointDetector,
     selection: SelectionOptions | None,
     max_megapixels: float,
-) -> tuple[dict[str, int], list[str]]:
-    """Write a shard; return the number of keypoints by image, and what could not be done."""
-    path, images = task
-    counts: dict[str, int] = {}
-    failures: list[str] = []
-
-    def groups() -> Iterator[Group]:
-        for name, state in images:
-            try:
-                rgb = load_image(root / name, max_megapixels=max_megapixels)
-                gray = luma(rgb)
-                keypoints = describe_keypoints(gray, find_keypoints(detector, rgb, selection))
-            except (MissingExtraError, WeightsError):  # concern all images
-                raise
-            except DeepDetectError as error:
-                failures.append(str(error) if name in str(error) else f"{name}: {error}")
-                continue
-            except MemoryError:
-                failures.append(f"{name}: there is not enough memory for it: use a smaller image")
-                continue
+) -> Iterator[Group]:
+    """Make the groups of images, with their numbers of keypoints."""
+    for name, state in images:
+        with noted_failures(name, failures):
+            rgb = load_image(root / name, max_megapixels=max_megapixels)
+            gray = luma(rgb)
+            keypoints = describe_keypoints(gray, find_keypoints(detector, rgb, selection))
             # Of a pixel of the image that they were found on.
             scaled = detector.settings["resolution"] != "native" and gray.size > MAX_AUTO_PIXELS
             uncertainty = math.sqrt(gray.size / MAX_AUTO_PIXELS) if scaled else 1.0
             column, row = np.rint(keypoints.xy).astype(np.int64).T
             group = feature_group(name, keypoints, state, uncertainty)
-            yield replace(group, arrays={**group.arrays, "colors": rgb[row, column]})
             counts[name] = len(keypoints)
-
-    write_groups(path, groups())
-    return counts, failures
+            yield replace(group, arrays={**group.arrays, "colors": rgb[row, column]})
 
 
 def feature_group(

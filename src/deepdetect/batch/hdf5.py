@@ -17,6 +17,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,7 @@ from .._shared.errors import (
 )
 from .._shared.progress import progress
 from .._shared.records import check_same, key, lock, plain
+from .engines import get_engine
 
 SETTINGS = "deepdetect"
 """Attribute of the file: what its content depends on besides the inputs, as JSON."""
@@ -44,12 +46,17 @@ STATE = "source_state"
 FORMAT = ("v110", "v110")
 """Of the files: read by HDF5 1.10 (2016) and later; groups of a million members stay fast."""
 
-
 MIN_SHARDS = 256
 """Of as many inputs, so that all workers have something to do."""
 
+LARGEST_SHARD = 32
+"""Inputs of one: what a killed worker loses, against the number of files."""
+
 State = tuple[int, ...]
 """Of an input of a group: whole numbers that change when it does."""
+
+Item = tuple[Any, State]
+"""An input by its name, with its state."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +70,10 @@ class Group:
     arrays: Mapping[str, np.ndarray]
     state: State = ()
     attributes: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+
+MakeGroups = Callable[[Sequence[Item], dict[Any, int], list[str]], Iterator[Group]]
+"""Makes the groups of inputs one by one; notes a count or a failure for each input."""
 
 
 @dataclass(frozen=True)
@@ -173,118 +184,122 @@ def state_of(group: Any) -> State:
     return tuple(int(number) for number in group.attrs.get(STATE, ()))
 
 
-class ShardedWriter:
-    """Writes an HDF5 file by shards, in PATH.shards beside it, which many processes may fill.
+def fill_file(
+    path: str | Path,
+    settings: Mapping[str, Any],
+    wanted: Mapping[Any, Mapping[str, State]],
+    make: MakeGroups,
+    *,
+    of: str,
+    others_stay: Callable[[str], bool],
+    engine: str,
+    workers: int | None,
+    overwrite: bool,
+    quiet: bool,
+) -> BatchReport:
+    """Make the groups that are wanted and not in the file yet, in the processes of an engine.
 
-    Settings are all that the content depends on besides the inputs; shards of others are not used.
+    The settings are all that the content depends on besides the inputs; shards of others are not
+    used. Of an input any of its groups will do, of the state that is named; the first is made.
+    `others_stay` says which groups of other inputs, and of inputs that fail, stay in the file.
     """
-
-    def __init__(self, path: Path, settings: Mapping[str, Any], overwrite: bool = False) -> None:
-        self.path = path
-        self.folder = path.with_name(path.name + ".shards")
-        self.settings = plain(settings)
-        self.shards = self.folder / key(settings)
-        self.keep = path.exists() and not overwrite
-
-    @contextmanager
-    def opened(self) -> Iterator[ShardedWriter]:
-        """Hold the file for this process.
-
-        An OptionError says that it was made with other settings or by another program, or is being
-        made by another process.
-        """
-        import_h5py()
-        if self.path.is_dir():
-            raise OptionError(f"{self.path} is a folder: name a file in it with -o")
-        if self.keep:
-            with open_hdf5(self.path) as file:
-                noted = file.attrs.get(SETTINGS)
-                check_same(self.path, None if noted is None else json.loads(noted), self.settings)
-        try:
-            self.shards.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise DeepDetectError(
-                f"cannot write {self.shards} ({error.strerror}): choose another place with -o"
-            ) from error
-        with lock(self.folder / "lock", self.path):
-            yield self
-
-    def done(self, wanted: Mapping[str, State]) -> set[str]:
-        """Return which groups are in the file or in shards with the states that are wanted."""
-        found: set[str] = set()
-        for path in [self.path] * self.keep + self._shard_files():
-            with open_hdf5(path) as file:
-                for name, group in _leaves(file):
-                    found -= {name}
-                    if wanted.get(name) == state_of(group):
-                        found.add(name)
-        return found
-
-    def shard(self, names: Sequence[Any]) -> Path:
-        """Return the file for the shard of these inputs: the same names give the same file."""
-        return self.shards / f"{key(names)}.h5"
-
-    def tasks(
-        self, items: Sequence[tuple[Any, State]], most: int
-    ) -> list[tuple[Path, Sequence[tuple[Any, State]]]]:
-        """Divide inputs and their states into shards of at most so many, or fewer of a few."""
-        size = min(most, max(1, len(items) // MIN_SHARDS))
-        shards = [items[k : k + size] for k in range(0, len(items), size)]
-        return [(self.shard([name for name, _ in shard]), shard) for shard in shards]
-
-    @staticmethod
-    def collect(
-        outcomes: Iterable[tuple[dict[Any, int], list[str]]], bar: Any
-    ) -> tuple[dict[Any, int], list[str]]:
-        """Join the counts and the failures of shards as they are made."""
+    import_h5py()
+    map_tasks, work = get_engine(engine), partial(_write_shard, make=make)
+    list(map_tasks(work, [], workers))  # what the engine lacks is said before a file is made
+    target, settings = Path(path).absolute(), plain(settings)
+    if target.is_dir():
+        raise OptionError(f"{target} is a folder: name a file in it with -o")
+    before = [target] if target.exists() and not overwrite else []
+    for kept in before:
+        with open_hdf5(kept) as file:
+            noted = file.attrs.get(SETTINGS)
+            check_same(kept, None if noted is None else json.loads(noted), settings)
+    folder = target.with_name(target.name + ".shards")
+    shards = folder / key(settings)
+    try:
+        shards.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DeepDetectError(
+            f"cannot write {shards} ({error.strerror}): choose another place with -o"
+        ) from error
+    with lock(folder / "lock", target):
+        states = _states(before + _shard_files(shards))
+        left = [
+            (name, next(iter(groups.values())))
+            for name, groups in wanted.items()
+            if not any(states.get(group) == state for group, state in groups.items())
+        ]
+        skipped = len(wanted) - len(left)
         counts: dict[Any, int] = {}
         failures: list[str] = []
-        for made, failed in outcomes:
-            bar.update(len(made) + len(failed))
-            counts |= made
-            failures += failed
-        return counts, failures
-
-    def merge(self, quiet: bool = True, stays: Callable[[str], bool] = lambda name: True) -> None:
-        """Merge all shards into the file, and remove them; `stays` says which groups may be in it.
-
-        Where the file cannot be written the shards stay.
-        """
-        shards, removed = self._shard_files(), []
-        if self.keep:
-            with open_hdf5(self.path) as file:
-                removed = [name for name, _ in _leaves(file) if not stays(name)]
-        if shards or removed:
-            with atomic_path(self.path) as temporary:
-                if self.keep:
-                    shutil.copyfile(self.path, temporary)
+        with progress(len(wanted), of, of.removesuffix("s"), quiet, skipped) as bar:
+            for made, failed in map_tasks(work, _divided(left, shards), workers):
+                bar.update(len(made) + len(failed))
+                counts |= made
+                failures += failed
+        lacking = {name for name, _ in left} - counts.keys()
+        stay = {group for name in wanted if name not in lacking for group in wanted[name]}
+        gone = [name for name in states if not (name in stay or others_stay(name))]
+        new = _shard_files(shards)
+        if new or gone:
+            with atomic_path(target) as temporary:
+                for kept in before:
+                    shutil.copyfile(kept, temporary)
                 with (
-                    progress(len(shards), "merging", "shard", quiet) as bar,
-                    _written(temporary, "r+" if self.keep else "w") as merged,
+                    progress(len(new), "merging", "shard", quiet) as bar,
+                    _written(temporary, "r+" if before else "w") as merged,
                 ):
-                    merged.attrs[SETTINGS] = json.dumps(self.settings)
-                    for name in removed:
-                        del merged[name]
-                    for shard in shards:
-                        _copy_groups(shard, merged, stays)
+                    merged.attrs[SETTINGS] = json.dumps(settings)
+                    for shard in new:
+                        _copy_groups(shard, merged)
                         bar.update(1)
+                    for name in filter(merged.__contains__, gone):
+                        del merged[name]
         with contextlib.suppress(OSError):  # what stays is merged again, to no effect
-            shutil.rmtree(self.folder)
-
-    def _shard_files(self) -> list[Path]:
-        """List the shards, older ones first: newer ones replace what they hold."""
-        shards = [path for path in self.shards.glob("*.h5") if not path.name.startswith(".")]
-        return sorted(shards, key=lambda path: (path.stat().st_mtime_ns, path.name))
+            shutil.rmtree(folder)
+    return BatchReport(Path(path), dict(sorted(counts.items())), skipped, (*sorted(failures),), of)
 
 
-def _copy_groups(shard: Path, merged: Any, stays: Callable[[str], bool]) -> None:
+def _shard_files(folder: Path) -> list[Path]:
+    """List the shards, older ones first: newer ones replace what they hold."""
+    shards = [path for path in folder.glob("*.h5") if not path.name.startswith(".")]
+    return sorted(shards, key=lambda path: (path.stat().st_mtime_ns, path.name))
+
+
+def _states(files: Sequence[Path]) -> dict[str, State]:
+    """Return the states of all groups."""
+    states: dict[str, State] = {}
+    for path in files:
+        with open_hdf5(path) as file:
+            states |= {name: state_of(group) for name, group in _leaves(file)}
+    return states
+
+
+def _divided(items: Sequence[Item], folder: Path) -> list[tuple[Path, Sequence[Item]]]:
+    """Divide inputs into shards; the same names give the same file."""
+    size = min(LARGEST_SHARD, max(1, len(items) // MIN_SHARDS))
+    parts = [items[k : k + size] for k in range(0, len(items), size)]
+    return [(folder / f"{key([name for name, _ in part])}.h5", part) for part in parts]
+
+
+def _write_shard(
+    task: tuple[Path, Sequence[Item]], make: MakeGroups
+) -> tuple[dict[Any, int], list[str]]:
+    """Write a shard; return the counts of its inputs, and what could not be done."""
+    path, items = task
+    counts: dict[Any, int] = {}
+    failures: list[str] = []
+    write_groups(path, make(items, counts, failures))
+    return counts, failures
+
+
+def _copy_groups(shard: Path, merged: Any) -> None:
     """Copy the groups of a shard, in the place of those of the same name."""
     with open_hdf5(shard) as file:
         for name, group in _leaves(file):
-            if stays(name):
-                if name in merged:
-                    del merged[name]
-                file.copy(group, merged, name=name)
+            if name in merged:
+                del merged[name]
+            file.copy(group, merged, name=name)
 
 
 def _leaves(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,34 +12,28 @@ import numpy as np
 from natsort import natsorted, ns
 
 from .. import __version__
-from .._shared.errors import InvalidFileError, OptionError
-from .._shared.machine import TaskMap
+from .._shared.errors import InvalidFileError, OptionError, noted_failures
 from .._shared.options import check_ranges, look_up, suggest_keywords
-from .._shared.progress import progress
 from .._shared.records import key
 from ..features.keypoints import Keypoints
 from ..features.matchers import MATCHERS
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
 from ..matching.pipeline import match_features
-from .engines import get_engine
 from .extraction import DESCRIPTOR, keypoints_of
 from .hdf5 import (
     SETTINGS,
     BatchReport,
     Group,
-    ShardedWriter,
+    Item,
     State,
     damaged,
     feature_names,
+    fill_file,
     open_hdf5,
     state_of,
-    write_groups,
 )
 from .pair_list import Pair, check_pairs, pair_name, read_pairs, sequential_pairs
-
-PAIRS_PER_SHARD = 64
-"""At most."""
 
 MATCHERS_OF_FLOATS = {name: MATCHERS[name] for name in MATCHERS if name != "hamming"}
 """Features in files are no bits."""
@@ -130,8 +124,7 @@ def match_pairs(
         >>> if __name__ == "__main__":  # doctest: +SKIP
         ...     match_pairs("features.h5", "pairs.txt", "matches.h5").check()
     """
-    map_tasks: TaskMap = get_engine(engine)
-    source, target = Path(features).absolute(), Path(path).absolute()
+    source = Path(features).absolute()
     if sequential < 1:
         raise OptionError(f"`sequential` must be at least 1, not {sequential}")
     if pairs in ("exhaustive", "sequential"):
@@ -140,24 +133,28 @@ def match_pairs(
         listed = sequential_pairs(names, len(names) if pairs == "exhaustive" else sequential)
     else:
         listed = read_pairs(pairs) if isinstance(pairs, (str, Path)) else check_pairs(pairs)
-    if source == target:
+    if source == Path(path).absolute():
         raise OptionError(f"{path} holds the features: give the matches another file with -o")
     found, failures, gone, made_with = _find_pairs(source, listed)
-    settings = {**vars(options), "features": made_with, "version": __version__}
-    work = partial(_match_shard, features=source, options=options)
-    list(map_tasks(work, [], workers))  # what the engine lacks is said before a file is made
-    with ShardedWriter(target, settings, overwrite).opened() as file:
-        turned = {pair[::-1]: states[::-1] for pair, states in found.items()}
-        wanted = {pair_name(*pair): sum(states, ()) for pair, states in (turned | found).items()}
-        done = file.done(wanted)
-        left = [p for p in found if done.isdisjoint((pair_name(*p), pair_name(*p[::-1])))]
-        items = [(pair, wanted[pair_name(*pair)]) for pair in sorted(left)]
-        skipped = len(found) - len(left)
-        with progress(len(found), "matching", "pair", quiet, skipped) as bar:
-            tasks = file.tasks(items, PAIRS_PER_SHARD)
-            counts, failed = file.collect(map_tasks(work, tasks, workers), bar)
-        file.merge(quiet, lambda name: name not in gone)
-    return BatchReport(Path(path), counts, skipped, (*failures, *failed), "pairs")
+    report = fill_file(
+        path,
+        {**vars(options), "features": made_with, "version": __version__},
+        {
+            (first, second): {
+                pair_name(first, second): (*state0, *state1),
+                pair_name(second, first): (*state1, *state0),
+            }
+            for (first, second), (state0, state1) in sorted(found.items())
+        },
+        partial(_match_pairs, features=source, options=options),
+        of="pairs",
+        others_stay=lambda name: name not in gone,
+        engine=engine,
+        workers=workers,
+        overwrite=overwrite,
+        quiet=quiet,
+    )
+    return replace(report, failures=(*failures, *report.failures))
 
 
 def _find_pairs(
@@ -205,35 +202,28 @@ def _state(file: Any, name: str) -> State | None:
     return (int(digest[:15], 16),)
 
 
-def _match_shard(
-    task: tuple[Path, Sequence[tuple[Pair, State]]], features: Path, options: PairMatchingOptions
-) -> tuple[dict[Pair, int], list[str]]:
-    """Write a shard; return the number of matches of each pair, and what could not be done."""
-    path, pairs = task
-    counts: dict[Pair, int] = {}
-    failures: list[str] = []
-
-    def groups() -> Iterator[Group]:
-        with open_hdf5(features) as file:
-            first: tuple[str, Keypoints] | None = None  # pairs are sorted by their first image
-            for (name0, name1), state in pairs:
-                try:
-                    if first is None or first[0] != name0:
-                        first = name0, _read_features(file, name0)
-                    features0, features1 = first[1], _read_features(file, name1)
-                    both = features0.descriptors, features1.descriptors
-                    if len({np.asarray(each).shape[-1:] for each in both}) > 1:
-                        raise InvalidFileError("their descriptors differ: extract both alike")
-                except InvalidFileError as error:
-                    failures.append(f"{name0} {name1}: {error}")
-                    continue
+def _match_pairs(
+    pairs: Sequence[Item],
+    counts: dict[Pair, int],
+    failures: list[str],
+    features: Path,
+    options: PairMatchingOptions,
+) -> Iterator[Group]:
+    """Make the groups of pairs, with their numbers of matches."""
+    with open_hdf5(features) as file:
+        first: tuple[str, Keypoints] | None = None  # pairs are sorted by their first image
+        for (name0, name1), state in pairs:
+            with noted_failures(f"{name0} {name1}", failures):
+                if first is None or first[0] != name0:
+                    first = name0, _read_features(file, name0)
+                features0, features1 = first[1], _read_features(file, name1)
+                both = features0.descriptors, features1.descriptors
+                if len({np.asarray(each).shape[-1:] for each in both}) > 1:
+                    raise InvalidFileError("their descriptors differ: extract both alike")
                 matches, scores = _match(features0, features1, options)
                 counts[name0, name1] = int(np.count_nonzero(matches >= 0))
                 arrays = {"matches0": matches, "matching_scores0": scores}
                 yield Group(pair_name(name0, name1), arrays, state)
-
-    write_groups(path, groups())
-    return counts, failures
 
 
 def _read_features(file: Any, name: str) -> Keypoints:
