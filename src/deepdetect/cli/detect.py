@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
-from .._shared.errors import DeepDetectError, MissingExtraError, OptionError, WeightsError
+from .._shared.errors import OptionError, noted_failures
 from .._shared.opencv import import_opencv
 from .._shared.progress import progress
 from .._shared.records import Outputs, plain
@@ -75,11 +75,8 @@ def detect(
     failures: list[str] = []
     with progress(len(paths), "detecting", "image", quiet=len(paths) == 1) as bar:
         for path, files in outputs.items():
-            outcome = work.detect(path, files)
-            if isinstance(outcome, str):
-                failures.append(outcome)
-            else:
-                results.append(outcome)
+            with noted_failures(str(path), failures):
+                results.append(work.detect(path, files))
             bar.update(1)
     nothing = not failures and not any(result["keypoints"] for result in results)
     if nothing:
@@ -131,33 +128,23 @@ class _Work:
             whose = str(changed[0]) if len(changed) == 1 else f"{len(changed)} images"
             cli.note(f"replacing the results of {whose} with other options ({flags})")
 
-    def detect(self, path: Path, files: dict[str, Path]) -> dict[str, Any] | str:
-        """Detect, save and draw the keypoints of one image; return its numbers, or what failed.
-
-        What is raised concerns all images.
-        """
+    def detect(self, path: Path, files: dict[str, Path]) -> dict[str, Any]:
+        """Detect, save and draw the keypoints of one image; return its numbers."""
         shown = {"file": files["file"], "pictures": {n: files[n] for n in files if n != "file"}}
         outputs = Outputs([*files.values()], [path], overwrite=self.overwrite)
         done = outputs.find()  # another command may have done it meanwhile
         if done is not None and done["settings"] == self.settings:
             return {"image": path, **done["numbers"], **shown, "skipped": True}
         earlier = None if self.overwrite else Outputs([files["file"]], [path]).find()
-        try:
-            started = time.perf_counter()
-            rgb = load_image(path)
-            if "dense" in files and isinstance(self.detector, DeepDetect):  # the network runs once
-                heatmap, logits = self.detector.heatmap_and_logits(rgb)
-                selection = self.selection or SelectionOptions()
-                keypoints = select_keypoints(heatmap, selection, logits, ignore=self.mask)
-            else:
-                keypoints = find_keypoints(self.detector, rgb, self.selection, self.mask)
-            seconds = time.perf_counter() - started
-        except (MissingExtraError, WeightsError):  # concern all images
-            raise
-        except DeepDetectError as error:
-            return str(error) if str(path) in str(error) else f"{path}: {error}"
-        except MemoryError:
-            return f"{path}: there is not enough memory for it: use a smaller image"
+        started = time.perf_counter()
+        rgb = load_image(path)
+        if "dense" in files and isinstance(self.detector, DeepDetect):  # the network runs once
+            heatmap, logits = self.detector.heatmap_and_logits(rgb)
+            selection = self.selection or SelectionOptions()
+            keypoints = select_keypoints(heatmap, selection, logits, ignore=self.mask)
+        else:
+            keypoints = find_keypoints(self.detector, rgb, self.selection, self.mask)
+        seconds = time.perf_counter() - started
         numbers = {
             "width": keypoints.image_size[0],
             "height": keypoints.image_size[1],

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from cyclopts import Parameter
 
-from .._shared.errors import DeepDetectError, OptionError
+from .._shared.errors import DeepDetectError, OptionError, noted_failures
 from .._shared.options import look_up
 from ..datasets import StereoPair, load_motorcycle
 from ..datasets.middlebury import load_middlebury
@@ -159,12 +159,11 @@ def evaluate_stereo(
         label_settings: Label settings whose labels are the keypoints, without a network: paper or
             dense, or a file; may be repeated.
     """
-    pairs, failures = [], []
+    pairs: list[StereoPair] = []
+    failures: list[str] = []
     for scene in scenes:
-        try:
+        with noted_failures(str(scene), failures):
             pairs.append(load_middlebury(scene))
-        except DeepDetectError as error:
-            failures.append(str(error))
     if not pairs:
         raise DeepDetectError("; ".join(failures))
     sources: dict[str, HeatmapDetector] = {}

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .._shared.errors import ImageError, OptionError, RegistrationError
+from .._shared.errors import ImageError, OptionError, RegistrationError, noted_failures
 from .._shared.progress import stage_progress
 from ..batch.pair_matching import MATCHERS_OF_FLOATS
 from ..detector.detector import DeepDetect
@@ -268,7 +268,12 @@ def stitch(
         raise OptionError("--max-keypoints is for --detector points: leave it out, or choose that")
     chosen, _ = chosen_detector(detector, values)
     options = StitchingOptions(**OPTIONS.take(values))
-    images, failures = _readable(paths)
+    images: list[Path] = []
+    failures: list[str] = []
+    for path in paths:
+        with noted_failures(str(path), failures):
+            load_image(path)
+            images.append(path)
     if len(images) < min(len(paths), 2) or (reference is not None and reference not in images):
         what = "too few images, or not the reference, can be read"
         raise ImageError(f"there is no panorama, as {what}: {'; '.join(failures)}")
@@ -294,19 +299,6 @@ def stitch(
         cli.note(f"not in the panorama: {images[number]}, as {reason}")
     numbers = {**_numbers(panorama, images, file), "failures": failures}
     return cli.Result(numbers, None, failures, len(paths))
-
-
-def _readable(images: Sequence[Path]) -> tuple[list[Path], list[str]]:
-    """Return the images that can be read, and what is wrong with each of the others."""
-    readable, failures = [], []
-    for path in images:
-        try:
-            load_image(path)
-        except ImageError as error:
-            failures.append(str(error))
-        else:
-            readable.append(path)
-    return readable, failures
 
 
 def _numbers(panorama: Panorama, images: Sequence[Path], output: Path) -> dict[str, Any]:
