@@ -107,9 +107,9 @@ def compare(published: Callable[[], int], ours: Callable[[], int], rounds: int) 
         both: list[tuple[float, float]] = []
         found = []
         for run in (published, ours):
-            with profiled() as profile:
+            with profiled() as profiler:
                 found.append(run())
-            both.append((profile.seconds, profile.memory))
+            both.append(profiler.total)
         if turn:
             profiles.append(both)
             counts.append(found)

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.spatial.distance import cdist
 
 from deepdetect import DeepDetectError, ImageError
-from deepdetect.evaluation.baselines.method import BaselineError, LocalFeature
+from deepdetect.evaluation.baselines.method import LocalFeature
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.evaluation.run import STAGES, CacheError, MatchSettings, Run
 from deepdetect.features.keypoints import Keypoints
@@ -179,15 +179,6 @@ def test_another_image_under_the_same_name_is_detected_anew(
     copy.write_bytes(path.read_bytes())
     run.keypoints(FAST, copy)
     assert run.made == 1
-
-
-def test_a_descriptor_for_each_keypoint_is_asked_for(pair: Pair, one_line) -> None:
-    method = dataclasses.replace(
-        FAST, describe=lambda rgb, features: np.zeros((3, 128), np.float32)
-    )
-    with pytest.raises(BaselineError, match="one for each") as caught:
-        Run(Path()).matches(method, pair, MatchSettings())
-    one_line(caught.value)
 
 
 @pytest.mark.parametrize("matcher", ["flann", "exact"])

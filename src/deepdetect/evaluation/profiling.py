@@ -6,11 +6,8 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
-
-import numpy as np
+from typing import Any, NamedTuple, TypeVar
 
 from .._shared.errors import DeepDetectError
 from .._shared.machine import start_child
@@ -18,21 +15,11 @@ from .._shared.machine import start_child
 Outcome = TypeVar("Outcome")
 
 
-@dataclass
-class Profile:
-    """What a piece of work took.
-
-    Attributes:
-        seconds: wall time.
-        memory: bytes that the process grew by at most while it ran.
-    """
+class Profile(NamedTuple):
+    """What a piece of work took: wall time, and bytes that the process grew by at most."""
 
     seconds: float = 0.0
-    memory: float = 0
-
-    def packed(self) -> np.ndarray:
-        """Return it as an array for the cache; `Profile(*array)` reads it."""
-        return np.array([self.seconds, self.memory], np.float64)
+    memory: float = 0.0
 
 
 class StageProfiler:
@@ -43,29 +30,24 @@ class StageProfiler:
 
     Attributes:
         stages: by name; stages of one name add up their seconds, the largest memory counts.
-        memory: bytes that the process grew by at most since the first stage began, including what
-            an earlier stage still holds.
+        total: of all stages; its memory includes what an earlier stage still holds.
     """
 
     def __init__(self) -> None:
         self.stages: dict[str, Profile] = {}
-        self.memory = 0
+        self.total = Profile()
         self._begin()
         self._first = self._before
-
-    @property
-    def seconds(self) -> float:
-        """Of all stages."""
-        return sum(profile.seconds for profile in self.stages.values())
 
     def record(self, name: str) -> None:
         """End a stage, and begin the next one."""
         seconds = time.perf_counter() - self._started
         peak = max(_memory("VmHWM"), self._before)
-        profile = self.stages.setdefault(name, Profile())
-        profile.seconds += seconds
-        profile.memory = max(profile.memory, peak - self._before)
-        self.memory = max(self.memory, peak - self._first)
+        before = self.stages.get(name, Profile())
+        memory = max(before.memory, peak - self._before)
+        self.stages[name] = Profile(before.seconds + seconds, memory)
+        memory = max(self.total.memory, peak - self._first)
+        self.total = Profile(self.total.seconds + seconds, memory)
         self._begin()
 
     def _begin(self) -> None:
@@ -82,11 +64,10 @@ _highest = 0
 
 
 @contextmanager
-def profiled() -> Iterator[Profile]:
-    """Measure the time and the growth of memory of the block; known when it has ended."""
+def profiled() -> Iterator[StageProfiler]:
+    """Measure the time and the growth of memory of the block: the `total`, when it has ended."""
     profiler = StageProfiler()
-    profile = profiler.stages["block"] = Profile()
-    yield profile
+    yield profiler
     profiler.record("block")
 
 

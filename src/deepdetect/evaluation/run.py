@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
-import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,7 +20,7 @@ from ..features.keypoints import Keypoints
 from ..features.matchers import get_matcher, match_descriptors
 from ..io.image import load_image
 from ..matching.pipeline import check_memory
-from .baselines.method import BaselineError, LocalFeature
+from .baselines.method import LocalFeature
 from .profiling import Profile, profiled
 from .report import Row, Rows
 
@@ -43,9 +42,6 @@ STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
 Raise the version when a change of the code changes the stage's results: cached ones of another
 version are not used, nor what was made from them.
 """
-
-OPTIONAL = ("logits", "sizes", "angles", "octaves", "descriptors")
-"""Columns that keypoints may have."""
 
 RECENT_IMAGES = 8
 """Images whose keypoints are kept in memory."""
@@ -112,7 +108,6 @@ class Run:
         self.made = 0
         self.skipped: list[str] = []
         self.failures: list[str] = []
-        self._temporary: Path | None = None
         self._recent: OrderedDict[str, tuple[Keypoints, Profile]] = OrderedDict()
         self._described: tuple[str, list[np.ndarray], Profile] | None = None
 
@@ -123,12 +118,13 @@ class Run:
 
     def files_folder(self) -> Path:
         """Return a folder for images that are made: the cache's, or a temporary one."""
-        if self.cache is not None:
-            return self.cache
-        if self._temporary is None:
-            self._temporary = Path(tempfile.mkdtemp(prefix="deepdetect-benchmark-"))
-            weakref.finalize(self, shutil.rmtree, self._temporary, ignore_errors=True)
-        return self._temporary
+        return Path(self._temporary.name) if self.cache is None else self.cache
+
+    @cached_property
+    def _temporary(self) -> tempfile.TemporaryDirectory[str]:
+        return tempfile.TemporaryDirectory(
+            prefix="deepdetect-benchmark-", ignore_cleanup_errors=True
+        )
 
     def attempt(self, name: str, work: Callable[..., Result], *arguments: Any) -> Result | None:
         """Do a piece of work; when it cannot be done, note that it is skipped and why.
@@ -207,16 +203,10 @@ class Run:
     def _keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, Profile]:
         def make() -> Row:
             rgb = load_image(image)
-            with profiled() as profile:
+            with profiled() as profiler:
                 found = feature.detect(rgb)
-            optional = {n: part for n in OPTIONAL if (part := getattr(found, n)) is not None}
-            return {
-                "xy": found.xy,
-                "scores": found.scores,
-                "image_size": found.image_size,
-                **optional,
-                "profile": profile.packed(),
-            }
+            known = {name: value for name, value in vars(found).items() if value is not None}
+            return {**known, "profile": profiler.total}
 
         kept = self.cached("keypoints", (feature.detection, image), make)
         profile = Profile(*kept.pop("profile").tolist())
@@ -235,7 +225,7 @@ class Run:
             check_memory([len(keypoints) for keypoints in both])
             descriptors, describe = self._descriptors(feature, images, both)
             matcher = get_matcher("hamming" if feature.binary else settings.matcher)
-            with profiled() as match:
+            with profiled() as profiler:
                 found = match_descriptors(
                     descriptors[0],
                     descriptors[1],
@@ -245,7 +235,7 @@ class Run:
                     seed=settings.seed,
                     positions=(both[0].xy, both[1].xy),
                 )
-            profiles = describe.packed(), match.packed()
+            profiles = describe, profiler.total
             return {"rows0": found.indices0, "rows1": found.indices1, "profiles": profiles}
 
         kept = self.cached("matches", (*feature.key, images, settings), make)
@@ -261,18 +251,12 @@ class Run:
         if self._described is None or self._described[0] != name:
             self._described = None  # frees its memory before more is needed
             rgb = [load_image(image) for image in images]
-            with profiled() as profile:
+            with profiled() as profiler:
                 descriptors = [
                     feature.describe(pixels, keypoints)
                     for pixels, keypoints in zip(rgb, both, strict=True)
                 ]
-            for image, keypoints, rows in zip(images, both, descriptors, strict=True):
-                if len(rows) != len(keypoints):
-                    raise BaselineError(
-                        f"{feature.name} made {len(rows)} descriptors for {len(keypoints)} "
-                        f"keypoints in {image}: there must be one for each"
-                    )
-            self._described = name, descriptors, profile
+            self._described = name, descriptors, profiler.total
         return self._described[1:]
 
 

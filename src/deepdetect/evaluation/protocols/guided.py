@@ -163,14 +163,14 @@ def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -
 
     def make() -> Row:
         gray0, gray1 = (luma(load_image(image)) for image in images)
-        with profiled() as profile:
+        with profiled() as profiler:
             guide, found = guided_matches(gray0, gray1, first, second, seed=seed)
         return {
             "model": guide.model,
             "matrix": np.empty((0, 3)) if guide.matrix is None else guide.matrix,
             "points0": np.empty((0, 2)) if found is None else first[found.indices0],
             "points1": np.empty((0, 2)) if found is None else found.points1,
-            "seconds": profile.seconds,
+            "seconds": profiler.total.seconds,
         }
 
     return run.cached("guided", (feature.detection, images, seed), make)

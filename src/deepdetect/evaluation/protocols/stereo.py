@@ -142,7 +142,7 @@ def reconstruct_points(run: Run, pipeline: Pipeline, scene: Path) -> Row:
     def make() -> Row:
         pair = load_calibrated_pair(scene)
         runs = [pipeline.run(pair) for _ in range(pipeline.rounds)]
-        runs = sorted(runs, key=lambda points: points[3].seconds)
+        runs = sorted(runs, key=lambda points: points[3].total.seconds)
         pixels, disparity, filled, profiler = runs[len(runs) // 2]
         stages = profiler.stages.items()
         return {
@@ -151,9 +151,9 @@ def reconstruct_points(run: Run, pipeline: Pipeline, scene: Path) -> Row:
             "points": len(pixels),
             "of them filled": filled,
             **{f"{stage}, s": profile.seconds for stage, profile in stages},
-            "seconds": profiler.seconds,
+            "seconds": profiler.total.seconds,
             **{f"{stage}, MB": profile.memory / 1e6 for stage, profile in stages},
-            "all, MB": max(profiler.memory for *_, profiler in runs) / 1e6,
+            "all, MB": max(profiler.total.memory for *_, profiler in runs) / 1e6,
         }
 
     files = [scene / name for name in ("left.png", "right.png", "calib.json")]
