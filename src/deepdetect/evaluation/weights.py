@@ -26,8 +26,13 @@ from .protocols.masks import (
     score_at_scale,
     score_samples,
 )
-from .protocols.paper import OXFORD_PAIRS, foreground_row, mean_correct_matches, pair_repeatability
-from .protocols.planar import pairs_of, select_pairs
+from .protocols.paper import (
+    OXFORD_PAIRS,
+    foreground_row,
+    mean_correct_matches,
+    repeatability_rows,
+)
+from .protocols.planar import select_pairs
 from .report import Row, mean, where
 from .run import Run
 
@@ -201,25 +206,21 @@ def evaluate_oxford(
         heatmap = detector.heatmap(load_image(image))
         return {t: float((heatmap > t).mean()) for t in thresholds}
 
-    def repeatability(feature: LocalFeature, pair: PlanarPair) -> Row:
-        return {"scene": pair.scene, "value": pair_repeatability(run, feature, pair)}
-
     def matches(feature: LocalFeature, pair: PlanarPair) -> Row:
         correct, every = mean_correct_matches(run, feature, pair)
         return {"correct": correct, "all": every}
 
     images = {f"{scene.name}/{path.name}": path for scene in scenes for path in scene.images}
-    pairs = {pair.name: pair for pair in pairs_of(scenes)}
     matched = {pair.name: pair for pair in select_pairs(scenes, OXFORD_PAIRS)}
     density = run.rows("density of ", features, images, densities)
-    repeated = run.rows("repeatability of ", features, pairs, repeatability)
+    repeated = repeatability_rows(run, features, scenes)
     counts = run.rows("matches of ", features, matched, matches)
     if run.failures and not density:
         raise ImageError(run.failures[0])
     return OxfordScore(
         {t: mean(density, t) or 0.0 for t in thresholds},
         {
-            scene: mean(where(repeated, scene=scene), "value") or 0.0
+            scene: mean(where(repeated, scene=scene), "repeatability") or 0.0
             for scene in dict.fromkeys(row["scene"] for row in repeated)
         },
         {row["item"]: row["correct"] for row in counts},

@@ -15,7 +15,7 @@ from deepdetect.evaluation.options import BenchmarkOptions
 from deepdetect.evaluation.protocols.guided import (
     SEEDS,
     _guided_cells,
-    guided_section,
+    guided_sections,
     match_guided,
 )
 from deepdetect.evaluation.report import Section
@@ -46,7 +46,7 @@ def section(options: BenchmarkOptions, pair: PlanarPair) -> Section:
     run = Run(pair.first.parent)
     elsewhere = MOVE + [[0, 0, 40], [0, 0, 0], [0, 0, 0]]
     wrong = dataclasses.replace(pair, homography=elsewhere)
-    found = guided_section(run, options, {"true": [pair], "wrong": [wrong]}, "key", "Scenes")
+    (found,) = guided_sections(run, options, {"true": [pair], "wrong": [wrong]}, "key", "Scenes")
     assert not run.skipped
     return found
 
@@ -58,7 +58,7 @@ def rows(section, key: str) -> dict[str, dict[str, object]]:
 
 @pytest.mark.slow
 def test_both_ways_and_both_baselines_have_counts_and_precision(section) -> None:
-    found = rows(section, "key_true")
+    found = rows(section, "key_guided_true")
     assert len(found) == 3
     assert sum(name.startswith("baseline") for name in found) == 2
     for row in found.values():
@@ -76,7 +76,7 @@ def test_both_ways_and_both_baselines_have_counts_and_precision(section) -> None
 def test_the_counts_are_those_of_match_images(
     section, options: BenchmarkOptions, pair: PlanarPair
 ) -> None:
-    row = rows(section, "key_true")["DeepDetect, threshold 0.5"]
+    row = rows(section, "key_guided_true")["DeepDetect, threshold 0.5"]
     counts = []
     for seed in range(SEEDS):
         found = match_images(pair.first, pair.second, options.detector, seed=seed)
@@ -90,7 +90,7 @@ def test_the_counts_are_those_of_match_images(
 @pytest.mark.slow
 def test_a_wrong_truth_finds_nothing_right(section) -> None:
     """The ground truth only evaluates: the matches are the same, and none of them is right."""
-    true, wrong = rows(section, "key_true"), rows(section, "key_wrong")
+    true, wrong = rows(section, "key_guided_true"), rows(section, "key_guided_wrong")
     for name, row in wrong.items():
         assert row["guided: precision"] < 0.01
         assert row["guided: corner error, px"] == pytest.approx(40, abs=1)
@@ -106,8 +106,8 @@ def test_unrelated_images_are_said_to_be_unguided(
     Image.fromarray(noise).save(tmp_path / "img2.png")
     pair = PlanarPair("none", 2, tmp_path / "img1.png", tmp_path / "img2.png", np.eye(3))
     run = Run(tmp_path)
-    found = guided_section(run, options, {"true": [pair]}, "key", "None")
-    for row in rows(found, "key_true").values():
+    (found,) = guided_sections(run, options, {"true": [pair]}, "key", "None")
+    for row in rows(found, "key_guided_true").values():
         assert row["guided by"] == "none"
         assert row["guided: corner error, px"] is None
         assert row["guided: seconds"] > 0

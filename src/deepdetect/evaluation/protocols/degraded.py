@@ -8,15 +8,27 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from ..._shared.atomic import atomic_path
-from ..._shared.opencv import cv2
 from ..._shared.records import file_digest
 from ...datasets.degradation import DEGRADATIONS, Degradation, degrade
 from ...datasets.planar import PlanarPair
 from ...io.image import load_image
+from ...viz.draw import save_picture
 from ..baselines.method import LocalFeature
 from ..metrics.homography import accuracy_at
-from ..report import Cell, Columns, Measure, Row, Rows, Table, average, mean_of, tabulate, where
+from ..options import BenchmarkOptions
+from ..report import (
+    Cell,
+    Columns,
+    Measure,
+    Row,
+    Rows,
+    Section,
+    Table,
+    average,
+    mean_of,
+    tabulate,
+    where,
+)
 from ..run import Run
 from .standard import MATCHING_BUDGET, PAIRS, RADII_PX, budget_name, correct, pair_row, repeated
 
@@ -57,6 +69,19 @@ VALUES: tuple[tuple[str, int, str, Score], ...] = (
     ("correct at 1 px", MATCHING_BUDGET, ",.0f", correct),
 )
 """Title, budget, style and function of what is compared."""
+
+
+def degraded_sections(
+    run: Run, options: BenchmarkOptions, pairs: Sequence[PlanarPair], key: str, title: str
+) -> list[Section]:
+    """Measure and show all features of the standard protocol on all pairs."""
+    if "degraded" not in options.protocols:
+        return []
+    features = options.standard_features()
+    rows = degraded_rows(run, features, pairs, options.degraded_images)
+    text = (TEXT, WHICH_TEXT[options.degraded_images])
+    tables = degraded_tables(features, rows, f"{key}_degraded", f"{title} ({len(pairs)} pairs)")
+    return [Section(f"{title}, dark and blurred", text, tables)]
 
 
 def degraded_rows(
@@ -104,10 +129,7 @@ def degraded_copy(image: Path, degradation: Degradation, folder: Path) -> Path:
     digest = file_digest(image)[:16]
     path = folder / "degraded" / f"{digest}-{degradation.name}-v{degradation.version}.png"
     if not path.exists():
-        copy = degrade(load_image(image), degradation)
-        with atomic_path(path) as temporary:
-            encoded = cv2.imencode(".png", cv2.cvtColor(copy, cv2.COLOR_RGB2BGR))[1]
-            temporary.write_bytes(encoded.tobytes())
+        save_picture(degrade(load_image(image), degradation), path)
     return path
 
 

@@ -54,17 +54,19 @@ NOTE = (
 )
 
 
-def guided_section(
+def guided_sections(
     run: Run,
     options: BenchmarkOptions,
     truths: Mapping[str, Sequence[PlanarPair]],
     key: str,
     title: str,
-) -> Section:
+) -> list[Section]:
     """Match pairs by descriptors alone and guided.
 
     `truths` has the same pairs with the homographies that evaluate them, by the names of these.
     """
+    if "guided" not in options.protocols:
+        return []
     features = (options.deepdetect_480(), *options.chance_baselines())
     pairs = {
         of_truth[0].name: dict(zip(truths, of_truth, strict=True))
@@ -74,7 +76,7 @@ def guided_section(
     rows = run.rows("guided matches of ", features, pairs, partial(guided_row, run))
     tables = [
         Table(
-            f"{key}_{truth}",
+            f"{key}_guided_{truth}",
             f"Matches by descriptors alone and guided, {truth} homographies",
             COLUMNS,
             [
@@ -92,7 +94,7 @@ def guided_section(
         "the default of `match_images`; the true homography only evaluates. DeepDetect sees "
         f"images squashed to 480x480 as {options.channels.upper()}."
     )
-    return Section(f"{title}, descriptors alone and guided", (text,), tables)
+    return [Section(f"{title}, descriptors alone and guided", (text,), tables)]
 
 
 def guided_row(run: Run, feature: LocalFeature, by_truth: Mapping[str, PlanarPair]) -> Row:

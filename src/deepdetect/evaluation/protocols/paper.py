@@ -107,20 +107,28 @@ def repeatability_table(
 ) -> Table:
     """Measure the paper's repeatability at 1 px: the mean of the scenes, and that of each."""
 
-    def measure(feature: LocalFeature, pair: PlanarPair) -> Row:
-        return {"scene": pair.scene, "repeatability": pair_repeatability(run, feature, pair)}
-
     def over_scenes(own: Rows) -> Cell:
         return mean_of(mean(where(own, scene=s.name), "repeatability") for s in scenes)
 
-    pairs = {pair.name: pair for scene in scenes for pair in scene.pairs}
-    rows = run.rows("repeatability of ", features, pairs, measure)
+    rows = repeatability_rows(run, features, scenes)
     columns: Columns = {
         "mean": (".4f", over_scenes),
         **{scene.name: average(".4f", "repeatability", scene=scene.name) for scene in scenes},
     }
     title = "Repeatability as in the paper"
     return tabulate(key, title, features, rows, columns, REPEATABILITY_NOTE)
+
+
+def repeatability_rows(
+    run: Run, features: Sequence[LocalFeature], scenes: Sequence[PlanarScene]
+) -> Rows:
+    """Measure the "repeatability" of all pairs, with their "scene"."""
+
+    def measure(feature: LocalFeature, pair: PlanarPair) -> Row:
+        return {"scene": pair.scene, "repeatability": pair_repeatability(run, feature, pair)}
+
+    pairs = {pair.name: pair for scene in scenes for pair in scene.pairs}
+    return run.rows("repeatability of ", features, pairs, measure)
 
 
 def matches_table(
@@ -255,7 +263,7 @@ def mask_figure(scene: PlanarScene) -> Figure:
     return Figure("masks", title, picture(draw_label(rgb, fuse(luma(rgb)))))
 
 
-def match_figure(run: Run, feature: LocalFeature, pair: PlanarPair, number: str) -> Figure:
+def match_figure(run: Run, feature: LocalFeature, number: str, pair: PlanarPair) -> Figure:
     """Draw Figure 6 or 7: a sample of the matches of a pair, the correct ones green."""
     found = run.matches(feature, (pair.first, pair.second), PAPER_MATCHING)
     correct = transfer_errors(found.points0, found.points1, pair.homography) < CORRECT_PX

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
 
 from ...datasets.planar import (
     OXFORD_KINDS,
@@ -14,13 +16,14 @@ from ...datasets.planar import (
     load_low_visibility,
     load_oxford,
 )
-from ..baselines.method import LocalFeature
 from ..baselines.opencv import CLASSICAL, with_kd_trees
 from ..charts import bar_chart
 from ..options import BenchmarkOptions
 from ..report import Figure, Rows, Section, Table
 from ..run import Run
 from . import paper
+from .degraded import degraded_sections
+from .guided import guided_sections
 from .paper_numbers import (
     DEEPDETECT,
     FIGURE_6,
@@ -30,6 +33,7 @@ from .paper_numbers import (
     OXFORD_REPEATABILITY,
     with_paper_rows,
 )
+from .standard import standard_sections
 
 KEYPOINT_SCENES = ("graf", "bikes", "leuven")
 """Of Figure 2."""
@@ -68,32 +72,28 @@ def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
         for pair in pairs
         if not (pair.first.parent / f"H1to{pair.number}p.refined").exists()
     ]
+    if unrefined and "standard" in options.protocols:
+        run.skipped.append(
+            f"refined homographies of {', '.join(unrefined)}: there is no file H1toKp.refined "
+            "(benchmarks/refine_oxford.py makes them); these are evaluated by the published one"
+        )
     if len(unrefined) == len(pairs):
         del by_truth["refined"]
-    sections = []
-    if "paper" in options.protocols:
-        sections.append(_oxford_paper(run, options, scenes))
-    if "standard" in options.protocols:
-        for truth, of_truth in by_truth.items():
-            title, key = f"Oxford, {truth} homographies", f"oxford_{truth}"
-            sections.append(_standard(run, options, of_truth, key, title, TRUTHS[truth]))
-        if "refined" not in by_truth:
-            run.skipped.append(
-                "Oxford evaluated by refined homographies: there are no files H1toKp.refined; "
-                "benchmarks/refine_oxford.py makes them"
-            )
-        elif unrefined:
-            run.skipped.append(
-                f"refined homographies of {', '.join(unrefined)}: there is no file H1toKp.refined"
-                "; these pairs are evaluated by the published one in that section too"
-            )
+    sections = _oxford_paper(run, options, scenes)
+    for truth, of_truth in by_truth.items():
+        key, title = f"oxford_{truth}", f"Oxford, {truth} homographies"
+        sections += standard_sections(run, options, pairs_of(of_truth), key, title, TRUTHS[truth])
     chosen = {t: select_pairs(by_truth[t], GUIDED_PAIRS) for t in reversed(by_truth)}
-    sections += _guided(run, options, chosen, "oxford", "Oxford")
-    truth, of_truth = list(by_truth.items())[-1]
-    return sections + _degraded(run, options, of_truth, "oxford", f"Oxford, {truth} homographies")
+    sections += guided_sections(run, options, chosen, "oxford", "Oxford")
+    # Of the last, most accurate truth.
+    return sections + degraded_sections(run, options, pairs_of(of_truth), "oxford", title)
 
 
-def _oxford_paper(run: Run, options: BenchmarkOptions, scenes: Sequence[PlanarScene]) -> Section:
+def _oxford_paper(
+    run: Run, options: BenchmarkOptions, scenes: Sequence[PlanarScene]
+) -> list[Section]:
+    if "paper" not in options.protocols:
+        return []
     features, matching = options.density_features(), with_kd_trees(options.matching_features())
     pairs = select_pairs(scenes, paper.OXFORD_PAIRS)
     density = paper.density_table(run, features, scenes, "oxford_density", with_paper=True)
@@ -102,7 +102,6 @@ def _oxford_paper(run: Run, options: BenchmarkOptions, scenes: Sequence[PlanarSc
     figure_6_pairs = select_pairs(scenes, (*paper.OXFORD_PAIRS, ("graf", 3)))
     drawn = [scene for scene in scenes if scene.name in KEYPOINT_SCENES]
     figure_6, figures = _figures(run, options, figure_6_pairs, "oxford", drawn)
-    masks = run.attempt("Figure 4, the masks", paper.mask_figure, scenes[0])
     text = (
         "Tables I and II, the Oxford half of III, Figures 1, 2, 4 and 6. DeepDetect sees images "
         f"squashed to 480x480 as {options.channels.upper()}; the classical detectors see them as "
@@ -120,8 +119,9 @@ def _oxford_paper(run: Run, options: BenchmarkOptions, scenes: Sequence[PlanarSc
     mean = OXFORD_REPEATABILITY[DEEPDETECT]["mean"]
     title = f"Figure 1: average repeatability, with baselines; in the paper DeepDetect has {mean}"
     figure_1 = Figure("oxford_repeatability", title, png)
-    figures = [figure_1, *figures, *filter(None, [masks])]
-    return Section("Oxford, the paper's protocol", (text,), tables, figures)
+    figure_4 = _drawn(run, "Figure 4, masks", paper.mask_figure, scenes[:1])
+    figures = [figure_1, *figures, *figure_4]
+    return [Section("Oxford, the paper's protocol", (text,), tables, figures)]
 
 
 def _figures(
@@ -129,28 +129,25 @@ def _figures(
     options: BenchmarkOptions,
     pairs: Sequence[PlanarPair],
     key: str,
-    drawn: Sequence[PlanarScene],
+    scenes: Sequence[PlanarScene],
 ) -> tuple[Table, list[Figure]]:
     """Make Figure 6 with its table, and Figure 2 of some scenes."""
     features = CLASSICAL["sift"], CLASSICAL["sift-low"], options.deepdetect_480()
-    title = "Figure 6: correct matches"
-    table = paper.matches_table(run, features, pairs, f"{key}_figure6", title)
-    keypoints = [
-        run.attempt(f"Figure 2, keypoints of {s.name}", paper.keypoint_figure, run, features, s)
-        for s in drawn
-    ]
-    matches = _match_figures(run, features[-1], pairs, "Figure 6")
-    return with_paper_rows(table, FIGURE_6), [*filter(None, keypoints), *matches]
-
-
-def _match_figures(
-    run: Run, feature: LocalFeature, pairs: Sequence[PlanarPair], number: str
-) -> list[Figure]:
-    draw = paper.match_figure
+    table = paper.matches_table(run, features, pairs, f"{key}_figure6", "Figure 6: correct matches")
+    keypoints = partial(paper.keypoint_figure, run, features)
+    matches = partial(paper.match_figure, run, features[-1], "Figure 6")
     figures = [
-        run.attempt(f"{number}, matches of {pair.name}", draw, run, feature, pair, number)
-        for pair in pairs
+        *_drawn(run, "Figure 2, keypoints", keypoints, scenes),
+        *_drawn(run, "Figure 6, matches", matches, pairs),
     ]
+    return with_paper_rows(table, FIGURE_6), figures
+
+
+def _drawn(
+    run: Run, what: str, draw: Callable[[Any], Figure], items: Sequence[PlanarPair | PlanarScene]
+) -> list[Figure]:
+    """Draw each item; of what cannot be drawn the reason is noted."""
+    figures = [run.attempt(f"{what} of {item.name}", draw, item) for item in items]
     return [figure for figure in figures if figure is not None]
 
 
@@ -159,20 +156,17 @@ def hpatches(run: Run, options: BenchmarkOptions) -> list[Section]:
     found = load_hpatches(run.folder("hpatches"))
     scenes = [scene.with_max_pairs(options.max_pairs) for scene in found]
     last = [scene.pairs[-1] for scene in scenes]
-    sections = []
-    if "paper" in options.protocols:
-        sections.append(_hpatches_paper(run, options, scenes, last))
-    if "standard" in options.protocols:
+    subsets = {f"all {len(scenes)} scenes": scenes}
+    subset = [scene for scene in scenes if in_d2net_subset(scene)]
+    if 0 < len(subset) < len(scenes):
+        subsets[f"the {len(subset)} scenes of D2-Net"] = subset
+    sections = _hpatches_paper(run, options, scenes, last)
+    for name, chosen in subsets.items():
+        key, title = f"hpatches_{len(chosen)}", f"HPatches, {name}"
         text = "Evaluated by its own files."
-        subsets = {f"all {len(scenes)} scenes": scenes}
-        subset = [scene for scene in scenes if in_d2net_subset(scene)]
-        if 0 < len(subset) < len(scenes):
-            subsets[f"the {len(subset)} scenes of D2-Net"] = subset
-        for name, chosen in subsets.items():
-            key, title = f"hpatches_{len(chosen)}", f"HPatches, {name}"
-            sections.append(_standard(run, options, chosen, key, title, text))
-    sections += _guided(run, options, {"published": last}, "hpatches", "HPatches")
-    return sections + _degraded(run, options, scenes, "hpatches", "HPatches")
+        sections += standard_sections(run, options, pairs_of(chosen), key, title, text)
+    sections += guided_sections(run, options, {"published": last}, "hpatches", "HPatches")
+    return sections + degraded_sections(run, options, pairs_of(scenes), "hpatches", "HPatches")
 
 
 def _hpatches_paper(
@@ -180,7 +174,9 @@ def _hpatches_paper(
     options: BenchmarkOptions,
     scenes: Sequence[PlanarScene],
     last: Sequence[PlanarPair],
-) -> Section:
+) -> list[Section]:
+    if "paper" not in options.protocols:
+        return []
     features = options.density_features()
     repeatability = paper.repeatability_table(run, features, scenes, "hpatches_repeatability")
     light = {scene.name: is_illumination(scene) for scene in scenes}
@@ -196,8 +192,9 @@ def _hpatches_paper(
         paper.density_table(run, features, scenes, "hpatches_density"),
         paper.matches_table(run, options.matching_features(), last, "hpatches_matches"),
     ]
-    figures = _match_figures(run, options.deepdetect_480(), drawn, "Figure 7")
-    return Section("HPatches, the paper's protocol", (text,), tables, figures)
+    draw = partial(paper.match_figure, run, options.deepdetect_480(), "Figure 7")
+    figures = _drawn(run, "Figure 7, matches", draw, drawn)
+    return [Section("HPatches, the paper's protocol", (text,), tables, figures)]
 
 
 def table_3(by_scene: Table, light: Mapping[str, bool]) -> Table:
@@ -241,59 +238,8 @@ def low_visibility(run: Run, options: BenchmarkOptions) -> list[Section]:
         ]
         text = (NOTHING_MOVES,)
         sections.append(Section(f"{title}, the paper's protocol", text, tables, figures))
-    if "standard" in options.protocols:
-        sections.append(_standard(run, options, scenes, key, title, NOTHING_MOVES))
-    return sections + _guided(run, options, {"published": pairs}, key, title)
-
-
-def _standard(
-    run: Run,
-    options: BenchmarkOptions,
-    scenes: Sequence[PlanarScene],
-    key: str,
-    title: str,
-    text: str,
-) -> Section:
-    from . import standard
-
-    pairs, features = pairs_of(scenes), options.standard_features()
-    rows = standard.standard_rows(run, features, pairs)
-    what = f"{title} ({len(pairs)} pairs)"
-    return Section(
-        f"{title}, the standard protocol",
-        (text,),
-        standard.standard_tables(features, rows, key, what),
-        standard.standard_figures(features, rows, key, what),
-    )
-
-
-def _guided(
-    run: Run,
-    options: BenchmarkOptions,
-    truths: Mapping[str, Sequence[PlanarPair]],
-    key: str,
-    title: str,
-) -> list[Section]:
-    if "guided" not in options.protocols:
-        return []
-    from .guided import guided_section
-
-    return [guided_section(run, options, truths, f"{key}_guided", title)]
-
-
-def _degraded(
-    run: Run, options: BenchmarkOptions, scenes: Sequence[PlanarScene], key: str, title: str
-) -> list[Section]:
-    if "degraded" not in options.protocols:
-        return []
-    from . import degraded
-
-    pairs, features = pairs_of(scenes), options.standard_features()
-    rows = degraded.degraded_rows(run, features, pairs, options.degraded_images)
-    what = f"{title} ({len(pairs)} pairs)"
-    text = (degraded.TEXT, degraded.WHICH_TEXT[options.degraded_images])
-    tables = degraded.degraded_tables(features, rows, f"{key}_degraded", what)
-    return [Section(f"{title}, dark and blurred", text, tables)]
+    sections += standard_sections(run, options, pairs, key, title, NOTHING_MOVES)
+    return sections + guided_sections(run, options, {"published": pairs}, key, title)
 
 
 def pairs_of(scenes: Sequence[PlanarScene]) -> list[PlanarPair]:

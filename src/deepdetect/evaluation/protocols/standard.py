@@ -24,6 +24,7 @@ from ..metrics.homography import (
     match_accuracy,
 )
 from ..metrics.repeatability import coverage, mutual_nn_repeatability
+from ..options import BenchmarkOptions
 from ..report import (
     Cell,
     Columns,
@@ -31,6 +32,7 @@ from ..report import (
     Measure,
     Row,
     Rows,
+    Section,
     Table,
     average,
     mean,
@@ -62,6 +64,25 @@ MATCHING_NOTE = (
     f"ratio {RATIO} (none for learned descriptors). Means over the pairs; no matches count as "
     "a precision of 0."
 )
+
+
+def standard_sections(
+    run: Run,
+    options: BenchmarkOptions,
+    pairs: Sequence[PlanarPair],
+    key: str,
+    title: str,
+    text: str,
+) -> list[Section]:
+    """Measure and show all features on all pairs."""
+    if "standard" not in options.protocols:
+        return []
+    features = options.standard_features()
+    rows = standard_rows(run, features, pairs)
+    what = f"{title} ({len(pairs)} pairs)"
+    tables = standard_tables(features, rows, key, what)
+    figures = standard_figures(features, rows, key, what)
+    return [Section(f"{title}, the standard protocol", (text,), tables, figures)]
 
 
 def standard_rows(run: Run, features: Sequence[LocalFeature], pairs: Sequence[PlanarPair]) -> Rows:
