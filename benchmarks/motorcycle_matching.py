@@ -48,7 +48,7 @@ def main() -> None:
         cells = []
         for kept in (np.ones(len(found), bool), found.inliers):
             score = stereo_score(found.points0[kept], found.points1[kept], pair.disparity)
-            cells.append(f"{score.matches:,}, {score.precision:.1%}")
+            cells.append(f"{score['matches']:,}, {score['precision']:.1%}")
         print(f"| `{name}` | {' | '.join(cells)} |", flush=True)
 
 

@@ -172,7 +172,7 @@ def evaluate_stereo(
     for name in weights or (() if label_settings else PRETRAINED):
         sources[f"weights {name}"] = DeepDetect(name)
     rows = score_stereo_matches(sources, pairs, quiet=False)
-    table = Table("stereo", "", STEREO_COLUMNS, [{**row, **row["score"]} for row in rows])
+    table = Table("stereo", "", STEREO_COLUMNS, rows)
     return cli.Result(rows, table.to_markdown(), failures, len(scenes), "scenes")
 
 
@@ -278,7 +278,7 @@ def run_demo(pair: StereoPair, detector: HeatmapDetector, folder: Path) -> dict[
     lines = draw_matches(pair.left, pair.right, *points, errors[known] <= TOLERANCE_PX)
     caption = (
         f"{len(matches):,} matches, a random sample drawn; green: within {TOLERANCE_PX:g} px of "
-        f"the true disparity ({scores['all_matches'].precision:.1%}), red: not"
+        f"the true disparity ({scores['all_matches']['precision']:.1%}), red: not"
     )
     heatmap = draw_heatmap(detector.heatmap(pair.left))
     pictures = {
@@ -297,7 +297,7 @@ def run_demo(pair: StereoPair, detector: HeatmapDetector, folder: Path) -> dict[
     return {
         "keypoints": [len(each) for each in both],
         "density": [each.density for each in both],
-        **{n: {**vars(each), "precision": each.precision} for n, each in scores.items()},
+        **scores,
         "seconds": matches.seconds,
         "pictures": paths,
     }

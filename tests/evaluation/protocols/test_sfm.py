@@ -13,7 +13,7 @@ from deepdetect.datasets.posed_images import PosedImage, PosedPair, PosedScene, 
 from deepdetect.evaluation.benchmarks import run_benchmarks
 from deepdetect.evaluation.options import BenchmarkOptions
 from deepdetect.evaluation.protocols import sfm
-from deepdetect.evaluation.protocols.sfm import SfmScene, camera_table, choose_images
+from deepdetect.evaluation.protocols.sfm import camera_table, choose_images, true_views
 from deepdetect.evaluation.run import Run
 from deepdetect.geometry.camera import PosedView
 from deepdetect.sfm import MultiViewOptions
@@ -51,19 +51,19 @@ def images(folder: Path, count: int) -> tuple[PosedImage, ...]:
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> SfmScene:
-    return SfmScene("arc", images(tmp_path, 5))
+def scene(tmp_path: Path) -> PosedScene:
+    return PosedScene("arc", images(tmp_path, 5), ())
 
 
 @pytest.fixture
-def rows(scene: SfmScene) -> list:
+def rows(scene: PosedScene) -> list:
     # Twice as large, in another frame, and one is missing.
     turn = cv2.Rodrigues(np.array([0.5, -1, 0.2]))[0]
     own = {
         name: PosedView(
             name, view.camera, view.rotation @ turn.T, -view.rotation @ turn.T @ (2 * turn @ c)
         )
-        for name, view in list(scene.truth.items())[:4]
+        for name, view in list(true_views(scene).items())[:4]
         for c in (view.centre,)
     }
     good = model(own, 1000, 3.5, 0.25)
@@ -94,7 +94,7 @@ def test_cameras_are_compared_after_the_alignment(rows: list) -> None:
 
 
 def test_models_are_compared_with_the_first_in_the_unit_of_the_truth(
-    scene: SfmScene, rows: list
+    scene: PosedScene, rows: list
 ) -> None:
     first = rows[0]["true"]
     half = {  # in a unit of its own, and one camera is 0.03 of the truth's aside
@@ -111,7 +111,7 @@ def test_models_are_compared_with_the_first_in_the_unit_of_the_truth(
     assert values[0] is values[1] is values[3] is values[4] is None
     assert 0.005 < values[2] < 0.03
     error = lines[2]["centres, unit of the truth"]
-    centres = [view.centre for view in scene.truth.values()]
+    centres = [view.centre for view in true_views(scene).values()]
     extent = max(np.linalg.norm(a - b) for a in centres for b in centres)
     assert lines[2]["centres, ‰ of the extent"] == pytest.approx(1000 * error / extent)
 

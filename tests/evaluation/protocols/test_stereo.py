@@ -197,8 +197,8 @@ def test_each_source_is_beside_its_chance_level(shifted_pair: StereoPair) -> Non
     assert every["density"] == 1
     assert labels["precision"] > 0.9
     assert chance["precision"] < labels["precision"]
-    assert labels["score"]["evaluated"] == labels["score"]["matches"]
+    assert labels["evaluated"] == labels["matches"]
     wrong = StereoPair(pair.name, pair.left, pair.right, pair.disparity + 3)
     found = score_stereo_matches({"labels": LabelDetector()}, [wrong])
     assert found[0]["precision"] < 0.1
-    assert found[0]["score"]["matches"] == labels["score"]["matches"]
+    assert found[0]["matches"] == labels["matches"]

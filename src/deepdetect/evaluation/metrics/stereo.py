@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from ...geometry import disparity_errors
@@ -14,35 +12,24 @@ TOLERANCE_PX = 1.0
 DISPARITY_TOLERANCES_PX = (0.5, 1.0, 2.0, 4.0)
 
 
-@dataclass(frozen=True)
-class StereoScore:
-    """Matches evaluated by the true disparity.
-
-    Attributes:
-        matches: number of matches.
-        evaluated: those of them whose true disparity is known.
-        correct: those of the evaluated that are within 1 px of it.
-    """
-
-    matches: int
-    evaluated: int
-    correct: int
-
-    @property
-    def precision(self) -> float:
-        """Fraction of the evaluated matches that are correct."""
-        return self.correct / self.evaluated if self.evaluated else 0.0
-
-
-def stereo_score(points0: np.ndarray, points1: np.ndarray, disparity: np.ndarray) -> StereoScore:
-    """Evaluate (N, 2) matched positions by the (H, W) true disparity of the left image, or NaN."""
+def stereo_score(
+    points0: np.ndarray, points1: np.ndarray, disparity: np.ndarray
+) -> dict[str, float]:
+    """Score (N, 2) matched positions by the (H, W) true disparity of the left image, or NaN."""
     return score_errors(disparity_errors(points0, points1, disparity))
 
 
-def score_errors(errors: np.ndarray) -> StereoScore:
-    """Count the errors of `disparity_errors` that are known and at most `TOLERANCE_PX`."""
-    known = np.isfinite(errors)
-    return StereoScore(len(errors), int(known.sum()), int((errors[known] <= TOLERANCE_PX).sum()))
+def score_errors(errors: np.ndarray) -> dict[str, float]:
+    """Score the (N,) errors of `disparity_errors`, NaN where the truth is unknown.
+
+    Returns the number of "matches", those of them that can be "evaluated", those of these that are
+    "correct" within `TOLERANCE_PX`, and the fraction that is, the "precision".
+    """
+    evaluated = int(np.isfinite(errors).sum())
+    correct = int((errors <= TOLERANCE_PX).sum())
+    precision = correct / evaluated if evaluated else 0.0
+    counts = {"matches": len(errors), "evaluated": evaluated, "correct": correct}
+    return {**counts, "precision": precision}
 
 
 def disparity_scores(

@@ -9,8 +9,8 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from ..._shared.errors import NoDepthError
 from ...batch.extraction import feature_group
 from ...batch.hdf5 import Group, import_h5py, open_hdf5, write_groups
 from ...datasets.pair_selection import evenly_spaced
-from ...datasets.posed_images import PosedImage, PosedScene, load_posed_scenes
+from ...datasets.posed_images import PosedScene, load_posed_scenes
 from ...detector.point_detector import PointDetector
 from ...features.keypoints import Keypoints
 from ...features.scale_space import dominant_angles
@@ -132,24 +132,17 @@ class SfmMethod:
         return self.name
 
 
-@dataclass(eq=False)
-class SfmScene:
-    """The images of a scene that are reconstructed, with their cameras."""
-
-    name: str
-    images: tuple[PosedImage, ...]
-
-    @cached_property
-    def truth(self) -> dict[str, PosedView]:
-        """The true cameras and poses by the names of the files."""
-        views = {}
-        for image in self.images:
-            name, matrix = image.path.name, image.intrinsics
-            height, width = load_image(image.path).shape[:2]
-            focal, centre = (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2])
-            camera = Camera((width, height), focal, centre)
-            views[name] = PosedView(name, camera, image.rotation, image.translation)
-        return views
+@lru_cache
+def true_views(scene: PosedScene) -> dict[str, PosedView]:
+    """Return the true cameras and poses by the names of the files."""
+    views = {}
+    for image in scene.images:
+        name, matrix = image.path.name, image.intrinsics
+        height, width = load_image(image.path).shape[:2]
+        focal, centre = (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2])
+        camera = Camera((width, height), focal, centre)
+        views[name] = PosedView(name, camera, image.rotation, image.translation)
+    return views
 
 
 def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
@@ -172,7 +165,7 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
     figures = []
     for name, scene in chosen.items():
         errors = {
-            f"{row['method']}, {kind} intrinsics": relative_pose_errors(views, scene.truth)
+            f"{row['method']}, {kind} intrinsics": relative_pose_errors(views, true_views(scene))
             for row in where(rows, item=name)
             for kind in KINDS
             for views in [row[kind]["views"]]
@@ -183,14 +176,14 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
     return [Section("Many images", TEXT, tables, figures)]
 
 
-def choose_images(scene: PosedScene, most: int) -> SfmScene:
-    """Return all images of a scene, the first of a sequence, or evenly spaced ones.
+def choose_images(scene: PosedScene, most: int) -> PosedScene:
+    """Return a scene with all of its images, the first of a sequence, or evenly spaced ones.
 
     Between evenly spaced frames of a long sequence there would be nothing in common.
     """
     sequence = scene.pairs[0].frame_distance is not None
     images = scene.images[:most] if sequence else evenly_spaced(scene.images, most)
-    return SfmScene(scene.name, tuple(images))
+    return replace(scene, images=tuple(images))
 
 
 def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
@@ -202,14 +195,14 @@ def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
     return [ours, sift, chance] if "sift" in options.classical else [ours, chance]
 
 
-def measure_scene(run: Run, method: SfmMethod, scene: SfmScene) -> Row:
+def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
     """Reconstruct a scene by a method, or read the result from the cache.
 
     Returns the values of `run_method`, the "scene", and for each kind of intrinsics the registered
     "views" and the `MODEL_COLUMNS`.
     """
     images = tuple(image.path for image in scene.images)
-    cameras = {name: view.camera for name, view in scene.truth.items()}
+    cameras = {name: view.camera for name, view in true_views(scene).items()}
     depends = (
         (method.name, method.depends),
         [(image.path, image.path.name, image.intrinsics) for image in scene.images],
@@ -232,8 +225,8 @@ def camera_table(rows: Rows) -> Table:
     """Tabulate cameras and sparse points of each method on each scene."""
     lines = []
     for row in rows:
-        scene: SfmScene = row["scene"]
-        truth = scene.truth
+        scene: PosedScene = row["scene"]
+        truth = true_views(scene)
         first = next((each for each in where(rows, scene=scene, method=rows[0]["method"])), row)
         for kind in KINDS:
             views = row[kind]["views"]

@@ -472,10 +472,9 @@ def score_stereo_matches(
     with progress(len(pairs) * (2 * len(sources) + 1), "matching", "pair", quiet) as bar:
 
         def evaluate(source: str, pair: StereoPair, found: Matches) -> None:
-            score = stereo_score(found.points0, found.points1, pair.disparity)
             density = (found.keypoints0.density + found.keypoints1.density) / 2
-            row = {"source": source, "pair": pair.name, "density": density}
-            rows.append({**row, "score": vars(score), "precision": score.precision})
+            score = stereo_score(found.points0, found.points1, pair.disparity)
+            rows.append({"source": source, "pair": pair.name, "density": density, **score})
             bar.update(1)
 
         for name, detector in sources.items():
