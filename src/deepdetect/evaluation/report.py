@@ -42,15 +42,11 @@ def mean_of(values: Iterable[float | None]) -> float | None:
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
+    """A table; its key, as "oxford_matches", is the name of its file.
 
-    Attributes:
-        key: name of its file, as "oxford_matches".
-        title: the line above it.
-        columns: how numbers are written, as ".3f", ",d" or ".1%", by the columns' titles.
-        rows: cells by the columns' titles; one that is missing, None or NaN is a dash.
-        note: what a reader must know to read it.
-        in_text: False for a long one: report.md names its file instead of showing its rows.
+    The columns say how numbers are written, as ".3f", ",d" or ".1%", by title. The rows have cells
+    by title; one that is missing, None or NaN is a dash. A table that is not `in_text` is named in
+    report.md, not shown.
     """
 
     key: str
@@ -115,12 +111,18 @@ def average(style: str, name: Any, **wanted: Any) -> tuple[str, Measure]:
 
 def median(style: str, name: Any) -> tuple[str, Measure]:
     """Make the column of the median of a value, over the rows where it is not None."""
+    return style, lambda rows: median_of(rows, name)
 
-    def cell(rows: Rows) -> Cell:
-        known = [row[name] for row in rows if row[name] is not None]
-        return float(np.median(known)) if known else None
 
-    return style, cell
+def median_of(rows: Iterable[Row], name: Any) -> float | None:
+    """Return the median of the values of this name that are not None; None without any."""
+    known = [row[name] for row in rows if row[name] is not None]
+    return float(np.median(known)) if known else None
+
+
+def largest(style: str, name: Any) -> tuple[str, Measure]:
+    """Make the column of the largest value."""
+    return style, lambda rows: max((row[name] for row in rows), default=None)
 
 
 def tabulate(
@@ -159,12 +161,8 @@ class Section:
 class Report:
     """All of a benchmark.
 
-    Attributes:
-        title: the heading.
-        metadata: how it was made: command, versions, commit, machine, data.
-        sections: in order.
-        skipped: what was not measured, each with the reason.
-        failures: of that, what was wanted and could not be measured.
+    `metadata` says how it was made, `skipped` what was not measured, each with the reason;
+    `failures` are those of them that were wanted and could not be measured.
     """
 
     title: str

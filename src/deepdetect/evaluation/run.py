@@ -55,12 +55,8 @@ class CacheError(DeepDetectError):
 class MatchSettings:
     """How the descriptors of a pair are matched.
 
-    Attributes:
-        matcher: for Euclid's distances; binary descriptors are matched by Hamming's, exactly.
-        ratio: the ratio test keeps matches strictly under it.
-        mutual: keep only mutual nearest neighbours.
-        budget: only the best this many keypoints of each image are matched; None: all.
-        seed: of a matcher that is random.
+    The matcher is for Euclid's distances; binary descriptors are matched by Hamming's, exactly.
+    Only the best `budget` keypoints of each image take part.
     """
 
     matcher: str = "flann"
@@ -72,12 +68,9 @@ class MatchSettings:
 
 @dataclass(frozen=True, eq=False)
 class PairMatches:
-    """The matches of a pair.
+    """The (M, 2) matched positions of a pair, and those of all keypoints that took part.
 
-    Attributes:
-        points0, points1: (M, 2) float32 matched positions.
-        keypoints0, keypoints1: all keypoints that were matched, (N0, 2) and (N1, 2).
-        describe, match: what describing both images and matching took when it was done.
+    With what describing both images and matching took when it was done.
     """
 
     points0: np.ndarray
@@ -99,8 +92,7 @@ class Run:
 
     Attributes:
         made: number of results that were computed, not found in the cache.
-        skipped: what was not measured, each with the reason.
-        failures: of that, what was wanted and could not be measured.
+        skipped, failures: as of `Report`.
     """
 
     def __init__(self, data: Path, cache: Path | None = None, quiet: bool = True) -> None:

@@ -26,20 +26,17 @@ class BaselineError(DeepDetectError):
 
 @dataclass(frozen=True)
 class LocalFeature:
-    """A detector and its descriptor.
+    """A detector and its descriptor, by a name as "sift-low" and a title as tables have it.
 
     Attributes:
-        name: by which users choose it, as "sift-low".
-        title: how tables name it, as "SIFT, low settings".
-        detect: function from a (H, W, 3) uint8 RGB image to its features.
-        describe: function from the image and its features to (N, D) descriptors.
+        detect: function from a (H, W, 3) uint8 RGB image to its keypoints.
+        describe: function from the image and its keypoints to (N, D) descriptors.
         binary: the descriptors are compared by Hamming's distance, else by Euclid's.
         learned: the descriptors were learned for their detector and need no ratio test.
         chance: the points know nothing about the image, and the time they take means nothing.
         version: what results depend on besides the name: cached ones of another are not used.
         detection: what the keypoints depend on, where several features share them.
-        own_scale: how the keypoints are described at their own sizes and angles; None where they
-            have none.
+        own_scale: how keypoints with sizes of their own are described at these.
     """
 
     name: str
@@ -65,12 +62,9 @@ class LocalFeature:
 
 @dataclass(frozen=True)
 class PointDescriptor:
-    """How keypoints are described by their positions alone.
+    """How keypoints are described by their positions alone; the defaults are the paper's.
 
-    Attributes:
-        name: "sift", "rootsift" or "sift-opencv".
-        size_px: diameter (paper: 3).
-        angle_deg: orientation; -1 is OpenCV's "unset", as the paper's code leaves it.
+    An angle of -1 is OpenCV's "unset".
     """
 
     name: str = "sift"
@@ -78,7 +72,7 @@ class PointDescriptor:
     angle_deg: float = -1.0
 
     def describe(self, rgb: np.ndarray, features: Keypoints) -> np.ndarray:
-        """Describe keypoints; (N, D) float32."""
+        """Return (N, D) float32 descriptors."""
         return get_descriptor(self.name)(luma(rgb), features.xy, self.size_px, self.angle_deg)
 
 
@@ -92,9 +86,7 @@ COMMON_DESCRIPTOR = PointDescriptor("rootsift", 4.0, 0.0)
 class OwnScaleDescriptor:
     """RootSIFT of keypoints at their own sizes and angles; without angles the dominant gradient's.
 
-    Attributes:
-        size_factor: the size that is described over that of the keypoint. A descriptor covers a
-            square with six times its size as the side.
+    A descriptor covers a square with six times its size as the side; the factor scales the size.
     """
 
     size_factor: float = 1.0

@@ -6,11 +6,11 @@ from ..._shared.errors import ImageError
 from ...datasets.planar import PlanarPair, load_oxford
 from ..baselines.method import LocalFeature
 from ..options import BenchmarkOptions
-from ..report import Cell, Columns, Row, Rows, Section, tabulate
+from ..report import Cell, Columns, Row, Rows, Section, largest, tabulate
 from ..run import Run
 from .paper import PAPER_MATCHING
 from .planar import select_pairs
-from .standard import STAGES, stage_columns
+from .standard import MEMORY_COLUMNS, SECONDS_COLUMNS, STAGES, stage_costs
 
 PAIR = ("graf", 3)
 ROUNDS = 3
@@ -30,18 +30,17 @@ def speed(run: Run, options: BenchmarkOptions) -> list[Section]:
     for turn in range(ROUNDS + 1):
         found = run.rows("speed of ", features, {pairs[0].name: pairs[0]}, _measure)
         rows += found if turn else []
-    chance = {feature.name for feature in features if feature.chance}
 
     def slowest(own: Rows) -> Cell:
-        totals = [sum(row["seconds", stage] for stage in STAGES) for row in own]
+        totals = [sum(row["seconds", stage] or 0 for stage in STAGES) for row in own]
         return max(totals) / min(totals) if totals else None
 
     columns: Columns = {
-        "keypoints": (",d", lambda own: own[0]["keypoints"] if own else None),
-        "matches": (",d", lambda own: own[0]["matches"] if own else None),
-        **stage_columns("seconds", chance),
+        "keypoints": largest(",d", "keypoints"),
+        "matches": largest(",d", "matches"),
+        **SECONDS_COLUMNS,
         "slowest over fastest round": (".2f", slowest),
-        **stage_columns("memory", chance),
+        **MEMORY_COLUMNS,
     }
     note = (
         f"{pairs[0].name}, the paper's matching. Medians of {ROUNDS} rounds over all methods; "
@@ -56,7 +55,5 @@ def _measure(feature: LocalFeature, pair: PlanarPair) -> Row:
     fresh = Run(pair.first.parent)
     keypoints, detected = fresh.keypoints(feature, pair.first)
     found = fresh.matches(feature, (pair.first, pair.second), PAPER_MATCHING)
-    row: Row = {"keypoints": len(keypoints), "matches": len(found.points0)}
-    for stage, profile in zip(STAGES, (detected, found.describe, found.match), strict=True):
-        row["seconds", stage], row["memory", stage] = profile.seconds, profile.memory
-    return row
+    counts = {"keypoints": len(keypoints), "matches": len(found.points0)}
+    return counts | stage_costs(feature, detected, found)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 
@@ -25,6 +24,7 @@ from ..metrics.homography import (
 )
 from ..metrics.repeatability import coverage, mutual_nn_repeatability
 from ..options import BenchmarkOptions
+from ..profiling import Profile
 from ..report import (
     Cell,
     Columns,
@@ -35,11 +35,14 @@ from ..report import (
     Section,
     Table,
     average,
+    largest,
     mean,
+    median,
+    median_of,
     tabulate,
     where,
 )
-from ..run import MatchSettings, Run
+from ..run import MatchSettings, PairMatches, Run
 
 BUDGETS: tuple[int | None, ...] = (512, 1024, 2048, 4096, 8192, None)
 """Numbers of keypoints; None: all."""
@@ -100,8 +103,7 @@ def pair_row(
         By name: "kind"; ("keypoints", budget) in the image that has fewer; ("repeated", budget,
         radius), and the same of "chance" and "localization"; ("coverage", budget) of the first
         image; "matches", and ("correct", px), ("precision", px) and ("score", px); "all matches"
-        and ("accuracy", px) without a ratio test; "corner errors" by seed; ("seconds", stage) and
-        ("memory", stage).
+        and ("accuracy", px) without a ratio test; "corner errors" by seed; and `stage_costs`.
     """
     images = (pair.first, pair.second)
     (first, detected), (second, _) = (run.keypoints(feature, image) for image in images)
@@ -145,9 +147,19 @@ def pair_row(
         xy = [(each if budget is None else each.best(budget)).xy for each in places]
         row |= _repeatability(run, feature, pair, sizes, xy, budget)
         row["coverage", budget] = coverage(xy[0], sizes[0])
+    return row | stage_costs(feature, detected, matches)
+
+
+def stage_costs(feature: LocalFeature, detected: Profile, matches: PairMatches) -> Row:
+    """Return ("seconds", stage), ("MB", stage), and the "seconds" of a pair, detected in twice.
+
+    Without seconds of detecting random points: they are those of the detector that they follow.
+    """
+    row: Row = {}
     for stage, profile in zip(STAGES, (detected, matches.describe, matches.match), strict=True):
-        row["seconds", stage], row["memory", stage] = profile.seconds, profile.memory
-    return row
+        row["seconds", stage], row["MB", stage] = profile.seconds, profile.memory / 1e6
+    row["seconds"] = detected.seconds + sum(row["seconds", stage] for stage in STAGES)
+    return row | ({"seconds": None, ("seconds", "detect"): None} if feature.chance else {})
 
 
 def _repeatability(
@@ -194,7 +206,6 @@ def standard_tables(
     features: Sequence[LocalFeature], rows: Rows, key: str, what: str
 ) -> list[Table]:
     """Tabulate the rows; `what` names the data in the titles."""
-    chance = {feature.name for feature in features if feature.chance}
     tables: list[tuple[str, str, Columns, str]] = [
         (
             f"repeatability_{radius:g}px",
@@ -210,7 +221,7 @@ def standard_tables(
         ("matching", f"Matches, {what}", MATCHING_COLUMNS, MATCHING_NOTE),
         ("homography", f"Homographies, {what}", _homography_columns(), HOMOGRAPHY_NOTE),
         ("accuracy", f"Mean matching accuracy, {what}", ACCURACY_COLUMNS, ACCURACY_NOTE),
-        ("cost", "Coverage, time and memory", _cost_columns(chance), COST_NOTE),
+        ("cost", "Coverage, time and memory", COST_COLUMNS, COST_NOTE),
     ]
     return [
         tabulate(f"{key}_{name}", title, features, rows, {**PAIRS, **columns}, note)
@@ -270,38 +281,6 @@ def _homography_columns() -> Columns:
     }
 
 
-def _cost_columns(chance: Container[str]) -> Columns:
-    def seconds(own: Rows) -> Cell:
-        return None if own and own[0]["method"] in chance else median_seconds(own)
-
-    return {
-        **{f"coverage, {budget_name(b)}": average(".3f", ("coverage", b)) for b in BUDGETS},
-        **stage_columns("seconds", chance),
-        "pair, s": (".3f", seconds),
-        "correct at 1 px": (",.0f", correct),
-        **stage_columns("memory", chance),
-    }
-
-
-def stage_columns(what: Literal["seconds", "memory"], chance: Container[str]) -> Columns:
-    """Make the columns of the median seconds, or of the largest memory, of each stage.
-
-    The seconds of detecting random points, those of the detector that they follow, mean nothing.
-    """
-
-    def seconds(own: Rows, stage: str) -> Cell:
-        if not own or (stage == "detect" and own[0]["method"] in chance):
-            return None
-        return float(np.median([row["seconds", stage] for row in own]))
-
-    def megabytes(own: Rows, stage: str) -> Cell:
-        return max((row["memory", stage] / 1e6 for row in own), default=None)
-
-    if what == "seconds":
-        return {f"{stage}, s": (".3f", partial(seconds, stage=stage)) for stage in STAGES}
-    return {f"{stage}, MB": (",.0f", partial(megabytes, stage=stage)) for stage in STAGES}
-
-
 PAIRS: Columns = {"pairs": (",d", len)}
 
 MATCHING_COLUMNS: Columns = {
@@ -321,6 +300,18 @@ MATCHING_COLUMNS: Columns = {
 ACCURACY_COLUMNS: Columns = {
     "matches": average(",.0f", "all matches"),
     **{f"{px} px": average(".3f", ("accuracy", px)) for px in MATCH_THRESHOLDS_PX},
+}
+
+SECONDS_COLUMNS: Columns = {f"{s}, s": median(".3f", ("seconds", s)) for s in STAGES}
+
+MEMORY_COLUMNS: Columns = {f"{s}, MB": largest(",.0f", ("MB", s)) for s in STAGES}
+
+COST_COLUMNS: Columns = {
+    **{f"coverage, {budget_name(b)}": average(".3f", ("coverage", b)) for b in BUDGETS},
+    **SECONDS_COLUMNS,
+    "pair, s": median(".3f", "seconds"),
+    "correct at 1 px": (",.0f", correct),
+    **MEMORY_COLUMNS,
 }
 
 REPEATABILITY_NOTE = (
@@ -359,14 +350,6 @@ COST_NOTE = (
 )
 
 
-def median_seconds(rows: Rows) -> float | None:
-    """Return the median time of a pair: detecting twice, describing both, matching."""
-    if not rows:
-        return None
-    detect, describe, match = (np.array([row["seconds", s] for row in rows]) for s in STAGES)
-    return float(np.median(2 * detect + describe + match))
-
-
 def standard_figures(
     features: Sequence[LocalFeature], rows: Rows, key: str, what: str
 ) -> list[Figure]:
@@ -397,9 +380,7 @@ def standard_figures(
     points = {
         feature.title: ([seconds], [count])
         for feature, own in measured
-        if not feature.chance
-        and (seconds := median_seconds(own))
-        and (count := correct(own)) is not None
+        if (seconds := median_of(own, "seconds")) and (count := correct(own)) is not None
     }
     label = f"correct matches at 1 px of {MATCHING_BUDGET:,} keypoints"
     x_label = "detecting, describing and matching a pair, s"
