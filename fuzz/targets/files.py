@@ -14,8 +14,8 @@ from hypothesis import strategies
 from deepdetect import Keypoints, OptionError, load_keypoints, load_matches, save_keypoints
 from deepdetect.geometry.camera import read_calibration
 from deepdetect.io.masks import encode_mask, load_mask
+from deepdetect.labels import find_label_settings
 from deepdetect.labels.detectors import DETECTORS
-from deepdetect.labels.settings import read_label_settings
 
 from ..case import Target, expect, prepared
 from ..mutations import mutate
@@ -146,7 +146,7 @@ def label_settings(generator: np.random.Generator, folder: Path) -> None:
     path = folder / "settings.toml"
     path.write_bytes(content)
     try:
-        read_label_settings(path)
+        find_label_settings(path)
     except OptionError:
         raise
     except UnicodeError as error:  # of the file's name in a message

@@ -15,7 +15,7 @@ import pytest
 from deepdetect import DeepDetectError, load_image, load_keypoints
 from deepdetect.geometry.camera import read_calibration
 from deepdetect.io.masks import load_mask
-from deepdetect.labels.settings import read_label_settings
+from deepdetect.labels import find_label_settings
 
 CORPUS = Path(__file__).parents[2] / "fuzz" / "corpus"
 READERS: dict[str, Callable[[Path], Any]] = {
@@ -23,7 +23,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "calibration": lambda path: read_calibration(path, (64, 48), (64, 48)),
     "image": load_image,
     "keypoints": load_keypoints,
-    "label-settings": read_label_settings,
+    "label-settings": find_label_settings,
     "mask": load_mask,
 }
 FILES = sorted(path for path in CORPUS.rglob("*") if path.is_file())

@@ -11,7 +11,7 @@ from deepdetect import OptionError
 from deepdetect.io.image import luma
 from deepdetect.io.masks import load_mask
 from deepdetect.labels import LabelOptions, fuse
-from deepdetect.labels.batch import LabelTask, label_files
+from deepdetect.labels.batch import LabelTask, label_file
 
 FAST = LabelOptions(("fast",), "normal")
 SOBEL = LabelOptions(("sobel",), "normal")
@@ -30,10 +30,8 @@ def test_an_image_is_labelled_in_several_ways(
         LabelTask(image, tmp_path / "fast.png", FAST),
         LabelTask(image, tmp_path / "sobel.png", SOBEL, tmp_path / "figure.png"),
     ]
-    seen = []
-    reports = label_files(tasks, workers=1, callback=seen.append)
-    assert seen == reports
-    for task, report in zip(tasks, reports, strict=True):
+    for task in tasks:
+        report = label_file(task)
         label = fuse(luma(photo[:60, :80]), task.options)
         assert (report.mask, report.density) == (task.mask, label.density)
         np.testing.assert_array_equal(load_mask(task.mask), label.mask)
@@ -44,7 +42,7 @@ def test_a_bad_image_is_reported(image: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.png").write_bytes(image.read_bytes()[:100])
     paths = (tmp_path / "bad.png", image)
     tasks = [LabelTask(path, tmp_path / "masks" / path.name, FAST) for path in paths]
-    bad, good = label_files(tasks, workers=1)
+    bad, good = map(label_file, tasks)
     assert "bad.png" in str(bad.error)
     assert np.isnan(bad.density)
     assert good.error is None
@@ -54,7 +52,7 @@ def test_a_bad_image_is_reported(image: Path, tmp_path: Path) -> None:
 def test_what_is_done_and_what_is_stale(image: Path, tmp_path: Path) -> None:
     task = LabelTask(image, tmp_path / "mask.png", FAST)
     assert task.outputs.find() is None
-    label_files([task], workers=1)
+    label_file(task)
     assert task.outputs.find() is not None
     with pytest.raises(OptionError, match="other settings"):
         dataclasses.replace(task, options=SOBEL).outputs.find()

@@ -5,10 +5,21 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from deepdetect.io.image import load_image, luma
 from deepdetect.io.masks import load_mask
-from deepdetect.labels import DETECTOR_NAMES, DETECTORS, Label, LabelOptions, draw_label, fuse
+from deepdetect.labels import (
+    DETECTOR_NAMES,
+    DETECTORS,
+    Label,
+    LabelOptions,
+    draw_label,
+    fuse,
+    visibility_of,
+)
 from deepdetect.viz.draw import CAPTION_HEIGHT
 
 
@@ -36,6 +47,22 @@ def test_the_or_of_all_parts(visibility: str, gray: np.ndarray, single: dict) ->
     np.testing.assert_array_equal(label.mask, edges | points)
     assert label.density == pytest.approx((edges | points).sum() / gray.size)
     assert 0 < label.density < 1
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [(255, 255, "low"), (0, 63, "low"), (0, 64, "normal"), (180, 243, "low"), (180, 244, "normal")],
+)
+def test_low_visibility_at_its_limit(low: int, high: int, expected: str) -> None:
+    gray = np.full((20, 20), low, np.uint8)
+    gray[:, 10:] = high
+    assert visibility_of(gray) == expected
+
+
+@given(arrays(np.uint8, st.tuples(st.integers(1, 30), st.integers(1, 30))))
+def test_the_range_is_that_of_two_percentiles(gray: np.ndarray) -> None:
+    low, high = np.percentile(gray, [1, 99], method="inverted_cdf").astype(int)
+    assert visibility_of(gray) == ("low" if high - low < 64 else "normal")
 
 
 def published(shared: Path) -> list[tuple[Path, bool]]:

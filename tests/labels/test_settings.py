@@ -14,7 +14,6 @@ from deepdetect.labels import (
     LabelOptions,
     find_label_settings,
     fuse,
-    read_label_settings,
 )
 from deepdetect.labels.detectors import run_detector
 
@@ -33,7 +32,7 @@ def gray() -> np.ndarray:
 
 
 def test_a_file_chooses_detectors_and_settings(tmp_path: Path, gray: np.ndarray) -> None:
-    options = read_label_settings(
+    options = find_label_settings(
         write(
             tmp_path,
             'detectors = ["fast"]\n[fast]\nnormal = { threshold = 40, suppression = true }\n'
@@ -45,6 +44,11 @@ def test_a_file_chooses_detectors_and_settings(tmp_path: Path, gray: np.ndarray)
         fuse(gray, normal).mask, DETECTORS["fast"].mask(gray, threshold=40, suppression=True)
     )
     np.testing.assert_array_equal(fuse(gray, low).mask, DETECTORS["fast"].mask(gray, threshold=7))
+
+
+def test_an_unknown_visibility_is_told_the_nearest() -> None:
+    with pytest.raises(OptionError, match="unknown visibility 'lo': did you mean 'low'"):
+        LabelOptions(visibility="lo")
 
 
 def test_a_whole_number_serves_for_a_fraction() -> None:
@@ -80,7 +84,7 @@ def test_mistakes_in_the_file_are_one_sentence(
     tmp_path: Path, text: str, one_line: Callable[[BaseException], str]
 ) -> None:
     with pytest.raises(OptionError, match=r"labels\.toml") as caught:
-        read_label_settings(write(tmp_path, text))
+        find_label_settings(write(tmp_path, text))
     one_line(caught.value)
 
 

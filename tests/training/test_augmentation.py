@@ -12,10 +12,8 @@ from PIL import Image
 from deepdetect.io.image import luma
 from deepdetect.labels import (
     DETECTOR_NAMES,
-    LOW_VISIBILITY_RANGE,
     LabelOptions,
     fuse,
-    luma_range,
     visibility_of,
 )
 from deepdetect.training import augmentation
@@ -76,7 +74,7 @@ def test_the_widest_image_is_of_low_visibility_too(seed: int) -> None:
     generator = np.random.default_rng(seed)
     extreme = generator.choice(np.array([0, 255], np.uint8), (16, 16, 3))
     dark = darken(extreme, draw_darkening(generator))
-    assert luma_range(luma(dark)) < LOW_VISIBILITY_RANGE
+    assert visibility_of(luma(dark)) == "low"
 
 
 @given(

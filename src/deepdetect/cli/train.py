@@ -17,7 +17,7 @@ from .._shared.provenance import provenance
 from ..batch.engines import get_engine
 from ..detector.pretrained import resolve_weights
 from ..labels import LabelOptions, find_label_settings
-from ..labels.batch import LabelTask, label_files
+from ..labels.batch import LabelReport, LabelTask, label_file
 from ..training import (
     DeviceOptions,
     PointsTrainingOptions,
@@ -236,8 +236,11 @@ def label(
         tasks.append(LabelTask(image, folder / f"{image.stem}.png", options, figure, overwrite))
     _check_outputs(tasks)
     left = [task for task in tasks if task.outputs.find() is None]
+    reports: list[LabelReport] = []
     with progress(len(left), "labelling", "image") as bar:
-        reports = label_files(left, callback=lambda _: bar.update(1), **how)
+        for report in how["map_tasks"](label_file, left, how["workers"]):
+            reports.append(report)
+            bar.update(1)
     done = sorted((r for r in reports if r.error is None), key=lambda r: str(r.image))
     failures = [report.error for report in reports if report.error is not None]
     names = ("image", "mask", "visibility", "density")

@@ -1,14 +1,12 @@
-"""Labels of image files, written as 1-bit PNG masks by several processes."""
+"""Labels of image files, written as 1-bit PNG masks."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from .._shared.errors import DeepDetectError, MissingExtraError
-from .._shared.machine import TaskMap, map_in_processes
 from .._shared.records import Outputs
 from ..io.image import load_image, luma
 from ..io.masks import save_mask
@@ -45,26 +43,8 @@ class LabelReport:
     error: str | None = None
 
 
-def label_files(
-    tasks: Sequence[LabelTask],
-    workers: int | None = None,
-    callback: Callable[[LabelReport], None] | None = None,
-    map_tasks: TaskMap = map_in_processes,
-) -> list[LabelReport]:
-    """Label image files, in parallel over processes; one report per mask, in order of completion.
-
-    An image that cannot be read is reported, and the others are labelled all the same.
-    """
-    reports = []
-    for report in map_tasks(label_file, tasks, workers):
-        if callback is not None:
-            callback(report)
-        reports.append(report)
-    return reports
-
-
 def label_file(task: LabelTask) -> LabelReport:
-    """Make the mask of an image file."""
+    """Make the mask of an image file; what is wrong with the image is reported."""
     try:
         rgb = load_image(task.image)
         label = fuse(luma(rgb), task.options)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,10 @@ from .._shared.options import suggest_keywords
 from ..io.image import load_image, luma
 from ..viz.draw import draw_masks
 from .detectors import DETECTORS, run_detector
-from .settings import LabelOptions
-from .visibility import Visibility, visibility_of
+from .settings import LabelOptions, Visibility
+
+LOW_VISIBILITY_RANGE = 64
+"""An image whose luma spans fewer grey levels than this is of low visibility."""
 
 
 @suggest_keywords
@@ -25,16 +28,16 @@ class Label:
         keypoints: (H, W) bool, pixels marked by a keypoint detector.
         edges: (H, W) bool, pixels marked by an edge detector.
         visibility: the settings that were used, "normal" or "low".
-        mask: (H, W) bool, the pixelwise OR of both.
     """
 
     keypoints: np.ndarray
     edges: np.ndarray
     visibility: Visibility
-    mask: np.ndarray = field(init=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "mask", self.keypoints | self.edges)
+    @cached_property
+    def mask(self) -> np.ndarray:
+        """(H, W) bool, the pixelwise OR of both."""
+        return self.keypoints | self.edges
 
     def __repr__(self) -> str:
         height, width = self.mask.shape
@@ -44,6 +47,29 @@ class Label:
     def density(self) -> float:
         """Fraction of the pixels that are marked."""
         return float(self.mask.mean())
+
+
+@suggest_keywords
+def visibility_of(gray: np.ndarray) -> Visibility:
+    """Decide which detector settings an image gets.
+
+    An image is of low visibility when its luma spans fewer than 64 grey levels between the 1st and
+    the 99th percentile. (The paper's darkened images span at most 32; its normal ones at least
+    146.)
+
+    Args:
+        gray: (H, W) uint8 luma.
+
+    Returns:
+        "normal" or "low".
+
+    Example:
+        >>> visibility_of(np.full((16, 16), 20, np.uint8))
+        'low'
+    """
+    cumulative = np.cumsum(np.bincount(gray.ravel(), minlength=256)) / gray.size
+    darkest, brightest = np.searchsorted(cumulative, [0.01, 0.99])
+    return "low" if brightest - darkest < LOW_VISIBILITY_RANGE else "normal"
 
 
 @suggest_keywords
@@ -72,7 +98,9 @@ def fuse(
         (True, False)
     """
     gray = _luma(image, channels)
-    visibility = visibility_of(gray, options.visibility)
+    visibility = options.visibility
+    if visibility == "auto":
+        visibility = visibility_of(gray)
     marked = {"keypoint": np.zeros(gray.shape, bool), "edge": np.zeros(gray.shape, bool)}
     for name in options.detectors:
         settings = options.parameters(name, visibility)

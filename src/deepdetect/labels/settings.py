@@ -6,12 +6,13 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from .._shared.errors import OptionError, unknown_name
 from .._shared.options import resolve_name_or_path, suggest_keywords
 from .detectors import DETECTOR_NAMES, DETECTORS, Value, select_detectors
-from .visibility import Visibility, VisibilityChoice
+
+Visibility = Literal["normal", "low"]
 
 Settings = Mapping[str, Mapping[str, Mapping[str, Value]]]
 """Changed settings by detector, section and parameter, as a settings file holds them."""
@@ -46,7 +47,7 @@ class LabelOptions:
     """
 
     detectors: tuple[str, ...] = DETECTOR_NAMES
-    visibility: VisibilityChoice = "auto"
+    visibility: Literal["auto", "normal", "low"] = "auto"
     settings: Settings = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
@@ -123,25 +124,7 @@ LABEL_SETTINGS: dict[str, LabelOptions] = {
 def find_label_settings(settings: str | Path) -> LabelOptions:
     """Look settings up by name, or read them from a file.
 
-    Args:
-        settings: a name of `LABEL_SETTINGS`, or the path of a TOML file.
-
-    Raises:
-        OptionError: the name is unknown, or the file cannot be read or is wrong.
-
-    Example:
-        >>> find_label_settings("dense").settings
-        {'sobel': {'normal': {'relative_threshold': 0.02}}}
-    """
-    found = resolve_name_or_path("label settings", settings, LABEL_SETTINGS)
-    return read_label_settings(found) if isinstance(found, Path) else found
-
-
-@suggest_keywords
-def read_label_settings(path: str | Path) -> LabelOptions:
-    """Read detectors and their settings from a TOML file.
-
-    The file may name the detectors, and change some of their settings::
+    A TOML file may name the detectors, and change some of their settings::
 
         detectors = ["fast", "harris", "sobel"]  # default: all nine
 
@@ -149,9 +132,20 @@ def read_label_settings(path: str | Path) -> LabelOptions:
         normal = { threshold = 20 }
         low_visibility = { threshold = 4 }
 
+    Args:
+        settings: a name of `LABEL_SETTINGS`, or the path of a file.
+
     Raises:
-        OptionError: the file cannot be read, or a name or value is wrong.
+        OptionError: the name is unknown, the file cannot be read, or a name or value in it is
+            wrong.
+
+    Example:
+        >>> find_label_settings("dense").settings
+        {'sobel': {'normal': {'relative_threshold': 0.02}}}
     """
+    path = resolve_name_or_path("label settings", settings, LABEL_SETTINGS)
+    if isinstance(path, LabelOptions):
+        return path
     try:
         content = tomllib.loads(Path(path).read_text("utf-8-sig"))
     except OSError as error:

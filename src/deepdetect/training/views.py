@@ -14,7 +14,7 @@ from .._shared.opencv import cv2
 from .._shared.records import file_digest, key
 from ..io.image import find_images, load_image, luma, scale_short_side
 from ..labels import LabelOptions, fuse
-from ..labels.visibility import Visibility
+from ..labels.settings import Visibility
 from .augmentation import AUGMENTATION_VERSION, Darkening, augment, darken, draw_darkening
 from .recipe import TrainingOptions
 
