@@ -62,7 +62,7 @@ def test_there_are_8000_photographs_and_more() -> None:
     assert len(pictures) >= 8000
     assert len({(crop.source, crop.path) for crop in crops}) == len(pictures)
     free = [crop for crop in crops if crop.is_free]
-    assert {crop.source for crop in crops} == {source.name for source in listed_sources()}
+    assert {crop.source for crop in crops} == set(listed_sources())
     for name, part in (("photographs", crops), ("photographs-free", free)):
         dataset = find_remote_dataset(name)
         assert dataset.images == len(part)

@@ -15,8 +15,12 @@ from .posed_images import PosedImage, PosedScene, load_posed_scenes
 @cache
 def remote_datasets() -> dict[str, RemoteDataset]:
     """Return the data sets on the web by name."""
-    text = resources.files(__package__).joinpath("known/datasets.json").read_text("utf-8")
-    return {name: _remote_dataset(name, **entry) for name, entry in json.loads(text).items()}
+    return {name: _remote_dataset(name, **entry) for name, entry in _known("datasets").items()}
+
+
+def _known(name: str) -> Any:
+    file = resources.files(__package__).joinpath(f"known/{name}.json")
+    return json.loads(file.read_text("utf-8")) if file.is_file() else {}
 
 
 def _remote_dataset(name: str, files: Any = (), texts: Any = None, **values: Any) -> RemoteDataset:
@@ -27,7 +31,7 @@ def _remote_dataset(name: str, files: Any = (), texts: Any = None, **values: Any
         return RemoteDataset(name, files=photographs.archives(crops), prepare=prepare, **values)
     made = tuple(RemoteFile(**{**file, "urls": tuple(file["urls"])}) for file in files)
     written = {path: json.dumps(value, indent=1) + "\n" for path, value in (texts or {}).items()}
-    return RemoteDataset(name, files=made, texts=written, **values)
+    return RemoteDataset(name, files=made, contents=_known(name), texts=written, **values)
 
 
 def find_remote_dataset(name: str) -> RemoteDataset:

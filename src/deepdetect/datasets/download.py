@@ -7,16 +7,13 @@ COCO with its 19 GB needs.
 from __future__ import annotations
 
 import errno
-import gzip
 import hashlib
-import json
 import re
 import shutil
 import tarfile
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import resources
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -34,7 +31,6 @@ TIMEOUT_SECONDS = 60.0
 """A host that sends nothing for this long has failed."""
 
 ARCHIVE_SUFFIXES = (".zip", ".tar.gz", ".tgz", ".tar")
-GZIP_SIGNATURE = b"\x1f\x8b"
 
 WRITE_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO),
@@ -82,8 +78,7 @@ class RemoteDataset:
         images: number of images.
         licence: the terms of use.
         contents: `content_digest` of files by their path in the data set, which does not depend
-            on the archive or the image format they came in; None for those that the package
-            has in `known/NAME.json`, if any.
+            on the archive or the image format they came in.
         texts: files that are written, not downloaded, by path in the data set.
         prepare: turns what was unpacked into the data set, in the folder that it is given; its
             second argument says whether it shows no progress.
@@ -94,7 +89,7 @@ class RemoteDataset:
     files: tuple[RemoteFile, ...]
     images: int
     licence: str
-    contents: Mapping[str, str] | None = field(default=None, repr=False)
+    contents: Mapping[str, str] = field(default_factory=dict, repr=False)
     texts: Mapping[str, str] = field(default_factory=dict, repr=False)
     prepare: Callable[[Path, bool], None] | None = field(default=None, repr=False)
 
@@ -102,13 +97,6 @@ class RemoteDataset:
     def size(self) -> int:
         """Bytes of the download."""
         return sum(file.size for file in self.files)
-
-    def known_contents(self) -> Mapping[str, str]:
-        """Return the digests that the contents must have, by path."""
-        if self.contents is not None:
-            return self.contents
-        file = resources.files(__package__).joinpath(f"known/{self.name}.json")
-        return json.loads(file.read_text("utf-8")) if file.is_file() else {}
 
 
 def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = True) -> Path:
@@ -283,7 +271,7 @@ def _check(dataset: RemoteDataset, folder: Path, subject: str) -> None:
             f"{subject} holds {count:,} images, not the {dataset.images:,} of {dataset.name}: "
             "choose another folder"
         )
-    for name, digest in dataset.known_contents().items():
+    for name, digest in dataset.contents.items():
         found = content_digest(folder, name)
         if found != digest:
             state = "is missing" if found is None else "is not the one of the data set"
@@ -330,11 +318,12 @@ def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
             with zipfile.ZipFile(archive) as zipped:
                 _extract(zipped.infolist(), lambda one: zipped.extract(one, target), quiet)
         else:
-            _check_gzip(archive)
             with tarfile.open(archive) as tar:
+                while tar.fileobj.read(CHUNK_BYTES):
+                    pass  # the checksum of gzip lies behind the last member
                 endings = file.suffixes or ("",)
-                members = [m for m in tar.getmembers() if m.name.lower().endswith(endings)]
-                _extract(members, lambda one: _extract_member(tar, one, target), quiet)
+                members = [m for m in tar if not m.isdir() and m.name.lower().endswith(endings)]
+                _extract(members, lambda one: _extract_file(tar, one, target), quiet)
     except Exception as error:  # zip, tar and their compressions raise many kinds
         if isinstance(error, OSError) and error.errno in WRITE_ERRORS:
             raise
@@ -347,26 +336,17 @@ def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
         (target / file.inside).rmdir()
 
 
-def _extract_member(tar: tarfile.TarFile, member: tarfile.TarInfo, target: Path) -> None:
-    """Extract a member that stays below the folder; Python before 3.11.4 has no filter for it."""
-    if hasattr(tarfile, "data_filter"):
-        tar.extract(member, target, filter="data")
-        return
-    inside = (target / member.name).resolve().is_relative_to(target.resolve())
-    if not inside or not (member.isreg() or member.isdir()):
-        raise tarfile.TarError(f"{member.name!r} leads outside, or is no file and no folder")
-    member.mode = 0o755 if member.isdir() else 0o644
-    tar.extract(member, target)
+def _extract_file(tar: tarfile.TarFile, member: tarfile.TarInfo, target: Path) -> None:
+    """Write a file of a tar archive below a folder; a link becomes a copy.
 
-
-def _check_gzip(archive: Path) -> None:
-    """Read a gzip file to its end, where its checksum is: unpacking a tar stops before it."""
-    with archive.open("rb") as start:
-        if start.read(2) != GZIP_SIGNATURE:
-            return
-    with gzip.open(archive) as file:
-        while file.read(1 << 20):
-            pass
+    Python has a filter for it from 3.11.4 on only.
+    """
+    path, content = target / member.name, tar.extractfile(member)
+    if content is None or not path.resolve().is_relative_to(target.resolve()):
+        raise tarfile.TarError(f"{member.name!r} leads outside, or is no file")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with content, path.open("wb") as file:
+        shutil.copyfileobj(content, file)
 
 
 def _extract(members: Sequence[Any], extract: Callable[[Any], object], quiet: bool) -> None:

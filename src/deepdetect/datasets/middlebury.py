@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from .._shared.errors import ImageError, MissingImageError, require_packages
 from ..geometry.camera import Calibration, read_calibration
@@ -53,36 +54,24 @@ def load_middlebury(folder: str | Path) -> StereoPair:
     root, left, right = _load_views(folder)
     path = root / "calib.json"
     try:
-        truth = json.loads(path.read_bytes()).get("ground_truth")
-        if truth is None:
-            raise ImageError(f"{root} has no ground truth: take a scene that has one")
+        truth = json.loads(path.read_bytes())["ground_truth"]
         value, unknown = float(truth["value_per_pixel"]), float(truth["unknown"])
         file = root / truth["file"]
     except OSError as error:
         raise ImageError(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except (
-        ValueError,
-        OverflowError,
-        RecursionError,
-        KeyError,
-        TypeError,
-        AttributeError,
-    ) as error:
-        raise ImageError(f"{path} does not say how its ground truth is stored ({error})") from None
-    stored = _load_gray(file) if file.is_file() else None
-    if stored is None or not value > 0:
+    except (ValueError, OverflowError, RecursionError, KeyError, TypeError) as error:
         raise ImageError(
-            f"the ground truth {file} is missing, or no grey image with a scale above 0"
-        )
+            f"{path} does not say how a ground truth is stored ({error}): take a scene that has one"
+        ) from None
+    with open_image(file) as image:
+        stored, is_gray = np.asarray(image), image.mode == "L" or image.mode.startswith("I")
+    if not is_gray or not value > 0:
+        raise ImageError(f"the ground truth {file} is no grey image with a scale above 0")
     disparity = np.where(stored == unknown, np.nan, stored / value).astype(np.float32)
-    return StereoPair(root.name, left, right, _enlarged(disparity, left.shape[:2]))
-
-
-def _load_gray(path: Path) -> np.ndarray | None:
-    """Read the grey values of an image of 8 or 16 bits, None if it has colours."""
-    with open_image(path) as image:
-        gray = image.mode == "L" or image.mode.startswith("I")
-        return np.asarray(image) if gray else None
+    # A map may be smaller than the images: each pixel has the nearest of its values.
+    size = (left.shape[1], left.shape[0])
+    disparity = np.asarray(Image.fromarray(disparity).resize(size, Image.Resampling.NEAREST))
+    return StereoPair(root.name, left, right, disparity)
 
 
 def load_calibrated_pair(folder: str | Path) -> CalibratedStereoPair:
@@ -116,12 +105,3 @@ def _load_views(folder: str | Path) -> tuple[Path, np.ndarray, np.ndarray]:
     if left.shape != right.shape:
         raise ImageError(f"left.png and right.png in {root} differ in size: take a rectified pair")
     return root, left, right
-
-
-def _enlarged(disparity: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Read a smaller map at each pixel of the image: the nearest of its values."""
-    row, column = (
-        np.minimum((np.arange(full) + 0.5) * own / full, own - 1).astype(int)
-        for full, own in zip(shape, disparity.shape, strict=True)
-    )
-    return disparity[np.ix_(row, column)]

@@ -14,10 +14,12 @@ import io
 import json
 import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -48,19 +50,15 @@ SOURCES_FOLDER = "sources"
 
 @dataclass(frozen=True)
 class Source:
-    """A repository on GitHub, "OWNER/NAME", at a commit, with images in some folders, or in all.
+    """A repository on GitHub, "OWNER/NAME", at a commit, whose archive has so many megabytes.
 
-    The names of its crops begin with `name`. The archive has about so many megabytes. Some folders
-    have other licences than the repository.
+    The names of its crops begin with `name`.
     """
 
     name: str
     repository: str
     commit: str
-    folders: Sequence[str]
-    licence: str
     megabytes: int
-    other_licences: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def archive(self) -> RemoteFile:
@@ -76,10 +74,11 @@ class Source:
 
 
 @cache
-def listed_sources() -> tuple[Source, ...]:
-    """Return the repositories that crops are listed of."""
+def listed_sources() -> dict[str, Source]:
+    """Return the repositories that crops are listed of, by name."""
     text = resources.files(__package__).joinpath("known/sources.json").read_text("utf-8")
-    return tuple(Source(**row) for row in json.loads(text))
+    names = ("name", "repository", "commit", "megabytes")
+    return {row["name"]: Source(*(row[name] for name in names)) for row in json.loads(text)}
 
 
 @dataclass(frozen=True)
@@ -125,13 +124,12 @@ def write_crops(folder: Path, quiet: bool, crops: Sequence[Crop]) -> None:
     Crops of a picture come one after the other.
     """
     rows = [("file", "picture", "licence", "sha256")]
-    repositories = {source.name: source for source in listed_sources()}
     with progress(len(crops), "cropping", "crop", quiet) as bar:
         for number, (crop, picture) in enumerate(_cut(folder / SOURCES_FOLDER, crops)):
             file = folder / crop.part / f"{crop.source}_{number:05d}.jpg"
             file.parent.mkdir(parents=True, exist_ok=True)
             picture.save(file, quality=JPEG_QUALITY, subsampling=0)
-            source = repositories[crop.source]
+            source = listed_sources()[crop.source]
             url = f"https://github.com/{source.repository}/blob/{source.commit}/{crop.path}"
             rows.append((file.relative_to(folder).as_posix(), url, crop.licence, crop.sha256))
             bar.update(1)
@@ -142,23 +140,22 @@ def write_crops(folder: Path, quiet: bool, crops: Sequence[Crop]) -> None:
 
 def _cut(sources: Path, crops: Sequence[Crop]) -> Iterator[tuple[Crop, Image.Image]]:
     """Yield crops with their pixels; a picture is read once for all of its crops."""
-    held: tuple[str, Image.Image] | None = None
-    for crop in crops:
-        path = sources / crop.source / crop.path
-        if held is None or held[0] != crop.sha256:
-            try:
-                content = path.read_bytes()
-            except OSError:
-                raise DeepDetectError(
-                    f"{crop.source} has no {crop.path}: the archive is not the one that is listed"
-                ) from None
-            if hashlib.sha256(content).hexdigest() != crop.sha256:
-                raise DeepDetectError(
-                    f"{crop.path} of {crop.source} is not the picture that is listed: it has "
-                    "changed or was damaged on the way"
-                )
-            held = crop.sha256, Image.fromarray(load_image(content))
-        yield crop, cut(held[1], crop.short_side_px, crop.x, crop.y)
+    for listed, of_picture in groupby(crops, attrgetter("source", "path", "sha256")):
+        source, path, sha256 = listed
+        try:
+            content = (sources / source / path).read_bytes()
+        except OSError:
+            raise DeepDetectError(
+                f"{source} has no {path}: the archive is not the one that is listed"
+            ) from None
+        if hashlib.sha256(content).hexdigest() != sha256:
+            raise DeepDetectError(
+                f"{path} of {source} is not the picture that is listed: it has changed or was "
+                "damaged on the way"
+            )
+        picture = Image.fromarray(load_image(content))
+        for crop in of_picture:
+            yield crop, cut(picture, crop.short_side_px, crop.x, crop.y)
 
 
 def cut(picture: Image.Image, short_side_px: int, x: int, y: int) -> Image.Image:
@@ -177,4 +174,4 @@ def cut(picture: Image.Image, short_side_px: int, x: int, y: int) -> Image.Image
 def archives(crops: Sequence[Crop]) -> tuple[RemoteFile, ...]:
     """Return the archives that crops are cut from."""
     used = {crop.source for crop in crops}
-    return tuple(source.archive for source in listed_sources() if source.name in used)
+    return tuple(source.archive for name, source in listed_sources().items() if name in used)

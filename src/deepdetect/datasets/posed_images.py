@@ -19,7 +19,7 @@ import numpy as np
 
 from .._shared.errors import ImageError
 from ..geometry.camera import cross_matrix
-from ..io.image import ORIENTATION_TAG, load_image
+from ..io.image import ORIENTATION_TAG
 from ..io.image_file import open_image
 from .pair_selection import FRAME_DISTANCES, sequence_pairs, unordered_pairs
 
@@ -164,8 +164,8 @@ def _read_strecha(folder: Path) -> list[PosedImage]:
         if not found:
             raise ImageError(f"there is no image {stem}.jpg or .png for {file}: put it there")
         intrinsics = _scaled(numbers[:9].reshape(3, 3), size, found[0], file)
-        pose = _world_to_camera(numbers[12:21].reshape(3, 3), numbers[21:24])
-        images.append(_posed_image(found[0], intrinsics, *pose, file))
+        axes, centre = numbers[12:21].reshape(3, 3), numbers[21:24]
+        images.append(_posed_image(found[0], intrinsics, axes.T, -axes.T @ centre, file))
     return images
 
 
@@ -188,12 +188,12 @@ def _read_kitti(folder: Path) -> list[PosedImage]:
             )
         where = f"line {frame + 1} of {poses}"
         pose = _numbers(lines[frame].split(), 12, where).reshape(3, 4)
-        rotation, translation = _world_to_camera(pose[:, :3], pose[:, 3])
-        image = _posed_image(path, projection[:, :3], rotation, translation, where)
+        axes, centre = pose[:, :3], pose[:, 3]
+        image = _posed_image(path, projection[:, :3], axes.T, -axes.T @ centre, where)
         _image_size(path)  # damaged images are an error, and those that are to be turned
         # The poses are of the first camera; the last column leads from it to the images' own.
         offset = np.linalg.solve(image.intrinsics, projection[:, 3])
-        images.append(replace(image, translation=translation + offset))
+        images.append(replace(image, translation=image.translation + offset))
     return images
 
 
@@ -272,11 +272,6 @@ def _rotation_of_quaternion(quaternion: np.ndarray, where: str) -> np.ndarray:
     return np.eye(3) + 2 * w * skew + 2 * skew @ skew
 
 
-def _world_to_camera(axes: np.ndarray, centre: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose of a camera with these axes, as columns, and this centre in the world."""
-    return axes.T, -axes.T @ centre
-
-
 def _posed_image(
     path: Path,
     intrinsics: np.ndarray,
@@ -313,12 +308,9 @@ def _scaled(
 
 def _image_size(path: Path) -> tuple[int, int]:
     """Return (width, height) without decoding the pixels."""
-    try:
-        with open_image(path) as opened:
-            size, turned = opened.size, opened.getexif().get(ORIENTATION_TAG, 1) != 1
-    except ImageError:  # of the file's head only; this says what is wrong
-        height, width = load_image(path).shape[:2]
-        return width, height
+    with open_image(path) as opened:
+        size: tuple[int, int] = opened.size
+        turned = opened.getexif().get(ORIENTATION_TAG, 1) != 1
     if turned:
         raise ImageError(
             f"{path} is to be turned by its EXIF orientation, its camera is not: save it upright "
