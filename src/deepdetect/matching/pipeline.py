@@ -134,11 +134,11 @@ def match_images(
         keypoints = find[0](), find[1]()
     with timer.stage("guided matching"):
         keypoints0, keypoints1 = _ordered(keypoints, swapped)
-        source = (keypoints0, keypoints1) if source is None else source
+        if first is None:
+            source = (keypoints0, keypoints1) if source is None else source
+            first = guiding_geometry(gray0, gray1, guiding, seed, source)
         pixels0, pixels1 = np.rint(keypoints0.xy), np.rint(keypoints1.xy)
-        guide, matched = guided_matches(
-            gray0, gray1, pixels0, pixels1, guiding, seed, source, first
-        )
+        guide, matched = guided_matches(gray0, gray1, pixels0, pixels1, first, seed)
     if swapped:
         guide = guide.swapped()
     if matched is None:

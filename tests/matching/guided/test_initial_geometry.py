@@ -98,7 +98,7 @@ def assert_nothing(found: InitialGeometry) -> None:
 
 def check_agreeing(found: InitialGeometry) -> None:
     """Its points agree with the matrix."""
-    assert 0 < len(found.points0) == len(found.points1) <= found.num_matches
+    assert 0 < len(found.points0) == len(found.points1) <= len(found.inliers)
     measure = transfer_errors if found.model == "homography" else epipolar_errors
     errors = measure(found.points0, found.points1, found.matrix)
     assert errors.max() < GUIDING_THRESHOLDS_PX[found.model]
@@ -195,7 +195,7 @@ def test_stronger_tilts_are_tried_where_something_hints_at_a_geometry(
     picture: Callable[..., np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = picture("camera", (200, 150))
-    monkeypatch.setattr(module, "MAX_LOG10_NFA", -1e9)
+    monkeypatch.setattr("deepdetect.geometry.estimation.MAX_LOG10_NFA", -1e9)
     for hint, tried in ((0.0, 30), (-1e9, 10)):
         monkeypatch.setattr(module, "MAX_HINT_LOG10_NFA", hint)
         found = initial_geometry(image, image)
@@ -223,7 +223,7 @@ def test_clear_depth_is_decided_on_small_copies(
     monkeypatch.setattr(module, "MIN_COARSE_DEPTH_INLIERS", 50)
     found = find_initial_geometry(left, right)
     assert found.model == "fundamental"
-    assert found.tentative is None  # larger copies were not looked at
+    assert found.source is None  # larger copies were not looked at
     errors = epipolar_errors(points0, points1, found.matrix)
     assert np.quantile(errors, 0.95) < 1.5
     limit = GUIDING_THRESHOLDS_PX["fundamental"] * left.shape[1] / 400
@@ -237,7 +237,7 @@ def test_depth_that_few_matches_show_is_decided_on_larger_copies(
     monkeypatch.setattr(module, "MIN_COARSE_DEPTH_INLIERS", 10_000)
     found = find_initial_geometry(*art[:2])
     assert found.model == "fundamental"
-    assert found.tentative is not None
+    assert found.source is not None
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.evaluation.metrics.stereo import stereo_score
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import luma
-from deepdetect.matching.guided import guided_matches
+from deepdetect.matching.guided import guided_matches, guiding_geometry
 
 from ..conftest import match
 
@@ -75,13 +75,14 @@ def test_a_plane_that_the_images_do_not_show_does_not_guide(
     xy = np.stack(np.meshgrid(np.arange(256), np.arange(256)), -1).reshape(-1, 2)
     # Few keypoints have another where the plane would take them; that decides nothing.
     xy = xy[np.random.default_rng(1).random(len(xy)) < fraction]
-    guide, found = guided_matches(gray, other, xy, xy, "auto")
+    guide, found = guided_matches(gray, other, xy, xy, guiding_geometry(gray, other))
     assert guide.model != "homography"
     if found is not None:  # what the poster shows agrees with a fundamental matrix, too
         inside = ((xy[found.indices0] > 80) & (xy[found.indices0] < 176)).all(axis=1)
         errors = np.linalg.norm(found.points1 - xy[found.indices0], axis=1)
         assert (inside & (errors < 1)).mean() > 0.9
-    asked, found = guided_matches(gray, other, xy, xy, "homography")
+    plane = guiding_geometry(gray, other, "homography")
+    asked, found = guided_matches(gray, other, xy, xy, plane)
     assert asked.model == "homography"
     inside = ((xy[found.indices0] > 80) & (xy[found.indices0] < 176)).all(axis=1)
     assert inside.mean() > 0.95

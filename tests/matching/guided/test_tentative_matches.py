@@ -9,7 +9,7 @@ import pytest
 from deepdetect import Keypoints, PointDetector
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import luma
-from deepdetect.matching.guided import guided_matches
+from deepdetect.matching.guided import guided_matches, guiding_geometry
 from deepdetect.matching.guided import initial_geometry as module
 from deepdetect.matching.guided.initial_geometry import matches_of_points
 
@@ -69,7 +69,8 @@ def test_guided_matching_begins_with_points(pair, points, monkeypatch) -> None:
     places = [np.rint(each.xy) for each in points]
     with monkeypatch.context() as patched:
         patched.setattr(module, "detect_sift", None)
-        guide, found = guided_matches(*grays, *places, source=points)
+        first = guiding_geometry(*grays, source=points)
+        guide, found = guided_matches(*grays, *places, first)
     assert guide.model == "homography"
     assert found is not None
     errors = np.linalg.norm(
@@ -80,10 +81,8 @@ def test_guided_matching_begins_with_points(pair, points, monkeypatch) -> None:
 
 def test_where_points_give_nothing_sift_is_tried(pair, points) -> None:
     grays = luma(pair[0]), luma(pair[1])
-    places = [np.rint(each.xy) for each in points]
     shuffled = np.random.default_rng(0).permutation(len(points[1]))
     wrong = replace(points[1], xy=points[1].xy[shuffled][:, ::-1])
-    guide, found = guided_matches(*grays, *places, source=(points[0], wrong))
-    plain, _ = guided_matches(*grays, *places)
-    assert found is not None
-    np.testing.assert_array_equal(guide.matrix, plain.matrix)
+    found, plain = (guiding_geometry(*grays, source=one) for one in ((points[0], wrong), None))
+    assert found.matrix is not None
+    np.testing.assert_array_equal(found.matrix, plain.matrix)

@@ -15,7 +15,7 @@ from ...features.keypoints import nearest_keypoints
 from ...geometry import transform_points
 from ...geometry.transforms import transfer_errors
 from ...io.image import load_image, luma
-from ...matching.guided import guided_matches
+from ...matching.guided import guided_matches, guiding_geometry
 from ..baselines.method import LocalFeature
 from ..metrics.homography import corner_error
 from ..options import BenchmarkOptions
@@ -166,7 +166,8 @@ def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -
     def make() -> Row:
         gray0, gray1 = (luma(load_image(image)) for image in images)
         with profiled() as profiler:
-            guide, found = guided_matches(gray0, gray1, first, second, seed=seed)
+            geometry = guiding_geometry(gray0, gray1, seed=seed)
+            guide, found = guided_matches(gray0, gray1, first, second, geometry, seed)
         return {
             "model": guide.model,
             "matrix": np.empty((0, 3)) if guide.matrix is None else guide.matrix,

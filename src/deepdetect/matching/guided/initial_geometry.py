@@ -19,7 +19,7 @@ from ...features.keypoints import Keypoints
 from ...features.matchers import exact_neighbours, match_descriptors
 from ...features.matches import TwoViewGeometry
 from ...features.sift import describe_keypoints, detect_sift
-from ...geometry.estimation import MAX_LOG10_NFA, Parallax, TwoViewModel
+from ...geometry.estimation import TwoViewModel
 from ...geometry.images import downscale
 from ...geometry.semi_calibrated import MATCH_SIGMA_PX, refine_fundamental
 from ...geometry.transforms import (
@@ -117,6 +117,12 @@ class TentativeMatches:
         return TentativeMatches(views, scales, features, self.matched[::-1], self.ratios)
 
 
+Source = TentativeMatches | Points | tuple[Keypoints, Keypoints] | None
+"""What a geometry is found from: matches that have been made already, (K, 2) positions in both
+images of another matcher, or keypoints: these make the matches where they are points of all scales
+and enough. Else SIFT does."""
+
+
 def find_tentative_matches(
     gray0: np.ndarray,
     gray1: np.ndarray,
@@ -198,44 +204,28 @@ def _separate(*matches: np.ndarray) -> tuple[np.ndarray, ...]:
     return matches
 
 
-@dataclass(frozen=True, eq=False)
-class InitialGeometry:
-    """A geometry from tentative matches, at the images' own size.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class InitialGeometry(TwoViewModel):
+    """A model of tentative matches, at the images' own size; "none" when none can be trusted.
 
-    The model is "homography", "fundamental", or "none" when none can be trusted. `points0` and
-    `points1` are the matches that agree with it; `num_matches` those it was estimated from;
-    `parallax` what a homography leaves that was chosen, not asked for; `tentative` the matches of
-    the larger images, where they have been made.
+    `points0` and `points1` are the matches that agree with it; `num_views` were simulated for them.
+    Another model would be found from the `source`.
     """
 
-    model: str
-    matrix: np.ndarray | None
     points0: np.ndarray
     points1: np.ndarray
-    num_matches: int
-    log10_nfa: float
     num_views: int = 0
-    parallax: Parallax | None = None
-    tentative: TentativeMatches | None = None
+    source: Source = None
 
     @classmethod
-    def of(cls, two_view: TwoViewModel, points: Points) -> InitialGeometry:
-        """Return a model with the matches that agree with it."""
-        on_model = points[0][two_view.inliers], points[1][two_view.inliers]
-        count, alarms = len(two_view.inliers), two_view.log10_nfa
-        return cls(
-            two_view.model, two_view.matrix, *on_model, count, alarms, parallax=two_view.parallax
-        )
-
-    @property
-    def trusted(self) -> bool:
-        """Whether chance does not explain it."""
-        return self.log10_nfa < MAX_LOG10_NFA
+    def of(cls, model: TwoViewModel, points0: np.ndarray, points1: np.ndarray) -> InitialGeometry:
+        """Return a model with those of the matches that agree with it."""
+        return cls(**vars(model), points0=points0[model.inliers], points1=points1[model.inliers])
 
     def untrusted(self) -> InitialGeometry:
         """Return that there is none, and how near it was."""
-        points, evidence = np.empty((0, 2)), (self.num_matches, self.log10_nfa, self.num_views)
-        return InitialGeometry("none", None, points, points, *evidence)
+        nowhere = np.empty((0, 2))
+        return replace(self, model="none", matrix=None, points0=nowhere, points1=nowhere)
 
     def rescaled(self, scale0: float, scale1: float) -> InitialGeometry:
         """Return a geometry of images at other scales as one of the images themselves."""
@@ -250,7 +240,7 @@ class InitialGeometry:
 
     def as_two_view_geometry(self) -> TwoViewGeometry:
         """Return what the user is told of it."""
-        counts = self.num_matches, len(self.points0)
+        counts = len(self.inliers), len(self.points0)
         return TwoViewGeometry(
             self.model, self.matrix, *counts, float(self.log10_nfa), self.num_views
         )
@@ -261,25 +251,21 @@ def guiding_geometry(
     gray1: np.ndarray,
     model: str = "auto",
     seed: int = 0,
-    source: TentativeMatches | Points | tuple[Keypoints, Keypoints] | None = None,
+    source: Source = None,
 ) -> InitialGeometry:
-    """Return the geometry to begin with.
-
-    `source` are matches that have been made already, (K, 2) positions in both images of another
-    matcher, or keypoints: these make the matches where they are points of all scales and enough.
-    Else SIFT does.
-    """
+    """Return the geometry to begin with."""
     if isinstance(source, TentativeMatches) or source is None:
-        return find_initial_geometry(gray0, gray1, model, seed, source)
-    if not isinstance(source[0], Keypoints):
+        geometry = find_initial_geometry(gray0, gray1, model, seed, source)
+    elif isinstance(source[0], Keypoints):
+        matches = matches_of_points(gray0, gray1, source)
+        if matches is not None:
+            geometry = estimate_initial_geometry(matches, model, seed)
+        if matches is None or len(geometry.points0) < MIN_COARSE_INLIERS:
+            geometry = find_initial_geometry(gray0, gray1, model, seed)
+    else:
         sizes = gray0.shape[::-1], gray1.shape[::-1]
-        return _geometry_of_positions(source, sizes, model, seed)
-    matches = matches_of_points(gray0, gray1, source)
-    if matches is not None:
-        geometry = estimate_initial_geometry(matches, model, seed)
-        if len(geometry.points0) >= MIN_COARSE_INLIERS:
-            return geometry
-    return find_initial_geometry(gray0, gray1, model, seed)
+        geometry = _geometry_of_positions(source, sizes, model, seed)
+    return geometry if geometry.source is not None else replace(geometry, source=source)
 
 
 def find_initial_geometry(
@@ -302,7 +288,7 @@ def find_initial_geometry(
         tentative = find_tentative_matches(gray0, gray1)
     geometry = estimate_initial_geometry(tentative, model, seed)
     if geometry.matrix is not None:
-        return replace(geometry, tentative=tentative)
+        return replace(geometry, source=tentative)
     if longest <= SIMULATED_SIDE_PX:
         return estimate_initial_geometry(tentative, model, seed, view_keypoints=MAX_KEYPOINTS // 2)
     tentative = find_tentative_matches(
@@ -317,7 +303,7 @@ def _is_clear(geometry: InitialGeometry) -> bool:
     """Whether most matches of the coarse pass, and enough, agree with a model that fits alone."""
     depth = geometry.model == "fundamental"
     least = MIN_COARSE_DEPTH_INLIERS if depth else MIN_COARSE_INLIERS
-    most = len(geometry.points0) >= max(least, MIN_COARSE_FRACTION * geometry.num_matches)
+    most = len(geometry.points0) >= max(least, MIN_COARSE_FRACTION * len(geometry.inliers))
     parallax = geometry.parallax
     doubtful = parallax is not None and parallax.exceeds(MIN_PARALLAX_FRACTION)
     return geometry.matrix is not None and most and (depth or not doubtful)
@@ -347,7 +333,7 @@ def _geometry_of_positions(points: Points, sizes: Sizes, model: str, seed: int) 
     )
     scaled0, scaled1 = _separate(scaled_points(points0, scale0), scaled_points(points1, scale1))
     chosen = choose_model(scaled0, scaled1, (size0, size1), model, seed)
-    geometry = InitialGeometry.of(chosen, (scaled0, scaled1))
+    geometry = InitialGeometry.of(chosen, scaled0, scaled1)
     return geometry.rescaled(scale0, scale1) if geometry.trusted else geometry.untrusted()
 
 
@@ -366,14 +352,15 @@ def estimate_initial_geometry(
     """
     size0, size1 = ((view.shape[1], view.shape[0]) for view in tentative.views)
     nowhere = np.empty((0, 2))
-    best = InitialGeometry("none", None, nowhere, nowhere, 0, float("inf"))
+    nothing = TwoViewModel("none", None, np.zeros(0, bool), float("inf"))
+    best = InitialGeometry.of(nothing, nowhere, nowhere)
     num_views = 0
     for points, ratios, views in _more_and_more_matches(tentative, view_keypoints):
         num_views += views
         for ratio in MAX_RATIOS:
             chosen = points[0][ratios < ratio], points[1][ratios < ratio]
             two_view = choose_model(*chosen, (size0, size1), model, seed, semi_calibrated)
-            geometry = InitialGeometry.of(two_view, chosen)
+            geometry = InitialGeometry.of(two_view, *chosen)
             geometry = _with_further_evidence(geometry, chosen[0], tentative)
             if geometry.log10_nfa < best.log10_nfa:
                 best = replace(geometry, num_views=num_views)

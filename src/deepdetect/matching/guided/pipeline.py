@@ -10,18 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...features.keypoints import Keypoints, nearest_keypoints
+from ...features.keypoints import nearest_keypoints
 from ...features.matches import GuidedMatches, TwoViewGeometry
 from ...geometry.homography_refinement import refine_homography
 from ...geometry.images import downscale, warp_to_reference
 from ...geometry.transforms import scaled_homography, transform_points
-from .initial_geometry import (
-    MIN_PARALLAX_FRACTION,
-    InitialGeometry,
-    Points,
-    TentativeMatches,
-    guiding_geometry,
-)
+from .initial_geometry import MIN_PARALLAX_FRACTION, InitialGeometry, guiding_geometry
 from .rectified import match_by_rectification
 from .verification import dissimilarity
 
@@ -65,19 +59,13 @@ def guided_matches(
     gray1: np.ndarray,
     xy0: np.ndarray,
     xy1: np.ndarray,
-    model: str = "auto",
+    first: InitialGeometry,
     seed: int = 0,
-    source: TentativeMatches | Points | tuple[Keypoints, Keypoints] | None = None,
-    first: InitialGeometry | None = None,
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
-    """Match keypoints on whole pixels, (N, 2) and (M, 2), of two images by their geometry.
+    """Match keypoints on whole pixels, (N, 2) and (M, 2), of two images by their `first` geometry.
 
-    `first` is the geometry to begin with where `guiding_geometry`, whose arguments the others are,
-    has found it already. Returns the geometry that guided, and the matches; None when no geometry
-    could be trusted.
+    Returns the geometry that guided, and the matches; None when no geometry could be trusted.
     """
-    if first is None:
-        first = guiding_geometry(gray0, gray1, model, seed, source)
     enough = MIN_MATCHED_FRACTION * min(len(xy0), len(xy1))
     if first.model == "homography":
         assert first.matrix is not None
@@ -85,8 +73,7 @@ def guided_matches(
         matches, verified = match_by_homography(gray0, gray1, xy0, xy1, matrix, seed)
         if verified >= _least_verified(first):
             return _trusted(first, matrix, matches, max(enough, MIN_MATCHES))
-        source = source if first.tentative is None else first.tentative
-        depth = guiding_geometry(gray0, gray1, "fundamental", seed, source)
+        depth = guiding_geometry(gray0, gray1, "fundamental", seed, first.source)
         first = replace(depth, num_views=depth.num_views + first.num_views)
     if first.matrix is None:
         return first.untrusted().as_two_view_geometry(), None
