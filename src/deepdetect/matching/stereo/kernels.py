@@ -119,57 +119,39 @@ def _step(before, least, cost, total, after, p1, p2):  # type: ignore[no-untyped
 
 
 @compiled(nogil=True)
-def sum_along_rows(first, last, gray, cost, total, direction, p1, p2):  # type: ignore[no-untyped-def]
-    """Add the paths along some rows, to the right (1) or to the left (-1).
+def sum_along_paths(first, last, gray, cost, total, down, right, p1, p2):  # type: ignore[no-untyped-def]
+    """Add the paths of some rows, or of some columns where they go `down` (1) or up (-1).
 
-    `p2` holds the penalty of a larger change of disparity for each change of the grey level.
-    """
-    width, count = cost.shape[1], cost.shape[2]
-    lines = np.empty((2, count + 2), np.uint16)
-    for y in range(first, last):
-        lines[:] = 0
-        lines[:, 0] = lines[:, count + 1] = END
-        least = np.uint16(0)
-        x = 0 if direction == 1 else width - 1
-        tone = gray[y, x]
-        for step in range(width):
-            x = step if direction == 1 else width - 1 - step
-            change = abs(np.int32(gray[y, x]) - np.int32(tone))
-            tone = gray[y, x]
-            least = _step(
-                lines[step % 2], least, cost[y, x], total[y, x], lines[1 - step % 2],
-                p1, p2[change],
-            )  # fmt: skip
-
-
-@compiled(nogil=True)
-def sum_along_columns(  # type: ignore[no-untyped-def]
-    first, last, gray, cost, total, direction, slant, p1, p2
-):
-    """Add the paths of some columns, down (1) or up (-1), `slant` columns to the right per row.
-
-    A slanting path that leaves at one side starts again at the other, in its next row: so there
-    are as many paths as columns, and each belongs to one call.
+    They go to the `right` (1) or to the left (-1) by a pixel per step. A slanting path that leaves
+    at one side starts again at the other, in its next row: so there are as many paths as columns,
+    and each belongs to one call. `p2` holds the penalty of a larger change of disparity for each
+    change of the grey level.
     """
     height, width, count = cost.shape
-    lines = np.zeros((2, last - first, count + 2), np.uint16)
+    paths, steps = last - first, height if down else width
+    lines = np.zeros((2, paths, count + 2), np.uint16)
     lines[:, :, 0] = lines[:, :, count + 1] = END
-    leasts = np.zeros(last - first, np.uint16)
-    tones = np.zeros(last - first, np.uint8)
-    for step in range(height):
-        y = step if direction == 1 else height - 1 - step
-        for path in range(last - first):
-            x = (first + path + slant * step) % width
-            if step == 0 or (slant == 1 and x == 0) or (slant == -1 and x == width - 1):
-                lines[step % 2, path, 1 : count + 1] = 0
-                leasts[path] = 0
-                tones[path] = gray[y, x]
-            change = abs(np.int32(gray[y, x]) - np.int32(tones[path]))
+    leasts = np.zeros(paths, np.uint16)
+    tones = np.zeros(paths, np.uint8)
+    for k in range(paths * steps):  # in the order of the memory
+        if down:
+            step, path = k // paths, k % paths
+            y = step if down == 1 else height - 1 - step
+            x = (first + path + right * step) % width
+        else:
+            step, path = k % steps, k // steps
+            y = first + path
+            x = step if right == 1 else width - 1 - step
+        if step == 0 or (right == 1 and x == 0) or (right == -1 and x == width - 1):
+            lines[step % 2, path, 1 : count + 1] = 0
+            leasts[path] = 0
             tones[path] = gray[y, x]
-            leasts[path] = _step(
-                lines[step % 2, path], leasts[path], cost[y, x], total[y, x],
-                lines[1 - step % 2, path], p1, p2[change],
-            )  # fmt: skip
+        change = abs(np.int32(gray[y, x]) - np.int32(tones[path]))
+        tones[path] = gray[y, x]
+        leasts[path] = _step(
+            lines[step % 2, path], leasts[path], cost[y, x], total[y, x],
+            lines[1 - step % 2, path], p1, p2[change],
+        )  # fmt: skip
 
 
 @compiled(nogil=True)

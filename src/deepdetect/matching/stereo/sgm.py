@@ -9,6 +9,7 @@ grey values along the row (Lucas and Kanade, 1981): `benchmarks/row_matching.py`
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -204,18 +205,17 @@ def aggregate(
     outside: int = WRONG_PLACE_BITS,
 ) -> np.ndarray:
     """Return the (H, W, D) uint16 costs of a pair's censuses, summed over the eight paths."""
-    from .kernels import sum_along_columns, sum_along_rows
+    from .kernels import sum_along_paths
 
     height, width = gray.shape
     cost = matching_cost(left, right, min_disparity, count, outside)
     total = np.zeros(cost.shape, np.uint16)
     p2 = np.maximum(P2_BITS / (1 + np.arange(256) / P2_HALF_GRADIENT_LEVELS), MIN_P2_BITS)
     penalties = np.uint16(P1_BITS * COST_PER_BIT), (p2 * COST_PER_BIT).astype(np.uint16)
-    volumes = gray, cost, total
-    for direction in (1, -1):
-        parallel_for(height, sum_along_rows, *volumes, direction, *penalties)
-        for slant in (-1, 0, 1):
-            parallel_for(width, sum_along_columns, *volumes, direction, slant, *penalties)
+    for down, right in product((-1, 0, 1), repeat=2):
+        if down or right:
+            paths = width if down else height
+            parallel_for(paths, sum_along_paths, gray, cost, total, down, right, *penalties)
     return total
 
 
