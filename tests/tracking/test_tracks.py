@@ -8,7 +8,7 @@ import pytest
 
 from deepdetect import DeepDetectError, OptionError
 from deepdetect.tracking import TrackedFrame, load_tracks, save_tracks
-from deepdetect.tracking.tracks import write_tracks
+from deepdetect.tracking.tracks import TrackDrawer, track_color, write_tracks
 
 
 def frame(number: int, tracks: list[int], ages: list[int]) -> TrackedFrame:
@@ -65,3 +65,20 @@ def test_a_table_is_whole_or_not_there(tmp_path: Path) -> None:
 def test_shapes_are_checked() -> None:
     with pytest.raises(OptionError):
         TrackedFrame(0, np.arange(2), np.zeros((3, 2)), np.zeros(2), np.zeros(2))
+
+
+def test_tracks_are_drawn_where_they_are() -> None:
+    black = np.zeros((60, 80, 3), np.uint8)
+    drawer = TrackDrawer(tail=3)
+    drawn = black
+    for k, x in enumerate((20.0, 30.0, 40.0)):
+        frame = TrackedFrame(k, np.array([5]), np.array([[x, 30]]), np.ones(1), np.array([k]))
+        drawn = drawer.draw(black, frame)
+    color = np.array(track_color(5), float)
+    for x in (20, 30, 40):  # lines are blended with what is below
+        seen = drawn[30, x].astype(float)
+        assert seen.max() > 120
+        np.testing.assert_allclose(seen / seen.max(), color / color.max(), atol=0.05)
+    assert not drawn[50:].any()
+    assert not black.any()
+    assert drawer.draw(black, frame, "12 frames/s").astype(int).sum() > drawn.astype(int).sum()

@@ -5,15 +5,133 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from deepdetect import DeepDetectError, OptionError
-from deepdetect.tracking import TrackedFrame
-from deepdetect.tracking.video import (
-    CODECS,
-    TrackDrawer,
-    track_color,
-    write_video,
+from deepdetect import DeepDetectError, ImageError, OptionError
+from deepdetect._shared.errors import BatchError, MissingFileError
+from deepdetect.tracking import FrameSource
+from deepdetect.tracking.video import CODECS, write_video
+
+
+def test_a_folder_gives_its_images_by_name(frame_folder, moving_photo) -> None:
+    with FrameSource(frame_folder, every=2) as source:
+        assert (source.count, source.live, source.fps) == (3, False, 5.0)
+        frames = list(source)
+    assert [frame.number for frame in frames] == [0, 2, 4]
+    np.testing.assert_array_equal(frames[1].rgb, moving_photo(2))
+
+
+def test_a_video_gives_what_was_written(moving_photo, tmp_path: Path) -> None:
+    with write_video(tmp_path / "v.mp4", 12.0) as write:
+        for k in range(6):
+            write(moving_photo(k))
+    with FrameSource(tmp_path / "v.mp4") as source:
+        assert source.count == 6
+        assert source.fps == pytest.approx(12)
+        frames = list(source)
+    assert len(frames) == 6
+    # Compressed, and red is not blue.
+    for k, frame in enumerate(frames):
+        assert np.abs(frame.rgb.astype(int) - moving_photo(k)).mean() < 6
+    with FrameSource(tmp_path / "v.mp4", every=4, max_frames=5) as source:
+        assert source.count == 2
+        assert [frame.number for frame in source] == [0, 4]
+    with FrameSource(tmp_path / "v.mp4", max_frames=2) as source:
+        assert source.count == len(list(source)) == 2
+
+
+def test_an_image_that_is_no_frame_is_left_out(frame_folder, moving_photo) -> None:
+    (frame_folder / "002.png").write_bytes(b"no image")
+    Image.fromarray(moving_photo(3)[:-9]).save(frame_folder / "003.png")
+    with FrameSource(frame_folder, max_frames=3) as source:
+        assert [frame.number for frame in source] == [0, 1, 4]
+        bad, small = source.failures
+    assert "002.png is not an image" in bad
+    assert "003.png has 320x231 pixels, the first frame has 320x240" in small
+    for path in frame_folder.iterdir():
+        path.write_bytes(b"no image")
+    with FrameSource(frame_folder) as source, pytest.raises(BatchError, match="none of 6 frames"):
+        next(iter(source))
+
+
+class Camera:
+    """What OpenCV gives for a camera, of three frames."""
+
+    opened = True
+    released = 0
+
+    def __init__(self, number: int) -> None:
+        self.number, self.left = number, 3
+
+    def isOpened(self) -> bool:
+        return self.opened
+
+    def get(self, _: int) -> float:
+        return 0.0
+
+    def grab(self) -> bool:
+        self.left -= 1
+        return self.left >= 0
+
+    def read(self):
+        blue = np.zeros((48, 64, 3), np.uint8)
+        blue[..., 0] = 200
+        return self.grab(), blue
+
+    def release(self) -> None:
+        Camera.released += 1
+
+
+def test_a_camera_by_its_number(monkeypatch) -> None:
+    import cv2
+
+    monkeypatch.setattr(cv2, "VideoCapture", Camera)
+    for given in (1, "1"):
+        Camera.released = 0
+        with FrameSource(given) as source:
+            assert (source.camera, source.live, source.count) == (1, True, None)
+            frames = list(source)
+        assert len(frames) == 3
+        assert frames[0].rgb[0, 0].tolist() == [0, 0, 200]
+        assert Camera.released == 1
+    monkeypatch.setattr(Camera, "opened", False)
+    with pytest.raises(MissingFileError, match="no camera 1"):
+        FrameSource(1)
+
+
+def test_a_folder_named_like_a_camera_is_a_folder(frame_folder, tmp_path, monkeypatch) -> None:
+    frame_folder.rename(tmp_path / "7")
+    monkeypatch.chdir(tmp_path)
+    with FrameSource("7") as source:
+        assert not source.live
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "words"),
+    [
+        ("none.mp4", MissingFileError, "no video, folder or camera"),
+        ("text.mp4", DeepDetectError, "no video"),
+        ("empty", ImageError, "no image"),
+        ("one.png", ImageError, "one image"),
+    ],
 )
+def test_a_mistake_is_one_sentence(
+    name: str, kind: type[Exception], words: str, moving_photo, tmp_path: Path, one_line
+) -> None:
+    (tmp_path / "text.mp4").write_text("I am no video")
+    (tmp_path / "empty").mkdir()
+    Image.fromarray(moving_photo(0)).save(tmp_path / "one.png")
+    with pytest.raises(kind) as caught:
+        FrameSource(tmp_path / name)
+    assert words in one_line(caught.value)
+
+
+@pytest.mark.parametrize("values", [{"every": 0}, {"every": 1.5}, {"max_frames": 0}])
+def test_wrong_options(values, frame_folder) -> None:
+    with pytest.raises(OptionError, match=next(iter(values))):
+        FrameSource(frame_folder, **values)
+    with pytest.raises(OptionError, match="number of a camera"):
+        FrameSource(-1)
 
 
 def test_there_is_no_file_unless_it_is_whole(moving_photo, tmp_path: Path) -> None:
@@ -82,20 +200,3 @@ def test_frames_of_another_size_are_refused(moving_photo, tmp_path: Path) -> Non
         write(moving_photo(0))
         with pytest.raises(DeepDetectError, match="pixels"):
             write(moving_photo(0)[:100])
-
-
-def test_tracks_are_drawn_where_they_are() -> None:
-    black = np.zeros((60, 80, 3), np.uint8)
-    drawer = TrackDrawer(tail=3)
-    drawn = black
-    for k, x in enumerate((20.0, 30.0, 40.0)):
-        frame = TrackedFrame(k, np.array([5]), np.array([[x, 30]]), np.ones(1), np.array([k]))
-        drawn = drawer.draw(black, frame)
-    color = np.array(track_color(5), float)
-    for x in (20, 30, 40):  # lines are blended with what is below
-        seen = drawn[30, x].astype(float)
-        assert seen.max() > 120
-        np.testing.assert_allclose(seen / seen.max(), color / color.max(), atol=0.05)
-    assert not drawn[50:].any()
-    assert not black.any()
-    assert drawer.draw(black, frame, "12 frames/s").astype(int).sum() > drawn.astype(int).sum()

@@ -10,10 +10,10 @@ from cyclopts import Parameter
 
 from .._shared.errors import OptionError
 from .._shared.records import Outputs
-from ..tracking.frames import FrameSource
 from ..tracking.pipeline import output_files
 from ..tracking.pipeline import track as track_points
 from ..tracking.tracker import TrackingOptions
+from ..tracking.video import FrameSource
 from . import _options as cli
 
 TRACKING = cli.From(TrackingOptions, "max_keypoints")

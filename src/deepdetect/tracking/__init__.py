@@ -1,9 +1,9 @@
 """Video: points followed from frame to frame."""
 
-from .frames import Frame, FrameSource
 from .pipeline import TrackingReport, point_candidates, track, track_frames
 from .tracker import Tracker, TrackingOptions
 from .tracks import TrackedFrame, load_tracks, save_tracks
+from .video import Frame, FrameSource
 
 __all__ = [
     "Frame",

@@ -19,10 +19,9 @@ from .._shared.progress import progress
 from .._shared.signals import ENDING, exit_by_signal, handle_signals
 from ..detector.detector import Detector
 from ..detector.point_detector import PointDetector
-from .frames import FrameSource
 from .tracker import CANDIDATES, Detect, Tracker, TrackingOptions
-from .tracks import TrackedFrame, write_tracks
-from .video import TrackDrawer, check_video_name, write_video
+from .tracks import TrackDrawer, TrackedFrame, write_tracks
+from .video import Frame, FrameSource, check_video_name, write_video
 
 MIN_SIDE_PX = 32
 """Smallest longer side that frames are scaled down to."""
@@ -84,23 +83,19 @@ def track_frames(
     """
     if max_side is not None and not max_side >= MIN_SIDE_PX:
         raise OptionError(f"`max_side` must be at least {MIN_SIDE_PX} pixels, not {max_side}")
-    return _followed(source, tracker, max_side)
+    return ((frame.rgb, _tracked(tracker, frame, max_side)) for frame in source)
 
 
-def _followed(
-    source: FrameSource, tracker: Tracker, max_side: int | None
-) -> Iterator[tuple[np.ndarray, TrackedFrame]]:
-    for frame in source:
-        height, width = frame.rgb.shape[:2]
-        if max_side is None or max(height, width) <= max_side:
-            yield frame.rgb, tracker.update(frame.rgb, number=frame.number)
-            continue
-        factor = max_side / max(height, width)
-        size = max(1, round(width * factor)), max(1, round(height * factor))
-        small = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
-        found = tracker.update(small, number=frame.number)
-        xy = (found.xy + 0.5) * np.divide((width, height), size) - 0.5
-        yield frame.rgb, replace(found, xy=xy.astype(np.float32))
+def _tracked(tracker: Tracker, frame: Frame, max_side: int | None) -> TrackedFrame:
+    height, width = frame.rgb.shape[:2]
+    if max_side is None or max(height, width) <= max_side:
+        return tracker.update(frame.rgb, number=frame.number)
+    factor = max_side / max(height, width)
+    size = max(1, round(width * factor)), max(1, round(height * factor))
+    small = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
+    found = tracker.update(small, number=frame.number)
+    xy = (found.xy + 0.5) * np.divide((width, height), size) - 0.5
+    return replace(found, xy=xy.astype(np.float32))
 
 
 @suggest_keywords

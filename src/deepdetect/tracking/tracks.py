@@ -1,7 +1,9 @@
-"""Where points are in the frames of a video, and their table in a file."""
+"""Where points are in the frames of a video: a table in a file, and pictures."""
 
 from __future__ import annotations
 
+import colorsys
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,9 +13,16 @@ import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import InvalidFileError, MissingFileError, OptionError, first_line
+from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 
 HEADER = "frame,track,x,y,score"
+
+READABLE_WIDTH_PX = 800
+"""Lines and letters grow with frames that are wider than this."""
+
+HUE_STEP = 0.61803
+"""Of the colours of following tracks: neighbours are far apart (the golden ratio)."""
 
 
 @suggest_keywords
@@ -133,3 +142,39 @@ def load_tracks(path: str | Path) -> list[TrackedFrame]:
         xy, scores = part[:, 2:4].astype(np.float32), part[:, 4].astype(np.float32)
         frames.append(TrackedFrame(number, tracks, xy, scores, ages))
     return frames
+
+
+class TrackDrawer:
+    """Draws tracks with their last positions, up to `tail`, over frames."""
+
+    def __init__(self, tail: int = 10) -> None:
+        self._frames: deque[TrackedFrame] = deque(maxlen=tail)
+
+    def draw(self, rgb: np.ndarray, frame: TrackedFrame, caption: str = "") -> np.ndarray:
+        """Return a copy of a frame, (H, W, 3) uint8, with its tracks and a caption."""
+        self._frames.append(frame)
+        canvas = np.ascontiguousarray(rgb.copy())
+        unit = max(1.0, rgb.shape[1] / READABLE_WIDTH_PX)
+        colors = {track: track_color(track) for track in frame.tracks.tolist()}
+        tails: dict[int, list[list[float]]] = {}
+        for past in self._frames:
+            for track, place in zip(past.tracks.tolist(), past.xy.tolist(), strict=True):
+                if track in colors:
+                    tails.setdefault(track, []).append(place)
+        for track, places in tails.items():
+            line = np.rint(np.array(places)).astype(np.int32).reshape(-1, 1, 2)
+            cv2.polylines(canvas, [line], False, colors[track], max(1, round(unit)), cv2.LINE_AA)
+            end = (int(line[-1, 0, 0]), int(line[-1, 0, 1]))
+            cv2.circle(canvas, end, round(2 * unit), colors[track], -1, cv2.LINE_AA)
+        if caption:
+            place, font = (round(8 * unit), round(22 * unit)), cv2.FONT_HERSHEY_SIMPLEX
+            for color, width in (((0, 0, 0), 4), ((255, 255, 255), 1)):
+                style = font, 0.6 * unit, color, round(width * unit), cv2.LINE_AA
+                cv2.putText(canvas, caption, place, *style)
+        return canvas
+
+
+def track_color(track: int) -> tuple[int, int, int]:
+    """Return a bright RGB colour that a track keeps."""
+    red, green, blue = colorsys.hsv_to_rgb(track * HUE_STEP % 1, 0.8, 1.0)
+    return round(255 * red), round(255 * green), round(255 * blue)

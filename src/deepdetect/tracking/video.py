@@ -1,28 +1,173 @@
-"""Video files of the tracked points."""
+"""Frames of a video file, a folder of images, or a camera; and video files of frames."""
 
 from __future__ import annotations
 
-import colorsys
-from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from itertools import count, islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import DeepDetectError, OptionError
+from .._shared.errors import (
+    BatchError,
+    DeepDetectError,
+    ImageError,
+    InvalidFileError,
+    MissingFileError,
+    OptionError,
+)
 from .._shared.opencv import cv2
-from .tracks import TrackedFrame
+from .._shared.options import suggest_keywords
+from ..io.image import IMAGE_SUFFIXES, find_images, load_image
+
+FOLDER_FPS = 10.0
+"""Of the frames in a folder, which say nothing of it."""
+
+MAX_FPS = 1000.0
+"""What a file states above it is wrong."""
+
 
 CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
 """Of the files, by their suffix."""
 
-READABLE_WIDTH_PX = 800
-"""Lines and letters grow with frames that are wider than this."""
 
-HUE_STEP = 0.61803
-"""Of the colours of following tracks: neighbours are far apart (the golden ratio)."""
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A frame.
+
+    Attributes:
+        number: in the source, from 0 on.
+        rgb: (H, W, 3) uint8.
+    """
+
+    number: int
+    rgb: np.ndarray
+
+
+class FrameSource(AbstractContextManager["FrameSource"]):
+    """The frames of a video file, of the images below a folder, or of a camera.
+
+    It is iterated once, in a `with` block.
+
+    Args:
+        source: a file, a folder (images in the order of their names), or the number of a camera.
+        every: take each frame with a number that this divides.
+        max_frames: that are taken; None: all.
+
+    Attributes:
+        live: whether it is a camera, which has no end.
+        fps: frames per second of what is taken.
+        count: number of frames that will be taken, as far as the file states it; None where it is
+            not known.
+        failures: a sentence on each image of a folder that was left out until now: it cannot be
+            read, or has another size than the first one.
+
+    Raises:
+        MissingFileError: there is no such file, folder or camera.
+        ImageError: the folder holds no image.
+        InvalidFileError: the file is no video that can be read.
+        OptionError: an option is out of its range.
+    """
+
+    @suggest_keywords
+    def __init__(
+        self, source: str | Path | int, *, every: int = 1, max_frames: int | None = None
+    ) -> None:
+        for name, value in (("every", every), ("max_frames", max_frames)):
+            if value is not None and (value < 1 or value % 1):
+                raise OptionError(f"`{name}` must be a whole number from 1 on, not {value}")
+        self.every, self.max_frames = every, max_frames
+        self.camera = _camera_number(source)
+        self.live = self.camera is not None
+        self._capture: Any = None
+        self._images: list[Path] = []
+        self.failures: list[str] = []
+        path, fps = Path(str(source)), FOLDER_FPS
+        if not self.live and path.is_dir():
+            self._images = find_images(path)
+            total = len(self._images)
+        else:
+            self._capture = self._opened(path)
+            stated = float(self._capture.get(cv2.CAP_PROP_FPS))
+            fps = stated if 0 < stated <= MAX_FPS else fps
+            total = 0 if self.live else int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        self.fps = fps / every
+        taken = -(-max(0, total) // every)
+        self.count = min((number for number in (taken, max_frames) if number), default=None)
+
+    def _opened(self, path: Path) -> Any:
+        """Open a file or a camera by OpenCV."""
+        if not self.live and not path.is_file():
+            raise MissingFileError(f"there is no video, folder or camera {path}: check the path")
+        if not self.live and path.suffix.lower() in IMAGE_SUFFIXES:
+            raise ImageError(f"{path} is one image: give a video, or the folder of the frames")
+        capture = cv2.VideoCapture(self.camera if self.live else str(path))
+        if capture.isOpened():
+            return capture
+        if self.live:
+            raise MissingFileError(
+                f"there is no camera {self.camera}, or another program uses it: try another "
+                "number, or close that program"
+            )
+        raise InvalidFileError(
+            f"{path} is no video that the installed OpenCV can read: convert it to MP4 "
+            "(H.264), or give a folder of its frames"
+        )
+
+    def __iter__(self) -> Iterator[Frame]:
+        frames = self._from_images() if self._capture is None else self._from_capture()
+        return islice(frames, self.max_frames)
+
+    def _from_images(self) -> Iterator[Frame]:
+        first: tuple[int, ...] = ()
+        for number, path in list(enumerate(self._images))[:: self.every]:
+            try:
+                rgb = load_image(path)
+            except ImageError as error:
+                self.failures.append(str(error))
+                continue
+            height, width = rgb.shape[:2]
+            first = first or (width, height)
+            if (width, height) == first:
+                yield Frame(number, rgb)
+            else:
+                self.failures.append(
+                    f"{path} has {width}x{height} pixels, the first frame has "
+                    f"{first[0]}x{first[1]}: give frames of one size"
+                )
+        if not first:
+            count = len(self.failures)
+            raise BatchError(f"none of {count} frames can be read", self.failures)
+
+    def _from_capture(self) -> Iterator[Frame]:
+        for number in count():
+            wanted = number % self.every == 0
+            # What is not wanted is not decoded where the format allows it.
+            done, bgr = self._capture.read() if wanted else (self._capture.grab(), None)
+            if not done:
+                break
+            if wanted:
+                yield Frame(number, load_image(bgr, channels="bgr"))
+        if not number:
+            raise DeepDetectError("the source gives no frame: check it with another program")
+
+    def __exit__(self, *_: object) -> None:
+        if self._capture is not None:
+            self._capture.release()
+
+
+def _camera_number(source: str | Path | int) -> int | None:
+    """Return the number of a camera, None where a path is meant."""
+    if isinstance(source, int):
+        if source < 0:
+            raise OptionError(f"the number of a camera must be 0 or more, not {source}")
+        return source
+    text = str(source)
+    return int(text) if text.isascii() and text.isdigit() and not Path(text).exists() else None
 
 
 def count_frames(path: Path) -> int:
@@ -31,11 +176,10 @@ def count_frames(path: Path) -> int:
     if cv2.CAP_FFMPEG in cv2.videoio_registry.getBackends():
         # It can leave frames undecoded, which takes a fiftieth of the time.
         backend, settings = cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1]
-    capture, count = cv2.VideoCapture(str(path), backend, settings), 0
-    while capture.grab():
-        count += 1
+    capture = cv2.VideoCapture(str(path), backend, settings)
+    frames = next(number for number in count() if not capture.grab())
     capture.release()
-    return count
+    return frames
 
 
 def check_video_name(path: str | Path) -> str:
@@ -86,39 +230,3 @@ def write_video(path: str | Path, fps: float) -> Iterator[Callable[[np.ndarray],
                 f"cannot write {path} ({found} of {len(sizes)} frames are in the file): free "
                 "some space, or choose another place"
             )
-
-
-class TrackDrawer:
-    """Draws tracks with their last positions, up to `tail`, over frames."""
-
-    def __init__(self, tail: int = 10) -> None:
-        self._frames: deque[TrackedFrame] = deque(maxlen=tail)
-
-    def draw(self, rgb: np.ndarray, frame: TrackedFrame, caption: str = "") -> np.ndarray:
-        """Return a copy of a frame, (H, W, 3) uint8, with its tracks and a caption."""
-        self._frames.append(frame)
-        canvas = np.ascontiguousarray(rgb.copy())
-        unit = max(1.0, rgb.shape[1] / READABLE_WIDTH_PX)
-        colors = {track: track_color(track) for track in frame.tracks.tolist()}
-        tails: dict[int, list[list[float]]] = {}
-        for past in self._frames:
-            for track, place in zip(past.tracks.tolist(), past.xy.tolist(), strict=True):
-                if track in colors:
-                    tails.setdefault(track, []).append(place)
-        for track, places in tails.items():
-            line = np.rint(np.array(places)).astype(np.int32).reshape(-1, 1, 2)
-            cv2.polylines(canvas, [line], False, colors[track], max(1, round(unit)), cv2.LINE_AA)
-            end = (int(line[-1, 0, 0]), int(line[-1, 0, 1]))
-            cv2.circle(canvas, end, round(2 * unit), colors[track], -1, cv2.LINE_AA)
-        if caption:
-            place, font = (round(8 * unit), round(22 * unit)), cv2.FONT_HERSHEY_SIMPLEX
-            for color, width in (((0, 0, 0), 4), ((255, 255, 255), 1)):
-                style = font, 0.6 * unit, color, round(width * unit), cv2.LINE_AA
-                cv2.putText(canvas, caption, place, *style)
-        return canvas
-
-
-def track_color(track: int) -> tuple[int, int, int]:
-    """Return a bright RGB colour that a track keeps."""
-    red, green, blue = colorsys.hsv_to_rgb(track * HUE_STEP % 1, 0.8, 1.0)
-    return round(255 * red), round(255 * green), round(255 * blue)
