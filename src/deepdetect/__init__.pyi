@@ -23,8 +23,11 @@ from .io.tables import (
     save_keypoints as save_keypoints,
     save_matches as save_matches,
 )
-from .matching.options import MatchingOptions as MatchingOptions
-from .matching.pipeline import match_features as match_features, match_images as match_images
+from .matching.pipeline import (
+    MatchingOptions as MatchingOptions,
+    match_features as match_features,
+    match_images as match_images,
+)
 from .matching.registration import register as register
 from .matching.stereo.matching import disparity_map as disparity_map
 from .matching.stitching import stitch as stitch

@@ -25,7 +25,7 @@ from deepdetect.evaluation.weights import _of_paper, evaluate, evaluate_oxford
 from deepdetect.geometry.transforms import transfer_errors
 from deepdetect.io.image import luma
 from deepdetect.labels import fuse
-from deepdetect.matching.options import PUBLISHED_MATCHING
+from deepdetect.matching import PUBLISHED_MATCHING
 
 SIZE = 96
 

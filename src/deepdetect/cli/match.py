@@ -21,13 +21,15 @@ from ..geometry import GeometryOptions
 from ..geometry.estimation import ESTIMATORS, MODEL_NAMES
 from ..io.image import load_image
 from ..io.tables import save_matches
-from ..matching.options import (
+from ..matching.pipeline import (
+    GUIDED_STAGES,
     PUBLISHED_MATCHING,
     TWO_VIEW_MODELS,
     UNGUIDED_ONLY,
+    UNGUIDED_STAGES,
     MatchingOptions,
+    match_images,
 )
-from ..matching.pipeline import GUIDED_STAGES, UNGUIDED_STAGES, match_images
 from ..matching.registration import register as register_images
 from ..matching.stitching import STAGES, Panorama, StitchingOptions
 from ..matching.stitching import stitch as stitch_images

@@ -2,11 +2,12 @@ from .guided import (
     TentativeMatches as TentativeMatches,
     find_tentative_matches as find_tentative_matches,
 )
-from .options import (
+from .pipeline import (
     PUBLISHED_MATCHING as PUBLISHED_MATCHING,
     MatchingOptions as MatchingOptions,
+    match_features as match_features,
+    match_images as match_images,
 )
-from .pipeline import match_features as match_features, match_images as match_images
 from .registration import Registration as Registration, register as register
 from .stereo import (
     DisparityMap as DisparityMap,

@@ -24,8 +24,7 @@ from ..geometry.camera import Calibration, Camera, read_calibration
 from ..geometry.images import window_sums
 from ..io.exif import calibration_from_exif
 from ..io.image import Images, ignore_masks, load_image, luma
-from ..matching.options import MatchingOptions
-from ..matching.pipeline import match_images
+from ..matching.pipeline import MatchingOptions, match_images
 from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity
 from .outliers import PointFilterOptions
 from .rectification import (

@@ -14,8 +14,7 @@ import numpy as np
 from ..._shared.opencv import cv2
 from ...datasets.posed_images import PosedPair, PosedScene, load_posed_scenes
 from ...detector.detector import DeepDetect
-from ...matching.options import MatchingOptions
-from ...matching.pipeline import match_images
+from ...matching.pipeline import MatchingOptions, match_images
 from ..baselines.method import LocalFeature
 from ..baselines.opencv import CLASSICAL, STANDARD
 from ..charts import line_chart

@@ -25,6 +25,7 @@ from ..stereo.matching import (
     DisparityOptions,
     compute_disparity,
     find_disparity_range,
+    range_with_margin,
 )
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -34,9 +35,6 @@ DISPARITY = DisparityOptions(discontinuity_margin_px=1)
 
 MAX_VOLUME = 1e8
 """Pixels of the frame times disparities; with more, the images are scaled down."""
-
-TAIL_FRACTION = 0.01
-"""Of the disparities of sparse matches at each end, which may be wrong."""
 
 MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25
 """Added to the range of disparities at both ends, in pixels, and as a fraction of it."""
@@ -176,15 +174,18 @@ def rectified_view(
     points0: np.ndarray,
     points1: np.ndarray,
     fundamental: np.ndarray,
+    scale: float | None = None,
 ) -> RectifiedView | None:
-    """Rectify both images, smaller where there would be too much to search, and match rows."""
-    scale, sizes = 1.0, (gray0.shape[::-1], gray1.shape[::-1])
-    frame = rectified_frame(points0, points1, fundamental, *sizes)
+    """Rectify both images, smaller where there would be too much to search, and match rows.
+
+    Those that have been made smaller for that already are given with their `scale`.
+    """
+    frame = rectified_frame(points0, points1, fundamental, gray0.shape[::-1], gray1.shape[::-1])
     if frame is None:
         return None
     low, high = _range_of_matches(frame, points0, points1)
     volume = float(np.prod(frame.size)) * (high - low + 1)
-    if volume > MAX_VOLUME:
+    if scale is None and volume > MAX_VOLUME:
         longest = max(*gray0.shape, *gray1.shape)
         scale = max(1, round(longest * (MAX_VOLUME / volume) ** (1 / 3))) / longest
         gray0, gray1 = (
@@ -192,10 +193,7 @@ def rectified_view(
         )
         points0, points1 = scaled_points(points0, scale), scaled_points(points1, scale)
         fundamental = scaled_fundamental(fundamental, scale, scale)
-        frame = rectified_frame(points0, points1, fundamental, gray0.shape[::-1], gray1.shape[::-1])
-        if frame is None:
-            return None
-        low, high = _range_of_matches(frame, points0, points1)
+        return rectified_view(gray0, gray1, points0, points1, fundamental, scale)
     (first, valid0), (second, valid1) = frame.warp(gray0, 0), frame.warp(gray1, 1)
     # About an epipole everything grows, or everything shrinks: what small copies of the two views
     # agree on in the other direction is wrong.
@@ -226,17 +224,9 @@ def rectified_view(
     )
     relied, kept = (disparities.matched & (correlation >= bound) for bound in bounds)
     nan = np.float32(np.nan)
-    return RectifiedView(
-        frame,
-        scale,
-        first,
-        second,
-        DisparityMap(
-            np.where(relied, disparities.disparity, nan), relied, disparities.disparity_range
-        ),
-        np.where(kept, disparities.disparity, nan),
-        np.where(kept, correlation, nan),
-    )
+    disparity = np.where(kept, disparities.disparity, nan)
+    sure = DisparityMap(np.where(relied, disparity, nan), relied, disparities.disparity_range)
+    return RectifiedView(frame, scale or 1.0, first, second, sure, disparity, correlation)
 
 
 def _match_rows(
@@ -293,7 +283,7 @@ def _range_of_matches(
     disparity = disparity[np.isfinite(disparity)]
     if not len(disparity):
         return 0, 0
-    smallest, largest = _range_with_margin(disparity)
+    smallest, largest = range_with_margin(disparity, MARGIN_PX, MARGIN_FRACTION)
     if isinstance(frame, PolarFrame):
         if np.mean(disparity > 0) > MIN_FRACTION_OF_ONE_SIGN:
             smallest = max(smallest, -MARGIN_PX)
@@ -302,19 +292,13 @@ def _range_of_matches(
     return int(np.floor(smallest)), int(np.ceil(largest))
 
 
-def _range_with_margin(disparity: np.ndarray) -> tuple[float, float]:
-    """Return the range of most disparities, with a margin on both sides."""
-    low, high = np.quantile(disparity, [TAIL_FRACTION, 1 - TAIL_FRACTION])
-    margin = MARGIN_PX + MARGIN_FRACTION * (high - low)
-    return float(low - margin), float(high + margin)
-
-
 def _is_range_too_wide(view: RectifiedView) -> bool:
     """Whether less had to be searched than was, so that larger images could have been matched."""
     searched = view.disparities.disparity_range
     if view.scale == 1 or searched is None:
         return False
-    low, high = _range_with_margin(view.disparities.disparity[view.disparities.matched])
+    found = view.disparities.disparity[view.disparities.matched]
+    low, high = range_with_margin(found, MARGIN_PX, MARGIN_FRACTION)
     return searched[1] - searched[0] > MAX_RANGE_EXCESS * (high - low)
 
 

@@ -47,7 +47,7 @@ SEARCH_WIDTH_PX, SEARCH_MAX_SPECKLE_AREA_PX = 160, 50
 SEARCH_UNIQUENESS_RATIO = 1.3
 """Least ratio of the cost of any other place on the row: what has no match is rarely so clear."""
 
-SEARCH_TAIL_FRACTION = 0.01
+TAIL_FRACTION = 0.01
 """Of the disparities at each end, which may be wrong."""
 
 SEARCH_MARGIN_PX = 1.5
@@ -276,11 +276,17 @@ def find_disparity_range(left: np.ndarray, right: np.ndarray) -> DisparityRange 
     known = filter_speckles(coarse.disparity, clear, SEARCH_MAX_SPECKLE_AREA_PX)
     if not known.any():
         return None
-    tails = SEARCH_TAIL_FRACTION, 1 - SEARCH_TAIL_FRACTION
-    low, high = np.quantile(coarse.disparity[known], tails)
-    margin = SEARCH_MARGIN_PX + SEARCH_MARGIN_FRACTION * (high - low)
-    smallest, largest = int(np.floor((low - margin) * scale)), int(np.ceil((high + margin) * scale))
-    return max(smallest, 1 - width), min(largest, width - 1)
+    low, high = range_with_margin(coarse.disparity[known], SEARCH_MARGIN_PX, SEARCH_MARGIN_FRACTION)
+    return max(math.floor(low * scale), 1 - width), min(math.ceil(high * scale), width - 1)
+
+
+def range_with_margin(
+    disparity: np.ndarray, margin_px: float, margin_fraction: float
+) -> tuple[float, float]:
+    """Return the range of most disparities, with a margin at both ends."""
+    low, high = np.quantile(disparity, [TAIL_FRACTION, 1 - TAIL_FRACTION])
+    margin = margin_px + margin_fraction * (high - low)
+    return float(low - margin), float(high + margin)
 
 
 def filter_speckles(disparity: np.ndarray, known: np.ndarray, max_area_px: int) -> np.ndarray:

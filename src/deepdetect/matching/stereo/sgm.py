@@ -212,10 +212,10 @@ def aggregate(
     total = np.zeros(cost.shape, np.uint16)
     p2 = np.maximum(P2_BITS / (1 + np.arange(256) / P2_HALF_GRADIENT_LEVELS), MIN_P2_BITS)
     penalties = np.uint16(P1_BITS * COST_PER_BIT), (p2 * COST_PER_BIT).astype(np.uint16)
-    for down, right in product((-1, 0, 1), repeat=2):
-        if down or right:
-            paths = width if down else height
-            parallel_for(paths, sum_along_paths, gray, cost, total, down, right, *penalties)
+    for direction in product((-1, 0, 1), repeat=2):
+        if any(direction):
+            paths = width if direction[0] else height
+            parallel_for(paths, sum_along_paths, gray, cost, total, *direction, *penalties)
     return total
 
 
