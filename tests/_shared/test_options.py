@@ -85,7 +85,9 @@ OPTIONS = sorted(
     {
         kind
         for module in pkgutil.walk_packages(deepdetect.__path__, "deepdetect.")
-        if not module.name.startswith(("deepdetect.cli", "deepdetect.__main__"))
+        if not module.name.startswith(
+            ("deepdetect.cli", "deepdetect.__main__", "deepdetect.integrations")
+        )
         for name, kind in vars(importlib.import_module(module.name)).items()
         if name.endswith("Options") and dataclasses.is_dataclass(kind)
     },

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -38,30 +40,26 @@ def views(photo: np.ndarray) -> Views:
 
 
 @pytest.fixture
-def stand_in(
+def drop_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Callable[[str, dict[str, str], ModuleType], ModuleType]]:
-    """Take a package, or where it is missing one of the same contract, for a module of ours."""
-    import importlib
-    import importlib.util
+) -> Iterator[Callable[[str, dict[str, str]], ModuleType]]:
+    """Import a drop-in with its program, or where that is missing with one of the same contract."""
+    used: list[str] = []
 
-    used: list[tuple[str, ModuleType]] = []
-
-    def take(package: str, files: dict[str, str], module: ModuleType) -> ModuleType:
+    def take(package: str, files: dict[str, str]) -> ModuleType:
         if importlib.util.find_spec(package) is None:
             for name, text in files.items():
                 path = tmp_path / "stand-ins" / name
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_text(text)
             monkeypatch.syspath_prepend(tmp_path / "stand-ins")
-            used.append((package, module))
-            importlib.reload(module)
-        return module
+            used.append(package)
+            # Pytest, which looks for examples in it, has left what it could not import.
+            sys.modules.pop(f"deepdetect.integrations.{package}", None)
+        return importlib.import_module(f"deepdetect.integrations.{package}")
 
     yield take
-    monkeypatch.undo()
-    for package, module in used:
-        for name in [n for n in sys.modules if n == package or n.startswith(f"{package}.")]:
-            del sys.modules[name]
-        importlib.invalidate_caches()
-        importlib.reload(module)
+    for package in used:
+        for name in list(sys.modules):
+            if f"{name}.".startswith((f"{package}.", f"deepdetect.integrations.{package}.")):
+                del sys.modules[name]

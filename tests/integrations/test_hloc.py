@@ -15,7 +15,6 @@ import pytest
 from PIL import Image
 
 from deepdetect import PointDetector
-from deepdetect.integrations import hloc
 
 from .conftest import Views
 
@@ -47,10 +46,9 @@ STAND_IN = {
 
 
 @pytest.fixture
-def load(stand_in: Callable[..., ModuleType]) -> Callable[[str, dict[str, Any]], Any]:
+def load(drop_in: Callable[..., ModuleType]) -> Callable[[str, dict[str, Any]], Any]:
     """Make a model as hloc does: by the name of a module, which holds one model."""
-    stand_in("hloc", STAND_IN, hloc)
-    hloc.register()
+    drop_in("hloc", STAND_IN).register()
 
     def make(kind: str, conf: dict[str, Any]) -> Any:
         base = importlib.import_module("hloc.utils.base_model").BaseModel
@@ -126,6 +124,8 @@ def test_dense_matches_of_two_views(views: Views, load: Callable[..., Any]) -> N
 def test_hloc_itself_writes_and_matches(views: Views, tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
     from hloc import extract_features, match_dense, match_features
+
+    from deepdetect.integrations import hloc
 
     hloc.register()
     images = tmp_path / "images"

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from deepdetect import OptionError, PointDetector
-from deepdetect.integrations.kornia import DeepDetectDetector, DeepDetectFeature
 from deepdetect.io.image import luma
 
 from .conftest import Views
 
 torch = pytest.importorskip("torch", reason="needs torch")
 kornia_feature = pytest.importorskip("kornia.feature", reason="needs kornia")
+kornia = pytest.importorskip("deepdetect.integrations.kornia")
 
 
 def tensor(*images: np.ndarray) -> torch.Tensor:
@@ -20,7 +20,7 @@ def tensor(*images: np.ndarray) -> torch.Tensor:
 
 def test_frames_are_those_of_the_detector(views: Views) -> None:
     expected = PointDetector(100).detect(views.first)
-    lafs, scores = DeepDetectDetector(PointDetector(100))(tensor(views.first))
+    lafs, scores = kornia.DeepDetectDetector(PointDetector(100))(tensor(views.first))
     assert lafs.shape == (1, 100, 2, 3)
     assert np.array_equal(kornia_feature.get_laf_center(lafs)[0], expected.xy)
     assert np.array_equal(scores[0], expected.scores)
@@ -34,7 +34,7 @@ def test_patches_are_what_sift_describes(views: Views) -> None:
     assert len(rows) > 30
     gray = luma(views.first)
     image = tensor(views.first).mean(1, keepdim=True)
-    lafs = DeepDetectDetector(PointDetector(200))(tensor(views.first))[0][:, rows]
+    lafs = kornia.DeepDetectDetector(PointDetector(200))(tensor(views.first))[0][:, rows]
     patches = kornia_feature.extract_patches_from_pyramid(image, lafs, 16)[0, :, 0].numpy()
     for row, patch in zip(rows, patches, strict=True):
         (x, y), size, angle = points.xy[row], points.sizes[row], np.deg2rad(points.angles[row])
@@ -50,10 +50,12 @@ def test_patches_are_what_sift_describes(views: Views) -> None:
 
 @pytest.mark.parametrize("descriptor", ["ours", "kornia"])
 def test_matches_of_two_views(views: Views, descriptor: str) -> None:
-    local_feature = DeepDetectFeature(PointDetector(500))
+    local_feature = kornia.DeepDetectFeature(PointDetector(500))
     if descriptor == "kornia":
         patches = kornia_feature.LAFDescriptor(kornia_feature.SIFTDescriptor(32, rootsift=True))
-        local_feature = kornia_feature.LocalFeature(DeepDetectDetector(PointDetector(500)), patches)
+        local_feature = kornia_feature.LocalFeature(
+            kornia.DeepDetectDetector(PointDetector(500)), patches
+        )
     matcher = kornia_feature.LocalFeatureMatcher(
         local_feature, kornia_feature.DescriptorMatcher("smnn", 0.9)
     )
@@ -65,18 +67,20 @@ def test_matches_of_two_views(views: Views, descriptor: str) -> None:
 
 def test_a_batch_is_filled_as_kornia_does(views: Views) -> None:
     flat = np.full_like(views.first, 90)
-    lafs, scores, descriptors = DeepDetectFeature(PointDetector(50))(tensor(views.first, flat))
+    lafs, scores, descriptors = kornia.DeepDetectFeature(PointDetector(50))(
+        tensor(views.first, flat)
+    )
     assert (lafs.shape[:2], scores.shape, descriptors.shape) == ((2, 50), (2, 50), (2, 50, 128))
     assert kornia_feature.laf_is_filled(lafs).sum(dim=1).tolist() == [50, 0]
     assert torch.allclose(descriptors[0].norm(dim=1), torch.ones(50))
-    alone = DeepDetectFeature(PointDetector(50))(tensor(flat))
+    alone = kornia.DeepDetectFeature(PointDetector(50))(tensor(flat))
     assert [len(part[0]) for part in alone] == [0, 0, 0]
 
 
 def test_a_mask_hides(views: Views) -> None:
     mask = torch.zeros(1, 1, 200, 256)
     mask[:, :, :, :100] = 1
-    lafs, _ = DeepDetectDetector(PointDetector(50))(tensor(views.first), mask)
+    lafs, _ = kornia.DeepDetectDetector(PointDetector(50))(tensor(views.first), mask)
     assert kornia_feature.get_laf_center(lafs)[..., 0].max() < 101
     with pytest.raises(OptionError, match="the mask must have the shape"):
-        DeepDetectDetector(PointDetector(50))(tensor(views.first), mask[0])
+        kornia.DeepDetectDetector(PointDetector(50))(tensor(views.first), mask[0])

@@ -13,26 +13,22 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect, OptionError
-from deepdetect.integrations.transformers import (
-    DeepDetectForKeypointDetection,
-    DeepDetectImageProcessor,
-    register,
-)
 
 from .conftest import Views
 
 torch = pytest.importorskip("torch", reason="needs torch")
 transformers = pytest.importorskip("transformers", reason="needs transformers")
+drop_in = pytest.importorskip("deepdetect.integrations.transformers")
 
 
 @pytest.fixture(scope="module")
 def model() -> Any:
-    return DeepDetectForKeypointDetection.from_deepdetect()
+    return drop_in.DeepDetectForKeypointDetection.from_deepdetect()
 
 
 @pytest.fixture(scope="module")
 def processor() -> Any:
-    return DeepDetectImageProcessor()
+    return drop_in.DeepDetectImageProcessor()
 
 
 def run(model: Any, inputs: Any) -> Any:
@@ -73,9 +69,9 @@ print(json.dumps([type(model).__name__, type(processor).__name__, processor.max_
 
 
 def test_what_was_saved_is_loaded_without_network(views: Views, model: Any, tmp_path: Path) -> None:
-    copy = DeepDetectForKeypointDetection.from_deepdetect(max_keypoints=100)
+    copy = drop_in.DeepDetectForKeypointDetection.from_deepdetect(max_keypoints=100)
     copy.save_pretrained(tmp_path)
-    DeepDetectImageProcessor(max_pixels=10**6).save_pretrained(tmp_path)
+    drop_in.DeepDetectImageProcessor(max_pixels=10**6).save_pretrained(tmp_path)
     Image.fromarray(views.first).save(tmp_path / "photo.png")
     done = subprocess.run(
         [sys.executable, "-c", OFFLINE, str(tmp_path), str(tmp_path / "photo.png")],
@@ -86,13 +82,13 @@ def test_what_was_saved_is_loaded_without_network(views: Views, model: Any, tmp_
     assert done.returncode == 0, done.stderr
     names = ["DeepDetectForKeypointDetection", "DeepDetectImageProcessor", 10**6, 100, 100]
     assert json.loads(done.stdout.splitlines()[-1]) == names
-    logits = run(model, DeepDetectImageProcessor()(views.first, return_tensors="pt")).logits
+    logits = run(model, drop_in.DeepDetectImageProcessor()(views.first, return_tensors="pt")).logits
     saved = torch.from_numpy(np.load(tmp_path / "logits.npy"))
     assert torch.equal(saved, logits)
     probability = torch.sigmoid(saved[0]).numpy()
     onnx = DeepDetect(backend="onnxruntime").heatmap(views.first)
     assert np.abs(probability - onnx).max() < 1e-5
-    again = DeepDetectForKeypointDetection.from_pretrained(tmp_path, nms_radius=2)
+    again = drop_in.DeepDetectForKeypointDetection.from_pretrained(tmp_path, nms_radius=2)
     assert again.config.nms_radius == 2
     assert again.config.max_keypoints == 100
 
@@ -119,12 +115,12 @@ def test_a_batch_of_unequal_sizes(views: Views, model: Any, processor: Any) -> N
 
 def test_images_scaled_down_keep_their_pixel_centres(model: Any, views: Views) -> None:
     large = cv2.resize(views.first, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST)
-    processor = DeepDetectImageProcessor(max_pixels=views.first[..., 0].size)
+    processor = drop_in.DeepDetectImageProcessor(max_pixels=views.first[..., 0].size)
     inputs = processor(large, return_tensors="pt")
     assert inputs["pixel_values"].shape[2:] == (200, 256)
     (found,) = processor.post_process_keypoint_detection(run(model, inputs), [large.shape[:2]])
     (small,) = processor.post_process_keypoint_detection(
-        run(model, DeepDetectImageProcessor()(views.first, return_tensors="pt")),
+        run(model, drop_in.DeepDetectImageProcessor()(views.first, return_tensors="pt")),
         [views.first.shape[:2]],
     )
     # Of three pixels in a row that are one in the small image, the middle one.
@@ -132,7 +128,7 @@ def test_images_scaled_down_keep_their_pixel_centres(model: Any, views: Views) -
 
 
 def test_it_can_be_trained(views: Views, processor: Any) -> None:
-    model = DeepDetectForKeypointDetection.from_deepdetect()
+    model = drop_in.DeepDetectForKeypointDetection.from_deepdetect()
     inputs = processor(views.first, return_tensors="pt")
     labels = (torch.from_numpy(DeepDetect().heatmap(views.first)) < 0.5)[None]
     optimizer = torch.optim.Adam(model.parameters(), 1e-3)
@@ -149,10 +145,12 @@ def test_it_can_be_trained(views: Views, processor: Any) -> None:
 
 
 def test_options(views: Views, processor: Any) -> None:
-    register()
-    register()  # twice does no harm
+    drop_in.register()
+    drop_in.register()  # twice does no harm
     assert transformers.AutoConfig.for_model("deepdetect", max_keypoints=7).max_keypoints == 7
-    dense = DeepDetectForKeypointDetection.from_deepdetect("dense", max_keypoints=50, nms_radius=3)
+    dense = drop_in.DeepDetectForKeypointDetection.from_deepdetect(
+        "dense", max_keypoints=50, nms_radius=3
+    )
     output = run(dense, processor(views.first, return_tensors="pt"))
     (found,) = processor.post_process_keypoint_detection(output, [views.first.shape[:2]])
     expected = DeepDetect("dense", backend="onnxruntime").detect(

@@ -8,8 +8,6 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from deepdetect.integrations import vismatch
-
 from .conftest import Views
 
 torch = pytest.importorskip("torch", reason="needs torch")
@@ -52,9 +50,9 @@ def tensor(image: np.ndarray) -> torch.Tensor:
 
 @pytest.mark.parametrize(("count", "least"), [(500, 200), (None, 3000)])
 def test_matches_of_two_views(
-    views: Views, stand_in: Callable[..., ModuleType], count: int | None, least: int
+    views: Views, drop_in: Callable[..., ModuleType], count: int | None, least: int
 ) -> None:
-    stand_in("vismatch", {"vismatch/__init__.py": STAND_IN}, vismatch)
+    vismatch = drop_in("vismatch", {"vismatch/__init__.py": STAND_IN})
     matcher = vismatch.DeepDetectMatcher(max_num_keypoints=count, ransac_reproj_thresh=2)
     assert matcher.ransac_reproj_thresh == 2
     found = matcher(tensor(views.first), tensor(views.second))
@@ -68,8 +66,8 @@ def test_matches_of_two_views(
     assert count is None or len(found["all_kpts0"]) == count
 
 
-def test_no_matches_are_an_empty_answer(stand_in: Callable[..., ModuleType]) -> None:
-    stand_in("vismatch", {"vismatch/__init__.py": STAND_IN}, vismatch)
+def test_no_matches_are_an_empty_answer(drop_in: Callable[..., ModuleType]) -> None:
+    vismatch = drop_in("vismatch", {"vismatch/__init__.py": STAND_IN})
     flat = torch.full((3, 64, 80), 0.4)
     found = vismatch.DeepDetectMatcher()(flat, flat)
     assert found["matched_kpts0"].shape == (0, 2)

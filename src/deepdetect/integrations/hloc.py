@@ -8,25 +8,25 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from .._shared.errors import OptionError, unknown_name
+from .._shared.errors import OptionError, require_packages, unknown_name
 from ..detector.detector import AnyDetector, DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import unit_length
 from ..features.matchers import get_matcher, match_descriptors
 from ..matching.pipeline import match_images
-from .packages import base_class, import_package
 from .tensors import load_tensor
 
-if TYPE_CHECKING:
-    from torch import Tensor
+require_packages("the drop-in for hloc", "hloc", "torch")
 
-    from .packages import AnyBase as BaseModel
-else:
-    BaseModel = base_class("hloc.utils.base_model", "BaseModel")
+import hloc.extractors
+import hloc.matchers
+import torch
+from hloc.utils.base_model import BaseModel
+from torch import Tensor
 
 NAME = "deepdetect"
 
@@ -85,8 +85,6 @@ class DeepDetectExtractor(BaseModel):
         self._radians = conf["angle_unit"] == "radians"
 
     def _forward(self, data: dict[str, Tensor]) -> dict[str, Tensor]:
-        import torch
-
         image = data["image"]
         points = self._detector.extract(load_tensor(image[0]))
         assert points.angles is not None
@@ -119,8 +117,6 @@ class DeepDetectMatcher(BaseModel):
         self._ratio, self._mutual = float(conf["ratio"]), bool(conf["mutual"])
 
     def _forward(self, data: dict[str, Tensor]) -> dict[str, Tensor]:
-        import torch
-
         described = [data[name][0].T.cpu().float().numpy() for name in self.required_inputs]
         if len(described[1]) > MAX_KEYPOINTS:
             raise OptionError(
@@ -159,8 +155,6 @@ class DeepDetectDenseMatcher(BaseModel):
         )
 
     def _forward(self, data: dict[str, Tensor]) -> dict[str, Tensor]:
-        import torch
-
         # Hloc wants the positions in the first image to be the refined ones; ours are the second's.
         second, first = (load_tensor(data[name][0]) for name in ("image1", "image0"))
         matches = match_images(second, first, self._detector)
@@ -179,23 +173,19 @@ def register() -> None:
     Call it once in the program that calls hloc; then `{"name": "deepdetect"}` is an extractor of
     `hloc.extract_features` and a matcher of `hloc.match_features`, and `{"name":
     "deepdetect_dense"}` a matcher of `hloc.match_dense`.
-
-    Raises:
-        MissingExtraError: hloc is not installed.
     """
     models = (
-        ("hloc.extractors", NAME, DeepDetectExtractor),
-        ("hloc.matchers", NAME, DeepDetectMatcher),
-        ("hloc.matchers", f"{NAME}_dense", DeepDetectDenseMatcher),
+        (hloc.extractors, NAME, DeepDetectExtractor),
+        (hloc.matchers, NAME, DeepDetectMatcher),
+        (hloc.matchers, f"{NAME}_dense", DeepDetectDenseMatcher),
     )
     for package, name, model in models:
-        parent = import_package(package)
         # Hloc imports a module by name, and takes the one model that says it is from there.
-        module = ModuleType(f"{package}.{name}", model.__doc__)
+        module = ModuleType(f"{package.__name__}.{name}", model.__doc__)
         model.__module__ = module.__name__
         setattr(module, model.__name__, model)
         sys.modules[module.__name__] = module
-        setattr(parent, name, module)
+        setattr(package, name, module)
 
 
 def _check_names(conf: dict[str, Any], known: Iterable[str]) -> None:

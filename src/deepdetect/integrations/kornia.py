@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
-from .._shared.errors import OptionError
+from .._shared.errors import OptionError, require_packages
 from .._shared.options import suggest_keywords
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints, unit_length
-from .packages import base_class, import_package
 from .tensors import load_tensor, padded
 
-if TYPE_CHECKING:
-    from torch import Tensor
-    from torch.nn import Module
-else:
-    Module = base_class("torch.nn", "Module")
+require_packages("the drop-in for kornia", "torch", "kornia")
+
+import torch
+from kornia.feature import laf_from_center_scale_ori
+from torch import Tensor
+from torch.nn import Module
 
 LAF_SCALE_PER_SIZE = 3.0
 """A LAF's scale is half the side of the patch that is described: six sigma, as SIFT's."""
@@ -33,13 +32,11 @@ class DeepDetectDetector(Module):
 
     Raises:
         OptionError: an option is unknown or out of its range.
-        MissingExtraError: torch or kornia is not installed.
     """
 
     @suggest_keywords
     def __init__(self, detector: PointDetector = PointDetector()) -> None:
         super().__init__()
-        self._laf_from_center_scale_ori = import_package("kornia.feature").laf_from_center_scale_ori
         self._detector = detector
 
     def forward(self, img: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -66,8 +63,6 @@ class DeepDetectDetector(Module):
 
     def _lafs(self, points: Keypoints) -> Tensor:
         """Return (N, 2, 3) frames."""
-        import torch
-
         assert points.sizes is not None
         assert points.angles is not None
         if not len(points):
@@ -75,10 +70,8 @@ class DeepDetectDetector(Module):
         scales = torch.from_numpy(LAF_SCALE_PER_SIZE * points.sizes).view(1, -1, 1, 1)
         # Kornia's angles grow against the clock, OpenCV's and ours with it.
         angles = torch.from_numpy(-points.angles).view(1, -1, 1)
-        lafs: Tensor = self._laf_from_center_scale_ori(
-            torch.from_numpy(points.xy)[None], scales, angles
-        )[0]
-        return lafs
+        lafs: Tensor = laf_from_center_scale_ori(torch.from_numpy(points.xy)[None], scales, angles)
+        return lafs[0]
 
 
 class DeepDetectFeature(DeepDetectDetector):

@@ -6,20 +6,18 @@ ours; see their licences.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
-from .._shared.errors import OptionError, unknown_name
+from .._shared.errors import OptionError, require_packages, unknown_name
 from .._shared.options import suggest_keywords
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import SIZES_PER_SCALE
-from .packages import base_class
 from .tensors import load_tensor
 
-if TYPE_CHECKING:
-    from torch import Tensor
-    from torch.nn import Module
-else:
-    Module = base_class("torch.nn", "Module")
+require_packages("the drop-in for LightGlue", "torch")
+
+from torch import Tensor
+from torch.nn import Module
 
 Scale = Literal["diameter", "sigma"]
 
@@ -36,7 +34,6 @@ class DeepDetectExtractor(Module):
 
     Raises:
         OptionError: an option is unknown or out of its range.
-        MissingExtraError: torch is not installed.
     """
 
     @suggest_keywords

@@ -8,35 +8,31 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from .._shared.errors import OptionError
+from .._shared.errors import OptionError, require_packages
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.heatmap import MAX_AUTO_PIXELS
 from ..detector.pretrained import resolve_weights
 from ..detector.tiling import STRIDE, fill_planes
 from ..features.selection import Maps, SelectionOptions, select_from_maps
-from .packages import base_class, import_package
 from .tensors import load_tensor, padded
 
-if TYPE_CHECKING:
-    from torch import Tensor
+require_packages("the drop-in for transformers", "transformers", "torch")
 
-    from .packages import AnyBase as BaseImageProcessor
-    from .packages import AnyBase as ModelOutput
-    from .packages import AnyBase as PreTrainedConfig
-    from .packages import AnyBase as PreTrainedModel
-else:
-    BaseImageProcessor = base_class("transformers", "BaseImageProcessor")
-    ModelOutput = base_class("transformers.utils", "ModelOutput")
-    PreTrainedConfig = base_class("transformers", "PretrainedConfig")
-    PreTrainedModel = base_class("transformers", "PreTrainedModel")
+import transformers
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits, pad
+from transformers.utils import ModelOutput
+
+from ..detector.network.espnet import ESPNet
+from ..detector.network.weights import load_network
 
 
-class DeepDetectConfig(PreTrainedConfig):
+class DeepDetectConfig(transformers.PretrainedConfig):
     """The shape of the network, and which pixels of its heat map become keypoints.
 
     Args:
@@ -48,7 +44,6 @@ class DeepDetectConfig(PreTrainedConfig):
 
     Raises:
         OptionError: a number is out of its range.
-        MissingExtraError: transformers is not installed.
     """
 
     model_type = "deepdetect"
@@ -103,7 +98,7 @@ class DeepDetectKeypointOutput(ModelOutput):
     mask: Tensor | None = None
 
 
-class DeepDetectForKeypointDetection(PreTrainedModel):
+class DeepDetectForKeypointDetection(transformers.PreTrainedModel):
     """The network with the selection of keypoints.
 
     `from_deepdetect()` makes it from the weights inside the package, `save_pretrained` and
@@ -111,9 +106,6 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
 
     Args:
         config: the shape of the network, whose weights are random.
-
-    Raises:
-        MissingExtraError: transformers is not installed.
     """
 
     config_class = DeepDetectConfig
@@ -121,8 +113,6 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
     main_input_name = "pixel_values"
 
     def __init__(self, config: DeepDetectConfig) -> None:
-        from ..detector.network.espnet import ESPNet
-
         super().__init__(config)
         self.network = ESPNet(config.p, config.q, config.decoder_channels)
         self.post_init()
@@ -149,8 +139,6 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
             OptionError: an option is unknown or out of its range.
         """
         model = cls(DeepDetectConfig(keypoint_threshold, max_keypoints, nms_radius))
-        from ..detector.network.weights import load_network
-
         network = load_network(resolve_weights(weights, ".safetensors"))
         model.network.load_state_dict(network.state_dict())
         return model.eval()
@@ -173,8 +161,6 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
             return_dict: False for a tuple instead of the output by names.
             **keywords: not used; programs that go through all models give some.
         """
-        from torch.nn.functional import binary_cross_entropy_with_logits
-
         sizes = _sizes(pixel_values, pixel_mask)
         logits = self._logits(pixel_values, sizes)
         loss = None
@@ -208,8 +194,6 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
 
     def _logits(self, pixel_values: Tensor, sizes: list[tuple[int, int]]) -> Tensor:
         """Run the network on images of equal size together: each gets what it gets alone."""
-        from torch.nn.functional import pad
-
         shape = (len(sizes), *pixel_values.shape[-2:])
         logits = pixel_values.new_full(shape, LOGIT_OUTSIDE)
         for height, width in set(sizes):
@@ -223,7 +207,7 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
         return logits
 
 
-class DeepDetectImageProcessor(BaseImageProcessor):
+class DeepDetectImageProcessor(transformers.BaseImageProcessor):
     """Turns images to the tensors that the model takes, and its output to pixels.
 
     Args:
@@ -232,7 +216,6 @@ class DeepDetectImageProcessor(BaseImageProcessor):
 
     Raises:
         OptionError: the number is not above 0.
-        MissingExtraError: transformers is not installed.
     """
 
     model_input_names = ["pixel_values", "pixel_mask"]  # noqa: RUF012  # as transformers has it
@@ -259,7 +242,6 @@ class DeepDetectImageProcessor(BaseImageProcessor):
         Raises:
             ImageError: an image cannot be read or is not fit.
         """
-        batch_feature = import_package("transformers").BatchFeature
         loaded = [self._shrunk(load_tensor(image)) for image in _listed(images)]
         height, width = (max(rgb.shape[axis] for rgb in loaded) for axis in (0, 1))
         height, width = height + -height % STRIDE, width + -width % STRIDE
@@ -268,7 +250,8 @@ class DeepDetectImageProcessor(BaseImageProcessor):
         for row, rgb in enumerate(loaded):
             fill_planes(rgb, values[row])
             mask[row, : rgb.shape[0], : rgb.shape[1]] = 1
-        return batch_feature({"pixel_values": values, "pixel_mask": mask}, return_tensors)
+        tensors = {"pixel_values": values, "pixel_mask": mask}
+        return transformers.BatchFeature(tensors, return_tensors)
 
     def _shrunk(self, rgb: np.ndarray) -> np.ndarray:
         height, width = rgb.shape[:2]
@@ -318,11 +301,7 @@ def register() -> None:
     """Let transformers' AutoConfig, AutoModel and AutoImageProcessor find these classes.
 
     Then `AutoModelForKeypointDetection.from_pretrained(folder)` loads what was saved.
-
-    Raises:
-        MissingExtraError: transformers is not installed.
     """
-    transformers = import_package("transformers")
     config, model = DeepDetectConfig, DeepDetectForKeypointDetection
     transformers.AutoConfig.register(config.model_type, config, exist_ok=True)
     transformers.AutoModel.register(config, model, exist_ok=True)

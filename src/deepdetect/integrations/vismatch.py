@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from .._shared.errors import require_packages
 from ..detector.detector import AnyDetector, DeepDetect
 from ..detector.point_detector import PointDetector
 from ..matching.pipeline import match_images
-from .packages import base_class
 from .tensors import load_tensor
 
-if TYPE_CHECKING:
-    import numpy as np
-    from torch import Tensor
-    from torch.nn import Module as BaseMatcher
-else:
-    BaseMatcher = base_class("vismatch", "BaseMatcher")
+require_packages("the drop-in for vismatch", "vismatch", "torch")
+
+from torch import Tensor
+from vismatch import BaseMatcher
 
 
 class DeepDetectMatcher(BaseMatcher):
@@ -32,7 +32,6 @@ class DeepDetectMatcher(BaseMatcher):
 
     Raises:
         OptionError: an option is unknown or out of its range.
-        MissingExtraError: vismatch is not installed.
     """
 
     def __init__(
