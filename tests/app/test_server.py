@@ -287,11 +287,11 @@ def test_a_worker_ends_with_the_server(tmp_path: Path) -> None:
     code = (
         "import os, pathlib, sys\n"
         "from deepdetect.app.jobs import Job\n"
-        "from deepdetect.app.tasks import SentImage\n"
+        "from deepdetect.app.tasks import Order, SentImage\n"
         "if __name__ == '__main__':\n"
         "    folder = pathlib.Path(sys.argv[1])\n"
         "    images = [SentImage(path, path.name) for path in folder.glob('*.png')]\n"
-        "    job = Job(folder, 'folder-keypoints', images, {}, 100)\n"
+        "    job = Job(Order('folder-keypoints', images, {}, folder, 100))\n"
         "    while job.state['stage'] == 'starting':\n"
         "        pass\n"
         "    print(job.process.pid, flush=True)\n"
@@ -357,7 +357,7 @@ def test_a_full_disk_is_said_by_the_task(tmp_path: Path) -> None:
         "def full(*given):\n    raise OSError(errno.ENOSPC, 'No space left on device')\n"
         "jobs.TASKS['match'] = types.SimpleNamespace(run=full)\n"
         "receiver, sender = multiprocessing.Pipe(duplex=False)\n"
-        "jobs.run_task(sender, pathlib.Path(sys.argv[1]), 'match', [], {}, 1)\n"
+        "jobs.run_task(sender, jobs.Order('match', [], {}, pathlib.Path(sys.argv[1]), 1))\n"
         "pathlib.Path(sys.argv[1], 'told').write_text(receiver.recv()['error'])\n"
     )
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True)

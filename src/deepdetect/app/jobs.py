@@ -10,7 +10,6 @@ import shutil
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -21,7 +20,7 @@ from .._shared.errors import DeepDetectError, OptionError
 from .._shared.machine import end_with_parent
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.signals import kill_group, signals_held
-from .tasks import TASKS, SentImage
+from .tasks import TASKS, Order
 
 FOLDER_PREFIX = "deepdetect-app-"
 """Of the folder of a server, in the folder for temporary files."""
@@ -66,7 +65,7 @@ class AppOptions:
 
 
 class Job:
-    """A task, the process that does it, and the folder of its files.
+    """A task, and the process that does it.
 
     Attributes:
         name: secret, known to the page alone.
@@ -74,23 +73,15 @@ class Job:
         started, asked: when it began, and when the page has last asked for it.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        kind: str,
-        images: Sequence[SentImage],
-        options: Mapping[str, float],
-        max_megapixels: float,
-    ) -> None:
+    def __init__(self, order: Order) -> None:
         self.name = secrets.token_urlsafe(24)
-        self.folder = folder
+        self.folder = order.folder
         self.started = self.asked = time.monotonic()
         self.state: dict[str, Any] = {"state": "running", "stage": "starting"}
         self._reason = NO_RESULT
         context = multiprocessing.get_context("spawn")
         self._receiver, sender = context.Pipe(duplex=False)
-        task = (sender, folder, kind, images, options, max_megapixels)
-        self.process = context.Process(target=run_task, args=task)
+        self.process = context.Process(target=run_task, args=(sender, order))
         with signals_held(), sender:  # Ctrl+C is for the server, which ends its tasks
             self.process.start()
         self._listener = threading.Thread(target=self._listen, daemon=True)
@@ -143,12 +134,10 @@ class Jobs:
                 "of them, or cancel it"
             )
 
-    def start(
-        self, folder: Path, kind: str, images: Sequence[SentImage], options: Mapping[str, float]
-    ) -> Job:
-        """Start a task with the images of a folder, where there is room."""
+    def start(self, order: Order) -> Job:
+        """Start a task where there is room."""
         self.check_room()
-        job = Job(folder, kind, images, options, self.limits.max_megapixels)
+        job = Job(order)
         self._jobs[job.name] = job
         return job
 
@@ -182,14 +171,7 @@ class Jobs:
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
-def run_task(
-    sender: Connection,
-    folder: Path,
-    kind: str,
-    images: Sequence[SentImage],
-    options: Mapping[str, float],
-    max_megapixels: float,
-) -> None:
+def run_task(sender: Connection, order: Order) -> None:
     """Do a task, in a process of its own: its files are in `results`, its state is sent."""
     from ..io.image_file import limit_megapixels
 
@@ -198,18 +180,19 @@ def run_task(
     for stream in (1, 2):  # what libraries print
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
     end_with_parent(kill_group)
-    (folder / "results").mkdir()
+    results = order.folder / "results"
+    results.mkdir()
 
     def report(stage: str, done: int, total: int) -> None:
         sender.send({"state": "running", "stage": stage, "done": done, "total": total})
 
     try:
-        with limit_megapixels(max_megapixels):
-            result = TASKS[kind].run(images, options, folder / "results", report)
+        with limit_megapixels(order.max_megapixels):
+            result = TASKS[order.kind].run(order.images, order.options, results, report)
         sender.send({"state": "done", **vars(result)})
         return
     except DeepDetectError as error:
-        reason = _for_the_page(str(error), images, folder)
+        reason = _for_the_page(str(error), order)
     except MemoryError:
         reason = "there is not enough memory for this: use smaller images"
     except OSError as error:
@@ -217,11 +200,11 @@ def run_task(
     sender.send({"state": "failed", "error": reason})
 
 
-def _for_the_page(message: str, images: Sequence[SentImage], folder: Path) -> str:
+def _for_the_page(message: str, order: Order) -> str:
     """Name images and files as the user does, and options as `deepdetect app` does."""
-    for number, image in enumerate(images):
+    for number, image in enumerate(order.images):
         message = message.replace(str(image.path), image.name)
         message = message.replace(f"images[{number}]", image.name)
-    for path in (folder / "results", folder):
+    for path in (order.folder / "results", order.folder):
         message = message.replace(f"{path}{os.sep}", "")
     return message.replace("`max_megapixels`", "--max-megapixels")

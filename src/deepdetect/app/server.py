@@ -35,7 +35,7 @@ from .. import __version__
 from .._shared.errors import DeepDetectError, OptionError, unknown_name
 from ..detector.pretrained import RANKER
 from .jobs import AppOptions, Jobs
-from .tasks import TASKS, SentImage
+from .tasks import TASKS, Order, SentImage
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")
@@ -272,11 +272,11 @@ class AppServer:
             return await self._received(kind, _Body(request), left)
 
     async def _received(self, kind: str, body: _Body, left: int) -> Response:
+        options = self.options
         size = int.from_bytes(await body.read(min(4, left)))
         if not 0 < size <= min(MAX_DESCRIPTION_BYTES, left - 4):
             raise HTTPException(400, "the description of the task is missing")
         names, sizes, given = _described(await body.read(size))
-        options = self.options
         if len(names) > options.max_files:
             raise OptionError(
                 f"there are {len(names)} images, over {options.max_files}: give fewer, or "
@@ -299,7 +299,8 @@ class AppServer:
                 with image.path.open("xb") as file:
                     async for piece in body.pieces(bytes_):
                         file.write(piece)
-            job = self.jobs.start(folder, kind, images, numbers)
+            order = Order(kind, images, numbers, folder, options.max_megapixels)
+            job = self.jobs.start(order)
             made.pop_all()
         return JSONResponse({"job": job.name})
 

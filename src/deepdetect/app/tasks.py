@@ -42,6 +42,17 @@ Images = Sequence[SentImage]
 
 
 @dataclass(frozen=True)
+class Order:
+    """A task of this kind to be done: its folder is made for it, and has the images."""
+
+    kind: str
+    images: Images
+    options: Options
+    folder: Path
+    max_megapixels: float
+
+
+@dataclass(frozen=True)
 class TaskResult:
     """Names and values as text, the file that the page shows, and all that can be downloaded."""
 

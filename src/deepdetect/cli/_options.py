@@ -280,21 +280,24 @@ MAX_DEPTH = 2
 """Of dictionaries within others, in a table."""
 
 
-def table(values: Mapping[str, Any], title: str = "") -> str:
-    """Return names and values in two columns; tables and matrices among them are left to JSON."""
-    rows = [*table_rows(values)]
-    width = max((len(name) for name, _ in rows), default=0)
-    return "\n".join([*filter(None, [title]), *(f"  {n:<{width}}  {v}" for n, v in rows)])
+def table(*columns: Mapping[str, Any], title: str = "") -> str:
+    """Return names with their value in each column; tables and matrices are left to JSON."""
+    texts = [dict(_table_rows(values)) for values in columns]
+    names = dict.fromkeys(name for column in texts for name in column)
+    width = max(map(len, names), default=0)
+    rows = [[f"  {name:<{width}}", *(column.get(name, "-") for column in texts)] for name in names]
+    lines = ["  ".join(f"{text:<18}" for text in row).rstrip() for row in rows]
+    return "\n".join([title, *lines] if title else lines)
 
 
-def table_rows(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+def _table_rows(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
     """Yield the rows of a table."""
     for name, value in values.items():
         if name == "failures":  # listed at the end
             continue
         title = prefix + str(name).replace("_", " ")
         if isinstance(value, Mapping):
-            yield from () if prefix.count(":") == MAX_DEPTH else table_rows(value, f"{title}: ")
+            yield from () if prefix.count(":") == MAX_DEPTH else _table_rows(value, f"{title}: ")
         elif isinstance(value, (list, tuple)):
             if value and not any(isinstance(each, (list, tuple, Mapping)) for each in value):
                 yield title, ", ".join(map(_text, value))

@@ -58,7 +58,7 @@ def doctor() -> Result:
     marks = {"ok": "", "problem": "PROBLEM: ", "missing": "not installed: "}
     remedies = {each.name: each.remedy for each in findings if each.remedy}
     text = table({each.name: marks[each.status] + each.value for each in findings}) + "\n\n"
-    text += table(remedies, "what to do") if remedies else "all that is installed works"
+    text += table(remedies, title="what to do") if remedies else "all that is installed works"
     values = {"ok": healthy, "findings": [finding._asdict() for finding in findings]}
     return Result(values, text, exit_code=0 if healthy else 1)
 

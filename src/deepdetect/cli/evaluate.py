@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -25,7 +24,7 @@ from ..evaluation.options import PAPER_RESOLUTION_PX, BenchmarkOptions
 from ..evaluation.protocols.masks import LabelDetector
 from ..evaluation.protocols.stereo import match_random_points, score_stereo_matches
 from ..evaluation.report import Table
-from ..evaluation.weights import Evaluation, OxfordScore, evaluate_oxford
+from ..evaluation.weights import Evaluation, evaluate_oxford
 from ..evaluation.weights import evaluate as run
 from ..features.display import draw_matches
 from ..geometry import disparity_errors
@@ -79,18 +78,26 @@ def evaluate(
     weights = [values.pop("weights", "default"), *(compare or ())]
     detectors = [DeepDetect(path, **values) for path in weights]
     found = [run(detector, **measures) for detector in detectors]
-    on_oxford = [each.oxford for each in found if each.oxford is not None]
     columns = [
         {"weights": detector.weights, "backend": detector.runtime, **_values(evaluation)}
         for detector, evaluation in zip(detectors, found, strict=True)
     ]
     report = {**columns[0], **({"compare": columns[1:]} if compare else {})}
+    scores: list[Any] = [found[0], *(each.oxford for each in found)]
+    scores += [each.foreground for each in found]
     if labels:
         squashed = LabelDetector(heatmap_options=HeatmapOptions(PAPER_RESOLUTION_PX))
-        on_oxford.append(evaluate_oxford(squashed, scenes, quiet=False))
-        report["labels"] = {"oxford": asdict(on_oxford[-1])}
+        scores.append(evaluate_oxford(squashed, scenes, quiet=False))
+        report["labels"] = {"oxford": asdict(scores[-1])}
         columns.append({"weights": "labels", **report["labels"]})
-    return cli.Result(report, _side_by_side(columns), _failures(found, on_oxford), what="parts")
+    by_scale = [
+        {f"x{row['scale']:g} {row['visibility']}": row for row in column.get("scales", ())}
+        for column in columns
+    ]
+    text = cli.table(*({**c, "scales": s} for c, s in zip(columns, by_scale, strict=True)))
+    failures = [failure for score in scores if score is not None for failure in score.failures]
+    # What all weights lack is listed once.
+    return cli.Result(report, text, list(dict.fromkeys(failures)), what="parts")
 
 
 def _values(evaluation: Evaluation) -> dict[str, Any]:
@@ -105,28 +112,6 @@ def _values(evaluation: Evaluation) -> dict[str, Any]:
         if (score := getattr(evaluation, name)) is not None:
             values[name] = asdict(score)
     return values
-
-
-def _side_by_side(results: Sequence[Mapping[str, Any]]) -> str:
-    """Return the table of several results."""
-    columns = []
-    for each in results:
-        scales = {f"x{row['scale']:g} {row['visibility']}": row for row in each.get("scales", ())}
-        columns.append(dict(cli.table_rows({**each, "scales": None, **scales})))
-    names = dict.fromkeys(name for column in columns for name in column)
-    wide = max(len(name) for name in names)
-    rows = [(f"  {n:<{wide}}", *(f"{c.get(n, '-'):>20}" for c in columns)) for n in names]
-    return "\n".join(map(" ".join, rows))
-
-
-def _failures(found: Sequence[Evaluation], on_oxford: Sequence[OxfordScore]) -> list[str]:
-    """List what is in no score; what all weights lack is listed once."""
-    scores: list[Any] = [
-        *on_oxford,
-        *(each.foreground for each in found if each.foreground is not None),
-    ]
-    parts = [found[0].failures, *(score.failures for score in scores)]
-    return list(dict.fromkeys(failure for listed in parts for failure in listed))
 
 
 STEREO_COLUMNS = {
@@ -258,7 +243,8 @@ def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Resu
     folder = cli.output_folder(output)
     numbers = run_demo(load_motorcycle(), detector, folder)
     values = {"weights": detector.weights, "backend": detector.runtime, **numbers}
-    return cli.Result(values, cli.table(values, "Correct: within 1 px of the true disparity."))
+    title = "Correct: within 1 px of the true disparity."
+    return cli.Result(values, cli.table(values, title=title))
 
 
 def run_demo(pair: StereoPair, detector: HeatmapDetector, folder: Path) -> dict[str, Any]:
