@@ -75,7 +75,7 @@ def test_two_images_of_one_name_are_refused(run, photos: Path, tmp_path: Path) -
     Image.open(photos / "cat.jpg").save(other)
     result = run("detect", photos / "cat.jpg", other)
     assert result.exit_code == 2
-    assert "same files" in result.stderr
+    assert "would both write" in result.stderr
 
 
 @pytest.mark.parametrize("short", [MemoryError, DeepDetectError("there is not enough memory")])

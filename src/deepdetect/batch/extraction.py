@@ -26,7 +26,7 @@ from ..features.selection import SelectionOptions
 from ..features.sift import describe_keypoints
 from ..io.image import find_images, load_image, luma
 from ..io.image_file import megapixel_limit
-from .hdf5 import BatchReport, Group, Item, State, fill_file
+from .hdf5 import BatchReport, Group, Item, State, damaged, fill_file
 
 DESCRIPTOR = "rootsift"
 
@@ -169,11 +169,19 @@ def feature_group(
     return Group(name, arrays, state, {"keypoints": {"uncertainty": np.float32(uncertainty)}})
 
 
-def keypoints_of(group: Any, descriptor_type: str | None = None) -> Keypoints:
-    """Return the keypoints in hloc's group of an image; "rootsift" descriptors become bytes again.
+def read_keypoints(file: Any, name: str, descriptor_type: str | None = None) -> Keypoints:
+    """Return the keypoints of an image in a file; "rootsift" descriptors become bytes again.
 
-    Where it holds something else, this is a ValueError, TypeError, KeyError, or what h5py raises.
+    An InvalidFileError says that they are damaged.
     """
+    try:
+        return _keypoints_of(file[name], descriptor_type)
+    # h5py raises any of these, by what is damaged; a wrong shape asks for too much memory.
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError) as error:
+        raise damaged(Path(f"{file.filename}, {name}"), error) from error
+
+
+def _keypoints_of(group: Any, descriptor_type: str | None) -> Keypoints:
     arrays = {name: group[name][()] for name in group if name != "colors"}
     xy = np.asarray(arrays["keypoints"], np.float32)
     size, scales = arrays.get("image_size"), arrays.get("scales")

@@ -20,14 +20,13 @@ from ..features.matchers import MATCHERS
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
 from ..matching.pipeline import match_features
-from .extraction import DESCRIPTOR, keypoints_of
+from .extraction import DESCRIPTOR, read_keypoints
 from .hdf5 import (
     SETTINGS,
     BatchReport,
     Group,
     Item,
     State,
-    damaged,
     feature_names,
     fill_file,
     open_hdf5,
@@ -211,12 +210,13 @@ def _match_pairs(
 ) -> Iterator[Group]:
     """Make the groups of pairs, with their numbers of matches."""
     with open_hdf5(features) as file:
+        kind = DESCRIPTOR if DESCRIPTOR in str(file.attrs.get(SETTINGS)) else None
         first: tuple[str, Keypoints] | None = None  # pairs are sorted by their first image
         for (name0, name1), state in pairs:
             with noted_failures(f"{name0} {name1}", failures):
                 if first is None or first[0] != name0:
-                    first = name0, _read_features(file, name0)
-                features0, features1 = first[1], _read_features(file, name1)
+                    first = name0, read_keypoints(file, name0, kind)
+                features0, features1 = first[1], read_keypoints(file, name1, kind)
                 both = features0.descriptors, features1.descriptors
                 if len({np.asarray(each).shape[-1:] for each in both}) > 1:
                     raise InvalidFileError("their descriptors differ: extract both alike")
@@ -224,15 +224,6 @@ def _match_pairs(
                 counts[name0, name1] = int(np.count_nonzero(matches >= 0))
                 arrays = {"matches0": matches, "matching_scores0": scores}
                 yield Group(pair_name(name0, name1), arrays, state)
-
-
-def _read_features(file: Any, name: str) -> Keypoints:
-    ours = DESCRIPTOR in str(file.attrs.get(SETTINGS, ""))
-    try:
-        return keypoints_of(file[name], DESCRIPTOR if ours else None)
-    # h5py raises any of these, by what is damaged; a wrong shape asks for too much memory.
-    except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError) as error:
-        raise damaged(Path(f"{file.filename}, {name}"), error) from error
 
 
 def _match(

@@ -198,7 +198,7 @@ def output_folder(output: Path) -> Path:
 
 
 def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
-    """Replace folders by the images below them, and check that no two have one name.
+    """Replace folders by the images below them.
 
     The folder of the results is left out when it lies in one of the folders; where it is one of
     them, what earlier runs made in it.
@@ -214,26 +214,25 @@ def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
             if not below:
                 raise OptionError(f"all images in {path} are results of earlier runs")
         images |= dict.fromkeys(below)
-    seen: dict[str, Path] = {}
-    for image in images:
-        if image.stem in seen:
-            raise OptionError(
-                f"{seen[image.stem]} and {image} would write the same files: "
-                "rename one, or do them one after the other into two folders"
-            )
-        seen[image.stem] = image
     return list(images)
 
 
-def check_inputs_survive(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """Check that no file to be written is one of those that are read, under whatever name."""
+def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
+    """Check that no file is written twice, or over one that is read, under whatever name."""
     # Not by name: links, and capitals on some systems, give one file several.
     files = {(path.stat().st_dev, path.stat().st_ino) for path in inputs if path.exists()}
+    seen: set[Path] = set()
     for output in outputs:
         if output.exists() and (output.stat().st_dev, output.stat().st_ino) in files:
             raise OptionError(
                 f"{output} would be written over, which is an input: choose another place with -o"
             )
+        if output in seen:
+            raise OptionError(
+                f"two images would both write {output}: rename one, or do them one after the other "
+                "into two folders"
+            )
+        seen.add(output)
 
 
 def check_folder_not_made(folder: Path, output: Path) -> None:
@@ -266,7 +265,7 @@ def writing(
 
     No input is written over, nor what was made of others.
     """
-    check_inputs_survive(files.values(), inputs)
+    check_outputs(files.values(), inputs)
     with claimed(Outputs([*files.values()], inputs, overwrite=overwrite)), whole(files) as made:
         yield made
 

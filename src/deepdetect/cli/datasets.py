@@ -18,19 +18,15 @@ datasets = App("datasets", help="Download data sets for training and for the ben
 @command()
 def list_datasets() -> Result:
     """Show the data sets that can be downloaded."""
-    found = remote_datasets().values()
     values = [
         {
             **{name: getattr(each, name) for name in ("name", "title", "images", "licence")},
             "bytes": each.size,
+            "urls": [url for file in each.files for url in file.urls],
         }
-        for each in found
+        for each in remote_datasets().values()
     ]
-    urls = [[url for file in each.files for url in file.urls] for each in found]
-    return Result(
-        [{**each, "urls": listed} for each, listed in zip(values, urls, strict=True)],
-        "\n\n".join(map(table, values)),
-    )
+    return Result(values, "\n\n".join(table({**each, "urls": None}) for each in values))
 
 
 @datasets.command

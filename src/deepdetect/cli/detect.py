@@ -65,7 +65,7 @@ def detect(
         | {name: folder / f"{path.stem}_{name}.jpg" for name in drawn if pictures}
         for path in paths
     }
-    cli.check_inputs_survive([file for files in outputs.values() for file in files.values()], paths)
+    cli.check_outputs([file for files in outputs.values() for file in files.values()], paths)
     mask = None if ignore is None else load_mask(ignore)
     if detector == "network" and "max_keypoints" in values:
         cli.note("these are the best pixels of the heat map: --detector points finds better points")

@@ -176,7 +176,7 @@ def _export(
     `FOLDER` and `MAX_KEYPOINTS`.
     """
     inputs = [*sources, *(values[name] for name in ("matches", "pairs") if name in values)]
-    cli.check_inputs_survive([marker], inputs)
+    cli.check_outputs([marker], inputs)
     of_folder = len(sources) == 1 and sources[0].is_dir()
     saved, points = SAVED.take(values), MAX_KEYPOINTS.take(values)
     for name in saved if of_folder else (*points, *values):
@@ -252,6 +252,6 @@ def onnx(
         for path in calibration or ()
         for image in (find_images(path) if path.is_dir() else [path])
     ]
-    cli.check_inputs_survive([file], [resolve_weights(weights), *images])
+    cli.check_outputs([file], [resolve_weights(weights), *images])
     metadata = write_onnx(weights, file, options, calibration=images, licence=licence)
     return cli.Result({"file": file, "bytes": file.stat().st_size, "metadata": metadata})

@@ -279,7 +279,7 @@ def stitch(
     if len(images) < min(len(paths), 2) or (reference is not None and reference not in images):
         what = "too few images, or not the reference, can be read"
         raise ImageError(f"there is no panorama, as {what}: {'; '.join(failures)}")
-    cli.check_inputs_survive([file], paths)
+    cli.check_outputs([file], paths)
     with cli.writing({"file": file}, images, overwrite) as made:
         try:
             with stage_progress("stitching", STAGES) as done:

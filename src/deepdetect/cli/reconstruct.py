@@ -91,7 +91,7 @@ def reconstruct(
     files = {ending: model.with_name(model.stem + ending) for ending in ENDINGS}
     files[model.suffix.lower()] = model
     if "calibration" in values:
-        cli.check_inputs_survive(files.values(), [values["calibration"]])
+        cli.check_outputs(files.values(), [values["calibration"]])
     chosen, selection = chosen_detector(detector or "network", values, weights="dense")
     # The bar is on a terminal only: what is logged stays readable.
     with (

@@ -62,7 +62,7 @@ def track(
                 "replace it with --overwrite"
             )
     if Path(source).is_file():
-        cli.check_inputs_survive(files, [Path(source)])
+        cli.check_outputs(files, [Path(source)])
     outputs = Outputs(files, [Path(source)], overwrite=overwrite)
     with nullcontext() if live else cli.claimed(outputs):
         report = track_points(source, file, options=options, quiet=False, **frames)

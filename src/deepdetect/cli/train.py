@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -234,7 +232,9 @@ def label(
     for image in cli.expand_images(images, folder):
         figure = folder / f"{image.stem}_labels.png" if visualize else None
         tasks.append(LabelTask(image, folder / f"{image.stem}.png", options, figure, overwrite))
-    _check_outputs(tasks)
+    cli.check_outputs(
+        [path for task in tasks for path in task.outputs.paths], [task.image for task in tasks]
+    )
     left = [task for task in tasks if task.outputs.find() is None]
     reports: list[LabelReport] = []
     with progress(len(left), "labelling", "image") as bar:
@@ -336,14 +336,3 @@ def _engine(values: dict[str, Any]) -> dict[str, Any]:
     chosen = ENGINE.take(values)
     map_tasks = get_engine(chosen.get("engine", "processes"))
     return {"map_tasks": map_tasks, "workers": chosen.get("workers")}
-
-
-def _check_outputs(tasks: Sequence[LabelTask]) -> None:
-    """Check that no image is replaced, and no output by another."""
-    outputs = [path for task in tasks for path in task.outputs.paths]
-    cli.check_inputs_survive(outputs, [task.image for task in tasks])
-    for path, count in Counter(outputs).items():
-        if count > 1:
-            raise OptionError(
-                f"two images would both write {path}: rename one, or leave out --visualize"
-            )

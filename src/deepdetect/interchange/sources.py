@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from .._shared.errors import InvalidFileError, OptionError, first_line
+from .._shared.errors import InvalidFileError, OptionError
 from .._shared.options import suggest_keywords
-from ..batch.extraction import extract_features, keypoints_of
+from ..batch.extraction import extract_features, read_keypoints
 from ..batch.hdf5 import feature_names, import_h5py, open_hdf5
 from ..batch.pair_list import Pair, read_pairs, sequential_pairs
 from ..batch.pair_matching import match_pairs
@@ -76,15 +76,8 @@ def read_collection(
 
 def read_features_file(path: Path) -> dict[str, Keypoints]:
     """Read all features of an HDF5 file of hloc's layout, by the name of the image."""
-    found: dict[str, Keypoints] = {}
     with open_hdf5(path) as file:
-        for name in sorted(feature_names(file)):
-            try:
-                found[name] = keypoints_of(file[name])
-            except (OptionError, ValueError, TypeError) as error:
-                raise InvalidFileError(
-                    f"{path} holds no features of {name} ({first_line(error)}): extract them again"
-                ) from None
+        found = {name: read_keypoints(file, name) for name in sorted(feature_names(file))}
     if not found:
         raise InvalidFileError(f"{path} holds no features: give a file of deepdetect extract")
     return found
