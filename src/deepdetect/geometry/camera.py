@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import MissingCalibrationError, ReconstructionError, first_line
+from .._shared.errors import MissingCalibrationError, ReconstructionError
 from .._shared.options import suggest_keywords
 
 Size = tuple[int, int]
@@ -85,6 +85,12 @@ class Camera:
         """The (3, 3) camera matrix."""
         (fx, fy), (cx, cy) = self.focal_px, self.centre
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+    def scaled(self, size: Size) -> Camera:
+        """Return the camera of its image at another (width, height)."""
+        ratio = np.divide(size, self.size)
+        centre = (np.array(self.centre) + 0.5) * ratio - 0.5
+        return Camera(size, (ratio * self.focal_px).tolist(), centre.tolist())
 
     def rays(self, points: np.ndarray) -> np.ndarray:
         """Return (N, 3) float64 viewing directions (x, y, 1) of (N, 2) pixels, in its frame."""
@@ -170,30 +176,22 @@ class Calibration:
 
 
 def read_calibration(path: str | Path, size0: Size, size1: Size) -> Calibration:
-    """Read a calib.json, in the format at the top of this module.
+    """Read a calib.json, in the format at the top of this module, for images of (width, height).
 
-    Args:
-        path: the file.
-        size0, size1: (width, height) of the left and the right image.
-
-    Raises:
-        ReconstructionError: the file is missing, damaged, contradictory, or for images of
-            another size.
+    A ReconstructionError says that it is missing, damaged, contradictory, or for another size.
     """
     try:
-        values = json.loads(Path(path).read_bytes())
+        return _calibration(json.loads(Path(path).read_bytes()), size0, size1, str(path))
+    except ReconstructionError as error:
+        raise ReconstructionError(f"{path}: {error}") from None
     except OSError as error:
         missing = isinstance(error, FileNotFoundError)
         kind = MissingCalibrationError if missing else ReconstructionError
         raise kind(f"{path} cannot be read ({error.strerror}): check the path") from None
     except (ValueError, RecursionError) as error:
         raise ReconstructionError(
-            f"{path} is not valid JSON ({first_line(error)}): correct it, or give the focal length"
+            f"{path} is not valid JSON ({error}): correct it, or give the focal length"
         ) from None
-    try:
-        return _calibration(values, size0, size1, str(path))
-    except ReconstructionError as error:
-        raise ReconstructionError(f"{path}: {error}") from None
 
 
 def _calibration(values: Any, size0: Size, size1: Size, source: str) -> Calibration:

@@ -39,11 +39,9 @@ MIN_RADIUS_PX = 8.0
 
 @dataclass(frozen=True, eq=False)
 class PlanarFrame:
-    """Two views rectified by homographies; `view` is 0 for the first and 1 for the second.
+    """Two views rectified by homographies (3, 3), from their pixels to those of the frame.
 
-    Attributes:
-        homographies: (3, 3) of each view, from its pixels to those of the frame.
-        size: (width, height) of the frame.
+    Its size is (width, height); `view` is 0 for the first view and 1 for the second.
     """
 
     homographies: tuple[np.ndarray, np.ndarray]

@@ -262,10 +262,6 @@ def log10_nfa(
 
     The (M,) inliers are the matches within the threshold in pixels of the second image, of a size
     (width, height); so many models were tried for each minimal sample.
-
-    Example:
-        >>> log10_nfa(np.arange(100) < 30, "homography", 3, (640, 480)) < -50
-        True
     """
     width, height = image_size
     if model == "homography":
@@ -294,18 +290,12 @@ def _log_binomial(count: int, chosen: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Parallax:
-    """The matches off a plane, and how many of them agree on an epipole.
+    """How many matches lie off a plane, and how many of them agree on an epipole.
 
     What a homography leaves of the matches of a static scene moves along lines through the epipole
     (Chum, Werner and Matas, "Two-view geometry estimation unaffected by a dominant plane", 2005).
     Wrong matches move anywhere, and those of a repeated pattern in one direction, but they are few
-    beside what lies on the plane.
-
-    Attributes:
-        on_plane: number of matches that the homography explains.
-        off_plane: number of those that it does not.
-        agreeing: number of the latter that move along lines through the epipole.
-        log10_nfa: decimal logarithm of the number of false alarms of that agreement.
+    beside what lies on the plane. `log10_nfa` is of the agreement.
     """
 
     on_plane: int
@@ -346,15 +336,7 @@ class TwoViewModel(Geometry):
 def measure_parallax(
     points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, seed: int = 0
 ) -> Parallax:
-    """Look for an epipole among the (M, 2) matches that a homography leaves, some of them wrong.
-
-    Example:
-        >>> points = np.random.default_rng(0).uniform(0, 500, (300, 2))
-        >>> depth = np.repeat([0, 1.0], 150) * np.linspace(8, 40, 300)  # half of it before a wall
-        >>> moved = points + np.column_stack([depth, np.zeros(300)])
-        >>> measure_parallax(points, moved, np.eye(3)).shows_depth
-        True
-    """
+    """Look for an epipole among the (M, 2) matches that a homography leaves, some of them wrong."""
     points0, points1 = (np.asarray(points, np.float64) for points in (points0, points1))
     off = transfer_errors(points0, points1, homography) >= MIN_PARALLAX_PX
     on_plane = len(off) - int(np.count_nonzero(off))

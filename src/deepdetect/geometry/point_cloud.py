@@ -92,11 +92,7 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class RobustBox:
-    """The axis-aligned box that holds all but the outermost points.
-
-    Attributes:
-        low, high: (3,) float64 corners, in the cloud's unit.
-    """
+    """The axis-aligned box that holds all but the outermost points, by two (3,) corners."""
 
     low: np.ndarray
     high: np.ndarray

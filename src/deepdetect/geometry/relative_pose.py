@@ -20,15 +20,10 @@ BLOCK = 100_000
 
 @dataclass(frozen=True, eq=False)
 class Triangulation:
-    """Triangulated points.
+    """Points (N, 3) float64 in the frame of the first camera, not finite where rays are parallel.
 
-    Attributes:
-        points: (N, 3) float64 in the frame of the first camera: x right, y down, z forward, in
-            units of the translation's length. Not finite where the rays are parallel.
-        cheirality: (N,) bool, whether the point lies in front of both cameras.
-        reprojection_errors: (N,) float64 distances of the matched positions from the projected
-            point, in pixels: the root mean square of both images.
-        triangulation_angle: (N,) float64 angle between both rays in radians.
+    `cheirality` (N,) says which lie in front of both cameras; the errors (N,) are in pixels, the
+    root mean square of both images, and the angles (N,) between both rays in radians.
     """
 
     points: np.ndarray
@@ -49,14 +44,6 @@ def triangulate(
     Both positions are first moved onto a pair of epipolar lines (`correct_matches`): this is the
     maximum likelihood for errors of the same size in both images. The rays then meet, and the depth
     is a quotient, accurate at small angles too.
-
-    Example:
-        >>> from .camera import Camera
-        >>> cameras = Calibration(*[Camera((640, 480), 500.0)] * 2)
-        >>> pose = np.eye(3), np.array([-1.0, 0, 0])
-        >>> points = triangulate([[319.5, 239.5]], [[269.5, 239.5]], cameras, *pose).points
-        >>> points.round(6).tolist()
-        [[0.0, 0.0, 10.0]]
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)

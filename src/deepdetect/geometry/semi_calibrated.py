@@ -18,7 +18,7 @@ import numpy as np
 from .._shared.opencv import cv2
 from .camera import Calibration, Camera, cross_matrix
 from .estimation import TwoViewModel, log10_nfa
-from .relative_pose import best_of_four, moved_pose
+from .relative_pose import Pose, best_of_four, moved_pose
 from .transforms import epipolar_errors, signed_epipolar_errors
 
 Size = tuple[int, int]
@@ -102,11 +102,11 @@ def estimate_semi_calibrated(
         return best
     essential, cameras = start
     inliers = points0[best.inliers], points1[best.inliers]
-    views = _Views(best_of_four(essential, *inliers, cameras.calibration), cameras)
+    views = best_of_four(essential, *inliers, cameras.calibration), cameras
     for _ in range(MAX_FITS):
         inliers = points0[best.inliers], points1[best.inliers]
         views = _fit(views, *inliers, np.full(len(inliers[0]), MATCH_SIGMA_PX))
-        model = judge(views.fundamental)
+        model = judge(_fundamental(*views))
         if model.log10_nfa > best.log10_nfa:
             break
         hopeless = best.log10_nfa == model.log10_nfa > 0
@@ -133,8 +133,8 @@ def refine_fundamental(
         return fundamental
     cameras = _nearest_cameras(fundamental, sizes)
     essential = cameras.essential(fundamental)
-    views = _Views(best_of_four(essential, points0, points1, cameras.calibration), cameras)
-    matrix = _fit(views, points0, points1, match_sigmas_px).fundamental
+    views = best_of_four(essential, points0, points1, cameras.calibration), cameras
+    matrix = _fundamental(*_fit(views, points0, points1, match_sigmas_px))
     return np.asarray(matrix / np.linalg.norm(matrix))
 
 
@@ -202,20 +202,18 @@ class _Cameras:
         return np.append(of_focal, self.offsets / PRINCIPAL_POINT_SPREAD)
 
 
-@dataclass(frozen=True, eq=False)
-class _Views:
-    """A relative pose and both cameras: 11 parameters."""
+Views = tuple[Pose, _Cameras]
+"""A relative pose and both cameras: 11 parameters."""
 
-    pose: tuple[np.ndarray, np.ndarray]
-    cameras: _Cameras
 
-    @property
-    def fundamental(self) -> np.ndarray:
-        rotation, translation = self.pose
-        return self.cameras.fundamental(cross_matrix(translation) @ rotation)
+def _fundamental(pose: Pose, cameras: _Cameras) -> np.ndarray:
+    rotation, translation = pose
+    return cameras.fundamental(cross_matrix(translation) @ rotation)
 
-    def moved(self, change: np.ndarray) -> _Views:
-        return _Views(moved_pose(self.pose, change[:5]), self.cameras.moved(change[5:]))
+
+def _moved(views: Views, change: np.ndarray) -> Views:
+    pose, cameras = views
+    return moved_pose(pose, change[:5]), cameras.moved(change[5:])
 
 
 def _fit_essential(
@@ -246,13 +244,13 @@ def _fit_essential(
     return np.asarray(matrix)
 
 
-def _fit(views: _Views, points0: np.ndarray, points1: np.ndarray, sigmas: np.ndarray) -> _Views:
+def _fit(views: Views, points0: np.ndarray, points1: np.ndarray, sigmas: np.ndarray) -> Views:
     """Fit pose and cameras to matches, with a Cauchy loss, and to what is usual (MAP estimate)."""
     count = len(points0)
 
-    def residuals(views: _Views) -> np.ndarray:
-        errors = signed_epipolar_errors(points0, points1, views.fundamental)
-        return np.append(errors / sigmas, views.cameras.deviations())
+    def residuals(views: Views) -> np.ndarray:
+        errors = signed_epipolar_errors(points0, points1, _fundamental(*views))
+        return np.append(errors / sigmas, views[1].deviations())
 
     def cost(errors: np.ndarray) -> float:
         matches, usual = errors[:count], errors[count:]
@@ -262,7 +260,7 @@ def _fit(views: _Views, points0: np.ndarray, points1: np.ndarray, sigmas: np.nda
     errors = residuals(views)
     lowest = cost(errors)
     for _ in range(MAX_ITERATIONS):
-        varied = (residuals(views.moved(axis)) for axis in np.eye(11) * step)
+        varied = (residuals(_moved(views, axis)) for axis in np.eye(11) * step)
         slopes = np.column_stack([(other - errors) / step for other in varied])
         weights = np.ones(len(errors))
         weights[:count] = 1 / (1 + (errors[:count] / 2) ** 2)
@@ -270,7 +268,7 @@ def _fit(views: _Views, points0: np.ndarray, points1: np.ndarray, sigmas: np.nda
         before = lowest
         while damping < 1e6:
             damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
-            moved = views.moved(-np.linalg.solve(damped, gradient))
+            moved = _moved(views, -np.linalg.solve(damped, gradient))
             moved_errors = residuals(moved)
             if cost(moved_errors) < lowest:
                 views, errors, lowest = moved, moved_errors, cost(moved_errors)

@@ -6,7 +6,7 @@ fundamental matrix of the same matches, and on the parallax that the homography 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -55,21 +55,6 @@ MIN_FOREGROUND_ON_LINES = 0.8
 """Of the matches clearly off the plane, explained by the fundamental matrix. On planes wrong
 matches are this far off, and fewer lie on their lines: up to 0.65 of them on sixteen pairs of
 Oxford."""
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """What a pair shows, and the models that say so.
-
-    Attributes:
-        kind: "unrelated" (no model explains enough), "static" (nothing moves), "rotation" of the
-            camera, "plane" (or a rotation, where no calibration tells them apart), or "depth".
-        plane, epipolar: the homography and the fundamental matrix of the matches.
-    """
-
-    kind: str
-    plane: TwoViewModel
-    epipolar: TwoViewModel
 
 
 def fit_model(
@@ -129,16 +114,12 @@ def classify_scene(
     size1: Size,
     calibration: Calibration | None = None,
     seed: int = 0,
-) -> Scene:
-    """Say what a pair shows, by (M, 2) matches that are spread out.
+) -> tuple[str, TwoViewModel]:
+    """Say what a pair shows, by (M, 2) matches that are spread out, and their fundamental matrix.
 
-    Matches side by side are no independent evidence. A calibration, where it is known, tells a
-    rotating camera from a plane.
-
-    Example:
-        >>> points = np.random.default_rng(0).uniform(0, 500, (300, 2))
-        >>> classify_scene(points, points + 5, (510, 510)).kind
-        'plane'
+    "unrelated" (no model explains enough), "static" (nothing moves), "rotation" of the camera,
+    "plane" (or a rotation, where no calibration tells them apart), or "depth". Matches side by side
+    are no independent evidence.
     """
     plane, epipolar = (
         fit_model(points0, points1, model, size1, SCENE_THRESHOLDS_PX[model], seed)
@@ -146,17 +127,17 @@ def classify_scene(
     )
     known = len(points0) >= MIN_MATCHES and epipolar.matrix is not None
     if not known or min(plane.log10_nfa, epipolar.log10_nfa) > MAX_LOG10_NFA:
-        return Scene("unrelated", plane, epipolar)
+        return "unrelated", epipolar
     agreeing = plane.inliers | epipolar.inliers
     if is_static(np.linalg.norm(points1 - points0, axis=1)[agreeing]):
-        return Scene("static", plane, epipolar)
+        return "static", epipolar
     if plane.matrix is None or not is_planar(points0, points1, plane, epipolar, seed):
-        return Scene("depth", plane, epipolar)
+        return "depth", epipolar
     if has_foreground(transfer_errors(points0, points1, plane.matrix), epipolar.inliers):
-        return Scene("depth", plane, epipolar)
+        return "depth", epipolar
     on_plane = points0[plane.inliers], points1[plane.inliers]
     rotated = calibration is not None and is_pure_rotation(*on_plane, calibration)
-    return Scene("rotation" if rotated else "plane", plane, epipolar)
+    return "rotation" if rotated else "plane", epipolar
 
 
 def is_planar(

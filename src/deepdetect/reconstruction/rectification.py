@@ -343,27 +343,20 @@ def _rotation_errors(
     About the vertical and the line of sight: a tilt hardly changes disparities. Infinite when none
     leaves the matches on their rows.
     """
-    camera = calibration.camera1
-    rays = calibration.camera0.rays(pixels)
-    wanted = (pixels[:, 0] - disparity - camera.centre[0]) / camera.focal_px[0]
+    camera, rays = calibration.camera1, calibration.camera0.rays(pixels)
+    matched = pixels - np.column_stack([disparity, np.zeros(len(disparity))])
+    wanted = camera.rays(matched)[:, 0]
     # The rotation about the vertical that most pixels ask for is near enough to begin with.
     angle = np.median(np.arctan(wanted) - np.arctan(rays[:, 0]))
     rotation = cv2.Rodrigues(np.array([0, angle, 0]))[0]
-    error = np.empty(0)
-    for iteration in range(ROBUST_ITERATIONS + 1):
+    for _ in range(ROBUST_ITERATIONS):
         rotated = rays @ rotation.T
-        if (rotated[:, 2] <= 0).any():  # only with a focal length that cannot be
-            return np.full(len(pixels), np.inf)
         x, y = (rotated[:, :2] / rotated[:, 2:]).T
-        error = wanted - x
-        if iteration < ROBUST_ITERATIONS:
-            slopes = np.column_stack([1 + x * x, -y])
-            angles = _robust_step(slopes, error, camera.focal_px[0])
-            rotation = cv2.Rodrigues(np.array([0, *angles]))[0] @ rotation
-    off_row = y * camera.focal_px[1] + camera.centre[1] - pixels[:, 1]
-    if np.median(np.abs(off_row)) > MAX_OFF_ROW_PX:
-        return np.full(len(pixels), np.inf)
-    return np.abs(error) * camera.focal_px[0]
+        slopes = np.column_stack([1 + x * x, -y])
+        angles = _robust_step(slopes, wanted - x, camera.focal_px[0])
+        rotation = cv2.Rodrigues(np.array([0, *angles]))[0] @ rotation
+    across, down = np.abs(camera.project(rays @ rotation.T) - matched).T
+    return across if np.median(down) <= MAX_OFF_ROW_PX else np.full(len(pixels), np.inf)
 
 
 def _plane_errors(pixels: np.ndarray, disparity: np.ndarray) -> np.ndarray:

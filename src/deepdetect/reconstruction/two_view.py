@@ -18,8 +18,9 @@ from ..features.matches import Matches
 from ..features.selection import grid_subsample
 from ..geometry import epipolar_errors
 from ..geometry.camera import Calibration, Camera, fundamental_matrix
+from ..geometry.estimation import TwoViewModel
 from ..geometry.relative_pose import RelativePose, estimate_relative_pose, triangulate
-from ..geometry.two_view import SCENE_THRESHOLDS_PX, Scene, classify_scene
+from ..geometry.two_view import SCENE_THRESHOLDS_PX, classify_scene
 from .outliers import PointFilterOptions, disparity_space, sor_inliers
 from .subpixel import refine_matches, spread_corners
 
@@ -65,7 +66,7 @@ NO_DEPTH = {
     "plane": "one homography explains all the matches: the images show a plane, or the camera only "
     "rotated, and there is no depth",
 }
-"""What is said of the kinds of `Scene` without depth."""
+"""What is said of the kinds of scenes without depth."""
 
 
 def reconstruct_two_view(
@@ -94,12 +95,12 @@ def reconstruct_two_view(
         indices, points1 = pose_indices, aligned
         dropped["not refined"] = len(points0) - len(indices)
     with timer.stage("checks"):
-        cells, scene = check_matches(*evident, calibration.camera1.size, calibration, seed)
+        cells, epipolar = check_matches(*evident, calibration.camera1.size, calibration, seed)
     with timer.stage("pose"):
         found = estimate_relative_pose(*evident, calibration, MAX_EPIPOLAR_DISTANCE_PX, seed)
-        pose = check_pose(found, cells, scene, calibration)
+        pose = check_pose(found, cells, epipolar, calibration)
     with timer.stage("focal length"):
-        explained = cells[scene.epipolar.inliers]
+        explained = cells[epipolar.inliers]
         on_lines = evident[0][explained], evident[1][explained]
         check_focal(*on_lines, pose.errors[explained], calibration, seed)
     baseline = 1.0 if calibration.baseline_mm is None else calibration.baseline_mm
@@ -149,40 +150,43 @@ def check_matches(
     size1: tuple[int, int],
     calibration: Calibration | None = None,
     seed: int = 0,
-) -> tuple[np.ndarray, Scene]:
+) -> tuple[np.ndarray, TwoViewModel]:
     """Refuse matches (M, 2) that show no overlap, no motion, or no depth.
 
-    Returns the (K,) rows of those that were used, one per cell, and what these show. A calibration
-    distinguishes a rotating camera from a plane.
+    Returns the (K,) rows of those that were used, one per cell, and their fundamental matrix. A
+    calibration distinguishes a rotating camera from a plane.
     """
     indices = grid_subsample(points0, GRID_SIZE_PX, seed)
-    scene = classify_scene(points0[indices], points1[indices], size1, calibration, seed)
+    kind, epipolar = classify_scene(points0[indices], points1[indices], size1, calibration, seed)
     if not len(points0):
         raise NoDepthError(
             "there are no matches: the images do not overlap, or do not show the same scene, "
             "or no pixel of one is above the threshold (lower `threshold`, or give `density`)"
         )
-    if scene.kind == "unrelated":
+    if kind == "unrelated":
         raise NoDepthError(
             f"too few of the {len(points0):,} matches agree with one geometry: the images do not "
             "overlap, or do not show the same scene"
         )
-    if scene.kind != "depth":
-        raise NoDepthError(NO_DEPTH[scene.kind])
-    return indices, scene
+    if kind != "depth":
+        raise NoDepthError(NO_DEPTH[kind])
+    return indices, epipolar
 
 
 def check_pose(
-    pose: RelativePose | None, indices: np.ndarray, scene: Scene, calibration: Calibration
+    pose: RelativePose | None,
+    indices: np.ndarray,
+    epipolar: TwoViewModel,
+    calibration: Calibration,
 ) -> RelativePose:
     """Refuse a pose that explains far less than is possible: the calibration is wrong.
 
-    The pose is that of all matches; `indices` and `scene` are those of `check_matches`.
+    The pose is that of all matches; `indices` and `epipolar` are those of `check_matches`.
     """
     wrong_focal = _wrong_focal(calibration)
     if pose is None:
         raise ReconstructionError(f"no pose of the cameras fits the matches: {wrong_focal}")
-    possible = np.count_nonzero(scene.epipolar.inliers)
+    possible = np.count_nonzero(epipolar.inliers)
     explained = np.count_nonzero(pose.errors[indices] < MAX_SCENE_DISTANCE_PX)
     if explained < MIN_POSE_RATIO * possible:
         raise ReconstructionError(

@@ -15,7 +15,7 @@ import numpy as np
 
 from .._shared.opencv import cv2
 from .._shared.records import file_state
-from ..geometry.camera import Camera, PosedView, angles_between, relative_fundamental
+from ..geometry.camera import PosedView, angles_between, relative_fundamental
 from ..geometry.transforms import scaled_points
 from ..io.image import load_image, luma
 from ..matching.guided.rectified import match_by_rectification
@@ -160,11 +160,8 @@ def limited_view(view: PosedView) -> PosedView:
     scale = MAX_SIDE_PX / max(width, height)
     if scale >= 1:
         return view
-    size = round(width * scale), round(height * scale)
-    ratio = np.divide(size, view.camera.size)
-    centre = (np.array(view.camera.centre) + 0.5) * ratio - 0.5
-    focal = ratio * view.camera.focal_px
-    return replace(view, camera=Camera(size, focal.tolist(), centre.tolist()))
+    camera = view.camera.scaled((round(width * scale), round(height * scale)))
+    return replace(view, camera=camera)
 
 
 def fuse_matches(

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from .._shared.opencv import cv2
 from ..batch.pair_list import Pair
 
 COMPARED_KEYPOINTS = 512
@@ -27,13 +28,7 @@ MAX_TRAINING_DESCRIPTORS = 50_000
 
 
 def similar_pairs(names: Sequence[str], vectors: np.ndarray, count: int) -> list[Pair]:
-    """Return each name with the `count` whose vectors (N, D) are most alike, every pair once.
-
-    Example:
-        >>> angles = np.radians([0, 10, 90, 95])
-        >>> similar_pairs("abcd", np.column_stack([np.cos(angles), np.sin(angles)]), 1)
-        [('a', 'b'), ('c', 'd')]
-    """
+    """Return each name with the `count` whose vectors (N, D) are most alike, every pair once."""
     found: set[tuple[int, int]] = set()
     for k, vector in enumerate(vectors):
         alike = vectors @ vector
@@ -44,12 +39,7 @@ def similar_pairs(names: Sequence[str], vectors: np.ndarray, count: int) -> list
 
 
 def largest_component(pairs: Sequence[Pair]) -> int:
-    """Return the number of images in the largest component that pairs connect.
-
-    Example:
-        >>> largest_component([("a", "b"), ("c", "d"), ("b", "e")]), largest_component([])
-        (3, 0)
-    """
+    """Return the number of images in the largest component that pairs connect."""
     components: list[set[str]] = []
     for pair in pairs:
         touched = [names for names in components if not names.isdisjoint(pair)]
@@ -58,22 +48,13 @@ def largest_component(pairs: Sequence[Pair]) -> int:
     return max(map(len, components), default=0)
 
 
-def vlad_vectors(
-    descriptors: Sequence[np.ndarray], words: int = WORDS, seed: int = 0
-) -> np.ndarray:
+def vlad_vectors(descriptors: Sequence[np.ndarray], seed: int = 0) -> np.ndarray:
     """Describe each image by one vector: VLAD with the square roots of what each word sums.
 
-    Descriptors are (N_i, D) float32 of length 1; so are the vectors (images, words * D), or 0 for
+    Descriptors are (N_i, D) float32 of length 1; so are the vectors (images, WORDS * D), or 0 for
     an image without keypoints.
-
-    Example:
-        >>> rng = np.random.default_rng(0)
-        >>> one, two = rng.random((2, 40, 8), np.float32)
-        >>> found = vlad_vectors([one, two, one[:30]], words=4)
-        >>> bool(found[0] @ found[2] > found[0] @ found[1])
-        True
     """
-    centres = _vocabulary(np.concatenate(descriptors), words, seed)
+    centres = _vocabulary(np.concatenate(descriptors), seed)
     vectors = np.zeros((len(descriptors), centres.size), np.float32)
     for row, own in enumerate(descriptors):
         if not len(own):
@@ -87,21 +68,16 @@ def vlad_vectors(
     return vectors
 
 
-def _vocabulary(descriptors: np.ndarray, words: int, seed: int) -> np.ndarray:
+def _vocabulary(descriptors: np.ndarray, seed: int) -> np.ndarray:
     """Return the centres of k-means."""
     rng = np.random.default_rng(seed)
     if len(descriptors) > MAX_TRAINING_DESCRIPTORS:
         descriptors = rng.choice(descriptors, MAX_TRAINING_DESCRIPTORS, replace=False)
-    count = min(words, len(descriptors))
-    centres = rng.choice(descriptors, count, replace=False)
-    for _ in range(KMEANS_ITERATIONS):
-        nearest = _nearest(descriptors, centres)
-        sizes = np.bincount(nearest, minlength=count)
-        sums = np.zeros_like(centres)
-        np.add.at(sums, nearest, descriptors)
-        filled = sizes > 0
-        centres[filled] = sums[filled] / sizes[filled, None]
-    return centres
+    centres = rng.choice(descriptors, min(WORDS, len(descriptors)), replace=False)
+    nearest = _nearest(descriptors, centres).astype(np.int32)
+    criteria = (cv2.TERM_CRITERIA_COUNT, KMEANS_ITERATIONS, 0.0)
+    flags = cv2.KMEANS_USE_INITIAL_LABELS
+    return cv2.kmeans(descriptors, len(centres), nearest, criteria, 1, flags)[2]
 
 
 def _nearest(descriptors: np.ndarray, centres: np.ndarray) -> np.ndarray:

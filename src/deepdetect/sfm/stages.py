@@ -174,11 +174,9 @@ class Stages:
                     sizes[name] = int(width), int(height)
                     keypoints[name] = len(file[name]["keypoints"])
                     continue
-                # 1.jpg is in the sentence on 11.jpg, too.
                 begins = (f"{folder.absolute() / name} ", f"{name}: ")
-                sentences = [text for text in report.failures if name in text]
-                sentences.sort(key=lambda text: not text.startswith(begins))
-                failures[name] = [*sentences, "it could not be read"][0]
+                found = [text for text in report.failures if text.startswith(begins)]
+                failures[name] = [*found, "it could not be read"][0]
         return sizes, keypoints, failures
 
     def choose_pairs(self, names: Sequence[str]) -> list[Pair]:

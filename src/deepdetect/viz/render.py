@@ -78,7 +78,9 @@ def render(cloud: PointCloud, camera: PosedView, point_width: float | None = Non
     require_points(cloud)
     if point_width is not None and not point_width > 0:
         raise OptionError(f"the width of a point must be above 0 pixels, not {point_width}")
-    nearest = _nearest_points(cloud, _finer(camera), point_width)
+    width, height = camera.camera.size
+    fine_camera = camera.camera.scaled((width * SUPERSAMPLING, height * SUPERSAMPLING))
+    nearest = _nearest_points(cloud, replace(camera, camera=fine_camera), point_width)
     # The last colour is that of pixels which show no point.
     colors = np.append(cloud.colors, np.full((1, 3), 255, np.uint8), axis=0)
     fine = colors[nearest].astype(np.uint16)
@@ -117,14 +119,6 @@ def draw_clouds(
         panels.append(add_caption(drawn, f"{title}: {len(cloud):,} points"))
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
     return vstack([hstack(row) for row in rows])
-
-
-def _finer(camera: PosedView) -> PosedView:
-    coarse, times = camera.camera, SUPERSAMPLING
-    size = coarse.size[0] * times, coarse.size[1] * times
-    # The centre of the first fine pixel lies before that of the first pixel.
-    centre = [times * middle + (times - 1) / 2 for middle in coarse.centre]
-    return replace(camera, camera=Camera(size, coarse.focal_px[0] * times, centre))
 
 
 def _nearest_points(cloud: PointCloud, camera: PosedView, point_width: float | None) -> np.ndarray:
