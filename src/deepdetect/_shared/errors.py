@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 
 
@@ -116,6 +116,12 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
     nearest = difflib.get_close_matches(str(name).lower(), spelled, n=1, cutoff=0.5)
     hint = f": did you mean {spelled[nearest[0]]!r}?" if nearest else ""
     return OptionError(f"unknown {kind} {name!r}{hint} (known: {', '.join(names)})")
+
+
+def check_name(kind: str, name: object, known: Collection[object]) -> None:
+    """Raise the error for an unknown name, as "projection", where it is none of the known ones."""
+    if name not in known:
+        raise unknown_name(kind, name, map(str, known))
 
 
 WITHOUT_GPU = (

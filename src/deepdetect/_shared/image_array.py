@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .errors import ImageError, unknown_name
+from .errors import ImageError, check_name
 
 Channels = Literal["rgb", "bgr"]
 CHANNEL_ORDERS = ("rgb", "bgr")
@@ -15,8 +15,7 @@ CHANNEL_COUNTS = (1, 3, 4)
 
 def check_channels(channels: str) -> None:
     """Refuse an unknown order of the colours of an image in an array."""
-    if channels not in CHANNEL_ORDERS:
-        raise unknown_name("channel order", channels, CHANNEL_ORDERS)
+    check_name("channel order", channels, CHANNEL_ORDERS)
 
 
 def as_array(image: Any) -> np.ndarray:

@@ -11,7 +11,7 @@ from numbers import Real
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from .errors import OptionError, unknown_name
+from .errors import OptionError, check_name, unknown_name
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -48,8 +48,7 @@ def suggest_keywords(
         for name in kwargs:
             if name in elsewhere:
                 raise OptionError(f"unknown option {name!r}: {elsewhere[name]}")
-            if name not in names:
-                raise unknown_name("option", name, names)
+            check_name("option", name, names)
         return function(*args, **kwargs)
 
     return call
@@ -103,8 +102,7 @@ def look_up(kind: str, name: str, registry: Mapping[str, Entry]) -> Entry:
     Raises:
         OptionError: the name is unknown (the nearest right one is named).
     """
-    if name not in registry:
-        raise unknown_name(kind, name, registry)
+    check_name(kind, name, registry)
     return registry[name]
 
 

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from .._shared.errors import DeepDetectError, OptionError, unknown_name
+from .._shared.errors import DeepDetectError, OptionError, check_name
 from .._shared.image_array import Channels, check_channels
 from .._shared.machine import available_memory, release_freed_memory
 from .._shared.opencv import cv2, is_lack_of_memory
@@ -65,8 +65,7 @@ class HeatmapOptions:
                 f"not {self.resolution!r}"
             )
         check_channels(self.network_channels)
-        if self.tta not in ("none", "flip"):
-            raise unknown_name("tta", self.tta, ["none", "flip"])
+        check_name("tta", self.tta, ("none", "flip"))
         if self.tile_megapixels != "auto":
             check_ranges(self, between={"tile_megapixels": (MIN_TILE_MEGAPIXELS, math.inf)})
             if self.resolution != "native":

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .._shared.errors import OptionError, unknown_name
+from .._shared.errors import OptionError, check_name
 from .._shared.image_array import Channels
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
@@ -61,12 +61,10 @@ class PointDetector:
         ranker: str | Path | None = None,
     ) -> None:
         check_max_keypoints(max_keypoints)
-        if spread not in SPREADS:
-            raise unknown_name("spread", spread, SPREADS)
+        check_name("spread", spread, SPREADS)
         if spread != "none" and max_keypoints is None:
             raise OptionError(f"`spread={spread!r}` needs `max_keypoints`: how many to spread")
-        if resolution not in ("auto", "native"):
-            raise unknown_name("resolution of points", resolution, ("auto", "native"))
+        check_name("resolution of points", resolution, ("auto", "native"))
         self.max_keypoints, self.spread, self.resolution = max_keypoints, spread, resolution
         self.ranker = RANKER if ranker is None else Path(ranker).absolute()
         load_ranker(self.ranker)

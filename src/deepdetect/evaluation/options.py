@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from .._shared.errors import OptionError, unknown_name
+from .._shared.errors import OptionError, check_name
 from .._shared.options import check_ranges, suggest_keywords
 from ..detector.detector import DeepDetect
 from ..detector.heatmap import HeatmapOptions
@@ -71,8 +71,7 @@ class BenchmarkOptions:
     def __post_init__(self) -> None:
         check_ranges(self, positive=("max_pairs",), between={"max_images": (3, float("inf"))})
         for name in self.classical:
-            if name not in BASELINES:
-                raise unknown_name("classical baseline", name, BASELINES)
+            check_name("classical baseline", name, BASELINES)
         stems = [Path(weights).stem for weights in self.geometry_weights]
         if len(set(stems)) < len(stems):
             raise OptionError(

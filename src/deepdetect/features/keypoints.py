@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .._shared.errors import OptionError, require_packages, unknown_name
+from .._shared.errors import OptionError, check_name, require_packages
 from .._shared.image_array import Channels
 from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
@@ -192,8 +192,7 @@ class Keypoints:
             OptionError: the scale is unknown.
             MissingExtraError: torch is not installed.
         """
-        if scale not in SIZES_PER_SCALE:
-            raise unknown_name("scale", scale, SIZES_PER_SCALE)
+        check_name("scale", scale, SIZES_PER_SCALE)
         require_packages("LightGlue", "torch")
         import torch
 

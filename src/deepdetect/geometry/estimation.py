@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import OptionError, unknown_name
+from .._shared.errors import OptionError, check_name
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from .transforms import epipolar_errors, transfer_errors, transform_points
@@ -79,8 +79,7 @@ class GeometryOptions:
     iterations: int = 10_000
 
     def __post_init__(self) -> None:
-        if self.estimator not in ESTIMATORS:
-            raise unknown_name("estimator", self.estimator, ESTIMATORS)
+        check_name("estimator", self.estimator, ESTIMATORS)
         if not 0 < self.confidence < 1:
             raise OptionError(f"the confidence must lie between 0 and 1, not {self.confidence}")
         check_ranges(self, positive=("inlier_threshold", "iterations"))
@@ -199,8 +198,7 @@ def estimate_geometry(
 
 def check_model(model: str, seed: int, options: GeometryOptions) -> None:
     """Raise an OptionError where `estimate_geometry` would, whatever the matches."""
-    if model not in MODEL_NAMES:
-        raise unknown_name("model", model, MODEL_NAMES)
+    check_name("model", model, MODEL_NAMES)
     if not 0 <= seed < 2**31:
         raise OptionError(f"the seed must lie in [0, 2147483647], not {seed}")
     if model == "essential":

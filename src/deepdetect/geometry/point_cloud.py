@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import OptionError, unknown_name
+from .._shared.errors import OptionError, check_name
 from .._shared.options import suggest_keywords
 
 UNITS = {
@@ -54,8 +54,7 @@ class PointCloud:
     frame: str = "left camera"
 
     def __post_init__(self) -> None:
-        if self.unit not in UNITS:
-            raise unknown_name("unit", self.unit, UNITS)
+        check_name("unit", self.unit, UNITS)
         points, colors = _array(self.points), _array(self.colors)
         if points.size == colors.size == 0:
             points, colors = np.empty((0, 3)), np.empty((0, 3), np.uint8)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import OptionError, require_packages, unknown_name
+from .._shared.errors import OptionError, check_name, require_packages
 from ..detector.detector import AnyDetector, DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import unit_length
@@ -74,8 +74,7 @@ class DeepDetectExtractor(BaseModel):
 
     def _init(self, conf: dict[str, Any]) -> None:
         _check_names(conf, self.default_conf)
-        if conf["angle_unit"] not in ("degrees", "radians"):
-            raise unknown_name("angle unit", conf["angle_unit"], ("degrees", "radians"))
+        check_name("angle unit", conf["angle_unit"], ("degrees", "radians"))
         if conf["max_keypoints"] > MAX_KEYPOINTS:
             raise OptionError(
                 f"hloc can match up to {MAX_KEYPOINTS} keypoints, not {conf['max_keypoints']}: "
@@ -191,5 +190,4 @@ def register() -> None:
 def _check_names(conf: dict[str, Any], known: Iterable[str]) -> None:
     """Refuse options that a model does not have; "name" is hloc's own."""
     for name in conf:
-        if name not in {"name", *known}:
-            raise unknown_name("option", name, known)
+        check_name("option", name, ("name", *known))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from .._shared.errors import OptionError, require_packages, unknown_name
+from .._shared.errors import OptionError, check_name, require_packages
 from .._shared.options import suggest_keywords
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import SIZES_PER_SCALE
@@ -46,8 +46,7 @@ class DeepDetectExtractor(Module):
                 f"LightGlue takes up to {MAX_KEYPOINTS} keypoints, not "
                 f"{detector.max_keypoints or 'all'}: give the detector a smaller `max_keypoints`"
             )
-        if scale not in SIZES_PER_SCALE:
-            raise unknown_name("scale", scale, SIZES_PER_SCALE)
+        check_name("scale", scale, SIZES_PER_SCALE)
         self._scale = scale
         self._detector = detector
 

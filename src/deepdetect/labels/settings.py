@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from .._shared.errors import OptionError, unknown_name
+from .._shared.errors import OptionError, check_name, unknown_name
 from .._shared.options import resolve_name_or_path, suggest_keywords
 from .detectors import DETECTOR_NAMES, DETECTORS, Value, select_detectors
 
@@ -53,8 +53,7 @@ class LabelOptions:
     def __post_init__(self) -> None:
         names = (self.detectors,) if isinstance(self.detectors, str) else self.detectors
         object.__setattr__(self, "detectors", select_detectors(names))
-        if self.visibility not in ("auto", *SECTIONS):
-            raise unknown_name("visibility", self.visibility, ("auto", *SECTIONS))
+        check_name("visibility", self.visibility, ("auto", *SECTIONS))
         checked = {name: _checked(name, self.settings[name]) for name in self.settings}
         object.__setattr__(self, "settings", checked)
         if idle := sorted(checked.keys() - set(self.detectors)):
@@ -84,8 +83,7 @@ def _checked(detector: str, sections: Any) -> dict[str, dict[str, Value]]:
     ):
         raise OptionError(f"{detector} must be a table of tables, as normal = {{ threshold = 20 }}")
     for section in sections:
-        if section not in SECTIONS.values():
-            raise unknown_name(f"part of {detector}", section, SECTIONS.values())
+        check_name(f"part of {detector}", section, SECTIONS.values())
     return {
         section: {name: _checked_value(detector, name, value) for name, value in values.items()}
         for section, values in sections.items()
@@ -94,8 +92,7 @@ def _checked(detector: str, sections: Any) -> dict[str, dict[str, Value]]:
 
 def _checked_value(detector: str, name: str, value: Any) -> Value:
     settings = DETECTORS[detector].settings
-    if name not in settings:
-        raise unknown_name(f"setting of {detector}", name, settings)
+    check_name(f"setting of {detector}", name, settings)
     default, limits = settings[name]
     kind = type(default)
     if type(value) is not kind and not (kind is float and type(value) is int):

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from .._shared.errors import OptionError, unknown_name
+from .._shared.errors import OptionError, check_name
 from .._shared.image_array import Channels
 from .._shared.machine import require_memory
 from .._shared.options import check_ranges, suggest_keywords
@@ -78,8 +78,7 @@ class MatchingOptions:
             raise OptionError(
                 "the matcher hamming compares binary descriptors, as ORB's: take exact or flann"
             )
-        if self.two_view_model not in TWO_VIEW_MODELS:
-            raise unknown_name("two-view model", self.two_view_model, TWO_VIEW_MODELS)
+        check_name("two-view model", self.two_view_model, TWO_VIEW_MODELS)
         if self.angle != -1 and not 0 <= self.angle < 360:
             raise OptionError(f"the angle must lie in [0, 360) or be -1, not {self.angle}")
         limits = {"keypoint_size": (0, 100), "ratio": (0, 1)}

@@ -19,7 +19,7 @@ import numpy as np
 
 from .. import __version__
 from .._shared.atomic import atomic_path
-from .._shared.errors import MissingImageError, OptionError, ReconstructionError, unknown_name
+from .._shared.errors import MissingImageError, OptionError, ReconstructionError, check_name
 from .._shared.machine import available_memory, map_in_processes, needed_memory, processor_count
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.progress import progress
@@ -83,8 +83,7 @@ class MultiViewOptions:
     single_camera: bool | None = None
 
     def __post_init__(self) -> None:
-        if self.pairs not in get_args(PairChoice):
-            raise unknown_name("way to choose pairs", self.pairs, get_args(PairChoice))
+        check_name("way to choose pairs", self.pairs, get_args(PairChoice))
         check_ranges(
             self,
             positive=("sequential",),

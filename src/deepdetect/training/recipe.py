@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from .._shared.errors import OptionError, unknown_name
+from .._shared.errors import OptionError, check_name
 from .._shared.machine import processor_count
 from .._shared.options import check_ranges, look_up, suggest_keywords
 from ..labels import LABEL_SETTINGS, LabelOptions
@@ -144,8 +144,7 @@ class TrainingOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.optimizer not in OPTIMIZERS:
-            raise unknown_name("optimizer", self.optimizer, OPTIMIZERS)
+        check_name("optimizer", self.optimizer, OPTIMIZERS)
         self._check_sizes()
         check_ranges(
             self,
@@ -205,8 +204,7 @@ class DeviceOptions:
 
     def __post_init__(self) -> None:
         for name, known in (("device", DEVICES), ("precision", PRECISIONS)):
-            if getattr(self, name) not in known:
-                raise unknown_name(name, getattr(self, name), known)
+            check_name(name, getattr(self, name), known)
         check_ranges(self, positive=("threads",), not_negative=("num_workers",))
 
     @property

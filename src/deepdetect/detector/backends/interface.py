@@ -15,7 +15,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from ..._shared.errors import DeepDetectError, OptionError, WeightsError, unknown_name
+from ..._shared.errors import DeepDetectError, OptionError, WeightsError, check_name
 from ..._shared.options import suggest_keywords
 
 BACKENDS = ("onnxruntime", "openvino", "torch")
@@ -54,12 +54,10 @@ class RuntimeOptions:
     precision: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:
-        if self.backend not in ("auto", *BACKENDS):
-            raise unknown_name("backend", self.backend, ("auto", *BACKENDS))
+        check_name("backend", self.backend, ("auto", *BACKENDS))
         if self.threads is not None and self.threads < 1:
             raise OptionError(f"threads must be at least 1, not {self.threads}")
-        if self.precision not in PRECISIONS:
-            raise unknown_name("precision", self.precision, PRECISIONS)
+        check_name("precision", self.precision, PRECISIONS)
 
     def check_backend(self, backend: str) -> None:
         """Raise an OptionError if a backend has not what is asked of it."""

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from ..._shared.atomic import atomic_path
-from ..._shared.errors import OptionError, WeightsError, require_packages, unknown_name
+from ..._shared.errors import OptionError, WeightsError, check_name, require_packages
 from ..._shared.options import check_ranges, suggest_keywords
 from ...features.selection import check_max_keypoints
 from ...io.image import load_image
@@ -72,8 +72,7 @@ class OnnxOptions:
     max_keypoints: int = MAX_KEYPOINTS
 
     def __post_init__(self) -> None:
-        if self.precision not in PRECISIONS:
-            raise unknown_name("precision", self.precision, PRECISIONS)
+        check_name("precision", self.precision, PRECISIONS)
         if self.size is not None and len(self.size) != 2:
             raise OptionError(f"`size` must be height and width, not {self.size}")
         ranges = {"size": (8, 16384), "batch": (1, 1024), "max_keypoints": (0, 100_000)}

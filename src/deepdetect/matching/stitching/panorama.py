@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..._shared.errors import OptionError, unknown_name
+from ..._shared.errors import OptionError, check_name
 from ..._shared.image_array import Channels
 from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.progress import StageTimer
@@ -150,8 +150,7 @@ def stitch(
         >>> panorama.image.shape
         (160, 240, 3)
     """
-    if projection not in PROJECTIONS:
-        raise unknown_name("projection", projection, PROJECTIONS)
+    check_name("projection", projection, PROJECTIONS)
     if len(images) < 2:
         raise OptionError("a panorama needs two images or more: give more images")
     if reference is not None and not 0 <= reference < len(images):
