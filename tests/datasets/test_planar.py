@@ -7,10 +7,7 @@ import pytest
 
 from deepdetect import ImageError
 from deepdetect.datasets.planar import (
-    NOT_IN_D2NET_SUBSET,
     OXFORD_KINDS,
-    in_d2net_subset,
-    is_illumination,
     load_hpatches,
     load_low_visibility,
     load_oxford,
@@ -74,12 +71,10 @@ def test_fewer_pairs_keep_their_numbers(oxford: Path) -> None:
 def test_hpatches_scenes_come_with_the_light_first(hpatches: Path) -> None:
     scenes = load_hpatches(hpatches)
     assert [scene.name for scene in scenes] == ["i_dc", "i_pool", "v_wall"]
-    assert [is_illumination(scene) for scene in scenes] == [True, True, False]
+    assert [scene.pairs[0].kind for scene in scenes] == [*["illumination"] * 2, "viewpoint"]
     pair = scenes[2].pairs[3]
     assert (pair.name, pair.first.name, pair.second.name) == ("v_wall 1-5", "1.png", "5.png")
     np.testing.assert_array_equal(pair.homography, [[1, 0, 0], [0, 1, 5], [0, 0, 1]])
-    assert len(NOT_IN_D2NET_SUBSET) == 8
-    assert [scene.name for scene in scenes if not in_d2net_subset(scene)] == ["i_dc"]
 
 
 def test_what_is_missing_or_wrong_is_named(hpatches: Path, one_line) -> None:
@@ -107,6 +102,7 @@ def test_there_are_two_scenes_of_low_visibility(tmp_path: Path) -> None:
 def test_the_shared_copies_can_be_read(shared: Path) -> None:
     data = shared / "data"
     assert sum(len(s.images) for s in load_oxford(data / "oxford", "refined")) == 48
-    assert {is_illumination(s) for s in load_hpatches(data / "hpatches")} == {True, False}
+    kinds = {scene.pairs[0].kind for scene in load_hpatches(data / "hpatches")}
+    assert kinds == {"illumination", "viewpoint"}
     for scene in load_low_visibility(data / "low-visibility"):
         np.testing.assert_array_equal(scene.pairs[0].homography, np.eye(3))

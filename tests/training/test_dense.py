@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import os
 
 import pytest
 
@@ -10,18 +11,24 @@ from deepdetect import OptionError  # noqa: E402
 from deepdetect.detector.network.espnet import ESPNet  # noqa: E402
 from deepdetect.training import dense  # noqa: E402
 from deepdetect.training.dataset import TrainingData  # noqa: E402
-from deepdetect.training.dense import DenseTrainer, initial_network  # noqa: E402
-from deepdetect.training.engine import launch  # noqa: E402
+from deepdetect.training.dense import (  # noqa: E402
+    DenseTrainer,
+    freeze_batch_norm,
+    initial_network,
+    launch,
+)
 from deepdetect.training.recipe import DeviceOptions, Stage, TrainingOptions  # noqa: E402
 
 PLAIN = DeviceOptions("cpu", "float32", compile=False, threads=1)
 
 
-def make_trainer(network: torch.nn.Module, **options: object) -> DenseTrainer:
+def make_trainer(
+    network: torch.nn.Module, device: DeviceOptions = PLAIN, **options: object
+) -> DenseTrainer:
     """A trainer of 150 steps without warm-up, at a learning rate of 0.1 falling to nothing."""
     values = {"stages": (Stage(16, 1, 150),), "learning_rate": 0.1, **options}
     data = TrainingData([None], [None], "")
-    return DenseTrainer(network, TrainingOptions(**values), data, PLAIN, launch(PLAIN))
+    return DenseTrainer(network, TrainingOptions(**values), data, device, launch(device))
 
 
 class Constant(torch.nn.Module):
@@ -122,3 +129,66 @@ def test_a_frozen_encoder_stays_as_it_is(frozen_batch_norm: bool) -> None:
     assert not any(name.startswith("encoder.") for name in changed)
     assert len([name for name in changed if name.endswith("weight")]) > 10
     assert frozen_batch_norm != any("running" in name for name in changed)
+
+
+def gradients(
+    trainer: DenseTrainer, images: torch.Tensor, truth: torch.Tensor
+) -> list[torch.Tensor]:
+    trainer.network.train()
+    trainer.network.zero_grad()
+    loss = torch.nn.functional.binary_cross_entropy_with_logits(trainer.logits(images), truth)
+    trainer.fabric.backward(loss)
+    return [parameter.grad.clone() for parameter in trainer.network.parameters()]
+
+
+def two_trainers(side: int, options: DeviceOptions) -> tuple[list[torch.Tensor], ...]:
+    """Return the gradients of one network, by an eager trainer in float32 and by another one."""
+    torch.manual_seed(0)
+    first, second = ESPNet(), ESPNet()
+    second.load_state_dict(first.state_dict())
+    rgb = torch.randint(0, 256, (2, side, side, 3), dtype=torch.uint8)
+    truth = (torch.rand(2, 1, side, side) < 0.4).float()
+    plain = make_trainer(first, DeviceOptions("cpu", "float32", compile=False))
+    other = make_trainer(second, options)
+    return tuple(gradients(trainer, trainer.to_float(rgb), truth) for trainer in (plain, other))
+
+
+def test_gradients_in_bfloat16_are_those_of_float32_within_rounding() -> None:
+    expected, found = two_trainers(96, DeviceOptions("cpu", "bfloat16", compile=False))
+    a, b = (torch.cat([gradient.flatten() for gradient in each]) for each in (expected, found))
+    assert torch.isfinite(b).all()
+    assert torch.nn.functional.cosine_similarity(a, b, dim=0) > 0.97
+    assert (a - b).norm() / a.norm() < 0.25
+
+
+def test_a_compiler_that_does_not_work_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*arguments: object) -> torch.Tensor:
+        raise torch._dynamo.exc.TorchDynamoException("Python.h is missing")
+
+    monkeypatch.setattr(torch, "compile", lambda *arguments, **options: broken)
+    monkeypatch.setattr("shutil.which", lambda name: "/usr/bin/g++")
+    images = torch.rand(1, 3, 32, 32)
+    trainer = make_trainer(ESPNet(), DeviceOptions("cpu", "float32"))
+    assert trainer.compiled
+    assert trainer.logits(images).shape == (1, 1, 32, 32)
+    assert "eager" in trainer.describe()
+    with pytest.raises(OptionError, match="compile=False"):
+        make_trainer(ESPNet(), DeviceOptions("cpu", "float32", compile=True)).logits(images)
+
+
+@pytest.mark.skipif(
+    not os.environ.get("DEEPDETECT_TEST_COMPILE"),
+    reason="takes minutes: set DEEPDETECT_TEST_COMPILE=1",
+)
+def test_compiled_training_gives_the_eager_gradients() -> None:
+    expected, found = two_trainers(64, DeviceOptions("cpu", "float32", compile=True))
+    for a, b in zip(expected, found, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-3)
+
+
+def test_frozen_batch_norm_keeps_its_statistics() -> None:
+    network = torch.nn.Sequential(torch.nn.BatchNorm2d(3), torch.nn.Dropout(0.5)).train()
+    freeze_batch_norm(network)
+    network(torch.rand(2, 3, 8, 8))
+    assert torch.equal(network[0].running_mean, torch.zeros(3))
+    assert network[1].training

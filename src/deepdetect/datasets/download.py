@@ -131,7 +131,13 @@ def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = Tru
         missing = [(file, path) for file, path in every if not path.exists()]
         # Twice the size: for the archives, and for what is unpacked.
         done = sum(file_state(_part(path))[0] for _, path in missing)
-        _require_space(store, dataset.size + sum(file.size for file, _ in missing) - done)
+        needed = dataset.size + sum(file.size for file, _ in missing) - done
+        free = shutil.disk_usage(store).free
+        if free < needed:
+            raise DeepDetectError(
+                f"{final.parent} has {free / 1e9:.1f} GB free, {needed / 1e9:.1f} GB are needed: "
+                "make room or choose another folder"
+            )
         for file, path in missing:
             download(file, path, quiet=quiet)
         _assemble(dataset, paths, final, quiet)
@@ -156,7 +162,6 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
     from requests import RequestException
 
     part = _part(path)
-    failure = DeepDetectError(f"{path.name} has no address")
     for k, url in enumerate(file.urls):
         if k and file.checksum is None:
             part.unlink(missing_ok=True)  # another host may have other bytes
@@ -252,15 +257,6 @@ def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> str | None:
             if re.fullmatch("[0-9a-f]{64}", stated):
                 return f"sha256:{stated}"
     return None
-
-
-def _require_space(folder: Path, needed: int) -> None:
-    free = shutil.disk_usage(folder).free
-    if free < needed:
-        raise DeepDetectError(
-            f"{folder.parent} has {free / 1e9:.1f} GB free, {needed / 1e9:.1f} GB are needed: "
-            "make room or choose another folder"
-        )
 
 
 def _check(dataset: RemoteDataset, folder: Path, subject: str) -> None:

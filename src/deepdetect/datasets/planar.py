@@ -81,20 +81,20 @@ def load_oxford(
 
     The "published" truth is in H1toKp; "refined" reads H1toKp.refined where there is one.
     """
-    root = Path(folder)
-    there = [root / name for name in OXFORD_KINDS if (root / name).is_dir()]
-    if not there:
-        raise ImageError(f"there are no Oxford scenes in {folder}: {OXFORD_LAYOUT}")
-    images = [f"img{number}" for number in range(1, 7)]
     scenes = []
-    for scene in there:
+    for name, kind in OXFORD_KINDS.items():
+        scene = Path(folder) / name
+        if not scene.is_dir():
+            continue
         homographies = [f"H1to{number}p" for number in range(2, 7)]
         if truth == "refined":
-            refined = [f"{name}.refined" for name in homographies]
+            refined = [f"{published}.refined" for published in homographies]
             choices = zip(homographies, refined, strict=True)
-            homographies = [new if (scene / new).exists() else name for name, new in choices]
-        suffixes, kind = (".png", ".ppm", ".pgm"), OXFORD_KINDS[scene.name]
-        scenes.append(_load_scene(scene, images, homographies, suffixes, OXFORD_LAYOUT, kind))
+            homographies = [new if (scene / new).exists() else old for old, new in choices]
+        suffixes = (".png", ".ppm", ".pgm")
+        scenes.append(_load_scene(scene, "img", homographies, suffixes, OXFORD_LAYOUT, kind))
+    if not scenes:
+        raise ImageError(f"there are no Oxford scenes in {folder}: {OXFORD_LAYOUT}")
     return scenes
 
 
@@ -105,37 +105,25 @@ def load_hpatches(folder: str | Path) -> list[PlanarScene]:
     H_1_2 to H_1_6.
     """
     root = Path(folder)
-    found = [*sorted(root.glob("i_*")), *sorted(root.glob("v_*"))]
-    scenes = [path for path in found if path.is_dir()]
+    homographies = [f"H_1_{number}" for number in range(2, 7)]
+    scenes = []
+    for prefix, kind in (("i_", "illumination"), ("v_", "viewpoint")):
+        for path in sorted(root.glob(f"{prefix}*")):
+            if path.is_dir():
+                layout = "a scene has images 1 to 6"
+                scenes.append(_load_scene(path, "", homographies, (".ppm", ".png"), layout, kind))
     if not scenes:
         raise ImageError(
             f"there are no HPatches scenes in {folder}: it must hold folders i_NAME and v_NAME"
         )
-    images = [f"{number}" for number in range(1, 7)]
-    homographies = [f"H_1_{number}" for number in range(2, 7)]
-    layout = "a scene has images 1 to 6"
-    loaded = []
-    for path in scenes:
-        kind = "illumination" if path.name.startswith("i_") else "viewpoint"
-        loaded.append(_load_scene(path, images, homographies, (".ppm", ".png"), layout, kind))
-    return loaded
-
-
-def is_illumination(scene: PlanarScene) -> bool:
-    """Whether a scene of HPatches changes the light; the others change the viewpoint."""
-    return scene.name.startswith("i_")
-
-
-def in_d2net_subset(scene: PlanarScene) -> bool:
-    """Whether a scene is one of the 108 of the D2-Net subset, on which most papers report."""
-    return scene.name not in NOT_IN_D2NET_SUBSET
+    return scenes
 
 
 def load_low_visibility(folder: str | Path) -> list[PlanarScene]:
     """List the paper's dusty and smoky scenes: SCENE/img1, SCENE/img2 (.png or .bmp), H1to2p."""
     layout = "the folder must hold dusty and smoky"
     return [
-        _load_scene(Path(folder) / name, ("img1", "img2"), ("H1to2p",), (".png", ".bmp"), layout)
+        _load_scene(Path(folder) / name, "img", ("H1to2p",), (".png", ".bmp"), layout)
         for name in ("dusty", "smoky")
     ]
 
@@ -155,25 +143,25 @@ def read_homography(path: Path) -> np.ndarray:
 
 def _load_scene(
     folder: Path,
-    images: Sequence[str],
+    prefix: str,
     homographies: Sequence[str],
     suffixes: Sequence[str],
     layout: str,
     kind: str = "",
 ) -> PlanarScene:
-    """Load images, named without their suffixes, and the homographies from the first to the others.
+    """Load images, PREFIX1 and so on, and the homographies from the first to each of the others.
 
     The suffixes are looked for in this order; `layout` says what the folder must hold.
     """
     files = []
-    for name in images:
-        found = [path for end in suffixes if (path := folder / f"{name}{end}").exists()]
+    for number in range(1, len(homographies) + 2):
+        names = [folder / f"{prefix}{number}{suffix}" for suffix in suffixes]
+        found = [path for path in names if path.exists()]
         if not found:
-            raise ImageError(f"there is no image {name} in {folder}: {layout}")
+            raise ImageError(f"there is no image {prefix}{number} in {folder}: {layout}")
         files.append(found[0])
-    others = enumerate(zip(files[1:], homographies, strict=True), start=2)
     pairs = [
         PlanarPair(folder.name, number, files[0], file, read_homography(folder / name), kind)
-        for number, (file, name) in others
+        for number, (file, name) in enumerate(zip(files[1:], homographies, strict=True), start=2)
     ]
     return PlanarScene(folder.name, tuple(pairs))

@@ -81,14 +81,9 @@ def jitter_color(rgb: np.ndarray, generator: np.random.Generator, exact: bool) -
     which matters for the keypoints of dark images.
     """
     if exact or generator.random() < 0.5:
-        return to_gray(rgb)
+        return cv2.cvtColor(luma(rgb), cv2.COLOR_GRAY2RGB)
     angle = generator.uniform(0, 2 * np.pi)
     return rotate_hue(rgb, angle, generator.uniform(0, MAX_JITTER_SATURATION))
-
-
-def to_gray(rgb: np.ndarray) -> np.ndarray:
-    """Replace the colours of (H, W, 3) uint8 RGB by the luma, on which labels depend."""
-    return cv2.cvtColor(luma(rgb), cv2.COLOR_GRAY2RGB)
 
 
 def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:

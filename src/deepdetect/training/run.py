@@ -132,8 +132,7 @@ def _dense_trainer(
     """Make the labels, and what is trained on them; arguments of `train`."""
     require_packages("training", *TRAINING_PACKAGES)
     from .dataset import prepare_data
-    from .dense import DenseTrainer, initial_network
-    from .engine import launch
+    from .dense import DenseTrainer, initial_network, launch
 
     options, network = initial_network(options, init_weights)  # before the labels, for its errors
     fabric = launch(device)
@@ -218,7 +217,7 @@ def profile(
     lengths = [min(n, TIMED_STEPS + WARM_UP_STEPS) for n in steps_of_stage]
     log = log if trainer.is_main else None
     if log is not None:
-        log(f"timing {trainer.engine.describe()}")
+        log(f"timing {trainer.describe()}")
     profiles, first = [], 0
     with progress(sum(lengths), "timing", "step", log is None) as bar:
         for length, whole in zip(lengths, steps_of_stage, strict=True):
@@ -237,7 +236,7 @@ def _time_steps(
     from .trainer import FULL_IMAGE_PIXELS
 
     stage, warm_up = trainer.schedule.position(first).stage, min(WARM_UP_STEPS, last - first - 1)
-    on_gpu = trainer.engine.device.type == "cuda"
+    on_gpu = trainer.device.type == "cuda"
     if on_gpu:
         torch.cuda.reset_peak_memory_stats()
     waited = 0.0

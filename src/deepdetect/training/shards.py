@@ -162,21 +162,21 @@ def write_shards(
         for number, chosen in enumerate(_deal(part, images, shard_size)):
             if not chosen:
                 continue
-            views = [
-                image.validation_views if kind == "validation" else image.normal + image.dark
-                for image in chosen.values()
+            whole = kind == "training"
+            rows = [
+                (name, image, image.normal + image.dark if whole else image.validation_views)
+                for name, image in chosen
             ]
             made_from = [
-                (name, image.digest, *(view.name for view in needed))
-                for (name, image), needed in zip(chosen.items(), views, strict=True)
+                (name, image.digest, *(view.name for view in views)) for name, image, views in rows
             ]
             digest = key(label_key(options.labels), made_from)[:12]
             path = output / f"{kind}-{number:06d}-{digest}.tar"
-            files[kind].append((path, len(chosen)))
+            files[kind].append((path, len(rows)))
             if not path.exists():
-                tasks.append(_ShardTask(path, chosen, views, options.labels))
+                tasks.append(_ShardTask(path, rows, options.labels))
     failures: list[str] = []
-    total = sum(len(task.images) for task in tasks)
+    total = sum(len(task.rows) for task in tasks)
     with progress(total, "shards", "image", quiet) as bar:
         for count, unread in map_tasks(_write_shard, tasks, workers):
             bar.update(count)
@@ -188,41 +188,39 @@ def write_shards(
             sorted(failures),
         )
     index: dict[str, Any] = {"options": _fixed_options(options)}
-    for kind, rows in files.items():
-        index[kind] = [{"file": path.name, "images": count} for path, count in rows]
+    for kind, shards in files.items():
+        index[kind] = [{"file": path.name, "images": count} for path, count in shards]
     with atomic_path(output / INDEX) as temporary:  # after all shards
         temporary.write_text(json.dumps(index, indent=1))
     return Shards(output, tuple(files["training"]), tuple(files["validation"]))
 
 
 class _ShardTask(NamedTuple):
-    """A shard to be written: its path, its images by their names in the folder, and their views."""
+    """A shard to be written: its path, and the name of each image, the image, its views."""
 
     path: Path
-    images: Mapping[str, SourceImage]
-    views: Sequence[tuple[View, ...]]
+    rows: Sequence[tuple[str, SourceImage, Sequence[View]]]
     labels: LabelOptions
 
 
 def _deal(
     images: Sequence[SourceImage], root: Path, shard_size: int
-) -> list[dict[str, SourceImage]]:
+) -> list[list[tuple[str, SourceImage]]]:
     """Deal images by the checksums of their names: most shards stay when an image is added."""
-    shards: list[dict[str, SourceImage]] = [{} for _ in range(-(-len(images) // shard_size))]
+    shards: list[list[tuple[str, SourceImage]]] = [[] for _ in range(-(-len(images) // shard_size))]
     for image in images:
         name = image.path.relative_to(root).as_posix()
         checksum = hashlib.sha256(name.encode()).digest()
-        shards[int.from_bytes(checksum[:8], "big") % len(shards)][name] = image
+        shards[int.from_bytes(checksum[:8], "big") % len(shards)].append((name, image))
     return shards
 
 
 def _write_shard(task: _ShardTask) -> tuple[int, list[str]]:
     """Write one shard, if all of its images can be read; return their number, and what fails."""
     failures: list[str] = []
-    rows = zip(task.images.items(), task.views, strict=True)
     with contextlib.suppress(BatchError), atomic_path(task.path) as temporary:
         with tarfile.open(temporary, "w") as tar:
-            for k, ((name, image), views) in enumerate(rows):
+            for k, (name, image, views) in enumerate(task.rows):
                 try:
                     files = _files_of(name, image.path, views, task.labels)
                 except ImageError as error:
@@ -235,7 +233,7 @@ def _write_shard(task: _ShardTask) -> tuple[int, list[str]]:
                     tar.addfile(member, io.BytesIO(content))
         if failures:
             raise BatchError("the shard is not complete", failures)
-    return len(task.images), failures
+    return len(task.rows), failures
 
 
 def _files_of(

@@ -7,11 +7,10 @@ from functools import partial
 from typing import Any
 
 from ...datasets.planar import (
+    NOT_IN_D2NET_SUBSET,
     OXFORD_KINDS,
     PlanarPair,
     PlanarScene,
-    in_d2net_subset,
-    is_illumination,
     load_hpatches,
     load_low_visibility,
     load_oxford,
@@ -157,7 +156,7 @@ def hpatches(run: Run, options: BenchmarkOptions) -> list[Section]:
     scenes = [scene.with_max_pairs(options.max_pairs) for scene in found]
     last = [scene.pairs[-1] for scene in scenes]
     subsets = {f"all {len(scenes)} scenes": scenes}
-    subset = [scene for scene in scenes if in_d2net_subset(scene)]
+    subset = [scene for scene in scenes if scene.name not in NOT_IN_D2NET_SUBSET]
     if 0 < len(subset) < len(scenes):
         subsets[f"the {len(subset)} scenes of D2-Net"] = subset
     sections = _hpatches_paper(run, options, scenes, last)
@@ -179,7 +178,7 @@ def _hpatches_paper(
         return []
     features = options.density_features()
     repeatability = paper.repeatability_table(run, features, scenes, "hpatches_repeatability")
-    light = {scene.name: is_illumination(scene) for scene in scenes}
+    light = {scene.name: scene.name.startswith("i_") for scene in scenes}
     of_kind = [[pair for pair in last if light[pair.scene] is kind] for kind in (True, False)]
     drawn = [pair for pairs in of_kind for pair in pairs[: FIGURE_7_SCENES // 2]]
     text = (
