@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import tempfile
+import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -110,13 +112,13 @@ class Run:
 
     def files_folder(self) -> Path:
         """Return a folder for images that are made: the cache's, or a temporary one."""
-        return Path(self._temporary.name) if self.cache is None else self.cache
+        return self._temporary if self.cache is None else self.cache
 
     @cached_property
-    def _temporary(self) -> tempfile.TemporaryDirectory[str]:
-        return tempfile.TemporaryDirectory(
-            prefix="deepdetect-benchmark-", ignore_cleanup_errors=True
-        )
+    def _temporary(self) -> Path:
+        folder = Path(tempfile.mkdtemp(prefix="deepdetect-benchmark-"))
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        return folder
 
     def attempt(self, name: str, work: Callable[..., Result], *arguments: Any) -> Result | None:
         """Do a piece of work; when it cannot be done, note that it is skipped and why.
