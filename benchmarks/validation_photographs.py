@@ -16,7 +16,7 @@ from pathlib import Path
 
 from deepdetect import DeepDetect
 from deepdetect._shared.machine import processor_count
-from deepdetect.evaluation.metrics.masks import Measured, mean_score, measure_heatmap
+from deepdetect.evaluation.protocols.masks import Measured, mean_score, measure_heatmap
 from deepdetect.io.image import load_image
 from deepdetect.labels import LabelOptions
 from deepdetect.training.recipe import Stage, TrainingOptions

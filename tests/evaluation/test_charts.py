@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import MissingExtraError
-from deepdetect.evaluation.charts import (
+from deepdetect.evaluation.report import (
     WIDEST,
     bar_chart,
     line_chart,

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect.evaluation.charts import picture
-from deepdetect.evaluation.report import Figure, Report, Section, Table
+from deepdetect.evaluation.report import Figure, Report, Section, Table, picture
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import cv2
@@ -203,7 +204,13 @@ def test_samples_and_their_scales(tmp_path: Path, photo: np.ndarray) -> None:
 
 @pytest.mark.parametrize(
     ("options", "named"),
-    [({"scales": (0.5,)}, "samples"), ({"sample": "x"}, "'samples'"), ({"scales": (0,)}, "above")],
+    [
+        ({"scales": (0.5,)}, "samples"),
+        ({"sample": "x"}, "'samples'"),
+        ({"scales": (0,)}, "above"),
+        ({"scales": (1, math.nan)}, "above"),
+        ({"scales": (math.inf,)}, "above"),
+    ],
 )
 def test_wrong_options_are_said(options: dict, named: str, one_line) -> None:
     with pytest.raises(OptionError) as caught:

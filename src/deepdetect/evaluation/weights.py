@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,11 +17,10 @@ from ..detector.detector import DeepDetect
 from ..features.selection import SelectionOptions
 from ..io.image import find_images, load_image
 from .baselines.method import LocalFeature, deepdetect_feature
-from .metrics.masks import MaskScore
 from .options import PAPER_RESOLUTION_PX, THRESHOLDS
 from .protocols.masks import (
     LabelDensityDetector,
-    check_scales,
+    MaskScore,
     load_sample,
     sample_images,
     score_at_scale,
@@ -144,7 +144,8 @@ def evaluate(
         >>> list(evaluate(samples=folder).masks)
         ['low']
     """
-    check_scales(scales)
+    if not all(0 < scale < math.inf for scale in scales):
+        raise OptionError(f"a scale must be a number above 0, not one of {scales}")
     if scales and samples is None:
         raise OptionError("scales are of the images in samples: name their folder, too")
     if equal_density and oxford is None and foreground is None:

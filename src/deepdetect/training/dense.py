@@ -37,7 +37,7 @@ from ..detector.network.weights import (
     weights_digest,
 )
 from ..detector.pretrained import resolve_weights
-from ..evaluation.metrics.masks import score_heatmap
+from ..evaluation.protocols.masks import score_heatmap
 from ..io.image import luma
 from ..labels import visibility_of
 from .checkpoint import Point

@@ -7,22 +7,95 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, ImageError, OptionError
+from deepdetect import DeepDetect, ImageError
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.detector.pretrained import pretrained_weights
-from deepdetect.evaluation.metrics.masks import MaskScore
 from deepdetect.evaluation.protocols.masks import (
+    NUM_BINS,
     LabelDetector,
-    check_scales,
+    MaskScore,
     load_sample,
+    mean_score,
+    measure_heatmap,
     sample_images,
     score_at_scale,
+    score_heatmap,
     score_samples,
 )
 from deepdetect.io.image import luma
 from deepdetect.labels import LabelOptions, fuse
 from deepdetect.training.augmentation import Darkening
 from deepdetect.training.views import View, render
+
+
+def score(heatmap: np.ndarray, mask: np.ndarray) -> MaskScore:
+    return mean_score([measure_heatmap(heatmap, mask)])
+
+
+def test_known_answers() -> None:
+    heatmap = np.array([[0.9, 0.8, 0.2, 0.4]])
+    mask = np.array([[True, False, True, False]])
+    loss, iou = score_heatmap(heatmap, mask)
+    assert loss == pytest.approx(-np.log([0.9, 0.2, 0.2, 0.6]).mean())
+    assert iou == pytest.approx(1 / 3)
+    nothing = np.zeros((4, 4))
+    assert score_heatmap(nothing, nothing > 0)[1] == 1, "empty masks agree"
+    assert score_heatmap(nothing + 1, nothing > 0)[0] == pytest.approx(-np.log(1e-7))
+
+
+def test_the_loss_is_torch_s() -> None:
+    torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
+    rng = np.random.default_rng(0)
+    logits, mask = rng.normal(0, 3, (32, 32)).astype(np.float32), rng.random((32, 32)) < 0.3
+    expected = torch.nn.functional.binary_cross_entropy_with_logits(
+        torch.from_numpy(logits), torch.from_numpy(mask).float()
+    )
+    loss, _ = score_heatmap(1 / (1 + np.exp(-logits)), mask)
+    assert loss == pytest.approx(float(expected), abs=1e-5)
+
+
+def test_images_count_the_same_for_the_loss_and_pixels_for_the_calibration() -> None:
+    generator = np.random.default_rng(3)
+    heatmap = generator.random((60, 50)).astype(np.float32)
+    mask = generator.random(heatmap.shape) < 0.4
+    whole = score(heatmap, mask)
+    halves = [(heatmap[rows], mask[rows]) for rows in (slice(9), slice(9, None))]
+    parts = mean_score([measure_heatmap(*half) for half in halves])
+    assert (parts.loss, parts.iou) == pytest.approx(
+        tuple(np.mean([score_heatmap(*half) for half in halves], axis=0))
+    )
+    assert parts.images == 2
+    assert parts.calibration_error == pytest.approx(whole.calibration_error)
+    assert (parts.density, parts.label_density) == (whole.density, whole.label_density)
+    # Errors of opposite sign in two images do not cancel in the mean of both, but do when pooled.
+    flat = np.full((4, 4), 0.5)
+    both = mean_score([measure_heatmap(flat, np.full((4, 4), k > 0)) for k in (0, 1)])
+    assert both.calibration_error == 0
+
+
+def test_probabilities_have_the_error_by_which_they_are_wrong() -> None:
+    generator = np.random.default_rng(0)
+    right = generator.uniform(0.2, 0.8, (600, 500))
+    mask = generator.random(right.shape) < right
+    for excess in (0, 0.1, -0.05):
+        found = score((right + excess).astype(np.float32), mask)
+        assert found.calibration_error == pytest.approx(abs(excess), abs=0.005)
+        assert found.density == pytest.approx((right + excess > 0.5).mean())
+        assert found.label_density == mask.mean()
+
+
+def test_the_calibration_error_is_that_of_the_definition() -> None:
+    generator = np.random.default_rng(2)
+    heatmap = (generator.random((40, 50)) ** 3).astype(np.float32)
+    heatmap[0, :2] = 0, 1
+    mask = generator.random(heatmap.shape) < 0.3
+    expected = 0.0
+    for number in range(NUM_BINS):
+        low, high = number / NUM_BINS, (number + 1) / NUM_BINS
+        inside = (heatmap >= low) & ((heatmap < high) | (number == NUM_BINS - 1))
+        if inside.any():
+            expected += inside.mean() * abs(heatmap[inside].mean() - mask[inside].mean())
+    assert score(heatmap, mask).calibration_error == pytest.approx(expected, rel=1e-5)
 
 
 class Labels:
@@ -55,12 +128,6 @@ def test_a_detector_that_knows_the_labels_has_full_marks(photo: np.ndarray) -> N
         assert score.loss < 1e-6
         assert score.density == pytest.approx(score.label_density)
         assert 0 < score.density < 1
-
-
-@pytest.mark.parametrize("scale", [0, -1, float("nan"), float("inf")])
-def test_nonsense_is_refused(scale: float) -> None:
-    with pytest.raises(OptionError, match="above 0"):
-        check_scales([scale])
 
 
 @pytest.mark.parametrize("scale", [0.02, 1e-6])

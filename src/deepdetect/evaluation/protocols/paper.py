@@ -17,7 +17,6 @@ from ...geometry.transforms import transfer_errors
 from ...io.image import load_image, luma
 from ...viz.draw import add_caption, hstack
 from ..baselines.method import LocalFeature
-from ..charts import picture
 from ..metrics.repeatability import foreground_fraction, repeatability_paper
 from ..options import BenchmarkOptions
 from ..report import (
@@ -31,6 +30,7 @@ from ..report import (
     average,
     mean,
     mean_of,
+    picture,
     tabulate,
     where,
 )

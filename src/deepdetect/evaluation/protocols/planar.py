@@ -16,9 +16,8 @@ from ...datasets.planar import (
     load_oxford,
 )
 from ..baselines.opencv import CLASSICAL, with_kd_trees
-from ..charts import bar_chart
 from ..options import BenchmarkOptions
-from ..report import Figure, Rows, Section, Table
+from ..report import Figure, Rows, Section, Table, bar_chart
 from ..run import Run
 from . import paper
 from .degraded import degraded_sections

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,6 @@ from ...detector.detector import DeepDetect
 from ...matching.pipeline import MatchingOptions, match_images
 from ..baselines.method import LocalFeature
 from ..baselines.opencv import CLASSICAL, STANDARD
-from ..charts import line_chart
 from ..metrics.pose import (
     EPIPOLAR_THRESHOLD_PX,
     POSE_THRESHOLDS_DEG,
@@ -27,7 +26,19 @@ from ..metrics.pose import (
     translation_error,
 )
 from ..options import BenchmarkOptions, without_repeats
-from ..report import Columns, Figure, Row, Rows, Section, Table, average, median, tabulate, where
+from ..report import (
+    Columns,
+    Figure,
+    Row,
+    Rows,
+    Section,
+    Table,
+    average,
+    line_chart,
+    median,
+    tabulate,
+    where,
+)
 from ..run import MatchSettings, Run
 
 THRESHOLD_PX = 1.0
@@ -260,25 +271,6 @@ SUMMARY: Columns = {
 }
 
 
-def _grouped(
-    key: str,
-    title: str,
-    name: str,
-    groups: Sequence[str | int],
-    methods: Sequence[PoseMethod],
-    rows: Rows,
-    columns: Columns,
-    note: str = NOTE,
-) -> Table:
-    """Tabulate all methods in each group of the rows, by a value that is the first column."""
-    lines: Rows = []
-    for group in groups:
-        part = tabulate(key, title, methods, where(rows, **{name: group}), columns, note)
-        lines += [{name: group, **line} for line in part.rows]
-    style = "" if isinstance(groups[0], str) else "d"
-    return replace(part, columns={name: style, **part.columns}, rows=lines)
-
-
 def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], rows: Rows) -> Table:
     """Tabulate each method on each scene, losses to SIFT beside wins."""
     sift = {row["item"]: row[ERROR] < GOOD_DEG for row in where(rows, method="sift")}
@@ -306,8 +298,8 @@ def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], row
         f"error of {GOOD_DEG:g}° or more where SIFT's is under it; better: the other way round. "
         "Seconds: median, from the images to the matches, of the run that made them."
     )
-    names = [scene.name for scene in scenes]
-    return _grouped("pose", "Relative poses", "scene", names, methods, rows, columns, note)
+    groups = [{"scene": scene.name} for scene in scenes]
+    return tabulate("pose", "Relative poses", methods, rows, columns, note, groups)
 
 
 def distance_table(scene: PosedScene, methods: Sequence[PoseMethod], rows: Rows) -> Table:
@@ -315,8 +307,8 @@ def distance_table(scene: PosedScene, methods: Sequence[PoseMethod], rows: Rows)
     distances = sorted({pair.frame_distance or 0 for pair in scene.pairs})
     title = f"Relative poses in {scene.name}, by frame distance"
     key = f"pose_{file_name(scene.name)}_distances"
-    own = where(rows, scene=scene.name)
-    return _grouped(key, title, DISTANCE, distances, methods, own, SUMMARY)
+    groups = [{DISTANCE: distance} for distance in distances]
+    return tabulate(key, title, methods, where(rows, scene=scene.name), SUMMARY, NOTE, groups)
 
 
 PAIR_COLUMNS = {

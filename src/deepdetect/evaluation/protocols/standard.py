@@ -12,7 +12,6 @@ import numpy as np
 from ...datasets.planar import PlanarPair
 from ...geometry import GeometryOptions, estimate_geometry
 from ..baselines.method import LocalFeature
-from ..charts import line_chart
 from ..metrics.homography import (
     CORNER_THRESHOLDS_PX,
     MATCH_THRESHOLDS_PX,
@@ -36,6 +35,7 @@ from ..report import (
     Table,
     average,
     largest,
+    line_chart,
     mean,
     median,
     median_of,

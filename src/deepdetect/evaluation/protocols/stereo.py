@@ -37,11 +37,10 @@ from ...viz.render import draw_clouds
 from ..baselines.method import LocalFeature, deepdetect_feature
 from ..baselines.opencv import self_described
 from ..baselines.random import AllPixels, RandomDetector
-from ..charts import picture
 from ..metrics.stereo import DISPARITY_TOLERANCES_PX, disparity_scores, stereo_score
 from ..options import PAPER_RESOLUTION_PX, BenchmarkOptions
 from ..profiling import StageProfiler
-from ..report import Figure, Row, Section, Table, where
+from ..report import Figure, Row, Section, Table, picture, where
 from ..run import Run
 from .paper_numbers import FIGURE_8, with_paper_column
 
