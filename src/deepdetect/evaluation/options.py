@@ -141,14 +141,6 @@ class BenchmarkOptions:
         features += [with_common_descriptor(feature) for feature in (native, *chance)]
         return without_repeats(features)
 
-    def stereo_detectors(self) -> dict[str, DeepDetect]:
-        """Return detectors with the weights for stereo pairs, at the image's own size, by name."""
-        native = HeatmapOptions("native", self.channels)
-        return {
-            Path(weights).stem: self.detector.with_weights(weights).configured(native)
-            for weights in self.geometry_weights
-        }
-
 
 def without_repeats(features: Sequence[LocalFeature]) -> list[LocalFeature]:
     """Return the features, each once; two that are not the same must not have one name."""

@@ -16,7 +16,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._shared.errors import DeepDetectError, OptionError, WeightsError, first_line
+from ..._shared.errors import OptionError, WeightsError, first_line
 from ..._shared.opencv import cv2
 from ..._shared.options import look_up
 from ...detector.backends.interface import import_onnxruntime
@@ -127,21 +127,17 @@ def _external_feature(
     """Make a local feature of a function; whatever it raises becomes a `BaselineError`."""
 
     def run(rgb: np.ndarray) -> Keypoints:
-        try:
-            found = detect(rgb)
-        except DeepDetectError:
-            raise
-        except Exception as error:  # anyone's code
-            raise BaselineError(f"{name}: {type(error).__name__}: {first_line(error)}") from error
-        if not isinstance(found, Mapping) or not {"keypoints", "scores"} <= set(found):
-            raise BaselineError(f"{name} must return a dict with 'keypoints' and 'scores'")
         size = (rgb.shape[1], rgb.shape[0])
         try:
+            found = detect(rgb)
             return Keypoints(
                 found["keypoints"], found["scores"], size, descriptors=found.get("descriptors")
             )
-        except (OptionError, TypeError, ValueError) as error:
-            raise BaselineError(f"{name} returned keypoints that do not fit: {error}") from error
+        except Exception as error:  # anyone's code
+            raise BaselineError(
+                f"{name} made no dict of keypoints and scores: {type(error).__name__}: "
+                f"{first_line(error)}"
+            ) from error
 
     def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:
         if features.descriptors is None:

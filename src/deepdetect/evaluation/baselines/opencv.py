@@ -99,11 +99,11 @@ def _opencv(name: str) -> LocalFeature:
 
 def self_described(name: str) -> LocalFeature:
     """Make a local feature of `OPENCV_SETTINGS` whose descriptors have these settings, too."""
-
-    def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:
-        return describe_with(_make(name), rgb, features)
-
-    return replace(_opencv(name), name=f"{name}-self-described", describe=describe)
+    return replace(
+        _opencv(name),
+        name=f"{name}-self-described",
+        describe=lambda rgb, features: describe_with(_make(name), rgb, features),
+    )
 
 
 def _harris(

@@ -275,7 +275,8 @@ PAPER_FLANN_CHECKS = 100
 
 def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
     """Return what is compared, chance baselines last."""
-    detectors = options.stereo_detectors()
+    native = options.native_detector()
+    detectors = {Path(each).stem: native.with_weights(each) for each in options.geometry_weights}
     found: list[Pipeline] = []
     for name, detector in detectors.items():
         weights = file_digest(detector.weights)[:16]
