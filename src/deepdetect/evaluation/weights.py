@@ -28,7 +28,7 @@ from .protocols.masks import (
 )
 from .protocols.paper import (
     OXFORD_PAIRS,
-    foreground_row,
+    foreground_rows,
     mean_correct_matches,
     repeatability_rows,
 )
@@ -239,12 +239,7 @@ def evaluate_foreground(
 ) -> ForegroundScore:
     """Measure how many keypoints lie on the foreground; arguments as of `evaluate_oxford`."""
     run = Run(Path(), quiet=quiet)
-    rows = run.rows(
-        "foreground of ",
-        [_feature(_of_paper(detector, equal_density))],
-        {image.image.name: image for image in images},
-        lambda feature, image: foreground_row(run, feature, image),
-    )
+    rows = foreground_rows(run, [_feature(_of_paper(detector, equal_density))], images)
     known = [row for row in rows if row["density"] > 0]
     if run.failures and not rows:
         raise ImageError(run.failures[0])

@@ -272,7 +272,6 @@ def test_the_name_is_the_files_and_the_version_its_content(make: Make) -> None:
     path = make(name="Bright one.onnx")
     method = onnx_feature(path)
     assert method.name == method.title == "Bright one"
-    assert onnx_feature(path, "mine").name == "mine"
     moved = path.rename(path.with_name("moved.onnx"))
     assert onnx_feature(moved).version == method.version
     assert onnx_feature(make(descriptors=True)).version != method.version

@@ -17,7 +17,6 @@ import hashlib
 import importlib
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -69,11 +68,11 @@ def plugin_feature(target: str) -> LocalFeature:
     source = getattr(sys.modules[module], "__file__", None)
     watched = str(Path(source).stat().st_mtime_ns) if source else "1"
     version = f"{getattr(function, 'version', '')} {watched}"
-    feature = _external_feature(target, function, version, getattr(function, "learned", False))
-    return replace(feature, binary=bool(getattr(function, "binary", False)))
+    learned, binary = (bool(getattr(function, kind, False)) for kind in ("learned", "binary"))
+    return _external_feature(target, function, version, learned, binary)
 
 
-def onnx_feature(path: str | Path, name: str | None = None) -> LocalFeature:
+def onnx_feature(path: str | Path) -> LocalFeature:
     """Make a local feature of an ONNX file.
 
     Raises:
@@ -95,7 +94,7 @@ def onnx_feature(path: str | Path, name: str | None = None) -> LocalFeature:
         raise WeightsError(f"{file} must have the outputs keypoints and scores, not {outputs}")
     version = hashlib.sha256(data).hexdigest()[:16]
     detect = partial(_run_onnx, session, outputs)
-    return _external_feature(name or file.stem, detect, version, "descriptors" in outputs)
+    return _external_feature(file.stem, detect, version, learned="descriptors" in outputs)
 
 
 def _run_onnx(session: Any, outputs: list[str], rgb: np.ndarray) -> dict[str, np.ndarray]:
@@ -122,7 +121,11 @@ def _run_onnx(session: Any, outputs: list[str], rgb: np.ndarray) -> dict[str, np
 
 
 def _external_feature(
-    name: str, detect: Callable[[np.ndarray], Any], version: str, learned: bool
+    name: str,
+    detect: Callable[[np.ndarray], Any],
+    version: str,
+    learned: bool,
+    binary: bool = False,
 ) -> LocalFeature:
     """Make a local feature of a function; whatever it raises becomes a `BaselineError`."""
 
@@ -144,4 +147,4 @@ def _external_feature(
             return COMMON_DESCRIPTOR.describe(rgb, features)
         return features.descriptors
 
-    return LocalFeature(name, name, run, describe, learned=bool(learned), version=version)
+    return LocalFeature(name, name, run, describe, binary, learned, version=version)

@@ -160,12 +160,7 @@ def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
     """Table I's second half: which fraction of the keypoints lies on the foreground."""
     images = load_foreground(run.folder("foreground"))
     features = options.density_features()
-    rows = run.rows(
-        "foreground of ",
-        features,
-        {image.image.name: image for image in images},
-        lambda feature, image: foreground_row(run, feature, image),
-    )
+    rows = foreground_rows(run, features, images)
     for feature in features:
         own = where(rows, method=feature.name)
         if empty := sum(row["fraction"] != row["fraction"] for row in own):  # NaN
@@ -192,18 +187,23 @@ def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
     return [Section("Foreground (Table I)", (), [table])]
 
 
-def foreground_row(run: Run, feature: LocalFeature, image: MaskedPhotograph) -> Row:
-    """Return the fraction of the keypoints on the foreground, NaN without any, and their density.
+def foreground_rows(
+    run: Run, features: Sequence[LocalFeature], images: Sequence[MaskedPhotograph]
+) -> Rows:
+    """Measure the fraction of the keypoints on the foreground, NaN without any, and their density.
 
-    Raises:
-        ImageError: the mask is not of the image's size.
+    The "covered" fraction of the pixels is what random keypoints reach.
     """
-    keypoints, _ = run.keypoints(feature, image.image)
-    mask = image.foreground()
-    if mask.shape[::-1] != keypoints.image_size:
-        raise ImageError(f"{image.mask.name} is not of the photograph's size")
-    fraction = foreground_fraction(keypoints.xy, mask)
-    return {"fraction": fraction, "density": keypoints.density, "covered": float(mask.mean())}
+
+    def measure(feature: LocalFeature, image: MaskedPhotograph) -> Row:
+        keypoints, _ = run.keypoints(feature, image.image)
+        mask = image.foreground()
+        if mask.shape[::-1] != keypoints.image_size:
+            raise ImageError(f"{image.mask.name} is not of the photograph's size")
+        fraction = foreground_fraction(keypoints.xy, mask)
+        return {"fraction": fraction, "density": keypoints.density, "covered": float(mask.mean())}
+
+    return run.rows("foreground of ", features, {each.image.name: each for each in images}, measure)
 
 
 def pair_repeatability(run: Run, feature: LocalFeature, pair: PlanarPair) -> float:

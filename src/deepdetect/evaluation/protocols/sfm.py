@@ -114,17 +114,16 @@ Pair = tuple[str, str]
 
 @dataclass(frozen=True)
 class SfmMethod:
-    """A row of the tables; `name` is also the title.
+    """A row of the tables; `name` is also the title, and results depend on `version`, too.
 
-    `find` writes the keypoints of the images in a folder, `match` returns the matches of pairs
-    (None: as `reconstruct_many`); both are functions of a module. Results depend on `depends`
-    besides. With `chance` the time it takes to find the points means nothing.
+    `find` writes the keypoints of the images in a folder, `match` returns the matches of pairs;
+    both are functions of a module. With `chance` the time that finding takes means nothing.
     """
 
     name: str
     find: Callable[[Stages, Path], None]
-    match: Callable[[Stages, Sequence[Pair]], dict[Pair, np.ndarray]] | None = None
-    depends: str = ""
+    match: Callable[[Stages, Sequence[Pair]], dict[Pair, np.ndarray]] = Stages.match
+    version: str = ""
     chance: bool = False
 
     @property
@@ -188,10 +187,10 @@ def choose_images(scene: PosedScene, most: int) -> PosedScene:
 
 def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
     """Return the ranked points, SIFT where it is among the baselines, and random points."""
-    digest = str(SFM_POINTS.settings)
-    ours = SfmMethod("DeepDetect, points", find_points, depends=digest)
+    version, random = str(SFM_POINTS.settings), "baseline: as many random points"
+    ours = SfmMethod("DeepDetect, points", find_points, version=version)
     sift = SfmMethod("SIFT, pycolmap", find_sift, match_sift)
-    chance = SfmMethod("baseline: as many random points", find_random_points, None, digest, True)
+    chance = SfmMethod(random, find_random_points, version=version, chance=True)
     return [ours, sift, chance] if "sift" in options.classical else [ours, chance]
 
 
@@ -204,7 +203,7 @@ def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
     images = tuple(image.path for image in scene.images)
     cameras = {name: view.camera for name, view in true_views(scene).items()}
     depends = (
-        (method.name, method.depends),
+        (method.name, method.version),
         [(image.path, image.path.name, image.intrinsics) for image in scene.images],
         repr(vars(OPTIONS)),
         import_pycolmap().__version__,
@@ -359,7 +358,7 @@ def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, 
         sizes = {name: (int(width), int(height)) for name, (width, height) in sides.items()}
         start = _times()
         pairs = stages.choose_pairs(list(sizes))
-        matches = method.match(stages, pairs) if method.match else stages.match(pairs)
+        matches = method.match(stages, pairs)
         took = (0 if method.chance else took) + _times() - start
         row = {
             "keypoints an image": float(np.mean(counts)),
