@@ -61,13 +61,13 @@ def test_the_papers_recipe() -> None:
 
 def test_a_preset_keeps_its_label_settings_unless_others_are_given(tmp_path: Path) -> None:
     dense = find_label_settings("dense")
-    assert chosen_recipe("dense", None, None, {}).labels == dense
-    assert chosen_recipe("dense", "sobel,fast", None, {}).labels.settings == dense.settings
-    assert chosen_recipe("dense", "fast", None, {}).labels == LabelOptions(("fast",))
-    assert chosen_recipe("dense", None, "paper", {}).labels == LabelOptions()
-    assert chosen_recipe("paper", None, "dense", {}).labels == dense
+    assert chosen_recipe("dense", None, None).labels == dense
+    assert chosen_recipe("dense", "sobel,fast", None).labels.settings == dense.settings
+    assert chosen_recipe("dense", "fast", None).labels == LabelOptions(("fast",))
+    assert chosen_recipe("dense", None, "paper").labels == LabelOptions()
+    assert chosen_recipe("paper", None, "dense").labels == dense
     (tmp_path / "mine.toml").write_text("[fast]\nnormal = { threshold = 20 }\n")
-    chosen = chosen_recipe("dense", None, str(tmp_path / "mine.toml"), {}).labels
+    chosen = chosen_recipe("dense", None, str(tmp_path / "mine.toml")).labels
     assert list(chosen.settings) == ["fast"]
 
 

@@ -100,11 +100,6 @@ class Job:
         self.process.kill()  # before it had a group, and on Windows
         self._listener.join()
 
-    def remove(self) -> None:
-        """End the process, and remove all files."""
-        self.stop("it was cancelled")
-        shutil.rmtree(self.folder, ignore_errors=True)
-
     def _listen(self) -> None:
         with contextlib.suppress(EOFError), self._receiver:
             while True:
@@ -143,16 +138,15 @@ class Jobs:
 
     def find(self, name: str) -> Job | None:
         """Return a task by its name, and note that the page has asked for it."""
-        job = self._jobs.get(name)
-        if job is not None:
+        if job := self._jobs.get(name):
             job.asked = time.monotonic()
         return job
 
     def remove(self, name: str) -> None:
         """End a task, if there is one of this name, and remove its files."""
-        job = self._jobs.pop(name, None)
-        if job is not None:
-            job.remove()
+        if job := self._jobs.pop(name, None):
+            job.stop("it was cancelled")
+            shutil.rmtree(job.folder, ignore_errors=True)
 
     def end_overdue(self) -> None:
         """End the tasks that last too long, and forget those that the page has forgotten."""

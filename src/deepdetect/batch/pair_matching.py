@@ -134,17 +134,11 @@ def match_pairs(
         listed = read_pairs(pairs) if isinstance(pairs, (str, Path)) else check_pairs(pairs)
     if source == Path(path).absolute():
         raise OptionError(f"{path} holds the features: give the matches another file with -o")
-    found, failures, gone, made_with = _find_pairs(source, listed)
+    wanted, failures, gone, made_with = _find_pairs(source, listed)
     report = fill_file(
         path,
         {**vars(options), "features": made_with, "version": __version__},
-        {
-            (first, second): {
-                pair_name(first, second): (*state0, *state1),
-                pair_name(second, first): (*state1, *state0),
-            }
-            for (first, second), (state0, state1) in sorted(found.items())
-        },
+        wanted,
         partial(_match_pairs, features=source, options=options),
         of="pairs",
         others_stay=lambda name: name not in gone,
@@ -158,14 +152,14 @@ def match_pairs(
 
 def _find_pairs(
     features: Path, pairs: Sequence[Pair]
-) -> tuple[dict[Pair, tuple[State, State]], list[str], set[str], str]:
+) -> tuple[dict[Pair, dict[str, State]], list[str], set[str], str]:
     """Look for the features of pairs.
 
-    Return pairs that can be matched, with the states of their features; a sentence on each other;
-    groups of pairs without features, whose matches would point nowhere; and a digest of the
-    settings of the features.
+    Return the groups that will do for each pair that can be matched, with the states of its
+    features; a sentence on each other; groups of pairs without features, whose matches would point
+    nowhere; and a digest of the settings of the features.
     """
-    found: dict[Pair, tuple[State, State]] = {}
+    wanted: dict[Pair, dict[str, State]] = {}
     failures: list[str] = []
     gone: set[str] = set()
     taken: dict[str, Pair] = {}
@@ -174,19 +168,19 @@ def _find_pairs(
         states = {name: _state(file, name) for pair in pairs for name in pair}
         for pair in pairs:
             state0, state1 = states[pair[0]], states[pair[1]]
-            name = pair_name(*pair)
+            name, reversed_name = pair_name(*pair), pair_name(*pair[::-1])
             if state0 is None or state1 is None:
                 lacking = pair[0] if state0 is None else pair[1]
                 failures.append(f"{' '.join(pair)}: {features.name} has no features of {lacking}")
-                gone |= {name, pair_name(*pair[::-1])}
+                gone |= {name, reversed_name}
             elif taken.setdefault(name, pair) != pair:
                 failures.append(
                     f"{' '.join(pair)}: its group {name} is that of {' '.join(taken[name])}, too: "
                     "rename an image"
                 )
             else:
-                found[pair] = state0, state1
-    return found, failures, gone - taken.keys(), settings
+                wanted[pair] = {name: state0 + state1, reversed_name: state1 + state0}
+    return dict(sorted(wanted.items())), failures, gone - taken.keys(), settings
 
 
 def _state(file: Any, name: str) -> State | None:

@@ -96,7 +96,8 @@ def make_app(summaries: bool = False) -> App:
         help_format="plaintext",
         help_formatter=FORMATTER,
         version=f"deepdetect {__version__}",
-        default_parameter=Parameter(allow_repeating=True),  # the last one wins
+        # Of an option that is repeated the last one counts.
+        default_parameter=Parameter(allow_repeating=True, negative_iterable=()),
     )
     for title, commands in COMMANDS.items():
         group = Group.create_ordered(title)

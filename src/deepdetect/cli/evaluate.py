@@ -268,15 +268,11 @@ def run_demo(pair: StereoPair, detector: HeatmapDetector, folder: Path) -> dict[
     )
     heatmap = draw_heatmap(detector.heatmap(pair.left))
     pictures = {
-        f"{side}_keypoints": draw_dense_keypoints(rgb, keypoints)
-        for side, rgb, keypoints in zip(
-            ("left", "right"), (pair.left, pair.right), both, strict=True
-        )
+        "left_keypoints": draw_dense_keypoints(pair.left, both[0]),
+        "right_keypoints": draw_dense_keypoints(pair.right, both[1]),
+        "left_heatmap": add_caption(heatmap, "probability of a keypoint: dark blue 0, yellow 1"),
+        "matches": add_caption(lines, caption),
     }
-    pictures["left_heatmap"] = add_caption(
-        heatmap, "probability of a keypoint: dark blue 0, yellow 1"
-    )
-    pictures["matches"] = add_caption(lines, caption)
     paths = [folder / f"{pair.name}_{name}.jpg" for name in pictures]
     for path, picture in zip(paths, pictures.values(), strict=True):
         save_picture(picture, path)

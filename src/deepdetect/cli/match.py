@@ -118,15 +118,12 @@ def match(
     }
     geometry = GeometryOptions(**known, **GEOMETRY.take(values))
     changes = MATCHING.take(values)
-    how: dict[str, Any] = {
-        "selection": selection,
-        "options": replace(start, geometry=geometry, **changes),
-    }
+    values |= {"selection": selection, "options": replace(start, geometry=geometry, **changes)}
     guided = values.get("guided_matching", True)
     with cli.writing(files, [image0, image1], overwrite) as made:
         stages = _guided_stages(detector) if guided else UNGUIDED_STAGES
         with stage_progress("matching", stages) as done:
-            matches = match_images(rgb0, rgb1, chosen, progress=done, **how, **values)
+            matches = match_images(rgb0, rgb1, chosen, progress=done, **values)
         save_matches(matches, made["file"])
         if pictures:
             _draw(rgb0, rgb1, matches, made["picture"])

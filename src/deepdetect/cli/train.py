@@ -31,24 +31,6 @@ from . import _options as cli
 from .features import EXTRACTION
 
 Folder = Annotated[Path, Parameter(help="Folder of the images, of train also of shards.")]
-Detectors = Annotated[
-    str | None,
-    Parameter(
-        help="Some of sift, orb, brisk, fast, agast, harris, shi-tomasi, canny, sobel, with commas "
-        "between.  [default: all]"
-    ),
-]
-LabelSettings = Annotated[
-    str | None,
-    Parameter(help="Detectors and their settings: paper or dense, or a file.  [default: paper]"),
-]
-Preset = Annotated[
-    str,
-    Parameter(
-        help="Recipe that the other options change: default (its values are shown here), paper "
-        "(the paper's own), or dense (normal light only, denser labels)."
-    ),
-]
 RUN = cli.From(
     train_network,
     "validation init_weights",
@@ -93,15 +75,58 @@ POINTS_RUN = cli.From(
 )
 
 
-@cli.command(RUN, RECIPE, DEVICE)
+def chosen_label_settings(
+    detectors: str | None = None, label_settings: str | None = None
+) -> LabelOptions:
+    """Find settings by name or TOML file; detectors replace theirs.
+
+    Args:
+        detectors: Some of sift, orb, brisk, fast, agast, harris, shi-tomasi, canny, sobel, with
+            commas between.  [default: all]
+        label_settings: Detectors and their settings: paper or dense, or a file.  [default: paper]
+    """
+    settings = find_label_settings(label_settings or "paper")
+    if detectors is None:
+        return settings
+    names = tuple(name.strip() for name in detectors.split(",") if name.strip())
+    return replace(settings, detectors=names)
+
+
+def chosen_recipe(
+    preset: str = "default",
+    detectors: str | None = None,
+    label_settings: str | None = None,
+    **values: Any,
+) -> TrainingOptions:
+    """Return a preset's training options with the given values changed.
+
+    Args:
+        preset: Recipe that the other options change: default (its values are shown here), paper
+            (the paper's own), or dense (normal light only, denser labels).
+    """
+    if "stages" in values:
+        values["stages"] = tuple(map(Stage.parse, values["stages"]))
+    if "short_sides" in values:
+        values["short_sides"] = tuple(values["short_sides"])
+    recipe = training_preset(preset)
+    labels = chosen_label_settings(detectors, label_settings)
+    if label_settings is not None:
+        values["labels"] = labels
+    elif detectors is not None:  # the preset's settings, for the detectors that are used
+        values["labels"] = recipe.labels.with_detectors(labels.detectors)
+    return replace(recipe, **values)
+
+
+PRESET = cli.From(chosen_recipe, "preset", more="")
+LABELS = cli.From(chosen_label_settings, "detectors label_settings")
+
+
+@cli.command(PRESET, LABELS, RUN, RECIPE, DEVICE)
 def train(
     images: Folder,
     /,
     *,
     output: cli.Output,
-    preset: Preset = "default",
-    detectors: Detectors = None,
-    label_settings: LabelSettings = None,
     profiling: Annotated[bool, Parameter("--profile", negative="")] = False,
     **values: Any,
 ) -> cli.Result:
@@ -124,7 +149,7 @@ def train(
     if given := run.pop("init_weights", None):
         run["init_weights"] = given[0] if len(given) == 1 else tuple(given)
     run |= {"device": DeviceOptions(**DEVICE.take(values)), "log": cli.note}
-    recipe = chosen_recipe(preset, detectors, label_settings, values)
+    recipe = chosen_recipe(**values)
     if profiling:
         profiles = [asdict(each) for each in profile(images, output, recipe, **run)]
         return cli.Result(profiles, "\n".join(map(cli.table, profiles)))
@@ -162,15 +187,12 @@ def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli
     return cli.Result({"weights": result.weights, "best": result.best, "points": result.points})
 
 
-@cli.command(SHARDS, SHARD_SIZE, ENGINE)
+@cli.command(PRESET, LABELS, SHARDS, SHARD_SIZE, ENGINE)
 def shards(
     images: Folder,
     /,
     *,
     output: cli.Output,
-    preset: Preset = "default",
-    detectors: Detectors = None,
-    label_settings: LabelSettings = None,
     **values: Any,
 ) -> cli.Result:
     """Pack the images in a folder with their labels into tar files.
@@ -189,7 +211,7 @@ def shards(
     cli.check_folder_not_made(images, folder)
     how = {**SHARD_SIZE.take(values), **_engine(values)}
     # Shards are for any stages: one that fits every size stands for them.
-    recipe = chosen_recipe(preset, detectors, label_settings, {**values, "stages": ["16x1x1"]})
+    recipe = chosen_recipe(**{**values, "stages": ["16x1x1"]})
     made = write_shards(images, folder, recipe, quiet=False, **how)
     return cli.Result(
         {
@@ -202,12 +224,10 @@ def shards(
     )
 
 
-@cli.command(cli.From(LabelOptions, "visibility", more=""), ENGINE)
+@cli.command(LABELS, cli.From(LabelOptions, "visibility", more=""), ENGINE)
 def label(
     *images: cli.Images,
     output: cli.Output,
-    detectors: Detectors = None,
-    label_settings: LabelSettings = None,
     visualize: bool = False,
     overwrite: cli.Overwrite = False,
     **values: Any,
@@ -227,7 +247,7 @@ def label(
     """
     folder = cli.output_folder(output)
     how = _engine(values)
-    options = replace(chosen_label_settings(detectors, label_settings), **values)
+    options = replace(chosen_label_settings(**LABELS.take(values)), **values)
     tasks = []
     for image in cli.expand_images(images, folder):
         figure = folder / f"{image.stem}_labels.png" if visualize else None
@@ -303,32 +323,6 @@ def average(
         save_weights(network, made["weights"], {"parts": json.dumps(parts), **provenance()})
         export_onnx(network, made["onnx"])
     return cli.Result(files)
-
-
-def chosen_label_settings(detectors: str | None, chosen: str | None) -> LabelOptions:
-    """Find settings by name or TOML file; detectors (with commas between) replace theirs."""
-    settings = find_label_settings(chosen or "paper")
-    if detectors is None:
-        return settings
-    names = tuple(name.strip() for name in detectors.split(",") if name.strip())
-    return replace(settings, detectors=names)
-
-
-def chosen_recipe(
-    preset: str, detectors: str | None, label_settings: str | None, values: dict[str, Any]
-) -> TrainingOptions:
-    """Return a preset's training options with the given values changed."""
-    if "stages" in values:
-        values["stages"] = tuple(map(Stage.parse, values["stages"]))
-    if "short_sides" in values:
-        values["short_sides"] = tuple(values["short_sides"])
-    recipe = training_preset(preset)
-    if label_settings is not None:
-        values["labels"] = chosen_label_settings(detectors, label_settings)
-    elif detectors is not None:  # the preset's settings, for the detectors that are used
-        chosen = chosen_label_settings(detectors, None).detectors
-        values["labels"] = recipe.labels.with_detectors(chosen)
-    return replace(recipe, **values)
 
 
 def _engine(values: dict[str, Any]) -> dict[str, Any]:
