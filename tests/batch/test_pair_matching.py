@@ -11,7 +11,7 @@ import pytest
 from deepdetect import DeepDetectError, Keypoints, OptionError, PointDetector
 from deepdetect.batch import PairMatchingOptions, extract_features, match_pairs
 from deepdetect.batch.pair_list import pair_name, read_pairs
-from deepdetect.batch.pair_matching import _match
+from deepdetect.batch.pair_matching import _match, match_group
 
 PAIR = ("a/00.png", "b/01.png")
 
@@ -159,8 +159,9 @@ def test_more_keypoints_than_int16_holds() -> None:
         Keypoints(positions[rows], np.ones(len(rows)), (501, 501), descriptors=many[rows])
         for rows in (last, np.arange(len(many)))
     )
-    matches, scores = _match(features0, features1, PairMatchingOptions(matcher="exact"))
-    assert matches.tolist() == last.tolist()
+    rows, scores = _match(features0, features1, PairMatchingOptions(matcher="exact"))
+    group = match_group(("a", "b"), len(features0), rows, scores)
+    assert group.arrays["matches0"].tolist() == last.tolist()
     assert scores.tolist() == [1, 1]
 
 

@@ -192,17 +192,17 @@ class Outputs:
         self.check()
         records = [_record(path) for path in self.paths]
         missing = {each for path in records for each in path.parents if not each.exists()}
-        states = [file_state(path) for path in self.paths]
-        contents = [path.read_bytes() if path.is_file() else None for path in records]
+        before = [
+            (file_state(path), record.read_bytes() if record.is_file() else None)
+            for path, record in zip(self.paths, records, strict=True)
+        ]
         values: dict[str, Any] = {}
         try:
             self._note(False, values)
             yield values
             self._note(True, values)
         except BaseException:
-            for path, record, state, content in zip(
-                self.paths, records, states, contents, strict=True
-            ):
+            for path, record, (state, content) in zip(self.paths, records, before, strict=True):
                 if file_state(path) == state:
                     _restore(record, content)
             for folder in sorted(missing, reverse=True):  # from the innermost

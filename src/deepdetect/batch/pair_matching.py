@@ -214,16 +214,24 @@ def _match_pairs(
                 both = features0.descriptors, features1.descriptors
                 if len({np.asarray(each).shape[-1:] for each in both}) > 1:
                     raise InvalidFileError("their descriptors differ: extract both alike")
-                matches, scores = _match(features0, features1, options)
-                counts[name0, name1] = int(np.count_nonzero(matches >= 0))
-                arrays = {"matches0": matches, "matching_scores0": scores}
-                yield Group(pair_name(name0, name1), arrays, state)
+                rows, scores = _match(features0, features1, options)
+                counts[name0, name1] = len(rows)
+                yield match_group((name0, name1), len(features0), rows, scores, state)
+
+
+def match_group(
+    pair: Pair, count: int, rows: np.ndarray, scores: np.ndarray, state: State = ()
+) -> Group:
+    """Return hloc's group of (K, 2) matched rows, where the first image has `count` keypoints."""
+    matches0, scores0 = np.full(count, -1, np.int32), np.zeros(count, np.float32)
+    matches0[rows[:, 0]], scores0[rows[:, 0]] = rows[:, 1], scores
+    return Group(pair_name(*pair), {"matches0": matches0, "matching_scores0": scores0}, state)
 
 
 def _match(
     features0: Keypoints, features1: Keypoints, options: PairMatchingOptions
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (N0,) int32 rows of the second image, -1 without a match, and (N0,) float32 scores."""
+    """Return (K, 2) rows of the matched keypoints, and (K,) scores."""
     how = {name: getattr(options, name) for name in ("matcher", "ratio", "mutual", "seed")}
     found = match_features(features0, features1, **how)
     kept = found.inliers
@@ -232,8 +240,4 @@ def _match(
         kept = estimate_geometry(
             found.points0, found.points1, options.verify, seed=options.seed, options=geometry
         ).inliers
-    matches = np.full(len(features0), -1, np.int32)
-    scores = np.zeros(len(features0), np.float32)
-    rows = found.indices0[kept]
-    matches[rows], scores[rows] = found.indices1[kept], found.scores[kept]
-    return matches, scores
+    return np.column_stack([found.indices0, found.indices1])[kept], found.scores[kept]

@@ -107,10 +107,8 @@ def _found(find: Callable[..., Keypoints], img: Tensor, mask: Tensor | None) -> 
     images = [load_tensor(one) for one in img]
     if mask is None:
         return [find(image) for image in images]
-    if mask.shape != (len(img), 1, *img.shape[-2:]):
-        raise OptionError(
-            f"the mask must have the shape {(len(img), 1, *img.shape[-2:])}, "
-            f"not {tuple(mask.shape)}"
-        )
-    hidden = [(one[0] <= 0).cpu().numpy() for one in mask]
+    shape = (len(img), 1, *img.shape[-2:])
+    if mask.shape != shape:
+        raise OptionError(f"the mask must have the shape {shape}, not {tuple(mask.shape)}")
+    hidden = (mask[:, 0] <= 0).cpu().numpy()
     return [find(image, ignore=where) for image, where in zip(images, hidden, strict=True)]

@@ -88,11 +88,6 @@ class Collection:
                         f"which has {len(self.keypoints[name])}: they are of other features"
                     )
 
-    @property
-    def paths(self) -> list[Path]:
-        """Files of the images, as far as they are known."""
-        return [path for name in self.keypoints if (path := self.path(name)) is not None]
-
     def path(self, name: str) -> Path | None:
         """Return the file of an image, or None where it is not known."""
         path = None if self.folder is None else self.folder / name

@@ -5,17 +5,15 @@ Its pixels are ours: hloc adds the half pixel of COLMAP itself.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-
-import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import OptionError
 from .._shared.options import suggest_keywords
 from ..batch.extraction import feature_group
-from ..batch.hdf5 import Group, write_groups
+from ..batch.hdf5 import write_groups
 from ..batch.pair_list import pair_name
+from ..batch.pair_matching import match_group
 from .collection import Collection, check_names, check_upright
 
 FILES = ("features.h5", "matches.h5", "pairs.txt")
@@ -42,7 +40,7 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
         MissingExtraError: h5py is not installed.
     """
     check_names(name for pair in collection.matches for name in pair)
-    check_upright(collection.paths)
+    check_upright(path for name in collection.keypoints if (path := collection.path(name)))
     features, matches, pairs = (Path(output) / name for name in FILES)
 
     taken: dict[str, tuple[str, str]] = {}
@@ -53,22 +51,15 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
                 f"hloc would have one group for the matches of {' '.join(pair)} and of "
                 f"{' '.join(other)}: rename an image"
             )
-
-    def match_groups() -> Iterator[Group]:
-        for (name0, name1), found in collection.matches.items():
-            count = len(collection.keypoints[name0])
-            matches0 = np.full(count, -1, np.int32)
-            scores = np.zeros(count, np.float32)
-            matches0[found.rows[:, 0]] = found.rows[:, 1]
-            scores[found.rows[:, 0]] = found.scores
-            arrays = {"matches0": matches0, "matching_scores0": scores}
-            yield Group(pair_name(name0, name1), arrays)
-
-    groups = (feature_group(name, points) for name, points in collection.keypoints.items())
-    write_groups(features, groups)
+    keypoints = collection.keypoints
+    write_groups(features, (feature_group(name, points) for name, points in keypoints.items()))
     if not collection.matches:
         return (features,)
-    write_groups(matches, match_groups())
+    groups = (
+        match_group(pair, len(keypoints[pair[0]]), found.rows, found.scores)
+        for pair, found in collection.matches.items()
+    )
+    write_groups(matches, groups)
     with atomic_path(pairs) as temporary:
         lines = (" ".join(pair) + "\n" for pair in collection.matches)
         temporary.write_text("".join(lines), encoding="utf-8")

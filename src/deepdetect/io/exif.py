@@ -6,6 +6,7 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+from PIL.ExifTags import IFD, Base
 
 from .._shared.errors import ReconstructionError
 from ..geometry.camera import Calibration, Camera, Size
@@ -16,11 +17,6 @@ DIAGONAL_35MM_MM = float(np.hypot(36, 24))
 
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 """Of FocalPlaneResolutionUnit: inch, centimetre, and by custom millimetre and micrometre."""
-
-ORIENTATION, EXIF_BLOCK = 0x0112, 0x8769
-FOCAL_LENGTH, FOCAL_LENGTH_35MM = 0x920A, 0xA405
-FOCAL_PLANE_X, FOCAL_PLANE_Y, FOCAL_PLANE_UNIT = 0xA20E, 0xA20F, 0xA210
-WIDTH, HEIGHT = 0xA002, 0xA003
 
 TRANSPOSED = (5, 6, 7, 8)
 """Orientations that exchange width and height."""
@@ -54,7 +50,7 @@ def camera_from_exif(image: Any, size: Size) -> Camera:
     tags, orientation = _tags(image)
     turned = orientation in TRANSPOSED
     own = (size[1], size[0]) if turned else size
-    taken = (_number(tags.get(WIDTH)), _number(tags.get(HEIGHT)))
+    taken = (_number(tags.get(Base.ExifImageWidth)), _number(tags.get(Base.ExifImageHeight)))
     if not min(taken) > 0:
         taken = (float(own[0]), float(own[1]))
     if abs(own[0] * taken[1] / (own[1] * taken[0]) - 1) > MAX_ASPECT_DIFFERENCE:
@@ -62,7 +58,7 @@ def camera_from_exif(image: Any, size: Size) -> Camera:
             f"{name} was cropped after it was taken ({taken[0]:.0f}x{taken[1]:.0f} by its EXIF), "
             f"so its focal length does not apply: {ADVICE}"
         )
-    film = _number(tags.get(FOCAL_LENGTH_35MM)) * float(np.hypot(*own)) / DIAGONAL_35MM_MM
+    film = _number(tags.get(Base.FocalLengthIn35mmFilm)) * float(np.hypot(*own)) / DIAGONAL_35MM_MM
     focal = _by_sensor(tags, own[0] / taken[0])
     if focal is None or (film > 0 and abs(focal[0] / film - 1) > MAX_FOCAL_DIFFERENCE):
         focal = (film, film)
@@ -73,10 +69,10 @@ def camera_from_exif(image: Any, size: Size) -> Camera:
 
 def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None:
     """Return (fx, fy) in pixels from the resolution of the sensor, or None."""
-    length = _number(tags.get(FOCAL_LENGTH))
-    unit = MM_PER_UNIT.get(int(_number(tags.get(FOCAL_PLANE_UNIT))) or 2, 0.0)
-    across = _number(tags.get(FOCAL_PLANE_X))
-    down = _number(tags.get(FOCAL_PLANE_Y)) or across
+    length = _number(tags.get(Base.FocalLength))
+    unit = MM_PER_UNIT.get(int(_number(tags.get(Base.FocalPlaneResolutionUnit))) or 2, 0.0)
+    across = _number(tags.get(Base.FocalPlaneXResolution))
+    down = _number(tags.get(Base.FocalPlaneYResolution)) or across
     if not (length > 0 and unit > 0 and across > 0 and down > 0):
         return None
     return length * across / unit * scale, length * down / unit * scale
@@ -89,14 +85,14 @@ def _tags(image: Any) -> tuple[dict[int, Any], int]:
     """
     try:
         if hasattr(image, "getexif"):
-            return dict(image.getexif().get_ifd(EXIF_BLOCK)), 1
+            return dict(image.getexif().get_ifd(IFD.Exif)), 1
         if not is_file(image):
             return {}, 1
         with open_image(image) as opened:
             exif = opened.getexif()
         # HEIF images are turned when they are opened.
-        orientation = opened.info.get("original_orientation") or exif.get(ORIENTATION, 1)
-        return dict(exif.get_ifd(EXIF_BLOCK)), int(orientation)
+        orientation = opened.info.get("original_orientation") or exif.get(Base.Orientation, 1)
+        return dict(exif.get_ifd(IFD.Exif)), int(orientation)
     except Exception:  # Pillow's readers raise many kinds; broken tags are ignored
         return {}, 1
 
