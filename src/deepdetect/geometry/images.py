@@ -185,7 +185,6 @@ def track_round_trip(
     levels: int,
     iterations: int = 30,
     step_px: float = 0.01,
-    min_eigenvalue: float = 1e-4,
     expected: np.ndarray | None = None,
     back_to_start: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -201,7 +200,6 @@ def track_round_trip(
         "winSize": (window_px, window_px),
         "maxLevel": levels,
         "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, iterations, step_px),
-        "minEigThreshold": min_eigenvalue,
     }
     guided = {**settings, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
     start = np.ascontiguousarray(points, np.float32).reshape(-1, 1, 2)

@@ -34,13 +34,8 @@ MIN_DISTANCE_PX = 8.0
 WINDOW_PX = 21
 """Side of the patch that is followed."""
 
-SEARCH: dict[str, Any] = {
-    "levels": 3,  # above the image itself, each half as large: the more, the farther a point moves
-    "iterations": 30,
-    "step_px": 0.01,
-    "min_eigenvalue": 1e-4,  # of the patch's gradients: flat patches are not followed
-}
-"""How a patch is searched for, as `track_round_trip` takes it."""
+LEVELS = 3
+"""Of the pyramid above the image: the more, the farther a point may move."""
 
 BORDER_PX = 2.0
 """Points nearer to the border of the image are dropped."""
@@ -149,9 +144,8 @@ class Tracker:
             self._since_detection = 0
         self._since_detection += 1
         self._gray = gray
-        points = {name: values.copy() for name, values in self._points.items()}
-        found = TrackedFrame(self._frames if number is None else number, **points)
-        self._points["ages"] += 1
+        found = TrackedFrame(self._frames if number is None else number, **self._points)
+        self._points["ages"] = self._points["ages"] + 1  # not those of the frame
         self._frames += 1
         return found
 
@@ -160,7 +154,9 @@ class Tracker:
         xy = self._points["xy"]
         if not len(xy):
             return
-        there, errors = track_round_trip(before, gray, xy, WINDOW_PX, back_to_start=True, **SEARCH)
+        there, errors = track_round_trip(
+            before, gray, xy, WINDOW_PX, levels=LEVELS, back_to_start=True
+        )
         low, high = BORDER_PX, np.array(gray.shape[::-1]) - 1 - BORDER_PX
         kept = (
             (errors <= self.options.max_return_error_px)

@@ -18,8 +18,8 @@ from deepdetect.matching.guided.initial_geometry import (
 from deepdetect.matching.guided.initial_geometry import (
     InitialGeometry,
     estimate_initial_geometry,
-    find_initial_geometry,
     find_tentative_matches,
+    guiding_geometry,
 )
 
 MILD = np.array([[0.9, -0.12, 25.0], [0.15, 0.95, -8.0], [2e-4, -1e-4, 1.0]])
@@ -221,7 +221,7 @@ def test_clear_depth_is_decided_on_small_copies(
     left, right, points0, points1 = art
     monkeypatch.setattr(module, "COARSE_SIDE_PX", 400)
     monkeypatch.setattr(module, "MIN_COARSE_DEPTH_INLIERS", 50)
-    found = find_initial_geometry(left, right)
+    found = guiding_geometry(left, right)
     assert found.model == "fundamental"
     assert found.source is None  # larger copies were not looked at
     errors = epipolar_errors(points0, points1, found.matrix)
@@ -235,7 +235,7 @@ def test_depth_that_few_matches_show_is_decided_on_larger_copies(
 ) -> None:
     monkeypatch.setattr(module, "COARSE_SIDE_PX", 400)
     monkeypatch.setattr(module, "MIN_COARSE_DEPTH_INLIERS", 10_000)
-    found = find_initial_geometry(*art[:2])
+    found = guiding_geometry(*art[:2])
     assert found.model == "fundamental"
     assert found.source is not None
 

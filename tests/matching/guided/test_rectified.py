@@ -13,7 +13,7 @@ from deepdetect.features.matches import GuidedMatches
 from deepdetect.geometry import epipolar_errors, transform_points
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import rectified
-from deepdetect.matching.guided.initial_geometry import InitialGeometry, find_initial_geometry
+from deepdetect.matching.guided.initial_geometry import InitialGeometry, guiding_geometry
 from deepdetect.matching.guided.rectified import match_by_rectification
 
 TURNED = cv2.getRotationMatrix2D((225, 190), 30, 1.0)
@@ -27,7 +27,7 @@ def cones(shared: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def first(cones) -> InitialGeometry:
-    return find_initial_geometry(*cones[:2], "fundamental")
+    return guiding_geometry(*cones[:2], "fundamental")
 
 
 def match(
@@ -66,7 +66,7 @@ def test_most_keypoints_are_matched_and_right(cones, move: np.ndarray, precision
     size = (right.shape[1], right.shape[0])
     second = cv2.warpAffine(right, move, size, flags=cv2.INTER_CUBIC)
     xy0 = every_second(left)
-    found = match(left, second, xy0, find_initial_geometry(left, second, "fundamental"))
+    found = match(left, second, xy0, guiding_geometry(left, second, "fundamental"))
     assert found is not None
     assert len(found) > 0.35 * len(xy0)
     assert within(found, xy0, cones, move) > precision

@@ -253,29 +253,17 @@ def guiding_geometry(
     seed: int = 0,
     source: Source = None,
 ) -> InitialGeometry:
-    """Return the geometry to begin with."""
-    if isinstance(source, TentativeMatches) or source is None:
-        geometry = find_initial_geometry(gray0, gray1, model, seed, source)
-    elif isinstance(source[0], Keypoints):
+    """Find the geometry to begin with, by the least effort that it takes."""
+    tentative = source if isinstance(source, TentativeMatches) else None
+    if isinstance(source, tuple) and isinstance(source[0], Keypoints):
         matches = matches_of_points(gray0, gray1, source)
         if matches is not None:
             geometry = estimate_initial_geometry(matches, model, seed)
-        if matches is None or len(geometry.points0) < MIN_COARSE_INLIERS:
-            geometry = find_initial_geometry(gray0, gray1, model, seed)
-    else:
+            if len(geometry.points0) >= MIN_COARSE_INLIERS:
+                return replace(geometry, source=source)
+    elif not (source is None or isinstance(source, TentativeMatches)):
         sizes = gray0.shape[::-1], gray1.shape[::-1]
-        geometry = _geometry_of_positions(source, sizes, model, seed)
-    return geometry if geometry.source is not None else replace(geometry, source=source)
-
-
-def find_initial_geometry(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    model: str = "auto",
-    seed: int = 0,
-    tentative: TentativeMatches | None = None,
-) -> InitialGeometry:
-    """Find the geometry of a pair by SIFT, by the least effort that it takes."""
+        return replace(_geometry_of_positions(source, sizes, model, seed), source=source)
     longest = max(*gray0.shape, *gray1.shape)
     if tentative is None and longest > COARSE_SIDE_PX and model != "fundamental":
         coarse = find_tentative_matches(
@@ -283,20 +271,22 @@ def find_initial_geometry(
         )
         geometry = estimate_initial_geometry(coarse, model, seed, semi_calibrated=False)
         if _is_clear(geometry):
-            return geometry
+            return replace(geometry, source=source)
     if tentative is None:
         tentative = find_tentative_matches(gray0, gray1)
     geometry = estimate_initial_geometry(tentative, model, seed)
     if geometry.matrix is not None:
         return replace(geometry, source=tentative)
-    if longest <= SIMULATED_SIDE_PX:
-        return estimate_initial_geometry(tentative, model, seed, view_keypoints=MAX_KEYPOINTS // 2)
-    tentative = find_tentative_matches(
-        gray0, gray1, max_side_px=SIMULATED_SIDE_PX, max_keypoints=SIMULATED_KEYPOINTS
+    small, keypoints = longest <= SIMULATED_SIDE_PX, MAX_KEYPOINTS
+    if not small:
+        keypoints = SIMULATED_KEYPOINTS
+        tentative = find_tentative_matches(
+            gray0, gray1, max_side_px=SIMULATED_SIDE_PX, max_keypoints=keypoints
+        )
+    geometry = estimate_initial_geometry(
+        tentative, model, seed, semi_calibrated=small, view_keypoints=keypoints // 2
     )
-    return estimate_initial_geometry(
-        tentative, model, seed, semi_calibrated=False, view_keypoints=SIMULATED_KEYPOINTS // 2
-    )
+    return replace(geometry, source=source)
 
 
 def _is_clear(geometry: InitialGeometry) -> bool:

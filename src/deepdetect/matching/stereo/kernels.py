@@ -13,9 +13,6 @@ from ..._shared.kernels import compiled
 END = np.uint16(30000)
 """Cost beyond both ends of a path's disparities: more than any sum, and room to add a step."""
 
-UNKNOWN = np.float32(1e9)
-"""An unknown disparity, so far from any other that it is never on the same surface."""
-
 BLOCK = 128
 """Pixels of a row that are processed together, so that the sums stay in the nearest cache."""
 

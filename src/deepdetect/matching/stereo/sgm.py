@@ -8,8 +8,8 @@ grey values along the row (Lucas and Kanade, 1981): `benchmarks/row_matching.py`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -80,13 +80,15 @@ MIN_GAIN = 0.2
 """Least contrast of the right view over the left: below, it shows something else, and the disparity
 stays."""
 
+UNKNOWN = np.float32(1e9)
+"""An unknown disparity, so far from any other that it is never on the same surface."""
+
 DisparityRange = tuple[int, int]
 """The smallest and the largest disparity tried, in whole pixels: the match of a left (x, y) is
 searched from the right x - largest to x - smallest."""
 
 
-@dataclass(frozen=True, eq=False)
-class SGMResult:
+class SGMResult(NamedTuple):
     """Raw disparities of the left view, (H, W) each: float32 in pixels, and how sure they are.
 
     `consistent`: it leads inside the right image, and both views agree on it within a pixel.
@@ -105,31 +107,33 @@ def semi_global_matching(
 
     The disparities are sub-pixel by a parabola, and still cluster around whole pixels.
     """
-    from .kernels import best_of_rows
-
     height, width = left.shape
-    tried = disparities[0], disparities[1] - disparities[0] + 1
-    count = -(-tried[1] // LANES) * LANES
+    count = -(-(disparities[1] - disparities[0] + 1) // LANES) * LANES
     censuses = census(left), census(right)
     match = match_distance(*censuses, disparities)
     outside = round(match + OUTSIDE_COST * (WRONG_PLACE_BITS - match))
-    result = SGMResult(
-        disparity=np.zeros((height, width), np.float32),
-        consistent=np.zeros((height, width), bool),
-        uniqueness_ratio=np.ones((height, width), np.float32),
-    )
     rows = max(VOLUME_BYTES // (3 * width * count) - 2 * BAND_OVERLAP_PX, BAND_OVERLAP_PX)
     if height <= rows + 2 * BAND_OVERLAP_PX:
         rows = height
+    parts = []
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         first = max(top - BAND_OVERLAP_PX, 0)
         band = slice(first, min(bottom + BAND_OVERLAP_PX, height))
         bands = left[band], censuses[0][band], censuses[1][band]
-        total = aggregate(*bands, disparities[0], count, outside)[top - first : bottom - first]
-        inner = slice(top, bottom)
-        outputs = result.disparity[inner], result.consistent[inner], result.uniqueness_ratio[inner]
-        parallel_for(len(total), best_of_rows, total, *tried, *outputs)
+        total = aggregate(*bands, disparities[0], count, outside)
+        parts.append(_least_costs(total[top - first : bottom - first], disparities))
+    return SGMResult(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def _least_costs(total: np.ndarray, disparities: DisparityRange) -> SGMResult:
+    """Choose the disparities of the least (H, W, D) uint16 sums of costs."""
+    from .kernels import best_of_rows
+
+    disparity, ratio = np.empty((2, *total.shape[:2]), np.float32)
+    result = SGMResult(disparity, np.empty(disparity.shape, bool), ratio)
+    tried = disparities[0], disparities[1] - disparities[0] + 1
+    parallel_for(len(total), best_of_rows, total, *tried, *result)
     return result
 
 
@@ -179,18 +183,14 @@ def match_distance(left: np.ndarray, right: np.ndarray, disparities: DisparityRa
 
     Matches are what both views find nearest without any path. Noise makes them more distant.
     """
-    from .kernels import best_of_rows
-
-    height, width = left.shape
+    height = len(left)
     centres = np.arange(min(SAMPLED_ROW_STEP // 2, height // 2), height, SAMPLED_ROW_STEP)
     # Costs are sums over three rows. Places outside are the most distant.
     rows = np.clip(centres[:, None] + [-1, 0, 1], 0, height - 1).ravel()
     tried = disparities[0], disparities[1] - disparities[0] + 1
     cost = matching_cost(left[rows], right[rows], *tried, CENSUS_BITS)[1::3]
-    disparity, ratio = np.empty((2, len(centres), width), np.float32)
-    agreed = np.empty(ratio.shape, bool)
-    parallel_for(len(cost), best_of_rows, cost.astype(np.uint16), *tried, disparity, agreed, ratio)
-    distances = cost.min(axis=2)[agreed & (ratio > 1)] / COST_PER_BIT
+    found = _least_costs(cost.astype(np.uint16), disparities)
+    distances = cost.min(axis=2)[found.consistent & (found.uniqueness_ratio > 1)] / COST_PER_BIT
     return (
         min(float(np.median(distances)), WRONG_PLACE_BITS) if len(distances) else WRONG_PLACE_BITS
     )
@@ -259,8 +259,6 @@ def _smoothed(disparity: np.ndarray, known: np.ndarray, radius: int) -> np.ndarr
 
 def _padded(values: np.ndarray, radius: int, known: np.ndarray | None = None) -> np.ndarray:
     """Pad an image; disparities that are not known are marked, those of the border too."""
-    from .kernels import UNKNOWN
-
     border = 0.0
     if known is not None:
         border, values = float(UNKNOWN), np.where(known, values, UNKNOWN)

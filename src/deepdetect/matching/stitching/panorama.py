@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -25,7 +25,7 @@ STAGES = ("reading", "registration", "compositing")
 """Of a panorama."""
 
 Projection = Literal["plane", "cylindrical", "spherical"]
-PROJECTIONS = ("plane", "cylindrical", "spherical")
+PROJECTIONS = get_args(Projection)
 
 
 @suggest_keywords

@@ -171,22 +171,20 @@ def _connected(number: int, pairs: Sequence[RegisteredPair]) -> set[int]:
 def _compose(group: Sequence[int], pairs: Sequence[RegisteredPair]) -> dict[int, np.ndarray]:
     """Compose homographies to the image with most matches, along the maximum spanning tree."""
     tree: list[RegisteredPair] = []
+    steps: list[tuple[int, int, np.ndarray]] = []
     matches = dict.fromkeys(group, 0)
     for pair in sorted(pairs, key=lambda pair: -pair.matches):
         if pair.second not in _connected(pair.first, tree):
             tree.append(pair)
+            steps.append((pair.first, pair.second, np.linalg.inv(pair.homography)))
+            steps.append((pair.second, pair.first, pair.homography))
         matches[pair.first] += pair.matches
         matches[pair.second] += pair.matches
     homographies = {max(group, key=lambda number: matches[number]): np.eye(3)}
     queue = list(homographies)
     for number in queue:
-        for pair in tree:
-            if pair.first == number and pair.second not in homographies:
-                other, step = pair.second, np.linalg.inv(pair.homography)
-            elif pair.second == number and pair.first not in homographies:
-                other, step = pair.first, pair.homography
-            else:
-                continue
-            homographies[other] = homographies[number] @ step
-            queue.append(other)
+        for here, other, step in steps:
+            if here == number and other not in homographies:
+                homographies[other] = homographies[number] @ step
+                queue.append(other)
     return homographies
