@@ -173,7 +173,7 @@ def match_images(
         return _match_unguided(grays, keypoints, model, mutual, seed, options, timer)
     # A pair and the swapped pair are matched alike: images are ordered by their pixels.
     swapped = mutual and _key(grays[0]) > _key(grays[1])
-    gray0, gray1 = _ordered(grays, swapped)
+    grays = _ordered(grays, swapped)
     source: Any = tentative_matches
     if swapped and source is not None:
         made = isinstance(source, TentativeMatches)
@@ -183,7 +183,7 @@ def match_images(
     # where no geometry can be trusted nobody may ever ask for them.
     if isinstance(detector, DeepDetect) and all(mask is None for mask in masks):
         with timer.stage("initial geometry"):
-            first = guiding_geometry(gray0, gray1, guiding, seed, source)
+            first = guiding_geometry(grays, guiding, seed, source)
         if first.matrix is None:
             guide = first.as_two_view_geometry()
             return _no_matches(lazy(find[0]), lazy(find[1]), guide, timer)
@@ -193,9 +193,9 @@ def match_images(
         keypoints0, keypoints1 = _ordered(keypoints, swapped)
         if first is None:
             source = (keypoints0, keypoints1) if source is None else source
-            first = guiding_geometry(gray0, gray1, guiding, seed, source)
-        pixels0, pixels1 = np.rint(keypoints0.xy), np.rint(keypoints1.xy)
-        guide, matched = guided_matches(gray0, gray1, pixels0, pixels1, first, seed)
+            first = guiding_geometry(grays, guiding, seed, source)
+        pixels = np.rint(keypoints0.xy), np.rint(keypoints1.xy)
+        guide, matched = guided_matches(grays, pixels, first, seed)
     if swapped:
         guide = guide.swapped()
     if matched is None:

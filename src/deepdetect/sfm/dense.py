@@ -112,11 +112,12 @@ def dense_points(folder: Path, images: Sequence[RegisteredImage], stride_px: int
         other, its_view, its_scale = _prepared(folder, neighbour)
         _, own, its = np.intersect1d(reference.points, neighbour.points, return_indices=True)
         found = match_by_rectification(
-            gray,
-            luma(other),
+            (gray, luma(other)),
             xy,
-            scaled_points(reference.xy[own], scale),
-            scaled_points(neighbour.xy[its], its_scale),
+            (
+                scaled_points(reference.xy[own], scale),
+                scaled_points(neighbour.xy[its], its_scale),
+            ),
             relative_fundamental(view, its_view),
             exact=True,
         )

@@ -221,7 +221,7 @@ def test_clear_depth_is_decided_on_small_copies(
     left, right, points0, points1 = art
     monkeypatch.setattr(module, "COARSE_SIDE_PX", 400)
     monkeypatch.setattr(module, "MIN_COARSE_DEPTH_INLIERS", 50)
-    found = guiding_geometry(left, right)
+    found = guiding_geometry((left, right))
     assert found.model == "fundamental"
     assert found.source is None  # larger copies were not looked at
     errors = epipolar_errors(points0, points1, found.matrix)
@@ -235,7 +235,7 @@ def test_depth_that_few_matches_show_is_decided_on_larger_copies(
 ) -> None:
     monkeypatch.setattr(module, "COARSE_SIDE_PX", 400)
     monkeypatch.setattr(module, "MIN_COARSE_DEPTH_INLIERS", 10_000)
-    found = guiding_geometry(*art[:2])
+    found = guiding_geometry(art[:2])
     assert found.model == "fundamental"
     assert found.source is not None
 

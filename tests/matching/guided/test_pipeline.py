@@ -72,17 +72,18 @@ def test_a_plane_that_the_images_do_not_show_does_not_guide(
     gray = luma(photo)
     other = np.random.default_rng(0).integers(0, 256, gray.shape).astype(np.uint8)
     other[85:171, 85:171] = gray[85:171, 85:171]
+    grays = gray, other
     xy = np.stack(np.meshgrid(np.arange(256), np.arange(256)), -1).reshape(-1, 2)
     # Few keypoints have another where the plane would take them; that decides nothing.
     xy = xy[np.random.default_rng(1).random(len(xy)) < fraction]
-    guide, found = guided_matches(gray, other, xy, xy, guiding_geometry(gray, other))
+    guide, found = guided_matches(grays, (xy, xy), guiding_geometry(grays))
     assert guide.model != "homography"
     if found is not None:  # what the poster shows agrees with a fundamental matrix, too
         inside = ((xy[found.indices0] > 80) & (xy[found.indices0] < 176)).all(axis=1)
         errors = np.linalg.norm(found.points1 - xy[found.indices0], axis=1)
         assert (inside & (errors < 1)).mean() > 0.9
-    plane = guiding_geometry(gray, other, "homography")
-    asked, found = guided_matches(gray, other, xy, xy, plane)
+    plane = guiding_geometry(grays, "homography")
+    asked, found = guided_matches(grays, (xy, xy), plane)
     assert asked.model == "homography"
     inside = ((xy[found.indices0] > 80) & (xy[found.indices0] < 176)).all(axis=1)
     assert inside.mean() > 0.95

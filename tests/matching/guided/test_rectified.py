@@ -27,14 +27,15 @@ def cones(shared: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def first(cones) -> InitialGeometry:
-    return guiding_geometry(*cones[:2], "fundamental")
+    return guiding_geometry(cones[:2], "fundamental")
 
 
 def match(
     gray0: np.ndarray, gray1: np.ndarray, xy0: np.ndarray, first: InitialGeometry
 ) -> GuidedMatches | None:
     assert first.matrix is not None
-    found = match_by_rectification(gray0, gray1, xy0, first.points0, first.points1, first.matrix)
+    sparse = first.points0, first.points1
+    found = match_by_rectification((gray0, gray1), xy0, sparse, first.matrix)
     return None if found is None else found[1]
 
 
@@ -66,7 +67,7 @@ def test_most_keypoints_are_matched_and_right(cones, move: np.ndarray, precision
     size = (right.shape[1], right.shape[0])
     second = cv2.warpAffine(right, move, size, flags=cv2.INTER_CUBIC)
     xy0 = every_second(left)
-    found = match(left, second, xy0, guiding_geometry(left, second, "fundamental"))
+    found = match(left, second, xy0, guiding_geometry((left, second), "fundamental"))
     assert found is not None
     assert len(found) > 0.35 * len(xy0)
     assert within(found, xy0, cones, move) > precision
@@ -111,7 +112,7 @@ def test_a_matrix_that_is_off_is_corrected(cones, first) -> None:
     counts = []
     for exact in (True, False):
         found = match_by_rectification(
-            *(left, right, xy0, first.points0, first.points1, wrong), exact=exact
+            (left, right), xy0, (first.points0, first.points1), wrong, exact
         )
         assert found is not None
         matrix, matches = found
@@ -128,7 +129,7 @@ def test_matches_that_the_sparse_ones_contradict_do_not_count(cones, first) -> N
     assert first.matrix is not None
     astray = first.points1.copy()
     astray[::2, 0] -= 8
-    given = left, right, every_second(left), first.points0, astray, first.matrix
+    given = (left, right), every_second(left), (first.points0, astray), first.matrix
     assert match_by_rectification(*given) is None
     assert match_by_rectification(*given, exact=True) is not None
 

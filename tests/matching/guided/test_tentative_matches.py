@@ -36,7 +36,7 @@ def points(pair: tuple[np.ndarray, np.ndarray]) -> tuple[Keypoints, Keypoints]:
 
 
 def test_points_match_at_their_own_sizes_and_angles(pair, points) -> None:
-    found = matches_of_points(luma(pair[0]), luma(pair[1]), points)
+    found = matches_of_points((luma(pair[0]), luma(pair[1])), points)
     assert found is not None
     errors = np.linalg.norm(transform_points(found.points0, TURNED) - found.points1, axis=1)
     assert len(errors) > 60
@@ -45,9 +45,9 @@ def test_points_match_at_their_own_sizes_and_angles(pair, points) -> None:
 
 def test_of_a_large_image_they_are_scaled(pair, points, monkeypatch) -> None:
     grays = luma(pair[0]), luma(pair[1])
-    whole = matches_of_points(*grays, points)
+    whole = matches_of_points(grays, points)
     monkeypatch.setattr(module, "MAX_SIDE_PX", 128)
-    found = matches_of_points(*grays, points)
+    found = matches_of_points(grays, points)
     assert found is not None
     assert found.scales == (0.5, 0.5)
     assert found.features[0].xy.max() < 128
@@ -59,18 +59,18 @@ def test_of_a_large_image_they_are_scaled(pair, points, monkeypatch) -> None:
 def test_too_few_or_plain_keypoints_are_not_taken(pair, points, monkeypatch) -> None:
     grays = luma(pair[0]), luma(pair[1])
     plain = tuple(replace(each, sizes=None) for each in points)
-    assert matches_of_points(*grays, plain) is None
+    assert matches_of_points(grays, plain) is None
     monkeypatch.setattr(module, "MIN_POINTS", 401)
-    assert matches_of_points(*grays, points) is None
+    assert matches_of_points(grays, points) is None
 
 
 def test_guided_matching_begins_with_points(pair, points, monkeypatch) -> None:
     grays = luma(pair[0]), luma(pair[1])
-    places = [np.rint(each.xy) for each in points]
+    places = np.rint(points[0].xy), np.rint(points[1].xy)
     with monkeypatch.context() as patched:
         patched.setattr(module, "detect_sift", None)
-        first = guiding_geometry(*grays, source=points)
-        guide, found = guided_matches(*grays, *places, first)
+        first = guiding_geometry(grays, source=points)
+        guide, found = guided_matches(grays, places, first)
     assert guide.model == "homography"
     assert found is not None
     errors = np.linalg.norm(
@@ -83,6 +83,6 @@ def test_where_points_give_nothing_sift_is_tried(pair, points) -> None:
     grays = luma(pair[0]), luma(pair[1])
     shuffled = np.random.default_rng(0).permutation(len(points[1]))
     wrong = replace(points[1], xy=points[1].xy[shuffled][:, ::-1])
-    found, plain = (guiding_geometry(*grays, source=one) for one in ((points[0], wrong), None))
+    found, plain = (guiding_geometry(grays, source=one) for one in ((points[0], wrong), None))
     assert found.matrix is not None
     np.testing.assert_array_equal(found.matrix, plain.matrix)

@@ -164,10 +164,10 @@ def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -
     first, second = (run.keypoints(feature, image)[0].xy for image in images)
 
     def make() -> Row:
-        gray0, gray1 = (luma(load_image(image)) for image in images)
+        grays = luma(load_image(pair.first)), luma(load_image(pair.second))
         with profiled() as profiler:
-            geometry = guiding_geometry(gray0, gray1, seed=seed)
-            guide, found = guided_matches(gray0, gray1, first, second, geometry, seed)
+            geometry = guiding_geometry(grays, seed=seed)
+            guide, found = guided_matches(grays, (first, second), geometry, seed)
         return {
             "model": guide.model,
             "matrix": np.empty((0, 3)) if guide.matrix is None else guide.matrix,

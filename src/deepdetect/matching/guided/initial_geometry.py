@@ -32,8 +32,8 @@ from ...geometry.two_view import GUIDING_THRESHOLDS_PX, choose_model
 from .asift import TILTS, simulated_views
 from .epipolar_search import epipolar_search, log10_p_value
 
-Points = tuple[np.ndarray, np.ndarray]
-"""(M, 2) matched positions in both images, row by row."""
+Pair = tuple[np.ndarray, np.ndarray]
+"""Something of both images: themselves, (H, W) uint8 luma, or (M, 2) matched positions."""
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 """(width, height) of both images."""
@@ -98,7 +98,7 @@ class TentativeMatches:
     views: tuple[np.ndarray, np.ndarray]
     scales: tuple[float, float]
     features: tuple[Keypoints, Keypoints]
-    matched: Points
+    matched: Pair
     ratios: np.ndarray
 
     @property
@@ -117,7 +117,7 @@ class TentativeMatches:
         return TentativeMatches(views, scales, features, self.matched[::-1], self.ratios)
 
 
-Source = TentativeMatches | Points | tuple[Keypoints, Keypoints] | None
+Source = TentativeMatches | Pair | tuple[Keypoints, Keypoints] | None
 """What a geometry is found from: matches that have been made already, (K, 2) positions in both
 images of another matcher, or keypoints: these make the matches where they are points of all scales
 and enough. Else SIFT does."""
@@ -156,9 +156,7 @@ def find_tentative_matches(
     return TentativeMatches((view0, view1), (scale0, scale1), features, (points0, points1), ratios)
 
 
-def matches_of_points(
-    gray0: np.ndarray, gray1: np.ndarray, points: tuple[Keypoints, Keypoints]
-) -> TentativeMatches | None:
+def matches_of_points(grays: Pair, points: tuple[Keypoints, Keypoints]) -> TentativeMatches | None:
     """Match points of all scales, best first, at their own sizes and angles, as sparse keypoints.
 
     Of two images in unlike light, or of which one is blurred, they give two to five times as many
@@ -167,14 +165,14 @@ def matches_of_points(
     if min(len(each) for each in points) < MIN_POINTS:
         return None
     described = []
-    for gray, each in zip((gray0, gray1), points, strict=True):
+    for gray, each in zip(grays, points, strict=True):
         if each.sizes is None or each.angles is None:
             return None
         best = describe_keypoints(gray, each[:MAX_KEYPOINTS])
         scale = min(1.0, MAX_SIDE_PX / max(gray.shape))
         described.append(replace(best, xy=scaled_points(best.xy, scale)))
     features = described[0], described[1]
-    return find_tentative_matches(gray0, gray1, features, max_side_px=MAX_SIDE_PX)
+    return find_tentative_matches(*grays, features, max_side_px=MAX_SIDE_PX)
 
 
 def _match_sparse(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, ...]:
@@ -247,33 +245,29 @@ class InitialGeometry(TwoViewModel):
 
 
 def guiding_geometry(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    model: str = "auto",
-    seed: int = 0,
-    source: Source = None,
+    grays: Pair, model: str = "auto", seed: int = 0, source: Source = None
 ) -> InitialGeometry:
     """Find the geometry to begin with, by the least effort that it takes."""
     tentative = source if isinstance(source, TentativeMatches) else None
     if isinstance(source, tuple) and isinstance(source[0], Keypoints):
-        matches = matches_of_points(gray0, gray1, source)
+        matches = matches_of_points(grays, source)
         if matches is not None:
             geometry = estimate_initial_geometry(matches, model, seed)
             if len(geometry.points0) >= MIN_COARSE_INLIERS:
                 return replace(geometry, source=source)
     elif not (source is None or isinstance(source, TentativeMatches)):
-        sizes = gray0.shape[::-1], gray1.shape[::-1]
+        sizes = grays[0].shape[::-1], grays[1].shape[::-1]
         return replace(_geometry_of_positions(source, sizes, model, seed), source=source)
-    longest = max(*gray0.shape, *gray1.shape)
+    longest = max(max(gray.shape) for gray in grays)
     if tentative is None and longest > COARSE_SIDE_PX and model != "fundamental":
         coarse = find_tentative_matches(
-            gray0, gray1, max_side_px=COARSE_SIDE_PX, max_keypoints=COARSE_KEYPOINTS
+            *grays, max_side_px=COARSE_SIDE_PX, max_keypoints=COARSE_KEYPOINTS
         )
         geometry = estimate_initial_geometry(coarse, model, seed, semi_calibrated=False)
         if _is_clear(geometry):
             return replace(geometry, source=source)
     if tentative is None:
-        tentative = find_tentative_matches(gray0, gray1)
+        tentative = find_tentative_matches(*grays)
     geometry = estimate_initial_geometry(tentative, model, seed)
     if geometry.matrix is not None:
         return replace(geometry, source=tentative)
@@ -281,7 +275,7 @@ def guiding_geometry(
     if not small:
         keypoints = SIMULATED_KEYPOINTS
         tentative = find_tentative_matches(
-            gray0, gray1, max_side_px=SIMULATED_SIDE_PX, max_keypoints=keypoints
+            *grays, max_side_px=SIMULATED_SIDE_PX, max_keypoints=keypoints
         )
     geometry = estimate_initial_geometry(
         tentative, model, seed, semi_calibrated=small, view_keypoints=keypoints // 2
@@ -299,7 +293,7 @@ def _is_clear(geometry: InitialGeometry) -> bool:
     return geometry.matrix is not None and most and (depth or not doubtful)
 
 
-def _geometry_of_positions(points: Points, sizes: Sizes, model: str, seed: int) -> InitialGeometry:
+def _geometry_of_positions(points: Pair, sizes: Sizes, model: str, seed: int) -> InitialGeometry:
     """Estimate the geometry from sparse matches of another matcher, some of them wrong.
 
     Raises:
@@ -364,7 +358,7 @@ def estimate_initial_geometry(
 
 def _more_and_more_matches(
     tentative: TentativeMatches, view_keypoints: int
-) -> Iterator[tuple[Points, np.ndarray, int]]:
+) -> Iterator[tuple[Pair, np.ndarray, int]]:
     """Yield matched positions, ratios and the number of simulated views, up to strong tilts."""
     (points0, points1), ratios = tentative.matched, tentative.ratios
     yield (points0, points1), ratios, 0

@@ -15,7 +15,7 @@ from ...features.matches import GuidedMatches, TwoViewGeometry
 from ...geometry.homography_refinement import refine_homography
 from ...geometry.images import downscale, warp_to_reference
 from ...geometry.transforms import scaled_homography, transform_points
-from .initial_geometry import MIN_PARALLAX_FRACTION, InitialGeometry, guiding_geometry
+from .initial_geometry import MIN_PARALLAX_FRACTION, InitialGeometry, Pair, guiding_geometry
 from .rectified import match_by_rectification
 from .verification import dissimilarity
 
@@ -40,7 +40,7 @@ MIN_PROPOSED_FRACTION = 0.25
 """Where fewer of the keypoints that the second image shows under the homography have a partner
 there, keypoints are few, and all of them are verified."""
 
-MAX_VERIFIED_MEGAPIXELS = 6.0
+MAX_VERIFIED_PIXELS = 6e6
 """Larger images are compared at this size, which bounds memory and time."""
 
 MAX_REFINED_SIDE_PX = 1600
@@ -55,32 +55,28 @@ MIN_SCALE = 1 / 16
 
 
 def guided_matches(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    xy0: np.ndarray,
-    xy1: np.ndarray,
-    first: InitialGeometry,
-    seed: int = 0,
+    grays: Pair, pixels: Pair, first: InitialGeometry, seed: int = 0
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
     """Match keypoints on whole pixels, (N, 2) and (M, 2), of two images by their `first` geometry.
 
     Returns the geometry that guided, and the matches; None when no geometry could be trusted.
     """
-    enough = MIN_MATCHED_FRACTION * min(len(xy0), len(xy1))
+    enough = MIN_MATCHED_FRACTION * min(len(xy) for xy in pixels)
     if first.model == "homography":
         assert first.matrix is not None
-        matrix = _refine_homography(gray0, gray1, first.matrix)
-        matches, verified = match_by_homography(gray0, gray1, xy0, xy1, matrix, seed)
+        matrix = _refine_homography(grays, first.matrix)
+        matches, verified = match_by_homography(grays, pixels, matrix, seed)
         if verified >= _least_verified(first):
             return _trusted(first, matrix, matches, max(enough, MIN_MATCHES))
-        depth = guiding_geometry(gray0, gray1, "fundamental", seed, first.source)
+        depth = guiding_geometry(grays, "fundamental", seed, first.source)
         first = replace(depth, num_views=depth.num_views + first.num_views)
     if first.matrix is None:
         return first.untrusted().as_two_view_geometry(), None
-    dense = match_by_rectification(gray0, gray1, xy0, first.points0, first.points1, first.matrix)
+    sparse = first.points0, first.points1
+    dense = match_by_rectification(grays, pixels[0], sparse, first.matrix)
     if dense is None or len(dense[1]) < enough:
         # Too little around the sparse matches is alike, but they are distinct, and agree.
-        dense = first.matrix, _sparse_matches(gray0, xy0, first)
+        dense = first.matrix, _sparse_matches(grays[0], pixels[0], first)
     return _trusted(first, *dense, MIN_MATCHES)
 
 
@@ -112,12 +108,7 @@ def _sparse_matches(gray0: np.ndarray, xy0: np.ndarray, first: InitialGeometry) 
 
 
 def match_by_homography(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    xy0: np.ndarray,
-    xy1: np.ndarray,
-    homography: np.ndarray,
-    seed: int = 0,
+    grays: Pair, pixels: Pair, homography: np.ndarray, seed: int = 0
 ) -> tuple[GuidedMatches, float]:
     """Match keypoints by a homography, and keep those whose patches are the same.
 
@@ -125,48 +116,47 @@ def match_by_homography(
     Returns the fraction with the same patches, too: of the pairs that the homography proposes, or,
     where keypoints are few, of all keypoints that the second image shows under it.
     """
-    predicted = transform_points(xy0, homography)
-    indices1, distances = nearest_keypoints(predicted, xy1, (gray1.shape[1], gray1.shape[0]))
+    size1 = grays[1].shape[::-1]
+    predicted = transform_points(pixels[0], homography)
+    indices1, distances = nearest_keypoints(predicted, pixels[1], size1)
     with np.errstate(invalid="ignore"):
-        shown = (predicted > -0.5) & (predicted < np.array(gray1.shape[::-1]) - 0.5)
+        shown = (predicted > -0.5) & (predicted < np.array(size1) - 0.5)
     near = distances < MAX_DISTANCE_PX
     indices0 = np.flatnonzero(shown.all(axis=1))
     proposed = np.flatnonzero(near)
     # Where keypoints are few it is chance which of them have another there: all are judged.
     if len(proposed) >= MIN_PROPOSED_FRACTION * len(indices0):
         indices0 = proposed
-    ratios = _compare(gray0, gray1, xy0[indices0], homography, seed)
+    ratios = _compare(grays, pixels[0][indices0], homography, seed)
     same = ratios < 1
     kept = same & near[indices0]
     indices0 = indices0[kept]
     indices1 = indices1[indices0]
-    scores = np.clip(1 - ratios[kept], 0, 1)
-    matches = GuidedMatches(indices0, xy1[indices1].astype(np.float64), scores, indices1=indices1)
+    scores, ends = np.clip(1 - ratios[kept], 0, 1), pixels[1][indices1].astype(np.float64)
+    matches = GuidedMatches(indices0, ends, scores, indices1=indices1)
     return matches, float(same.mean()) if len(same) else 0.0
 
 
-def _compare(
-    gray0: np.ndarray, gray1: np.ndarray, pixels: np.ndarray, homography: np.ndarray, seed: int
-) -> np.ndarray:
+def _compare(grays: Pair, pixels0: np.ndarray, homography: np.ndarray, seed: int) -> np.ndarray:
     """Return the `dissimilarity` of keypoints, of large images on smaller copies."""
     (gray0, scale0), (gray1, scale1) = (
-        downscale(gray, round(max(gray.shape) * min(1, np.sqrt(MAX_VERIFIED_MEGAPIXELS / area))))
-        for gray, area in ((each, each.size / 1e6) for each in (gray0, gray1))
+        downscale(gray, round(max(gray.shape) * min(1, np.sqrt(MAX_VERIFIED_PIXELS / gray.size))))
+        for gray in grays
     )
     if scale0 < 1 or scale1 < 1:
         homography = scaled_homography(homography, scale0, scale1)
         last = np.array(gray0.shape[::-1], np.float32) - 1
-        pixels = np.clip(np.rint((pixels + np.float32(0.5)) * scale0 - 0.5), 0, last)
+        pixels0 = np.clip(np.rint((pixels0 + np.float32(0.5)) * scale0 - 0.5), 0, last)
     warped, valid = warp_to_reference(gray1, homography, (gray0.shape[1], gray0.shape[0]))
-    return dissimilarity(gray0, warped, valid, pixels, seed)
+    return dissimilarity(gray0, warped, valid, pixels0, seed)
 
 
-def _refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
+def _refine_homography(grays: Pair, homography: np.ndarray) -> np.ndarray:
     """Refine a homography on the images, scaled down to what that needs; (3, 3)."""
-    scales = _scales_at_centre(homography, gray0.shape)
+    scales = _scales_at_centre(homography, grays[0].shape)
     (small0, scale0), (small1, scale1) = (
         downscale(gray, min(MAX_REFINED_SIDE_PX, round(max(gray.shape) * scale)))
-        for gray, scale in zip((gray0, gray1), scales, strict=True)
+        for gray, scale in zip(grays, scales, strict=True)
     )
     start = scaled_homography(homography, scale0, scale1)
     return scaled_homography(refine_homography(small0, small1, start), 1 / scale0, 1 / scale1)

@@ -9,7 +9,6 @@ rows, or larger images can be searched, the images are rectified again.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,14 +20,15 @@ from ...geometry.images import downscale, equalise, gaussian_blur, local_zncc, t
 from ...geometry.semi_calibrated import refine_fundamental
 from ...geometry.transforms import epipolar_errors, scaled_fundamental, scaled_points
 from ..stereo.matching import (
-    DisparityMap,
     DisparityOptions,
     compute_disparity,
     find_disparity_range,
     range_with_margin,
 )
+from ..stereo.sgm import DisparityRange
+from .initial_geometry import Pair
 
-Pair = tuple[np.ndarray, np.ndarray]
+Size = tuple[int, int]
 
 DISPARITY = DisparityOptions(discontinuity_margin_px=1)
 """How rows are matched; the range is found."""
@@ -95,16 +95,16 @@ MIN_AGREEMENT = 0.75
 class RectifiedView:
     """Two images, at `scale`, in their frame, and the disparities between them, (H, W) each.
 
-    `disparities` are those that geometry may rely on; `kept` those of all matches that are kept,
-    perhaps more, else NaN; `correlation` the local ZNCC of both views after the disparity.
+    `disparity` is NaN where no match is kept; `relied` are the matches that geometry may rely on;
+    `correlation` is the local ZNCC of both views after the disparity.
     """
 
     frame: RectifiedFrame
     scale: float
-    first: np.ndarray
-    second: np.ndarray
-    disparities: DisparityMap
-    kept: np.ndarray
+    views: Pair
+    searched: DisparityRange
+    disparity: np.ndarray
+    relied: np.ndarray
     correlation: np.ndarray
 
     def to_frame(self, points: np.ndarray, side: int) -> np.ndarray:
@@ -117,84 +117,69 @@ class RectifiedView:
 
     def pixels_of(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the rows of the points inside the frame, and the nearest columns and rows."""
-        height, width = self.first.shape
+        height, width = self.disparity.shape
         nearest = np.rint(np.where(np.isfinite(points), points, -1)).astype(np.int64)
         inside = np.flatnonzero(((nearest >= 0) & (nearest < (width, height))).all(axis=1))
         return inside, *nearest[inside].T
 
 
 def match_by_rectification(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    xy0: np.ndarray,
-    points0: np.ndarray,
-    points1: np.ndarray,
-    fundamental: np.ndarray,
-    exact: bool = False,
+    grays: Pair, xy0: np.ndarray, sparse: Pair, fundamental: np.ndarray, exact: bool = False
 ) -> tuple[np.ndarray, GuidedMatches] | None:
     """Match (N, 2) keypoints of the first image by rectifying the pair.
 
-    `points0` and `points1` are sparse matches that fit the fundamental matrix, x1^T F x0 = 0. An
+    The `sparse` matches, (M, 2) in both images, fit the fundamental matrix, x1^T F x0 = 0. An
     `exact` matrix is known: it is not corrected, and sparse matches that contradict do not matter.
     Returns the refined matrix and the matches, which fit it exactly; None where the pair cannot be
     rectified, too few corners can be tracked, or the sparse matches contradict.
     """
-    sizes = (gray0.shape[::-1], gray1.shape[::-1])
-    sparse = points0, points1
-    view = rectified_view(gray0, gray1, *sparse, fundamental)
+    sizes = (grays[0].shape[::-1], grays[1].shape[::-1])
+    view = rectified_view(grays, sparse, fundamental)
     tracks = None if view is None else _track(view)
     if view is None or tracks is None:
         return None
-    tracked, on_rows = tracks[:2], tracks[2]
+    tracked, on_rows = tracks
     fundamental = _refine(fundamental, sparse, tracked, sizes)
     errors = epipolar_errors(tracked[0], on_rows, fundamental)
     near = float(np.quantile(errors, ROW_QUANTILE)) < MAX_ROW_ERROR_PX
     if not exact and (not near or _is_range_too_wide(view)):
-        again = rectified_view(gray0, gray1, *tracked, fundamental)
+        again = rectified_view(grays, tracked, fundamental)
         tracks = None if again is None else _track(again)
         if again is not None and tracks is not None:
-            counts = [np.count_nonzero(each.disparities.matched) for each in (view, again)]
+            counts = [np.count_nonzero(each.relied) for each in (view, again)]
             if counts[1] >= counts[0]:
                 view, near = again, True
-                fundamental = _refine(fundamental, sparse, tracks[:2], sizes)
+                fundamental = _refine(fundamental, sparse, tracks[0], sizes)
     if not exact and _agreement(view, sparse) < MIN_AGREEMENT:
         return None
     # Rows that are off, and could not be corrected, are a reason to doubt low correlation.
-    disparity = view.kept if near else view.disparities.disparity
+    disparity = view.disparity if near else np.where(view.relied, view.disparity, np.nan)
     rows, ends, scores = _sample(view, disparity, xy0)
     ends = _moved_to_lines(xy0[rows], ends, fundamental)
-    height, width = gray1.shape
-    inside = ((ends > -0.5) & (ends < (width - 0.5, height - 0.5))).all(axis=1)
+    inside = ((ends > -0.5) & (ends < np.array(sizes[1]) - 0.5)).all(axis=1)
     return fundamental, GuidedMatches(rows[inside], ends[inside], scores[inside], subpixel=True)
 
 
 def rectified_view(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    points0: np.ndarray,
-    points1: np.ndarray,
-    fundamental: np.ndarray,
-    scale: float | None = None,
+    grays: Pair, sparse: Pair, fundamental: np.ndarray, scale: float | None = None
 ) -> RectifiedView | None:
     """Rectify both images, smaller where there would be too much to search, and match rows.
 
     Those that have been made smaller for that already are given with their `scale`.
     """
-    frame = rectified_frame(points0, points1, fundamental, gray0.shape[::-1], gray1.shape[::-1])
+    frame = rectified_frame(*sparse, fundamental, grays[0].shape[::-1], grays[1].shape[::-1])
     if frame is None:
         return None
-    low, high = _range_of_matches(frame, points0, points1)
+    low, high = _range_of_matches(frame, sparse)
     volume = float(np.prod(frame.size)) * (high - low + 1)
     if scale is None and volume > MAX_VOLUME:
-        longest = max(*gray0.shape, *gray1.shape)
+        longest = max(max(gray.shape) for gray in grays)
         scale = max(1, round(longest * (MAX_VOLUME / volume) ** (1 / 3))) / longest
-        gray0, gray1 = (
-            downscale(gray, round(max(gray.shape) * scale))[0] for gray in (gray0, gray1)
-        )
-        points0, points1 = scaled_points(points0, scale), scaled_points(points1, scale)
+        small0, small1 = (downscale(gray, round(max(gray.shape) * scale))[0] for gray in grays)
+        points0, points1 = (scaled_points(points, scale) for points in sparse)
         fundamental = scaled_fundamental(fundamental, scale, scale)
-        return rectified_view(gray0, gray1, points0, points1, fundamental, scale)
-    (first, valid0), (second, valid1) = frame.warp(gray0, 0), frame.warp(gray1, 1)
+        return rectified_view((small0, small1), (points0, points1), fundamental, scale)
+    (first, valid0), (second, valid1) = frame.warp(grays[0], 0), frame.warp(grays[1], 1)
     # About an epipole everything grows, or everything shrinks: what small copies of the two views
     # agree on in the other direction is wrong.
     seen = None if isinstance(frame, PolarFrame) else find_disparity_range(first, second)
@@ -204,54 +189,44 @@ def rectified_view(
         if widened[1] - widened[0] <= int(MAX_VOLUME / float(np.prod(frame.size))):
             low, high = widened
     widest = frame.size[0] - 1
-    low, high = max(low, -widest), min(high, widest)
-    if low >= high:
+    searched = max(low, -widest), min(high, widest)
+    if searched[0] >= searched[1]:
         return None
-    options = replace(DISPARITY, disparity_range=(low, high))
-    disparities, correlation = _match_rows(first, second, valid0, valid1, options)
+    disparity, matched, correlation = _match_rows((first, second), (valid0, valid1), searched)
     # Some rows are matched with rows of the second view that show something else: what is found
     # there is found by chance, the best of as many disparities as everywhere.
     height = len(first)
     count = max(1, round(height * NULL_FRACTION))
     rows = (height - count) // 2 + np.arange(count)
     others = (rows + height // 2) % height
-    null, null_correlation = _match_rows(
-        first[rows], second[others], valid0[rows], valid1[others], options
-    )
+    unrelated, shown = (first[rows], second[others]), (valid0[rows], valid1[others])
+    _, null, null_correlation = _match_rows(unrelated, shown, searched)
     pixels, null_pixels = (int(np.count_nonzero(valid)) for valid in (valid0, valid0[rows]))
-    bounds = _correlation_bounds(
-        correlation[disparities.matched], pixels, null_correlation[null.matched], null_pixels
-    )
-    relied, kept = (disparities.matched & (correlation >= bound) for bound in bounds)
-    nan = np.float32(np.nan)
-    disparity = np.where(kept, disparities.disparity, nan)
-    sure = DisparityMap(np.where(relied, disparity, nan), relied, disparities.disparity_range)
-    return RectifiedView(frame, scale or 1.0, first, second, sure, disparity, correlation)
+    bounds = _correlation_bounds(correlation[matched], pixels, null_correlation[null], null_pixels)
+    relied, kept = (matched & (correlation >= bound) for bound in bounds)
+    disparity = np.where(kept, disparity, np.float32(np.nan))
+    views = first, second
+    return RectifiedView(frame, scale or 1.0, views, searched, disparity, relied, correlation)
 
 
 def _match_rows(
-    first: np.ndarray,
-    second: np.ndarray,
-    valid0: np.ndarray,
-    valid1: np.ndarray,
-    options: DisparityOptions,
-) -> tuple[DisparityMap, np.ndarray]:
-    """Return the disparities where both views show something, and the correlation after them."""
-    disparities = compute_disparity(first, second, options)
-    row, column = np.indices(first.shape, dtype=np.float32)
-    known = disparities.matched & np.isfinite(disparities.disparity)
-    x = np.where(known, column - disparities.disparity, -1).astype(np.float32)
-    aligned = cv2.remap(second, x, row, cv2.INTER_LINEAR)
-    shown = cv2.remap(valid1.astype(np.uint8), x, row, cv2.INTER_NEAREST) > 0
-    known &= valid0 & shown
+    views: Pair, shown: Pair, searched: DisparityRange
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return disparities, where they match what both views show, and the correlation there."""
+    found = compute_disparity(*views, replace(DISPARITY, disparity_range=searched))
+    row, column = np.indices(found.disparity.shape, dtype=np.float32)
+    x = np.where(found.matched, column - found.disparity, -1).astype(np.float32)
+    aligned = cv2.remap(views[1], x, row, cv2.INTER_LINEAR)
+    inside = cv2.remap(shown[1].astype(np.uint8), x, row, cv2.INTER_NEAREST) > 0
+    matched = found.matched & shown[0] & inside
     correlation = local_zncc(
-        gaussian_blur(first, CORRELATION_SIGMA_PX),
+        gaussian_blur(views[0], CORRELATION_SIGMA_PX),
         gaussian_blur(aligned, CORRELATION_SIGMA_PX),
-        np.ones(first.shape, bool),
+        np.ones(row.shape, bool),
         CORRELATION_WINDOW_PX,
     )
-    matched = DisparityMap(disparities.disparity, known, disparities.disparity_range)
-    return matched, np.where(known, np.nan_to_num(correlation), np.float32(-1))
+    correlation = np.where(matched, np.nan_to_num(correlation), np.float32(-1))
+    return found.disparity, matched, correlation
 
 
 def _correlation_bounds(
@@ -275,11 +250,9 @@ def _correlation_bounds(
     return high, min(high, float(few.min())) if len(few) else high
 
 
-def _range_of_matches(
-    frame: RectifiedFrame, points0: np.ndarray, points1: np.ndarray
-) -> tuple[int, int]:
+def _range_of_matches(frame: RectifiedFrame, sparse: Pair) -> DisparityRange:
     """Return the disparities of sparse matches, with a margin on both sides."""
-    disparity = frame.to_frame(points0, 0)[:, 0] - frame.to_frame(points1, 1)[:, 0]
+    disparity = frame.to_frame(sparse[0], 0)[:, 0] - frame.to_frame(sparse[1], 1)[:, 0]
     disparity = disparity[np.isfinite(disparity)]
     if not len(disparity):
         return 0, 0
@@ -294,28 +267,25 @@ def _range_of_matches(
 
 def _is_range_too_wide(view: RectifiedView) -> bool:
     """Whether less had to be searched than was, so that larger images could have been matched."""
-    searched = view.disparities.disparity_range
-    if view.scale == 1 or searched is None:
-        return False
-    found = view.disparities.disparity[view.disparities.matched]
-    low, high = range_with_margin(found, MARGIN_PX, MARGIN_FRACTION)
-    return searched[1] - searched[0] > MAX_RANGE_EXCESS * (high - low)
+    low, high = range_with_margin(view.disparity[view.relied], MARGIN_PX, MARGIN_FRACTION)
+    searched = view.searched[1] - view.searched[0]
+    return view.scale < 1 and searched > MAX_RANGE_EXCESS * (high - low)
 
 
-def _track(view: RectifiedView) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def _track(view: RectifiedView) -> tuple[Pair, np.ndarray] | None:
     """Track corners around their matches; None with fewer than `MIN_TRACKS`.
 
     Returns their positions in both images at their own size, and those in the second moved in the
     frame to the rows of the first: where row matching may look for them.
     """
-    first, second = equalise(view.first), equalise(view.second)
-    mask = view.disparities.matched.astype(np.uint8)
+    first, second = (equalise(gray) for gray in view.views)
+    mask = view.relied.astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(first, TRACKED_CORNERS, 0.001, 5, mask=mask)
     if corners is None or len(corners) < MIN_TRACKS:
         return None
     start = corners.reshape(-1, 2)
     column, row = np.rint(start).astype(np.int64).T
-    disparity = view.disparities.disparity[row, column]
+    disparity = view.disparity[row, column]
     expected = start - np.column_stack([disparity, np.zeros(len(start))]).astype(np.float32)
     ends, gaps = track_round_trip(
         first, second, start, TRACKED_WINDOW_PX, levels=1, expected=expected
@@ -326,14 +296,11 @@ def _track(view: RectifiedView) -> tuple[np.ndarray, np.ndarray, np.ndarray] | N
         return None
     start, ends = start[good], ends[good]
     on_rows = np.column_stack([ends[:, 0], start[:, 1]])
-    return view.from_frame(start, 0), view.from_frame(ends, 1), view.from_frame(on_rows, 1)
+    return (view.from_frame(start, 0), view.from_frame(ends, 1)), view.from_frame(on_rows, 1)
 
 
 def _refine(
-    fundamental: np.ndarray,
-    sparse: Pair,
-    tracked: Sequence[np.ndarray],
-    sizes: tuple[tuple[int, int], tuple[int, int]],
+    fundamental: np.ndarray, sparse: Pair, tracked: Pair, sizes: tuple[Size, Size]
 ) -> np.ndarray:
     """Fit the fundamental matrix to tracks and sparse matches, as exact as each of them are."""
     sigmas = []
@@ -353,9 +320,8 @@ def _agreement(view: RectifiedView, sparse: Pair) -> float:
     """
     positions = [view.to_frame(points, side) for side, points in enumerate(sparse)]
     inside, column, row = view.pixels_of(positions[0])
-    disparity = view.disparities.disparity[row, column]
-    errors = positions[0][inside, 0] - positions[1][inside, 0] - disparity
-    errors = np.abs(errors[np.isfinite(errors)])
+    errors = positions[0][inside, 0] - positions[1][inside, 0] - view.disparity[row, column]
+    errors = np.abs(errors[view.relied[row, column] & np.isfinite(errors)])
     return float((errors < MAX_DISAGREEMENT_PX).mean()) if len(errors) else 0.0
 
 

@@ -147,7 +147,8 @@ def _registered_pairs(views: Sequence[_Image], seed: int) -> list[RegisteredPair
         if enough and second in _connected(first, pairs):
             continue
         a, b = views[first], views[second]
-        guide, matches = guided_matches(a.gray, b.gray, a.keypoints, b.keypoints, geometry, seed)
+        keypoints = a.keypoints, b.keypoints
+        guide, matches = guided_matches((a.gray, b.gray), keypoints, geometry, seed)
         if guide.matrix is not None and matches is not None and len(matches):
             points = a.keypoints[matches.indices0]
             spread = np.argsort(bayer_order(points, a.size), kind="stable")[:MAX_CORRESPONDENCES]
