@@ -212,11 +212,7 @@ class AppServer:
             }
             for kind, task in TASKS.items()
         ]
-        limits = {
-            "file_mb": options.max_file_mb,
-            "task_mb": options.max_task_mb,
-            "files": options.max_files,
-        }
+        limits = {n: getattr(options, f"max_{n}") for n in ("file_mb", "task_mb", "files")}
         return {"engine": "python", "version": __version__, "tasks": tasks, "limits": limits}
 
     def _check_key(self, request: Request) -> None:
@@ -276,28 +272,26 @@ class AppServer:
         size = int.from_bytes(await body.read(min(4, left)))
         if not 0 < size <= min(MAX_DESCRIPTION_BYTES, left - 4):
             raise HTTPException(400, "the description of the task is missing")
-        names, sizes, given = _described(await body.read(size))
-        if len(names) > options.max_files:
+        files, given = _described(await body.read(size))
+        if len(files) > options.max_files:
             raise OptionError(
-                f"there are {len(names)} images, over {options.max_files}: give fewer, or "
+                f"there are {len(files)} images, over {options.max_files}: give fewer, or "
                 "allow more by --max-files"
             )
-        for name, bytes_ in zip(names, sizes, strict=True):
-            if bytes_ > options.max_file_mb * 1e6:
+        for name, length in files:
+            if length > options.max_file_mb * 1e6:
                 raise OptionError(f"{name} is over {options.max_file_mb:g} MB: make it smaller")
-        if sum(sizes) != left - 4 - size:
+        if sum(length for _, length in files) != left - 4 - size:
             raise HTTPException(400, "the images are not as long as is said")
-        numbers = TASKS[kind].check(len(names), given)
+        numbers = TASKS[kind].check(len(files), given)
         with contextlib.ExitStack() as made:
             folder = self.jobs.new_folder()
             made.callback(shutil.rmtree, folder, ignore_errors=True)
-            images = [
-                SentImage(folder / f"{number:04d}{_suffix(name)}", name)
-                for number, name in enumerate(names)
-            ]
-            for image, bytes_ in zip(images, sizes, strict=True):
-                with image.path.open("xb") as file:
-                    async for piece in body.pieces(bytes_):
+            images = []
+            for number, (name, length) in enumerate(files):
+                images.append(SentImage(folder / f"{number:04d}{_suffix(name)}", name))
+                with images[-1].path.open("xb") as file:
+                    async for piece in body.pieces(length):
                         file.write(piece)
             order = Order(kind, images, numbers, folder, options.max_megapixels)
             job = self.jobs.start(order)
@@ -363,19 +357,16 @@ def _body_length(request: Request, largest: int) -> int:
     return int(text)
 
 
-def _described(text: bytes) -> tuple[list[str], list[int], dict[str, object]]:
-    """Return the names and sizes of images, and the options, of a description in JSON."""
+def _described(text: bytes) -> tuple[list[tuple[str, int]], dict[str, object]]:
+    """Return the names and lengths of images, and the options, of a description in JSON."""
     try:
         values = json.loads(text)
-        names = [_clean(str(one["name"])) for one in values["files"]]
-        sizes = [one["size"] for one in values["files"]]
-        options = dict(values["options"])
-        whole = all(type(size) is int and size >= 0 for size in sizes)
+        files = [(_clean(str(one["name"])), one["size"]) for one in values["files"]]
+        if not all(type(length) is int and length >= 0 for _, length in files):
+            raise ValueError
+        return files, dict(values["options"])
     except (ValueError, TypeError, KeyError, RecursionError):
-        whole = False
-    if not whole:
-        raise HTTPException(400, "the description of the task is damaged")
-    return names, sizes, options
+        raise HTTPException(400, "the description of the task is damaged") from None
 
 
 def _clean(name: str) -> str:

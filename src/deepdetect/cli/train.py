@@ -52,7 +52,7 @@ RECIPE = cli.From(
         "short_sides": "--short-side",
         "frozen_batch_norm": "--frozen-batch-norm/--batch-norm",
     },
-    types={"stages": list[str] | None, "short_sides": list[int] | None},
+    types={"stages": list[str] | None},
     defaults={
         "stages": "240x16x44 480x8x10",
         "short_sides": "480 360 240",
@@ -106,8 +106,6 @@ def chosen_recipe(
     """
     if "stages" in values:
         values["stages"] = tuple(map(Stage.parse, values["stages"]))
-    if "short_sides" in values:
-        values["short_sides"] = tuple(values["short_sides"])
     recipe = training_preset(preset)
     labels = chosen_label_settings(detectors, label_settings)
     if label_settings is not None:
