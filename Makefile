@@ -13,6 +13,13 @@ INSTALLER ?= uv
 # Two processes, each with whole files (what a file sets up is set up once), on one thread each. One
 # that crashes ends the run: with a new one in its place pytest-xdist may wait for ever.
 PYTEST := -m pytest -n 2 --dist loadfile --max-worker-restart 0
+# The parts of the package with their tests, those that take longest first, and what is left.
+LONGEST := detector matching reconstruction cli evaluation app
+PARTS := $(LONGEST) $(filter-out $(LONGEST),$(notdir $(patsubst %/,%,$(wildcard tests/[!_]*/ tests/_shared/))))
+TESTS := $(foreach part,$(PARTS),"tests/$(part) $(wildcard src/deepdetect/$(part))") "tests/test_*.py src/deepdetect/*.py"
+# Each part in a process of its own, two at a time: what it has loaded goes with it.
+run_parts = printf '%s\n' $(TESTS) | xargs -P 2 -I{} sh -c \
+	'output=$$($(VENV)/bin/python -m pytest -q $(1) {} 2>&1); status=$$?; echo "$$output"; exit $$status'
 export OMP_NUM_THREADS ?= 1
 # The tests start many interpreters: what one has compiled, the next should find.
 unexport PYTHONDONTWRITEBYTECODE
@@ -40,16 +47,13 @@ install_package = $(call install,$(1)) --no-deps --no-build-isolation --editable
 demo: $(VENV)/.demo
 	$(VENV)/bin/deepdetect demo -o $(DEMO_OUTPUT)
 
-# Tests that are compiled once, and a package whose modules are, take a third less time.
-unexport PYTHONDONTWRITEBYTECODE
-
 # The fast tests. Those marked as slow run with `make test-all`.
 test: $(VENV)/.test
-	$(VENV)/bin/python $(PYTEST) $(TESTS)
+	@$(call run_parts,)
 
 # All tests, and ten minutes of wrong input and kills.
 test-all: $(VENV)/.test test-opencv4 test-ray test-integrations onnxruntime
-	$(VENV)/bin/python $(PYTEST) --runslow
+	@$(call run_parts,--runslow)
 	$(VENV)/bin/python -m fuzz --seconds 540 --kills 8
 
 # All wrong input and all kills of docs/limits.md: a quarter of an hour on two cores.

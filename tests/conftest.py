@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import os
-import platform
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,13 +12,8 @@ import hypothesis
 import numpy as np
 import pytest
 
-from deepdetect._shared import machine
-
 # Some tests import ONNX Runtime by themselves.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
-
-# Training keeps what it frees, for speed; a process of tests goes on with others.
-machine.disable_malloc_trim = lambda: None
 
 # The same examples on every run, no files left behind, no limit on time.
 for _name, _examples in (("quick", 10), ("thorough", 60)):
@@ -51,16 +43,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if item.get_closest_marker("slow"):
             item.add_marker(skip)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _memory_given_back() -> Iterator[None]:
-    """Give the memory of a file's tests back to the system: there is a process beside this one."""
-    yield
-    gc.collect()
-    gc.freeze()  # the modules, which need not be looked through again
-    if platform.libc_ver()[0] == "glibc":
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 @pytest.fixture(scope="session")
