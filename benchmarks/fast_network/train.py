@@ -117,6 +117,11 @@ def learning_rate(highest: float, progress: float) -> float:
     return highest * max((1 + cosine) / 2, 1e-3)
 
 
+def save(network: nn.Module, path: Path) -> None:
+    """Write the weights."""
+    save_file({name: each.contiguous() for name, each in network.state_dict().items()}, path)
+
+
 def main() -> None:
     """Train and write the weights."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -171,9 +176,9 @@ def main() -> None:
             torch._foreach_lerp_(states[0], states[1], 1 - decay)
         if progress > shown + 0.05:
             shown = progress
-            save_file(average.state_dict(), given.output)
+            save(average, given.output)
             print(step, loss.item(), *scores(average, views.validation(), device), flush=True)
-    save_file(average.state_dict(), given.output)
+    save(average, given.output)
     print(step, *scores(average, views.validation(), device))
 
 
