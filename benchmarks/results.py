@@ -29,16 +29,32 @@ ROOT = Path(__file__).parents[1]
 RESULTS_FOLDER = ROOT / "docs" / "results"
 BLOCK = re.compile(r"(<!-- results:([\w-]+)(?: (.*?))? -->\n).*?(<!-- /results -->)", re.DOTALL)
 
+BENCHMARK = "-m deepdetect benchmark {} --data {{data}} -o {{output}}"
 STAGES = {
-    "oxford-paper": "oxford --protocol paper",
-    "oxford-standard": "oxford --protocol standard",
-    "oxford-guided": "oxford --protocol guided",
-    "hpatches": "hpatches --protocol paper",
-    "foreground": "foreground",
-    "low-visibility": "low-visibility --protocol paper",
-    "speed": "speed",
+    **{
+        name: BENCHMARK.format(words)
+        for name, words in {
+            "oxford-paper": "oxford --protocol paper",
+            "oxford-standard": "oxford --protocol standard",
+            "oxford-points": "oxford --protocol standard --baselines "
+            "sift,fast,harris,hessian,hessian-scales",
+            "oxford-guided": "oxford --protocol guided",
+            "hpatches": "hpatches --protocol paper",
+            "foreground": "foreground",
+            "low-visibility": "low-visibility --protocol paper",
+            "middlebury": "middlebury",
+            "speed": "speed",
+        }.items()
+    },
+    "labels-stereo": "-m deepdetect evaluate-stereo {data}/middlebury/cones "
+    "{data}/middlebury/teddy --label-settings paper --label-settings dense --weights default "
+    "--weights dense",
+    "disparity": "benchmarks/row_matching.py {data}/middlebury",
+    "motorcycle": "benchmarks/motorcycle_matching.py",
+    "published-pipeline": "benchmarks/published_pipeline.py {data}",
+    "fuzz": "-m fuzz",
 }
-"""Arguments of `deepdetect benchmark` by the stage's name."""
+"""Arguments of Python by the stage's name. What writes no report prints its tables."""
 
 RANDOM = "baseline: random points, same number"
 TITLES = {
@@ -56,14 +72,18 @@ class Result:
 
     Attributes:
         stage: of `STAGES`.
-        table: key of the report's table.
+        table: key of the report's table, or its number where it is printed. With a * in it: the
+            rows of all that fit, after what the * stands for.
         columns: the table's columns by their titles in the result, each with the digits that are
-            printed; those that are not named are left out. Empty: all, with all digits.
+            printed, and with the key of the table, if it is another one, whose rows are the same;
+            those that are not named are left out. Empty: all, with all digits.
+        rows: only those with this text in their first cells.
     """
 
     stage: str
     table: str
-    columns: dict[str, tuple[str, str]] = field(default_factory=dict)
+    columns: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    rows: str = ""
 
 
 SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
@@ -119,8 +139,57 @@ RESULTS = {
             "score, 3 px": ("matching score at 3 px", ".3f"),
         },
     ),
-    "guided-all": Result("oxford-guided", "oxford_guided_refined"),
-    "repeatability-hpatches-kinds": Result("hpatches", "hpatches_table3"),
+    "guided": Result(
+        "oxford-guided",
+        "oxford_guided_refined",
+        {
+            "unguided, correct": ("descriptors alone: correct", ".0f"),
+            "precision": ("descriptors alone: precision", ".3f"),
+            "guided, correct": ("guided: correct", ".0f"),
+            "guided, precision": ("guided: precision", ".3f"),
+            "of the ceiling": ("guided: of the matchable", ".3f"),
+            "lowest of three seeds": ("lowest", ".3f"),
+            "one to one": ("guided: unique", ".0f"),
+            "corner error, px": ("guided: corner error, px", ".2f"),
+        },
+        rows="DeepDetect",
+    ),
+    "guided-baselines": Result("oxford-guided", "oxford_guided_refined"),
+    "repeatability-hpatches": Result("hpatches", "hpatches_table3"),
+    "points": Result(
+        "oxford-points",
+        "oxford_refined_repeatability_1px",
+        {
+            "@1 512": ("512", ".3f"),
+            "@1 2048": ("2,048", ".3f"),
+            "@1 8192": ("8,192", ".3f"),
+            "@3 2048": ("2,048", ".3f", "oxford_refined_repeatability_3px"),
+            "@3 8192": ("8,192", ".3f", "oxford_refined_repeatability_3px"),
+            "correct": ("correct at 1 px", ".0f", "oxford_refined_matching"),
+            "within 1 px": ("accuracy at 1 px", ".3f", "oxford_refined_homography"),
+        },
+    ),
+    "points-by-change": Result("oxford-points", "oxford_refined_kinds"),
+    "middlebury": Result(
+        "middlebury",
+        "middlebury_*",
+        {
+            "points": ("points", ".0f"),
+            **{f"within {t} px": (f"1 - bad-{t}", ".3f") for t in ("0.5", "1", "2", "4")},
+            "mean error (EPE), px": ("EPE, px", ".2f"),
+            "completeness": ("completeness at 1 px", ".3f"),
+            "F-score": ("F-score", ".3f"),
+            "half-occluded: points": ("half-occluded, with a point", ".0f"),
+            "half-occluded: within 1 px": ("of these within 1 px", ".3f"),
+            "s": ("seconds", ".2f"),
+            "MB": ("all, MB", ".0f"),
+        },
+    ),
+    "labels-stereo": Result("labels-stereo", "0"),
+    "disparity": Result("disparity", "0"),
+    "motorcycle": Result("motorcycle", "0"),
+    "published-pipeline": Result("published-pipeline", "0"),
+    "fuzz": Result("fuzz", "0"),
     "foreground": Result(
         "foreground",
         "foreground",
@@ -186,31 +255,60 @@ def main() -> None:
 
 
 def run_stage(stage: str, data: Path, work: Path) -> None:
-    """Run a benchmark; what its cache holds is not made again."""
-    words = [sys.executable, "-m", "deepdetect", "benchmark", *STAGES[stage].split()]
-    words += ["--data", str(data), "-o", str(work / stage)]
-    print(shlex.join(words[1:]), flush=True)
-    subprocess.run(words, check=True)
+    """Run what makes a report; of a benchmark what its cache holds is not made again."""
+    folder = work / stage
+    words = [word.format(data=data, output=folder) for word in STAGES[stage].split()]
+    print(shlex.join(words), flush=True)
+    if "benchmark" in words:
+        subprocess.run([sys.executable, *words], check=True)
+        return
+    made = subprocess.run([sys.executable, *words], check=True, stdout=subprocess.PIPE, text=True)
+    tables = {str(k): {"rows": rows} for k, rows in enumerate(printed_tables(made.stdout))}
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "report.json").write_text(json.dumps({"metadata": {}, "tables": tables}))
+
+
+def printed_tables(text: str) -> list[list[dict[str, str]]]:
+    r"""Return the rows of the Markdown tables in a text.
+
+    Example:
+        >>> printed_tables("| a | b |\n|---|--:|\n| x | 1,024 |\n| y | – |\n")
+        [[{'a': 'x', 'b': '1024'}, {'a': 'y', 'b': ''}]]
+    """
+    tables = []
+    for block in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
+        head, _, *rows = (
+            [cell.strip() for cell in line[1:-1].split("|")] for line in block.splitlines()
+        )
+        plain = [[re.sub(r"(?<=\d),(?=\d{3})|^–$", "", cell) for cell in row] for row in rows]
+        tables.append([dict(zip(head, row, strict=True)) for row in plain])
+    return tables
 
 
 def write_result(name: str, work: Path) -> None:
     """Write a table of a report as docs/results/NAME.csv, and how it was made."""
     result = RESULTS[name]
     report = json.loads((work / result.stage / "report.json").read_text())
-    rows = report["tables"][result.table]["rows"]
-    method = next(iter(rows[0]))
-    columns = result.columns or {title: (title, "") for title in list(rows[0])[1:]}
-    lines = [[method, *columns]]
-    for row in rows:
-        cells = [
-            "" if row.get(title) is None else format(row[title], style)
-            for title, style in columns.values()
-        ]
-        lines.append([TITLES.get(row[method], row[method]), *cells])
+    tables = {key: table["rows"] for key, table in report["tables"].items()}
+    start, several, _ = result.table.partition("*")
+    keys = [key for key in tables if key.startswith(start)] if several else [result.table]
+    first = next(iter(tables[keys[0]][0]))
+    columns = result.columns or {title: (title, "") for title in list(tables[keys[0]][0])[1:]}
+    lines = [[*(["scene"] if several else []), first, *columns]]
+    for key in keys:
+        for number, row in enumerate(tables[key]):
+            if result.rows not in " ".join(str(cell) for cell in list(row.values())[:2]):
+                continue
+            lines.append([key.removeprefix(start)] if several else [])
+            lines[-1].append(TITLES.get(row[first], row[first]))
+            for title, style, *other in columns.values():
+                cell = (tables[other[0]][number] if other else row).get(title)
+                lines[-1].append("" if cell is None else format(cell, style))
     with (RESULTS_FOLDER / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows(lines)
     index = json.loads((RESULTS_FOLDER / "index.json").read_text())
-    made = provenance() | {"command": f"deepdetect benchmark {STAGES[result.stage]} --data DATA"}
+    command = STAGES[result.stage].format(data="DATA", output="REPORT").removeprefix("-m ")
+    made = provenance() | {"command": command}
     index["results"][name] = made | {"weights": report["metadata"].get("weights (SHA-256)", "")}
     index["results"] = dict(sorted(index["results"].items()))
     text = json.dumps(index, indent=1, ensure_ascii=False) + "\n"

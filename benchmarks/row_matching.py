@@ -39,6 +39,7 @@ from deepdetect import DeepDetect, disparity_map
 from deepdetect._shared.errors import ImageError
 from deepdetect.datasets.middlebury import load_motorcycle
 from deepdetect.evaluation.protocols.stereo import ground_truths, sgbm_disparity
+from deepdetect.evaluation.report import Row, Table
 from deepdetect.io.image import load_image, luma
 from deepdetect.matching.stereo import DENSE, DisparityOptions
 from deepdetect.matching.stereo.sgm import semi_global_matching
@@ -46,15 +47,21 @@ from deepdetect.matching.stereo.sgm import semi_global_matching
 TOLERANCES = (0.25, 0.5, 1.0, 2.0, 4.0)
 AT_EDGES = DisparityOptions(uniqueness_ratio=1.0, discontinuity_margin_px=0)
 SEARCH_WITHOUT_TRUTH = 64
+COLUMNS = {
+    **{"scene": "", "way": "", "points": ",d"},
+    **{f"within {tolerance:g} px": ".4f" for tolerance in TOLERANCES},
+    **{"completeness": ".4f", "tenths of a pixel": "", "seconds": ".2f"},
+}
 
 
 def main() -> None:
-    """Print one line for each scene and way."""
+    """Print a table with a row for each scene and way."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path, help="folder of the scenes")
     parser.add_argument("--repeats", type=int, default=3, help="the fastest counts (default: 3)")
     arguments = parser.parse_args()
     detector = DeepDetect("dense")
+    rows: list[Row] = []
     for name, left, right, known in scenes(arguments.data):
         keypoints = detector.detect(left).xy
         for way, compute in ways(left, right, keypoints, search_count(known)).items():
@@ -65,7 +72,9 @@ def main() -> None:
                 found = compute()
                 seconds.append(time.perf_counter() - started)
             for note, truth in known.items():
-                print(f"{name + note:22s} {way:22s} {scores(found, truth)} {min(seconds):6.2f} s")
+                row = {"scene": name + note, "way": way, "seconds": min(seconds)}
+                rows.append(row | scores(found, truth))
+    print(Table("rows", "", COLUMNS, rows).to_markdown())
 
 
 def ways(
@@ -75,8 +84,8 @@ def ways(
     row, column = np.indices(left.shape[:2])
     every = np.column_stack([column.ravel(), row.ravel()])
     return {
-        f"keypoints ({len(keypoints):,})": lambda: ours(left, right, keypoints),
-        f"every ({len(every):,})": lambda: ours(left, right, every),
+        "keypoints": lambda: ours(left, right, keypoints),
+        "every": lambda: ours(left, right, every),
         "edges": lambda: ours(left, right, every, AT_EDGES),
         "parabola": lambda: by_parabola(left, right),
         "dense": lambda: ours(left, right, every, DENSE),
@@ -137,19 +146,22 @@ def search_count(known: dict[str, np.ndarray | None]) -> int:
     return -(-(int(np.nanmax(truth)) + 2) // 16) * 16
 
 
-def scores(found: np.ndarray, truth: np.ndarray | None) -> str:
-    """Return points, shares within the tolerances, completeness and tenths of a pixel as text."""
+def scores(found: np.ndarray, truth: np.ndarray | None) -> Row:
+    """Return points, shares within the tolerances, completeness and tenths of a pixel."""
     points = int(np.isfinite(found).sum())
     if truth is None:
-        return f"{points:9,d}  {'no truth':56s}"
+        return {"points": points}
     errors = np.abs(found - truth)
     errors = errors[np.isfinite(errors)]
-    shares = " ".join(f"{np.mean(errors <= tolerance):.4f}" for tolerance in TOLERANCES)
-    complete = np.count_nonzero(errors <= 1) / np.count_nonzero(np.isfinite(truth))
-    return f"{points:9,d}  {shares}  {complete:.4f}  {tenths(found, truth):12s}"
+    return {
+        "points": points,
+        **{f"within {t:g} px": float(np.mean(errors <= t)) for t in TOLERANCES},
+        "completeness": np.count_nonzero(errors <= 1) / np.count_nonzero(np.isfinite(truth)),
+        "tenths of a pixel": tenths(found, truth),
+    }
 
 
-def tenths(found: np.ndarray, truth: np.ndarray) -> str:
+def tenths(found: np.ndarray, truth: np.ndarray) -> str | None:
     """Return how often the rarest and the most frequent tenth is met, over that of the truth.
 
     A truth that is rounded to parts of a pixel says nothing about it.
@@ -159,7 +171,7 @@ def tenths(found: np.ndarray, truth: np.ndarray) -> str:
         np.histogram(disparity[both] % 1, bins=10, range=(0, 1))[0] for disparity in (found, truth)
     )
     if not expected.all():
-        return "-"
+        return None
     ratios = counts / expected
     return f"{ratios.min():.2f} to {ratios.max():.2f}"
 
