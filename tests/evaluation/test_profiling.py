@@ -60,7 +60,7 @@ def _leave() -> None:
 
 
 def test_a_child_tells_its_own_memory_not_that_of_its_parent() -> None:
-    held = np.ones(60_000_000)  # 480 MB
+    held = np.ones(30_000_000)  # 240 MB
     assert peak_memory() > held.nbytes
     assert 1e6 < run_in_child(peak_memory) < held.nbytes
 
