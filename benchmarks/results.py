@@ -76,7 +76,7 @@ class Result:
             rows of all that fit, after what the * stands for.
         columns: the table's columns by their titles in the result, each with the digits that are
             printed, and with the key of the table, if it is another one, whose rows are the same;
-            those that are not named are left out. Empty: all, with all digits.
+            those that are not named are left out. Empty: all, with four digits.
         rows: only those with this text in their first cells.
     """
 
@@ -303,6 +303,7 @@ def write_result(name: str, work: Path) -> None:
             lines[-1].append(TITLES.get(row[first], row[first]))
             for title, style, *other in columns.values():
                 cell = (tables[other[0]][number] if other else row).get(title)
+                style = style or (".4f" if isinstance(cell, float) else "")
                 lines[-1].append("" if cell is None else format(cell, style))
     with (RESULTS_FOLDER / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows(lines)

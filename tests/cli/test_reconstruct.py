@@ -277,11 +277,11 @@ def test_models_of_before_survive_a_failure(
     """A full disk in the middle of the depth map: what is there stays whole."""
     Path("m_depth.npz").write_bytes(b"of before")
 
-    def fail(file: Any, **arrays: Any) -> None:
+    def fail(file: Any, *arguments: Any, **options: Any) -> None:
         file.write(b"half")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(np, "savez_compressed", fail)
+    monkeypatch.setattr(np.lib.format, "write_array", fail)
     result = run(
         *("reconstruct", folder / "left.png", folder / "right.png", "--focal", FOCAL),
         *("-o", "m.ply", "--overwrite"),

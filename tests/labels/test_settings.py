@@ -75,7 +75,6 @@ def test_a_whole_number_serves_for_a_fraction() -> None:
         "[orb]\nnormal = { levels = 0x" + "f" * 9000 + " }",
         "[orb]\nnormal = { levels = " + "9" * 9000 + " }",
         "a = " + "[" * 15_000,
-        "a" + ".a" * 50_000 + " = 1",
         "[sobel]\nnormal = { relative_threshold = nan }",
         'detectors = ["sobel"]\n[fast]\nnormal = { threshold = 3 }',
     ],
