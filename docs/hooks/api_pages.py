@@ -88,7 +88,7 @@ _PAGES = (
         (
             "reconstruct",
             "reconstruction.Reconstruction",
-            "reconstruction.ReconstructionOptions",
+            "reconstruction.PointFilterOptions",
             "disparity_map",
             "matching.DisparityMap",
             "matching.DisparityOptions",

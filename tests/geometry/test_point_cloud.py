@@ -28,7 +28,6 @@ def test_slices_masks_and_numbers_select_points() -> None:
     ("points", "colors", "unit", "word"),
     [
         (np.zeros((3, 2)), np.zeros((3, 2), np.uint8), "mm", "(N, 3)"),
-        ([[1.0, 2, 3], [1.0]], np.zeros((2, 3), np.uint8), "mm", "(N, 3)"),
         (np.zeros((3, 3), int), np.zeros((3, 3), np.uint8), "mm", "float32"),
         (np.zeros((3, 3)), np.zeros((3, 3)), "mm", "uint8"),
         (np.zeros((1, 3)), [[0, 0, 256]], "mm", "255"),

@@ -22,7 +22,6 @@ from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.geometry.point_cloud import PointCloud
 from deepdetect.matching.stereo import DisparityOptions, disparity_map
 from deepdetect.reconstruction.outliers import PointFilterOptions
-from deepdetect.reconstruction.pipeline import ReconstructionOptions
 from deepdetect.reconstruction.result import Reconstruction
 
 CONES_POINTS = 49_979
@@ -30,16 +29,10 @@ CONES_POINTS = 49_979
 
 
 def reconstruct(left: Any, right: Any, detector: Any = None, **settings: Any) -> Any:
-    """Call the function with all settings by their names, whichever object they belong to."""
-    fields = {
-        kind: {f.name for f in dataclasses.fields(kind)} & settings.keys()
-        for kind in (SelectionOptions, ReconstructionOptions)
-    }
-    selection, options = (
-        kind(**{name: settings.pop(name) for name in names}) if names else None
-        for kind, names in fields.items()
-    )
-    settings |= {} if options is None else {"options": options}
+    """Call the function with the settings of a selection among the others."""
+    names = {field.name for field in dataclasses.fields(SelectionOptions)} & settings.keys()
+    chosen = {name: settings.pop(name) for name in names}
+    selection = SelectionOptions(**chosen) if chosen else None
     return deepdetect.reconstruct(left, right, detector, selection=selection, **settings)
 
 

@@ -69,16 +69,10 @@ class PlanarFrame:
 class PolarFrame:
     """Two views rectified about their epipoles; methods as of `PlanarFrame`.
 
-    Attributes:
-        fundamental: (3, 3) with x1^T F x0 = 0.
-        epipoles: (2,) of each view, in pixels.
-        orientation: 1 or -1: which half of an epipolar line of the second view belongs to the half
-            of the first.
-        middle: angle of the middle row in the first view, in radians.
-        first_angle: angle of the first row, relative to the middle one.
-        step: between rows in radians, and between columns in natural logarithms of the radius.
-        min_radius_px: radius of the first column.
-        size: (width, height) of the frame.
+    The orientation is 1 or -1: which half of an epipolar line of the second view belongs to the
+    half of the first. `middle` is the angle of the middle row in the first view, `first_angle` that
+    of the first row relative to it, and `min_radius_px` the radius of the first column; the step is
+    in radians between rows, and in natural logarithms of the radius between columns.
     """
 
     fundamental: np.ndarray

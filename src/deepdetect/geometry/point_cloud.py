@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -55,7 +54,7 @@ class PointCloud:
 
     def __post_init__(self) -> None:
         check_name("unit", self.unit, UNITS)
-        points, colors = _array(self.points), _array(self.colors)
+        points, colors = np.asarray(self.points), np.asarray(self.colors)
         if points.size == colors.size == 0:
             points, colors = np.empty((0, 3)), np.empty((0, 3), np.uint8)
         if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
@@ -141,10 +140,3 @@ def require_points(cloud: PointCloud) -> None:
     """Raise an OptionError for an empty cloud."""
     if not len(cloud):
         raise OptionError("the point cloud has no points: there is nothing to show or to write")
-
-
-def _array(values: Any) -> np.ndarray:
-    try:
-        return np.asarray(values)
-    except ValueError:
-        return np.empty(0, object)  # rows of several lengths

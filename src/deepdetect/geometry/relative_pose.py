@@ -47,23 +47,12 @@ def triangulate(
     """
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
-    pose = np.asarray(rotation, np.float64), np.asarray(translation, np.float64).reshape(3)
-    starts = range(0, max(len(points0), 1), BLOCK)
-    parts = (slice(start, start + BLOCK) for start in starts)
-    blocks = [
-        _triangulate_block(points0[part], points1[part], calibration, *pose) for part in parts
-    ]
-    return Triangulation(*(np.concatenate(values) for values in zip(*blocks, strict=True)))
-
-
-def _triangulate_block(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    calibration: Calibration,
-    rotation: np.ndarray,
-    translation: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Triangulate some matches: the fields of `Triangulation`."""
+    if len(points0) > BLOCK:
+        parts = [slice(start, start + BLOCK) for start in range(0, len(points0), BLOCK)]
+        pose = calibration, rotation, translation
+        blocks = [vars(triangulate(points0[part], points1[part], *pose)).values() for part in parts]
+        return Triangulation(*map(np.concatenate, zip(*blocks, strict=True)))
+    rotation, translation = (np.asarray(part, np.float64) for part in (rotation, translation))
     fundamental = fundamental_matrix(calibration, rotation, translation)
     moved0, moved1 = correct_matches(points0, points1, fundamental)
     camera0, camera1 = calibration.camera0, calibration.camera1
@@ -80,7 +69,7 @@ def _triangulate_block(
     cheirality = np.isfinite(depth) & (depth > 0) & (depth1 > 0)
     error = ((moved0 - points0) ** 2).sum(1) + ((moved1 - points1) ** 2).sum(1)
     angle = np.arctan2(np.sqrt(squares), np.einsum("ij,ij->i", rays1, rotated))
-    return points, cheirality, np.sqrt(error / 2), angle
+    return Triangulation(points, cheirality, np.sqrt(error / 2), angle)
 
 
 def correct_matches(

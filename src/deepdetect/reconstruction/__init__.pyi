@@ -1,5 +1,3 @@
-from .pipeline import (
-    ReconstructionOptions as ReconstructionOptions,
-    reconstruct as reconstruct,
-)
+from .outliers import PointFilterOptions as PointFilterOptions
+from .pipeline import reconstruct as reconstruct
 from .result import Reconstruction as Reconstruction

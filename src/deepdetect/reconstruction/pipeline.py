@@ -7,7 +7,7 @@ disparity map, from which the keypoints of the left image take their points.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -49,21 +49,6 @@ MIN_MATCHED_FRACTION = 0.25
 
 
 @suggest_keywords
-@dataclass(frozen=True, eq=False)
-class ReconstructionOptions:
-    """How a pair becomes points.
-
-    Attributes:
-        disparity: the disparity map of rectified pairs; "auto": `DENSE` where every pixel is asked
-            for (a density of 1), else the strict default.
-        point_filter: which points are kept.
-    """
-
-    disparity: DisparityOptions | Literal["auto"] = "auto"
-    point_filter: PointFilterOptions = field(default_factory=PointFilterOptions)
-
-
-@suggest_keywords
 def reconstruct(
     left: Any,
     right: Any,
@@ -76,7 +61,8 @@ def reconstruct(
     selection: SelectionOptions | None = None,
     ignore: np.ndarray | Images | None = None,
     seed: int = 0,
-    options: ReconstructionOptions = ReconstructionOptions(),
+    disparity: DisparityOptions | Literal["auto"] = "auto",
+    point_filter: PointFilterOptions = PointFilterOptions(),
     progress: Callable[[str], object] | None = None,
 ) -> Reconstruction:
     """Reconstruct a scene from two images.
@@ -97,7 +83,9 @@ def reconstruct(
             takes every pixel, and `DENSE` disparities; `subpixel` does not apply.
         ignore: as of `match_images`; of a rectified pair only the mask of the left image counts.
         seed: of all random choices.
-        options: all else.
+        disparity: of rectified pairs; "auto": `DENSE` where every pixel is asked for, else the
+            strict default.
+        point_filter: which points are kept.
         progress: called with the name of each stage when it ends.
 
     Returns:
@@ -145,7 +133,10 @@ def reconstruct(
     if rectified:
         with timer.stage("keypoints"):
             keypoints = find_keypoints(detector, rgb[0], whole, masks[0])
-        made = _from_disparities(keypoints, grays, known, selection, options, timer)
+        if disparity == "auto":
+            every_pixel = selection is not None and selection.density == 1
+            disparity = DENSE if every_pixel else DisparityOptions()
+        made = _from_disparities(keypoints, grays, known, disparity, point_filter, timer)
     else:
         with timer.stage("keypoints and matching"):
             matches = match_images(
@@ -159,7 +150,7 @@ def reconstruct(
                 seed=seed,
                 tentative_matches=tentative,
             )
-        made = reconstruct_two_view(matches, grays, known, options.point_filter, seed, timer)
+        made = reconstruct_two_view(matches, grays, known, point_filter, seed, timer)
     columns, rows = np.rint(made["pixels"]).astype(np.int64).T
     return Reconstruction(
         **made,
@@ -177,16 +168,11 @@ def _from_disparities(
     keypoints: Keypoints,
     grays: tuple[np.ndarray, np.ndarray],
     calibration: Calibration,
-    selection: SelectionOptions | None,
-    options: ReconstructionOptions,
+    options: DisparityOptions,
+    point_filter: PointFilterOptions,
     timer: StageTimer,
 ) -> dict[str, Any]:
     """Take the keypoints of the left image from the disparity map of a rectified pair."""
-    every_pixel = selection is not None and selection.density == 1
-    how = options.disparity
-    if how == "auto":
-        how = DENSE if every_pixel else DisparityOptions()
-    point_filter = options.point_filter
     check_cameras(calibration)
     keypoints = replace(keypoints, xy=np.rint(keypoints.xy))
     if not len(keypoints):
@@ -195,9 +181,9 @@ def _from_disparities(
             "image of one grey level shows nothing)"
         )
     with timer.stage("matching"):
-        found = compute_disparity(*grays, how).at(keypoints)
+        found = compute_disparity(*grays, options).at(keypoints)
     matched, disparity = found.matched, found.disparity
-    least = MIN_UNIQUE_FRACTION if how.uniqueness_ratio > 1 else MIN_MATCHED_FRACTION
+    least = MIN_UNIQUE_FRACTION if options.uniqueness_ratio > 1 else MIN_MATCHED_FRACTION
     if np.count_nonzero(matched) < least * len(keypoints):
         raise NoDepthError(
             f"only {np.count_nonzero(matched):,} of {len(keypoints):,} keypoints have a match on "
@@ -217,7 +203,7 @@ def _from_disparities(
         "behind a camera": int(np.count_nonzero(~in_front)),
         "parallax": int(np.count_nonzero(in_front & ~kept)),
     }
-    if point_filter.sor_neighbors and how.discontinuity_margin_px:
+    if point_filter.sor_neighbors and options.discontinuity_margin_px:
         with timer.stage("outlier removal"):
             inliers = sor_inliers_on_grid(
                 pixels[kept], disparity[kept], grays[0].shape[::-1], point_filter

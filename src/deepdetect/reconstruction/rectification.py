@@ -120,17 +120,18 @@ def find_rectification(
     `offset_px` is what is added to a disparity before it gives the depth. The tentative matches of
     larger copies are returned where they were needed.
     """
-    size0, size1 = gray0.shape[::-1], gray1.shape[::-1]
-    if size0 != size1:
+    size = gray0.shape[::-1]
+    if gray0.shape != gray1.shape:
         nowhere = np.empty((0, 2))
-        return detect_rectification(nowhere, nowhere, size0, size1, offset_px, seed), None
-    if max(size0) > COARSE_SIDE_PX:
+        nothing = detect_rectification(nowhere, nowhere, size, offset_px, seed)
+        return replace(nothing, reason="the images differ in size"), None
+    if max(size) > COARSE_SIDE_PX:
         found = _coarse_pass(gray0, gray1, offset_px, seed)
         if found is not None:
             return found, None
     tentative = find_tentative_matches(gray0, gray1)
     points = tentative.points0, tentative.points1
-    return detect_rectification(*points, size0, size1, offset_px, seed), tentative
+    return detect_rectification(*points, size, offset_px, seed), tentative
 
 
 def _coarse_pass(
@@ -142,7 +143,7 @@ def _coarse_pass(
     )
     scale, size = coarse.scales[0], coarse.views[0].shape[::-1]
     # The thresholds are pixels of the copies: what they decide holds with a margin.
-    found = detect_rectification(*coarse.matched, size, size, offset_px * scale, seed)
+    found = detect_rectification(*coarse.matched, size, offset_px * scale, seed)
     if found.by_fundamental < MIN_COARSE_INLIERS:
         return None
     if found.rectified:
@@ -182,12 +183,11 @@ def _row_error(points0: np.ndarray, points1: np.ndarray, seed: int) -> float:
 def detect_rectification(
     points0: np.ndarray,
     points1: np.ndarray,
-    size0: tuple[int, int],
-    size1: tuple[int, int],
+    size: tuple[int, int],
     offset_px: float = 0.0,
     seed: int = 0,
 ) -> Rectification:
-    """Decide from matches (M, 2) whether a pair is rectified; sizes are (width, height)."""
+    """Decide from matches (M, 2) whether a pair of images of one (width, height) is rectified."""
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
     indices = grid_subsample(points0, GRID_SIZE_PX, seed)
@@ -195,8 +195,8 @@ def detect_rectification(
     limit = MAX_ROW_DISTANCE_PX
     on_rows = np.abs(second[:, 1] - first[:, 1]) <= limit
     # Of a rectified pair Sampson's distance is that in rows over the root of 2.
-    epipolar = fit_model(first, second, "fundamental", size1, limit / np.sqrt(2), seed)
-    other_rows = _best_other_rows(first, second, size0, seed)
+    epipolar = fit_model(first, second, "fundamental", size, limit / np.sqrt(2), seed)
+    other_rows = _best_other_rows(first, second, size, seed)
     disparity = (first - second)[on_rows, 0]
     spread = np.quantile(disparity, [0.05, 0.5, 0.95]) if len(disparity) else np.full(3, np.nan)
     vertical_offset = np.nan
@@ -207,10 +207,8 @@ def detect_rectification(
     )
     best = max(by_fundamental, by_other_rows)
     reason = ""
-    if size0 != size1:
-        reason = "the images differ in size"
     # Rows are a line in every point; nothing was sampled, so this is on the safe side.
-    elif log10_nfa(on_rows, "fundamental", limit, size1) > MAX_LOG10_NFA:
+    if log10_nfa(on_rows, "fundamental", limit, size) > MAX_LOG10_NFA:
         reason = "hardly any match is on the same row in both images"
     elif on_rows_count < MIN_INLIER_RATIO * best:
         reason = (
@@ -223,7 +221,7 @@ def detect_rectification(
         reason = "nothing moves between the images"
     elif spread[2] - spread[0] < MIN_PLANAR_SPREAD_PX:
         threshold_px = SCENE_THRESHOLDS_PX["homography"]
-        plane = fit_model(first, second, "homography", size1, threshold_px, seed)
+        plane = fit_model(first, second, "homography", size, threshold_px, seed)
         if is_planar(first, second, plane, epipolar, seed):
             reason = "one homography explains all the matches: all move nearly the same"
     return Rectification(
