@@ -229,9 +229,9 @@ def test_lists_of_pairs(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("a.jpg b.jpg\na.jpg\n", "line 2 of .* is no pair"),
-        ("a.jpg b.jpg c.jpg\n", "line 1 of .* is no pair"),
-        ("a.jpg a.jpg\n", "line 1 of .* is no pair"),
+        ("a.jpg b.jpg\na.jpg\n", r"\['a.jpg'\] in .* is no pair"),
+        ("a.jpg b.jpg c.jpg\n", "in .* is no pair"),
+        ("a.jpg a.jpg\n", "in .* is no pair"),
         ("\n", "has no pairs"),
         (None, "there is no file .*pairs.txt: check the path"),
     ],

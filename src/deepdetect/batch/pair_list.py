@@ -28,7 +28,6 @@ def read_pairs(path: str | Path) -> list[Pair]:
     Raises:
         DeepDetectError: the file is missing or empty, or a line is something else.
     """
-    pairs: list[Pair] = []
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -36,19 +35,10 @@ def read_pairs(path: str | Path) -> list[Pair]:
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is no text in UTF-8"
         raise DeepDetectError(f"{path} cannot be read ({reason}): check the file") from None
-    for number, line in enumerate(text.splitlines(), 1):
-        if not line.strip():
-            continue
-        names = line.strip().split("\t") if "\t" in line.strip() else line.split()
-        if len(names) != 2 or names[0] == names[1]:
-            raise DeepDetectError(
-                f"line {number} of {path} is no pair: give the names of two images, with a blank "
-                "between, or a tab where they have blanks themselves"
-            )
-        pairs.append((names[0], names[1]))
-    if not pairs:
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    if not lines:
         raise DeepDetectError(f"{path} has no pairs: give the names of two images on each line")
-    return _once_each(pairs)
+    return check_pairs([line.split("\t" if "\t" in line else None) for line in lines], str(path))
 
 
 def sequential_pairs(names: Sequence[str], following: int) -> list[Pair]:
@@ -63,21 +53,18 @@ def sequential_pairs(names: Sequence[str], following: int) -> list[Pair]:
     ]
 
 
-def check_pairs(pairs: Sequence[Pair]) -> list[Pair]:
-    """Return pairs that were given from Python, once each; an OptionError says which is none."""
-    for pair in pairs:
-        names = () if isinstance(pair, str) else tuple(pair)
-        if len(names) != 2 or names[0] == names[1] or not all(names):
-            raise OptionError(
-                f"{pair!r} in `pairs` is no pair: give (name, name) of two images, or a text file"
-            )
-    return _once_each([(name0, name1) for name0, name1 in pairs])
+def check_pairs(pairs: Sequence[Sequence[str]], place: str = "`pairs`") -> list[Pair]:
+    """Return pairs without those that are there before, or the other way round.
 
-
-def _once_each(pairs: Sequence[Pair]) -> list[Pair]:
-    """Leave out pairs that are there before, or the other way round."""
+    An OptionError says which is none.
+    """
     kept: dict[Pair, None] = {}
     for pair in pairs:
-        if pair[::-1] not in kept:
-            kept[pair] = None
+        if isinstance(pair, str) or len(pair) != 2 or pair[0] == pair[1] or not all(pair):
+            raise OptionError(
+                f"{pair!r} in {place} is no pair: give the names of two images, in a text file on "
+                "a line with a blank between, or a tab where they have blanks themselves"
+            )
+        if (pair[1], pair[0]) not in kept:
+            kept[pair[0], pair[1]] = None
     return list(kept)
