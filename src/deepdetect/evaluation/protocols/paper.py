@@ -210,9 +210,9 @@ def pair_repeatability(run: Run, feature: LocalFeature, pair: PlanarPair) -> flo
     """Return the paper's repeatability of a pair."""
     images = (pair.first, pair.second)
 
-    def make() -> dict[str, np.ndarray]:
+    def make() -> Row:
         first, second = (run.keypoints(feature, image)[0].xy for image in images)
-        return {"value": np.array(repeatability_paper(first, second, pair.homography))}
+        return {"value": repeatability_paper(first, second, pair.homography)}
 
     depends = (feature.detection, images, pair.homography)
     return float(run.cached("repeatability_paper", depends, make)["value"])

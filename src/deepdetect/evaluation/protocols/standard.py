@@ -10,12 +10,12 @@ from functools import partial
 import numpy as np
 
 from ...datasets.planar import PlanarPair
+from ...features.keypoints import Keypoints
 from ...geometry import GeometryOptions, estimate_geometry
 from ..baselines.method import LocalFeature
 from ..metrics.homography import (
     CORNER_THRESHOLDS_PX,
     MATCH_THRESHOLDS_PX,
-    Sizes,
     accuracy_at,
     area_under_curve,
     corner_error,
@@ -108,9 +108,6 @@ def pair_row(
     images = (pair.first, pair.second)
     (first, detected), (second, _) = (run.keypoints(feature, image) for image in images)
     sizes = first.image_size, second.image_size
-    # Each position once: another orientation of SIFT's is not another place.
-    places = [first.distinct(), second.distinct()]
-    fewest = min(map(len, places))
     ratio = 1.0 if feature.learned else RATIO
     settings = MatchSettings("exact", ratio, mutual=True, budget=MATCHING_BUDGET)
     matches = run.matches(feature, images, settings)
@@ -123,15 +120,14 @@ def pair_row(
         for found in (matches, unfiltered)
     )
 
-    def corner_errors() -> dict[str, np.ndarray]:
+    def corner_errors() -> Row:
         options = GeometryOptions(inlier_threshold=INLIER_THRESHOLD_PX)
         points = matches.points0, matches.points1
         estimated = [
             estimate_geometry(*points, "homography", seed=seed, options=options).matrix
             for seed in range(SEEDS)
         ]
-        errors = [corner_error(matrix, pair.homography, sizes[0]) for matrix in estimated]
-        return {"errors": np.array(errors)}
+        return {"errors": [corner_error(each, pair.homography, sizes[0]) for each in estimated]}
 
     depends = (*feature.key, images, pair.homography, settings, (INLIER_THRESHOLD_PX, SEEDS))
     row: Row = {
@@ -141,12 +137,10 @@ def pair_row(
         **{("accuracy", px): without_ratio["precision", px] for px in MATCH_THRESHOLDS_PX},
         "corner errors": run.cached("corner_errors", depends, corner_errors)["errors"].tolist(),
     }
-    for budget in {*budgets, MATCHING_BUDGET}:
-        row["keypoints", budget] = fewest if budget is None else min(fewest, budget)
+    # Each position once: another orientation of SIFT's is not another place.
+    places = [first.distinct(), second.distinct()]
     for budget in budgets:
-        xy = [(each if budget is None else each.best(budget)).xy for each in places]
-        row |= _repeatability(run, feature, pair, sizes, xy, budget)
-        row["coverage", budget] = coverage(xy[0], sizes[0])
+        row |= _at_budget(run, feature, pair, places, budget)
     return row | stage_costs(feature, detected, matches)
 
 
@@ -162,26 +156,31 @@ def stage_costs(feature: LocalFeature, detected: Profile, matches: PairMatches) 
     return row | ({"seconds": None, ("seconds", "detect"): None} if feature.chance else {})
 
 
-def _repeatability(
+def _at_budget(
     run: Run,
     feature: LocalFeature,
     pair: PlanarPair,
-    sizes: Sizes,
-    xy: Sequence[np.ndarray],
+    places: Sequence[Keypoints],
     budget: int | None,
 ) -> Row:
-    def make() -> dict[str, np.ndarray]:
-        found = mutual_nn_repeatability(xy[0], xy[1], pair.homography, sizes, RADII_PX)
-        return {"rows": np.array(found)}
+    """Measure repeatability and coverage of the best keypoints of both images."""
+    first, second = (each if budget is None else each.best(budget) for each in places)
+    sizes = first.image_size, second.image_size
+
+    def make() -> Row:
+        found = mutual_nn_repeatability(first.xy, second.xy, pair.homography, sizes, RADII_PX)
+        return {"rows": found}
 
     depends = (feature.detection, (pair.first, pair.second), pair.homography, budget, RADII_PX)
     rows = run.cached("repeatability_mutual_nn", depends, make)["rows"].tolist()
-    names = ("repeated", "chance", "localization")
-    return {
-        (name, budget, radius): value
-        for radius, values in zip(RADII_PX, rows, strict=True)
-        for name, value in zip(names, values, strict=True)
+    row: Row = {
+        ("keypoints", budget): min(len(first), len(second)),
+        ("coverage", budget): coverage(first.xy, sizes[0]),
     }
+    for radius, values in zip(RADII_PX, rows, strict=True):
+        for name, value in zip(("repeated", "chance", "localization"), values, strict=True):
+            row[name, budget, radius] = value
+    return row
 
 
 def repeated(rows: Rows, budget: int | None, radius: float, name: str = "repeated") -> float | None:
