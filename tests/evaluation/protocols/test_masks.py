@@ -116,6 +116,7 @@ class Labels:
 
 
 def test_a_detector_that_knows_the_labels_has_full_marks(photo: np.ndarray) -> None:
+    photo = photo[:120, :160]
     dark = (photo * 0.15).astype(np.uint8)
     detector = Labels()
     rows = [score_at_scale(detector, [photo, dark], scale) for scale in (0.5, 2)]
@@ -163,9 +164,8 @@ def test_the_bundled_weights_hold_from_half_to_twice_the_size(
 
 def test_the_command_prints_a_row_for_each_scale(run_evaluate) -> None:
     text = run_evaluate("--scale", "0.5", "--scale", "2")
-    lines = [line.split() for line in text.splitlines()]
-    assert any(line[:2] == ["x0.5", "normal:"] for line in lines)
-    assert any(line[:2] == ["x2", "normal:"] for line in lines)
+    assert "x0.5 normal: loss" in text
+    assert "x2 normal: loss" in text
 
 
 def test_samples_without_a_mask_are_an_error(tmp_path: Path, photo: np.ndarray) -> None:
@@ -220,13 +220,13 @@ def test_bundled_weights_reach_the_bar(shared: Path) -> None:
 def test_labels_are_those_of_the_image_as_the_network_sees_it() -> None:
     from skimage import data
 
-    image = data.astronaut()[:480, :480]
+    image = data.astronaut()[:240, :240]
     truth = fuse(luma(image)).mask
-    squashed = LabelDetector(heatmap_options=HeatmapOptions(480))
+    squashed = LabelDetector(heatmap_options=HeatmapOptions(240))
     assert 0.1 < truth.mean() < 0.9
     np.testing.assert_array_equal(squashed.heatmap(image), truth)
-    wide = squashed.heatmap(cv2.resize(image, (960, 480)))
-    assert wide.shape == (480, 960)
+    wide = squashed.heatmap(cv2.resize(image, (480, 240)))
+    assert wide.shape == (240, 480)
 
 
 def test_labels_are_keypoints(photo: np.ndarray) -> None:
