@@ -39,7 +39,6 @@ class Server(http.server.ThreadingHTTPServer):
     daemon_threads = True
     content = b""
     break_after: int | None = None
-    stated: str | None = None
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), Handler)
@@ -57,13 +56,6 @@ class Handler(http.server.BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         asked = self.headers.get("Range")
         self.server.ranges.append(asked)
-        if self.path.startswith("/resolve/"):  # as a hub that keeps large files elsewhere
-            self.send_response(302)
-            self.send_header("X-Linked-Etag", f'"{self.server.stated}"')
-            self.send_header("Location", self.path.removeprefix("/resolve"))
-            self.send_header("Content-Length", "0")
-            self.end_headers()
-            return
         first = 0
         content = self.server.contents.get(self.path, self.server.content)
         if asked:
@@ -249,20 +241,6 @@ def test_a_damaged_tar_is_refused_without_a_checksum(
     with pytest.raises(DeepDetectError, match="no archive"):
         get_dataset(with_file(dataset, checksum=None), tmp_path / "tiny")
     assert not (tmp_path / "tiny").exists()
-
-
-def test_the_checksum_that_a_host_states_is_checked(
-    dataset: RemoteDataset, server: Server, tmp_path: Path
-) -> None:
-    url = server.url.replace("/train.zip", "/resolve/train.zip")
-    unknown = with_file(dataset, urls=(url,), checksum=None)
-    server.stated = hashlib.sha256(server.content).hexdigest()
-    server.break_after = 300_000
-    with pytest.raises(DeepDetectError, match="to resume"):
-        get_dataset(unknown, tmp_path / "tiny")
-    server.break_after = None
-    assert unpacked(get_dataset(unknown, tmp_path / "tiny")) == NAMES
-    assert server.ranges[-1] is not None, "it went on, and the whole was checked"
 
 
 def zipped(names: list[str]) -> bytes:

@@ -15,7 +15,6 @@ from deepdetect.labels import (
     find_label_settings,
     fuse,
 )
-from deepdetect.labels.detectors import run_detector
 
 
 def write(folder: Path, text: str) -> Path:
@@ -111,7 +110,7 @@ def test_extreme_settings_are_refused_or_work(
         except OptionError as error:
             refused = error
         if refused is None:
-            run_detector(name, image, options.parameters(name, "normal"))
+            DETECTORS[name].mask(image, **options.parameters(name, "normal"))
         else:
             assert f"{key} of {name} must" in one_line(refused)
 
@@ -123,15 +122,7 @@ def test_the_ends_of_the_ranges_work(name: str, key: str) -> None:
     for shape in ((16, 16), (16, 200)):
         image = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
         for value in (limits[0], limits[-1]):
-            assert run_detector(name, image, {key: kind(value)}).shape == shape
-
-
-def test_what_opencv_refuses_is_one_sentence(
-    gray: np.ndarray, one_line: Callable[[BaseException], str]
-) -> None:
-    with pytest.raises(OptionError) as caught:
-        run_detector("sobel", gray, {"kernel_size": 4})
-    assert "OpenCV refuses sobel(kernel_size=4)" in one_line(caught.value)
+            assert DETECTORS[name].mask(image, **{key: kind(value)}).shape == shape
 
 
 def test_those_for_geometry_mark_more_and_nothing_less(photo: np.ndarray) -> None:

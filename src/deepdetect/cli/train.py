@@ -15,7 +15,7 @@ from .._shared.provenance import provenance
 from ..batch.engines import get_engine
 from ..detector.pretrained import resolve_weights
 from ..labels import LabelOptions, find_label_settings
-from ..labels.batch import LabelReport, LabelTask, label_file
+from ..labels.fusion import LabelReport, LabelTask, label_file
 from ..training import (
     DeviceOptions,
     PointsTrainingOptions,

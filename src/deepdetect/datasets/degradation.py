@@ -42,16 +42,8 @@ class Degradation:
     version: int = 1
 
 
-def degrade(rgb: np.ndarray, degradation: Degradation, seed: int = 0) -> np.ndarray:
-    """Return a degraded copy of an image; the same one for the same image and seed.
-
-    Args:
-        rgb: (H, W, 3) uint8 sRGB.
-        degradation: one of `DEGRADATIONS`.
-        seed: of the random numbers; every image gets others.
-
-    Returns:
-        (H, W, 3) uint8 sRGB.
+def degrade(rgb: np.ndarray, degradation: Degradation) -> np.ndarray:
+    """Return a degraded copy of (H, W, 3) uint8 sRGB; the same one for the same image.
 
     Example:
         >>> white = np.full((32, 32, 3), 255, np.uint8)
@@ -59,7 +51,7 @@ def degrade(rgb: np.ndarray, degradation: Degradation, seed: int = 0) -> np.ndar
         137
     """
     own = int.from_bytes(hashlib.sha256(rgb.tobytes()).digest()[:8], "little")
-    return degradation.apply(to_linear(rgb), np.random.default_rng([seed, own]))
+    return degradation.apply(to_linear(rgb), np.random.default_rng([0, own]))
 
 
 def to_linear(rgb: np.ndarray) -> np.ndarray:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import errno
 import hashlib
-import re
 import shutil
 import tarfile
 import zipfile
@@ -46,8 +45,8 @@ class RemoteFile:
     Attributes:
         urls: its official host first, then mirrors; the next one is tried when one fails.
         size: in bytes, roughly.
-        checksum: "md5:..." or "sha256:..."; None where none is known: then the SHA-256 that the
-            host itself states is checked, if it does, and the contents of the data set.
+        checksum: "md5:..." or "sha256:..."; None where none is known: then the contents of the
+            data set are checked.
         into: in the data set, the folder that an archive is unpacked into, or the path of a
             single file.
         inside: folder of the archive whose contents are taken.
@@ -166,15 +165,13 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
         if k and file.checksum is None:
             part.unlink(missing_ok=True)  # another host may have other bytes
         try:
-            stated = _fetch(url, file, part, quiet)
-            for checksum in (file.checksum, stated):
-                if checksum is not None and not has_checksum(part, checksum):
-                    part.unlink()
-                    source = "" if checksum == file.checksum else ", which the host states"
-                    raise DeepDetectError(
-                        f"{url} does not have the checksum {checksum}{source}: it has changed or "
-                        "was damaged on the way; try again later"
-                    )
+            _fetch(url, file, part, quiet)
+            if file.checksum is not None and not has_checksum(part, file.checksum):
+                part.unlink()
+                raise DeepDetectError(
+                    f"{url} does not have the checksum {file.checksum}: it has changed or was "
+                    "damaged on the way; try again later"
+                )
             part.replace(path)
             return
         except DeepDetectError as error:
@@ -222,8 +219,8 @@ def _part(path: Path) -> Path:
     return path.with_name(f"{path.name}.part")
 
 
-def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> str | None:
-    """Append what is missing to a partial file; return the checksum that the host states."""
+def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> None:
+    """Append what is missing to a partial file."""
     import requests
 
     have = file_state(part)[0]
@@ -233,7 +230,7 @@ def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> str | None:
             if file.checksum is None:
                 part.unlink()
                 raise requests.ConnectionError("the partial file is of another file")
-            return None
+            return
         response.raise_for_status()
         if response.status_code != 206:  # the server sends all of it again
             have = 0
@@ -249,14 +246,6 @@ def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> str | None:
                 bar.update(len(chunk))
     if length and file_state(part)[0] < total:
         raise requests.ConnectionError("the connection broke off")
-    if file.checksum is None:
-        # Hugging Face's hub states that of a large file in a header of its redirection
-        # (`X-Linked-Etag` in huggingface_hub's file_download.py).
-        for answer in (*response.history, response):
-            stated = answer.headers.get("X-Linked-Etag", "").strip('"').lower()
-            if re.fullmatch("[0-9a-f]{64}", stated):
-                return f"sha256:{stated}"
-    return None
 
 
 def _check(dataset: RemoteDataset, folder: Path, subject: str) -> None:

@@ -42,7 +42,6 @@ FREE_LICENCES = ("CC0", "CC BY", "CC BY-SA", "Unsplash")
 RESTRICTED = re.compile(r"\b(n[cd]|non-?commercial|no-?deriv\w*)\b", re.IGNORECASE)
 """What a licence says that begins as a free one and is not."""
 
-LIST_FILE = "photographs.csv.gz"
 LICENCES_FILE = "licences.csv"
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 SOURCES_FOLDER = "sources"
@@ -110,7 +109,7 @@ class Crop:
 @cache
 def listed_crops() -> tuple[Crop, ...]:
     """Return all crops, those of a picture one after the other."""
-    file = resources.files(__package__).joinpath(f"known/{LIST_FILE}")
+    file = resources.files(__package__).joinpath("known/photographs.csv.gz")
     text = gzip.decompress(file.read_bytes()).decode()
     return tuple(
         Crop(*row[:4], *(int(number) for number in row[4:]))  # type: ignore[arg-type]

@@ -254,19 +254,6 @@ DETECTORS: dict[str, LabelDetector] = {
 DETECTOR_NAMES: tuple[str, ...] = tuple(DETECTORS)
 
 
-def run_detector(name: str, gray: np.ndarray, settings: Mapping[str, Value]) -> np.ndarray:
-    """Return what a detector marks; an OptionError where OpenCV refuses settings for this image."""
-    try:
-        return DETECTORS[name].mask(gray, **settings)
-    except (cv2.error, ValueError, OverflowError) as error:
-        reason = (str(error).strip().splitlines() or ["no reason given"])[-1]
-        size = f"{gray.shape[1]}x{gray.shape[0]}"
-        values = ", ".join(f"{key}={value}" for key, value in settings.items())
-        raise OptionError(
-            f"OpenCV refuses {name}({values}) for an image of {size} pixels ({reason}): change them"
-        ) from None
-
-
 def select_detectors(names: Iterable[str]) -> tuple[str, ...]:
     """Check names of detectors, and put them into the order of the table.
 

@@ -1,18 +1,26 @@
-"""Keypoint-edge fusion: the pixelwise OR of the label detectors (paper, Section III-A)."""
+"""Keypoint-edge fusion: the pixelwise OR of the label detectors (paper, Section III-A).
+
+Of images, and of files, whose labels are 1-bit PNG masks.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .._shared.errors import DeepDetectError, MissingExtraError
 from .._shared.image_array import Channels, check_channels
 from .._shared.options import suggest_keywords
+from .._shared.records import Outputs
 from ..io.image import load_image, luma
-from ..viz.draw import draw_masks
-from .detectors import DETECTORS, run_detector
+from ..io.masks import save_mask
+from ..viz.draw import draw_masks, save_picture
+from .detectors import DETECTORS
 from .settings import LabelOptions, Visibility
 
 LOW_VISIBILITY_RANGE = 64
@@ -88,7 +96,6 @@ def fuse(
 
     Raises:
         ImageError: the image cannot be read or is not fit.
-        OptionError: OpenCV refuses the settings of a detector for this image.
 
     Example:
         >>> square = np.zeros((32, 32), np.uint8)
@@ -104,7 +111,7 @@ def fuse(
     marked = {"keypoint": np.zeros(gray.shape, bool), "edge": np.zeros(gray.shape, bool)}
     for name in options.detectors:
         settings = options.parameters(name, visibility)
-        marked[DETECTORS[name].kind] |= run_detector(name, gray, settings)
+        marked[DETECTORS[name].kind] |= DETECTORS[name].mask(gray, **settings)
     return Label(marked["keypoint"], marked["edge"], visibility)
 
 
@@ -124,3 +131,47 @@ def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
     """
     masks = {"keypoints": label.keypoints, "edges": label.edges, "combined": label.mask}
     return draw_masks(rgb, masks, f"image ({label.visibility} visibility settings)")
+
+
+@dataclass(frozen=True)
+class LabelTask:
+    """A mask to be made from an image file; `figure` is the paper's Figure 4 of this label."""
+
+    image: Path
+    mask: Path
+    options: LabelOptions
+    figure: Path | None = None
+    overwrite: bool = False
+
+    @property
+    def outputs(self) -> Outputs:
+        """The files, and the records of what they were made from."""
+        paths = [self.mask] if self.figure is None else [self.mask, self.figure]
+        return Outputs(paths, [self.image], {"label": self.options}, self.overwrite)
+
+
+@dataclass(frozen=True)
+class LabelReport:
+    """The result for one mask: its settings and the marked fraction, or an error."""
+
+    image: Path
+    mask: Path
+    visibility: str | None = None
+    density: float = math.nan
+    error: str | None = None
+
+
+def label_file(task: LabelTask) -> LabelReport:
+    """Make the mask of an image file; what is wrong with the image is reported."""
+    try:
+        rgb = load_image(task.image)
+        label = fuse(luma(rgb), task.options)
+    except MissingExtraError:  # concerns all images
+        raise
+    except DeepDetectError as error:
+        return LabelReport(task.image, task.mask, error=str(error))
+    with task.outputs.writing():
+        if task.figure is not None:
+            save_picture(draw_label(rgb, label), task.figure)
+        save_mask(label.mask, task.mask)
+    return LabelReport(task.image, task.mask, label.visibility, label.density)

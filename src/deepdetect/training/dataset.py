@@ -43,6 +43,8 @@ class FolderSource:
     `memory_bytes` of views are kept in memory; those beyond are rendered each time.
     """
 
+    shard_sizes = None
+
     def __init__(
         self,
         images: Sequence[SourceImage],
@@ -218,12 +220,11 @@ class ValidationDataset(Dataset[tuple[Tensor, Tensor]]):
 
 @dataclass(frozen=True)
 class TrainingData:
-    """The images of a run, a digest of them, and the number of images in each shard."""
+    """The images of a run, and a digest of them."""
 
     training: ImageSource
     validation: ImageSource
     digest: str
-    shard_sizes: tuple[int, ...] | None = None
 
 
 def prepare_data(
@@ -267,7 +268,6 @@ def prepare_data(
         ShardSource(shards.training, options),
         ShardSource(shards.validation, options) if validation is None else held,
         key(names, digests)[:16],
-        tuple(count for _, count in shards.training),
     )
 
 

@@ -198,7 +198,7 @@ class DenseTrainer(Trainer):
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
         """Return the loader of the batches of some steps: (images, masks), see `CropDataset`."""
         rank, world = self.fabric.global_rank, self.fabric.world_size
-        steps = self.schedule, self.data.shard_sizes, first, last
+        steps = self.schedule, self.data.training.shard_sizes, first, last
         sampler = CropSampler(*steps, rank=rank, world_size=world)
         return self._loader(CropDataset(self.data.training, self.options), batch_sampler=sampler)
 

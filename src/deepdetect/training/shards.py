@@ -79,7 +79,8 @@ class ShardSource:
 
     def __init__(self, files: Files, options: TrainingOptions) -> None:
         self.files, self.options = files, options
-        self.ends = list(itertools.accumulate(count for _, count in files))
+        self.shard_sizes = tuple(count for _, count in files)
+        self.ends = list(itertools.accumulate(self.shard_sizes))
 
     def __len__(self) -> int:
         return self.ends[-1] if self.ends else 0

@@ -17,13 +17,14 @@ from torch.nn.utils import clip_grad_norm_
 from torch.optim import Optimizer
 from torch.utils.data import DataLoader
 
+from .._shared.atomic import atomic_path
 from .._shared.errors import OptionError
 from .._shared.progress import progress
 from .._shared.provenance import provenance
-from .._shared.records import check_same, plain
+from .._shared.records import check_same, file_digest, plain
+from ..evaluation.report import Table
 from .checkpoint import Point, read_checkpoint, restore, save_checkpoint
 from .dataset import loading
-from .model_card import save_curves, write_model_card
 
 CHECKPOINT = "checkpoint.safetensors"
 CARD = "MODEL_CARD.md"
@@ -201,8 +202,7 @@ class Trainer(abc.ABC):
         onnx = None
         if self.is_main:
             onnx = self.export(folder)
-            notes = self.read_notes(weights)
-            write_model_card(folder / CARD, weights, *self.card(best), notes, state.points)
+            self._write_card(folder, state.points, best)
         return TrainingResult(weights, onnx, state.points, best, speed)
 
     def _best(self, state: TrainingState) -> Point:
@@ -245,3 +245,64 @@ class Trainer(abc.ABC):
     def _all_notes(self) -> dict[str, Any]:
         recipe = json.dumps(dataclasses.asdict(self.options), sort_keys=True)
         return {"options": recipe, **self.origin, **self.notes, **provenance()}
+
+    def _write_card(self, folder: Path, points: Sequence[Point], best: Point) -> None:
+        """Write the model card, in Markdown: quality, origin and recipe of the best weights."""
+        weights = folder / self.weights_file
+        notes, (network, quality) = self.read_notes(weights), self.card(best)
+        known = ("command", "options", "point")
+        options = json.loads(notes["options"])
+        recipe = [{"option": name, "value": json.dumps(value)} for name, value in options.items()]
+        lines = [
+            "# Model card",
+            "",
+            f"`{weights.name}`, SHA-256 `{file_digest(weights)}`:",
+            network,
+            "",
+            "## How good the weights are",
+            "",
+            *quality,
+            "",
+            "## Where they come from",
+            "",
+            "```sh",
+            notes["command"],
+            "```",
+            "",
+            *(f"- {name.replace('_', ' ')}: {notes[name]}" for name in notes if name not in known),
+            "",
+            "## Recipe",
+            "",
+            Table("recipe", "", {"option": "", "value": ""}, recipe).to_markdown(),
+            "",
+            "## Curves",
+            "",
+            _curves(points).to_markdown(),
+            "",
+        ]
+        with atomic_path(folder / CARD) as temporary:
+            temporary.write_text("\n".join(lines), encoding="utf-8")
+
+
+def save_curves(points: Sequence[Point], folder: Path) -> None:
+    """Write curves.csv, and curves.png (paper, Figure 5)."""
+    with atomic_path(folder / "curves.csv") as temporary:
+        temporary.write_text(_curves(points).to_csv(), newline="")
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
+    steps = [point["step"] for point in points]
+    for name in points[0]:
+        if name.endswith(("loss", "score", "correct")):
+            axes.plot(steps, [point[name] for point in points], label=name.replace("_", " "))
+    axes.set_xlabel("step")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=7)
+    with atomic_path(folder / "curves.png") as temporary:
+        figure.savefig(temporary, dpi=120)
+
+
+def _curves(points: Sequence[Point]) -> Table:
+    styles = {name: "d" if isinstance(value, int) else ".6g" for name, value in points[0].items()}
+    return Table("curves", "", styles, points)

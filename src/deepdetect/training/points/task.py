@@ -19,9 +19,9 @@ from ..._shared.atomic import atomic_path
 from ..._shared.records import key
 from ...detector.points.detection import detect_points
 from ...detector.points.ranker import MAX_DEVIATIONS, Ranker, load_ranker, notes_of
+from ...evaluation.report import Table
 from ...io.image import find_images
 from ..checkpoint import Point
-from ..model_card import table
 from ..recipe import PointsTrainingOptions
 from ..sampler import milestones
 from ..trainer import Trainer
@@ -192,13 +192,14 @@ class RankerTrainer(Trainer):
             f"a perceptron of {count:,} parameters that ranks maxima of |det Hessian| in a scale\n"
             "space by how surely they are found again."
         )
-        rows = [[kind, *(f"{best[f'{kind} {m}']:.3f}" for m in MEASURES)] for kind in KINDS]
+        columns = {"pairs": "", **dict.fromkeys(MEASURES, ".3f")}
+        rows = [{"pairs": kind, **{m: best[f"{kind} {m}"] for m in MEASURES}} for kind in KINDS]
         return network, [
             "On synthetic pairs of views of the validation images, by whose score this step was",
             "chosen: one-to-one repeatability by number of keypoints (of an image of 800x640), and",
             "matches correct to 1 px over the number of keypoints.",
             "",
-            *table(["pairs", *MEASURES], rows),
+            Table("measures", "", columns, rows).to_markdown(),
             "",
             f"Score {best['score']:.4f} at step {best['step']:,}.",
         ]

@@ -11,7 +11,7 @@ from deepdetect import OptionError
 from deepdetect.io.image import luma
 from deepdetect.io.masks import load_mask
 from deepdetect.labels import LabelOptions, fuse
-from deepdetect.labels.batch import LabelTask, label_file
+from deepdetect.labels.fusion import LabelTask, label_file
 
 FAST = LabelOptions(("fast",), "normal")
 SOBEL = LabelOptions(("sobel",), "normal")
