@@ -11,7 +11,7 @@ from numbers import Real
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from .errors import OptionError, check_name, unknown_name
+from .errors import OptionError, check_name
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -104,21 +104,6 @@ def look_up(kind: str, name: str, registry: Mapping[str, Entry]) -> Entry:
     """
     check_name(kind, name, registry)
     return registry[name]
-
-
-def resolve_name_or_path(
-    kind: str, value: str | Path, registry: Mapping[str, Entry]
-) -> Entry | Path:
-    """Return the path that was given, or the entry of a registry whose name was given.
-
-    Raises:
-        OptionError: it is neither a path nor a known name (the nearest right one is named).
-    """
-    if is_path(value):
-        return Path(value)
-    if value not in registry:
-        raise unknown_name(kind, value, (*registry, "or the path of a file"))
-    return registry[str(value)]
 
 
 def is_path(value: str | Path) -> bool:

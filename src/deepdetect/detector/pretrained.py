@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .._shared.options import look_up, resolve_name_or_path
+from .._shared.options import is_path, look_up
 
 FOLDER = Path(__file__).parent / "weights"
 
@@ -24,10 +24,9 @@ def pretrained_weights(name: str = "default", suffix: str = ".onnx") -> Path:
 
     An OptionError names the nearest name that is known.
     """
-    return (FOLDER / look_up("weights", name, PRETRAINED)).with_suffix(suffix)
+    return (FOLDER / look_up("name or file of weights", name, PRETRAINED)).with_suffix(suffix)
 
 
 def resolve_weights(weights: str | Path, suffix: str = ".onnx") -> Path:
     """Return the path of weights that are named in `PRETRAINED`, or are a file."""
-    found = resolve_name_or_path("weights", weights, PRETRAINED)
-    return found if isinstance(found, Path) else pretrained_weights(str(weights), suffix)
+    return Path(weights) if is_path(weights) else pretrained_weights(str(weights), suffix)

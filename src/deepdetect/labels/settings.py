@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._shared.errors import OptionError, check_name, unknown_name
-from .._shared.options import resolve_name_or_path, suggest_keywords
+from .._shared.options import is_path, look_up, suggest_keywords
 from .detectors import DETECTOR_NAMES, DETECTORS, Value, select_detectors
 
 Visibility = Literal["normal", "low"]
@@ -140,11 +140,11 @@ def find_label_settings(settings: str | Path) -> LabelOptions:
         >>> find_label_settings("dense").settings
         {'sobel': {'normal': {'relative_threshold': 0.02}}}
     """
-    path = resolve_name_or_path("label settings", settings, LABEL_SETTINGS)
-    if isinstance(path, LabelOptions):
-        return path
+    if not is_path(settings):
+        return look_up("name or file of label settings", str(settings), LABEL_SETTINGS)
+    path = Path(settings)
     try:
-        content = tomllib.loads(Path(path).read_text("utf-8-sig"))
+        content = tomllib.loads(path.read_text("utf-8-sig"))
     except OSError as error:
         raise OptionError(f"{path} cannot be read ({error.strerror}): check the path") from None
     except (ValueError, RecursionError) as error:
