@@ -207,13 +207,12 @@ def match_images(
         points = points[0], keypoints1.xy[matched.indices1]
     else:  # the end in the second image is where the pixel of the first one is seen
         points = np.rint(points[0]), points[1]
-    points0, points1 = _ordered(points, swapped)
+    points = _ordered(points, swapped)
     indices0, indices1 = _ordered((matched.indices0, matched.indices1), swapped)
     with timer.stage("geometry"):
-        geometry = _final_geometry(points0, points1, model, seed, options.geometry, guide)
+        geometry = _final_geometry(points, model, seed, options.geometry, guide)
     return Matches(
-        points0,
-        points1,
+        *points,
         matched.scores,
         geometry.inliers,
         geometry.model,
@@ -388,16 +387,11 @@ def _key(gray: np.ndarray) -> tuple[tuple[int, ...], bytes]:
 
 
 def _final_geometry(
-    points0: np.ndarray,
-    points1: np.ndarray,
-    model: str,
-    seed: int,
-    options: GeometryOptions,
-    guide: TwoViewGeometry,
+    points: Points, model: str, seed: int, options: GeometryOptions, guide: TwoViewGeometry
 ) -> Geometry:
     """Return the geometry that guided where that is asked for, else estimate one."""
     if options.homography is None and guide.matrix is not None and model in ("auto", guide.model):
         errors_of = transfer_errors if guide.model == "homography" else epipolar_errors
-        errors = errors_of(points0, points1, guide.matrix)
+        errors = errors_of(*points, guide.matrix)
         return Geometry(guide.model, guide.matrix, errors < options.inlier_threshold)
-    return estimate_geometry(points0, points1, model, seed=seed, options=options)
+    return estimate_geometry(*points, model, seed=seed, options=options)

@@ -56,7 +56,7 @@ def test_costs_are_sums_of_distances() -> None:
                 distance[y, x, d] = int(left[y, x] ^ right[y, there]).bit_count()
         framed = np.pad(distance, ((1, 1), (1, 1), (0, 0)), mode="edge")
         sums = sum(framed[j : j + 9, i : i + 14] for j in range(3) for i in range(3))
-        np.testing.assert_array_equal(matching_cost(left, right, smallest, count), sums // 4)
+        np.testing.assert_array_equal(matching_cost((left, right), smallest, count), sums // 4)
 
 
 def test_flat_windows_have_no_texture() -> None:
@@ -72,9 +72,9 @@ def test_the_paths_are_those_of_the_definition() -> None:
     generator = np.random.default_rng(0)
     gray = generator.integers(0, 256, (9, 14), np.uint8)
     left, right = (generator.integers(0, 2**62, gray.shape, np.uint64) for _ in range(2))
-    total = module.aggregate(gray, left, right, -3, 16)
+    total = module.aggregate(gray, (left, right), -3, 16, module.WRONG_PLACE_BITS)
     height, width = gray.shape
-    cost = matching_cost(left, right, -3, 16).astype(int)
+    cost = matching_cost((left, right), -3, 16).astype(int)
     expected = np.zeros_like(cost)
     for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
         path = np.zeros_like(cost)
@@ -148,8 +148,8 @@ def test_matches_of_noisy_views_are_more_distant(motorcycle) -> None:
             census(np.clip(view + generator.normal(0, noise, view.shape), 0, 255).astype(np.uint8))
             for view in (left, right)
         ]
-        found = match_distance(*words, (0, 63))
-        cost = matching_cost(*words, 0, 64) / module.COST_PER_BIT
+        found = match_distance(words, (0, 63))
+        cost = matching_cost(words, 0, 64) / module.COST_PER_BIT
         true = cost[row, column, np.rint(truth[row, column]).astype(int)]
         # The matches that are found are the clearer half of the true ones.
         assert np.quantile(true, 0.1) < found < np.quantile(true, 0.6)

@@ -256,8 +256,7 @@ def guiding_geometry(
             if len(geometry.points0) >= MIN_COARSE_INLIERS:
                 return replace(geometry, source=source)
     elif not (source is None or isinstance(source, TentativeMatches)):
-        sizes = grays[0].shape[::-1], grays[1].shape[::-1]
-        return replace(_geometry_of_positions(source, sizes, model, seed), source=source)
+        return replace(_geometry_of_positions(grays, source, model, seed), source=source)
     longest = max(max(gray.shape) for gray in grays)
     if tentative is None and longest > COARSE_SIDE_PX and model != "fundamental":
         coarse = find_tentative_matches(
@@ -293,7 +292,7 @@ def _is_clear(geometry: InitialGeometry) -> bool:
     return geometry.matrix is not None and most and (depth or not doubtful)
 
 
-def _geometry_of_positions(points: Pair, sizes: Sizes, model: str, seed: int) -> InitialGeometry:
+def _geometry_of_positions(grays: Pair, points: Pair, model: str, seed: int) -> InitialGeometry:
     """Estimate the geometry from sparse matches of another matcher, some of them wrong.
 
     Raises:
@@ -310,10 +309,10 @@ def _geometry_of_positions(points: Pair, sizes: Sizes, model: str, seed: int) ->
     if not (np.isfinite(points0).all() and np.isfinite(points1).all()):
         raise OptionError("tentative matches must be finite positions: leave out the others")
     # The thresholds hold for images of this size.
-    scale0, scale1 = (min(1.0, MAX_SIDE_PX / max(size)) for size in sizes)
+    scale0, scale1 = (min(1.0, MAX_SIDE_PX / max(gray.shape)) for gray in grays)
     size0, size1 = (
-        (round(size[0] * scale), round(size[1] * scale))
-        for size, scale in zip(sizes, (scale0, scale1), strict=True)
+        (round(gray.shape[1] * scale), round(gray.shape[0] * scale))
+        for gray, scale in zip(grays, (scale0, scale1), strict=True)
     )
     scaled0, scaled1 = _separate(scaled_points(points0, scale0), scaled_points(points1, scale1))
     chosen = choose_model(scaled0, scaled1, (size0, size1), model, seed)

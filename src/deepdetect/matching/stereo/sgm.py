@@ -83,6 +83,8 @@ stays."""
 UNKNOWN = np.float32(1e9)
 """An unknown disparity, so far from any other that it is never on the same surface."""
 
+Pair = tuple[np.ndarray, np.ndarray]
+
 DisparityRange = tuple[int, int]
 """The smallest and the largest disparity tried, in whole pixels: the match of a left (x, y) is
 searched from the right x - largest to x - smallest."""
@@ -110,7 +112,7 @@ def semi_global_matching(
     height, width = left.shape
     count = -(-(disparities[1] - disparities[0] + 1) // LANES) * LANES
     censuses = census(left), census(right)
-    match = match_distance(*censuses, disparities)
+    match = match_distance(censuses, disparities)
     outside = round(match + OUTSIDE_COST * (WRONG_PLACE_BITS - match))
     rows = max(VOLUME_BYTES // (3 * width * count) - 2 * BAND_OVERLAP_PX, BAND_OVERLAP_PX)
     if height <= rows + 2 * BAND_OVERLAP_PX:
@@ -120,8 +122,8 @@ def semi_global_matching(
         bottom = min(top + rows, height)
         first = max(top - BAND_OVERLAP_PX, 0)
         band = slice(first, min(bottom + BAND_OVERLAP_PX, height))
-        bands = left[band], censuses[0][band], censuses[1][band]
-        total = aggregate(*bands, disparities[0], count, outside)
+        in_band = censuses[0][band], censuses[1][band]
+        total = aggregate(left[band], in_band, disparities[0], count, outside)
         parts.append(_least_costs(total[top - first : bottom - first], disparities))
     return SGMResult(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
@@ -149,11 +151,7 @@ def census(gray: np.ndarray) -> np.ndarray:
 
 
 def matching_cost(
-    left: np.ndarray,
-    right: np.ndarray,
-    min_disparity: int,
-    count: int,
-    outside: int = WRONG_PLACE_BITS,
+    censuses: Pair, min_disparity: int, count: int, outside: int = WRONG_PLACE_BITS
 ) -> np.ndarray:
     """Return the cost of so many disparities of each pixel of two censuses, (H, W, count) uint8.
 
@@ -162,6 +160,7 @@ def matching_cost(
     """
     from .kernels import cost_rows
 
+    left, right = censuses
     cost = np.empty((*left.shape, count), np.uint8)
     # Mirrored, growing disparities lie at growing addresses.
     mirrored = np.ascontiguousarray(right[:, ::-1])
@@ -178,17 +177,18 @@ def is_textured(gray: np.ndarray) -> np.ndarray:
     return cv2.dilate(gray, window) > cv2.erode(gray, window)
 
 
-def match_distance(left: np.ndarray, right: np.ndarray, disparities: DisparityRange) -> float:
+def match_distance(censuses: Pair, disparities: DisparityRange) -> float:
     """Return the median distance in bits of a pair's matches, from the censuses of some rows.
 
     Matches are what both views find nearest without any path. Noise makes them more distant.
     """
-    height = len(left)
+    height = len(censuses[0])
     centres = np.arange(min(SAMPLED_ROW_STEP // 2, height // 2), height, SAMPLED_ROW_STEP)
     # Costs are sums over three rows. Places outside are the most distant.
     rows = np.clip(centres[:, None] + [-1, 0, 1], 0, height - 1).ravel()
     tried = disparities[0], disparities[1] - disparities[0] + 1
-    cost = matching_cost(left[rows], right[rows], *tried, CENSUS_BITS)[1::3]
+    sampled = censuses[0][rows], censuses[1][rows]
+    cost = matching_cost(sampled, *tried, CENSUS_BITS)[1::3]
     found = _least_costs(cost.astype(np.uint16), disparities)
     distances = cost.min(axis=2)[found.consistent & (found.uniqueness_ratio > 1)] / COST_PER_BIT
     return (
@@ -197,18 +197,13 @@ def match_distance(left: np.ndarray, right: np.ndarray, disparities: DisparityRa
 
 
 def aggregate(
-    gray: np.ndarray,
-    left: np.ndarray,
-    right: np.ndarray,
-    min_disparity: int,
-    count: int,
-    outside: int = WRONG_PLACE_BITS,
+    gray: np.ndarray, censuses: Pair, min_disparity: int, count: int, outside: int
 ) -> np.ndarray:
     """Return the (H, W, D) uint16 costs of a pair's censuses, summed over the eight paths."""
     from .kernels import sum_along_paths
 
     height, width = gray.shape
-    cost = matching_cost(left, right, min_disparity, count, outside)
+    cost = matching_cost(censuses, min_disparity, count, outside)
     total = np.zeros(cost.shape, np.uint16)
     p2 = np.maximum(P2_BITS / (1 + np.arange(256) / P2_HALF_GRADIENT_LEVELS), MIN_P2_BITS)
     penalties = np.uint16(P1_BITS * COST_PER_BIT), (p2 * COST_PER_BIT).astype(np.uint16)

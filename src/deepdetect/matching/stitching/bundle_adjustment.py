@@ -32,6 +32,9 @@ FOCAL_WEIGHT = 1e-4
 Matrices = Mapping[int, np.ndarray]
 """By the number of the image."""
 
+Sizes = Mapping[int, tuple[int, int]]
+"""(width, height) of the images, by number."""
+
 Links = list[tuple[int, int, np.ndarray, np.ndarray]]
 """Numbers of two images, and (M, 2) points of both that are the same, in units."""
 
@@ -67,8 +70,12 @@ class RotatingCamera:
         return np.array([[self.focal_px, 0, x], [0, self.focal_px, y], [0, 0, 1]])
 
 
+Cameras = Mapping[int, RotatingCamera]
+"""By the number of the image."""
+
+
 def adjust_homographies(
-    homographies: Matrices, pairs: Sequence[RegisteredPair], sizes: Mapping[int, tuple[int, int]]
+    homographies: Matrices, pairs: Sequence[RegisteredPair], sizes: Sizes
 ) -> tuple[dict[int, np.ndarray], float]:
     """Fit all homographies but the first, which stays, to all pairs at once.
 
@@ -95,7 +102,7 @@ def adjust_homographies(
 
 
 def adjust_cameras(
-    homographies: Matrices, pairs: Sequence[RegisteredPair], sizes: Mapping[int, tuple[int, int]]
+    homographies: Matrices, pairs: Sequence[RegisteredPair], sizes: Sizes
 ) -> tuple[dict[int, RotatingCamera], float]:
     """Fit rotations and focal lengths of all cameras; else as `adjust_homographies`."""
     _, to_first, links = _in_units(homographies, pairs, sizes)
@@ -122,9 +129,7 @@ def adjust_cameras(
     return cameras, _residual_px(current, links)
 
 
-def level_cameras(
-    cameras: Mapping[int, RotatingCamera], reference: int
-) -> dict[int, RotatingCamera]:
+def level_cameras(cameras: Cameras, reference: int) -> dict[int, RotatingCamera]:
     """Turn all cameras together, so that the horizon is level and the reference in the middle.
 
     The horizon is what the rows of all images are parallel to (Brown and Lowe, "Automatic panoramic
@@ -143,7 +148,7 @@ def level_cameras(
 
 
 def _in_units(
-    homographies: Matrices, pairs: Sequence[RegisteredPair], sizes: Mapping[int, tuple[int, int]]
+    homographies: Matrices, pairs: Sequence[RegisteredPair], sizes: Sizes
 ) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], Links]:
     """Return the maps of pixels to units, 0 in the middle; and homographies and links in units."""
     to_unit = {}

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Literal
 
 import numpy as np
 
@@ -19,13 +18,10 @@ from ..._shared.machine import require_memory
 from ..._shared.opencv import cv2
 from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography, transform_points
-from .bundle_adjustment import Matrices, RotatingCamera
+from .bundle_adjustment import Cameras, Matrices, Sizes
 
 Box = tuple[int, int, int, int]
 """Left, top, right and bottom in pixels, right and bottom outside."""
-
-Sizes = Mapping[int, tuple[int, int]]
-"""(width, height) of the images, by number."""
 
 MAX_DEPTH_RATIO = 5.0
 """How many times farther from the camera one corner of an image may lie on a flat canvas than
@@ -160,11 +156,7 @@ def plan_plane(
 
 
 def plan_curved(
-    projection: Literal["cylindrical", "spherical"],
-    sizes: Sizes,
-    cameras: Mapping[int, RotatingCamera],
-    reference: int,
-    scale: float,
+    projection: str, sizes: Sizes, cameras: Cameras, reference: int, scale: float
 ) -> Canvas:
     """Find the smallest canvas of all images on a cylinder or a sphere.
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -54,17 +55,12 @@ class Registration:
     unregistered: dict[int, str]
 
 
-@dataclass(frozen=True, eq=False)
-class _Image:
+class _Image(NamedTuple):
     """An image with its sparse, described keypoints, and the (N, 2) dense ones."""
 
     gray: np.ndarray
     features: Keypoints
     keypoints: np.ndarray
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self.gray.shape[1], self.gray.shape[0]
 
 
 def register_images(
@@ -106,7 +102,7 @@ def register_images(
     }
     pairs = [pair for pair in pairs if pair.first in group]
     start = _compose(group, pairs)
-    sizes = {number: views[number].size for number in group}
+    sizes = {number: views[number].gray.shape[::-1] for number in group}
     homographies, residual_px = adjust_homographies(start, pairs, sizes)
     cameras = None
     if turning:
@@ -149,10 +145,11 @@ def _registered_pairs(views: Sequence[_Image], seed: int) -> list[RegisteredPair
         a, b = views[first], views[second]
         keypoints = a.keypoints, b.keypoints
         guide, matches = guided_matches((a.gray, b.gray), keypoints, geometry, seed)
-        if guide.matrix is not None and matches is not None and len(matches):
+        if guide.matrix is not None and matches is not None:
             points = a.keypoints[matches.indices0]
-            spread = np.argsort(bayer_order(points, a.size), kind="stable")[:MAX_CORRESPONDENCES]
-            pairs.append(RegisteredPair(first, second, guide.matrix, points[spread], len(points)))
+            order = np.argsort(bayer_order(points, a.gray.shape[::-1]), kind="stable")
+            spread = points[order[:MAX_CORRESPONDENCES]]
+            pairs.append(RegisteredPair(first, second, guide.matrix, spread, len(points)))
             partners[first] += 1
             partners[second] += 1
     return pairs
