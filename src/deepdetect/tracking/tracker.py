@@ -67,13 +67,10 @@ class TrackingOptions:
     def __post_init__(self) -> None:
         check_ranges(
             self,
-            positive=("max_keypoints", "detect_every"),
+            counts=("max_keypoints", "detect_every"),
             not_negative=("max_return_error_px",),
             fractions=("min_kept",),
         )
-        for name in ("max_keypoints", "detect_every"):
-            if getattr(self, name) % 1:
-                raise OptionError(f"`{name}` must be a whole number, not {getattr(self, name)}")
 
 
 class Tracker:

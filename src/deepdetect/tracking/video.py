@@ -21,7 +21,7 @@ from .._shared.errors import (
     OptionError,
 )
 from .._shared.opencv import cv2
-from .._shared.options import suggest_keywords
+from .._shared.options import check_ranges, suggest_keywords
 from ..io.image import IMAGE_SUFFIXES, find_images, load_image
 
 FOLDER_FPS = 10.0
@@ -77,10 +77,8 @@ class FrameSource(AbstractContextManager["FrameSource"]):
     def __init__(
         self, source: str | Path | int, *, every: int = 1, max_frames: int | None = None
     ) -> None:
-        for name, value in (("every", every), ("max_frames", max_frames)):
-            if value is not None and (value < 1 or value % 1):
-                raise OptionError(f"`{name}` must be a whole number from 1 on, not {value}")
         self.every, self.max_frames = every, max_frames
+        check_ranges(self, counts=("every", "max_frames"))
         self.camera = _camera_number(source)
         self.live = self.camera is not None
         self._capture: Any = None

@@ -277,11 +277,8 @@ def _overlap_means(first: WarpedImage, second: WarpedImage) -> tuple[float, floa
     if left >= right or top >= bottom:
         return None
     parts = [
-        (
-            slice(top - one.corner[1], bottom - one.corner[1]),
-            slice(left - one.corner[0], right - one.corner[0]),
-        )
-        for one in both
+        (slice(top - y, bottom - y), slice(left - x, right - x))
+        for x, y in (first.corner, second.corner)
     ]
     shared = (first.mask[parts[0]] > 0) & (second.mask[parts[1]] > 0)
     if np.count_nonzero(shared) < MIN_OVERLAP_PX:
