@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from .._shared.errors import OptionError
-from .._shared.progress import progress
+from .._shared.progress import stage_progress
 from .._shared.records import Outputs, check_not_made
 from ..io.point_cloud import find_writer
 from ..reconstruction.files import ENDINGS, save_reconstruction
@@ -35,9 +34,6 @@ MANY = cli.From(
 )
 WORKERS = cli.From(reconstruct_many, more="workers")
 """Options that two images do not have."""
-
-STAGES = 9
-"""Of a reconstruction of two images at most."""
 
 MAX_UNREGISTERED = 10
 """Images that are named with a reason on the terminal."""
@@ -93,16 +89,10 @@ def reconstruct(
     if "calibration" in values:
         cli.check_outputs(files.values(), [values["calibration"]])
     chosen, selection = chosen_detector(detector or "network", values, weights="dense")
-    # The bar is on a terminal only: what is logged stays readable.
     with (
         cli.writing(files, images, overwrite) as made,
-        progress(STAGES, "reconstructing", "stage", quiet=not sys.stderr.isatty()) as bar,
+        stage_progress("reconstructing") as done,
     ):
-
-        def done(stage: str) -> None:
-            bar.set_postfix_str(stage)
-            bar.update()
-
         left, right = images
         found = reconstruct_pair(left, right, chosen, selection=selection, progress=done, **values)
         title = f"{left.name} and {right.name}"
