@@ -184,13 +184,10 @@ def test_small_copies_of_large_images_decide_alone(motorcycle: Any) -> None:
     assert not with_offset.swapped
 
 
-@pytest.mark.parametrize("shift", [-2, 1])
-def test_rows_off_by_less_than_small_copies_show_are_seen_on_larger_ones(
-    shift: float, motorcycle: Any
-) -> None:
+def test_rows_off_by_less_than_small_copies_show_are_seen_on_larger_ones(motorcycle: Any) -> None:
     """Three pixels are less than one of the copies."""
     left, right = enlarged(motorcycle, 3)
-    found, initial = find_rectification(left, moved(right, [[1, 0, 0], [0, 1, shift]]))
+    found, initial = find_rectification(left, moved(right, [[1, 0, 0], [0, 1, 1]]))
     assert not found.rectified
     assert initial is not None
     assert len(initial.points0) > 500

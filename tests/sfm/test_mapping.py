@@ -129,10 +129,7 @@ def test_cameras_that_move_straight_ahead_are_mapped(attempts, tmp_path: Path) -
     """COLMAP's defaults find no pair to begin with: the second attempt does."""
     write_scenes(tmp_path / "database.db", {"ahead": (AHEAD, 5)})
     verified = verify_pairs(tmp_path / "database.db")
-    (tmp_path / "space").mkdir()
-    model, others = map_images(
-        tmp_path / "database.db", tmp_path, tmp_path / "space", verified, True
-    )
+    model, others = map_images(tmp_path / "database.db", tmp_path, verified, True)
     assert [len(models) for models in attempts] == [0, 1]
     views = read_sparse_model(model).views.values()
     assert (len(views), others) == (5, [])
@@ -148,10 +145,7 @@ def test_a_drive_beside_a_smaller_scene(attempts, ahead: int, calls: int, tmp_pa
     """A second attempt is made where more photographs are left than the first has mapped."""
     write_scenes(tmp_path / "database.db", {"ahead": (AHEAD, ahead), "aside": (ASIDE, 4)})
     verified = verify_pairs(tmp_path / "database.db")
-    (tmp_path / "space").mkdir()
-    model, others = map_images(
-        tmp_path / "database.db", tmp_path, tmp_path / "space", verified, True
-    )
+    model, others = map_images(tmp_path / "database.db", tmp_path, verified, True)
     assert len(attempts) == calls
     aside = frozenset(f"aside{number}.jpg" for number in range(4))
     names = {view.name for view in read_sparse_model(model).views.values()}

@@ -5,6 +5,7 @@ Schönberger and Frahm, "Structure-from-Motion Revisited", 2016.
 
 from __future__ import annotations
 
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -103,7 +104,6 @@ def verify_pairs(database: Path, seed: int = 0, workers: int | None = None) -> d
 def map_images(
     database: Path,
     folder: Path,
-    workspace: Path,
     verified: Iterable[Pair],
     known_cameras: bool,
     seed: int = 0,
@@ -130,16 +130,15 @@ def map_images(
             if forward:
                 how.mapper.init_max_forward_motion = 1.0
                 how.mapper.init_min_tri_angle = FORWARD_ANGLE_DEG
-            space = workspace / str(int(forward))
-            space.mkdir()
-            models = pycolmap.incremental_mapping(
-                database,
-                folder,
-                space,
-                how,
-                initial_image_pair_callback=lambda: registered(2),
-                next_image_callback=lambda: registered(1),
-            )
+            with tempfile.TemporaryDirectory(prefix="deepdetect-") as space:
+                models = pycolmap.incremental_mapping(
+                    database,
+                    folder,
+                    space,
+                    how,
+                    initial_image_pair_callback=lambda: registered(2),
+                    next_image_callback=lambda: registered(1),
+                )
             attempt = sorted(models.values(), key=_size, reverse=True)
             if not found or (attempt and _size(attempt[0]) > _size(found[0])):
                 found = attempt

@@ -245,21 +245,16 @@ class Stages:
             path.unlink()
             write_database(path, images, matches)
             verified = verify_pairs(path, self.seed, self.workers)
-        space = self.work / "mapping"
-        shutil.rmtree(space, ignore_errors=True)
-        space.mkdir()
         with progress(len(images), "mapping", "image", self.quiet) as bar:
             model, components = map_images(
                 database,
                 folder,
-                space,
                 verified,
                 known,
                 self.seed,
                 # Those of an attempt that is given up are counted again in the next.
                 lambda count: bar.update(min(count, len(images) - bar.n)),
             )
-        shutil.rmtree(space, ignore_errors=True)
         adjust(model, known)
         normalise_model(model)
         sparse.mkdir(exist_ok=True)
