@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,12 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from deepdetect._shared.errors import OptionError
-from deepdetect.features import selection
 from deepdetect.features.selection import (
     SelectionOptions,
-    grid_subsample,
     select_keypoints,
-    suppress_neighbors,
 )
 
 
@@ -206,31 +201,3 @@ def test_a_refined_keypoint_stays_with_its_pixel(heatmap: np.ndarray) -> None:
     height, width = heatmap.shape
     assert (refined.xy >= 0).all()
     assert (refined.xy <= (width - 1, height - 1)).all()
-
-
-def test_grid_subsample_takes_one_of_each_cell() -> None:
-    points = np.random.default_rng(0).uniform(0, 100, (5000, 2))
-    rows = grid_subsample(points, 10)
-    assert len(rows) == 100
-    assert len(np.unique(points[rows] // 10, axis=0)) == 100
-    assert (np.diff(rows) > 0).all()
-    np.testing.assert_array_equal(rows, grid_subsample(points, 10))
-    assert (rows != grid_subsample(points, 10, seed=1)).any()
-
-
-@pytest.mark.parametrize("least", [0, 10**9], ids=["compiled", "not compiled"])
-@pytest.mark.parametrize("seed", range(3))
-def test_of_two_radii_the_smaller_one_counts(
-    seed: int, least: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(selection, "MIN_COMPILED_POINTS", least)
-    monkeypatch.setattr(selection, "sys", SimpleNamespace(modules={}))
-    generator = np.random.default_rng(seed)
-    xy = generator.uniform(-3, 30, (300, 2))
-    scores, radii = generator.integers(20, size=300), generator.uniform(0.5, 6, 300)
-    kept: list[int] = []
-    for row in np.argsort(-scores, kind="stable"):
-        gaps = np.linalg.norm(xy[kept] - xy[row], axis=1)
-        if (gaps >= np.minimum(radii[kept], radii[row])).all():
-            kept.append(int(row))
-    assert suppress_neighbors(xy, scores, radii).tolist() == kept

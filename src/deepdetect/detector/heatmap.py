@@ -18,7 +18,8 @@ from .._shared.opencv import cv2, is_lack_of_memory
 from .._shared.options import check_ranges, suggest_keywords
 from ..features.selection import Maps, Rows, bands, sigmoid
 from .backends import Network
-from .tiling import STRIDE, fill_planes, open_tiled
+from .pretrained import STRIDE
+from .tiling import fill_planes, open_tiled
 
 MAX_AUTO_PIXELS = 2_000_000
 """Of an image that the resolution "auto" takes as it is."""

@@ -1,4 +1,4 @@
-"""The weights inside the package: one line each."""
+"""The weights inside the package, and the names of tensors in ONNX files."""
 
 from __future__ import annotations
 
@@ -17,6 +17,18 @@ PRETRAINED: dict[str, str] = {
     "free": "free",  # as default, from photographs of free licences alone
 }
 """File names without ending, by the names that users choose them by."""
+
+STRIDE = 8
+"""The network halves an image three times, so its sides must be multiples of 8."""
+
+PADDED_IMAGE = "padded_image"
+"""Name of the tensor that holds the image, padded to multiples of 8, in files that pad it."""
+
+LOGITS = "logits"
+"""Name of the output that holds logits; an output of another name holds probabilities."""
+
+KEYPOINTS, KEYPOINT_LOGITS = "keypoints", "keypoint_logits"
+"""Outputs of files that give keypoints, too: these are not read by the package."""
 
 
 def pretrained_weights(name: str = "default", suffix: str = ".onnx") -> Path:

@@ -22,9 +22,7 @@ from .._shared.machine import release_freed_memory
 from .._shared.progress import progress
 from .backends.onnx_parts import cut_onnx
 from .backends.onnxruntime_backend import start_session
-
-STRIDE = 8
-"""The network halves an image three times, so its sides must be multiples of 8."""
+from .pretrained import STRIDE
 
 BLOCKS = 9
 """Pyramids at an eighth of the size."""

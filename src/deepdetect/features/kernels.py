@@ -197,32 +197,6 @@ def nearest_of_nine(first, last, positions, xy, grid, nearest, distances):  # ty
         distances[k] = np.sqrt(least)
 
 
-@compiled(nogil=True)
-def keep_distant(x, y, radii, cell, columns, rows):  # type: ignore[no-untyped-def]
-    """Return which points, best first, have no kept point closer than the smaller of their radii.
-
-    The (N,) float64 positions are 0 or more; kept points are listed in a grid of square cells.
-    """
-    kept = np.zeros(len(x), np.bool_)
-    first = np.full((rows, columns), -1, np.int64)
-    following = np.full(len(x), -1, np.int64)
-    for k in range(len(x)):
-        row, column = int(y[k] / cell), int(x[k] / cell)
-        reach = int(np.ceil(radii[k] / cell))
-        free = True
-        for r in range(max(row - reach, 0), min(row + reach + 1, rows)):
-            for c in range(max(column - reach, 0), min(column + reach + 1, columns)):
-                other = first[r, c]
-                while other >= 0 and free:
-                    radius = min(radii[k], radii[other])
-                    free = (x[other] - x[k]) ** 2 + (y[other] - y[k]) ** 2 >= radius * radius
-                    other = following[other]
-        if free:
-            kept[k] = True
-            following[k], first[row, column] = first[row, column], k
-    return kept
-
-
 @compiled(nogil=True, inline="always")
 def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
     """Return the squared Euclidean distance; all in 32 bits, for speed."""

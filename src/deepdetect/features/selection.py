@@ -1,8 +1,7 @@
-"""Selection of keypoints: from heat maps, and from sets of positions."""
+"""Selection of keypoints from heat maps."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
@@ -12,10 +11,6 @@ from .._shared.errors import OptionError
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .keypoints import Keypoints, bayer_order
-
-GRID_CELLS = 24
-"""Along the longer side of the image; each cell gives its strongest keypoints in turn, so that all
-parts of the image have some."""
 
 MAX_OFFSET_PX = 0.499
 """The nearest pixel of a refined keypoint is still the one that it was found at."""
@@ -179,7 +174,7 @@ def select_from_maps(
         if options.subpixel:
             row, column = np.divmod(pixels, width)
             for k, axis in ((0, 1), (1, 0)):
-                xy[part, k] = _peak_offset(ranking, row + rows.start, column, axis)
+                xy[part, k] = peak_offset(ranking, row + rows.start, column, axis)
     del ranking
     heatmap = maps.heatmap()
     for rows, part in parts:
@@ -310,10 +305,10 @@ def _is_highest(
     return kept
 
 
-def _peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis: int) -> np.ndarray:
-    """Return the offset of the maximum of a parabola through pixels and their neighbours.
+def peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis: int) -> np.ndarray:
+    """Return the offset of the maximum of a parabola through pixels of a map and their neighbours.
 
-    It is 0 on the image's border, and where a pixel is not a maximum along the axis.
+    It is 0 on the border, and where a pixel is not a maximum along the axis (0: down, 1: right).
     """
     position, last = (row, column)[axis], ranking.shape[axis] - 1
     inner = (position > 0) & (position < last)
@@ -328,7 +323,7 @@ def _peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis:
     bend = 2 * middle - before - after
     peaked = inner & (middle >= before) & (middle >= after) & (bend > 0)
     offset = np.where(peaked, (after - before) / np.where(peaked, 2 * bend, 1), 0)
-    return np.clip(offset, -MAX_OFFSET_PX, MAX_OFFSET_PX).astype(np.float32)
+    return np.clip(offset, -MAX_OFFSET_PX, MAX_OFFSET_PX)
 
 
 def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -349,119 +344,3 @@ def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:
     if options.max_keypoints is not None:
         counts.append(int(options.max_keypoints))
     return min(counts, default=None)
-
-
-def grid_subsample(xy: np.ndarray, grid_size_px: int, seed: int = 0) -> np.ndarray:
-    """Choose one random of (N, 2) positions of each cell of a grid; (K,) rows in rising order."""
-    cell = np.floor(np.asarray(xy, np.float64) / grid_size_px).astype(np.int64)
-    order = np.random.default_rng(seed).permutation(len(cell))
-    _, first = np.unique(cell[order], axis=0, return_index=True)
-    return np.sort(order[first])
-
-
-MIN_COMPILED_POINTS = 30_000
-"""From which the import of numba takes less time than it saves, where nothing else has done it."""
-
-DISTANCE_STEP_PX = 0.25
-"""To which the distance of `spread_by_distance` is found."""
-
-
-def spread_over_grid(
-    xy: np.ndarray,
-    scores: np.ndarray,
-    image_size: tuple[int, int],
-    max_keypoints: int,
-    grid_cells: int = GRID_CELLS,
-) -> np.ndarray:
-    """Choose keypoints by score, in turn from all cells of a grid.
-
-    Returns at most `max_keypoints` rows: first the best of each cell, then the second-best, ...
-    `grid_cells` are along the longer side of the image.
-
-    Example:
-        >>> xy = np.array([[1, 1], [2, 1], [99, 99]])
-        >>> spread_over_grid(xy, np.array([3.0, 2.0, 1.0]), (100, 100), 2).tolist()
-        [0, 2]
-    """
-    side = max(image_size) / grid_cells
-    cell = np.floor(np.maximum(xy, 0) / side).astype(np.int64)
-    cell = cell[:, 1] * (grid_cells + 1) + cell[:, 0]
-    order = np.lexsort((-scores, cell))
-    first = np.flatnonzero(np.diff(cell[order], prepend=-1))
-    begins = np.repeat(first, np.diff(first, append=len(order)))
-    rank = np.arange(len(order)) - begins
-    return order[np.lexsort((-scores[order], rank))][:max_keypoints]
-
-
-def suppress_neighbors(
-    xy: np.ndarray, scores: np.ndarray, radius_px: float | np.ndarray
-) -> np.ndarray:
-    """Go through points from the best; return the rows that are not near a kept one, best first.
-
-    Near is strictly closer than the radius, or of (N,) radii than the smaller one of both points.
-    Of equal scores the first row comes first.
-
-    Example:
-        >>> xy = np.array([[0.0, 0], [1, 0], [2, 0], [9, 9]])
-        >>> suppress_neighbors(xy, np.array([1.0, 2, 3, 0]), 2).tolist()
-        [2, 0, 3]
-    """
-    order = np.argsort(-np.asarray(scores), kind="stable")
-    if not len(order):
-        return order
-    positions = np.asarray(xy, np.float64).reshape(-1, 2)[order]
-    positions = positions - positions.min(0)
-    radii = np.broadcast_to(np.asarray(radius_px, np.float64), len(order))[order]
-    cell = float(radii.min())
-    if len(order) < MIN_COMPILED_POINTS and "numba" not in sys.modules:
-        return order[_keep_distant(positions, radii, cell)]
-    from .kernels import keep_distant
-
-    columns, rows = (int(side) + 1 for side in positions.max(0) / cell)
-    x, y = (np.ascontiguousarray(axis) for axis in positions.T)
-    kept: np.ndarray = keep_distant(x, y, radii, cell, columns, rows)
-    return order[kept]
-
-
-def _keep_distant(positions: np.ndarray, radii: np.ndarray, cell: float) -> list[int]:
-    """Return which points are kept, as the compiled function does, by cells of a grid."""
-    squares = (radii * radii).tolist()
-    reaches = np.ceil(radii / cell).astype(np.int64).tolist()
-    columns, rows = (positions / cell).astype(np.int64).T.tolist()
-    cells: dict[tuple[int, int], list[int]] = {}
-    kept = []
-    x, y = positions.T.tolist()
-
-    def is_near(k: int, other: int) -> bool:
-        across, down = x[other] - x[k], y[other] - y[k]
-        return bool(across * across + down * down < min(squares[k], squares[other]))
-
-    for k, (column, row, reach) in enumerate(zip(columns, rows, reaches, strict=True)):
-        around = range(-reach, reach + 1)
-        near = (cells.get((column + i, row + j), ()) for i in around for j in around)
-        if not any(is_near(k, other) for members in near for other in members):
-            kept.append(k)
-            cells.setdefault((column, row), []).append(k)
-    return kept
-
-
-def spread_by_distance(xy: np.ndarray, scores: np.ndarray, count: int) -> np.ndarray:
-    """Choose the best points that are as far from each other as their number allows, best first.
-
-    Adaptive non-maximal suppression (Brown, Szeliski and Winder, 2005), by bisection of the
-    distance (Bailo et al., 2018).
-    """
-    from . import kernels  # noqa: F401 (each of the many passes then finds it imported)
-
-    best = np.argsort(-np.asarray(scores), kind="stable")
-    if count >= len(best):
-        return best
-    near, far = 0.0, float(np.linalg.norm(np.ptp(np.asarray(xy, np.float64), axis=0))) + 1
-    while far - near > DISTANCE_STEP_PX:
-        middle = (near + far) / 2
-        kept = suppress_neighbors(xy, scores, middle)
-        if len(kept) >= count:
-            near, best = middle, kept
-        else:
-            far = middle
-    return best[:count]

@@ -16,8 +16,8 @@ from .._shared.errors import OptionError, require_packages
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.heatmap import MAX_AUTO_PIXELS
-from ..detector.pretrained import resolve_weights
-from ..detector.tiling import STRIDE, fill_planes
+from ..detector.pretrained import STRIDE, resolve_weights
+from ..detector.tiling import fill_planes
 from ..features.selection import Maps, SelectionOptions, select_from_maps
 from .tensors import load_tensor, padded
 

@@ -1,6 +1,6 @@
 """Running the network: ONNX Runtime, OpenVINO or torch."""
 
-from .interface import BACKENDS, Network, RuntimeOptions
-from .registry import open_network
+from .interface import Network, RuntimeOptions
+from .registry import BACKENDS, open_network
 
 __all__ = ["BACKENDS", "Network", "RuntimeOptions", "open_network"]

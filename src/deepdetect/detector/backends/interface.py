@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import math
 import os
 import sys
 import threading
@@ -11,21 +10,12 @@ from collections.abc import MutableMapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from ..._shared.errors import DeepDetectError, OptionError, WeightsError, check_name
-from ..._shared.options import suggest_keywords
-
-BACKENDS = ("onnxruntime", "openvino", "torch")
-PRECISIONS = ("float32", "bfloat16")
-
-LOGITS = "logits"
-"""Name of the output that holds logits; an output of another name holds probabilities."""
-
-KEYPOINT_OUTPUTS = frozenset({"keypoints", "keypoint_logits"})
-"""Outputs of files that give keypoints, too: these are not read."""
+from ..._shared.errors import DeepDetectError, WeightsError
+from ..pretrained import LOGITS
 
 PROBE_SHAPE = (24, 32)
 """Height and width of the image that a network is tried on."""
@@ -43,7 +33,6 @@ class Network(Protocol):
         """
 
 
-@suggest_keywords
 @dataclass(frozen=True)
 class RuntimeOptions:
     """How the network is run: the options of `DeepDetect` of these names."""
@@ -51,26 +40,7 @@ class RuntimeOptions:
     backend: str = "auto"
     device: str = "cpu"
     threads: int | None = None
-    precision: Literal["float32", "bfloat16"] = "float32"
-
-    def __post_init__(self) -> None:
-        check_name("backend", self.backend, ("auto", *BACKENDS))
-        if self.threads is not None and self.threads < 1:
-            raise OptionError(f"threads must be at least 1, not {self.threads}")
-        check_name("precision", self.precision, PRECISIONS)
-
-    def check_backend(self, backend: str) -> None:
-        """Raise an OptionError if a backend has not what is asked of it."""
-        for option, usual, needed in (
-            ("precision", "float32", "openvino"),
-            ("device", "cpu", "onnxruntime"),
-        ):
-            value = getattr(self, option)
-            if value != usual and backend != needed:
-                raise OptionError(
-                    f'`{option}="{value}"` needs the backend {needed}, not {backend}: leave one of '
-                    "them out"
-                )
+    precision: str = "float32"
 
 
 def import_onnxruntime() -> ModuleType:
@@ -141,27 +111,6 @@ def as_logits(
         )
     probability = np.clip(output.astype(np.float64), 1e-38, 1 - 2.0**-25)
     return np.log(probability / (1 - probability)).astype(np.float32)
-
-
-def check_answer(network: Network, path: Path) -> None:
-    """Run a network on a small image of noise, so that a wrong one is refused when it is loaded."""
-    # Noise enough for this; importing NumPy's generators takes 6 MB.
-    numbers = np.arange(3 * math.prod(PROBE_SHAPE), dtype=np.uint16) * np.uint16(40503)
-    noise = numbers.reshape(1, 3, *PROBE_SHAPE).astype(np.float32) * np.float32(2**-16)
-    try:
-        logits = network(noise)
-    except WeightsError:
-        raise
-    except DeepDetectError as error:
-        raise WeightsError(
-            f"{path} does not fit: it must map one image (1, 3, height, width) of any size to one "
-            f"map (1, 1, height, width), but {error}"
-        ) from None
-    if logits.min() == logits.max():
-        raise WeightsError(
-            f"{path} gives the same value at every pixel of an image of noise: it is damaged, or "
-            "was never trained; use other weights"
-        )
 
 
 def unreadable(path: Path, error: Exception) -> WeightsError:

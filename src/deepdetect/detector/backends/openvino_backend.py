@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import OptionError
+from ..pretrained import KEYPOINT_LOGITS, KEYPOINTS, LOGITS, PADDED_IMAGE
 from .interface import (
-    KEYPOINT_OUTPUTS,
-    LOGITS,
     RuntimeOptions,
     as_logits,
     failed_run,
@@ -21,9 +19,6 @@ from .interface import (
     output_to_read,
     unreadable,
 )
-
-PADDED_IMAGE = "padded_image"
-"""Name of the tensor that holds the image, padded to multiples of 8, in files that pad it."""
 
 COMPILED_LAYERS = 100
 """Layers compiled for one size of image that are kept, the least recently used are dropped first.
@@ -52,19 +47,21 @@ class OpenVinoNetwork:
         # Tiles are computed in float32.
         self.onnx_path = path if options.precision == "float32" else None
         self.threads = options.threads
-        self._local = threading.local()
-        self._lock = threading.Lock()
         self._works = False  # it has given a right answer
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         try:
-            output = self._request().infer([image], share_inputs=True)[self._output_name]
+            model = self._model
+            if model is None:
+                model = self._model = self._compile()
+            request = model.create_infer_request()  # threads may run at once: one image each
+            output = request.infer([image], share_inputs=True)[self._output_name]
         except Exception as error:  # its exceptions share no base class
-            self._discard()
+            self._model = None
             raise failed_run(error, image.shape) from None
         # Where memory is short it may also answer with nothing, or with the map of the last image.
         if self._works and output.shape[2:] != image.shape[2:]:
-            self._discard()
+            self._model = None
             raise MemoryError("OpenVINO gave a map of another size")
         logits = as_logits(output, self._output_name, image.shape, self._path)
         self._works = True
@@ -75,21 +72,6 @@ class OpenVinoNetwork:
         # It refuses while another thread runs it, and versions before 2025 do not have it.
         with contextlib.suppress(Exception):
             self._model.release_memory()
-
-    def _request(self) -> Any:
-        """Return this thread's request: one holds an image at a time."""
-        with self._lock:
-            if self._model is None:
-                self._model = self._compile()
-            model = self._model
-        if getattr(self._local, "model", None) is not model:
-            self._local.request, self._local.model = model.create_infer_request(), model
-        return self._local.request
-
-    def _discard(self) -> None:
-        """Let the next call compile the model again."""
-        with self._lock:
-            self._model, self._local = None, threading.local()
 
 
 def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
@@ -128,7 +110,7 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
 def _keep_what_is_read(graph: Any) -> None:
     """Take out outputs that nobody reads, and the padding: images come padded."""
     names = {name for value in graph.outputs for name in value.get_names()}
-    unread = names - {LOGITS} if LOGITS in names else KEYPOINT_OUTPUTS
+    unread = names - {LOGITS} if LOGITS in names else {KEYPOINTS, KEYPOINT_LOGITS}
     for result in graph.get_results():
         if not result.output(0).get_names().isdisjoint(unread):
             graph.remove_result(result)

@@ -1,19 +1,30 @@
 """The backends that can run the network: one line each.
 
 To add a backend, write its module beside this one with a function
-`open_NAME(path, options) -> Network`, add its line, and its name to `interface.BACKENDS`.
+`open_NAME(path, options) -> Network`, and add its line.
 """
 
 from __future__ import annotations
 
 import functools
 import importlib.util
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from ..._shared.errors import MissingWeightsError, OptionError, WeightsError, require_packages
-from .interface import Network, RuntimeOptions, check_answer
+import numpy as np
+
+from ..._shared.errors import (
+    DeepDetectError,
+    MissingWeightsError,
+    OptionError,
+    WeightsError,
+    require_packages,
+    unknown_name,
+)
+from ..._shared.options import check_ranges
+from .interface import PROBE_SHAPE, Network, RuntimeOptions
 from .onnxruntime_backend import open_onnxruntime
 from .openvino_backend import open_openvino
 from .torch_backend import open_torch
@@ -25,25 +36,39 @@ class _Backend(NamedTuple):
     open: Callable[[Path, RuntimeOptions], Network]
 
 
-_BACKENDS = {
+BACKENDS = {
     "onnxruntime": _Backend(("onnxruntime",), ".onnx", open_onnxruntime),
     "openvino": _Backend(("openvino",), ".onnx", open_openvino),
     "torch": _Backend(("torch", "safetensors"), ".safetensors", open_torch),
 }
+PRECISIONS = ("float32", "bfloat16")
 
 
 def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
     """Load weights with the backend that fits, and return its name; a few networks are kept."""
+    if options.backend not in ("auto", *BACKENDS):
+        raise unknown_name("backend", options.backend, ("auto", *BACKENDS))
+    if options.precision not in PRECISIONS:
+        raise unknown_name("precision", options.precision, PRECISIONS)
+    check_ranges(options, between={"threads": (1, math.inf)})
     if not path.is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")
     name = _choose(path, options) if options.backend == "auto" else options.backend
-    backend = _BACKENDS[name]
+    backend = BACKENDS[name]
     if path.suffix.lower() != backend.suffix:
         raise OptionError(
             f"the backend {name} reads {backend.suffix} files, not {path.name}: "
             "leave the backend out, or give other weights"
         )
-    options.check_backend(name)
+    for option, usual, needed in (
+        ("precision", "float32", "openvino"),
+        ("device", "cpu", "onnxruntime"),
+    ):
+        value = getattr(options, option)
+        if value != usual and name != needed:
+            raise OptionError(
+                f'`{option}="{value}"` needs the backend {needed}, not {name}: leave one out'
+            )
     require_packages(f"reading {path.name} with the backend {name}", *backend.packages)
     file = path.stat()
     return _open(name, path, options, (path.absolute(), file.st_mtime_ns, file.st_size)), name
@@ -52,9 +77,30 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
 @functools.lru_cache(maxsize=4)
 def _open(backend: str, path: Path, options: RuntimeOptions, state: tuple[object, ...]) -> Network:
     """Load a file; one whose state has changed since is loaded again."""
-    network = _BACKENDS[backend].open(path, options)
-    check_answer(network, path)
+    network = BACKENDS[backend].open(path, options)
+    _check_answer(network, path)
     return network
+
+
+def _check_answer(network: Network, path: Path) -> None:
+    """Run a network on a small image of noise, so that a wrong one is refused when it is loaded."""
+    # Noise enough for this; importing NumPy's generators takes 6 MB.
+    numbers = np.arange(3 * math.prod(PROBE_SHAPE), dtype=np.uint16) * np.uint16(40503)
+    noise = numbers.reshape(1, 3, *PROBE_SHAPE).astype(np.float32) * np.float32(2**-16)
+    try:
+        logits = network(noise)
+    except WeightsError:
+        raise
+    except DeepDetectError as error:
+        raise WeightsError(
+            f"{path} does not fit: it must map one image (1, 3, height, width) of any size to one "
+            f"map (1, 1, height, width), but {error}"
+        ) from None
+    if logits.min() == logits.max():
+        raise WeightsError(
+            f"{path} gives the same value at every pixel of an image of noise: it is damaged, or "
+            "was never trained; use other weights"
+        )
 
 
 def _choose(path: Path, options: RuntimeOptions) -> str:

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from .interface import LOGITS, RuntimeOptions, as_logits
+from ..pretrained import LOGITS
+from .interface import RuntimeOptions, as_logits
 
 
 class TorchNetwork:

@@ -21,10 +21,9 @@ from ..._shared.errors import OptionError, WeightsError, check_name, require_pac
 from ..._shared.options import check_ranges, suggest_keywords
 from ...features.selection import check_max_keypoints
 from ...io.image import load_image
-from ..pretrained import resolve_weights
+from ..pretrained import LOGITS, resolve_weights
 from .onnx_graph import (
     IMAGE,
-    LOGITS,
     PROBABILITY,
     add_padding,
     fix_size,

@@ -15,16 +15,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ... import __version__
+from ..pretrained import LOGITS, PADDED_IMAGE, STRIDE
 
 if TYPE_CHECKING:
     from onnx import GraphProto, ModelProto, NodeProto
 
-IMAGE, PROBABILITY, LOGITS = "image", "probability", "logits"
-PADDED_IMAGE, PADDED_LOGITS = "padded_image", "padded_logits"
-"""Names of tensors: the two in the middle are what the network itself maps to each other."""
-
-STRIDE = 8
-"""The network halves an image three times, so the sides of `PADDED_IMAGE` are multiples of 8."""
+IMAGE, PROBABILITY, PADDED_LOGITS = "image", "probability", "padded_logits"
+"""Names of tensors: the network itself maps `PADDED_IMAGE` to `PADDED_LOGITS`."""
 
 _PADDING = {"shape", "sides", "minus_sides", "missing", "padding", PADDED_IMAGE}
 _ENDING = {"sigmoid", PROBABILITY}

@@ -13,12 +13,12 @@ import numpy as np
 
 from ...features.keypoints import bayer_order
 from ...features.selection import MAX_OFFSET_PX
-from .onnx_graph import LOGITS, add_constants, replace_nodes
+from ..pretrained import KEYPOINT_LOGITS, KEYPOINTS, LOGITS
+from .onnx_graph import add_constants, replace_nodes
 
 if TYPE_CHECKING:
     from onnx import ModelProto, NodeProto
 
-KEYPOINTS, KEYPOINT_LOGITS = "keypoints", "keypoint_logits"
 PREFIX = "keypoint"
 
 MAX_KEYPOINTS = 2048

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..._shared.machine import parallel_for
 from ..._shared.opencv import cv2
+from ...features.selection import peak_offset
 
 NMS_RADIUS = 2
 """A candidate is the maximum of a window of 5x5 in its level."""
@@ -21,9 +22,6 @@ LEAST_RESPONSE = 1e-8
 
 PIXELS_AT_ONCE = 1 << 15
 """Whose derivatives are computed together, so that they stay in the processor's cache."""
-
-MAX_OFFSET_PX = 0.499
-"""The nearest pixel of a refined position is still the one that it was found at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,33 +140,14 @@ def find_candidates(space: ScaleSpace) -> Candidates:
     Their positions are refined by a parabola in x and in y. There are none in the outermost rows
     and columns.
     """
-    found = []
+    found, positions = [], []
     for k in range(1, len(space.sigmas_px) - 2):
         response = np.abs(space.determinant[k])
         peak = (response == space.highest[k]) & (response > LEAST_RESPONSE)
-        row, column = np.nonzero(peak[1:-1, 1:-1])
-        found.append(np.stack([np.full(len(row), k), row + 1, column + 1]))
+        row, column = np.add(np.nonzero(peak[1:-1, 1:-1]), 1)
+        x = column + peak_offset(response, row, column, axis=1)
+        y = row + peak_offset(response, row, column, axis=0)
+        found.append(np.stack([np.full(len(row), k), row, column]))
+        positions.append(np.stack([x, y], 1))
     level, row, column = np.concatenate(found, 1)
-    offsets = [
-        _peak_offset(space.determinant, level, row, column, *step) for step in ((0, 1), (1, 0))
-    ]
-    xy = np.stack([column, row], 1) + np.stack(offsets, 1)
-    return Candidates(level, row, column, xy, space.sigmas_px[level])
-
-
-def _peak_offset(
-    determinant: np.ndarray,
-    level: np.ndarray,
-    row: np.ndarray,
-    column: np.ndarray,
-    down: int,
-    across: int,
-) -> np.ndarray:
-    """Return the offset of the maximum of a parabola through a pixel and its two neighbours."""
-    before, middle, after = (
-        np.abs(determinant[level, row + step * down, column + step * across]).astype(np.float64)
-        for step in (-1, 0, 1)
-    )
-    bend = 2 * middle - before - after
-    offset = np.where(bend > 0, (after - before) / np.where(bend > 0, 2 * bend, 1), 0)
-    return np.clip(offset, -MAX_OFFSET_PX, MAX_OFFSET_PX)
+    return Candidates(level, row, column, np.concatenate(positions), space.sigmas_px[level])
