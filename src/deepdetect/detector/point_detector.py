@@ -67,7 +67,7 @@ class PointDetector:
         check_name("resolution of points", resolution, ("auto", "native"))
         self.max_keypoints, self.spread, self.resolution = max_keypoints, spread, resolution
         self.ranker = RANKER if ranker is None else Path(ranker).absolute()
-        load_ranker(self.ranker)
+        self._ranker = load_ranker(self.ranker)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -170,10 +170,9 @@ class PointDetector:
             # Wherever a pixel of the small image, or one beside it, holds something to be ignored.
             share = cv2.resize(ignore.astype(np.float32), size, interpolation=cv2.INTER_AREA)
             ignore = cv2.dilate((share > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
-        ranker = load_ranker(self.ranker)
         with memory_named(gray.shape):
             found = detect_points(
-                gray, self.max_keypoints, spread=self.spread, ignore=ignore, ranker=ranker
+                gray, self.max_keypoints, spread=self.spread, ignore=ignore, ranker=self._ranker
             )
         if not scaled:
             return found

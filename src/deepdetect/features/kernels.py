@@ -27,20 +27,13 @@ MIN_SQUARED_NORMS = 1e-3
 
 @compiled(nogil=True, fastmath=True)
 def describe_tiles(first, last, magnitude, orientation, rows_of, origin, step, taps, spans, out):  # type: ignore[no-untyped-def]
-    """Describe the keypoints of the tiles from `first` to before `last`.
+    """Describe the keypoints of the tiles from `first` to before `last`, row by row, in `out`.
 
-    Args:
-        first, last: numbers of the tiles, row by row.
-        magnitude, orientation: (H, W) float32 gradient; orientation in units of 45 degrees.
-        rows_of: (h, w) int32 row of `out` for each point of the lattice, -1 where there is no
-            keypoint.
-        origin: (x, y) pixel of the lattice's first point.
-        step: of the lattice, in pixels.
-        taps: (4, T) float32 weights of the T pixels around a keypoint for each of four bins, T odd,
-            and zeros.
-        spans: (4, 3) first tap and end of the taps of each bin that are not 0, the end rounded up
-            to whole groups of `TAPS_AT_ONCE`; T.
-        out: (N, 128) uint8, written.
+    The (H, W) float32 orientations are in units of 45 degrees. `rows_of` holds the row of `out` for
+    each point of the lattice, -1 where there is no keypoint; its first point is the pixel (x, y)
+    `origin`. `taps` are (4, T) weights of the T pixels around a keypoint for each of four bins, and
+    zeros; `spans` (4, 3): the first tap and the end of those that are not 0, in whole groups of
+    `TAPS_AT_ONCE`, and T.
     """
     height, width = magnitude.shape
     reach = spans[0, 2] // 2
@@ -170,13 +163,10 @@ def correlation_distances(start, stop, first, rows0, second, rows1, mean, out): 
 
 @compiled(nogil=True)
 def nearest_of_nine(first, last, positions, xy, grid, nearest, distances):  # type: ignore[no-untyped-def]
-    """Find the nearest keypoint in the 3x3 pixels around the positions from `first` to `last`.
+    """Find the nearest of (M, 2) keypoints in the 3x3 pixels around positions, row by row.
 
-    Args:
-        positions: (N, 2) float64; not finite: none is found.
-        xy: (M, 2) float64 keypoints.
-        grid: (H, W) int32 row of the keypoint on each pixel, or -1.
-        nearest, distances: (N,) int32 rows and float64 distances, written where there is one.
+    `grid` holds the (H, W) row of the keypoint on each pixel, or -1. Of positions that are not
+    finite, or have none near, nothing is written.
     """
     height, width = grid.shape
     for k in range(first, last):
@@ -254,21 +244,12 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
     first, last, bands, queries, base, xy0, xy1, at0, at1, offsets, turn, seed, radii, before, rows,
     distances,
 ):  # fmt: skip
-    """Improve the queries of the bands from `first` to before `last`, one after the other.
+    """Improve the two best rows of the queries of some bands, one query after the other.
 
-    Args:
-        first, last: numbers of the bands.
-        bands: (B + 1,) query that each band begins with, in row-major order.
-        queries, base: (N, D), (M, D) uint8 descriptors.
-        xy0, xy1: their pixels.
-        at0, at1: (H, W) int32 row at each pixel, -1 where there is none.
-        offsets: distances in pixels to the queries whose neighbours are tried.
-        turn: number of the sweep; even ones go down, odd ones up.
-        seed: of the random tries.
-        radii: of the random tries around the best, in pixels.
-        before: (N, 2) rows as they were before this sweep, for queries of other bands: so the
-            bands may be done in any order.
-        rows, distances: (N, 2) best and second-best row and squared distances; improved.
+    `bands` are the queries that each begins with, in row-major order; `at0` and `at1` the rows at
+    each pixel, -1 where there is none; `before` the rows before this sweep, which are read of other
+    bands, so that the bands may be done in any order. Even turns go down, odd ones up. Neighbours
+    of queries at `offsets` are tried, and random ones within the `radii` around the best.
     """
     (height0, width0), (height1, width1) = at0.shape, at1.shape
     direction = 1 - 2 * (turn % 2)

@@ -50,8 +50,16 @@ SEARCH_SHRINK = 3
 nearer."""
 
 
+Neighbours = tuple[np.ndarray, np.ndarray]
+"""(N, count) int32 rows and (N, count) float32 distances, nearest first."""
+
+Positions = tuple[np.ndarray, np.ndarray] | None
+"""Keypoints of both images in pixels; None where they are not all of one scale and angle, so that
+neighbours need not match alike."""
+
+
 class Matcher(Protocol):
-    """Finds the nearest neighbours of descriptors."""
+    """Finds the `count` nearest neighbours of descriptors."""
 
     def __call__(
         self,
@@ -59,26 +67,18 @@ class Matcher(Protocol):
         base: np.ndarray,
         count: int,
         seed: int,
-        positions: tuple[np.ndarray, np.ndarray] | None = None,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Find neighbours; a matcher may leave out what it does not need.
+        positions: Positions = None,
+    ) -> Neighbours:
+        """Find for (N, D) queries the nearest rows of an (M, D) base, M >= count.
 
-        Args:
-            queries, base: (N, D) and (M, D) descriptors, M >= count, uint8 or float32.
-            count: neighbours of each query.
-            seed: of random choices: the same seed gives the same result.
-            positions: (N, 2) and (M, 2) keypoints in pixels; None where they are not all of one
-                scale and angle, so that neighbours need not match alike.
-
-        Returns:
-            (N, count) int32 rows of `base` and (N, count) float32 distances, nearest first.
+        Both are uint8 or float32. The same seed gives the same result.
         """
         ...
 
 
 def exact_neighbours(
-    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
-) -> tuple[np.ndarray, np.ndarray]:
+    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: Positions = None
+) -> Neighbours:
     """Find the true nearest neighbours by matrix products, as a `Matcher`; of equals the lower row.
 
     The time grows with the product of the numbers: meant for tens of thousands.
@@ -115,8 +115,8 @@ def exact_neighbours(
 
 
 def hamming_neighbours(
-    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
-) -> tuple[np.ndarray, np.ndarray]:
+    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: Positions = None
+) -> Neighbours:
     """Find nearest neighbours of binary descriptors (ORB, BRISK) by Hamming, as a `Matcher`."""
     if queries.dtype != np.uint8 or base.dtype != np.uint8:
         raise OptionError(
@@ -135,17 +135,17 @@ def flann_neighbours(
     base: np.ndarray,
     count: int,
     seed: int,
-    positions: object = None,
+    positions: Positions = None,
     trees: int = TREES,
     checks: int = CHECKS,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> Neighbours:
     """Find approximate nearest neighbours in random kd-trees; otherwise as `Matcher`.
 
     `checks` leaves are visited for each query.
     """
     queries, base = (np.asarray(part, np.float32) for part in (queries, base))
 
-    def search() -> tuple[np.ndarray, np.ndarray]:
+    def search() -> Neighbours:
         cv2.setRNGSeed(seed)
         index = cv2.flann_Index(base, {"algorithm": FLANN_INDEX_KDTREE, "trees": trees})
         return index.knnSearch(queries, count, params={"checks": checks})
@@ -157,8 +157,8 @@ def flann_neighbours(
 
 
 def faiss_neighbours(
-    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: object = None
-) -> tuple[np.ndarray, np.ndarray]:
+    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: Positions = None
+) -> Neighbours:
     """Find approximate nearest neighbours in an inverted file; otherwise as `Matcher`.
 
     The file holds quantised descriptors (Johnson, Douze and Jégou, "Billion-scale similarity search
@@ -189,12 +189,8 @@ def faiss_neighbours(
 
 
 def patchmatch_neighbours(
-    queries: np.ndarray,
-    base: np.ndarray,
-    count: int,
-    seed: int,
-    positions: tuple[np.ndarray, np.ndarray] | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: Positions = None
+) -> Neighbours:
     """Find one or two approximate nearest neighbours of each query by spreading good ones.
 
     A neighbour's match, moved along, is probably a good one (Barnes et al., "PatchMatch", 2009). On
@@ -246,12 +242,8 @@ def _grid(xy: np.ndarray) -> np.ndarray:
 
 
 def automatic_neighbours(
-    queries: np.ndarray,
-    base: np.ndarray,
-    count: int,
-    seed: int,
-    positions: tuple[np.ndarray, np.ndarray] | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
+    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: Positions = None
+) -> Neighbours:
     """Find neighbours exactly where keypoints are few, else by PatchMatch, else by FLANN.
 
     PatchMatch needs bytes, and keypoints on whole pixels of one scale and angle.
@@ -302,7 +294,7 @@ def match_descriptors(
     ratio: float = 0.99,
     mutual: bool = False,
     seed: int = 0,
-    positions: tuple[np.ndarray, np.ndarray] | None = None,
+    positions: Positions = None,
 ) -> DescriptorMatches:
     """Match by nearest neighbour and ratio test (Lowe, 2004), by ascending row of the first set.
 

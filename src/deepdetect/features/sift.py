@@ -48,14 +48,9 @@ def sift_descriptors(
     """Compute (N, 128) uint8 SIFT descriptors, by the fastest implementation for these keypoints.
 
     Many upright keypoints on whole pixels are described all at once, which differs from OpenCV's
-    result by 1 in one of ten thousand numbers; others by OpenCV.
-
-    Args:
-        gray: (H, W) uint8 luma.
-        xy: (N, 2) positions, centre of the first pixel (0, 0).
-        size: diameter of the keypoint in pixels.
-        angle: its orientation in degrees; 0 is upright. -1 is OpenCV's "unset", which its SIFT
-            takes for a rotation by one degree; the published code does the same.
+    result by 1 in one of ten thousand numbers; others by OpenCV. The size is a diameter in pixels,
+    the angle in degrees; -1 is OpenCV's "unset", which its SIFT takes for a rotation by one degree,
+    as the published code does.
     """
     dense = len(xy) > MIN_DENSE_DENSITY * gray.size
     upright = angle == 0 and DENSE_SIZES_PX[0] <= size <= DENSE_SIZES_PX[1]

@@ -8,7 +8,7 @@ import pytest
 
 from deepdetect._shared.errors import WeightsError
 from deepdetect.detector.points.candidate_features import FEATURES
-from deepdetect.detector.points.ranker import Ranker, load_ranker, notes_of
+from deepdetect.detector.points.ranker import Ranker, load_ranker
 from deepdetect.detector.pretrained import RANKER
 
 
@@ -44,7 +44,7 @@ def test_the_ranker_in_the_package_is_small_and_says_where_it_is_from() -> None:
     assert isinstance(ranker, Ranker)
     assert sum(w.size + b.size for w, b in ranker.layers) < 30_000
     assert RANKER.stat().st_size < 100_000
-    notes = notes_of(ranker)
+    notes = json.loads(ranker.notes)
     assert json.loads(str(notes["options"]))["seed"] == 0
     assert notes["photographs"] == 2705
 

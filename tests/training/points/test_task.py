@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load_file
 
 from deepdetect.detector.points.detection import detect_points
-from deepdetect.detector.points.ranker import load_ranker, notes_of
+from deepdetect.detector.points.ranker import load_ranker
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.training import PointsTrainingOptions, TrainingResult, train_points
 from deepdetect.training.checkpoint import read_checkpoint
@@ -92,7 +92,7 @@ def test_the_best_weights_are_those_of_the_best_measure(
     ranker = load_ranker(whole.weights)
     found = measure(partial(detect_points, ranker=ranker), validation_pairs(textures, 1))
     assert found["score"] == pytest.approx(whole.best["score"], abs=1e-6)
-    notes = notes_of(ranker)
+    notes = json.loads(ranker.notes)
     assert notes["images"] == "4"
     assert json.loads(notes["point"]) == whole.best
 

@@ -17,7 +17,6 @@ import numpy as np
 
 from ..._shared.errors import (
     DeepDetectError,
-    MissingWeightsError,
     OptionError,
     WeightsError,
     require_packages,
@@ -51,8 +50,6 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
     if options.precision not in PRECISIONS:
         raise unknown_name("precision", options.precision, PRECISIONS)
     check_ranges(options, between={"threads": (1, math.inf)})
-    if not path.is_file():
-        raise MissingWeightsError(f"there is no weights file {path}: check the path")
     name = _choose(path, options) if options.backend == "auto" else options.backend
     backend = BACKENDS[name]
     if path.suffix.lower() != backend.suffix:

@@ -153,8 +153,6 @@ def _load(path: Path) -> tuple[ModelProto, dict[str, str]]:
     """Return weights as a network in fp32 for any size, and where they come from."""
     import onnx
 
-    if not path.is_file():
-        raise WeightsError(f"there is no weights file {path}: check the path")
     suffix = path.suffix.lower()
     if suffix == ".safetensors":
         require_packages(f"exporting {path.name}", "torch", "safetensors")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
-import json
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,17 +48,9 @@ class Ranker:
 
 
 def load_ranker(path: Path = RANKER) -> Ranker:
-    """Load an npz file, as `deepdetect train-points` writes it; the last few are kept."""
-    try:
-        state = path.stat().st_mtime_ns
-    except OSError:
-        raise MissingWeightsError(f"there is no weights file {path}: check the path") from None
-    return _load(path.absolute(), state)
-
-
-@functools.lru_cache(maxsize=4)
-def _load(path: Path, state: int) -> Ranker:
-    """Read a file; one whose state has changed since is read again."""
+    """Load an npz file, as `deepdetect train-points` writes it."""
+    if not path.is_file():
+        raise MissingWeightsError(f"there is no weights file {path}: check the path")
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             notes = str(file["notes"])
@@ -83,9 +73,3 @@ def _load(path: Path, state: int) -> Ranker:
     if not fits:
         raise WeightsError(f"{path} holds another network than the ranker: use other weights")
     return Ranker(mean, deviation, layers, notes)
-
-
-def notes_of(ranker: Ranker) -> dict[str, object]:
-    """Return what the file says about the training."""
-    found: dict[str, object] = json.loads(ranker.notes) if ranker.notes else {}
-    return found

@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader
 from ..._shared.atomic import atomic_path
 from ..._shared.records import key
 from ...detector.points.detection import detect_points
-from ...detector.points.ranker import MAX_DEVIATIONS, Ranker, load_ranker, notes_of
+from ...detector.points.ranker import MAX_DEVIATIONS, Ranker, load_ranker
 from ...evaluation.report import Table
 from ...io.image import find_images
 from ..checkpoint import Point
@@ -184,7 +184,8 @@ class RankerTrainer(Trainer):
         save_ranker(self.average.export(dict(notes)), path)
 
     def read_notes(self, path: Path) -> Mapping[str, Any]:
-        return notes_of(load_ranker(path))
+        notes: dict[str, Any] = json.loads(load_ranker(path).notes)
+        return notes
 
     def card(self, best: Point) -> tuple[str, list[str]]:
         count = sum(parameter.numel() for parameter in self.ranker.parameters())
