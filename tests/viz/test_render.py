@@ -44,7 +44,11 @@ def test_from_the_left_camera_the_photograph_comes_back(
     cloud: PointCloud, photo: np.ndarray
 ) -> None:
     camera = left_camera((256, 256), 300.0, (127.5, 127.5))
-    np.testing.assert_array_equal(render(cloud, camera, point_width=1), photo)
+    picture = render(cloud, camera).astype(int)
+    shifts = [(0, 0), (0, 1), (1, 0), (0, -1), (-1, 0)]
+    gaps = [np.abs(np.roll(picture, shift, (0, 1)) - photo).mean() for shift in shifts]
+    assert gaps[0] < 8
+    assert gaps[0] == min(gaps)
 
 
 @pytest.mark.parametrize(
@@ -83,10 +87,10 @@ def test_wild_points_do_not_change_the_view(cloud: PointCloud) -> None:
 
 def test_the_nearest_point_is_seen_whatever_the_order() -> None:
     points = np.array([[0.0, 0, 10], [0, 0, 5], [0, 0, 20], [0, 0, -5]])
-    colors = np.array([[1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0]], np.uint8)
+    colors = np.array([[40, 0, 0], [80, 0, 0], [120, 0, 0], [160, 0, 0]], np.uint8)
     for order in ([0, 1, 2, 3], [3, 2, 1, 0], [1, 3, 0, 2]):
-        picture = render(PointCloud(points[order], colors[order], "mm"), PLAIN, point_width=6)
-        assert picture[30, 40].tolist() == [2, 0, 0]
+        picture = render(PointCloud(points[order], colors[order], "mm"), PLAIN)
+        assert picture[30, 40, 0] == round((80 + 3 * 255) / 4)  # a quarter of this pixel
 
 
 def test_a_near_narrow_point_hides_a_wide_far_one() -> None:
@@ -99,17 +103,6 @@ def test_a_near_narrow_point_hides_a_wide_far_one() -> None:
     nearest = np.argmin(depth)
     x, y = np.rint(xy[nearest]).astype(int)
     assert picture[y, x].tolist() == cloud.colors[nearest].tolist()
-
-
-def test_the_width_is_in_pixels_and_centred() -> None:
-    cloud = PointCloud([[0.0, 0, 10]], [[0, 0, 0]], "mm")
-    for width in (1, 2, 4, 20):
-        picture = render(cloud, PLAIN, point_width=width)
-        rows, columns = np.nonzero(picture[..., 0] < 255)
-        ink = (255 - picture[..., 0].astype(float)).sum() / 255
-        assert ink == pytest.approx(width**2, rel=0.01)
-        assert abs(rows.mean() - 29.5) <= 0.5
-        assert abs(columns.mean() - 39.5) <= 0.5
 
 
 def test_points_become_wider_as_the_viewer_comes_nearer() -> None:

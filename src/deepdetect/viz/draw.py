@@ -200,58 +200,31 @@ def add_scale(
     """Add a line of text below a picture, and the colours of values from `low` to `high`.
 
     The colours are those of `draw_heatmap` from `least_level` to 1. The values are at their ends,
-    with two digits, or so many that they tell apart what is a hundredth of the scale.
+    with as many decimals as tell apart a tenth of the scale.
     """
     width, unit = rgb.shape[1], line_scale(rgb)
-    bar = max(1, width // 5)
-    values = _rounded(low, high)
-    margins = round(2 * CAPTION_MARGIN * unit)
-    long = [_caption_width(each, unit) - margins for each in (*values, text)]
-    # In narrow pictures the values are as small as the text.
-    share = min(1.0, max(0, width - bar - 3 * margins) / sum(long))
-    ends = [
-        _caption(each, min(margins + int(share * own), (width - bar) // 3), unit)
-        for each, own in zip(values, long, strict=False)
-    ]
-    strip = _caption(text, width - bar - sum(end.shape[1] for end in ends), unit)
+    bar, end = max(1, width // 5), width // 7
+    decimals = max(0, 1 - math.floor(math.log10(abs(high - low) or abs(high) or 1)))
+    left, right = (_caption(f"{value:,.{decimals}f}", end, unit) for value in (low, high))
+    strip = _caption(text, width - bar - 2 * end, unit)
     gap = len(strip) // 4
     colors = np.zeros((len(strip), bar, 3), np.uint8)
     colors[gap : len(strip) - gap] = _viridis(np.linspace(least_level, 1, bar))
-    return np.concatenate([rgb, np.concatenate([strip, ends[0], colors, ends[1]], axis=1)])
-
-
-def _rounded(low: float, high: float) -> list[str]:
-    """Return the ends of a scale with as few digits as it needs."""
-
-    def decimals(value: float) -> int:  # of its first two digits
-        return 1 - math.floor(math.log10(abs(value) or 1))
-
-    least = decimals(high - low or high)
-    texts = []
-    for value in (low, high):
-        places = min(max(least, decimals(value)), least + 1)  # near 0 two digits would be too many
-        texts.append(f"{round(value, places) + 0.0:,.{max(0, places)}f}")  # not "-0"
-    return texts
+    return np.concatenate([rgb, np.concatenate([strip, left, colors, right], axis=1)])
 
 
 def _caption(text: str, width: int, unit: float) -> np.ndarray:
-    """Return a black strip with a line of text, so many times as large as the smallest."""
+    """Return a black strip with a line of text that fits it; `unit` is that of `line_scale`."""
     strip = np.zeros((round(CAPTION_HEIGHT * unit), width, 3), np.uint8)
-    margins = round(2 * CAPTION_MARGIN * unit)
-    room, long = width - margins, _caption_width(text, unit) - margins
+    room = width - round(2 * CAPTION_MARGIN * unit)
     if room <= 0:
         return strip
-    scale = CAPTION_SCALE * unit * min(1.0, room / max(long, 1))
     place, font = (round(CAPTION_MARGIN * unit), round(19 * unit)), cv2.FONT_HERSHEY_SIMPLEX
-    cv2.putText(strip, text, place, font, scale, WHITE, max(1, round(unit)), cv2.LINE_AA)
+    scale, thickness = CAPTION_SCALE * unit, max(1, round(unit))
+    (long, _), _ = cv2.getTextSize(text, font, scale, thickness)
+    scale *= min(1.0, room / max(long, 1))
+    cv2.putText(strip, text, place, font, scale, WHITE, thickness, cv2.LINE_AA)
     return strip
-
-
-def _caption_width(text: str, unit: float) -> int:
-    """Return how wide a strip is that a line of text just fits."""
-    font, thickness = cv2.FONT_HERSHEY_SIMPLEX, max(1, round(unit))
-    (width, _), _ = cv2.getTextSize(text, font, CAPTION_SCALE * unit, thickness)
-    return int(width) + round(2 * CAPTION_MARGIN * unit)
 
 
 def hstack(panels: Sequence[np.ndarray]) -> np.ndarray:

@@ -29,7 +29,7 @@ POINT_OVERLAP = 1.4
 """Points are drawn this much wider than their spacing, to close gaps also in side views."""
 
 MAX_POINT_WIDTH_PX = 5
-"""No point is drawn wider by default, so that a sparse cloud looks sparse."""
+"""No point is drawn wider, so that a sparse cloud looks sparse."""
 
 
 def orbit_camera(
@@ -50,8 +50,6 @@ def orbit_camera(
         >>> camera.rotation[2].round(6).tolist()  # it stands on the right and looks to the left
         [-1.0, 0.0, 0.0]
     """
-    if not -90 <= elevation <= 90:
-        raise OptionError(f"the elevation must lie in [-90, 90] degrees, not {elevation}")
     a, e = np.deg2rad([azimuth, elevation])
     right = [np.cos(a), 0, np.sin(a)]
     down = [np.sin(e) * np.sin(a), np.cos(e), -np.sin(e) * np.cos(a)]
@@ -70,36 +68,22 @@ def orbit_camera(
     return replace(plain, camera=Camera(size, focal, centre))
 
 
-def render(cloud: PointCloud, camera: PosedView, point_width: float | None = None) -> np.ndarray:
+def render(cloud: PointCloud, camera: PosedView) -> np.ndarray:
     """Draw a cloud on white, (H, W, 3) uint8, each point as a square that hides what is behind it.
 
-    Without a width in pixels each is as wide as a closed surface needs at its spacing and depth.
+    Each is as wide as a closed surface needs at its spacing and depth.
     """
     require_points(cloud)
-    if point_width is not None and not point_width > 0:
-        raise OptionError(f"the width of a point must be above 0 pixels, not {point_width}")
     width, height = camera.camera.size
     fine_camera = camera.camera.scaled((width * SUPERSAMPLING, height * SUPERSAMPLING))
-    nearest = _nearest_points(cloud, replace(camera, camera=fine_camera), point_width)
+    nearest = _nearest_points(cloud, replace(camera, camera=fine_camera))
     # The last colour is that of pixels which show no point.
     colors = np.append(cloud.colors, np.full((1, 3), 255, np.uint8), axis=0)
-    fine = colors[nearest].astype(np.uint16)
-    steps = range(SUPERSAMPLING)
-    total = sum(
-        fine[row::SUPERSAMPLING, column::SUPERSAMPLING] for row in steps for column in steps
-    )
-    return np.rint(total / SUPERSAMPLING**2).astype(np.uint8)
+    return cv2.resize(colors[nearest], (width, height), interpolation=cv2.INTER_AREA)
 
 
-def draw_clouds(
-    left: np.ndarray,
-    clouds: Mapping[str, PointCloud],
-    azimuth: float = 12.0,
-    elevation: float = 8.0,
-    width: int = 796,
-    columns: int = 2,
-) -> np.ndarray:
-    """Draw the left image and clouds by title, which share its frame and one unit, in panels.
+def draw_clouds(left: np.ndarray, clouds: Mapping[str, PointCloud], width: int = 796) -> np.ndarray:
+    """Draw the left image and clouds by title, which share its frame and one unit, two in a row.
 
     All are seen by one camera, which the one with the most points places.
     """
@@ -111,27 +95,22 @@ def draw_clouds(
     shrinks = width < left.shape[1]
     image = cv2.resize(left, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
     panels = [add_caption(image, "left image")]
-    camera = orbit_camera(max(clouds.values(), key=len), azimuth, elevation, size)
+    camera = orbit_camera(max(clouds.values(), key=len), size=size)
     for title, cloud in clouds.items():
         # Without points there is a white panel, which is what a method that finds none shows.
         empty = np.full((size[1], size[0], 3), 255, np.uint8)
         drawn = render(cloud, camera) if len(cloud) else empty
         panels.append(add_caption(drawn, f"{title}: {len(cloud):,} points"))
-    rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
-    return vstack([hstack(row) for row in rows])
+    return vstack([hstack(panels[k : k + 2]) for k in range(0, len(panels), 2)])
 
 
-def _nearest_points(cloud: PointCloud, camera: PosedView, point_width: float | None) -> np.ndarray:
+def _nearest_points(cloud: PointCloud, camera: PosedView) -> np.ndarray:
     """Find which point each pixel shows: (H, W) int64 index, -1 for none."""
     width, height = camera.camera.size
     xy, depth = camera.project(cloud.points)
-    if point_width is None:
-        spread = camera.camera.focal_px[0] * POINT_OVERLAP * angular_spacing(cloud)
-        sides = spread * np.maximum(cloud.points[:, 2], 0) / np.where(depth > 0, depth, np.inf)
-        sides = np.minimum(sides, MAX_POINT_WIDTH_PX * SUPERSAMPLING)
-    else:
-        sides = np.full(len(cloud), point_width * SUPERSAMPLING)
-    sides = np.maximum(np.rint(sides), 1).astype(np.int64)
+    spread = camera.camera.focal_px[0] * POINT_OVERLAP * angular_spacing(cloud)
+    sides = spread * np.maximum(cloud.points[:, 2], 0) / np.where(depth > 0, depth, np.inf)
+    sides = np.clip(np.rint(sides), 1, MAX_POINT_WIDTH_PX * SUPERSAMPLING).astype(np.int64)
     corners = np.rint(xy - (sides[:, None] - 1) / 2)
     visible = (depth > 0) & (corners > -sides[:, None]).all(1) & (corners < (width, height)).all(1)
     # From here on a point is its rank by depth, and the smallest rank is what a pixel shows.
