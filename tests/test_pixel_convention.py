@@ -17,8 +17,8 @@ from deepdetect.labels import DETECTORS
 from deepdetect.labels.detectors import pixels_mask
 
 
-def compute_heatmap(*arguments: Any) -> np.ndarray:
-    return compute_maps(*arguments).both()[0]
+def compute_heatmap(rgb: np.ndarray, *arguments: Any) -> np.ndarray:
+    return compute_maps([rgb], *arguments)[0].both()[0]
 
 
 def to_logits(probability: np.ndarray) -> np.ndarray:

@@ -13,12 +13,12 @@ from deepdetect.detector import heatmap
 from deepdetect.detector.heatmap import HeatmapOptions, compute_maps
 
 
-def compute_heatmap_and_logits(*arguments: Any) -> tuple[np.ndarray, np.ndarray]:
-    return compute_maps(*arguments).both()
+def compute_heatmap_and_logits(rgb: np.ndarray, *arguments: Any) -> tuple[np.ndarray, np.ndarray]:
+    return compute_maps([rgb], *arguments)[0].both()
 
 
-def compute_heatmap(*arguments: Any) -> np.ndarray:
-    return compute_maps(*arguments).both()[0]
+def compute_heatmap(rgb: np.ndarray, *arguments: Any) -> np.ndarray:
+    return compute_maps([rgb], *arguments)[0].both()[0]
 
 
 RGB = np.random.default_rng(11).integers(0, 256, (61, 90, 3), dtype=np.uint8)

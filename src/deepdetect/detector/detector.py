@@ -19,13 +19,7 @@ from ..features.selection import Maps, SelectionOptions, select_from_maps, selec
 from ..features.sift import describe_keypoints
 from ..io.image import Images, ignore_masks, image_named, load_each, load_image, luma
 from .backends import RuntimeOptions, open_network
-from .heatmap import (
-    HeatmapOptions,
-    compute_maps,
-    compute_maps_of_batch,
-    memory_named,
-    seen_size,
-)
+from .heatmap import HeatmapOptions, compute_maps, memory_named, seen_size
 from .pretrained import PRETRAINED, resolve_weights
 
 CHANNELS_OF_IMAGES = (
@@ -194,7 +188,8 @@ class DeepDetect:
         """
         rgb = load_image(image, channels=channels)
         with memory_named(rgb.shape):
-            return compute_maps(rgb, self._network, self.heatmap_options).both()
+            (maps,) = compute_maps([rgb], self._network, self.heatmap_options)
+            return maps.both()
 
     @suggest_keywords
     def heatmap_batch(
@@ -329,16 +324,15 @@ class DeepDetect:
     ) -> Keypoints:
         """Detect the keypoints of an image that `load_image` returned."""
         with memory_named(rgb.shape):
-            maps = compute_maps(rgb, self._network, self.heatmap_options)
+            (maps,) = compute_maps([rgb], self._network, self.heatmap_options)
             del rgb  # the keypoints need the room
             return select_from_maps(maps, options, ignore)
 
     def __repr__(self) -> str:
-        shown, precision = self.heatmap_options, self._runtime.precision
-        also = "" if precision == "float32" else f", precision={precision!r}"
+        shown = self.heatmap_options
         return (
             f"DeepDetect({self.weights.name}, resolution={shown.resolution!r}, "
-            f"network_channels={shown.network_channels!r}, backend={self.backend!r}{also})"
+            f"network_channels={shown.network_channels!r}, backend={self.runtime!r})"
         )
 
     def _run_each(
@@ -356,7 +350,7 @@ class DeepDetect:
                 places = [(number, rgb.shape) for number, rgb in batch]
                 loaded = [rgb for _, rgb in batch]
                 with image_named(places[0][0]), memory_named(places[0][1], len(batch)):
-                    maps = compute_maps_of_batch(loaded, self._network, self.heatmap_options)
+                    maps = compute_maps(loaded, self._network, self.heatmap_options)
                 del batch, loaded  # the keypoints need the room
                 for place in places:
                     yield (*place, maps.pop(0))

@@ -92,13 +92,6 @@ def seen_size(shape: tuple[int, ...], options: HeatmapOptions) -> tuple[int, int
 
 
 def compute_maps(
-    rgb: np.ndarray, network: Network, options: HeatmapOptions = HeatmapOptions()
-) -> Maps:
-    """Run the network on a (H, W, 3) uint8 RGB image, as `compute_maps_of_batch` does."""
-    return compute_maps_of_batch([rgb], network, options)[0]
-
-
-def compute_maps_of_batch(
     images: Sequence[np.ndarray], network: Network, options: HeatmapOptions = HeatmapOptions()
 ) -> list[Maps]:
     """Run the network once on (H, W, 3) uint8 RGB images that it sees at one size.

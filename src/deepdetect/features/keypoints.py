@@ -308,10 +308,6 @@ def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
     It is Bayer's matrix, of the image's own (width, height): neighbours come far apart. Nearest
     pixels count. The ranks are (N,) float32 in [0, 1).
-
-    Example:
-        >>> bayer_order(np.array([[0, 0], [1, 0], [0, 1], [1, 1]]), (2, 2)).tolist()
-        [0.0, 0.5, 0.75, 0.25]
     """
     column, row = np.rint(np.asarray(xy).reshape(-1, 2)).astype(np.int64).T
     bits = min(MAX_COORDINATE_BITS, max(1, (max(size) - 1).bit_length()))

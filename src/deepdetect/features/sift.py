@@ -270,11 +270,6 @@ def detect_sift(gray: np.ndarray, max_keypoints: int = 4000) -> Keypoints:
     """Detect SIFT keypoints, spread over a (H, W) uint8 image, and describe them by RootSIFT.
 
     They have sizes, angles and octaves; the descriptors are rotated to the keypoints' angles.
-
-    Example:
-        >>> gray = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
-        >>> detect_sift(gray, 20)
-        Keypoints(20 keypoints in 99x99 pixels, scores 0.0135 to 0.0788, 128-D uint8 descriptors)
     """
     size = (gray.shape[1], gray.shape[0])
     # Detected once: nearly all of the time goes into the pyramid, whatever the threshold.

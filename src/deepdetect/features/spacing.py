@@ -39,11 +39,6 @@ def spread_over_grid(
 
     Returns at most `max_keypoints` rows: first the best of each cell, then the second-best, ...
     `grid_cells` are along the longer side of the image.
-
-    Example:
-        >>> xy = np.array([[1, 1], [2, 1], [99, 99]])
-        >>> spread_over_grid(xy, np.array([3.0, 2.0, 1.0]), (100, 100), 2).tolist()
-        [0, 2]
     """
     side = max(image_size) / grid_cells
     cell = np.floor(np.maximum(xy, 0) / side).astype(np.int64)
@@ -62,11 +57,6 @@ def suppress_neighbors(
 
     Near is strictly closer than the radius, or of (N,) radii than the smaller one of both points.
     Of equal scores the first row comes first.
-
-    Example:
-        >>> xy = np.array([[0.0, 0], [1, 0], [2, 0], [9, 9]])
-        >>> suppress_neighbors(xy, np.array([1.0, 2, 3, 0]), 2).tolist()
-        [2, 0, 3]
     """
     order = np.argsort(-np.asarray(scores), kind="stable")
     if not len(order):

@@ -6,6 +6,7 @@ follow the published state dict, so that its weights load unchanged.
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from typing import Any
 
 import torch
@@ -16,17 +17,15 @@ EPSILON = 1e-3  # of every batch normalisation, as published
 DILATIONS = (1, 2, 4, 8, 16)
 
 
-class Convolution(nn.Module):
-    """A convolution without bias that keeps the size (stride 1) or halves it (stride 2)."""
+def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Conv2d:
+    """Make a convolution without bias that keeps the size (stride 1) or halves it (stride 2)."""
+    return nn.Conv2d(inputs, outputs, kernel, stride=stride, padding=kernel // 2, bias=False)
 
-    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(
-            inputs, outputs, kernel, stride=stride, padding=kernel // 2, bias=False
-        )
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self.conv(x)
+def _norm_activation(channels: int, **before: nn.Module) -> nn.Sequential:
+    """Make batch normalisation, then PReLU with one slope per channel, behind named modules."""
+    norm = nn.BatchNorm2d(channels, eps=EPSILON)
+    return nn.Sequential(OrderedDict(before, bn=norm, act=nn.PReLU(channels)))
 
 
 class _DilatedBfloat16(torch.autograd.Function):
@@ -77,30 +76,6 @@ class DilatedConvolution(nn.Module):
         return self.conv(x)
 
 
-class NormActivation(nn.Module):
-    """Batch normalisation, then PReLU with one slope per channel."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.bn = nn.BatchNorm2d(channels, eps=EPSILON)
-        self.act = nn.PReLU(channels)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.act(self.bn(x))
-
-
-class ConvolutionNormActivation(Convolution):
-    """Convolution, batch normalisation, PReLU."""
-
-    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1) -> None:
-        super().__init__(inputs, outputs, kernel, stride)
-        self.bn = nn.BatchNorm2d(outputs, eps=EPSILON)
-        self.act = nn.PReLU(outputs)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.act(self.bn(super().forward(x)))
-
-
 class SpatialPyramid(nn.Module):
     """Reduce, then five dilated branches, fused by running sums and joined.
 
@@ -114,7 +89,8 @@ class SpatialPyramid(nn.Module):
         super().__init__()
         narrow = outputs // len(DILATIONS)
         first = outputs - narrow * (len(DILATIONS) - 1)
-        self.c1 = Convolution(inputs, narrow, reduce, stride=2 if reduce == 3 else 1)
+        reducing = _convolution(inputs, narrow, reduce, stride=2 if reduce == 3 else 1)
+        self.c1 = nn.Sequential(OrderedDict(conv=reducing))
         for dilation in DILATIONS:
             width = first if dilation == 1 else narrow
             setattr(self, f"d{dilation}", DilatedConvolution(narrow, width, dilation))
@@ -149,7 +125,7 @@ class ResidualPyramid(SpatialPyramid):
     def __init__(self, inputs: int, outputs: int, residual: bool = True) -> None:
         super().__init__(inputs, outputs, reduce=1)
         self.residual = residual
-        self.bn = NormActivation(outputs)
+        self.bn = _norm_activation(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
         joined = self.branches(x)
@@ -161,15 +137,15 @@ class Encoder(nn.Module):
 
     def __init__(self, decoder_channels: int, p: int, q: int) -> None:
         super().__init__()
-        self.level1 = ConvolutionNormActivation(3, 16, 3, stride=2)
-        self.b1 = NormActivation(16 + 3)
+        self.level1 = _norm_activation(16, conv=_convolution(3, 16, 3, stride=2))
+        self.b1 = _norm_activation(16 + 3)
         self.level2_0 = DownsamplingPyramid(16 + 3, 64)
         self.level2 = nn.ModuleList(ResidualPyramid(64, 64) for _ in range(p))
-        self.b2 = NormActivation(128 + 3)
+        self.b2 = _norm_activation(128 + 3)
         self.level3_0 = DownsamplingPyramid(128 + 3, 128)
         self.level3 = nn.ModuleList(ResidualPyramid(128, 128) for _ in range(q))
-        self.b3 = NormActivation(256)
-        self.classifier = Convolution(256, decoder_channels, 1)
+        self.b3 = _norm_activation(256)
+        self.classifier = nn.Sequential(OrderedDict(conv=_convolution(256, decoder_channels, 1)))
         self.halve = nn.AvgPool2d(3, stride=2, padding=1)
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -197,14 +173,14 @@ class ESPNet(nn.Module):
         super().__init__()
         width = decoder_channels
         self.encoder = Encoder(width, p, q)
-        self.level3_C = Convolution(128 + 3, width, 1)
+        self.level3_C = nn.Sequential(OrderedDict(conv=_convolution(128 + 3, width, 1)))
         self.br = nn.BatchNorm2d(width, eps=EPSILON)
-        self.conv = ConvolutionNormActivation(16 + 3 + width, width, 3)
+        self.conv = _norm_activation(width, conv=_convolution(16 + 3 + width, width, 3))
         self.up_l3 = nn.Sequential(_double(width, width))
         self.combine_l2_l3 = nn.Sequential(
-            NormActivation(2 * width), ResidualPyramid(2 * width, width, residual=False)
+            _norm_activation(2 * width), ResidualPyramid(2 * width, width, residual=False)
         )
-        self.up_l2 = nn.Sequential(_double(width, width), NormActivation(width))
+        self.up_l2 = nn.Sequential(_double(width, width), _norm_activation(width))
         self.classifier = _double(width, 1)
 
     def forward(self, image: Tensor) -> Tensor:

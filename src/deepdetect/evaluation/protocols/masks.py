@@ -175,7 +175,8 @@ class LabelDetector:
         """Return the label as (H, W) float32, 0 or 1."""
         rgb = load_image(image)
         if self.heatmap_options is not None:
-            return compute_maps(rgb, self._network, self.heatmap_options).both()[0]
+            (maps,) = compute_maps([rgb], self._network, self.heatmap_options)
+            return maps.both()[0]
         return fuse(luma(rgb), self.options).mask.astype(np.float32)
 
     def _network(self, image: np.ndarray) -> np.ndarray:
