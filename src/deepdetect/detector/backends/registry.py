@@ -19,8 +19,8 @@ from ..._shared.errors import (
     DeepDetectError,
     OptionError,
     WeightsError,
+    check_name,
     require_packages,
-    unknown_name,
 )
 from ..._shared.options import check_ranges
 from .interface import PROBE_SHAPE, Network, RuntimeOptions
@@ -45,10 +45,8 @@ PRECISIONS = ("float32", "bfloat16")
 
 def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
     """Load weights with the backend that fits, and return its name; a few networks are kept."""
-    if options.backend not in ("auto", *BACKENDS):
-        raise unknown_name("backend", options.backend, ("auto", *BACKENDS))
-    if options.precision not in PRECISIONS:
-        raise unknown_name("precision", options.precision, PRECISIONS)
+    check_name("backend", options.backend, ("auto", *BACKENDS))
+    check_name("precision", options.precision, PRECISIONS)
     check_ranges(options, between={"threads": (1, math.inf)})
     name = _choose(path, options) if options.backend == "auto" else options.backend
     backend = BACKENDS[name]
