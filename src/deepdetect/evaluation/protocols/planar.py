@@ -70,13 +70,14 @@ def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
         for pair in pairs
         if not (pair.first.parent / f"H1to{pair.number}p.refined").exists()
     ]
+    if len(unrefined) == len(pairs):
+        unrefined = ["all pairs"]
+        del by_truth["refined"]
     if unrefined and "standard" in options.protocols:
         run.skipped.append(
             f"refined homographies of {', '.join(unrefined)}: there is no file H1toKp.refined "
             "(benchmarks/refine_oxford.py makes them); these are evaluated by the published one"
         )
-    if len(unrefined) == len(pairs):
-        del by_truth["refined"]
     sections = _oxford_paper(run, options, scenes)
     for truth, of_truth in by_truth.items():
         key, title = f"oxford_{truth}", f"Oxford, {truth} homographies"
