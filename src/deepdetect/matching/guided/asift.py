@@ -65,8 +65,7 @@ def simulate_view(
     border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": GRAY_OUTSIDE}
     rotated = cv2.warpAffine(gray, affine, (across, down), **border)
     blur = BLUR * np.sqrt(tilt**2 - 1)
-    if blur > 0:
-        rotated = cv2.GaussianBlur(rotated, (0, 0), sigmaX=blur, sigmaY=0.01)
+    rotated = cv2.GaussianBlur(rotated, (0, 0), sigmaX=blur, sigmaY=0.01)
     shorten = np.array([[1 / tilt, 0, 0], [0, 1.0, 0]])
     size = max(1, round(across / tilt)), down
     view = cv2.warpAffine(rotated, shorten, size, flags=cv2.INTER_LINEAR, **border)

@@ -35,9 +35,6 @@ from .epipolar_search import epipolar_search, log10_p_value
 Pair = tuple[np.ndarray, np.ndarray]
 """Something of both images: themselves, (H, W) uint8 luma, or (M, 2) matched positions."""
 
-Sizes = tuple[tuple[int, int], tuple[int, int]]
-"""(width, height) of both images."""
-
 MAX_SIDE_PX = 1200
 """Longer sides are scaled down to this: the initial geometry need not be fine."""
 
@@ -333,7 +330,7 @@ def estimate_initial_geometry(
     Of each view that is simulated, where the matches alone give nothing, there are so many
     keypoints; with 0 none is simulated. The other arguments are those of `choose_model`.
     """
-    size0, size1 = ((view.shape[1], view.shape[0]) for view in tentative.views)
+    sizes = tentative.views[0].shape[::-1], tentative.views[1].shape[::-1]
     nowhere = np.empty((0, 2))
     nothing = TwoViewModel("none", None, np.zeros(0, bool), float("inf"))
     best = InitialGeometry.of(nothing, nowhere, nowhere)
@@ -342,13 +339,13 @@ def estimate_initial_geometry(
         num_views += views
         for ratio in MAX_RATIOS:
             chosen = points[0][ratios < ratio], points[1][ratios < ratio]
-            two_view = choose_model(*chosen, (size0, size1), model, seed, semi_calibrated)
+            two_view = choose_model(*chosen, sizes, model, seed, semi_calibrated)
             geometry = InitialGeometry.of(two_view, *chosen)
             geometry = _with_further_evidence(geometry, chosen[0], tentative)
             if geometry.log10_nfa < best.log10_nfa:
                 best = replace(geometry, num_views=num_views)
             if best.trusted:
-                best = _with_further_matches(best, tentative, (size0, size1))
+                best = _with_further_matches(best, tentative)
                 return best.rescaled(*tentative.scales)
         if num_views and best.log10_nfa > MAX_HINT_LOG10_NFA:
             break
@@ -388,7 +385,7 @@ def _with_further_evidence(
 
 
 def _with_further_matches(
-    geometry: InitialGeometry, tentative: TentativeMatches, sizes: Sizes
+    geometry: InitialGeometry, tentative: TentativeMatches
 ) -> InitialGeometry:
     """Search along the lines of a fundamental matrix that few matches agree with, and refit it."""
     if geometry.model != "fundamental" or len(geometry.points0) >= MAX_MATCHES_TO_SEARCH:
@@ -399,6 +396,7 @@ def _with_further_matches(
         np.concatenate([geometry.points0, further[0]]),
         np.concatenate([geometry.points1, further[1]]),
     )
+    sizes = tentative.views[0].shape[::-1], tentative.views[1].shape[::-1]
     sigmas = np.full(len(points0), MATCH_SIGMA_PX)
     matrix = refine_fundamental(points0, points1, geometry.matrix, sizes, sigmas)
     inliers = epipolar_errors(points0, points1, matrix) < GUIDING_THRESHOLDS_PX["fundamental"]

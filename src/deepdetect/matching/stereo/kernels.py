@@ -169,13 +169,10 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
             # Places inside the right image: 0 <= x - min_disparity - d < width.
             low = min(max(0, x - min_disparity - width + 1), count)
             high = max(min(count, x - min_disparity + 1), low)
-            inside = np.uint16(65535)
+            least = inside = np.uint16(65535)
             for d in range(low, high):
                 inside = min(inside, sums[d])
-            least = inside
-            for d in range(low):
-                least = min(least, sums[d])
-            for d in range(high, count):
+            for d in range(count):
                 least = min(least, sums[d])
             # Where both are as good, the place that can be seen.
             seen = low < high and inside == least
