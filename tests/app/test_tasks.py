@@ -14,8 +14,8 @@ from PIL import Image
 import deepdetect
 from deepdetect import load_image, load_matches, register
 from deepdetect._shared.errors import DeepDetectError
+from deepdetect.app import tasks
 from deepdetect.app.tasks import TASKS, SentImage, TaskResult
-from deepdetect.reconstruction import pipeline
 from deepdetect.reconstruction.files import ENDINGS
 
 EXAMPLES = Path(deepdetect.__path__[0]) / "app/static/examples"
@@ -92,7 +92,7 @@ def test_a_model_and_a_focal_length_that_is_not_known_is_assumed_and_said(
     def said(*_: object, focal_px: float, **__: object) -> None:
         raise DeepDetectError(f"{focal_px} px were given")
 
-    monkeypatch.setattr(pipeline, "reconstruct", said)
+    monkeypatch.setattr(tasks, "reconstruct", said)
     with pytest.raises(DeepDetectError, match="995 px were given"):
         run("reconstruct", examples, names, tmp_path, focal_px=995)
 

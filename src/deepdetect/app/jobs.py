@@ -20,6 +20,7 @@ from .._shared.errors import DeepDetectError, OptionError
 from .._shared.machine import end_with_parent
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.signals import kill_group, signals_held
+from ..io.image_file import limit_megapixels
 from .tasks import TASKS, Order
 
 FOLDER_PREFIX = "deepdetect-app-"
@@ -167,8 +168,6 @@ class Jobs:
 
 def run_task(sender: Connection, order: Order) -> None:
     """Do a task, in a process of its own: its files are in `results`, its state is sent."""
-    from ..io.image_file import limit_megapixels
-
     if hasattr(os, "setsid"):
         os.setsid()  # so that all it starts can be ended
     for stream in (1, 2):  # what libraries print

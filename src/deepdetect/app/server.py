@@ -20,6 +20,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -33,7 +34,9 @@ from starlette.staticfiles import StaticFiles
 
 from .. import __version__
 from .._shared.errors import DeepDetectError, OptionError, unknown_name
+from ..detector.detector import DeepDetect
 from ..detector.pretrained import RANKER
+from ..io.image import IMAGE_SUFFIXES
 from .jobs import AppOptions, Jobs
 from .tasks import TASKS, Order, SentImage
 
@@ -228,16 +231,12 @@ class AppServer:
             raise HTTPException(403, "only the page of deepdetect app may ask this")
 
     @cached_property
-    def _detector(self) -> Any:
+    def _detector(self) -> DeepDetect:
         """The network, opened when it is first needed."""
-        from ..detector.detector import DeepDetect
-
         return DeepDetect(resolution="native")
 
     async def _heatmap(self, request: Request) -> Response:
         """Answer the pixels of an image, (H, W, 3) uint8, with its logits, (H, W) float32."""
-        import numpy as np
-
         self._check_key(request)
         try:
             width, height = (int(request.query_params[name]) for name in ("width", "height"))
@@ -376,7 +375,5 @@ def _clean(name: str) -> str:
 
 def _suffix(name: str) -> str:
     """Return the ending of an image's file, empty where it is another."""
-    from ..io.image import IMAGE_SUFFIXES
-
     suffix = Path(name).suffix.lower()
     return suffix if suffix in IMAGE_SUFFIXES else ""

@@ -13,7 +13,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
 from .._shared.errors import DeepDetectError, OptionError, ReconstructionError, install_command
+from ..detector.detector import DeepDetect
+from ..detector.point_detector import PointDetector
+from ..io.exif import calibration_from_exif
+from ..io.image import load_image
+from ..io.tables import save_keypoints, save_matches
+from ..matching.pipeline import GUIDED_STAGES, match_images
+from ..matching.registration import register
+from ..matching.stitching import STAGES, stitch
+from ..reconstruction.files import ENDINGS, save_reconstruction
+from ..reconstruction.pipeline import reconstruct
+from ..sfm.pipeline import reconstruct_many
+from ..viz.draw import add_caption, save_picture
 
 FOLDER_KEYPOINTS = 2048
 """Best keypoints of each image of a folder."""
@@ -102,11 +116,6 @@ class Task:
 
 def run_match(images: Images, options: Options, folder: Path, report: Report) -> TaskResult:
     """Match two images, guided by a geometry."""
-    from ..io.image import load_image
-    from ..io.tables import save_matches
-    from ..matching.pipeline import GUIDED_STAGES, match_images
-    from ..viz.draw import add_caption, save_picture
-
     stages = _stages(GUIDED_STAGES, report)
     first, second = (load_image(one.path) for one in images)
     matches = match_images(first, second, progress=stages)
@@ -130,12 +139,6 @@ def run_match(images: Images, options: Options, folder: Path, report: Report) ->
 
 def run_register(images: Images, options: Options, folder: Path, report: Report) -> TaskResult:
     """Warp the second image into the frame of the first."""
-    import numpy as np
-
-    from ..matching.pipeline import GUIDED_STAGES
-    from ..matching.registration import register
-    from ..viz.draw import save_picture
-
     stages = _stages(GUIDED_STAGES, report)
     found = register(images[0].path, images[1].path, progress=stages)
     pictures = {
@@ -156,9 +159,6 @@ def run_register(images: Images, options: Options, folder: Path, report: Report)
 
 def run_stitch(images: Images, options: Options, folder: Path, report: Report) -> TaskResult:
     """Make a panorama."""
-    from ..matching.stitching import STAGES, stitch
-    from ..viz.draw import save_picture
-
     stages = _stages(STAGES, report)
     panorama = stitch([one.path for one in images], progress=stages)
     save_picture(panorama.image, folder / "panorama.jpg")
@@ -176,12 +176,6 @@ def run_stitch(images: Images, options: Options, folder: Path, report: Report) -
 
 def run_reconstruct(images: Images, options: Options, folder: Path, report: Report) -> TaskResult:
     """Make a 3D model of two images."""
-    from ..detector.detector import DeepDetect
-    from ..io.exif import calibration_from_exif
-    from ..io.image import load_image
-    from ..reconstruction.files import ENDINGS, save_reconstruction
-    from ..reconstruction.pipeline import reconstruct
-
     done = itertools.count(1)
     report("starting", 0, MODEL_STAGES)
     left, right = (one.path for one in images)
@@ -217,8 +211,6 @@ def run_reconstruct_many(
     images: Images, options: Options, folder: Path, report: Report
 ) -> TaskResult:
     """Make cameras and a dense model of many images."""
-    from ..sfm.pipeline import reconstruct_many
-
     report("cameras and points of all images", 0, 0)
     work = folder / "work"
     found = reconstruct_many([one.path for one in images], work)
@@ -236,11 +228,6 @@ def run_folder_keypoints(
     images: Images, options: Options, folder: Path, report: Report
 ) -> TaskResult:
     """Write the best keypoints of each image, as one CSV file each, into one ZIP file."""
-    from ..detector.point_detector import PointDetector
-    from ..io.image import load_image
-    from ..io.tables import save_keypoints
-    from ..viz.draw import save_picture
-
     detector = PointDetector(FOLDER_KEYPOINTS)
     table, failures = folder / "table.csv", []
     shown, total = "", 0

@@ -21,7 +21,7 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import BatchError, DeepDetectError, OptionError
 from .._shared.records import Outputs, check_not_made, outputs_in
 from .._shared.signals import exit_by_signal, handle_signals
-from ..io.image import load_image
+from ..io.image import find_images, load_image
 from ..io.image_file import MAX_MEGAPIXELS, limit_megapixels
 from ._app import MORE
 from ._app import NOTHING_FOUND as NOTHING_FOUND
@@ -203,8 +203,6 @@ def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
     The folder of the results is left out when it lies in one of the folders; where it is one of
     them, what earlier runs made in it.
     """
-    from ..io.image import find_images
-
     images: dict[Path, None] = {}
     for path in paths:
         below = find_images(path, [output]) if path.is_dir() else [path]
@@ -237,8 +235,6 @@ def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
 
 def check_folder_not_made(folder: Path, output: Path) -> None:
     """Refuse a folder that holds images which earlier runs made, but for those below the output."""
-    from ..io.image import find_images
-
     if any(folder.glob("**/.deepdetect")):
         check_not_made(folder, find_images(folder, [output]))
 
