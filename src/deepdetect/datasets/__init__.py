@@ -27,8 +27,11 @@ def _remote_dataset(name: str, files: Any = (), texts: Any = None, **values: Any
     if name.startswith("photographs"):
         free = name.endswith("free")
         crops = [crop for crop in photographs.listed_crops() if crop.is_free or not free]
+        used = {crop.source for crop in crops}
+        sources = photographs.listed_sources()
+        archives = tuple(sources[each].archive for each in sources if each in used)
         prepare = partial(photographs.write_crops, crops=crops)
-        return RemoteDataset(name, files=photographs.archives(crops), prepare=prepare, **values)
+        return RemoteDataset(name, files=archives, prepare=prepare, **values)
     made = tuple(RemoteFile(**{**file, "urls": tuple(file["urls"])}) for file in files)
     written = {path: json.dumps(value, indent=1) + "\n" for path, value in (texts or {}).items()}
     return RemoteDataset(name, files=made, contents=_known(name), texts=written, **values)

@@ -168,9 +168,3 @@ def cut(picture: Image.Image, short_side_px: int, x: int, y: int) -> Image.Image
     return picture.resize(
         (CROP_SIDE_PX, CROP_SIDE_PX), Image.Resampling.LANCZOS, tuple(box.tolist())
     )
-
-
-def archives(crops: Sequence[Crop]) -> tuple[RemoteFile, ...]:
-    """Return the archives that crops are cut from."""
-    used = {crop.source for crop in crops}
-    return tuple(source.archive for name, source in listed_sources().items() if name in used)

@@ -64,18 +64,18 @@ def restore(
     It must be of the same run: fused optimisers write beyond a moment of another shape.
     """
     network.load_state_dict({name: tensors[f"network.{name}"] for name in network.state_dict()})
-    names = {parameter: name for name, parameter in network.named_parameters()}
+    parameters = dict(network.named_parameters())
     owners = {
-        names[parameter]: (optimizer, parameter)
+        parameter: optimizer
         for optimizer in optimizers
         for group in optimizer.param_groups
         for parameter in group["params"]
     }
     for name, value in tensors.items():
         if name.startswith("optimizer."):
-            _, moment, name_of_parameter = name.split(".", 2)
-            optimizer, parameter = owners[name_of_parameter]
-            optimizer.state[parameter][moment] = _like(value, parameter)
+            _, moment, of_parameter = name.split(".", 2)
+            parameter = parameters[of_parameter]
+            owners[parameter].state[parameter][moment] = _like(value, parameter)
 
 
 def _like(value: Tensor, parameter: Tensor) -> Tensor:

@@ -129,9 +129,6 @@ class PairDataset(Dataset[CandidatePair]):
     def __init__(self, files: Sequence[Path], options: PointsTrainingOptions) -> None:
         self.files, self.options = list(files), options
 
-    def __len__(self) -> int:
-        return self.options.steps * self.options.pairs
-
     def __getitem__(self, index: tuple[int, int]) -> CandidatePair:
         options = self.options
         generator = np.random.default_rng([options.seed, 3, *index])
@@ -140,7 +137,7 @@ class PairDataset(Dataset[CandidatePair]):
             file = self.files[int(generator.integers(len(self.files)))]
             gray = luma(load_image(file))
             pair = draw_pair(gray, kind, options.side, generator)
-            if min(overlaps(pair)) > MIN_OVERLAP and np.ptp(pair.images[0]) > 20:
+            if overlap(pair) > MIN_OVERLAP and np.ptp(pair.images[0]) > 20:
                 break
         low, high = np.log([options.min_density, options.max_density])
         density = float(np.exp(generator.uniform(low, high)))
@@ -148,13 +145,10 @@ class PairDataset(Dataset[CandidatePair]):
         return candidate_pair(pair, density, options.match_weight > 0 and kind != "zoom")
 
 
-def overlaps(pair: ViewPair) -> tuple[float, float]:
-    """Return which fraction of each view shows what the other one shows, on a coarse grid."""
+def overlap(pair: ViewPair) -> float:
+    """Return which fraction of a view, the lesser of both, shows what the other one shows."""
     side = pair.images[0].shape[0]
     ticks = np.linspace(0, side - 1, 24)
     grid = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)
-    found = []
-    for matrix in (pair.homography, np.linalg.inv(pair.homography)):
-        xy = transform_points(grid, matrix)
-        found.append(float(((xy > 0) & (xy < side - 1)).all(1).mean()))
-    return found[0], found[1]
+    seen = [transform_points(grid, m) for m in (pair.homography, np.linalg.inv(pair.homography))]
+    return min(float(((xy > 0) & (xy < side - 1)).all(1).mean()) for xy in seen)
