@@ -54,8 +54,6 @@ def drop_in(
                 path.write_text(text)
             monkeypatch.syspath_prepend(tmp_path / "stand-ins")
             used.append(package)
-            # Pytest, which looks for examples in it, has left what it could not import.
-            sys.modules.pop(f"deepdetect.integrations.{package}", None)
         return importlib.import_module(f"deepdetect.integrations.{package}")
 
     yield take
