@@ -112,7 +112,8 @@ def _keep_what_is_read(graph: Any) -> None:
     names = {name for value in graph.outputs for name in value.get_names()}
     unread = names - {LOGITS} if LOGITS in names else {KEYPOINTS, KEYPOINT_LOGITS}
     for result in graph.get_results():
-        if not result.output(0).get_names().isdisjoint(unread):
+        own = result.output(0).get_names()
+        if own & unread and LOGITS not in own:  # versions before 2025 have several names for one
             graph.remove_result(result)
     for node in graph.get_ordered_ops():
         for value in node.outputs():
