@@ -28,7 +28,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 # What calls the parts of OpenCV that moved between its versions 4 and 5.
 TESTS_OPENCV4 ?= tests/labels tests/features tests/geometry tests/evaluation/baselines \
-	tests/detector/network/test_onnx_variants.py
+	tests/detector/network/test_onnx_export.py
 # A quick part that touches most of the packages that this one depends on.
 TESTS_LOWEST ?= tests/io tests/detector tests/labels tests/features
 
