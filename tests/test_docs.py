@@ -79,7 +79,7 @@ def test_python_names_exist(page: str) -> None:
     for part in code(PRESENT[page]):
         for name in re.findall(r"(?<![\w/.-])deepdetect(?:\.\w+)+", part):
             if name != "deepdetect.onnx":
-                resolve(re.sub(r"(integrations\.\w+)\.", r"\1:", name))
+                resolve(re.sub(r"(integrations\.\w+)\.?", r"\1:", name))
         if found := re.fullmatch(r"from (deepdetect[\w.]*) import ([\w, ]+)", part):
             for name in found[2].split(", "):
                 resolve(f"{found[1]}:{name}")
