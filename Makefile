@@ -13,12 +13,12 @@ INSTALLER ?= uv
 # Two processes, each with whole files (what a file sets up is set up once), on one thread each. One
 # that crashes ends the run: with a new one in its place pytest-xdist may wait for ever.
 PYTEST := -m pytest -n 2 --dist loadfile --max-worker-restart 0
-# The parts of the package with their tests, those that take longest first, and what is left.
-LONGEST := detector matching reconstruction evaluation app
-PARTS := $(LONGEST) $(filter-out cli $(LONGEST),$(notdir $(patsubst %/,%,$(wildcard tests/[!_]*/ tests/_shared/))))
-TESTS := $(foreach part,$(PARTS),"tests/$(part) $(wildcard src/deepdetect/$(part))") \
-	"tests/cli/test_[a-e]*.py" "tests/cli/test_[f-s]*.py" "tests/cli/test_[t-z]*.py src/deepdetect/cli" \
-	"tests/test_*.py src/deepdetect/*.py"
+# The parts of the package with their tests; those that take long come first.
+LONG := detector matching reconstruction evaluation app training
+OTHERS := $(filter-out cli $(LONG),$(notdir $(patsubst %/,%,$(wildcard tests/[!_]*/ tests/_shared/))))
+parts = $(foreach part,$(1),"tests/$(part) $(wildcard src/deepdetect/$(part))")
+TESTS := $(call parts,$(LONG)) "tests/test_*.py src/deepdetect/*.py" "tests/cli/test_[a-e]*.py" \
+	"tests/cli/test_[f-s]*.py" "tests/cli/test_[t-z]*.py src/deepdetect/cli" $(call parts,$(OTHERS))
 # Each part in a process of its own, two at a time: what it has loaded goes with it.
 run_parts = printf '%s\n' $(TESTS) | xargs -P 2 -I{} sh -c \
 	'output=$$($(VENV)/bin/python -m pytest -q $(1) {} 2>&1); status=$$?; echo "$$output"; exit $$status'

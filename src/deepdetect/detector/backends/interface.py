@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ..._shared.errors import DeepDetectError, WeightsError
+from ..._shared.options import suggest_keywords
 from ..pretrained import LOGITS
 
 PROBE_SHAPE = (24, 32)
@@ -33,6 +34,7 @@ class Network(Protocol):
         """
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class RuntimeOptions:
     """How the network is run: the options of `DeepDetect` of these names."""
