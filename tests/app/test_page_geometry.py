@@ -87,7 +87,7 @@ def test_one_place_of_the_second_picture_is_one(run_node: Any) -> None:
 
 
 def test_wrong_matches_have_no_geometry(run_node: Any) -> None:
-    model, agrees = estimate(run_node, anywhere(100, 3), anywhere(100, 4))
+    model, agrees = estimate(run_node, anywhere(60, 3), anywhere(60, 4))
     assert model == "none"
     assert not agrees.any()
 

@@ -12,22 +12,6 @@ from deepdetect import SelectionOptions
 from deepdetect.features import select_keypoints
 
 
-def select_in_node(run_node: Any, logits: np.ndarray, options: dict[str, Any]) -> np.ndarray:
-    """Return (N, 3): x, y and probability of the page's keypoints."""
-    script = """
-const map = prepare(new Float32Array(bytes), width, height);
-const pixels = select(map, values.options);
-const rows = Array.from(pixels, (pixel) =>
-  [pixel % width, Math.floor(pixel / width), map.probability[pixel]]);
-writeFileSync(made, new Uint8Array(Float64Array.from(rows.flat()).buffer));
-"""
-    imports = 'import { prepare, select } from "@/selection.js";\n'
-    chosen = {"threshold": 0.5, "density": None, **options}
-    height, width = logits.shape
-    found = run_node(imports, script, logits, width=width, height=height, options=chosen)
-    return found.reshape(-1, 3)
-
-
 OPTIONS = (
     {},
     {"threshold": 0.9},
@@ -39,32 +23,38 @@ OPTIONS = (
 )
 
 
-def compare(run_node: Any, logits: np.ndarray, options: dict[str, Any]) -> int:
+def compare(run_node: Any, logits: np.ndarray) -> None:
+    """Compare x, y and probability of the page's keypoints by all options with the package's."""
     from deepdetect.features.selection import sigmoid
 
-    expected = select_keypoints(sigmoid(logits), SelectionOptions(**options), logits)
-    found = select_in_node(run_node, logits, options)
-    np.testing.assert_array_equal(found[:, :2], expected.xy)
-    np.testing.assert_allclose(found[:, 2], expected.scores, atol=2e-7)
-    return len(expected)
+    script = """
+const map = prepare(new Float32Array(bytes), width, height);
+const rows = values.options.flatMap((options) => Array.from(select(map, options), (pixel) =>
+  [values.options.indexOf(options), pixel % width, Math.floor(pixel / width),
+   map.probability[pixel]]));
+writeFileSync(made, new Uint8Array(Float64Array.from(rows.flat()).buffer));
+"""
+    imports = 'import { prepare, select } from "@/selection.js";\n'
+    chosen = [{"threshold": 0.5, "density": None, **options} for options in OPTIONS]
+    height, width = logits.shape
+    rows = run_node(imports, script, logits, width=width, height=height, options=chosen)
+    rows = rows.reshape(-1, 4)
+    for k, options in enumerate(OPTIONS):
+        expected = select_keypoints(sigmoid(logits), SelectionOptions(**options), logits)
+        found = rows[rows[:, 0] == k, 1:]
+        np.testing.assert_array_equal(found[:, :2], expected.xy, err_msg=str(options))
+        np.testing.assert_allclose(found[:, 2], expected.scores, atol=2e-7)
 
 
-@pytest.mark.parametrize("options", OPTIONS, ids=str)
-def test_the_keypoints_of_a_photograph(
-    options: dict[str, Any], run_node: Any, photo: np.ndarray
-) -> None:
-    logits = deepdetect.DeepDetect(backend="onnxruntime").heatmap_and_logits(photo)[1]
-    compare(run_node, logits, options)
+def test_the_keypoints_of_a_photograph(run_node: Any, photo: np.ndarray) -> None:
+    compare(run_node, deepdetect.DeepDetect().heatmap_and_logits(photo)[1])
 
 
-@pytest.mark.parametrize("options", OPTIONS, ids=str)
 @pytest.mark.parametrize(("height", "width"), [(16, 16), (37, 50)])
-def test_keypoints_among_many_equal_ranks(
-    height: int, width: int, options: dict[str, Any], run_node: Any
-) -> None:
+def test_keypoints_among_many_equal_ranks(height: int, width: int, run_node: Any) -> None:
     """Plateaus: which of their pixels are taken is decided by the same order."""
     logits = np.random.default_rng(0).integers(-2, 3, (height, width)).astype(np.float32)
-    compare(run_node, logits, options)
+    compare(run_node, logits)
 
 
 @pytest.mark.parametrize("size", [(250, 200), (131, 77)], ids=str)
