@@ -65,7 +65,7 @@ def oxford_folder(tmp_path_factory: pytest.TempPathFactory, write_scene) -> Path
     """Eight scenes of small images: only boat's are large enough for ORB; ubc 6 equals 1."""
     root = tmp_path_factory.mktemp("data")
     for index, scene in enumerate(SCENES):
-        size = (100, 92) if scene == "boat" else (48, 36 + index)
+        size = (94, 86) if scene == "boat" else (40, 32 + index)
         move = np.array(MOVES.get(scene, np.eye(3)), float)
         corner = (100 + 17 * index, 30 + 11 * index)
         write_scene(root / "oxford" / scene, size, move, corner=corner)

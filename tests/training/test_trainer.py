@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -48,12 +47,10 @@ TINY = dataclasses.replace(OPTIONS, stages=(Stage(64, 4, 1),), short_sides=(64,)
 STEPS = 11 * 3 // 4 + 11 // 2  # of OPTIONS; one of the twelve images is held out
 
 
-@pytest.fixture(scope="module", autouse=True)
-def every_step() -> Iterator[None]:
+@pytest.fixture
+def every_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """Write a checkpoint after each step."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer_module, "CHECKPOINT_INTERVAL_S", 0)
-        yield
+    monkeypatch.setattr(trainer_module, "CHECKPOINT_INTERVAL_S", 0)
 
 
 @pytest.fixture(scope="module")
@@ -147,6 +144,7 @@ def test_the_best_weights_say_where_they_come_from(run: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("every_step")
 @pytest.mark.parametrize(("method", "count"), [("training_step", 6), ("heatmap", 3)])
 def test_an_interrupted_run_ends_with_the_same_weights(
     method: str, count: int, run: Path, tmp_path: Path, fit, monkeypatch: pytest.MonkeyPatch
@@ -160,6 +158,7 @@ def test_an_interrupted_run_ends_with_the_same_weights(
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("every_step")
 def test_soap_resumes_with_the_same_weights(
     tmp_path: Path, fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:

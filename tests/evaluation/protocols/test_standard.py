@@ -42,7 +42,7 @@ def pairs(low_visibility_folder: Path) -> list[PlanarPair]:
 @pytest.fixture(scope="module", autouse=True)
 def few_random_points():
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(repeatability, "CHANCE_POINTS", 1000)
+        patched.setattr(repeatability, "CHANCE_POINTS", 200)
         yield
 
 

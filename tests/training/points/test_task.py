@@ -20,7 +20,7 @@ from deepdetect.training.points.measure import MEASURES, measure, validation_pai
 from deepdetect.training.points.task import RankerTrainer
 from deepdetect.training.trainer import CHECKPOINT
 
-OPTIONS = PointsTrainingOptions(steps=4, pairs=1, side=96, val_count=1, val_pairs=1)
+OPTIONS = PointsTrainingOptions(steps=2, pairs=1, side=96, val_count=1, val_pairs=1)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -42,6 +42,17 @@ def whole(textures: Path, tmp_path_factory) -> TrainingResult:
     return run(textures, tmp_path_factory.mktemp("whole"))
 
 
+@pytest.fixture(scope="module")
+def untrained(textures: Path) -> RankerTrainer:
+    """As it is before the first step; the caller keeps its random numbers."""
+    torch.manual_seed(3)
+    expected = torch.rand(4)
+    torch.manual_seed(3)
+    made = RankerTrainer(textures, textures, OPTIONS)
+    assert torch.equal(torch.rand(4), expected)
+    return made
+
+
 def interrupted(monkeypatch: pytest.MonkeyPatch, count: int) -> Any:
     calls = iter(range(count))
     step = RankerTrainer.training_step
@@ -60,17 +71,14 @@ def same_state(a: Path, b: Path) -> bool:
     return first.keys() == second.keys() and all(torch.equal(first[k], second[k]) for k in first)
 
 
-def test_training_changes_the_weights_and_measures(whole: TrainingResult, textures: Path) -> None:
-    torch.manual_seed(3)
-    expected = torch.rand(4)
-    torch.manual_seed(3)
-    start = RankerTrainer(textures, textures, OPTIONS)
-    assert torch.equal(torch.rand(4), expected), "the caller keeps its random numbers"
+def test_training_changes_the_weights_and_measures(
+    whole: TrainingResult, untrained: RankerTrainer
+) -> None:
     after = load_file(whole.weights.parent / CHECKPOINT)
     assert all(
-        (after[f"network.ranker.{n}"] != p).any() for n, p in start.ranker.named_parameters()
+        (after[f"network.ranker.{n}"] != p).any() for n, p in untrained.ranker.named_parameters()
     )
-    assert [point["step"] for point in whole.points] == [0, 4]
+    assert [point["step"] for point in whole.points] == [0, 2]
     assert whole.best["score"] == max(point["score"] for point in whole.points)
     assert "perceptron of" in (whole.weights.parent / "MODEL_CARD.md").read_text()
     assert "| zoom |" in (whole.weights.parent / "MODEL_CARD.md").read_text()
@@ -79,9 +87,9 @@ def test_training_changes_the_weights_and_measures(whole: TrainingResult, textur
 def test_an_interrupted_run_ends_with_the_same_weights(
     whole: TrainingResult, textures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with monkeypatch.context() as patch, interrupted(patch, 3):
+    with monkeypatch.context() as patch, interrupted(patch, 1):
         run(textures, tmp_path)
-    assert read_checkpoint(tmp_path / CHECKPOINT)[1]["step"] == 3
+    assert read_checkpoint(tmp_path / CHECKPOINT)[1]["step"] == 1
     assert run(textures, tmp_path).points == whole.points
     assert same_state(tmp_path, whole.weights.parent)
 
@@ -97,8 +105,8 @@ def test_the_best_weights_are_those_of_the_best_measure(
     assert json.loads(notes["point"]) == whole.best
 
 
-def test_an_untrained_ranker_ranks_by_the_first_feature(textures: Path) -> None:
-    module = RankerTrainer(textures, textures, OPTIONS).ranker
+def test_an_untrained_ranker_ranks_by_the_first_feature(untrained: RankerTrainer) -> None:
+    module = untrained.ranker
     features = module.mean + module.deviation * torch.randn(
         200, len(module.mean), generator=torch.Generator().manual_seed(1)
     )
