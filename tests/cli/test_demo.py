@@ -21,11 +21,9 @@ def test_a_shifted_copy_is_matched_right(tmp_path: Path) -> None:
     """The right view is the left one moved by 6 pixels: the truth is exact."""
     import cv2
 
-    noise = np.random.default_rng(0).integers(0, 256, (60, 90, 3), np.uint8)
-    texture = cv2.resize(noise, (180, 120), interpolation=cv2.INTER_CUBIC)
-    pair = StereoPair(
-        "noise", texture[:, :-6], texture[:, 6:], np.full((120, 174), 6.0, np.float32)
-    )
+    noise = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
+    texture = cv2.resize(noise, (120, 80), interpolation=cv2.INTER_CUBIC)
+    pair = StereoPair("noise", texture[:, :-6], texture[:, 6:], np.full((80, 114), 6.0, np.float32))
     result = run_demo(pair, FakeDetector(), tmp_path)
     assert result["all_matches"]["precision"] > 0.9
     assert result["inliers"]["precision"] >= result["all_matches"]["precision"]

@@ -20,15 +20,15 @@ from deepdetect.training.points.measure import MEASURES, measure, validation_pai
 from deepdetect.training.points.task import RankerTrainer
 from deepdetect.training.trainer import CHECKPOINT
 
-OPTIONS = PointsTrainingOptions(steps=2, pairs=1, side=96, val_count=1, val_pairs=1)
+OPTIONS = PointsTrainingOptions(steps=2, pairs=1, side=64, val_count=1, val_pairs=1)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def few_and_small() -> Iterator[None]:
     """Measure few pairs, and small ones, which is faster."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("deepdetect.training.points.measure.SIDE_PX", 96)
-        patch.setattr("deepdetect.training.points.task.STATISTICS_PAIRS", 4)
+        patch.setattr("deepdetect.training.points.measure.SIDE_PX", 64)
+        patch.setattr("deepdetect.training.points.task.STATISTICS_PAIRS", 2)
         patch.setattr("deepdetect.training.trainer.CHECKPOINT_INTERVAL_S", 0)
         yield
 
@@ -123,7 +123,7 @@ def test_the_measure_of_a_blind_detector(textures: Path) -> None:
     generator = np.random.default_rng(0)
 
     def blind(image: np.ndarray) -> Keypoints:
-        return Keypoints(generator.uniform(0, 95, (500, 2)), generator.random(500), (96, 96))
+        return Keypoints(generator.uniform(0, 63, (500, 2)), generator.random(500), (64, 64))
 
     found = measure(blind, pairs)
     assert len(found) == 1 + 4 * len(MEASURES)
