@@ -91,6 +91,8 @@ class Facade:
 @pytest.fixture(scope="session")
 def facade() -> Callable[[float], Facade]:
     """Draw a wall with a post that takes a share of the left view, of photographs."""
+    import functools
+
     import cv2
 
     data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
@@ -99,6 +101,7 @@ def facade() -> Callable[[float], Facade]:
     rotation = cv2.Rodrigues(np.radians([1.0, -3.0, 2.0]))[0]
     translation = -rotation @ [1.0, 0.06, 0.1]
 
+    @functools.cache
     def draw(share: float) -> Facade:
         wall = cv2.resize(data.astronaut(), (1000, 700), interpolation=cv2.INTER_CUBIC)
         post = np.ascontiguousarray(data.coffee()[:, 100 : 100 + max(1, round(400 * share))])

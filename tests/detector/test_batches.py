@@ -69,12 +69,12 @@ def test_images_of_one_size_are_run_together(photo: np.ndarray, backend: str, tt
     weights = "default" if backend != "torch" else pretrained_weights().with_suffix(".safetensors")
     detector = DeepDetect(weights, backend=backend, tta=tta)
     shapes = count_runs(detector)
-    pieces = [photo[y : y + 61, y : y + 83] for y in (0, 30, 60, 90, 120)]
+    pieces = [photo[y : y + 37, y : y + 51] for y in (0, 30, 60, 90, 120)]
     pieces[3] = np.full_like(pieces[3], 90)  # constant: the network is not run for it
     alone = [detector.heatmap(piece) for piece in pieces]
     shapes.clear()
     maps = detector.heatmap_batch(pieces, batch_size=3)
-    sizes = [(64, 88)] if tta == "none" else [(64, 88), (88, 64)]
+    sizes = [(40, 56)] if tta == "none" else [(40, 56), (56, 40)]
     assert {shape[2:] for shape in shapes} == set(sizes)
     assert [shape[0] for shape in shapes] == ([3, 1] if tta == "none" else [3] * 8 + [1] * 8)
     for map_, other in zip(maps, alone, strict=True):

@@ -164,7 +164,7 @@ def test_metadata(tmp_path: Path) -> None:
     assert read.items() >= {**expected, "licence": "CC0", "size": "48x64"}.items()
 
 
-@pytest.mark.parametrize("size", [None, (123, 157), (64, 96)])
+@pytest.mark.parametrize("size", [None, (123, 157)])
 def test_half_precision(
     size: tuple[int, int] | None,
     tmp_path: Path,
