@@ -238,7 +238,7 @@ def test_of_two_scenes_the_larger_is_the_model(write_fountain, tmp_path: Path, p
     """The negatives of three photographs are another scene: their descriptors are others."""
     from PIL import Image, ImageOps
 
-    folder = write_fountain(tmp_path / "photos", width=320)
+    folder = write_fountain(tmp_path / "photos", width=256)
     for name in ("0003", "0004", "0005"):
         with Image.open(folder / f"{name}.jpg") as image:
             ImageOps.invert(image).save(folder / f"negative-{name}.jpg")
