@@ -18,7 +18,7 @@ EVERY = deepdetect.SelectionOptions(density=1)
 
 def views(photo: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two colourful views, whose luma depends on the order of the colours."""
-    return photo[:, :200], photo[:, 40:240]
+    return photo[:160, 40:200], photo[:160, 64:224]
 
 
 def as_opencv(images: tuple[np.ndarray, ...]) -> list[np.ndarray]:

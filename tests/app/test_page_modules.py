@@ -11,7 +11,6 @@ import deepdetect
 from deepdetect import SelectionOptions
 from deepdetect.features import select_keypoints
 
-
 OPTIONS = (
     {},
     {"threshold": 0.9},

@@ -23,14 +23,14 @@ def fountain(shared: Path, tmp_path: Path) -> Path:
     folder.mkdir()
     for name in ("0004", "0005", "0006"):
         with Image.open(shared / "data" / "fountain" / f"{name}.jpg") as image:
-            image.resize((384, 256), Image.Resampling.LANCZOS).save(folder / f"{name}.jpg")
-    Image.new("RGB", (384, 256)).save(folder / "black.png")
+            image.resize((288, 192), Image.Resampling.LANCZOS).save(folder / f"{name}.jpg")
+    Image.new("RGB", (288, 192)).save(folder / "black.png")
     return folder
 
 
 def test_a_folder_becomes_a_model(run, fountain: Path) -> None:
-    arguments = ("reconstruct", fountain, "-o", "model", "--workers", 1, "--focal", 345)
-    result = run(*arguments, "--max-keypoints", 1500, "--json")
+    arguments = ("reconstruct", fountain, "-o", "model", "--workers", 1, "--focal", 259)
+    result = run(*arguments, "--max-keypoints", 1200, "--json")
     assert result.exit_code == 0, result.output
     values = json.loads(result.stdout)
     assert values == json.loads(Path("model/model.json").read_text())
@@ -43,7 +43,7 @@ def test_a_folder_becomes_a_model(run, fountain: Path) -> None:
         assert Path(file).exists()
     assert "mapping" in result.stderr
 
-    again = run(*arguments, "--max-keypoints", 1500)
+    again = run(*arguments, "--max-keypoints", 1200)
     assert again.exit_code == 0, again.output
     assert "unregistered: black.png" in again.stdout
     other = run(*arguments, "--max-keypoints", 1000)
@@ -54,7 +54,7 @@ def test_a_folder_becomes_a_model(run, fountain: Path) -> None:
     for gone in ("model.ply", "model.glb", "model.html", "model.json", "database.db"):
         Path("model", gone).unlink()
     copy = shutil.copytree(fountain, fountain.with_name("others"))
-    refused = run("reconstruct", copy, *arguments[2:], "--max-keypoints", 1500)
+    refused = run("reconstruct", copy, *arguments[2:], "--max-keypoints", 1200)
     assert refused.exit_code == 2
     assert one_sentence(refused.stderr)
     assert "exists, made from" in refused.stderr
