@@ -284,7 +284,7 @@ def test_models_of_before_survive_a_failure(
     monkeypatch.setattr(np.lib.format, "write_array", fail)
     result = run(
         *("reconstruct", folder / "left.png", folder / "right.png", "--focal", FOCAL),
-        *("-o", "m.ply", "--overwrite"),
+        *("--rectified", "--max-keypoints", 500, "-o", "m.ply", "--overwrite"),
     )
     assert result.exit_code == 2
     assert "No space left" in result.stderr

@@ -3,12 +3,14 @@ from __future__ import annotations
 import math
 import os
 
+import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
 
 from deepdetect import OptionError  # noqa: E402
 from deepdetect.detector.network.espnet import ESPNet  # noqa: E402
+from deepdetect.evaluation.protocols.masks import score_heatmap  # noqa: E402
 from deepdetect.training import dense  # noqa: E402
 from deepdetect.training.dataset import TrainingData  # noqa: E402
 from deepdetect.training.dense import (  # noqa: E402
@@ -192,3 +194,13 @@ def test_frozen_batch_norm_keeps_its_statistics() -> None:
     network(torch.rand(2, 3, 8, 8))
     assert torch.equal(network[0].running_mean, torch.zeros(3))
     assert network[1].training
+
+
+def test_the_loss_of_masks_is_torch_s() -> None:
+    rng = np.random.default_rng(0)
+    logits, mask = rng.normal(0, 3, (32, 32)).astype(np.float32), rng.random((32, 32)) < 0.3
+    expected = torch.nn.functional.binary_cross_entropy_with_logits(
+        torch.from_numpy(logits), torch.from_numpy(mask).float()
+    )
+    loss, _ = score_heatmap(1 / (1 + np.exp(-logits)), mask)
+    assert loss == pytest.approx(float(expected), abs=1e-5)

@@ -43,17 +43,6 @@ def test_known_answers() -> None:
     assert score_heatmap(nothing + 1, nothing > 0)[0] == pytest.approx(-np.log(1e-7))
 
 
-def test_the_loss_is_torch_s() -> None:
-    torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
-    rng = np.random.default_rng(0)
-    logits, mask = rng.normal(0, 3, (32, 32)).astype(np.float32), rng.random((32, 32)) < 0.3
-    expected = torch.nn.functional.binary_cross_entropy_with_logits(
-        torch.from_numpy(logits), torch.from_numpy(mask).float()
-    )
-    loss, _ = score_heatmap(1 / (1 + np.exp(-logits)), mask)
-    assert loss == pytest.approx(float(expected), abs=1e-5)
-
-
 def test_images_count_the_same_for_the_loss_and_pixels_for_the_calibration() -> None:
     generator = np.random.default_rng(3)
     heatmap = generator.random((60, 50)).astype(np.float32)
