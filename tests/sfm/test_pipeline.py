@@ -242,7 +242,9 @@ def test_of_two_scenes_the_larger_is_the_model(write_fountain, tmp_path: Path, p
     for name in ("0003", "0004", "0005"):
         with Image.open(folder / f"{name}.jpg") as image:
             ImageOps.invert(image).save(folder / f"negative-{name}.jpg")
-    found = reconstruct_many(folder, tmp_path / "model", **SPARSE)
+    found = reconstruct_many(
+        folder, tmp_path / "model", **{**SPARSE, "detector": PointDetector(500)}
+    )
     assert set(found.views) == {"0003.jpg", "0004.jpg", "0005.jpg", "0006.jpg"}
     negatives = tuple(f"negative-{name}.jpg" for name in ("0003", "0004", "0005"))
     assert found.components == (negatives,)

@@ -194,7 +194,7 @@ def test_two_images_of_different_things_have_no_geometry(
 def test_stronger_tilts_are_tried_where_something_hints_at_a_geometry(
     picture: Callable[..., np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    image = picture("camera", (200, 150))
+    image = picture("camera", (120, 90))
     monkeypatch.setattr("deepdetect.geometry.estimation.MAX_LOG10_NFA", -1e9)
     for hint, tried in ((0.0, 30), (-1e9, 10)):
         monkeypatch.setattr(module, "MAX_HINT_LOG10_NFA", hint)

@@ -65,12 +65,12 @@ def test_a_plane_guides_no_scene_with_depth(shared: Path, pair: str) -> None:
 
 
 def test_a_plane_that_the_images_do_not_show_does_not_guide(photo: np.ndarray) -> None:
-    # A poster that fills a ninth of an otherwise different picture, and all of the first one.
-    gray = luma(photo)
+    # A poster that fills a sixth of an otherwise different picture, and all of the first one.
+    gray = luma(photo)[20:236, 20:236]
     other = np.random.default_rng(0).integers(0, 256, gray.shape).astype(np.uint8)
-    other[85:171, 85:171] = gray[85:171, 85:171]
+    other[65:151, 65:151] = gray[65:151, 65:151]
     grays = gray, other
-    every = np.stack(np.meshgrid(np.arange(256), np.arange(256)), -1).reshape(-1, 2)
+    every = np.stack(np.meshgrid(np.arange(216), np.arange(216)), -1).reshape(-1, 2)
     first, plane = (guiding_geometry(grays, model) for model in ("auto", "homography"))
     # Few keypoints have another where the plane would take them; that decides nothing.
     for fraction in (1.0, 0.05):
@@ -78,12 +78,12 @@ def test_a_plane_that_the_images_do_not_show_does_not_guide(photo: np.ndarray) -
         guide, found = guided_matches(grays, (xy, xy), first)
         assert guide.model != "homography"
         if found is not None:  # what the poster shows agrees with a fundamental matrix, too
-            inside = ((xy[found.indices0] > 80) & (xy[found.indices0] < 176)).all(axis=1)
+            inside = ((xy[found.indices0] > 60) & (xy[found.indices0] < 156)).all(axis=1)
             errors = np.linalg.norm(found.points1 - xy[found.indices0], axis=1)
             assert (inside & (errors < 1)).mean() > 0.9
         asked, found = guided_matches(grays, (xy, xy), plane)
         assert asked.model == "homography"
-        inside = ((xy[found.indices0] > 80) & (xy[found.indices0] < 176)).all(axis=1)
+        inside = ((xy[found.indices0] > 60) & (xy[found.indices0] < 156)).all(axis=1)
         assert inside.mean() > 0.95
 
 

@@ -22,7 +22,7 @@ TURNED = cv2.getRotationMatrix2D((225, 190), 30, 1.0)
 @pytest.fixture(scope="module")
 def cones(shared: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     pair = load_middlebury(shared / "data" / "middlebury" / "cones")
-    left, right, disparity = (view[80:] for view in (pair.left, pair.right, pair.disparity))
+    left, right, disparity = (view[120:] for view in (pair.left, pair.right, pair.disparity))
     return luma(left), luma(right), disparity
 
 
