@@ -19,7 +19,7 @@ from deepdetect.detector.pretrained import pretrained_weights
 
 @pytest.fixture(scope="module")
 def detector() -> DeepDetect:
-    return DeepDetect(backend="onnxruntime")
+    return DeepDetect(backend="onnxruntime", threads=1)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_batches_of_either_layout(detector: DeepDetect, images: list[np.ndarray]
 def test_images_of_one_size_are_run_together(photo: np.ndarray, backend: str, tta: Any) -> None:
     pytest.importorskip(backend)
     weights = "default" if backend != "torch" else pretrained_weights().with_suffix(".safetensors")
-    detector = DeepDetect(weights, backend=backend, tta=tta)
+    detector = DeepDetect(weights, backend=backend, tta=tta, threads=1)
     shapes = count_runs(detector)
     pieces = [photo[y : y + 37, y : y + 51] for y in (0, 30, 60, 90, 120)]
     pieces[3] = np.full_like(pieces[3], 90)  # constant: the network is not run for it
@@ -86,7 +86,7 @@ def test_sizes_agree_where_the_network_sees_them(photo: np.ndarray) -> None:
     """Squashed to a square, images of all sizes are run together; others only in their turn."""
     pieces = [photo[:80, :96], photo[:70, :110], photo[:80, :96]]
     for resolution, runs in ((64, [3]), ("native", [1, 1, 1])):
-        detector = DeepDetect(backend="onnxruntime", resolution=resolution)
+        detector = DeepDetect(backend="onnxruntime", resolution=resolution, threads=1)
         shapes = count_runs(detector)
         maps = detector.heatmap_batch(pieces, batch_size=4)
         assert [shape[0] for shape in shapes] == runs
@@ -103,7 +103,7 @@ def test_a_network_for_one_image_names_the_way_out(
     model = onnx.load_model(str(pretrained_weights()))
     model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 1
     onnx.save_model(model, str(tmp_path / "one.onnx"))
-    detector = DeepDetect(tmp_path / "one.onnx", backend=backend)
+    detector = DeepDetect(tmp_path / "one.onnx", backend=backend, threads=1)
     pair = [photo[:64, :64], photo[64:128, :64]]
     assert len(detector.heatmap_batch(pair)) == 2
     with pytest.raises(DeepDetectError, match=r"2 images of 64x64 .*`batch_size=1`") as caught:

@@ -31,7 +31,7 @@ TORCH_WEIGHTS = pretrained_weights().with_suffix(".safetensors")
 
 @pytest.fixture(scope="module")
 def detector() -> DeepDetect:
-    return DeepDetect(backend="onnxruntime")
+    return DeepDetect(backend="onnxruntime", threads=1)
 
 
 @pytest.fixture(params=["onnxruntime", "openvino"])
@@ -77,7 +77,7 @@ def test_any_size_is_padded_with_its_border(
 def test_other_options_share_the_network(detector: DeepDetect, image: np.ndarray) -> None:
     options = HeatmapOptions(64, "bgr")
     other = detector.configured(options)
-    fresh = DeepDetect(backend="onnxruntime", resolution=64, network_channels="bgr")
+    fresh = DeepDetect(backend="onnxruntime", threads=1, resolution=64, network_channels="bgr")
     assert detector.heatmap_options == HeatmapOptions()
     assert other.heatmap_options == options
     assert other.backend == detector.backend
@@ -379,8 +379,9 @@ def test_a_detector_goes_to_other_processes(weights: Any, image: np.ndarray) -> 
     )
 
 
-def test_extracted_keypoints_are_the_detected_ones_described(image: np.ndarray) -> None:
-    detector = DeepDetect(backend="onnxruntime")
+def test_extracted_keypoints_are_the_detected_ones_described(
+    detector: DeepDetect, image: np.ndarray
+) -> None:
     found, expected = (call(image, 0.9) for call in (detector.extract, detector.detect))
     np.testing.assert_array_equal(found.xy, expected.xy)
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
