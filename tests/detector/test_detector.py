@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import importlib.util
 import os
 import pickle
@@ -46,13 +47,18 @@ def image(photo: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(photo[20:121, 60:197])
 
 
-def run_by_hand(rgb: np.ndarray) -> np.ndarray:
-    """The bundled network on an image whose sides are multiples of 8, without the package."""
+@functools.cache
+def bundled_session() -> Any:
     import onnxruntime
 
-    session = onnxruntime.InferenceSession(
+    return onnxruntime.InferenceSession(
         str(pretrained_weights()), providers=["CPUExecutionProvider"]
     )
+
+
+def run_by_hand(rgb: np.ndarray) -> np.ndarray:
+    """The bundled network on an image whose sides are multiples of 8, without the package."""
+    session = bundled_session()
     planes = (rgb.transpose(2, 0, 1)[None] / 255).astype(np.float32)
     return session.run(None, {session.get_inputs()[0].name: planes})[0][0, 0]
 
@@ -199,7 +205,11 @@ BAD_WEIGHTS = {
 }
 
 
-@pytest.mark.parametrize("name", BAD_WEIGHTS)
+@pytest.mark.parametrize(
+    ("name", "backend"),
+    [(name, "torch" if name.endswith(".safetensors") else "auto") for name in BAD_WEIGHTS]
+    + [(name, "onnxruntime") for name in BAD_WEIGHTS if name.endswith(".onnx")],
+)
 def test_wrong_weights(
     name: str,
     backend: str,
@@ -207,14 +217,13 @@ def test_wrong_weights(
     one_line: OneLine,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    if name.endswith(".safetensors"):
+    if backend == "torch":
         pytest.importorskip("torch")
-        backend = "torch"
     write, words = BAD_WEIGHTS[name]
     if write is not None:
         write(tmp_path / name)
     with pytest.raises(WeightsError) as caught:
-        DeepDetect(tmp_path / name, backend="auto" if name.endswith("pth") else backend)
+        DeepDetect(tmp_path / name, backend=backend)
     assert words in one_line(caught.value)
     assert name in str(caught.value)
     printed = capfd.readouterr()

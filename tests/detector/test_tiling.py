@@ -36,7 +36,7 @@ def open_bundled(weights: str = "default") -> TiledNetwork:
 
 @pytest.mark.parametrize(("weights", "upright"), [("default", False), ("dense", True)])
 def test_tiles_give_the_logits_of_the_whole(weights: str, upright: bool, strip: np.ndarray) -> None:
-    part = strip[:, :1300]
+    part = strip[:, :1000]
     rgb = np.ascontiguousarray(part.swapaxes(0, 1) if upright else part)
     whole = DeepDetect(weights, backend="onnxruntime", resolution="native", threads=1)
     expected = whole.heatmap_and_logits(rgb)[1]
@@ -72,7 +72,7 @@ def test_tiles_overlap_by_what_is_needed(
 def test_images_larger_than_the_memory_are_tiled(
     detector: DeepDetect, strip: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    part = strip[:, :1300]
+    part = strip[:, :1000]
     expected, expected_map = detector.detect(part), detector.heatmap(part)
     monkeypatch.setattr(heatmap, "available_memory", lambda: part[..., 0].size * 140)
     monkeypatch.setattr(tiling, "DEFAULT_TILE_MEGAPIXELS", 0.05)
