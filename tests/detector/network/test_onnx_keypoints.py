@@ -111,15 +111,8 @@ def test_a_batch_gives_those_of_each_image(session: Any, count: int, photo: np.n
     assert np.isfinite(values).sum(1)[1] < count
 
 
-@pytest.mark.parametrize(
-    ("size", "batch", "precision"),
-    [
-        ((64, 96), 1, "fp32"),
-        ((123, 157), 2, "fp32"),
-        ((17, 23), 1, "fp32"),
-        ((123, 157), 2, "fp16"),
-    ],
-)
+@pytest.mark.parametrize("precision", ["fp32", "fp16"])
+@pytest.mark.parametrize(("size", "batch"), [((123, 157), 2), ((17, 23), 1)])
 def test_one_size(
     size: tuple[int, int], batch: int, precision: str, tmp_path: Path, photo: np.ndarray
 ) -> None:
