@@ -308,9 +308,10 @@ def write_result(name: str, work: Path) -> None:
     with (RESULTS_FOLDER / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows(lines)
     index = json.loads((RESULTS_FOLDER / "index.json").read_text())
-    command = STAGES[result.stage].format(data="DATA", output="REPORT").removeprefix("-m ")
-    made = provenance() | {"command": command}
-    index["results"][name] = made | {"weights": report["metadata"].get("weights (SHA-256)", "")}
+    command = "python " + STAGES[result.stage].format(data="DATA", output="REPORT")
+    made = provenance() | {"command": command.replace("python -m deepdetect", "deepdetect")}
+    weights = report["metadata"].get("weights (SHA-256)")
+    index["results"][name] = made | ({"weights": weights} if weights else {})
     index["results"] = dict(sorted(index["results"].items()))
     text = json.dumps(index, indent=1, ensure_ascii=False) + "\n"
     (RESULTS_FOLDER / "index.json").write_text(text, encoding="utf-8")
