@@ -106,7 +106,7 @@ def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> 
         unguided.points0[unguided.inliers], unguided.points1[unguided.inliers], pair.disparity
     )
     assert score["correct"] > plain["correct"]
-    assert score.precision > plain.precision + 0.03
+    assert score["precision"] > plain["precision"] + 0.03
 
 
 @pytest.mark.slow
