@@ -13,15 +13,18 @@ INSTALLER ?= uv
 # Two processes, each with whole files (what a file sets up is set up once), on one thread each. One
 # that crashes ends the run: with a new one in its place pytest-xdist may wait for ever.
 PYTEST := -m pytest -n 2 --dist loadfile --max-worker-restart 0
-# The parts of the package with their tests; those that take long come first.
-LONG := detector matching reconstruction evaluation app training
-OTHERS := $(filter-out cli $(LONG),$(notdir $(patsubst %/,%,$(wildcard tests/[!_]*/ tests/_shared/))))
-parts = $(foreach part,$(1),"tests/$(part) $(wildcard src/deepdetect/$(part))")
-TESTS := $(call parts,$(LONG)) "tests/test_*.py src/deepdetect/*.py" "tests/cli/test_[a-e]*.py" \
-	"tests/cli/test_[f-s]*.py" "tests/cli/test_[t-z]*.py src/deepdetect/cli" $(call parts,$(OTHERS))
+# Parts of the package with their tests; those that take long come first, those not named together.
+LONG := matching detector evaluation app reconstruction training
+MEDIUM := features+labels benchmarks+integrations _shared+viz
+OTHERS := $(filter-out cli $(subst +, ,$(LONG) $(MEDIUM)),$(notdir $(patsubst %/,%,$(wildcard tests/[!_]*/))))
+parts = $(foreach part,$(1),tests/$(part) $(wildcard src/deepdetect/$(part)))
+TESTS := "$(call parts,$(OTHERS))" $(foreach part,$(LONG),"$(call parts,$(part))") \
+	"tests/test_*.py src/deepdetect/*.py" "tests/cli/test_[a-e]*.py" "tests/cli/test_[f-s]*.py" \
+	$(foreach both,$(MEDIUM),"$(call parts,$(subst +, ,$(both)))") \
+	"tests/cli/test_[t-z]*.py src/deepdetect/cli"
 # Each part in a process of its own, two at a time: what it has loaded goes with it.
-run_parts = printf '%s\n' $(TESTS) | xargs -P 2 -I{} sh -c \
-	'output=$$($(VENV)/bin/python -m pytest -q $(1) {} 2>&1); status=$$?; echo "$$output"; exit $$status'
+run_parts = printf '"%s"\n' $(TESTS) | xargs -P 2 -n 1 sh -c \
+	'output=$$($(VENV)/bin/python -m pytest -q $(1) $$0 2>&1); status=$$?; echo "$$output"; exit $$status'
 export OMP_NUM_THREADS ?= 1
 # The tests start many interpreters: what one has compiled, the next should find.
 unexport PYTHONDONTWRITEBYTECODE
