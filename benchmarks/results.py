@@ -77,7 +77,7 @@ class Result:
         columns: the table's columns by their titles in the result, each with the digits that are
             printed, and with the key of the table, if it is another one, whose rows are the same;
             those that are not named are left out. Empty: all, with four digits.
-        rows: only those with this text in their first cells.
+        rows: only those of which the first or the second cell begins with this.
     """
 
     stage: str
@@ -88,6 +88,16 @@ class Result:
 
 SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
 PAIRS = ("graf 1-6", "wall 1-6", "bikes 1-6", "leuven 1-6", "trees 1-6", "ubc 1-6", "boat 1-2")
+GUIDED: dict[str, tuple[str, ...]] = {
+    "unguided, correct": ("descriptors alone: correct", ".0f"),
+    "precision": ("descriptors alone: precision", ".3f"),
+    "guided, correct": ("guided: correct", ".0f"),
+    "guided, precision": ("guided: precision", ".3f"),
+    "of the ceiling": ("guided: of the matchable", ".3f"),
+    "lowest of three seeds": ("lowest", ".3f"),
+    "one to one": ("guided: unique", ".0f"),
+    "corner error, px": ("guided: corner error, px", ".2f"),
+}
 RESULTS = {
     "density": Result(
         "oxford-paper",
@@ -139,22 +149,10 @@ RESULTS = {
             "score, 3 px": ("matching score at 3 px", ".3f"),
         },
     ),
-    "guided": Result(
-        "oxford-guided",
-        "oxford_guided_refined",
-        {
-            "unguided, correct": ("descriptors alone: correct", ".0f"),
-            "precision": ("descriptors alone: precision", ".3f"),
-            "guided, correct": ("guided: correct", ".0f"),
-            "guided, precision": ("guided: precision", ".3f"),
-            "of the ceiling": ("guided: of the matchable", ".3f"),
-            "lowest of three seeds": ("lowest", ".3f"),
-            "one to one": ("guided: unique", ".0f"),
-            "corner error, px": ("guided: corner error, px", ".2f"),
-        },
-        rows="DeepDetect",
+    "guided": Result("oxford-guided", "oxford_guided_refined", GUIDED, rows="DeepDetect"),
+    "guided-baselines": Result(
+        "oxford-guided", "oxford_guided_refined", {"method": ("method", ""), **GUIDED}
     ),
-    "guided-baselines": Result("oxford-guided", "oxford_guided_refined"),
     "repeatability-hpatches": Result("hpatches", "hpatches_table3"),
     "points": Result(
         "oxford-points",
@@ -297,7 +295,7 @@ def write_result(name: str, work: Path) -> None:
     lines = [[*(["scene"] if several else []), first, *columns]]
     for key in keys:
         for number, row in enumerate(tables[key]):
-            if result.rows not in " ".join(str(cell) for cell in list(row.values())[:2]):
+            if not any(str(cell).startswith(result.rows) for cell in list(row.values())[:2]):
                 continue
             lines.append([key.removeprefix(start)] if several else [])
             lines[-1].append(TITLES.get(row[first], row[first]))
