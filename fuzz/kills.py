@@ -56,7 +56,6 @@ COMMANDS = {
             *("train", "IN", "-o", "OUT", "--stage", "64x4x2", "--short-side", "96"),
             *("--detectors", "fast", "--val-count", "2", "--device", "cpu", "--no-compile"),
             *("--precision", "float32", "--threads", "1", "--workers", "1"),
-            *("--checkpoint-interval", "0.1"),
         ),
         ("*.onnx",),
     ),

@@ -175,6 +175,10 @@ def test_files_of_others_are_not_replaced(tmp_path: Path) -> None:
         file.create_group("x")
     with pytest.raises(OptionError, match="written by something else"):
         fill(path, x=1)
+    with h5py.File(path, "w") as file:
+        file.attrs[hdf5.SETTINGS] = '{"ratio'
+    with pytest.raises(DeepDetectError, match="is damaged"):
+        fill(path, x=1)
     path.write_bytes(b"no HDF5")
     with pytest.raises(DeepDetectError, match="is no HDF5 file"):
         fill(path, x=1)

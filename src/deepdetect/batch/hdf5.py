@@ -212,8 +212,11 @@ def fill_file(
     before = [target] if target.exists() and not overwrite else []
     for kept in before:
         with open_hdf5(kept) as file:
-            noted = file.attrs.get(SETTINGS)
-            check_same(kept, None if noted is None else json.loads(noted), settings)
+            try:
+                noted = json.loads(file.attrs.get(SETTINGS, "null"))
+            except (ValueError, TypeError) as error:
+                raise damaged(kept, error) from error
+            check_same(kept, noted, settings)
     folder = target.with_name(target.name + ".shards")
     shards = folder / key(settings)
     try:
