@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from PIL import Image
 
 from deepdetect.geometry.camera import Camera, PosedView
+from deepdetect.io.image_file import limit_megapixels
 from deepdetect.sfm import dense
 from deepdetect.sfm.colmap import CameraIntrinsics
 from deepdetect.sfm.dense import (
@@ -157,3 +161,11 @@ def test_a_smaller_view_sees_the_same_directions(monkeypatch: pytest.MonkeyPatch
     points = np.array([[0.3, -0.2, 6.0]])
     expected = (own.project(points)[0] + 0.5) / 2 - 0.5
     np.testing.assert_allclose(small.project(points)[0], expected)
+
+
+def test_what_was_extracted_is_not_too_large(tmp_path: Path, photo: np.ndarray) -> None:
+    Image.fromarray(photo).save(tmp_path / "a.png")
+    camera = CameraIntrinsics("PINHOLE", photo.shape[1::-1], (1.0, 1.0, 0.0, 0.0))
+    with limit_megapixels(1e-3):  # as in another process than that of the command
+        rgb = dense._prepared_image(tmp_path / "a.png", (0, 0), camera, camera.size)
+    np.testing.assert_array_equal(rgb, photo)

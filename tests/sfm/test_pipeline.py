@@ -184,6 +184,9 @@ def test_a_run_goes_on_where_it_was_killed(small, tmp_path: Path, monkeypatch) -
     assert lost.exists()
     assert (output / "model.ply").read_bytes() == (before / "model.ply").read_bytes()
     assert found.matched == made.matched
+    next((output / "work").glob("mapping-*.json")).write_text("")
+    with pytest.raises(TypeError):  # it is mapped again
+        reconstruct_many(folder, output, **QUICK)
     with pytest.raises(OptionError, match=r"max_keypoints.*--overwrite"):
         reconstruct_many(folder, output, workers=1, detector=PointDetector(700))
 
@@ -221,6 +224,8 @@ def test_photographs_of_another_size_do_not_stop_a_calibrated_run(
         reconstruct_many(folder, tmp_path / "model", **arguments)
     with pytest.raises(ReconstructionError, match="not both"):
         reconstruct_many(folder, tmp_path / "model", focal_px=300, **arguments)
+    with pytest.raises(OptionError, match="`seed`"):
+        reconstruct_many(folder, tmp_path / "model", seed=-1, **arguments)
 
 
 def test_pairs_are_chosen(small, monkeypatch: pytest.MonkeyPatch) -> None:

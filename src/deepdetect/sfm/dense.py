@@ -148,8 +148,8 @@ def _prepared(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, PosedVi
 def _prepared_image(
     path: Path, state: tuple[int, int], intrinsics: CameraIntrinsics, size: tuple[int, int]
 ) -> np.ndarray:
-    """Read an image of this `file_state` without its distortion, of a size."""
-    rgb = intrinsics.undistort(load_image(path))
+    """Read an image of this `file_state`, which extraction has let pass, without its distortion."""
+    rgb = intrinsics.undistort(load_image(path, max_megapixels=np.inf))
     if size != intrinsics.size:
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
     return rgb

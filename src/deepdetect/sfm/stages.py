@@ -6,6 +6,7 @@ that they depend on: what a run finds with the right key it does not make again.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import shutil
@@ -34,12 +35,7 @@ from ..features.keypoints import Keypoints
 from ..features.selection import SelectionOptions
 from ..io.image import find_images
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
-from .dense import (
-    dense_points,
-    find_references,
-    limited_view,
-    merge_dense_points,
-)
+from .dense import dense_points, find_references, limited_view, merge_dense_points
 from .mapping import RegisteredImage, SparseModel, adjust, map_images, normalise_model, verify_pairs
 from .pair_selection import COMPARED_KEYPOINTS, SIMILAR, similar_pairs, vlad_vectors
 
@@ -125,6 +121,7 @@ class Stages:
     ) -> None:
         self.output, self.work = output, output / WORK
         self.options, self.workers, self.quiet, self.seed = options, workers, quiet, seed
+        self.matching = PairMatchingOptions(ratio=options.ratio, seed=seed)
         self.features = self.work / "features.h5"
 
     def folder_of(self, images: str | Path | Sequence[str | Path]) -> Path:
@@ -173,8 +170,9 @@ class Stages:
                     sizes[name] = int(width), int(height)
                     keypoints[name] = len(file[name]["keypoints"])
                     continue
-                begins = (f"{folder.absolute() / name} ", f"{name}: ")
-                found = [text for text in report.failures if text.startswith(begins)]
+                path = folder.absolute() / name
+                begins, within = (f"{path} ", f"{name}: "), f" {path}:"
+                found = [one for one in report.failures if one.startswith(begins) or within in one]
                 failures[name] = [*found, "it could not be read"][0]
         return sizes, keypoints, failures
 
@@ -195,9 +193,9 @@ class Stages:
     def match(self, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
         """Match pairs; return (K, 2) rows of keypoints of each."""
         path = self.work / "matches.h5"
-        options = PairMatchingOptions(ratio=self.options.ratio, seed=self.seed)
+        matching, workers = self.matching, self.workers
         match_pairs(
-            self.features, pairs, path, options=options, workers=self.workers, quiet=self.quiet
+            self.features, pairs, path, options=matching, workers=workers, quiet=self.quiet
         ).check()
         found = {}
         with open_hdf5(path) as file:
@@ -234,7 +232,7 @@ class Stages:
         )
         record = self.work / f"mapping-{made_of}.json"
         database, sparse = self.output / "database.db", self.output / "sparse"
-        if record.exists() and (sparse / "points3D.bin").exists():
+        with contextlib.suppress(OSError, ValueError):  # there is none, or a damaged one
             noted = json.loads(record.read_text(encoding="utf-8"))
             verified = {(a, b): count for a, b, count in noted["verified"]}
             components = [frozenset(names) for names in noted["components"]]
