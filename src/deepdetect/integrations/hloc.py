@@ -101,9 +101,8 @@ class DeepDetectExtractor(BaseModel):
 class DeepDetectMatcher(BaseModel):
     """Nearest neighbours of descriptors with the ratio test, for `hloc.match_features`.
 
-    Its options in hloc's configuration: `ratio`, the largest, and `mutual`, as of
-    `DeepDetect`'s unguided matches. It matches the features of any extractor whose descriptors are
-    compared by their Euclidean distance.
+    Its options in hloc's configuration: `ratio` and `mutual`, as of `match_features`. It matches
+    the features of any extractor whose descriptors are compared by their Euclidean distance.
     """
 
     default_conf: dict[str, Any] = {"ratio": 0.85, "mutual": True}  # noqa: RUF012

@@ -77,8 +77,7 @@ class Tracker:
     """Follows points through the frames of a video.
 
     Args:
-        detect: finds keypoints in a (H, W, 3) uint8 RGB image; a `DeepDetect` has its own method
-            for it: `PointDetector(1000).detect`.
+        detect: finds keypoints in a (H, W, 3) uint8 RGB image, as `PointDetector(3000).detect`.
         options: how points are followed.
 
     Example:
