@@ -71,9 +71,9 @@ def test_images_without_a_keypoint_are_skipped_and_said(photographs, tmp_path: P
     assert "1 images without a keypoint" in note
 
 
-def test_a_mask_of_another_size_is_skipped(photographs, tmp_path: Path) -> None:
+def test_masks_of_another_size_and_damaged_ones_are_skipped(photographs, tmp_path: Path) -> None:
     """It would be read at the wrong places."""
     Image.fromarray(np.full((30, 40), 255, np.uint8)).save(photographs[0].mask)
-    run = Run(tmp_path)
-    measured(run, CLASSICAL["fast"])
-    assert any("a.png" in note for note in run.skipped)
+    photographs[1].mask.write_text("no picture")
+    measured(run := Run(tmp_path), CLASSICAL["fast"])
+    assert [note.split(": ")[0][-5:] for note in run.skipped] == ["a.png", "b.png"]

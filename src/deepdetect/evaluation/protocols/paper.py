@@ -177,10 +177,11 @@ def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
         "over that of random points": (".2f", over_chance),
         "keypoints per pixel": average(".4f", "density"),
     }
-    covered = np.mean([image.foreground().mean() for image in images])
+    covered = {row["item"]: row["covered"] for row in rows}
     note = (
-        f"{len(images)} images; their foreground is {covered:.1%} of the pixels, which is what "
-        "random points reach. The paper's numbers are of 18 images that are not published."
+        f"{len(covered)} images; their foreground is {mean_of(covered.values()) or 0:.1%} of the "
+        "pixels, which is what random points reach. The paper's numbers are of 18 images that are "
+        "not published."
     )
     table = tabulate("foreground", "Keypoints on the foreground", features, rows, columns, note)
     table = with_paper_column(table, title, FOREGROUND)
