@@ -239,7 +239,7 @@ def register(
 
 @cli.command(PANORAMA, OPTIONS, STITCH_KEYPOINTS, POINTS, NETWORK, cli.MEGAPIXELS)
 def stitch(
-    *paths: cli.Images,
+    *sources: cli.Images,
     output: cli.Output = Path("panorama.jpg"),
     reference: Path | None = None,
     detector: Detector = "network",
@@ -252,7 +252,7 @@ def stitch(
     panorama shows 100 to 120 degrees at the most, a cylindrical or spherical one all around.
 
         deepdetect stitch left.jpg middle.jpg right.jpg -o panorama.jpg
-        deepdetect stitch *.jpg --projection cylindrical --crop -o panorama.jpg
+        deepdetect stitch photos/ --projection cylindrical --crop -o panorama.jpg
 
     Args:
         output: The panorama's file, or a folder for it.
@@ -260,6 +260,7 @@ def stitch(
             [default: the one in the middle]
     """
     file = cli.output_file(output, "panorama.jpg")
+    paths = cli.expand_images(sources, file)
     picture_suffix(file)  # before the work, which would else be lost
     if reference is not None and reference not in paths:
         raise OptionError(f"--reference {reference} must be one of the images: name it there")
