@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, reconstruct_many
+from deepdetect import DeepDetect, WeightsError, reconstruct_many
 from deepdetect.datasets.posed_images import PosedImage, PosedPair, PosedScene, load_posed_scenes
 from deepdetect.evaluation.benchmarks import run_benchmarks
 from deepdetect.evaluation.options import BenchmarkOptions
@@ -18,11 +18,7 @@ from deepdetect.evaluation.run import Run
 from deepdetect.geometry.camera import PosedView
 from deepdetect.sfm import MultiViewOptions
 
-POINTS, SIFT, RANDOM = (
-    "DeepDetect, points",
-    "SIFT, pycolmap",
-    "baseline: as many random points",
-)
+POINTS, SIFT, RANDOM = "DeepDetect, points", "SIFT, pycolmap", "baseline: as many random points"
 
 
 def model(views: dict, points=0, track_length=float("nan"), error=float("nan")):
@@ -132,6 +128,8 @@ def test_options_choose_the_methods() -> None:
     assert titles == [POINTS, SIFT, RANDOM]
     without = sfm.sfm_methods(BenchmarkOptions(detector, classical=()))
     assert [method.title for method in without] == [POINTS, RANDOM]
+    with pytest.raises(WeightsError, match=r"none\.npz"):
+        sfm.sfm_methods(BenchmarkOptions(detector, ranker="none.npz"))
 
 
 def test_what_cannot_be_reconstructed_is_a_result(

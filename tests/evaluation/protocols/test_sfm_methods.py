@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import Keypoints, load_image
+from deepdetect import Keypoints, PointDetector, load_image
 from deepdetect.datasets.posed_images import PosedPair, load_posed_scenes
 from deepdetect.evaluation.metrics.pose import epipolar_inlier_ratio
 from deepdetect.evaluation.protocols.sfm import (
@@ -61,10 +61,10 @@ def agreement(scene, stages: Stages, matches) -> list[float]:
 
 def test_random_points_differ_from_ours_in_nothing_but_their_places(scene, tmp_path: Path) -> None:
     ours, folder = stages_in(tmp_path / "ours", scene, 2)
-    find_points(ours, folder)
+    find_points(PointDetector(8192), ours, folder)
     shutil.copytree(tmp_path / "ours", tmp_path / "random", symlinks=True)  # found only once
     random, folder = stages_in(tmp_path / "random", scene, 2)
-    find_random_points(random, folder)
+    find_random_points(PointDetector(8192), random, folder)
     both = keypoints_of(ours), keypoints_of(random)
     pair = "0004.jpg", "0005.jpg"
     assert set(both[0]) == set(both[1]) == set(pair)

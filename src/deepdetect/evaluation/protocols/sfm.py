@@ -51,8 +51,6 @@ FEATURES, DATABASE = "features.h5", "sift.db"
 OPTIONS = MultiViewOptions(pairs="all")
 """Of all methods: those of `reconstruct_many`, but every pair is matched."""
 
-SFM_POINTS = PointDetector(MAX_KEYPOINTS)
-
 KINDS = ("true", "estimated")
 """Intrinsics that models are made with."""
 
@@ -187,10 +185,11 @@ def choose_images(scene: PosedScene, most: int) -> PosedScene:
 
 def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
     """Return the ranked points, SIFT where it is among the baselines, and random points."""
-    version, random = str(SFM_POINTS.settings), "baseline: as many random points"
-    ours = SfmMethod("DeepDetect, points", find_points, version=version)
+    points = PointDetector(MAX_KEYPOINTS, ranker=options.ranker)
+    version, random = str(points.settings), "baseline: as many random points"
+    ours = SfmMethod("DeepDetect, points", partial(find_points, points), version=version)
     sift = SfmMethod("SIFT, pycolmap", find_sift, match_sift)
-    chance = SfmMethod(random, find_random_points, version=version, chance=True)
+    chance = SfmMethod(random, partial(find_random_points, points), version=version, chance=True)
     return [ours, sift, chance] if "sift" in options.classical else [ours, chance]
 
 
@@ -274,14 +273,14 @@ def cost_table(rows: Rows) -> Table:
     return Table("sfm_cost", "Seconds and memory", COST_COLUMNS, lines, COST_NOTE)
 
 
-def find_points(stages: Stages, folder: Path) -> None:
+def find_points(detector: PointDetector, stages: Stages, folder: Path) -> None:
     """Find the ranked points of the images in a folder, as `reconstruct_many` does."""
-    stages.extract(folder, SFM_POINTS)
+    stages.extract(folder, detector)
 
 
-def find_random_points(stages: Stages, folder: Path) -> None:
+def find_random_points(detector: PointDetector, stages: Stages, folder: Path) -> None:
     """Put as many random points in place of the ranked ones, with their sizes in another order."""
-    find_points(stages, folder)
+    find_points(detector, stages, folder)
     with import_h5py().File(stages.work / FEATURES, "r+") as file:
         for number, name in enumerate(sorted(path.name for path in folder.iterdir())):
             rng = np.random.default_rng((0, number))
