@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.distance import cdist
 
 from deepdetect import DeepDetect, ImageError, MissingExtraError, OptionError
-from deepdetect.evaluation import benchmarks
+from deepdetect.evaluation import benchmarks, evaluate
 from deepdetect.evaluation.baselines.method import LocalFeature
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.evaluation.benchmarks import BENCHMARKS, run_benchmarks
@@ -275,3 +276,8 @@ def test_a_missing_package_stops_only_the_benchmark_that_needs_it(
     assert report.failures == ("the benchmark one: this needs pycolmap",)
     with pytest.raises(MissingExtraError):
         run_benchmarks(["one"], tmp_path, options)
+    monkeypatch.setitem(sys.modules, "scipy", None)
+    with pytest.raises(MissingExtraError, match="the package scipy"):
+        run_benchmarks(["other"], tmp_path, options)
+    with pytest.raises(MissingExtraError, match="the package scipy"):
+        evaluate(oxford=tmp_path)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
-from .._shared.errors import ImageError, MissingExtraError
+from .._shared.errors import ImageError, MissingExtraError, require_packages
 from .._shared.options import look_up
 from .._shared.provenance import provenance
 from .._shared.records import file_digest
@@ -49,6 +49,7 @@ def run_benchmarks(
     """
     started = time.monotonic()
     entries = [look_up("benchmark", name, BENCHMARKS) for name in names]
+    require_packages("a benchmark", "matplotlib", "scipy")  # before hours of work
     run = Run(Path(data), None if cache is None else Path(cache), quiet)
     sections: list[Section] = []
     for name, (module, function) in zip(names, entries, strict=True):

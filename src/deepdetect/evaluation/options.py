@@ -24,7 +24,8 @@ from .baselines.method import (
 from .baselines.opencv import CLASSICAL, STANDARD
 from .baselines.random import all_pixels_feature, random_feature
 
-DEFAULT_PROTOCOLS = ("paper", "standard", "guided")
+PROTOCOLS = ("paper", "standard", "guided", "degraded")
+DEFAULT_PROTOCOLS = PROTOCOLS[:3]
 """All but "degraded", which measures everything five times."""
 
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
@@ -41,7 +42,7 @@ class BenchmarkOptions:
 
     Attributes:
         detector: DeepDetect, with the weights that are evaluated.
-        protocols: one or more of "paper", "standard", "guided" and "degraded".
+        protocols: of `PROTOCOLS`.
         classical: names of the classical baselines.
         others: further local features.
         channels: order of the colours in the paper's protocol; "bgr" is what the paper's code
@@ -69,7 +70,10 @@ class BenchmarkOptions:
     ranker: str | Path | None = None
 
     def __post_init__(self) -> None:
-        check_ranges(self, positive=("max_pairs",), between={"max_images": (3, float("inf"))})
+        check_ranges(self, counts=("max_pairs",), between={"max_images": (3, float("inf"))})
+        for name in self.protocols:
+            check_name("protocol", name, PROTOCOLS)
+        check_name("choice of images", self.degraded_images, ("second", "both"))
         for name in self.classical:
             check_name("classical baseline", name, BASELINES)
         stems = [Path(weights).stem for weights in self.geometry_weights]

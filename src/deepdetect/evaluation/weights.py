@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from .._shared.errors import ImageError, OptionError
+from .._shared.errors import ImageError, OptionError, require_packages
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
 from ..datasets.foreground import MaskedPhotograph, load_foreground
@@ -153,7 +153,9 @@ def evaluate(
             "`equal_density` is for the keypoints of `oxford` and `foreground`: name a folder of "
             "one of them, too"
         )
-    scenes = None if oxford is None else load_oxford(oxford)  # before hours of work
+    if oxford is not None:  # what is missing is said before hours of work
+        require_packages("the Oxford protocol", "scipy")
+    scenes = None if oxford is None else load_oxford(oxford)
     masked = None if foreground is None else load_foreground(foreground)
     detector = DeepDetect() if detector is None else detector
     masks: dict[str, MaskScore] = {}
