@@ -42,7 +42,7 @@ from deepdetect.detector.pretrained import PRETRAINED
 from deepdetect.evaluation.profiling import profiled
 from deepdetect.evaluation.protocols.paper import CORRECT_PX
 from deepdetect.evaluation.protocols.planar import select_pairs
-from deepdetect.evaluation.protocols.stereo import (
+from deepdetect.evaluation.protocols.stereo_pipelines import (
     PAPER_FLANN_CHECKS,
     PAPER_FLANN_TREES,
     essential_inliers,

@@ -38,7 +38,8 @@ import numpy as np
 from deepdetect import DeepDetect, disparity_map
 from deepdetect._shared.errors import ImageError
 from deepdetect.datasets.middlebury import load_motorcycle
-from deepdetect.evaluation.protocols.stereo import ground_truths, sgbm_disparity
+from deepdetect.evaluation.protocols.stereo import ground_truths
+from deepdetect.evaluation.protocols.stereo_pipelines import sgbm_disparity
 from deepdetect.evaluation.report import Row, Table
 from deepdetect.io.image import load_image, luma
 from deepdetect.matching.stereo import DENSE, DisparityOptions

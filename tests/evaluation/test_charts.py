@@ -8,12 +8,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import MissingExtraError
-from deepdetect.evaluation.report import (
-    WIDEST,
-    bar_chart,
-    line_chart,
-    picture,
-)
+from deepdetect.evaluation.report import WIDEST, bar_chart, line_chart, picture
 
 pytest.importorskip("matplotlib", reason="needs matplotlib, which draws the charts")
 

@@ -84,9 +84,7 @@ def test_the_papers_way_squashes_and_the_standard_one_does_not(options: Benchmar
     assert bgr.deepdetect_native().version != options.deepdetect_native().version
 
 
-def test_methods_of_the_standard_protocol_fill_a_budget_in_an_order_of_worth(
-    shared: Path,
-) -> None:
+def test_methods_of_the_standard_protocol_fill_a_budget_in_an_order_of_worth(shared: Path) -> None:
     """OpenCV's ORB stops at 500; the paper's Harris marks blocks around each corner."""
     rgb = load_image(shared / "data" / "oxford" / "graf" / "img1.png")
     for method in STANDARD.values():

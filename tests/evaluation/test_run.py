@@ -287,7 +287,7 @@ def test_rows_are_of_each_method_and_item_but_for_failures(tmp_path: Path) -> No
     methods = [FAST, CLASSICAL["orb"]]
     rows = run.rows("density of ", methods, {"one": 1, "two": 2}, measure)
     assert [(row["method"], row["item"], row["value"]) for row in rows] == [
-        *(("fast", "one", 1), ("orb", "one", 1), ("orb", "two", 2)),
+        *(("fast", "one", 1), ("orb", "one", 1), ("orb", "two", 2))
     ]
     assert run.failures == ["density of FAST on two: damaged"]
 

@@ -15,9 +15,7 @@ from ._options import From, command, note
 
 @command(From(AppOptions, "port"), prints=False)
 def app(
-    *,
-    open_browser: Annotated[bool, Parameter("--open", negative="")] = False,
-    **values: Any,
+    *, open_browser: Annotated[bool, Parameter("--open", negative="")] = False, **values: Any
 ) -> None:
     """Serve a page at 127.0.0.1: keypoints, matches, registration, panoramas and 3D models.
 

@@ -22,7 +22,7 @@ from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
 from ..evaluation.metrics.stereo import TOLERANCE_PX, score_errors
 from ..evaluation.options import PAPER_RESOLUTION_PX, BenchmarkOptions
 from ..evaluation.protocols.masks import LabelDetector
-from ..evaluation.protocols.stereo import match_random_points, score_stereo_matches
+from ..evaluation.protocols.stereo_matches import match_random_points, score_stereo_matches
 from ..evaluation.report import Table
 from ..evaluation.weights import Evaluation, evaluate_oxford
 from ..evaluation.weights import evaluate as run

@@ -40,12 +40,7 @@ SAVED = cli.From(
     more="",
     types={"matches": Path | None, "images": Path | None},
 )
-FOLDER = cli.From(
-    match_folder,
-    "pairs sequential",
-    more="workers",
-    types={"pairs": Path | None},
-)
+FOLDER = cli.From(match_folder, "pairs sequential", more="workers", types={"pairs": Path | None})
 MAX_KEYPOINTS = cli.From(PointDetector, "max_keypoints", more="")
 VERIFY = cli.From(write_colmap, "verify", more="")
 CAMERAS = cli.From(

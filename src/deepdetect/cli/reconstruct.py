@@ -89,10 +89,7 @@ def reconstruct(
     if "calibration" in values:
         cli.check_outputs(files.values(), [values["calibration"]])
     chosen, selection = chosen_detector(detector or "network", values, weights="dense")
-    with (
-        cli.writing(files, images, overwrite) as made,
-        stage_progress("reconstructing") as done,
-    ):
+    with cli.writing(files, images, overwrite) as made, stage_progress("reconstructing") as done:
         left, right = images
         found = reconstruct_pair(left, right, chosen, selection=selection, progress=done, **values)
         title = f"{left.name} and {right.name}"

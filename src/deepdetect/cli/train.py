@@ -67,12 +67,7 @@ SHARDS = replace(RECIPE, common="max_images augmentations", more="short_sides sq
 
 SHARD_SIZE = cli.From(write_shards, "shard_size", more="")
 ENGINE = replace(EXTRACTION, common="")
-POINTS_RUN = cli.From(
-    train_ranker,
-    "validation num_workers",
-    more="",
-    types={"validation": Path},
-)
+POINTS_RUN = cli.From(train_ranker, "validation num_workers", more="", types={"validation": Path})
 
 
 def chosen_label_settings(
@@ -186,13 +181,7 @@ def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli
 
 
 @cli.command(PRESET, LABELS, SHARDS, SHARD_SIZE, ENGINE)
-def shards(
-    images: Folder,
-    /,
-    *,
-    output: cli.Output,
-    **values: Any,
-) -> cli.Result:
+def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
     """Pack the images in a folder with their labels into tar files.
 
     They are in WebDataset's layout. Training reads a few of them at a time, so they may be on a

@@ -26,12 +26,7 @@ from .protocols.masks import (
     score_at_scale,
     score_samples,
 )
-from .protocols.paper import (
-    OXFORD_PAIRS,
-    foreground_rows,
-    mean_correct_matches,
-    repeatability_rows,
-)
+from .protocols.paper import OXFORD_PAIRS, foreground_rows, mean_correct_matches, repeatability_rows
 from .protocols.planar import select_pairs
 from .report import Row, mean, where
 from .run import Run

@@ -113,8 +113,7 @@ def test_no_keypoints_are_an_answer(write: Write, crop: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize(
-    "target",
-    ["no_such_module_of_ours:find", "json:no_such_function", ":dumps", "json:decoder"],
+    "target", ["no_such_module_of_ours:find", "json:no_such_function", ":dumps", "json:decoder"]
 )
 def test_a_wrong_name_is_an_error_in_one_line(target: str, one_line) -> None:
     before = list(sys.path)

@@ -37,7 +37,7 @@ from deepdetect.evaluation.protocols.paper_numbers import (
     with_paper_rows,
 )
 from deepdetect.evaluation.protocols.planar import select_pairs
-from deepdetect.evaluation.protocols.stereo import paper_points
+from deepdetect.evaluation.protocols.stereo_pipelines import paper_points
 from deepdetect.evaluation.report import Table
 from deepdetect.evaluation.run import Run
 
@@ -49,10 +49,7 @@ REPEATABILITIES = {
 NOTEBOOK_MATCHES_OF_SIFT = (52, 163_510)
 """Correct and all of wall 1-6 with low settings, that the authors' notebooks print."""
 
-NOTEBOOK_KEYPOINTS = {
-    "DeepDetect": (605_433, 477_060),
-    "SIFT, low settings": (184_084, 118_628),
-}
+NOTEBOOK_KEYPOINTS = {"DeepDetect": (605_433, 477_060), "SIFT, low settings": (184_084, 118_628)}
 """The keypoints of both images of wall 1-6 that the authors' notebooks print."""
 
 CORRECT = {"bikes 1-6": 16_447, "leuven 1-6": 58_946, "ubc 1-6": 39_891}

@@ -10,12 +10,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect
-from deepdetect.datasets.posed_images import (
-    PosedImage,
-    PosedPair,
-    PosedScene,
-    load_posed_scenes,
-)
+from deepdetect.datasets.posed_images import PosedImage, PosedPair, PosedScene, load_posed_scenes
 from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.evaluation.benchmarks import run_benchmarks
 from deepdetect.evaluation.metrics.pose import rotation_error, translation_error
@@ -77,7 +72,7 @@ def test_all_methods_find_the_pose_and_the_control_does_not(report: Report, fold
     assert report.skipped == ()
     found = rows(find(report, "pose"))
     assert list(found) == [
-        *("DeepDetect", "DeepDetect, unguided", SIFT, "ORB, ratio 0.8", STRAIGHT_AHEAD),
+        *("DeepDetect", "DeepDetect, unguided", SIFT, "ORB, ratio 0.8", STRAIGHT_AHEAD)
     ]
     for title in ("DeepDetect", SIFT):
         assert found[title]["median error, °"] < 3
@@ -255,5 +250,5 @@ def test_the_rows_are_those_that_were_chosen(edge_detector: DeepDetect, tmp_path
     assert titles() == [*own, SIFT, "ORB, ratio 0.8", STRAIGHT_AHEAD]
     assert titles(classical=()) == [*own, STRAIGHT_AHEAD]
     assert titles(classical=("sift",), others=(CLASSICAL["sift"], CLASSICAL["brisk"])) == [
-        *(*own, SIFT, "BRISK, ratio 0.8", STRAIGHT_AHEAD),
+        *(*own, SIFT, "BRISK, ratio 0.8", STRAIGHT_AHEAD)
     ]

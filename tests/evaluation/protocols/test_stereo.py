@@ -19,15 +19,17 @@ from deepdetect.evaluation.protocols.masks import LabelDetector
 from deepdetect.evaluation.protocols.stereo import (
     AS_IT_IS,
     SHIFTED,
-    STAGES,
     count_voxels,
     ground_truths,
     middlebury,
+    shift_view,
+)
+from deepdetect.evaluation.protocols.stereo_matches import score_stereo_matches
+from deepdetect.evaluation.protocols.stereo_pipelines import (
+    STAGES,
     paper_points,
     pipelines,
-    score_stereo_matches,
     sgbm_disparity,
-    shift_view,
 )
 from deepdetect.evaluation.report import Section
 from deepdetect.evaluation.run import Run

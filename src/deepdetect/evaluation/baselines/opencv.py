@@ -30,11 +30,7 @@ OPENCV_SETTINGS: dict[str, tuple[str, str, Mapping[str, Any]]] = {
     ),
     "orb": ("ORB", "ORB_create", {}),
     "orb-many": ("ORB", "ORB_create", {"nfeatures": 10_000}),  # the default stops at 500
-    "orb-low": (
-        "ORB, low settings",
-        "ORB_create",
-        {"nfeatures": 1_000_000, "fastThreshold": 1},
-    ),
+    "orb-low": ("ORB, low settings", "ORB_create", {"nfeatures": 1_000_000, "fastThreshold": 1}),
     "brisk": ("BRISK", "BRISK_create", {}),
     "brisk-low": ("BRISK, low settings", "BRISK_create", {"thresh": 1, "octaves": 4}),
     # Rosten and Drummond 2006 (9-16); Mair et al. 2010.

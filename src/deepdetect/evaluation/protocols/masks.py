@@ -164,9 +164,7 @@ class LabelDetector:
     """
 
     def __init__(
-        self,
-        options: LabelOptions = LabelOptions(),
-        heatmap_options: HeatmapOptions | None = None,
+        self, options: LabelOptions = LabelOptions(), heatmap_options: HeatmapOptions | None = None
     ) -> None:
         self.options = options
         self.heatmap_options = heatmap_options

@@ -169,10 +169,7 @@ def hpatches(run: Run, options: BenchmarkOptions) -> list[Section]:
 
 
 def _hpatches_paper(
-    run: Run,
-    options: BenchmarkOptions,
-    scenes: Sequence[PlanarScene],
-    last: Sequence[PlanarPair],
+    run: Run, options: BenchmarkOptions, scenes: Sequence[PlanarScene], last: Sequence[PlanarPair]
 ) -> list[Section]:
     if "paper" not in options.protocols:
         return []

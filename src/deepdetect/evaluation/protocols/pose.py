@@ -231,12 +231,7 @@ def estimate_pose(
     second = _of_camera(points1, intrinsics1, camera)
     try:
         essential, inliers = cv2.findEssentialMat(
-            first,
-            second,
-            camera,
-            method=cv2.USAC_MAGSAC,
-            prob=CONFIDENCE,
-            threshold=THRESHOLD_PX,
+            first, second, camera, method=cv2.USAC_MAGSAC, prob=CONFIDENCE, threshold=THRESHOLD_PX
         )
         if essential is None or essential.shape != (3, 3) or not np.isfinite(essential).all():
             return None
