@@ -43,7 +43,7 @@ def test_tensors_of_any_layout_and_type(photo: np.ndarray) -> None:
     ("shape", "words"),
     [
         ((1, 3, 20, 30), "a batch: give one image of it"),
-        ((5, 20, 30), "give several grey images as a list"),
+        ((5, 20, 30), "give several grey images as a list to `detect_batch`"),
         ((20, 30, 2), "1, 3 or 4 channels"),
         ((20,), "(height, width)"),
     ],

@@ -27,7 +27,7 @@ def as_array(image: Any) -> np.ndarray:
     if image is None:
         raise ImageError("the image is None, as `cv2.imread` returns for a missing file: check it")
     if hasattr(image, "__next__"):
-        raise ImageError("an image is an iterator: give a list of images")
+        raise ImageError("an image is an iterator: give one image, or a list to `detect_batch`")
     if hasattr(image, "detach") and hasattr(image, "cpu"):  # a tensor
         image = image.detach().cpu()
         if image.is_floating_point():
@@ -70,7 +70,7 @@ def _channels_last(array: np.ndarray) -> np.ndarray:
     if array.ndim == 4:
         raise ImageError(
             f"an image array has shape {shape}, which is a batch: give one image of it, as "
-            "batch[0], or the batch to `DeepDetect.detect`"
+            "batch[0], or the batch to `detect_batch`"
         )
     if array.ndim == 3 and shape[2] not in CHANNEL_COUNTS and shape[0] in CHANNEL_COUNTS:
         array = np.moveaxis(array, 0, 2)
@@ -81,7 +81,7 @@ def _channels_last(array: np.ndarray) -> np.ndarray:
     raise ImageError(
         f"an image array has shape {shape}: it must be (height, width), (height, width, channels) "
         "or (channels, height, width), with 1, 3 or 4 channels"
-        + ("; give several grey images as a list" if array.ndim == 3 else "")
+        + ("; give several grey images as a list to `detect_batch`" if array.ndim == 3 else "")
     )
 
 
