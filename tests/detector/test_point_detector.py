@@ -25,7 +25,7 @@ def gray(image: np.ndarray) -> np.ndarray:
 
 def test_it_finds_the_best_points(image: np.ndarray, gray: np.ndarray) -> None:
     for spread in ("none", "grid", "anms"):
-        found = PointDetector(50, spread=spread).detect(image)
+        found = PointDetector(50.0, spread=spread).detect(image)
         np.testing.assert_array_equal(found.xy, detect_points(gray, 50, spread=spread).xy)
     assert len(PointDetector(None).detect(image)) == len(detect_points(gray))
 

@@ -36,7 +36,7 @@ def test_bad_stages_are_refused(text: str) -> None:
         {"val_fraction": 0.0},
         {"pos_weight": float("nan")},
         {"pos_weight_uncertain": True},
-        {"val_count": 0},
+        {"val_count": 2.5},
         {"warm_up": -1},
         {"short_sides": ()},
     ],
@@ -76,7 +76,7 @@ def test_a_preset_keeps_its_label_settings_unless_others_are_given(tmp_path: Pat
     [
         ({"device": "cpuu"}, "cpu"),
         ({"precision": "float16"}, "bfloat16"),
-        ({"threads": 0}, "above 0"),
+        ({"threads": 0}, "from 1 on"),
         ({"num_workers": -1}, "0"),
     ],
 )

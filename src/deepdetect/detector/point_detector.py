@@ -65,7 +65,8 @@ class PointDetector:
         if spread != "none" and max_keypoints is None:
             raise OptionError(f"`spread={spread!r}` needs `max_keypoints`: how many to spread")
         check_name("resolution of points", resolution, ("auto", "native"))
-        self.max_keypoints, self.spread, self.resolution = max_keypoints, spread, resolution
+        self.max_keypoints = None if max_keypoints is None else int(max_keypoints)
+        self.spread, self.resolution = spread, resolution
         self.ranker = RANKER if ranker is None else Path(ranker).absolute()
         self._ranker = load_ranker(self.ranker)
 

@@ -148,9 +148,10 @@ class TrainingOptions:
         self._check_sizes()
         check_ranges(
             self,
-            positive=("val_count", "learning_rate"),
+            positive=("learning_rate",),
             not_negative=("augmentations", "warm_up"),
             fractions=("dark_fraction", "color_jitter"),
+            counts=("val_count",),
             between={
                 "max_images": (2, math.inf),
                 "pos_weight": (0.1, 10),
@@ -205,7 +206,7 @@ class DeviceOptions:
     def __post_init__(self) -> None:
         for name, known in (("device", DEVICES), ("precision", PRECISIONS)):
             check_name(name, getattr(self, name), known)
-        check_ranges(self, positive=("threads",), not_negative=("num_workers",))
+        check_ranges(self, counts=("threads",), not_negative=("num_workers",))
 
     @property
     def accelerator(self) -> str:
@@ -257,12 +258,12 @@ class PointsTrainingOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        counts = dict.fromkeys(("steps", "pairs", "val_count", "val_pairs"), (1, math.inf))
         check_ranges(
             self,
             positive=("learning_rate", "min_density", "max_density"),
             not_negative=("match_weight", "seed"),
-            between={**counts, "side": (64, math.inf)},
+            counts=("steps", "pairs", "val_count", "val_pairs"),
+            between={"side": (64, math.inf)},
         )
         if self.min_density > self.max_density:
             raise OptionError("`min_density` must not be above `max_density`")

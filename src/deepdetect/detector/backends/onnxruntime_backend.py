@@ -88,7 +88,7 @@ def start_session(
     settings.log_severity_level = 4  # what fails is said by the exception, and by us
     settings.enable_cpu_mem_arena = settings.enable_mem_pattern = keep_memory
     if threads is not None:
-        settings.intra_op_num_threads = threads
+        settings.intra_op_num_threads = int(threads)
     # Falling back to the CPU after a failure, it would print blocks of text.
     session = onnxruntime.InferenceSession(model, settings, providers=[provider], enable_fallback=0)
     session.disable_fallback()

@@ -47,7 +47,7 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
     """Load weights with the backend that fits, and return its name; a few networks are kept."""
     check_name("backend", options.backend, ("auto", *BACKENDS))
     check_name("precision", options.precision, PRECISIONS)
-    check_ranges(options, between={"threads": (1, math.inf)})
+    check_ranges(options, counts=("threads",))
     name = _choose(path, options) if options.backend == "auto" else options.backend
     backend = BACKENDS[name]
     if path.suffix.lower() != backend.suffix:
