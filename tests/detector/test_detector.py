@@ -145,7 +145,7 @@ def test_the_automatic_backend(monkeypatch: pytest.MonkeyPatch) -> None:
         {"backend": "onnx"},
         {"backend": "torch"},
         {"backend": "onnxruntime", "weights": TORCH_WEIGHTS},
-        {"threads": 0},
+        {"threads": 1.5},
         {"device": "CUDAExecutionProvidr"},
         {"device": "cuda", "backend": "openvino"},
         {"precision": "bfloat16", "backend": "onnxruntime"},
@@ -279,7 +279,7 @@ SHORT_OF_MEMORY = """
 import resource, sys
 import numpy as np
 from deepdetect import DeepDetect, DeepDetectError
-detector = DeepDetect(backend=sys.argv[1], resolution="native", threads=1)
+detector = DeepDetect(sys.argv[1], backend=sys.argv[2], resolution="native", threads=1)
 image = np.random.default_rng(0).integers(0, 256, (1200, 1600, 3), np.uint8)
 expected = detector.heatmap(image[:64, :64])
 before = resource.getrlimit(resource.RLIMIT_AS)
@@ -298,15 +298,13 @@ for megabytes in (10, 80):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs a limit on memory that holds")
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino", "torch"])
 def test_too_little_memory_is_one_sentence(backend: str) -> None:
+    pytest.importorskip(backend)
+    weights = str(TORCH_WEIGHTS) if backend == "torch" else "default"
     environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", SHORT_OF_MEMORY, backend],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = [sys.executable, "-c", SHORT_OF_MEMORY, weights, backend]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert len(lines) == 2

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..pretrained import LOGITS
-from .interface import RuntimeOptions, as_logits
+from .interface import RuntimeOptions, as_logits, failed_run
 
 
 class TorchNetwork:
@@ -23,11 +23,14 @@ class TorchNetwork:
         import torch
 
         if self._threads is not None and torch.get_num_threads() != self._threads:
-            torch.set_num_threads(self._threads)  # of the process: another detector may set it
-        with torch.inference_mode():
-            tensor = torch.from_numpy(np.ascontiguousarray(image))
-            tensor = tensor.contiguous(memory_format=torch.channels_last)
-            logits = self._network(tensor).contiguous().numpy()
+            torch.set_num_threads(int(self._threads))  # of the process: another detector may set it
+        try:
+            with torch.inference_mode():
+                tensor = torch.from_numpy(np.ascontiguousarray(image))
+                tensor = tensor.contiguous(memory_format=torch.channels_last)
+                logits = self._network(tensor).contiguous().numpy()
+        except RuntimeError as error:
+            raise failed_run(error, image.shape) from None
         return as_logits(logits, LOGITS, image.shape, self._path)
 
 
