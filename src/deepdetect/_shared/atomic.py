@@ -92,7 +92,8 @@ def _clear(folder: Path) -> None:
 
 def _abandoned(folder: Path, names: re.Pattern[str]) -> list[Path]:
     """List what processes that have ended have left in a folder, by the names of it."""
-    matches = [(path, names.fullmatch(path.name)) for path in folder.iterdir()]
+    # Of a folder that may be written to, but not listed, `glob` gives nothing.
+    matches = [(path, names.fullmatch(path.name)) for path in folder.glob("*")]
     return [path for path, match in matches if match and _has_ended(path, **match.groupdict())]
 
 

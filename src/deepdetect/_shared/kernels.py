@@ -65,7 +65,7 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
             # Read while a function is decorated, not when it is called.
             config.CACHE_DIR = str(_temporary_folder())
             return numba.njit(cache=True, **flags)(function)
-        except (OSError, RuntimeError):
+        except (AttributeError, OSError, RuntimeError):  # Windows has no `getuid`
             return numba.njit(**flags)(function)
         finally:
             config.CACHE_DIR = before

@@ -83,7 +83,8 @@ def map_in_processes(
     """
     if workers is not None and workers < 1:
         raise OptionError(f"`workers` must be at least 1, not {workers}")
-    count = min(workers or processor_count(), len(tasks))
+    most = 61 if os.name == "nt" else len(tasks)  # Windows cannot wait for more
+    count = min(workers or processor_count(), most, len(tasks))
     if count <= 1:
         with _one_opencv_thread():
             yield from map(function, tasks)
