@@ -14,7 +14,7 @@ resource = pytest.importorskip("resource", reason="needs a limit on the size of 
 from deepdetect import DeepDetectError  # noqa: E402
 from deepdetect.detector.network.espnet import ESPNet  # noqa: E402
 from deepdetect.detector.network.onnx_export import export_onnx  # noqa: E402
-from deepdetect.detector.network.weights import save_weights  # noqa: E402
+from deepdetect.detector.network.weights import save_tensors  # noqa: E402
 from deepdetect.detector.points.ranker import load_ranker  # noqa: E402
 from deepdetect.training.checkpoint import save_checkpoint  # noqa: E402
 from deepdetect.training.points.task import save_ranker  # noqa: E402
@@ -32,7 +32,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
 
 
 WRITERS: dict[str, Callable[[Path], None]] = {
-    "best.safetensors": lambda path: save_weights(ESPNet(), path, {}),
+    "best.safetensors": lambda path: save_tensors(ESPNet().state_dict(), path, {}),
     "checkpoint.safetensors": lambda path: save_checkpoint(path, ESPNet(), [], {}),
     "deepdetect.onnx": lambda path: export_onnx(ESPNet(), path),
     "best.npz": lambda path: save_ranker(load_ranker(), path),

@@ -300,14 +300,16 @@ def average(
         average_weights,
         load_network,
         read_notes,
-        save_weights,
+        save_tensors,
         weights_digest,
     )
 
     with cli.writing(files, paths, overwrite) as made:
         network = average_weights(paths)
         parts = [{"sha256": weights_digest(load_network(p)), **read_notes(p)} for p in paths]
-        save_weights(network, made["weights"], {"parts": json.dumps(parts), **provenance()})
+        save_tensors(
+            network.state_dict(), made["weights"], {"parts": json.dumps(parts), **provenance()}
+        )
         export_onnx(network, made["onnx"])
     return cli.Result(files)
 

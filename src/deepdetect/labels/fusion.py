@@ -105,9 +105,7 @@ def fuse(
         (True, False)
     """
     gray = _luma(image, channels)
-    visibility = options.visibility
-    if visibility == "auto":
-        visibility = visibility_of(gray)
+    visibility = visibility_of(gray) if options.visibility == "auto" else options.visibility
     marked = {"keypoint": np.zeros(gray.shape, bool), "edge": np.zeros(gray.shape, bool)}
     for name in options.detectors:
         settings = options.parameters(name, visibility)

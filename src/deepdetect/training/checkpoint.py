@@ -9,13 +9,12 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from .._shared.atomic import atomic_path
 from .._shared.errors import WeightsError, first_line
 from .._shared.records import key
+from ..detector.network.weights import save_tensors
 
 Point = dict[str, float]
 """A point of the curves: losses and measures by name after a number of steps."""
@@ -30,14 +29,8 @@ def save_checkpoint(
         for optimizer in optimizers:
             for moment, value in optimizer.state.get(parameter, {}).items():
                 tensors[f"optimizer.{moment}.{name}"] = value
-    tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    header = {"state": json.dumps(metadata)}
-    header["digest"] = _digest(tensors, header["state"])
-    with atomic_path(path) as temporary:
-        try:
-            save_file(tensors, temporary, metadata=header)
-        except SafetensorError as error:  # a full disk
-            raise OSError(str(error)) from None
+    state = json.dumps(metadata)
+    save_tensors(tensors, path, {"state": state, "digest": _digest(tensors, state)})
 
 
 def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -86,4 +79,4 @@ def _like(value: Tensor, parameter: Tensor) -> Tensor:
 
 
 def _digest(tensors: Mapping[str, Tensor], state: str) -> str:
-    return key({name: value.numpy() for name, value in tensors.items()}, state)
+    return key({name: value.detach().cpu().numpy() for name, value in tensors.items()}, state)

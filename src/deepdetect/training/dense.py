@@ -33,7 +33,7 @@ from ..detector.network.weights import (
     average_weights,
     load_network,
     read_notes,
-    save_weights,
+    save_tensors,
     weights_digest,
 )
 from ..detector.pretrained import resolve_weights
@@ -283,7 +283,7 @@ class DenseTrainer(Trainer):
         return torch.sigmoid(logits.float()).cpu().numpy()
 
     def save(self, path: Path, notes: Mapping[str, Any]) -> None:
-        save_weights(self.network, path, dict(notes))
+        save_tensors(self.network.state_dict(), path, dict(notes))
 
     def read_notes(self, path: Path) -> Mapping[str, Any]:
         return read_notes(path)

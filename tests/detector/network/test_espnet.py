@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch", reason="needs torch, which is for training 
 from deepdetect import DeepDetect, WeightsError  # noqa: E402
 from deepdetect.detector.network.espnet import DilatedConvolution, ESPNet, ResidualPyramid  # noqa: E402
 from deepdetect.detector.network.onnx_export import export_onnx  # noqa: E402
-from deepdetect.detector.network.weights import load_network, save_weights  # noqa: E402
+from deepdetect.detector.network.weights import load_network, save_tensors  # noqa: E402
 from deepdetect.evaluation.protocols.masks import load_sample, sample_images, score_samples  # noqa: E402
 
 
@@ -55,7 +55,7 @@ def test_published_weights_score_as_published(shared: Path) -> None:
 def test_weights_survive_the_round_trip(tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = ESPNet()
-    save_weights(network, tmp_path / "w.safetensors", {"note": "x"})
+    save_tensors(network.state_dict(), tmp_path / "w.safetensors", {"note": "x"})
     loaded = load_network(tmp_path / "w.safetensors")
     for name, value in network.state_dict().items():
         assert torch.equal(value, loaded.state_dict()[name]), name

@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import nn
+from torch import Tensor, nn
 
 from ..._shared.atomic import atomic_path
 from ..._shared.errors import MissingWeightsError, WeightsError
 from .espnet import ESPNet
 
 
-def save_weights(network: nn.Module, path: str | Path, notes: dict[str, str]) -> None:
-    """Write a network's state dict, with notes in the file's header, whole or not at all."""
-    tensors = {
-        name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()
-    }
+def save_tensors(tensors: Mapping[str, Tensor], path: str | Path, notes: dict[str, str]) -> None:
+    """Write tensors, with notes in the file's header, whole or not at all."""
+    stored = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     with atomic_path(path) as temporary:
         try:
-            save_file(tensors, temporary, metadata=notes)
+            save_file(stored, temporary, metadata=notes)
         except SafetensorError as error:  # a full disk
             raise OSError(str(error)) from None
 
