@@ -35,7 +35,7 @@ class TwoViewGeometry:
             no matches.
         matrix: (3, 3) float64, refined, of the first image to the second; None without one.
         tentative_matches: number of tentative matches that it was first estimated from.
-        tentative_inliers: number of those that agree with it.
+        tentative_inliers: number of those that agree with it, and of more along its lines.
         log10_nfa: decimal logarithm of its number of false alarms (a contrario).
         simulated_views: number of views that were simulated to find it, as in ASIFT.
     """

@@ -26,6 +26,7 @@ from ..geometry.estimation import check_model
 from ..geometry.transforms import epipolar_errors, transfer_errors
 from ..io.image import Images, ignore_masks, load_image, luma
 from .guided import TentativeMatches, guided_matches, guiding_geometry
+from .guided.initial_geometry import checked_positions
 
 GUIDED_STAGES = ("initial geometry", "keypoints", "guided matching", "geometry")
 """A `PointDetector` has no first of them: its points give the geometry."""
@@ -157,6 +158,9 @@ def match_images(
     guiding = guiding_model(model, options)
     if tentative_matches is not None and not guided_matching:
         raise OptionError("`tentative_matches` guide: leave them out, or `guided_matching=False`")
+    source: Any = tentative_matches
+    if not (source is None or isinstance(source, TentativeMatches)):
+        source = checked_positions(source)
     detector = DeepDetect() if detector is None else detector
     check_selection(detector, selection)
     masks = ignore_masks(ignore, 2)
@@ -174,10 +178,8 @@ def match_images(
     # A pair and the swapped pair are matched alike: images are ordered by their pixels.
     swapped = mutual and _key(grays[0]) > _key(grays[1])
     grays = _ordered(grays, swapped)
-    source: Any = tentative_matches
     if swapped and source is not None:
-        made = isinstance(source, TentativeMatches)
-        source = source.swapped() if made else tuple(source)[::-1]
+        source = source.swapped() if isinstance(source, TentativeMatches) else source[::-1]
     first = None
     # Keypoints of the network take no part in the first geometry, and finding them cannot fail:
     # where no geometry can be trusted nobody may ever ask for them.
@@ -251,7 +253,7 @@ def match_features(
 
     Raises:
         OptionError: an option is unknown or out of its range, keypoints have no descriptors, or
-            those of the two images are of unlike types; or there are too many for the memory.
+            those of the two images are of unlike types or lengths, or too many for the memory.
 
     Example:
         >>> from deepdetect import PointDetector
@@ -264,13 +266,15 @@ def match_features(
     """
     if features0.descriptors is None or features1.descriptors is None:
         raise OptionError("these keypoints have no descriptors: find them by `extract`")
-    if features0.descriptor_type != features1.descriptor_type:
+    length0, length1 = features0.descriptors.shape[1], features1.descriptors.shape[1]
+    if (features0.descriptor_type, length0) != (features1.descriptor_type, length1):
         raise OptionError(
-            f"descriptors of the types {features0.descriptor_type} and "
-            f"{features1.descriptor_type} cannot be compared: extract both alike"
+            f"descriptors of the types {features0.descriptor_type} ({length0} numbers) and "
+            f"{features1.descriptor_type} ({length1}) cannot be compared: extract both alike"
         )
     if not 0 < ratio <= 1:
         raise OptionError(f"the ratio must be above 0 and at most 1, not {ratio}")
+    check_memory([len(features0), len(features1)])
     alike = features0.sizes is None and features1.sizes is None  # all of one scale and angle
     matches = match_descriptors(
         features0.descriptors,

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -167,7 +168,9 @@ def matches_of_points(grays: Pair, points: tuple[Keypoints, Keypoints]) -> Tenta
             return None
         best = describe_keypoints(gray, each[:MAX_KEYPOINTS])
         scale = min(1.0, MAX_SIDE_PX / max(gray.shape))
-        described.append(replace(best, xy=scaled_points(best.xy, scale)))
+        width, height = (round(side * scale) for side in best.image_size)
+        xy = scaled_points(best.xy, scale)
+        described.append(replace(best, xy=xy, image_size=(width, height)))
     features = described[0], described[1]
     return find_tentative_matches(*grays, features, max_side_px=MAX_SIDE_PX)
 
@@ -252,7 +255,7 @@ def guiding_geometry(
             geometry = estimate_initial_geometry(matches, model, seed)
             if len(geometry.points0) >= MIN_COARSE_INLIERS:
                 return replace(geometry, source=source)
-    elif not (source is None or isinstance(source, TentativeMatches)):
+    elif isinstance(source, tuple):
         return replace(_geometry_of_positions(grays, source, model, seed), source=source)
     longest = max(max(gray.shape) for gray in grays)
     if tentative is None and longest > COARSE_SIDE_PX and model != "fundamental":
@@ -289,12 +292,8 @@ def _is_clear(geometry: InitialGeometry) -> bool:
     return geometry.matrix is not None and most and (depth or not doubtful)
 
 
-def _geometry_of_positions(grays: Pair, points: Pair, model: str, seed: int) -> InitialGeometry:
-    """Estimate the geometry from sparse matches of another matcher, some of them wrong.
-
-    Raises:
-        OptionError: these are not two (K, 2) arrays of finite numbers.
-    """
+def checked_positions(points: Any) -> Pair:
+    """Return sparse matches of another matcher, two (K, 2) arrays of finite numbers, as float64."""
     try:
         points0, points1 = (np.array(each, np.float64) for each in points)
     except (TypeError, ValueError):
@@ -305,13 +304,18 @@ def _geometry_of_positions(grays: Pair, points: Pair, model: str, seed: int) -> 
         )
     if not (np.isfinite(points0).all() and np.isfinite(points1).all()):
         raise OptionError("tentative matches must be finite positions: leave out the others")
+    return points0, points1
+
+
+def _geometry_of_positions(grays: Pair, points: Pair, model: str, seed: int) -> InitialGeometry:
+    """Estimate the geometry from sparse matches of another matcher, some of them wrong."""
     # The thresholds hold for images of this size.
     scale0, scale1 = (min(1.0, MAX_SIDE_PX / max(gray.shape)) for gray in grays)
     size0, size1 = (
         (round(gray.shape[1] * scale), round(gray.shape[0] * scale))
         for gray, scale in zip(grays, (scale0, scale1), strict=True)
     )
-    scaled0, scaled1 = _separate(scaled_points(points0, scale0), scaled_points(points1, scale1))
+    scaled0, scaled1 = _separate(scaled_points(points[0], scale0), scaled_points(points[1], scale1))
     chosen = choose_model(scaled0, scaled1, (size0, size1), model, seed)
     geometry = InitialGeometry.of(chosen, scaled0, scaled1)
     return geometry.rescaled(scale0, scale1) if geometry.trusted else geometry.untrusted()
