@@ -38,6 +38,8 @@ def test_dense_keypoints_colour_their_own_pixels_only() -> None:
     greener = picture[..., 1] > picture[..., 0]
     assert greener[:50].all()
     assert not greener[50:].any()
+    beyond = Keypoints([[119.6, 30]] * 6000, np.ones(6000), (120, 100)).draw(rgb)
+    assert beyond[30, 119, 1] > 50
 
 
 @pytest.mark.parametrize(("sizes", "diameter"), [(None, 6), ([24], 24), ([1], 4)])

@@ -13,7 +13,13 @@ import numpy as np
 import pytest
 
 import deepdetect
-from deepdetect import DeepDetect, PointDetector, ReconstructionError, SelectionOptions
+from deepdetect import (
+    DeepDetect,
+    OptionError,
+    PointDetector,
+    ReconstructionError,
+    SelectionOptions,
+)
 from deepdetect._shared import machine
 from deepdetect._shared.errors import ImageError
 from deepdetect.datasets.middlebury import load_middlebury
@@ -337,6 +343,8 @@ def test_what_is_wrong_is_said(level: Any, one_line: Any, tmp_path: Path) -> Non
     assert "no focal length (EXIF)" in refusal(one_line, *pair, focal_px=None)
     assert "not both" in refusal(one_line, *pair, calibration=level.calibration)
     assert "must be above 0" in refusal(one_line, *pair, focal_px=-3)
+    with pytest.raises(OptionError, match="the seed must lie"):
+        reconstruct(*pair, AllPixels(), focal_px=500, seed=-1)
     path = tmp_path / "calib.json"
     path.write_text(json.dumps({"focal_px": 500, "baseline_mm": 0}))
     assert "baseline must be above 0" in refusal(one_line, *pair, focal_px=None, calibration=path)

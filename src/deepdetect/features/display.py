@@ -44,7 +44,7 @@ def draw_keypoints(rgb: np.ndarray, xy: np.ndarray, sizes: np.ndarray | None) ->
     canvas, unit = rgb // 2, line_scale(rgb)
     if len(xy) > MAX_CIRCLES:
         # Half transparent, so that the image shows through the dense points.
-        columns, rows = np.rint(xy).astype(int).T
+        columns, rows = np.clip(np.rint(xy).astype(int), 0, np.array(rgb.shape[1::-1]) - 1).T
         canvas[rows, columns] = canvas[rows, columns] // 2 + np.array(GREEN, np.uint8) // 2
         return canvas
     least = LEAST_RADIUS_PX * unit

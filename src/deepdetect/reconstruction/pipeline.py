@@ -21,6 +21,7 @@ from ..detector.detector import AnyDetector, DeepDetect, find_keypoints
 from ..features.keypoints import Keypoints
 from ..features.selection import SelectionOptions
 from ..geometry.camera import Calibration, Camera, read_calibration
+from ..geometry.estimation import GeometryOptions, check_model
 from ..geometry.images import window_sums
 from ..io.exif import calibration_from_exif
 from ..io.image import Images, ignore_masks, load_image, luma
@@ -110,6 +111,7 @@ def reconstruct(
         >>> bool(np.median(np.abs(found.disparity - shift)) < 0.1), found.unit
         (True, 'baseline')
     """
+    check_model("fundamental", seed, GeometryOptions())
     rgb = load_image(left, channels=channels), load_image(right, channels=channels)
     grays = luma(rgb[0]), luma(rgb[1])
     sizes = grays[0].shape[::-1], grays[1].shape[::-1]
