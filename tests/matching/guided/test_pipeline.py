@@ -15,6 +15,7 @@ from deepdetect.evaluation.metrics.stereo import stereo_score
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import guided_matches, guiding_geometry
+from deepdetect.matching.guided.pipeline import match_by_homography
 
 from ..conftest import match
 
@@ -87,6 +88,17 @@ def test_a_plane_that_the_images_do_not_show_does_not_guide(photo: np.ndarray) -
         assert inside.mean() > 0.95
 
 
+def test_of_few_keypoints_those_without_a_partner_are_verified_too(
+    photo: np.ndarray, second: np.ndarray
+) -> None:
+    """It is chance that none has one here: the images show the plane all the same."""
+    xy0 = np.stack(np.meshgrid(np.arange(32, 224, 16), np.arange(32, 224, 16)), -1).reshape(-1, 2)
+    xy1 = np.rint(transform_points(xy0, WARP)) + 4
+    matches, verified = match_by_homography((luma(photo), luma(second)), (xy0, xy1), WARP)
+    assert len(matches) == 0
+    assert verified > 0.95
+
+
 @pytest.mark.slow
 def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> None:
     pair = load_middlebury(shared / "data" / "middlebury" / "cones")
@@ -122,9 +134,7 @@ def test_a_plane_that_is_asked_for_guides(shared: Path, name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "model", ["fundamental", pytest.param("essential", marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("model", ["fundamental", "essential"])
 def test_who_asks_for_depth_gets_no_plane(facade: Any, model: str) -> None:
     """A homography explains nine tenths of the matches, and would drop what stands before."""
     pair = facade(0.07)
