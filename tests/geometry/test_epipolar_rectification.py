@@ -39,7 +39,6 @@ def two_views(motion: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.nda
 def frame_of(motion: tuple[np.ndarray, np.ndarray]) -> tuple[RectifiedFrame, list[np.ndarray]]:
     points0, points1, fundamental = two_views(motion)
     frame = rectified_frame(points0, points1, fundamental, SIZE, SIZE)
-    assert frame is not None
     return frame, [points0, points1]
 
 

@@ -15,7 +15,7 @@ from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 
 SIZES_PER_SCALE = {"diameter": 1.0, "sigma": 2.0}
-"""Of a keypoint of SIFT, by what a scale is."""
+"""Diameters of a keypoint of SIFT per unit of its scale, by the meaning of the scale."""
 
 MAX_COORDINATE_BITS = 12
 """Of a position in `bayer_order`: float32 holds the order exactly up to this many."""

@@ -49,7 +49,6 @@ SEARCH_SHRINK = 3
 """Random tries begin in the whole image around the best neighbour; each next one is so many times
 nearer."""
 
-
 Neighbours = tuple[np.ndarray, np.ndarray]
 """(N, count) int32 rows and (N, count) float32 distances, nearest first."""
 

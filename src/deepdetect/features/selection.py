@@ -16,10 +16,10 @@ MAX_OFFSET_PX = 0.499
 """The nearest pixel of a refined keypoint is still the one that it was found at."""
 
 Rows = Callable[[slice], np.ndarray]
-"""What gives the rows of a map that are asked for."""
+"""Returns the rows of a map that are asked for."""
 
 BAND_PIXELS = 4_000_000
-"""Of a map that are looked at at a time."""
+"""Of a map that are worked on at a time."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,14 +17,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .._shared.opencv import cv2
-from .transforms import transform_points
+from .camera import Size
+from .transforms import transform_points, translation_matrix
 
-Size = tuple[int, int]
 Both = tuple[np.ndarray, np.ndarray]
 
 MAX_STRETCH = 2.0
-"""A planar frame may stretch or shrink a part of a view by this factor, relative to its middle;
-beyond it the epipole is too near, and the frame is polar."""
+"""A planar frame may stretch or shrink a part of a view by this factor along its line at infinity,
+and by its square across, relative to the middle; beyond it the epipole is too near, and the frame
+is polar."""
 
 MAX_AREA = 3.0
 """Of a planar frame, relative to the larger view."""
@@ -166,8 +167,7 @@ def _planar_frame(
     middles = [np.median(of_view, axis=0) for of_view in points]
     for matrix, border, middle in zip(matrices, corners, middles, strict=True):
         depth = (border @ matrix[2, :2] + matrix[2, 2]) / (middle @ matrix[2, :2] + matrix[2, 2])
-        # Lengths across the line at infinity change with the square of this.
-        if depth.min() <= 0 or max(depth.max(), 1 / depth.min()) ** 2 > MAX_STRETCH**2:
+        if depth.min() <= 0 or max(depth.max(), 1 / depth.min()) > MAX_STRETCH:
             return None
     jacobians = [_jacobian(*each) for each in zip(matrices, middles, strict=True)]
     areas = np.linalg.det(jacobians)
@@ -178,14 +178,14 @@ def _planar_frame(
         scale = -scale
     first, second = (np.diag([scale, scale, 1]) @ matrix for matrix in matrices)
     moved = transform_points(points[0], first) - transform_points(points[1], second)
-    second = _translation(np.round(np.median(moved[:, 0])), 0) @ second
+    second = translation_matrix(np.round(np.median(moved[:, 0])), 0) @ second
     borders = np.stack([transform_points(corners[0], first), transform_points(corners[1], second)])
     (left, _), (right, _) = borders.min(axis=(0, 1)), borders.max(axis=(0, 1))
     top, bottom = borders[..., 1].min(axis=1).max(), borders[..., 1].max(axis=1).min()
     width, height = int(np.ceil(right - left)) + 1, int(np.ceil(bottom - top)) + 1
     if height < 2 or width * height > MAX_AREA * np.prod(sizes, axis=1).max():
         return None
-    shift = _translation(-np.floor(left), -np.floor(top))
+    shift = translation_matrix(-np.floor(left), -np.floor(top))
     return PlanarFrame((shift @ first, shift @ second), (width, height))
 
 
@@ -227,10 +227,6 @@ def _polar_frame(
 def _corners(size: Size) -> np.ndarray:
     right, bottom = size[0] - 1, size[1] - 1
     return np.array([[0, 0], [right, 0], [right, bottom], [0, bottom]], np.float64)
-
-
-def _translation(x: float, y: float) -> np.ndarray:
-    return np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
 
 
 def _jacobian(homography: np.ndarray, point: np.ndarray) -> np.ndarray:

@@ -17,6 +17,24 @@ Pose = tuple[np.ndarray, np.ndarray]
 BLOCK = 100_000
 """Matches that are triangulated at once: a score of arrays of millions would fill the memory."""
 
+MAX_ITERATIONS = 10
+"""Of Gauss-Newton."""
+
+DERIVATIVE_STEP = 1e-6
+"""By which the pose is varied for its derivatives, in radians."""
+
+MIN_CHANGE = 1e-9
+"""A smaller change of the pose, in radians, ends the refinement."""
+
+MAX_REFITS = 4
+"""How often the pose is fitted to its own inliers again ..."""
+
+MIN_INLIER_GAIN = 0.01
+"""... while that gives this fraction of further inliers."""
+
+MAX_MATCHES = 50_000
+"""That are used, sampled evenly: more do not improve the pose."""
+
 
 @dataclass(frozen=True, eq=False)
 class Triangulation:
@@ -97,25 +115,6 @@ def correct_matches(
     # On an epipole every line is right: such a match stays where it is.
     known = np.isfinite(moved0).all(1) & np.isfinite(moved1).all(1)
     return np.where(known[:, None], moved0, points0), np.where(known[:, None], moved1, points1)
-
-
-MAX_ITERATIONS = 10
-"""Of Gauss-Newton."""
-
-DERIVATIVE_STEP = 1e-6
-"""By which the pose is varied for its derivatives, in radians."""
-
-MIN_CHANGE = 1e-9
-"""A smaller change of the pose, in radians, ends the refinement."""
-
-MAX_REFITS = 4
-"""How often the pose is fitted to its own inliers again ..."""
-
-MIN_INLIER_GAIN = 0.01
-"""... while that gives this fraction of further inliers."""
-
-MAX_MATCHES = 50_000
-"""That are used, sampled evenly: more do not improve the pose."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,12 +16,10 @@ from functools import cached_property
 import numpy as np
 
 from .._shared.opencv import cv2
-from .camera import Calibration, Camera, cross_matrix
+from .camera import Calibration, Camera, Size, cross_matrix
 from .estimation import TwoViewModel, log10_nfa
 from .relative_pose import Pose, best_of_four, moved_pose
 from .transforms import epipolar_errors, signed_epipolar_errors
-
-Size = tuple[int, int]
 
 MODELS_PER_SAMPLE = 10
 """Five matches give up to ten essential matrices."""

@@ -112,6 +112,11 @@ def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.nda
     return np.linalg.norm(expected - points1, axis=1)
 
 
+def translation_matrix(x: float, y: float) -> np.ndarray:
+    """Return the (3, 3) map that moves positions by (x, y)."""
+    return np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
+
+
 def scaling_matrix(scale: float) -> np.ndarray:
     """Return the (3, 3) map from an image to the same image at another scale."""
     shift = 0.5 * scale - 0.5

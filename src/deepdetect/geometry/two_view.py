@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .camera import Calibration
+from .camera import Calibration, Size
 from .estimation import (
     MAX_LOG10_NFA,
     MIN_FRACTION_OF_PLANE,
@@ -22,8 +22,6 @@ from .estimation import (
 )
 from .semi_calibrated import estimate_semi_calibrated
 from .transforms import transfer_errors
-
-Size = tuple[int, int]
 
 GUIDING_THRESHOLDS_PX = {"homography": 3.0, "fundamental": 1.5}
 """Matches within this agree with a model that only guides: keypoints of small copies are coarse."""

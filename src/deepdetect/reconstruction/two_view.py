@@ -156,13 +156,13 @@ def check_matches(
     Returns the (K,) rows of those that were used, one per cell, and their fundamental matrix. A
     calibration distinguishes a rotating camera from a plane.
     """
-    indices = grid_subsample(points0, GRID_SIZE_PX, seed)
-    kind, epipolar = classify_scene(points0[indices], points1[indices], size1, calibration, seed)
     if not len(points0):
         raise NoDepthError(
             "there are no matches: the images do not overlap, or do not show the same scene, "
             "or no pixel of one is above the threshold (lower `threshold`, or give `density`)"
         )
+    indices = grid_subsample(points0, GRID_SIZE_PX, seed)
+    kind, epipolar = classify_scene(points0[indices], points1[indices], size1, calibration, seed)
     if kind == "unrelated":
         raise NoDepthError(
             f"too few of the {len(points0):,} matches agree with one geometry: the images do not "

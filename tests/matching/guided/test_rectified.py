@@ -35,14 +35,12 @@ def first(cones) -> InitialGeometry:
 def found(cones, first) -> GuidedMatches:
     """The matches of every second keypoint."""
     matches = match(*cones[:2], every_second(cones[0]), first)
-    assert matches is not None
     return matches
 
 
 def match(
     gray0: np.ndarray, gray1: np.ndarray, xy0: np.ndarray, first: InitialGeometry
 ) -> GuidedMatches | None:
-    assert first.matrix is not None
     sparse = first.points0, first.points1
     found = match_by_rectification((gray0, gray1), xy0, sparse, first.matrix)
     return None if found is None else found[1]
@@ -79,7 +77,6 @@ def test_most_keypoints_are_matched_and_right(cones, found, move, precision: flo
     else:
         second = cv2.warpAffine(right, move, right.shape[::-1], flags=cv2.INTER_CUBIC)
         found = match(left, second, xy0, guiding_geometry((left, second), "fundamental"))
-    assert found is not None
     assert len(found) > 0.35 * len(xy0)
     assert within(found, xy0, cones, move) > precision
     assert ((found.scores >= 0) & (found.scores <= 1)).all()
@@ -94,7 +91,6 @@ def test_low_correlation_is_kept_where_little_is_found_by_chance(
     xy0 = every_second(left)
     monkeypatch.setattr(rectified, "FALSE_DISCOVERY_RATE", 0.0)
     strict = match(left, right, xy0, first)
-    assert strict is not None
     assert set(strict.indices0) < set(found.indices0)
     assert len(found) > 1.05 * len(strict)
     assert within(found, xy0, cones, np.eye(2, 3)) > 0.97
@@ -107,7 +103,6 @@ def test_a_pair_with_too_much_to_search_is_matched_on_smaller_copies(
     xy0 = every_second(left)
     monkeypatch.setattr(rectified, "MAX_VOLUME", 3e6)
     found = match(left, right, xy0, first)
-    assert found is not None
     assert len(found) > 0.25 * len(xy0)
     move = np.float64([[1, 0, 0], [0, 1, 0]])
     assert within(found, xy0, cones, move) > 0.85
@@ -117,7 +112,6 @@ def test_a_matrix_that_is_off_is_corrected(cones, first) -> None:
     """One that is turned by a third of a degree about the middle of the image."""
     left, right, _ = cones
     turn = np.vstack([cv2.getRotationMatrix2D((225, 190), 0.3, 1), [0, 0, 1]])
-    assert first.matrix is not None
     wrong = np.linalg.inv(turn).T @ first.matrix
     xy0 = every_second(left)
     counts = []
@@ -125,7 +119,6 @@ def test_a_matrix_that_is_off_is_corrected(cones, first) -> None:
         found = match_by_rectification(
             (left, right), xy0, (first.points0, first.points1), wrong, exact
         )
-        assert found is not None
         matrix, matches = found
         assert epipolar_errors(xy0[matches.indices0], matches.points1, matrix).max() < 1e-6
         rows = np.abs(matches.points1[:, 1] - xy0[matches.indices0, 1])
@@ -137,7 +130,6 @@ def test_a_matrix_that_is_off_is_corrected(cones, first) -> None:
 def test_matches_that_the_sparse_ones_contradict_do_not_count(cones, first) -> None:
     """Sparse matches that lie on the right lines, but at other places of them."""
     left, right, _ = cones
-    assert first.matrix is not None
     astray = first.points1.copy()
     astray[::2, 0] -= 8
     given = (left, right), every_second(left), (first.points0, astray), first.matrix

@@ -268,7 +268,6 @@ def test_the_range_holds_the_disparities_and_not_much_more(surface, smooth_pair)
     found = find_disparity_range(*smooth_pair(surface))
     seen = surface[(surface <= WIDE_COLUMN) & (WIDE_COLUMN - surface < WIDE[1])]
     low, high = np.quantile(seen, [0.01, 0.99])
-    assert found is not None
     assert found[0] <= low
     assert found[1] >= high
     assert found[1] - found[0] + 1 < 1.5 * (high - low) + 20

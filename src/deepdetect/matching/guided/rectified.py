@@ -15,6 +15,7 @@ import numpy as np
 
 from ..._shared.opencv import cv2
 from ...features.matches import GuidedMatches
+from ...geometry.camera import Size
 from ...geometry.epipolar_rectification import PolarFrame, RectifiedFrame, rectified_frame
 from ...geometry.images import downscale, equalise, gaussian_blur, local_zncc, track_round_trip
 from ...geometry.semi_calibrated import refine_fundamental
@@ -27,8 +28,6 @@ from ..stereo.matching import (
 )
 from ..stereo.sgm import DisparityRange
 from .initial_geometry import Pair
-
-Size = tuple[int, int]
 
 DISPARITY = DisparityOptions(discontinuity_margin_px=1)
 """How rows are matched; the range is found."""
@@ -213,12 +212,12 @@ def _match_rows(
     views: Pair, shown: Pair, searched: DisparityRange
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return disparities, where they match what both views show, and the correlation there."""
-    found = compute_disparity(*views, replace(DISPARITY, disparity_range=searched))
-    row, column = np.indices(found.disparity.shape, dtype=np.float32)
-    x = np.where(found.matched, column - found.disparity, -1).astype(np.float32)
+    rows = compute_disparity(*views, replace(DISPARITY, disparity_range=searched))
+    row, column = np.indices(rows.disparity.shape, dtype=np.float32)
+    x = np.where(rows.matched, column - rows.disparity, -1).astype(np.float32)
     aligned = cv2.remap(views[1], x, row, cv2.INTER_LINEAR)
     inside = cv2.remap(shown[1].astype(np.uint8), x, row, cv2.INTER_NEAREST) > 0
-    matched = found.matched & shown[0] & inside
+    matched = rows.matched & shown[0] & inside
     correlation = local_zncc(
         gaussian_blur(views[0], CORRELATION_SIGMA_PX),
         gaussian_blur(aligned, CORRELATION_SIGMA_PX),
@@ -226,7 +225,7 @@ def _match_rows(
         CORRELATION_WINDOW_PX,
     )
     correlation = np.where(matched, np.nan_to_num(correlation), np.float32(-1))
-    return found.disparity, matched, correlation
+    return rows.disparity, matched, correlation
 
 
 def _correlation_bounds(

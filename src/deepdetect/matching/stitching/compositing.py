@@ -17,7 +17,7 @@ from ..._shared.errors import OptionError, RegistrationError
 from ..._shared.machine import require_memory
 from ..._shared.opencv import cv2
 from ...geometry.images import downscale
-from ...geometry.transforms import scaled_homography, transform_points
+from ...geometry.transforms import scaled_homography, transform_points, translation_matrix
 from .bundle_adjustment import Cameras, Matrices, Sizes
 
 Box = tuple[int, int, int, int]
@@ -129,7 +129,7 @@ def plan_plane(
         left, top = (np.ceil(edge.min(0)) - low).astype(int).tolist()
         right, bottom = (np.floor(edge.max(0)) - low).astype(int).tolist()
         boxes[number] = (left, top, right + 1, bottom + 1)
-    placed = {number: _shift(*-low) @ matrix for number, matrix in placed.items()}
+    placed = {number: translation_matrix(*-low) @ matrix for number, matrix in placed.items()}
 
     def draw(number: int, rgb: np.ndarray, image_scale: float, canvas_scale: float) -> WarpedImage:
         homography, (left, top, right, bottom) = placed[number], boxes[number]
@@ -143,7 +143,7 @@ def plan_plane(
         rgb, smaller = _downscaled(rgb, shown)
         if smaller < 1:
             homography = scaled_homography(homography, smaller, 1)
-        homography = _shift(-left, -top) @ homography
+        homography = translation_matrix(-left, -top) @ homography
         size = (right - left, bottom - top)
         drawn = cv2.warpPerspective(
             rgb, homography, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
@@ -191,10 +191,6 @@ def plan_curved(
         return WarpedImage(drawn, mask, corner)
 
     return Canvas(boxes, draw)
-
-
-def _shift(x: float, y: float) -> np.ndarray:
-    return np.array([[1, 0, x], [0, 1, y], [0, 0, 1]])
 
 
 def _downscaled(rgb: np.ndarray, shown: float) -> tuple[np.ndarray, float]:

@@ -14,7 +14,7 @@ from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.progress import StageTimer
 from ...detector.detector import AnyDetector, DeepDetect
 from ...geometry.images import downscale
-from ...geometry.transforms import scaled_homography
+from ...geometry.transforms import scaled_homography, translation_matrix
 from ...io.image import load_image
 from ..guided.initial_geometry import MAX_SIDE_PX
 from .bundle_adjustment import RotatingCamera, level_cameras
@@ -189,7 +189,7 @@ def stitch(
             part = (slice(top, bottom), slice(left, right))
             panorama, valid = panorama[part].copy(), valid[part].copy()
             if projection == "plane":
-                shift = np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1]])
+                shift = translation_matrix(-left, -top)
                 homographies = {n: shift @ matrix for n, matrix in homographies.items()}
     return Panorama(
         panorama,
