@@ -36,10 +36,10 @@ class AppOptions:
 
     Attributes:
         port: of 127.0.0.1; 0 for any that is free.
-        max_file_mb: size of the largest photograph, in megabytes.
-        max_task_mb: size of all photographs of one task, in megabytes.
-        max_files: number of photographs of one task.
-        max_megapixels: larger photographs are refused before they are decoded.
+        max_file_mb: size of the largest image file, in megabytes.
+        max_task_mb: size of all image files of one task, in megabytes.
+        max_files: number of images of one task.
+        max_megapixels: larger images are refused before they are decoded.
         max_tasks: tasks that are at work at the same time.
         max_task_s: seconds after which a task is ended.
         abandoned_s: seconds without a question from the page after which a task, or its result,
@@ -102,7 +102,7 @@ class Job:
         self._listener.join()
 
     def _listen(self) -> None:
-        with contextlib.suppress(EOFError), self._receiver:
+        with contextlib.suppress(EOFError, OSError), self._receiver:  # killed while it sends
             while True:
                 self.state = self._receiver.recv()
         self.process.join()

@@ -272,7 +272,7 @@ def _entry_name(name: str, others: Sequence[str]) -> str:
 
 
 def _stages(names: Sequence[str], report: Report) -> Callable[[str], None]:
-    """Report the first stage; return what is called when a stage ends. The last one are files."""
+    """Report the first stage; return what is called when a stage ends. "files" is the last one."""
     all_names, done = [*names, "files"], itertools.count()
 
     def ended(_: str) -> None:

@@ -200,7 +200,7 @@ def fill_file(
     """Make the groups that are wanted and not in the file yet, in the processes of an engine.
 
     The settings are all that the content depends on besides the inputs; shards of others are not
-    used. Of an input any of its groups will do, of the state that is named; the first is made.
+    used. Of an input any of its groups will do, if it has the named state; else the first is made.
     `others_stay` says which groups of other inputs, and of inputs that fail, stay in the file.
     """
     import_h5py()

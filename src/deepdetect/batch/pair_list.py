@@ -23,7 +23,7 @@ def pair_name(name0: str, name1: str) -> str:
 def read_pairs(path: str | Path) -> list[Pair]:
     """Read a list of pairs: two names of images on each line, with a blank or a tab between.
 
-    A pair that is there twice, or also the other way round, is taken once, as it is there first.
+    A pair that is listed twice, in either order, is taken once, as it is listed first.
 
     Raises:
         DeepDetectError: the file is missing or empty, or a line is something else.
@@ -54,9 +54,9 @@ def sequential_pairs(names: Sequence[str], following: int) -> list[Pair]:
 
 
 def check_pairs(pairs: Sequence[Sequence[str]], place: str = "`pairs`") -> list[Pair]:
-    """Return pairs without those that are there before, or the other way round.
+    """Return pairs, each once: one that is listed before, in either order, is left out.
 
-    An OptionError says which is none.
+    An OptionError says which is no pair.
     """
     kept: dict[Pair, None] = {}
     for pair in pairs:

@@ -99,8 +99,8 @@ def match_pairs(
     Args:
         features: file of `extract_features`, or of hloc.
         pairs: "exhaustive": all; "sequential": each image with those that follow it by name; or
-            pairs of names, or a text file with one on each line, of which one that is there twice,
-            or also the other way round, is taken once.
+            a list of pairs of names, or a text file with a pair on each line. A pair that is listed
+            twice, in either order, is taken once.
         path: the file.
         options: how they are matched.
         engine: "processes" of this machine, or "ray" for a cluster.

@@ -48,7 +48,7 @@ _limit: ContextVar[float] = ContextVar("max_megapixels", default=MAX_MEGAPIXELS)
 def limit_megapixels(max_megapixels: float) -> Iterator[None]:
     """Refuse larger images than these in the block, where a call gives no limit of its own.
 
-    It is for commands: what reads a photograph, and how often, lies deep below them.
+    It is for commands, since images are read deep below them. Other processes do not know it.
     """
     token = _limit.set(megapixel_limit(max_megapixels))
     try:

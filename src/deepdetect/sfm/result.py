@@ -36,7 +36,7 @@ class MultiViewReconstruction:
         sparse: the points by which the poses were estimated.
         sparse_errors: (N,) float32 their mean reprojection errors in pixels.
         sparse_views: (N,) int32 number of images that each of them is seen in.
-        dense: the dense points; without any where none were asked for.
+        dense: the dense points; empty where none were asked for.
         dense_errors: (M,) float32 reprojection errors of these in pixels: the root mean square of
             all images that agree.
         dense_views: (M,) uint8 number of images that agree on each of them.

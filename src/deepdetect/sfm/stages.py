@@ -1,7 +1,7 @@
 """The stages of a reconstruction of many images, each of which is done once.
 
 Features and matches are in the HDF5 files of `batch`. Mapping and dense points have a key of all
-that they depend on: what a run finds with the right key it does not make again.
+that they depend on: a run does not make again what it finds with the right key.
 """
 
 from __future__ import annotations
