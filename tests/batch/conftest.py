@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 
 @pytest.fixture
 def collection(photo: np.ndarray, tmp_path: Path) -> Callable[..., Path]:
     """Write a folder of overlapping crops of a photograph: a/00.png, a/01.png, ..., b/..."""
-    from PIL import Image
 
     def write(count: int, side: int = 128, name: str = "photos") -> Path:
         folder = tmp_path / name

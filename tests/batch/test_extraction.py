@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from deepdetect import DeepDetect, OptionError, PointDetector, SelectionOptions, load_image
 from deepdetect.batch import extract_features
@@ -89,7 +90,6 @@ def test_dense_keypoints(collection: Callable[..., Path], tmp_path: Path) -> Non
 
 def test_an_image_without_keypoints(tmp_path: Path) -> None:
     import h5py
-    from PIL import Image
 
     (tmp_path / "photos").mkdir()
     Image.new("RGB", (64, 48)).save(tmp_path / "photos/black.png")
@@ -163,8 +163,6 @@ def test_images_that_are_gone_lose_their_features(
 def test_an_image_that_is_too_large_is_a_failure(
     collection: Callable[..., Path], photo: np.ndarray, tmp_path: Path
 ) -> None:
-    from PIL import Image
-
     folder = collection(2)
     Image.fromarray(photo).save(folder / "large.png")
     report = extract_features(folder, tmp_path / "f.h5", FEW, workers=1, max_megapixels=0.02)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("h5py", reason="needs h5py")
 
@@ -39,8 +40,6 @@ def small_collection() -> Collection:
 @pytest.fixture(scope="session")
 def fountain(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Small copies of four photographs of a fountain."""
-    from PIL import Image
-
     folder = tmp_path_factory.mktemp("fountain") / "photos"
     folder.mkdir()
     for name in FOUNTAIN:

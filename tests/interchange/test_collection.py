@@ -37,8 +37,6 @@ def test_matches_of_other_keypoints_are_refused(one_line) -> None:
 
 
 def test_descriptors_come_from_the_photographs(photo: np.ndarray, tmp_path: Path) -> None:
-    from PIL import Image
-
     Image.fromarray(photo).save(tmp_path / "p.png")
     points = PointDetector(50).detect(photo)
     pixels = Keypoints(np.rint(points.xy), points.scores, points.image_size)

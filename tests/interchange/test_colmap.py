@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("pycolmap", reason="needs pycolmap")
 
@@ -45,8 +46,6 @@ def test_colmap_reads_what_is_written(small_collection: Collection, tmp_path: Pa
 
 def test_the_centre_of_a_pixel_is_where_colmap_finds_it(tmp_path: Path) -> None:
     """Known answer: COLMAP's own SIFT finds a blob half a pixel from where we say it is."""
-    from PIL import Image
-
     pycolmap = import_pycolmap()
     y, x = np.mgrid[:64, :64]
     blob = 255 * np.exp(-((x - 30) ** 2 + (y - 21) ** 2) / (2 * 4.0**2))

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("h5py", reason="needs h5py")
 
@@ -23,7 +24,6 @@ from deepdetect.interchange import match_folder, read_collection
 @pytest.fixture
 def pair(tmp_path: Path) -> Path:
     """Two views of one scene in a folder."""
-    from PIL import Image
     from skimage import data
 
     folder = tmp_path / "photos"

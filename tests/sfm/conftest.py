@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 FOUNTAIN = ("0003", "0004", "0005", "0006")
 
@@ -21,7 +22,6 @@ def pycolmap():
 @pytest.fixture(scope="session")
 def write_fountain(shared: Path) -> Callable[..., Path]:
     """Write small copies of photographs of the fountain."""
-    from PIL import Image
 
     def write(folder: Path, names=FOUNTAIN, width: int = 384) -> Path:
         folder.mkdir(parents=True, exist_ok=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image, ImageOps
 
 from deepdetect import (
     Camera,
@@ -91,8 +92,6 @@ def small(write_fountain, tmp_path_factory) -> tuple[Path, Path, MultiViewRecons
     pytest.importorskip("h5py", reason="needs h5py")
     pytest.importorskip("pycolmap", reason="needs pycolmap")
     data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
-    from PIL import Image
-
     root = tmp_path_factory.mktemp("sfm")
     folder = write_fountain(root / "photos", ("0004", "0005", "0006"), 288)
     Image.new("RGB", (288, 192)).save(folder / "black.png")
@@ -208,8 +207,6 @@ def test_a_known_camera_stays_as_it_is(write_fountain, shared: Path, tmp_path: P
 def test_photographs_of_another_size_do_not_stop_a_calibrated_run(
     write_fountain, tmp_path: Path, photo: np.ndarray, pycolmap
 ) -> None:
-    from PIL import Image
-
     folder = write_fountain(tmp_path / "photos", ("0004", "0005", "0006"))
     Image.fromarray(photo).save(folder / "other.png")
     calibration = {"focal_px": [344.935, 345.52], "cx": 189.65, "cy": 125.41, "width": 384}
@@ -241,8 +238,6 @@ def test_pairs_are_chosen(small, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_of_two_scenes_the_larger_is_the_model(write_fountain, tmp_path: Path, pycolmap) -> None:
     """The negatives of three photographs are another scene: their descriptors are others."""
-    from PIL import Image, ImageOps
-
     folder = write_fountain(tmp_path / "photos", width=256)
     for name in ("0003", "0004", "0005"):
         with Image.open(folder / f"{name}.jpg") as image:
@@ -262,8 +257,6 @@ def test_of_two_scenes_the_larger_is_the_model(write_fountain, tmp_path: Path, p
 def test_too_few_photographs_are_one_sentence(
     tmp_path: Path, photo: np.ndarray, one_line: Callable, pycolmap
 ) -> None:
-    from PIL import Image
-
     folder = tmp_path / "photos"
     folder.mkdir()
     with pytest.raises(ImageError):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 
 @pytest.fixture(scope="session")
@@ -23,8 +24,6 @@ def moving_photo() -> Callable[[int, tuple[int, int]], np.ndarray]:
 @pytest.fixture
 def frame_folder(moving_photo, tmp_path: Path) -> Path:
     """Six frames of it as PNG files."""
-    from PIL import Image
-
     folder = tmp_path / "frames"
     folder.mkdir()
     for k in range(6):
