@@ -84,6 +84,9 @@ def test_cameras_are_compared_after_the_alignment(rows: list) -> None:
     assert ours["centres, unit of the truth"] == pytest.approx(0, abs=1e-9)
     assert ours["rotations, °"] == pytest.approx(0, abs=1e-4)
     assert (ours["sparse points"], ours["track length"]) == (1000, 3.5)
+    *exact, missing = sfm.image_table(rows).values()[:5]
+    assert max(row["rotation, °"] for row in exact) < 1e-4
+    assert [missing["image"], missing["rotation, °"]] == ["000004.png", None]
     nothing = table.values()[2]
     assert nothing["AUC at 5°"] == 0
     assert nothing["centres, ‰ of the extent"] is nothing["rotations, °"] is None
@@ -158,7 +161,8 @@ def test_a_whole_run_on_small_images(write_posed_fountain, tmp_path: Path) -> No
     options = BenchmarkOptions(DeepDetect())
     report = run_benchmarks(["sfm"], folder, options, cache=tmp_path / "cache")
     assert report.failures == ()
-    cameras, costs = report.tables()
+    cameras, per_image, costs = report.tables()
+    assert len(per_image.rows) == 3 * 2 * len(names)
     assert all(cost > 0 for row in costs.values() for cost in [*row.values()][2:])
     lines = [*cameras.values()]
     given = {row["keypoints"]: row for row in lines if row["intrinsics"] == "true"}

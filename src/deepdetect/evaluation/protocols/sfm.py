@@ -66,6 +66,9 @@ CAMERA_COLUMNS = {
     **MODEL_COLUMNS,
 }
 
+IMAGE_COLUMNS = dict.fromkeys(("scene", "keypoints", "intrinsics", "image"), "")
+IMAGE_COLUMNS |= {"centre, unit of the truth": ".5f", "rotation, °": ".4f"}
+
 MAPPING_CPU = "mapping, {} intrinsics, CPU s"
 
 COST_COLUMNS = {
@@ -158,7 +161,7 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
     methods = sfm_methods(options)
     rows = run.rows("", methods, chosen, partial(measure_scene, run))
     rows = [row for name in chosen for row in where(rows, item=name)]
-    tables = [camera_table(rows), cost_table(rows)]
+    tables = [camera_table(rows), image_table(rows), cost_table(rows)]
     figures = []
     for name, scene in chosen.items():
         errors = {
@@ -246,6 +249,24 @@ def camera_table(rows: Rows) -> Table:
                 line["from the first row's, unit of the truth"] = apart
             lines.append(line)
     return Table("sfm", "Cameras and sparse points", CAMERA_COLUMNS, lines, CAMERA_NOTE)
+
+
+def image_table(rows: Rows) -> Table:
+    """Tabulate the errors of each camera."""
+    lines = []
+    for row in rows:
+        truth = true_views(row["scene"])
+        for kind in KINDS:
+            views, errors = row[kind]["views"], {}
+            if len(views) >= MIN_IMAGES:
+                found = camera_errors(list(views.values()), [truth[name] for name in views])
+                errors = dict(zip(views, zip(*found[:2], strict=True), strict=True))
+            for image in truth:
+                cells = row["scene"].name, row["method"], kind, image
+                cells += errors.get(image, (None, None))
+                lines.append(dict(zip(IMAGE_COLUMNS, cells, strict=True)))
+    note = "After the alignment of all centres; a dash: the image is not registered."
+    return Table("sfm_images", "All images", IMAGE_COLUMNS, lines, note, in_text=False)
 
 
 Views = Mapping[str, PosedView]
