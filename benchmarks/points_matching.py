@@ -3,10 +3,9 @@
     python benchmarks/points_matching.py --keypoints 2048
 
 Eight pairs of the Oxford set, refined homographies. Dense guided matching; guided matching of the
-best pixels of the heat map, of points that begin with SIFT's keypoints, and of points that begin
-with themselves; points matched by descriptors alone. Times are CPU seconds of the process, each
-way run once after one that is not counted. At the end the points of an image of 800x640 are timed
-beside its heat map, on one thread.
+best pixels of the heat map, and of points; points matched by descriptors alone. Times are CPU
+seconds of the process, each way run once after one that is not counted. At the end the points of an
+image of 800x640 are timed beside its heat map, on one thread.
 """
 
 from __future__ import annotations

@@ -119,7 +119,7 @@ def test_what_fails_is_listed_and_the_rest_is_there(made, folder: Path, run) -> 
         ("oxford", "img1"),
         ("hpatches", "HPatches"),
         ("pose", "no images with cameras"),
-        ("pose --max-pairs 0", "--max-pairs must be above 0"),
+        ("pose --max-pairs 0", "--max-pairs must be a whole number"),
     ],
 )
 def test_a_wrong_name_ends_with_one_line_and_exit_code_2(

@@ -210,7 +210,7 @@ def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
             made = outputs_in(output)
             below = [each for each in below if not (each.parent == path and each.name in made)]
             if not below:
-                raise OptionError(f"all images in {path} are results of earlier runs")
+                raise OptionError(f"all images in {path} are results of earlier runs: name others")
         images |= dict.fromkeys(below)
     return list(images)
 

@@ -149,7 +149,7 @@ def hloc(
 
 
 def _new_folder(folder: Path, marker: str, overwrite: bool) -> Path:
-    """Return the file by which it is known whose a folder is; refuse one that holds other files."""
+    """Return the file that marks a folder as ours; refuse a folder that holds other files."""
     known = overwrite or (folder / marker).exists() or not folder.is_dir()
     if not known and any(not path.name.startswith(".") for path in folder.iterdir()):
         raise OptionError(f"{folder} is not empty: choose another folder with -o, or --overwrite")
@@ -167,8 +167,8 @@ def _export(
 ) -> cli.Result:
     """Read or make a collection, and write it.
 
-    The marker is a file by which it is known whose the output is; the values are those of `SAVED`,
-    `FOLDER` and `MAX_KEYPOINTS`.
+    The marker is the file whose record says what the output was made of; the values are those of
+    `SAVED`, `FOLDER` and `MAX_KEYPOINTS`.
     """
     inputs = [*sources, *(values[name] for name in ("matches", "pairs") if name in values)]
     cli.check_outputs([marker], inputs)

@@ -177,13 +177,10 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
         except DeepDetectError as error:
             failure = error
         except RequestException as error:
-            answer = error.response
-            what = type(error).__name__
-            if answer is not None:
-                what = f"the server answers {answer.status_code}"
-            failure = DeepDetectError(
-                f"{url} cannot be downloaded ({what}): give the same command again to resume"
-            )
+            what, advice = type(error).__name__, "give the same command again to resume"
+            if error.response is not None:
+                what, advice = f"the server answers {error.response.status_code}", "try again later"
+            failure = DeepDetectError(f"{url} cannot be downloaded ({what}): {advice}")
     raise failure
 
 

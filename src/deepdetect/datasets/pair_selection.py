@@ -40,13 +40,13 @@ def sequence_pairs(
         >>> sequence_pairs(range(12), 5, (1, 10))
         [(0, 1), (10, 11), (0, 10), (1, 11)]
     """
-    there = set(frames)
+    existing = set(frames)
     starts_per_distance = max(1, max_pairs // len(distances))
     pairs = [
         (start, start + distance)
         for distance in distances
         for start in evenly_spaced(
-            [frame for frame in frames if frame + distance in there], starts_per_distance
+            [frame for frame in frames if frame + distance in existing], starts_per_distance
         )
     ]
     return evenly_spaced(pairs, max_pairs)

@@ -140,7 +140,7 @@ def evaluate(
         ['low']
     """
     if not all(0 < scale < math.inf for scale in scales):
-        raise OptionError(f"a scale must be a number above 0, not one of {scales}")
+        raise OptionError(f"scales must be numbers above 0, not {list(scales)}")
     if scales and samples is None:
         raise OptionError("scales are of the images in samples: name their folder, too")
     if equal_density and oxford is None and foreground is None:
