@@ -229,10 +229,8 @@ def patchmatch_start(first, last, queries, base, seed, rows, distances):  # type
         second = np.int64(_hash(state)) % count
         if second == best:
             second = (best + 1) % count
-        nearer, farther = (
-            _distance(queries, query, base, best),
-            _distance(queries, query, base, second),
-        )
+        nearer = _distance(queries, query, base, best)
+        farther = _distance(queries, query, base, second)
         if farther < nearer:
             best, second, nearer, farther = second, best, farther, nearer
         rows[query, 0], rows[query, 1] = best, second

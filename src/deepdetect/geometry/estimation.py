@@ -82,7 +82,7 @@ class GeometryOptions:
         check_name("estimator", self.estimator, ESTIMATORS)
         if not 0 < self.confidence < 1:
             raise OptionError(f"the confidence must lie between 0 and 1, not {self.confidence}")
-        check_ranges(self, positive=("inlier_threshold", "iterations"))
+        check_ranges(self, positive=("inlier_threshold",), counts=("iterations",))
         for name in ("homography", "camera0", "camera1"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, _matrix(name, getattr(self, name)))
@@ -148,7 +148,8 @@ def estimate_geometry(
         matches, or when estimation fails, the matrix is None and no match is an inlier.
 
     Raises:
-        OptionError: the model is unknown, or needs cameras that are not in the options.
+        OptionError: the model is unknown, or needs cameras that are not in the options, or the
+            positions are not as many.
 
     Example:
         >>> a = np.array([[0, 0], [9, 0], [9, 9], [0, 9], [4, 5]], float)
@@ -161,6 +162,9 @@ def estimate_geometry(
     check_model(model, seed, options)
     points0 = np.asarray(points0, np.float64).reshape(-1, 2)
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
+    if len(points0) != len(points1):
+        counts = f"{len(points0)} and {len(points1)}"
+        raise OptionError(f"matches need as many positions in both images, not {counts}")
     if options.homography is not None:
         errors = transfer_errors(points0, points1, options.homography)
         return Geometry("homography", options.homography, errors < options.inlier_threshold)
@@ -211,15 +215,14 @@ def _fit(
     """Fit a model by OpenCV's estimator; None, or an odd matrix, where that fails."""
     method = cv2.USAC_MAGSAC if options.estimator == "magsac" else cv2.RANSAC
     threshold, confidence = options.inlier_threshold, options.confidence
-    iterations = options.iterations
+    iterations = int(options.iterations)
     if model == "homography":
         return cv2.findHomography(
             points0, points1, method, threshold, maxIters=iterations, confidence=confidence
         )[0]
     if model == "fundamental":
-        return cv2.findFundamentalMat(points0, points1, method, threshold, confidence, iterations)[
-            0
-        ]
+        limits = threshold, confidence, iterations
+        return cv2.findFundamentalMat(points0, points1, method, *limits)[0]
     # Both images in normalised coordinates; the threshold shrinks with the focal length.
     cameras = _cameras(options)
     first, second = (

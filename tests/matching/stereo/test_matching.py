@@ -242,9 +242,9 @@ def test_what_is_wrong_is_said(photo: np.ndarray) -> None:
             found.at(np.array(keypoints))
     with pytest.raises(ImageError):
         disparity_map(photo, photo[:, 1:])
-    for options in ({"disparity_range": (4, 3)}, {"disparity_range": (0.5, 3)}):
+    for disparities in ((4, 3), (0.5, 3), (np.nan, 3), (3,), 5):
         with pytest.raises(OptionError):
-            DisparityOptions(**options)
+            DisparityOptions(disparity_range=disparities)
     with pytest.raises(OptionError, match="narrow disparity_range"):
         disparity_map(photo, photo, DisparityOptions(disparity_range=(0, 256)))
 

@@ -48,10 +48,8 @@ def epipolar_search(
     described0 = first.descriptors.astype(np.float32)
     described1 = second.descriptors.astype(np.float32)
     squares1 = (described1**2).sum(axis=1)
-    (ones0, lines1), (ones1, lines0) = (
-        _points_and_lines(points0, fundamental),
-        _points_and_lines(points1, fundamental.T),
-    )
+    ones0, lines1 = _points_and_lines(points0, fundamental)
+    ones1, lines0 = _points_and_lines(points1, fundamental.T)
     count = len(points0)
     best = np.full(count, np.inf, np.float32)
     partner = np.zeros(count, np.int64)

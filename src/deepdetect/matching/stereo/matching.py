@@ -86,7 +86,7 @@ class DisparityOptions:
 
     def __post_init__(self) -> None:
         whole = self.disparity_range
-        if whole and (len(whole) != 2 or any(int(d) != d for d in whole) or whole[0] > whole[1]):
+        if whole and (np.shape(whole) != (2,) or any(d % 1 for d in whole) or whole[0] > whole[1]):
             raise OptionError(
                 "disparity_range takes the smallest and the largest disparity, as (0, 63), not "
                 f"{whole}"

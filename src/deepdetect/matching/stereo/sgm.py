@@ -189,11 +189,11 @@ def match_distance(censuses: Pair, disparities: DisparityRange) -> float:
     tried = disparities[0], disparities[1] - disparities[0] + 1
     sampled = censuses[0][rows], censuses[1][rows]
     cost = matching_cost(sampled, *tried, CENSUS_BITS)[1::3]
-    found = _least_costs(cost.astype(np.uint16), disparities)
-    distances = cost.min(axis=2)[found.consistent & (found.uniqueness_ratio > 1)] / COST_PER_BIT
-    return (
-        min(float(np.median(distances)), WRONG_PLACE_BITS) if len(distances) else WRONG_PLACE_BITS
-    )
+    nearest = _least_costs(cost.astype(np.uint16), disparities)
+    matched = nearest.consistent & (nearest.uniqueness_ratio > 1)
+    distances = cost.min(axis=2)[matched] / COST_PER_BIT
+    typical = float(np.median(distances)) if len(distances) else np.inf
+    return min(typical, WRONG_PLACE_BITS)
 
 
 def aggregate(
