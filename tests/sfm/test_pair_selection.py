@@ -16,7 +16,7 @@ def test_small_sets_are_matched_exhaustively_and_large_ones_by_likeness() -> Non
     assert MultiViewOptions(pairs="sequential").pair_choice(3) == "sequential"
 
 
-@pytest.mark.parametrize("wrong", [{"pairs": "sequental"}, {"sequential": 0}, {"stride_px": 0}])
+@pytest.mark.parametrize("wrong", [{"pairs": "sequental"}, {"sequential": 0}, {"stride_px": 1.5}])
 def test_wrong_options_are_refused(wrong: dict) -> None:
     with pytest.raises(OptionError, match=r"sequential|must be"):
         MultiViewOptions(**wrong)

@@ -80,12 +80,7 @@ class MultiViewOptions:
 
     def __post_init__(self) -> None:
         check_name("way to choose pairs", self.pairs, get_args(PairChoice))
-        check_ranges(
-            self,
-            positive=("sequential",),
-            fractions=("ratio",),
-            between={"stride_px": (1, np.inf)},
-        )
+        check_ranges(self, counts=("sequential", "stride_px"), fractions=("ratio",))
 
     def pair_choice(self, count: int) -> str:
         """Return how the pairs of so many images are chosen."""
