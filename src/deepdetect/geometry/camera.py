@@ -168,10 +168,10 @@ class Calibration:
         """Raise `ReconstructionError` unless it is for images of these (width, height)."""
         for name, camera, size in (("left", self.camera0, size0), ("right", self.camera1, size1)):
             if camera.size != tuple(size):
-                known, own = (f"{width}x{height}" for width, height in (camera.size, size))
+                wanted, actual = (f"{width}x{height}" for width, height in (camera.size, size))
                 raise ReconstructionError(
-                    f"the calibration is for images of {known} pixels, the {name} image has {own}: "
-                    "give the calibration of this size"
+                    f"the calibration is for images of {wanted} pixels, the {name} image has "
+                    f"{actual}: give the calibration of this size"
                 )
 
 
@@ -226,8 +226,8 @@ def _camera(view: dict[str, Any], size: Size) -> Camera:
     """Return one view's camera; defaults come from the image."""
     if "focal_px" not in view:
         raise ReconstructionError('it has no "focal_px": add the focal length in pixels')
-    own = view.get("width", size[0]), view.get("height", size[1])
-    camera = Camera(own, view["focal_px"])
+    size = view.get("width", size[0]), view.get("height", size[1])
+    camera = Camera(size, view["focal_px"])
     centre = view.get("cx", camera.centre[0]), view.get("cy", camera.centre[1])
     return replace(camera, centre=centre)
 

@@ -82,9 +82,8 @@ def choose_model(
 ) -> TwoViewModel:
     """Return the model that may guide matching, trusted or not; many matches may be wrong.
 
-    "auto" is the homography, but the fundamental matrix where the matches alone show depth. This
-    may be one of cameras as most are (`semi_calibrated`), which few matches show but which takes
-    longer.
+    "auto" is the homography, but the fundamental matrix where the matches alone show depth. With
+    `semi_calibrated` it may be that of cameras as most are: fewer matches show it, in more time.
     """
     plane = TwoViewModel("none", None, np.zeros(len(points0), bool), float("inf"))
     if model != "fundamental":

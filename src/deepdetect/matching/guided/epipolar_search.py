@@ -92,11 +92,11 @@ def _points_and_lines(points: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarra
 def log10_p_value(
     first: Keypoints, second: Keypoints, fundamental: np.ndarray, used: np.ndarray
 ) -> float:
-    """Return how likely chance explains the matches along lines that a geometry did not come from.
+    """Return the log10 probability that chance explains further matches along epipolar lines.
 
-    `used` are the positions in the first image of those that it was estimated from, right or wrong:
-    they are no evidence. Lines at wrong places, the same but moved, find matches by chance alone;
-    as many as the right lines find are unlikely among them (a Poisson distribution).
+    `used` are the positions in the first image of those that the matrix was estimated from, right
+    or wrong: they are no evidence. Lines at wrong places, the same but moved, find matches by
+    chance alone; as many as the right lines find are unlikely among them (a Poisson distribution).
     """
     known = {(float(x), float(y)) for x, y in np.asarray(used, np.float32)}
 

@@ -73,7 +73,7 @@ SIMULATED_SIDE_PX, SIMULATED_KEYPOINTS = 320, 1000
 """Longer side and keypoints of images of which views are simulated; each view gets half as many."""
 
 MAX_MATCHES_TO_SEARCH = 200
-"""With fewer that agree with a fundamental matrix, it looks for more along its lines."""
+"""With fewer that agree with a fundamental matrix, more are searched for along its lines."""
 
 MAX_HINT_LOG10_NFA = 0.0
 """Where the logarithm of the number of false alarms of the best geometry so far is below this, it
@@ -331,8 +331,8 @@ def estimate_initial_geometry(
 ) -> InitialGeometry:
     """Estimate the geometry of a pair from its tentative matches, and those of simulated views.
 
-    Of each view that is simulated, where the matches alone give nothing, there are so many
-    keypoints; with 0 none is simulated. The other arguments are those of `choose_model`.
+    Views are simulated where the matches alone give nothing, each with `view_keypoints`; with 0
+    none is. The other arguments are those of `choose_model`.
     """
     sizes = tentative.views[0].shape[::-1], tentative.views[1].shape[::-1]
     nowhere = np.empty((0, 2))

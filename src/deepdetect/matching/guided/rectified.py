@@ -57,7 +57,7 @@ FALSE_DISCOVERY_RATE = 0.01
 only for the matches that geometry relies on."""
 
 NULL_FRACTION = 0.25
-"""Of the rows, which are matched with others for that."""
+"""Of the rows, which are matched with unrelated rows to measure it."""
 
 MAX_ROW_ERROR_PX, ROW_QUANTILE = 0.5, 0.9
 """Where this fraction of the tracked corners has its rows nearer than this to the lines of the new
@@ -164,7 +164,7 @@ def rectified_view(
 ) -> RectifiedView | None:
     """Rectify both images, smaller where there would be too much to search, and match rows.
 
-    Those that have been made smaller for that already are given with their `scale`.
+    Images that have been made smaller for that already come with their `scale`.
     """
     frame = rectified_frame(*sparse, fundamental, grays[0].shape[::-1], grays[1].shape[::-1])
     if frame is None:

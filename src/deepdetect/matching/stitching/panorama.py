@@ -19,7 +19,7 @@ from ...io.image import load_image
 from ..guided.initial_geometry import MAX_SIDE_PX
 from .bundle_adjustment import RotatingCamera, level_cameras
 from .compositing import Canvas, composite, crop_box, least_distorted, plan_curved, plan_plane
-from .registration import Registration, register_images
+from .registration import JointRegistration, register_images
 
 STAGES = ("reading", "registration", "compositing")
 """Of a panorama."""
@@ -205,7 +205,7 @@ def stitch(
 
 
 def _plan(
-    registration: Registration,
+    registration: JointRegistration,
     scales: dict[int, float],
     sizes: dict[int, tuple[int, int]],
     projection: Projection,

@@ -41,7 +41,7 @@ MAX_CAMERA_RESIDUAL_PX = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Registration:
+class JointRegistration:
     """Images in a common frame, by number; fields as of `Panorama`.
 
     The homographies, in the order in which images were connected, go to the frame of the first one;
@@ -70,7 +70,7 @@ def register_images(
     reference: int | None = None,
     turning: bool = False,
     seed: int = 0,
-) -> Registration:
+) -> JointRegistration:
     """Find the homographies of overlapping images, (H, W, 3) uint8 RGB, to a common frame.
 
     Points of a detector without heat map find the overlaps and confirm the homographies; else
@@ -113,7 +113,7 @@ def register_images(
                 "take all from one place, or choose the projection 'plane'"
             )
     counts = {(pair.first, pair.second): pair.matches for pair in pairs}
-    return Registration(homographies, cameras, counts, residual_px, unregistered)
+    return JointRegistration(homographies, cameras, counts, residual_px, unregistered)
 
 
 def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
