@@ -101,7 +101,6 @@ def register(
     Raises:
         ImageError: an image cannot be read or is not fit.
         OptionError: an option is unknown or out of its range.
-        MissingExtraError: numba is not installed.
         RegistrationError: no homography between the images can be trusted, or the images contradict
             it.
 

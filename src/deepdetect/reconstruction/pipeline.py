@@ -95,7 +95,6 @@ def reconstruct(
     Raises:
         ImageError: an image cannot be read or is not fit.
         OptionError: an option is unknown or out of its range.
-        MissingExtraError: numba is not installed.
         ReconstructionError: there is no calibration, it is wrong, or the pair gives no depth.
 
     Example:

@@ -194,7 +194,6 @@ def disparity_map(
     Raises:
         ImageError: the images cannot be read, or differ in size.
         OptionError: the disparity range is wider than the image.
-        MissingExtraError: numba is not installed.
 
     Example:
         >>> scene = np.random.default_rng(0).integers(0, 256, (64, 120), np.uint8)

@@ -136,7 +136,6 @@ def stitch(
         ImageError: an image cannot be read or is not fit.
         OptionError: an option is out of its range, there are fewer than two images, or the
             panorama would be too large.
-        MissingExtraError: numba is not installed.
         RegistrationError: no two images overlap, or one reaches the horizon of the reference, or
             the cameras of a curved panorama did more than turn.
 
