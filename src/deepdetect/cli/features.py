@@ -88,10 +88,9 @@ def match_many(
 
 
 def _result(report: BatchReport, unit: str, **listed: Any) -> cli.Result:
-    count, skipped, failures = len(report.counts), report.skipped, report.failures
-    text = (
-        f"{count} {report.of} with {sum(report.counts.values()):,} {unit}, {skipped} already done"
-    )
+    count, total = len(report.counts), sum(report.counts.values())
+    skipped, failures = report.skipped, report.failures
+    text = f"{count} {report.of} with {total:,} {unit}, {skipped} already done"
     text += f" -> {report.path}" if report.path.exists() else ""
     values = {"path": report.path, **listed, "skipped": skipped, "failures": failures}
     return cli.Result(values, text, failures, count + skipped + len(failures), report.of)

@@ -15,7 +15,7 @@ FRAME_DISTANCES = (1, 3, 5, 10, 15, 20)
 
 
 def unordered_pairs(count: int, max_pairs: int) -> list[tuple[int, int]]:
-    """Choose pairs of images in no order: all, or where there are more evenly spaced ones.
+    """Choose pairs of images in no order: all, or `max_pairs` evenly spaced ones of more.
 
     Example:
         >>> unordered_pairs(3, 60)

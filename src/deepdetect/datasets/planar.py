@@ -87,10 +87,9 @@ def load_oxford(
         if not scene.is_dir():
             continue
         homographies = [f"H1to{number}p" for number in range(2, 7)]
-        if truth == "refined":
-            refined = [f"{published}.refined" for published in homographies]
-            choices = zip(homographies, refined, strict=True)
-            homographies = [new if (scene / new).exists() else old for old, new in choices]
+        for k, published in enumerate(homographies if truth == "refined" else ()):
+            if (scene / f"{published}.refined").exists():
+                homographies[k] += ".refined"
         suffixes = (".png", ".ppm", ".pgm")
         scenes.append(_load_scene(scene, "img", homographies, suffixes, OXFORD_LAYOUT, kind))
     if not scenes:

@@ -202,9 +202,8 @@ class Report:
 
     def save(self, folder: Path) -> list[Path]:
         """Write report.md, figures/KEY.png, tables/KEY.csv and report.json; return the files."""
-        figures = [figure for section in self.sections for figure in section.figures]
         files = {"report.md": self._markdown().encode()}
-        files |= {f"figures/{figure.key}.png": figure.png for figure in figures}
+        files |= {f"figures/{f.key}.png": f.png for s in self.sections for f in s.figures}
         files |= {f"tables/{table.key}.csv": table.to_csv().encode() for table in self.tables()}
         files["report.json"] = (json.dumps(self.values(), indent=1) + "\n").encode()
         for name, content in files.items():

@@ -142,7 +142,7 @@ def _guided_cells(
 
 
 def guided_by(models: Sequence[str]) -> str:
-    """Say what guided, and how many of the seeds where not all."""
+    """Name the models that guided, and how many seeds they guided if not all."""
     trusted = [model for model in models if model != "none"]
     names = " or ".join(dict.fromkeys(trusted)) or "none"
     if len(trusted) in (0, len(models)):
@@ -167,10 +167,10 @@ def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -
         grays = luma(load_image(pair.first)), luma(load_image(pair.second))
         with profiled() as profiler:
             geometry = guiding_geometry(grays, seed=seed)
-            guide, found = guided_matches(grays, (first, second), geometry, seed)
+            trusted, found = guided_matches(grays, (first, second), geometry, seed)
         return {
-            "model": guide.model,
-            "matrix": np.empty((0, 3)) if guide.matrix is None else guide.matrix,
+            "model": trusted.model,
+            "matrix": np.empty((0, 3)) if trusted.matrix is None else trusted.matrix,
             "points0": np.empty((0, 2)) if found is None else first[found.indices0],
             "points1": np.empty((0, 2)) if found is None else found.points1,
             "seconds": profiler.total.seconds,

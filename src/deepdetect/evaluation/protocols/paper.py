@@ -230,7 +230,7 @@ def correct_matches(
 
 
 def mean_correct_matches(run: Run, feature: LocalFeature, pair: PlanarPair) -> tuple[int, int]:
-    """Return the same as means over `SEEDS` seeds, `MANY_SEEDS` under `FEW_MATCHES`, rounded."""
+    """Return both counts as rounded means over `SEEDS`, under `FEW_MATCHES` over `MANY_SEEDS`."""
     counts: list[tuple[int, int]] = []
     for seed in range(MANY_SEEDS):
         if seed == SEEDS and np.mean(counts, axis=0)[0] >= FEW_MATCHES:

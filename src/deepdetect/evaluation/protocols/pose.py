@@ -275,15 +275,15 @@ def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], row
         right = [(row[ERROR] < GOOD_DEG, sift[row["item"]]) for row in compared]
         return right.count((not only_sift, only_sift)) if right else None
 
-    def guided(own: Rows, guide: str) -> int | None:
-        guides = [row["guided by"] for row in own]
-        return guides.count(guide) if set(guides) - {None} else None
+    def guided(own: Rows, model: str) -> int | None:
+        models = [row["guided by"] for row in own]
+        return models.count(model) if set(models) - {None} else None
 
     columns: Columns = {
         **SUMMARY,
-        "guided by homography": (",d", partial(guided, guide="homography")),
-        "guided by fundamental": (",d", partial(guided, guide="fundamental")),
-        "unguided": (",d", partial(guided, guide="none")),
+        "guided by homography": (",d", partial(guided, model="homography")),
+        "guided by fundamental": (",d", partial(guided, model="fundamental")),
+        "unguided": (",d", partial(guided, model="none")),
         "worse than SIFT": (",d", partial(against_sift, only_sift=True)),
         "better than SIFT": (",d", partial(against_sift, only_sift=False)),
         "seconds": median(".2f", "seconds"),

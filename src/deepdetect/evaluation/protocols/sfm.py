@@ -404,7 +404,7 @@ def _times() -> np.ndarray:
 
 
 def _unpacked(model: Any) -> Row:
-    """Return of a model of pycolmap or None what is kept.
+    """Return what is kept of a model of pycolmap, or of None.
 
     The "names" of the registered images, (N, 12) "poses", rotation and translation, and the
     `MODEL_COLUMNS`.
