@@ -63,6 +63,14 @@ def test_new_points_only_where_there_are_no_tracks(moving_photo) -> None:
             assert gaps.min() > 8 - 1.5  # of the nearest pixels
 
 
+def test_changes_of_a_frame_do_not_move_the_tracks(moving_photo) -> None:
+    trackers = Tracker(grid_keypoints), Tracker(grid_keypoints)
+    for tracker in trackers:
+        tracker.update(moving_photo(0)).xy[:] *= 0.5 if tracker is trackers[0] else 1
+    first, second = (tracker.update(moving_photo(1)) for tracker in trackers)
+    np.testing.assert_array_equal(first.xy, second.xy)
+
+
 def test_a_point_that_is_covered_is_lost(moving_photo) -> None:
     tracker = Tracker(grid_keypoints, TrackingOptions(detect_every=99, min_kept=0))
     tracker.update(moving_photo(0))

@@ -140,8 +140,9 @@ class Tracker:
             self._since_detection = 0
         self._since_detection += 1
         self._gray = gray
-        found = TrackedFrame(self._frames if number is None else number, **self._points)
-        self._points["ages"] = self._points["ages"] + 1  # not those of the frame
+        copies = {name: values.copy() for name, values in self._points.items()}
+        found = TrackedFrame(self._frames if number is None else number, **copies)
+        self._points["ages"] += 1
         self._frames += 1
         return found
 
