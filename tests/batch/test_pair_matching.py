@@ -10,6 +10,7 @@ import pytest
 
 from deepdetect import DeepDetectError, Keypoints, OptionError, PointDetector
 from deepdetect.batch import PairMatchingOptions, extract_features, match_pairs
+from deepdetect.batch.hdf5 import open_hdf5
 from deepdetect.batch.pair_list import pair_name, read_pairs
 from deepdetect.batch.pair_matching import _match, match_group
 
@@ -63,7 +64,7 @@ def test_the_layout_is_that_of_hloc(features: Path, tmp_path: Path) -> None:
     assert (errors < 1).mean() > 0.9
 
 
-def test_what_is_done_is_skipped(features: Path, tmp_path: Path) -> None:
+def test_what_is_done_is_skipped(features: Path, tmp_path: Path, monkeypatch) -> None:
     path = tmp_path / "m.h5"
     assert match_pairs(features, [PAIR], path, workers=1).skipped == 0
     more = [PAIR[::-1], ("b/01.png", "a/02.png")]
@@ -71,8 +72,12 @@ def test_what_is_done_is_skipped(features: Path, tmp_path: Path) -> None:
     assert (list(report.counts), report.skipped) == ([more[1]], 1)
     with pytest.raises(OptionError, match=r"other settings \(`ratio`\)"):
         match_pairs(features, more, path, options=PairMatchingOptions(ratio=0.7))
+    monkeypatch.setattr("shutil.rmtree", lambda path: None)  # the shards stay
     report = match_pairs(features, more, path, workers=1, overwrite=True)
     assert len(report.counts) == 2
+    match_pairs(features, [PAIR], path, workers=1, overwrite=True)
+    with open_hdf5(path) as file, pytest.raises(ValueError, match="could not find"):
+        find_pair(file, *more[1])
 
 
 def test_features_that_have_changed_are_matched_again(

@@ -20,9 +20,12 @@ from deepdetect import (
     OptionError,
     PointDetector,
     ReconstructionError,
+    load_image,
     reconstruct_many,
 )
+from deepdetect.datasets.posed_images import load_posed_scenes
 from deepdetect.sfm import MultiViewOptions, MultiViewReconstruction, stages
+from deepdetect.sfm.mapping import read_sparse_model
 from deepdetect.sfm.stages import Stages
 
 QUICK = {
@@ -35,8 +38,6 @@ SPARSE = {**QUICK, "options": MultiViewOptions(dense=False)}
 
 def true_poses(shared: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return rotations and centres in metres, by name."""
-    from deepdetect.datasets.posed_images import load_posed_scenes
-
     (scene,) = load_posed_scenes(shared / "data" / "fountain")
     return {
         image.path.name: (image.rotation, -image.rotation.T @ image.translation)
@@ -134,8 +135,6 @@ def test_points_agree_with_the_photographs(small) -> None:
     depths = [np.median(cloud.points[:, 2]) for cloud in (found.dense, found.sparse)]
     assert depths[0] == pytest.approx(depths[1], rel=0.2)
     # A point has the colour of the photograph at its place.
-    from deepdetect import load_image
-
     xy, depth = reference.project(found.dense.points)
     rgb = load_image(folder / found.reference)
     inside = ((xy > 1) & (xy < np.array(reference.camera.size) - 2)).all(axis=1) & (depth > 0)
@@ -300,8 +299,6 @@ def test_the_order_of_imports_does_not_matter(pycolmap) -> None:
 @pytest.mark.slow
 def test_the_fountain_is_as_good_as_with_sift(shared: Path, tmp_path: Path, pycolmap) -> None:
     """All of the bars but time, beside pycolmap's own SIFT on the same photographs."""
-    from deepdetect.sfm.mapping import read_sparse_model
-
     folder, truth = shared / "data" / "fountain", true_poses(shared)
     camera = Camera((1536, 1024), (1379.74, 1382.08), (760.095, 503.155))
     parameters = ",".join(map(str, (*camera.focal_px, 760.595, 503.655)))

@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 from deepdetect import Keypoints, OptionError
+from deepdetect.io.image import luma
 from deepdetect.tracking import Tracker, TrackingOptions, point_candidates
 from deepdetect.tracking.tracker import free_keypoints
 
@@ -32,10 +34,6 @@ def test_tracks_move_as_the_photograph_does(moving_photo) -> None:
 
 def test_positions_agree_with_another_implementation(moving_photo) -> None:
     """Template matching of whole patches finds the same places."""
-    import cv2
-
-    from deepdetect.io.image import luma
-
     tracker = Tracker(grid_keypoints, TrackingOptions(detect_every=99, min_kept=0))
     first, second = tracker.update(moving_photo(0)), tracker.update(moving_photo(1))
     images = luma(moving_photo(0)), luma(moving_photo(1))

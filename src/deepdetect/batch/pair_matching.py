@@ -141,7 +141,7 @@ def match_pairs(
         wanted,
         partial(_match_pairs, features=source, options=options),
         of="pairs",
-        others_stay=lambda name: name not in gone,
+        others_stay=lambda name: not overwrite and name not in gone,
         engine=engine,
         workers=workers,
         overwrite=overwrite,
