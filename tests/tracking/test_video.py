@@ -3,6 +3,7 @@ from __future__ import annotations
 import signal
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -83,8 +84,6 @@ class Camera:
 
 
 def test_a_camera_by_its_number(monkeypatch) -> None:
-    import cv2
-
     monkeypatch.setattr(cv2, "VideoCapture", Camera)
     for given in (1, "1"):
         Camera.released = 0
@@ -150,8 +149,6 @@ def test_there_is_no_file_unless_it_is_whole(moving_photo, tmp_path: Path) -> No
 
 
 def test_no_encoder_is_one_sentence(moving_photo, tmp_path: Path, monkeypatch, one_line) -> None:
-    import cv2
-
     class Closed:
         def open(self, *arguments: object) -> None:
             pass

@@ -218,7 +218,7 @@ def run_reconstruct_many(
     for name in names:
         (work / name).rename(folder / name)
     numbers = {
-        "Images": f"{len(images) - len(found.unregistered)} of {len(images)}",
+        "Images": f"{len(found.views)} of {len(images)}",
         "Unregistered": f"{len(found.unregistered)}",
     }
     return TaskResult(numbers, "model.html", names)
