@@ -35,7 +35,6 @@ class Detector(Protocol):
         self, image: Any, *, ignore: np.ndarray | None = None, channels: Channels = "rgb"
     ) -> Keypoints:
         """Detect the keypoints of one image."""
-        ...
 
 
 class HeatmapDetector(Protocol):
@@ -43,7 +42,6 @@ class HeatmapDetector(Protocol):
 
     def heatmap(self, image: Any) -> np.ndarray:
         """Map an image to a (H, W) float32 probability of a keypoint."""
-        ...
 
 
 AnyDetector = Detector | HeatmapDetector

@@ -22,13 +22,13 @@ from .pretrained import STRIDE
 from .tiling import fill_planes, open_tiled
 
 MAX_AUTO_PIXELS = 2_000_000
-"""Of an image that the resolution "auto" takes as it is."""
+"""Size of the largest image that the resolution "auto" takes as it is."""
 
 RELEASE_PIXELS = 20_000_000
-"""Of an image whose maps need the memory that the network keeps: less would not be worth it."""
+"""Above this size the maps need the memory that the network keeps; below it is not worth it."""
 
 MIN_TILE_MEGAPIXELS = 1.5
-"""Of smaller tiles most would be overlap."""
+"""Smaller tiles would be mostly overlap."""
 
 Run = Callable[[list[np.ndarray]], list[np.ndarray]]
 """Maps images of one size, (H, W, 3) uint8, to their (H, W) logits."""

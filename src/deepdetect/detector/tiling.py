@@ -68,7 +68,7 @@ class TiledNetwork:
     end: Part
 
     def __call__(self, rgb: np.ndarray, tile_megapixels: float | None = None) -> np.ndarray:
-        """Compute the (H, W) float32 logits of (H, W, 3) uint8, so much of it at a time."""
+        """Compute the (H, W) float32 logits of (H, W, 3) uint8, in tiles of so many megapixels."""
         side = int((1e6 * (tile_megapixels or DEFAULT_TILE_MEGAPIXELS)) ** 0.5)
         height, width = rgb.shape[:2]
         size = (-(-height // STRIDE), -(-width // STRIDE))
@@ -191,7 +191,7 @@ def _in_bands(part: Part, *given: np.ndarray, into: np.ndarray | None = None) ->
 
 
 def _spans(length: int, side: int, margin: int) -> list[tuple[slice, slice, slice]]:
-    """Divide a length into as few equal parts as are, with their margins, at most a side long.
+    """Divide a length into as few equal parts as possible that, with margins, fit into a side.
 
     Of each: what is seen, what is written, and where that lies in what is seen.
     """

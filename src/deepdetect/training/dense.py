@@ -78,20 +78,31 @@ def initial_network(
         return dataclasses.replace(options, frozen_batch_norm=False), make()
 
 
-def launch(options: DeviceOptions) -> Any:
-    """Join the processes that `torchrun` has started, or be the only one; return the `Fabric`."""
-    if options.accelerator == "cpu":
+def launch(device: DeviceOptions, options: TrainingOptions) -> Any:
+    """Join the processes that `torchrun` has started, or be the only one; return the `Fabric`.
+
+    Raises:
+        OptionError: the processes cannot train by these options.
+    """
+    kind = device.accelerator
+    if kind == "cpu":
         disable_malloc_trim()
     alone = "TORCHELASTIC_RUN_ID" not in os.environ
     local, world = (1 if alone else int(os.environ[f"{n}WORLD_SIZE"]) for n in ("LOCAL_", ""))
-    if options.accelerator == "cuda" and local > torch.cuda.device_count():
+    if kind == "cuda" and local > torch.cuda.device_count():
         raise OptionError(
             f"there are {torch.cuda.device_count()} CUDA devices on this machine for {local} "
             "processes: use `device=cpu`, or lower torchrun's --nproc-per-node"
         )
+    if world > 1 and kind == "cpu" and not options.frozen_batch_norm:
+        raise OptionError(
+            "several processes need GPUs, or `frozen_batch_norm`: batch normalisation over "
+            "several CPUs is not there"
+        )
+    CropSampler(Schedule(options, images=1), world_size=world)  # which refuses uneven batches
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     fabric = Fabric(
-        accelerator=options.accelerator,
+        accelerator=kind,
         devices=local,
         num_nodes=world // local,
         # Buffers are the same everywhere: the batch normalisation sees to it.
@@ -100,8 +111,8 @@ def launch(options: DeviceOptions) -> Any:
         plugins=[LightningEnvironment() if alone else TorchElasticEnvironment()],
     )
     fabric.launch()
-    if options.threads is not None:
-        torch.set_num_threads(options.threads)  # launching sets its own
+    if device.threads is not None:
+        torch.set_num_threads(int(device.threads))  # launching sets its own
     return fabric
 
 
@@ -122,11 +133,6 @@ class DenseTrainer(Trainer):
         self.options, self.data, self.device_options = options, data, device
         self.fabric, self.device, self.is_main = fabric, fabric.device, fabric.is_global_zero
         kind, alone = device.accelerator, fabric.world_size == 1
-        if not (alone or kind == "cuda" or options.frozen_batch_norm):
-            raise OptionError(
-                "several processes need GPUs, or `frozen_batch_norm`: batch normalisation over "
-                "several CPUs is not there"
-            )
         initial_weights = weights_digest(network)
         if options.freeze_encoder:  # before it is compiled, which then leaves its gradients out
             network.get_submodule("encoder").requires_grad_(False)

@@ -62,7 +62,7 @@ def train(
         The weights' files and the loss curves.
 
     Raises:
-        MissingExtraError: torch, Lightning Fabric, safetensors or onnx is not installed.
+        MissingExtraError: a package of the extra `train` is not installed.
         ImageError: a folder is missing or empty.
         OptionError: the folder holds a run with other options, or the batch statistics or the
             encoder of random weights are to be frozen.
@@ -107,7 +107,7 @@ def train_points(
         The weights' file and the curves.
 
     Raises:
-        MissingExtraError: torch or safetensors is not installed.
+        MissingExtraError: a package of the extra `train` is not installed.
         ImageError: a folder is missing or empty.
         OptionError: the folder holds a run with other options or images.
     """
@@ -135,11 +135,11 @@ def _dense_trainer(
     from .dense import DenseTrainer, initial_network, launch
 
     options, network = initial_network(options, init_weights)  # before the labels, for its errors
-    fabric = launch(device)
+    fabric = launch(device, options)
     data = prepare_data(
-        Path(images),
+        images,
         options,
-        Path(output),
+        output,
         validation=validation,
         labels=labels,
         workers=workers,

@@ -57,7 +57,6 @@ class Schedule:
             progress = [(each + 0.5) / len(each) for each in within]
             order = np.argsort(np.concatenate(progress), kind="stable")
             self._stages, self._within = self._stages[order], self._within[order]
-
         batches = np.array([stage.batch for stage in options.stages])
         self._crops = np.concatenate([[0], np.cumsum(batches[self._stages])])
 

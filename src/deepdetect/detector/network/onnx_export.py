@@ -75,7 +75,7 @@ class OnnxOptions:
         if self.size is not None and len(self.size) != 2:
             raise OptionError(f"`size` must be height and width, not {self.size}")
         ranges = {"size": (8, 16384), "batch": (1, 1024), "max_keypoints": (0, 100_000)}
-        check_ranges(self, between=ranges)
+        check_ranges(self, counts=("size", "batch"), between=ranges)
         if self.max_keypoints:
             check_max_keypoints(self.max_keypoints)
         if self.batch > 1 and self.size is None:

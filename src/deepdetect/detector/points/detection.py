@@ -19,8 +19,8 @@ Spread = Literal["none", "grid", "anms"]
 SPREADS = ("none", "grid", "anms")
 
 CANDIDATES_PER_KEYPOINT, MIN_CANDIDATES = 6, 8192
-"""Of a limited number of keypoints that are not spread so many times as many candidates are ranked,
-but at least so many: those with the strongest response."""
+"""Where a limited number of keypoints is wanted, and not spread, only the strongest candidates are
+ranked: so many for each keypoint, and at least so many."""
 
 GRID_CELLS = 16
 """Of the spread "grid", along the longer side."""
@@ -69,8 +69,7 @@ def detect_points(
     strength = candidates.strength(space)
     rows = np.arange(len(candidates))
     if ignore is not None:
-        wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
-        rows = rows[wanted]
+        rows = rows[~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]]
     # The strongest alone would leave nothing to spread over dim regions.
     if max_keypoints is not None and spread == "none":
         most = max(CANDIDATES_PER_KEYPOINT * max_keypoints, MIN_CANDIDATES)

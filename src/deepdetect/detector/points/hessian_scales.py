@@ -21,7 +21,7 @@ LEAST_RESPONSE = 1e-8
 """Of a candidate, in an image with values in [0, 1]: less is rounding."""
 
 PIXELS_AT_ONCE = 1 << 14
-"""Whose derivatives are computed together, so that they stay in the processor's cache."""
+"""Derivatives of so many are computed together: they stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
