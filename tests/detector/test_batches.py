@@ -143,6 +143,12 @@ def test_a_bad_image_of_a_list_is_named(detector: DeepDetect, images: list[np.nd
         detector.detect_batch([*images[:2], "missing.png"])
 
 
+def test_lack_of_memory_for_a_map_is_one_sentence(detector, images, monkeypatch) -> None:
+    monkeypatch.setattr("deepdetect.features.selection.Maps.both", lambda maps: bytearray(2**62))
+    with pytest.raises(DeepDetectError, match="not enough memory for an image of"):
+        detector.heatmap_batch(images)
+
+
 def test_masks_of_a_list(detector: DeepDetect, images: list[np.ndarray]) -> None:
     masks = [np.zeros(image.shape[:2], bool) for image in images]
     for mask, column in zip(masks, (10, 20, 30), strict=True):

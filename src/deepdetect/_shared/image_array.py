@@ -9,13 +9,12 @@ import numpy as np
 from .errors import ImageError, check_name
 
 Channels = Literal["rgb", "bgr"]
-CHANNEL_ORDERS = ("rgb", "bgr")
 CHANNEL_COUNTS = (1, 3, 4)
 
 
 def check_channels(channels: str) -> None:
     """Refuse an unknown order of the colours of an image in an array."""
-    check_name("channel order", channels, CHANNEL_ORDERS)
+    check_name("channel order", channels, ("rgb", "bgr"))
 
 
 def as_array(image: Any) -> np.ndarray:

@@ -13,7 +13,8 @@ from pathlib import Path
 from .machine import processor_count
 from .opencv import DISTRIBUTIONS
 
-PACKAGES = ("numpy", *DISTRIBUTIONS, "pillow", "torch", "lightning-fabric")
+RUNTIMES = ("onnxruntime", "openvino", "torch")
+PACKAGES = ("numpy", *DISTRIBUTIONS, "pillow", *RUNTIMES, "lightning-fabric")
 """The packages that results depend on."""
 
 

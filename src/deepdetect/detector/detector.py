@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -211,7 +211,7 @@ class DeepDetect:
             ImageError: an image cannot be read or is not fit.
             OptionError: the batch size is out of its range.
         """
-        return [maps.both()[0] for _, _, maps in self._run_each(images, channels, batch_size)]
+        return self._map_batches(images, channels, batch_size, lambda _, maps: maps.both()[0])
 
     @suggest_keywords
     def detect(
@@ -281,11 +281,11 @@ class DeepDetect:
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
         masks = ignore_masks(ignore, len(images))
-        found = []
-        for number, shape, maps in self._run_each(images, channels, batch_size):
-            with image_named(number), memory_named(shape):
-                found.append(select_from_maps(maps, options, masks[number]))
-        return found
+
+        def select(number: int, maps: Maps) -> Keypoints:
+            return select_from_maps(maps, options, masks[number])
+
+        return self._map_batches(images, channels, batch_size, select)
 
     @suggest_keywords
     def extract(
@@ -333,16 +333,17 @@ class DeepDetect:
             f"network_channels={shown.network_channels!r}, backend={self.runtime!r})"
         )
 
-    def _run_each(
-        self, images: Images, channels: Channels, batch_size: int
-    ) -> Iterator[tuple[int, tuple[int, ...], Maps]]:
-        """Load images and run the network; yield the place of each, its shape and its maps."""
+    def _map_batches(
+        self, images: Images, channels: Channels, batch_size: int, make: Callable[[int, Maps], Any]
+    ) -> list[Any]:
+        """Load images and run the network; call a function with the place and maps of each."""
         if not isinstance(batch_size, (int, np.integer)) or batch_size < 1:
             raise OptionError(f"`batch_size` must be a whole number from 1 on, not {batch_size!r}")
 
         def size(loaded: tuple[int, np.ndarray]) -> tuple[int, int]:
             return seen_size(loaded[1].shape, self.heatmap_options)
 
+        made = []
         for _, group in itertools.groupby(load_each(images, channels), size):
             while batch := list(itertools.islice(group, batch_size)):
                 places = [(number, rgb.shape) for number, rgb in batch]
@@ -350,8 +351,10 @@ class DeepDetect:
                 with image_named(places[0][0]), memory_named(places[0][1], len(batch)):
                     maps = compute_maps(loaded, self._network, self.heatmap_options)
                 del batch, loaded  # the keypoints need the room
-                for place in places:
-                    yield (*place, maps.pop(0))
+                for number, shape in places:
+                    with image_named(number), memory_named(shape):
+                        made.append(make(number, maps.pop(0)))
+        return made
 
 
 def check_selection(detector: AnyDetector, selection: SelectionOptions | None) -> None:

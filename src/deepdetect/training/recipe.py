@@ -13,9 +13,6 @@ from .._shared.machine import processor_count
 from .._shared.options import check_ranges, look_up, suggest_keywords
 from ..labels import LABEL_SETTINGS, LabelOptions
 
-OPTIMIZERS = ("adam", "soap")
-DEVICES = ("auto", "cpu", "cuda")
-PRECISIONS = ("auto", "float32", "bfloat16")
 InitWeights = str | Path | Sequence[str | Path]
 
 
@@ -144,7 +141,7 @@ class TrainingOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        check_name("optimizer", self.optimizer, OPTIMIZERS)
+        check_name("optimizer", self.optimizer, ("adam", "soap"))
         self._check_sizes()
         check_ranges(
             self,
@@ -204,8 +201,8 @@ class DeviceOptions:
     num_workers: int | None = None
 
     def __post_init__(self) -> None:
-        for name, known in (("device", DEVICES), ("precision", PRECISIONS)):
-            check_name(name, getattr(self, name), known)
+        check_name("device", self.device, ("auto", "cpu", "cuda"))
+        check_name("precision", self.precision, ("auto", "float32", "bfloat16"))
         check_ranges(self, counts=("threads",), not_negative=("num_workers",))
 
     @property

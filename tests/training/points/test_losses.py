@@ -9,7 +9,7 @@ import torch
 from deepdetect.detector.points.candidate_features import FEATURES
 from deepdetect.training.points import losses, pairs
 from deepdetect.training.points.losses import mutual_pairs, pair_loss, soft_top_k
-from deepdetect.training.points.pairs import CandidatePair, Candidates, candidate_pair
+from deepdetect.training.points.pairs import CandidatePair, ViewCandidates, candidate_pair
 from deepdetect.training.points.views import ViewPair
 
 
@@ -39,7 +39,7 @@ def known_pair(distance_px: float = 0.3) -> CandidatePair:
     features = np.zeros((COUNT, FEATURES), np.float32)
     features[:, 0] = np.arange(COUNT)
     rows = np.arange(REPEATED)
-    view = Candidates(
+    view = ViewCandidates(
         xy=grid,
         sigma_px=np.ones(COUNT),
         features=features,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ...detector.points.detection import least_distances
 from ...features.spacing import suppress_neighbors
-from .pairs import CandidatePair, Candidates
+from .pairs import CandidatePair, ViewCandidates
 
 CLOSE_PX, NEAR_PX = 1.0, 3.0
 
@@ -55,7 +55,7 @@ def pair_loss(ranker: torch.nn.Module, pair: CandidatePair, match_weight: float)
     return total / 2
 
 
-def _choose(ranker: torch.nn.Module, view: Candidates, budget: float) -> Tensor:
+def _choose(ranker: torch.nn.Module, view: ViewCandidates, budget: float) -> Tensor:
     """Return (N,) how surely each candidate is among the best; 0 where a better one is near."""
     logits = ranker(torch.from_numpy(view.features))
     radii = least_distances(view.sigma_px)  # as at run time
@@ -81,7 +81,7 @@ def soft_top_k(logits: Tensor, budget: float, temperature: float) -> Tensor:
     return torch.sigmoid((logits - low.float()) / temperature)
 
 
-def _rewards(view: Candidates, here: Tensor, there: Tensor, match_weight: float) -> Tensor:
+def _rewards(view: ViewCandidates, here: Tensor, there: Tensor, match_weight: float) -> Tensor:
     """Return what a candidate is worth: its partner's choice, by the distances of the measure.
 
     One to one, as it is measured, and among those that may be chosen: with a sum over all near
@@ -98,7 +98,7 @@ def _rewards(view: Candidates, here: Tensor, there: Tensor, match_weight: float)
 
 
 def mutual_pairs(
-    view: Candidates, radius_px: float, possible_here: np.ndarray, possible_there: np.ndarray
+    view: ViewCandidates, radius_px: float, possible_here: np.ndarray, possible_there: np.ndarray
 ) -> np.ndarray:
     """Return which (P,) join mutual nearest neighbours among the possible candidates (N,), (M,)."""
     close = view.distance_px <= radius_px

@@ -31,7 +31,7 @@ ATTEMPTS = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class ViewCandidates:
     """The candidates of one view, and those of the other view that lie close to them there.
 
     Attributes:
@@ -59,7 +59,7 @@ class Candidates:
 class CandidatePair:
     """Two views of one image, and the number of keypoints that each is trained to keep."""
 
-    views: tuple[Candidates, Candidates]
+    views: tuple[ViewCandidates, ViewCandidates]
     budget: float
 
 
@@ -87,7 +87,7 @@ def candidate_pair(pair: ViewPair, density: float, with_descriptors: bool) -> Ca
         here, there = sides[k][0], sides[1 - k][0]
         similarity = described[k] @ described[1 - k].T if with_descriptors else None
         close = _correspondences(here, there, homography, pair.valid[1 - k], similarity)
-        views.append(Candidates(*sides[k], *close))
+        views.append(ViewCandidates(*sides[k], *close))
     return CandidatePair((views[0], views[1]), density * pair.images[0].size)
 
 
@@ -98,7 +98,7 @@ def _correspondences(
     valid: np.ndarray,
     similarity: np.ndarray | None,
 ) -> tuple[np.ndarray, ...]:
-    """Return the last five fields of `Candidates`."""
+    """Return the last five fields of `ViewCandidates`."""
     mapped = np.column_stack([here, np.ones(len(here))]) @ (homography / homography[2, 2]).T
     depth = mapped[:, 2:]
     before = depth[:, 0] > 0  # others lie behind the camera of the tilted view
