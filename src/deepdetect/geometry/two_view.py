@@ -76,8 +76,8 @@ def choose_model(
     points0: np.ndarray,
     points1: np.ndarray,
     sizes: tuple[Size, Size],
-    model: str = "auto",
-    seed: int = 0,
+    model: str,
+    seed: int,
     semi_calibrated: bool = True,
 ) -> TwoViewModel:
     """Return the model that may guide matching, trusted or not; many matches may be wrong.
@@ -109,8 +109,8 @@ def classify_scene(
     points0: np.ndarray,
     points1: np.ndarray,
     size1: Size,
-    calibration: Calibration | None = None,
-    seed: int = 0,
+    calibration: Calibration | None,
+    seed: int,
 ) -> tuple[str, TwoViewModel]:
     """Say what a pair shows, by (M, 2) matches that are spread out, and their fundamental matrix.
 

@@ -209,7 +209,7 @@ def disparity_map(
 
 
 def compute_disparity(
-    left: np.ndarray, right: np.ndarray, options: DisparityOptions = DisparityOptions()
+    left: np.ndarray, right: np.ndarray, options: DisparityOptions
 ) -> DisparityMap:
     """Compute the `disparity_map` of (H, W) uint8 luma."""
     if left.shape != right.shape:
