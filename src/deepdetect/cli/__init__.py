@@ -1,4 +1,4 @@
-"""The command line `deepdetect`: one module a command."""
+"""The command line `deepdetect`: its commands, some of them together in a module."""
 
 from ._app import main
 

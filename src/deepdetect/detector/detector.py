@@ -69,8 +69,8 @@ class DeepDetect:
             images of OpenCV leave it, and give the methods `channels="bgr"`.
         tta: "flip": a flipped or turned image gives the same keypoints of the heat map, in eight
             times the time.
-        tile_megapixels: with `resolution="native"`, images above so many megapixels are run in
-            tiles of this size: less memory, four to six times the time. "auto": where it is needed.
+        tile_megapixels: with `resolution="native"`, larger images are run in tiles of so many
+            megapixels: less memory, four to six times the time. "auto": where it is needed.
 
     Attributes:
         backend: name of the backend that runs.
@@ -199,9 +199,9 @@ class DeepDetect:
             images: in a list, a tuple or an array of four dimensions, each as of `heatmap`; their
                 sizes may differ.
             channels: as of `heatmap`.
-            batch_size: the network is run once for up to so many images that follow each other and
-                that it sees at one size. On a processor that pays for small images only: larger
-                ones take as long, and the memory of all of them.
+            batch_size: at most this many consecutive images, which the network sees at one size,
+                are run at once. On a processor that pays for small images only: larger ones take
+                as long, and the memory of all of them.
 
         Returns:
             The map of each, in their order: the same as one by one, but for the last bits of those
@@ -371,7 +371,7 @@ def find_keypoints(
     selection: SelectionOptions | None = None,
     ignore: np.ndarray | None = None,
 ) -> Keypoints:
-    """Find the keypoints of a (H, W, 3) uint8 image, ranked by logits where there are any.
+    """Find the keypoints of a (H, W, 3) uint8 image, ranked by logits where it has any.
 
     The detector may be anything with a method `heatmap` or `detect`, as those of this package have.
     The selection is of pixels of a heat map; None takes those over 0.5.

@@ -168,7 +168,7 @@ def _in_tiles(
 def _in_bands(part: Part, *given: np.ndarray, into: np.ndarray | None = None) -> np.ndarray:
     """Run a part at an eighth of the size in bands of rows.
 
-    `into` may be what is given, which is then replaced.
+    `into` may be the input itself, which is then overwritten.
     """
     # With one input it is a pyramid; what joins two has three times as many channels.
     height, rows = given[0].shape[2], 2 * BLOCK_MARGIN if len(given) == 1 else BLOCK_MARGIN
@@ -193,7 +193,7 @@ def _in_bands(part: Part, *given: np.ndarray, into: np.ndarray | None = None) ->
 def _spans(length: int, side: int, margin: int) -> list[tuple[slice, slice, slice]]:
     """Divide a length into as few equal parts as possible that, with margins, fit into a side.
 
-    Of each: what is seen, what is written, and where that lies in what is seen.
+    Of each: the slice that is read, the one that is written, and where that lies in the first.
     """
     count = 1
     while (core := -(-length // count)) + margin * min(count - 1, 2) > side and core > margin:

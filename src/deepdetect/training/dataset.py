@@ -134,7 +134,7 @@ class _LabelTask(NamedTuple):
 def _make_labels(
     task: _LabelTask,
 ) -> tuple[_LabelTask, dict[View, tuple[np.ndarray, np.ndarray]], str]:
-    """Write the labels of an image; return the views with their labels, and what is wrong."""
+    """Write the labels of an image; return the views with their labels, and the error, if any."""
     made = {}
     try:
         image = load_image(task.image)

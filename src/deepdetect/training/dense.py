@@ -96,8 +96,8 @@ def launch(device: DeviceOptions, options: TrainingOptions) -> Any:
         )
     if world > 1 and kind == "cpu" and not options.frozen_batch_norm:
         raise OptionError(
-            "several processes need GPUs, or `frozen_batch_norm`: batch normalisation over "
-            "several CPUs is not there"
+            "several processes need GPUs, or `frozen_batch_norm`: there is no batch normalisation "
+            "over several CPUs"
         )
     CropSampler(Schedule(options, images=1), world_size=world)  # which refuses uneven batches
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)

@@ -46,7 +46,7 @@ class OnnxRuntimeNetwork:
         return as_logits(output, self._output_name, image.shape, self.onnx_path)
 
     def release_memory(self) -> None:
-        """Give back what is kept from one run for the next: 150 bytes a pixel."""
+        """Release the memory that is kept between runs: 150 bytes a pixel."""
         settings = import_onnxruntime().RunOptions()
         settings.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
         smallest = np.zeros((1, 3, *PROBE_SHAPE), np.float32)
@@ -56,7 +56,7 @@ class OnnxRuntimeNetwork:
 
 
 def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
-    """Load an ONNX file; a device that is not there is an OptionError."""
+    """Load an ONNX file; a device that is not available is an OptionError."""
     onnxruntime = import_onnxruntime()
     device = options.device
     provider = PROVIDERS.get(device, device)

@@ -68,7 +68,7 @@ class OpenVinoNetwork:
         return logits
 
     def release_memory(self) -> None:
-        """Give back what is kept from one run for the next: 260 bytes a pixel."""
+        """Release the memory that is kept between runs: 260 bytes a pixel."""
         # It refuses while another thread runs it, and versions before 2025 do not have it.
         with contextlib.suppress(Exception):
             self._model.release_memory()
