@@ -43,9 +43,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     final = Path(path)
     temporary = final.with_name(f".{final.stem[:STEM_LENGTH]}.{_owner()}.part{final.suffix}")
     try:
-        final.parent.mkdir(parents=True, exist_ok=True)
         _clear(final.parent.absolute())
-        temporary.touch(exist_ok=False)
+        final.parent.mkdir(parents=True, exist_ok=True)
+        temporary.touch(exist_ok=False)  # at once: work that fails removes folders it has made
         yield temporary
         temporary.replace(final)
     except DeepDetectError:  # of a missing file, which is an OSError
@@ -92,7 +92,7 @@ def _clear(folder: Path) -> None:
 
 def _abandoned(folder: Path, names: re.Pattern[str]) -> list[Path]:
     """List what processes that have ended have left in a folder, by the names of it."""
-    # Of a folder that may be written to, but not listed, `glob` gives nothing.
+    # `glob` gives nothing of a folder that is missing, or may be written to but not listed.
     matches = [(path, names.fullmatch(path.name)) for path in folder.glob("*")]
     return [path for path, match in matches if match and _has_ended(path, **match.groupdict())]
 
