@@ -75,7 +75,7 @@ class Table:
         def line(cells: Iterable[str]) -> str:
             return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
-        rule = "|---|" + "---:|" * (len(self.columns) - 1)
+        rule = "|" + "".join("---:|" if style else "---|" for style in self.columns.values())
         rows = [
             [_shown(row.get(t), style) for t, style in self.columns.items()] for row in self.rows
         ]
