@@ -271,11 +271,11 @@ def test_a_missing_package_stops_only_the_benchmark_that_needs_it(
     monkeypatch.setattr(benchmarks, "BENCHMARKS", known)
     monkeypatch.setattr(speed, "lacks", lacks, raising=False)
     monkeypatch.setattr(speed, "works", lambda *_: [], raising=False)
-    options = BenchmarkOptions(edge_detector)
+    options = BenchmarkOptions(edge_detector, ("paper", "guided"))
     report = run_benchmarks(["one", "other"], tmp_path, options)
-    assert report.failures == ("the benchmark one: this needs pycolmap",)
-    with pytest.raises(MissingExtraError):
-        run_benchmarks(["one"], tmp_path, options)
+    notes = "the benchmark one: this needs pycolmap", "other: it has no protocol paper or guided"
+    assert (report.failures, report.skipped) == (notes[:1], notes)
+    pytest.raises(MissingExtraError, run_benchmarks, ["one"], tmp_path, options)
     monkeypatch.setitem(sys.modules, "scipy", None)
     with pytest.raises(MissingExtraError, match="the package scipy"):
         run_benchmarks(["other"], tmp_path, options)

@@ -55,7 +55,10 @@ def run_benchmarks(
     for name, (module, function) in zip(names, entries, strict=True):
         benchmark = getattr(import_module(f".protocols.{module}", __package__), function)
         try:
-            sections += benchmark(run, options)
+            found = benchmark(run, options)
+            if not found:
+                run.skipped.append(f"{name}: it has no protocol {' or '.join(options.protocols)}")
+            sections += found
         except (ImageError, MissingExtraError) as error:
             if len(names) == 1:
                 raise
