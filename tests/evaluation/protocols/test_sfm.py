@@ -22,12 +22,8 @@ POINTS, SIFT, RANDOM = "DeepDetect, points", "SIFT, pycolmap", "baseline: as man
 
 
 def model(views: dict, points=0, track_length=float("nan"), error=float("nan")):
-    return {
-        "views": views,
-        "sparse points": points,
-        "track length": track_length,
-        "reprojection error, px": error,
-    }
+    values = views, points, track_length, error
+    return dict(zip(("views", *sfm.MODEL_COLUMNS), values, strict=True))
 
 
 NOTHING = model({})
