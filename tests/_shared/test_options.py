@@ -41,7 +41,7 @@ def test_a_decorated_function_suggests_the_right_keyword() -> None:
 
 @dataclass(frozen=True)
 class Ranges:
-    size_px: float = 1
+    size_px: float = 1.0
     offsets_px: tuple[float, ...] = (1, 2)
     count: int = 0
     shares: tuple[tuple[float, float], ...] = ((0, 0.5), (1, 0.2))
@@ -64,10 +64,12 @@ class Ranges:
     [
         ({"size_px": 0}, "`size_px` must be above 0, not 0"),
         ({"size_px": math.nan}, "`size_px` must be above 0, not nan"),
+        ({"size_px": math.inf}, "`size_px` must be above 0, not inf"),
         ({"offsets_px": (3, -1)}, "`offsets_px` must be above 0, not (3, -1)"),
         ({"offsets_px": ()}, "`offsets_px` must be above 0, not ()"),
         ({"count": -1}, "`count` must be 0 or more, not -1"),
         ({"count": "3"}, "`count` must be 0 or more, not 3"),
+        ({"count": 1.5}, "`count` must be 0 or more, not 1.5"),
         ({"count": 10}, "`count` must lie in [0, 9], not 10"),
         ({"shares": ((0, 1.1),)}, "`shares` must lie in [0, 1], not ((0, 1.1),)"),
         ({"window_px": 4}, "`window_px` must be odd and at least 1, not 4"),
