@@ -7,15 +7,17 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, PointDetector, SelectionOptions, match_images
+from deepdetect import DeepDetect, Keypoints, PointDetector, SelectionOptions, match_images
 from deepdetect._shared.errors import OptionError, WeightsError
 from deepdetect.detector import HeatmapOptions
+from deepdetect.detector.detector import find_keypoints
 from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.features import select_keypoints
 from deepdetect.features.sift import root_sift_descriptors
@@ -401,3 +403,11 @@ def test_images_are_read_once(
     opened.clear()
     match_images(*paths, PointDetector(300))
     assert opened == paths
+
+
+def test_keypoints_of_another_detector_outside_of_the_image_are_refused() -> None:
+    outside = Keypoints(np.array([[3.0, 1.0], [8.0, 1.0]]), np.ones(2, np.float32), (9, 9))
+    detector = SimpleNamespace(detect=lambda rgb, ignore: outside)
+    assert find_keypoints(detector, np.zeros((4, 9, 3), np.uint8)) is outside
+    with pytest.raises(OptionError, match="outside of the image"):
+        find_keypoints(detector, np.zeros((4, 8, 3), np.uint8))

@@ -378,7 +378,12 @@ def find_keypoints(
     """
     check_selection(detector, selection)
     if not hasattr(detector, "heatmap"):
-        return detector.detect(rgb, ignore=ignore)
+        found = detector.detect(rgb, ignore=ignore)
+        if not ((found.xy >= -0.5) & (found.xy <= np.array(rgb.shape[1::-1]) - 0.5)).all():
+            raise OptionError(
+                "the detector has found keypoints outside of the image: correct its method detect"
+            )
+        return found
     options = selection or SelectionOptions()
     if isinstance(detector, DeepDetect):
         return detector._select(rgb, options, ignore)
