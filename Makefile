@@ -156,7 +156,8 @@ figures: $(VENV)/.test
 # The tables that README.md and the pages quote, from the data sets in DATA: hours on two cores, and
 # what was interrupted goes on. ONLY="density speed" makes some; DATA= fills the pages alone.
 results: $(VENV)/.test
-	$(VENV)/bin/python benchmarks/results.py $(DATA) $(if $(ONLY),--only $(ONLY))
+	$(VENV)/bin/python benchmarks/results.py $(DATA) $(if $(PUBLISHED),--published $(PUBLISHED)) \
+		$(if $(ONLY),--only $(ONLY))
 
 dist: $(VENV)/.test
 	rm -rf dist

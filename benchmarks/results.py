@@ -1,6 +1,6 @@
 """Writes the tables that README.md and the pages quote, and puts them into these.
 
-    python benchmarks/results.py DATA [--only NAME ...] [--work build/results]
+    python benchmarks/results.py DATA [--published FOLDER] [--only NAME ...] [--work build/results]
     python benchmarks/results.py [--check]
 
 The first line (`make results DATA=... ONLY=...`) runs the benchmarks that the results are made of,
@@ -8,7 +8,7 @@ each with a cache, so that what was interrupted goes on, and writes `docs/result
 command, commit, versions and machine of each in `docs/results/index.json`. The second one fills the
 blocks of README.md and docs/*.md between `<!-- results:NAME -->` and `<!-- /results -->` from these
 files; `<!-- results:NAME first|second -->` names the columns. With --check it only says whether
-the blocks are as the files have them.
+the blocks are as the files have them. Some results need the authors' weights.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from deepdetect._shared.provenance import provenance
 
@@ -42,10 +43,15 @@ STAGES = {
             "hpatches": "hpatches --protocol paper",
             "foreground": "foreground",
             "low-visibility": "low-visibility --protocol paper",
-            "middlebury": "middlebury",
+            "oxford-published": "oxford --protocol paper --baselines none --preset published "
+            "--weights {published}/published_matching.safetensors",
+            "middlebury": "middlebury --geometry-weights dense "
+            "--geometry-weights {published}/published_reconstruction.safetensors",
             "speed": "speed",
         }.items()
     },
+    "label-prediction": "-m deepdetect evaluate {data}/label-samples/val --json "
+    "--compare {published}/published_matching.safetensors",
     "labels-stereo": "-m deepdetect evaluate-stereo {data}/middlebury/cones "
     "{data}/middlebury/teddy --label-settings paper --label-settings dense --weights default "
     "--weights dense",
@@ -54,7 +60,7 @@ STAGES = {
     "published-pipeline": "benchmarks/published_pipeline.py {data}",
     "fuzz": "-m fuzz",
 }
-"""Arguments of Python by the stage's name. What writes no report prints its tables."""
+"""Arguments of Python by the stage's name. What writes no report prints its tables, or JSON."""
 
 RANDOM = "baseline: random points, same number"
 TITLES = {
@@ -75,7 +81,7 @@ class Result:
         table: key of the report's table, or its number where it is printed. With a * in it: the
             rows of all that fit, after what the * stands for.
         columns: the table's columns by their titles in the result, each with the digits that are
-            printed, and with the key of the table, if it is another one, whose rows are the same;
+            printed, and with the key of the table, if it is another one, with rows of that name;
             those that are not named are left out. Empty: all, with four digits.
         rows: only those of which the first or the second cell begins with this.
     """
@@ -86,6 +92,7 @@ class Result:
     rows: str = ""
 
 
+LIGHTS, MASKS = ("normal", "low"), ("loss", "iou", "calibration_error", "density")
 SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
 PAIRS = ("graf 1-6", "wall 1-6", "bikes 1-6", "leuven 1-6", "trees 1-6", "ubc 1-6", "boat 1-2")
 GUIDED: dict[str, tuple[str, ...]] = {
@@ -117,6 +124,17 @@ RESULTS = {
     "correct-matches": Result(
         "oxford-paper", "oxford_matches", {pair: (pair, ".0f") for pair in PAIRS}
     ),
+    "published-weights": Result(
+        "oxford-published",
+        "oxford_density",
+        {
+            "density": ("mean", ".4f"),
+            "repeatability": ("mean", ".4f", "oxford_repeatability"),
+            **{pair: (pair, ".0f", "oxford_matches") for pair in PAIRS},
+        },
+        rows="DeepDetect, threshold 0.5",
+    ),
+    "label-prediction": Result("label-prediction", "0"),
     "repeatability-one-to-one": Result(
         "oxford-standard",
         "oxford_refined_repeatability_1px",
@@ -219,32 +237,19 @@ RESULTS = {
     ),
 }
 
-README_HEAD = (
-    *("", "paper", "published weights, here", "ours", "random pixels, same number"),
-    *("best classical detector", "command"),
-)
-README_ROWS = (
-    ("density (keypoints per pixel)", "density", "mean", "in the paper", "A"),
-    ("repeatability as in the paper", "repeatability-paper", "mean", "mean", "A"),
-    ("correct matches, leuven 1-6", "correct-matches", "leuven 1-6", "leuven 1-6", "A"),
-    ("correct matches, wall 1-6", "correct-matches", "wall 1-6", "wall 1-6", "A"),
-    ("correct matches, trees 1-6", "correct-matches", "trees 1-6", "trees 1-6", "A"),
-)
-"""Title, result, its column, that of the paper's number, and the command; the rows of
-`readme-others.csv` follow."""
-
 
 def main() -> None:
     """Run what is asked for, then fill the blocks."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("data", nargs="?", type=Path, help="folder of the data sets")
+    parser.add_argument("--published", type=Path, help="folder of the authors' weights")
     parser.add_argument("--only", nargs="+", choices=sorted(RESULTS), default=sorted(RESULTS))
     parser.add_argument("--work", type=Path, default=ROOT / "build" / "results")
     parser.add_argument("--check", action="store_true", help="fill no block, compare them")
     arguments = parser.parse_args()
     if arguments.data is not None:
         for stage in dict.fromkeys(RESULTS[name].stage for name in arguments.only):
-            run_stage(stage, arguments.data, arguments.work)
+            run_stage(stage, arguments.data, arguments.published, arguments.work)
         for name in arguments.only:
             write_result(name, arguments.work)
     stale = fill_blocks(write=not arguments.check)
@@ -252,18 +257,36 @@ def main() -> None:
         raise SystemExit(f"run python benchmarks/results.py: {', '.join(stale)} is out of date")
 
 
-def run_stage(stage: str, data: Path, work: Path) -> None:
+def run_stage(stage: str, data: Path, published: Path | None, work: Path) -> None:
     """Run what makes a report; of a benchmark what its cache holds is not made again."""
     folder = work / stage
-    words = [word.format(data=data, output=folder) for word in STAGES[stage].split()]
+    if published is None and "{published}" in STAGES[stage]:
+        raise SystemExit(f"the stage {stage} needs the authors' weights: give --published")
+    places = {"data": data, "output": folder, "published": published}
+    words = [word.format(**places) for word in STAGES[stage].split()]
     print(shlex.join(words), flush=True)
     if "benchmark" in words:
         subprocess.run([sys.executable, *words], check=True)
         return
     made = subprocess.run([sys.executable, *words], check=True, stdout=subprocess.PIPE, text=True)
-    tables = {str(k): {"rows": rows} for k, rows in enumerate(printed_tables(made.stdout))}
+    found = [evaluated(made.stdout)] if "--json" in words else printed_tables(made.stdout)
+    tables = {str(k): {"rows": rows} for k, rows in enumerate(found)}
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "report.json").write_text(json.dumps({"metadata": {}, "tables": tables}))
+
+
+def evaluated(text: str) -> list[dict[str, Any]]:
+    """Return the rows of what `deepdetect evaluate --json` prints, one for each of the weights."""
+    report = json.loads(text)
+    return [
+        {"weights": Path(weights["weights"]).stem}
+        | {
+            f"{light}, {name}": weights[light][name]
+            for light in ("normal", "low")
+            for name in MASKS
+        }
+        for weights in (report, *report["compare"])
+    ]
 
 
 def printed_tables(text: str) -> list[list[dict[str, str]]]:
@@ -294,19 +317,21 @@ def write_result(name: str, work: Path) -> None:
     columns = result.columns or {title: (title, "") for title in list(tables[keys[0]][0])[1:]}
     lines = [[*(["scene"] if several else []), first, *columns]]
     for key in keys:
-        for number, row in enumerate(tables[key]):
+        for row in tables[key]:
             if not any(str(cell).startswith(result.rows) for cell in list(row.values())[:2]):
                 continue
             lines.append([key.removeprefix(start)] if several else [])
             lines[-1].append(TITLES.get(row[first], row[first]))
             for title, style, *other in columns.values():
-                cell = (tables[other[0]][number] if other else row).get(title)
+                same = [each for key in other for each in tables[key] if each[first] == row[first]]
+                cell = (same[0] if other else row).get(title)
                 style = style or (".4f" if isinstance(cell, float) else "")
                 lines[-1].append("" if cell is None else format(cell, style))
     with (RESULTS_FOLDER / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows(lines)
     index = json.loads((RESULTS_FOLDER / "index.json").read_text())
-    command = "python " + STAGES[result.stage].format(data="DATA", output="REPORT")
+    places = {"data": "DATA", "output": "REPORT", "published": "PUBLISHED"}
+    command = "python " + STAGES[result.stage].format(**places)
     made = provenance() | {"command": command.replace("python -m deepdetect", "deepdetect")}
     weights = report["metadata"].get("weights (SHA-256)")
     index["results"][name] = made | ({"weights": weights} if weights else {})
@@ -336,7 +361,8 @@ def fill_blocks(write: bool) -> list[str]:
 
 def block(name: str, columns: str | None) -> str:
     """Return the Markdown table of a block."""
-    head, *rows = readme_table() if name == "readme" else read_result(name)
+    composed = (RESULTS_FOLDER / f"{name}.json").exists()
+    head, *rows = composed_table(name) if composed else read_result(name)
     wanted = head if columns is None else [head[0], *columns.split("|")]
     places = [head.index(title) for title in wanted]
     lines = [[shown(row[k]) for k in places] for row in rows]
@@ -347,34 +373,40 @@ def block(name: str, columns: str | None) -> str:
 
 
 def shown(cell: str) -> str:
-    """Write a cell for a page: thousands apart, a dash for nothing.
+    """Write a cell for a page: thousands apart, zeros as is usual, a dash for nothing.
 
     Example:
-        >>> shown("192540 (.971)"), shown("0.25"), shown("")
-        ('192,540 (.971)', '0.25', '–')
+        >>> shown("192540 (.971)"), shown("-0.000"), shown("")
+        ('192,540 (0.971)', '0.000', '–')
     """
     apart = re.sub(r"(?<![\d.,])\d{4,}(?![\d.])", lambda m: f"{int(m[0]):,}", cell)
+    apart = re.sub(r"(?<![\d.])(?=\.\d)", "0", re.sub(r"^-(?=0\.0+$)", "", apart))
     return apart.replace("|", "\\|") if cell else "–"
 
 
-def readme_table() -> list[list[str]]:
-    """Return the README's table of results."""
-    published = {row[0]: row[1] for row in read_result("published-weights")}
-    rows = [list(README_HEAD)]
-    for title, name, column, paper_column, command in README_ROWS:
+def composed_table(name: str) -> list[list[str]]:
+    """Return the table of docs/results/NAME.json, where {result|row|column} is a cell of a result.
+
+    The row is known by its first cell, or the first two; as "best" it is that of the classical
+    detector with the highest number.
+    """
+
+    def filled(match: re.Match[str]) -> str:
+        (name, _, row), column = match[1].rpartition("|")[0].partition("|"), match[1].split("|")[-1]
         head, *lines = read_result(name)
         k = head.index(column)
-        values = {line[0]: line[k] for line in lines}
-        ours = "DeepDetect, threshold 0.5"
-        if paper_column == column:
-            paper = values.get(f"{ours}, in the paper") or values["DeepDetect, in the paper"]
-        else:
-            paper = next(line[head.index(paper_column)] for line in lines if line[0] == ours)
-        known = {t: v for t, v in values.items() if t.startswith(CLASSICAL) and "paper" not in t}
-        best = max(known, key=lambda t: float(known[t] or 0))
-        best = f"{known[best]} ({best})"
-        rows.append([title, paper, published[title], values[ours], values[RANDOM], best, command])
-    return rows + read_result("readme-others")[1:]
+        if row == "best":
+            known = [
+                x
+                for x in lines
+                if x[0].startswith(CLASSICAL) and not re.search("paper|as it is", x[0])
+            ]
+            best = max(known, key=lambda line: float(line[k] or 0))
+            return f"{best[k]} ({best[0]})"
+        return next(x[k] for x in lines if row in (x[0], ", ".join(x[:2])))
+
+    rows: list[list[str]] = json.loads((RESULTS_FOLDER / f"{name}.json").read_text("utf-8"))
+    return [[re.sub(r"{(.*?)}", filled, text) for text in row] for row in rows]
 
 
 if __name__ == "__main__":

@@ -51,5 +51,5 @@ def test_a_report_becomes_a_result_and_a_block(
     assert script.block("foreground", "density").splitlines()[-1] == (
         "| baseline: all pixels | 1.000 |"
     )
-    assert script.shown("192540 (.971)") == "192,540 (.971)"
+    assert script.shown("192540 (.971)") == "192,540 (0.971)"
     assert (script.shown("0.12345"), script.shown("")) == ("0.12345", "–")
