@@ -62,12 +62,11 @@ STAGES = {
 }
 """Arguments of Python by the stage's name. What writes no report prints its tables, or JSON."""
 
-RANDOM = "baseline: random points, same number"
-TITLES = {
-    "baseline: as many random points as DeepDetect, threshold 0.5": RANDOM,
-    "baseline: all pixels (a grid, where there is a budget)": "baseline: all pixels",
-}
+TITLES: dict[str, str] = json.loads((RESULTS_FOLDER / "titles.json").read_text("utf-8"))
 """Shorter titles of rows."""
+
+OWN = ", own size and angle"
+"""End of the titles of rows that become a column."""
 
 CLASSICAL = ("SIFT", "ORB", "BRISK", "FAST", "AGAST", "Harris", "Shi-Tomasi")
 
@@ -81,8 +80,8 @@ class Result:
         table: key of the report's table, or its number where it is printed. With a * in it: the
             rows of all that fit, after what the * stands for.
         columns: the table's columns by their titles in the result, each with the digits that are
-            printed, and with the key of the table, if it is another one, with rows of that name;
-            those that are not named are left out. Empty: all, with four digits.
+            printed, and with the key of the table, if it is another one, with rows of that name, or
+            of that name with this behind it. Empty: all columns, with four digits.
         rows: only those of which the first or the second cell begins with this.
     """
 
@@ -183,6 +182,7 @@ RESULTS = {
             "@3 8192": ("8,192", ".3f", "oxford_refined_repeatability_3px"),
             "correct": ("correct at 1 px", ".0f", "oxford_refined_matching"),
             "within 1 px": ("accuracy at 1 px", ".3f", "oxford_refined_homography"),
+            OWN[2:]: ("accuracy at 1 px", ".3f", "oxford_refined_homography", OWN),
         },
     ),
     "points-by-change": Result("oxford-points", "oxford_refined_kinds"),
@@ -278,14 +278,10 @@ def run_stage(stage: str, data: Path, published: Path | None, work: Path) -> Non
 def evaluated(text: str) -> list[dict[str, Any]]:
     """Return the rows of what `deepdetect evaluate --json` prints, one for each of the weights."""
     report = json.loads(text)
+    names = [(light, name) for light in ("normal", "low") for name in MASKS]
     return [
-        {"weights": Path(weights["weights"]).stem}
-        | {
-            f"{light}, {name}": weights[light][name]
-            for light in ("normal", "low")
-            for name in MASKS
-        }
-        for weights in (report, *report["compare"])
+        {"weights": Path(of["weights"]).stem, **{f"{n[0]}, {n[1]}": of[n[0]][n[1]] for n in names}}
+        for of in (report, *report["compare"])
     ]
 
 
@@ -315,16 +311,18 @@ def write_result(name: str, work: Path) -> None:
     keys = [key for key in tables if key.startswith(start)] if several else [result.table]
     first = next(iter(tables[keys[0]][0]))
     columns = result.columns or {title: (title, "") for title in list(tables[keys[0]][0])[1:]}
+    by_name = {(key, row.get(first)): row for key in tables for row in tables[key]}
     lines = [[*(["scene"] if several else []), first, *columns]]
     for key in keys:
         for row in tables[key]:
-            if not any(str(cell).startswith(result.rows) for cell in list(row.values())[:2]):
+            cells = [str(cell) for cell in list(row.values())[:2]]
+            if cells[0].endswith(OWN) or not any(x.startswith(result.rows) for x in cells):
                 continue
             lines.append([key.removeprefix(start)] if several else [])
             lines[-1].append(TITLES.get(row[first], row[first]))
             for title, style, *other in columns.values():
-                same = [each for key in other for each in tables[key] if each[first] == row[first]]
-                cell = (same[0] if other else row).get(title)
+                named = (*other[:1], row[first] + "".join(other[1:]))
+                cell = (by_name.get(named, {}) if other else row).get(title)
                 style = style or (".4f" if isinstance(cell, float) else "")
                 lines[-1].append("" if cell is None else format(cell, style))
     with (RESULTS_FOLDER / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
@@ -399,7 +397,7 @@ def composed_table(name: str) -> list[list[str]]:
             known = [
                 x
                 for x in lines
-                if x[0].startswith(CLASSICAL) and not re.search("paper|as it is", x[0])
+                if x[0].startswith(CLASSICAL) and not re.search("paper|as it is|own", x[0])
             ]
             best = max(known, key=lambda line: float(line[k] or 0))
             return f"{best[k]} ({best[0]})"

@@ -53,3 +53,25 @@ def test_a_report_becomes_a_result_and_a_block(
     )
     assert script.shown("192540 (.971)") == "192,540 (0.971)"
     assert (script.shown("0.12345"), script.shown("")) == ("0.12345", "–")
+
+
+def test_rows_of_own_sizes_become_a_column(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(script, "RESULTS_FOLDER", tmp_path)
+    (tmp_path / "index.json").write_text('{"results": {}}')
+    names = ("DeepDetect, points", f"DeepDetect, points{script.OWN}")
+    tables = {
+        "oxford_refined_repeatability_1px": [{"method": name, "2,048": 0.5} for name in names],
+        "oxford_refined_homography": [
+            {"method": name, "accuracy at 1 px": value}
+            for name, value in zip(names, (0.25, 0.75), strict=True)
+        ],
+    }
+    report = {"metadata": {}, "tables": {key: {"rows": rows} for key, rows in tables.items()}}
+    (tmp_path / "oxford-points").mkdir()
+    (tmp_path / "oxford-points" / "report.json").write_text(json.dumps(report))
+    script.write_result("points", tmp_path)
+    assert script.block("points", "@1 2048|within 1 px|own size and angle").splitlines()[2:] == [
+        "| points | 0.500 | 0.250 | 0.750 |"
+    ]
