@@ -1,4 +1,4 @@
-"""Compiled parts of descriptors, matchers, nearest keypoints and suppression.
+"""Compiled parts of descriptors, orientations, matchers, nearest keypoints and suppression.
 
 Dense SIFT works in tiles, so that intermediate results stay in the processor's cache: for each
 pixel of a tile eight soft orientations, summed along its row into the descriptor's four columns,
@@ -8,9 +8,12 @@ tile and their orientations, which lie side by side in memory.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from .._shared.kernels import compiled
+from .scale_space import BINS, RADIUS_PER_WINDOW
 
 TILE_COLUMNS = 32
 """Columns of the lattice in a tile."""
@@ -290,3 +293,107 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
                     )
             rows[query, 0], rows[query, 1] = best, second
             distances[query, 0], distances[query, 1] = nearer, farther
+
+
+@compiled(nogil=True)
+def keep_distant(x, y, radii, most):  # type: ignore[no-untyped-def]
+    """Return which points, best first, have no kept one closer than the smaller of their radii.
+
+    At most so many; positions are 0 or more. Kept points are chained by square cells: `newest`
+    holds the last one of each cell, `before` the one before each point; both -1 where there is
+    none.
+    """
+    cell = radii.min()
+    columns, rows = int(x.max() / cell) + 1, int(y.max() / cell) + 1
+    newest, before = np.full(rows * columns, -1), np.full(len(x), -1)
+    kept, count = np.empty(len(x), np.int64), 0
+    for k in range(len(x)):
+        if count == most:
+            break
+        row, column, reach = int(y[k] / cell), int(x[k] / cell), math.ceil(radii[k] / cell)
+        left, right = max(column - reach, 0), min(column + reach + 1, columns)
+        free = True
+        for r in range(max(row - reach, 0), min(row + reach + 1, rows)):
+            for near in range(r * columns + left, r * columns + right):
+                other = newest[near]
+                while other >= 0 and free:
+                    radius = min(radii[k], radii[other])
+                    free = (x[other] - x[k]) ** 2 + (y[other] - y[k]) ** 2 >= radius * radius
+                    other = before[other]
+        if free:
+            kept[count] = k
+            count += 1
+            own = row * columns + column
+            before[k], newest[own] = newest[own], k
+    return kept[:count]
+
+
+# Of OpenCV's arctangent, in degrees: the same bins are voted for.
+_ATAN = tuple(
+    np.float32(np.float32(c) * np.float32(180 / np.pi))
+    for c in (0.9997878412794807, -0.3258083974640975, 0.1555786518463281, -0.04432655554792128)
+)
+
+
+@compiled(nogil=True)
+def strongest_directions(image, pixels, windows):  # type: ignore[no-untyped-def]
+    """Return the directions of most of the gradients around (N, 2) pixels, (N,) float32 degrees.
+
+    They vote for `BINS` directions, each with its weight in a Gaussian window of one of (N,)
+    sigmas. The outermost pixels have no gradient.
+    """
+    height, width = image.shape
+    angles = np.zeros(len(pixels), np.float32)
+    side = 1
+    for window in windows:
+        side = max(side, 2 * int(np.rint(RADIUS_PER_WINDOW * window)) + 1)
+    room = min(side, height) * min(side, width)
+    dx, dy, weights = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room)
+    bins = np.empty(room, np.int32)
+    across = np.empty(min(side, width))
+    votes, smooth = np.empty((2, BINS)), np.empty(BINS)
+    p1, p3, p5, p7 = _ATAN
+    for n in range(len(pixels)):
+        column, row = pixels[n]
+        radius = int(np.rint(RADIUS_PER_WINDOW * windows[n]))
+        left, right = max(column - radius, 1), min(column + radius + 1, width - 1)
+        for x in range(left, right):
+            across[x - left] = math.exp(-0.5 * ((x - column) / windows[n]) ** 2)
+        count = 0
+        for y in range(max(row - radius, 1), min(row + radius + 1, height - 1)):
+            down = math.exp(-0.5 * ((y - row) / windows[n]) ** 2)
+            for x in range(left, right):
+                at = count + x - left
+                dx[at] = image[y, x + 1] - image[y, x - 1]
+                dy[at] = image[y + 1, x] - image[y - 1, x]
+                weights[at] = down * across[x - left]
+            count += max(right - left, 0)
+        for k in range(count):
+            x, y = abs(dx[k]), abs(dy[k])
+            high, low = (x, y) if x >= y else (y, x)
+            part = low / (high + np.float32(2.220446049250313e-16))
+            square = part * part
+            angle = (((p7 * square + p5) * square + p3) * square + p1) * part
+            angle = angle if x >= y else np.float32(90) - angle
+            angle = angle if dx[k] >= 0 else np.float32(180) - angle
+            angle = angle if dy[k] >= 0 else np.float32(360) - angle
+            bins[k] = np.int32(np.rint(angle * np.float32(BINS / 360)))
+            weights[k] *= np.sqrt(x * x + y * y)
+        votes[:] = 0
+        for k in range(count):
+            bin_ = bins[k]
+            votes[k & 1, bin_ if bin_ < BINS else 0] += weights[k]
+        votes[0] += votes[1]
+        best = 0
+        for k in range(BINS):
+            near = votes[0, k - 1] + votes[0, (k + 1) % BINS]
+            far = votes[0, k - 2] + votes[0, (k + 2) % BINS]
+            smooth[k] = (6 * votes[0, k] + 4 * near + far) / 16
+            best = k if smooth[k] > smooth[best] else best
+        before, after = smooth[best - 1], smooth[(best + 1) % BINS]
+        curvature = before - 2 * smooth[best] + after
+        shift = (before - after) / (2 * curvature) if curvature < 0 else 0.0
+        degrees = np.float32((best + shift) * (360 / BINS))
+        degrees += np.float32(360) if degrees < 0 else np.float32(0)
+        angles[n] = degrees if degrees < 360 else np.float32(0)
+    return angles

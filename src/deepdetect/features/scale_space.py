@@ -78,9 +78,6 @@ WINDOW_PER_SIGMA = 1.5
 
 RADIUS_PER_WINDOW = 3.0
 
-SAMPLES_AT_ONCE = 1 << 16
-"""Gradients that are voted with at a time, so that they stay in the processor's cache."""
-
 
 def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Return the dominant orientation of keypoints, as OpenCV's SIFT assigns it, (N,) float32.
@@ -91,6 +88,8 @@ def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.n
     is flat. Sizes are diameters, twice sigma. SIFT has further keypoints for directions with nearly
     as many votes; here it is always the highest.
     """
+    from .kernels import strongest_directions
+
     xy = np.asarray(xy, np.float64).reshape(-1, 2)
     sizes = np.broadcast_to(np.asarray(sizes, np.float64), len(xy))
     angles = np.zeros(len(xy), np.float32)
@@ -101,53 +100,5 @@ def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.n
         rows = np.flatnonzero((octaves == octave) & (layers == layer))
         pixels = np.rint(xy[rows] / 2.0**octave).astype(np.int64)
         windows = WINDOW_PER_SIGMA * sizes[rows] / SIZE_PER_SIGMA / 2.0**octave
-        radii = np.rint(RADIUS_PER_WINDOW * windows).astype(np.int64)
-        for radius in np.unique(radii).tolist():
-            alike = np.flatnonzero(radii == radius)
-            step = max(1, SAMPLES_AT_ONCE // (2 * radius + 1) ** 2)
-            for first in range(0, len(alike), step):
-                some = alike[first : first + step]
-                votes = _votes(image, pixels[some], windows[some], radius)
-                angles[rows[some]] = _highest(votes)
+        angles[rows] = strongest_directions(image, pixels, windows)
     return angles
-
-
-def _votes(image: np.ndarray, pixels: np.ndarray, windows: np.ndarray, radius: int) -> np.ndarray:
-    """Return (N, 36) histograms of the gradients around (N, 2) pixels of an image.
-
-    The Gaussian windows have (N,) sigmas, and sides of twice the radius.
-    """
-    height, width = image.shape
-    offsets = np.arange(-radius, radius + 1)
-    weights = np.exp(-0.5 * (offsets / windows[:, None]) ** 2)
-    x, y = (pixels[:, axis, None] + offsets for axis in (0, 1))
-    # The outermost pixels have no gradient.
-    across = np.where((x >= 1) & (x < width - 1), weights, 0)
-    down = np.where((y >= 1) & (y < height - 1), weights, 0)
-    x, y = np.clip(x, 1, width - 2), np.clip(y, 1, height - 2)
-    samples = (y * width)[:, :, None] + x[:, None]
-    flat = image.reshape(-1)
-    dx = (flat.take(samples + 1) - flat.take(samples - 1)).reshape(len(pixels), -1)
-    dy = (flat.take(samples + width) - flat.take(samples - width)).reshape(len(pixels), -1)
-    magnitude, angle = cv2.cartToPolar(dx, dy, angleInDegrees=True)
-    bins = np.rint(angle * np.float32(BINS / 360)).astype(np.intp) % BINS
-    bins += BINS * np.arange(len(pixels))[:, None]
-    values = (down[:, :, None] * across[:, None]).reshape(magnitude.shape) * magnitude
-    votes = np.bincount(bins.reshape(-1), values.reshape(-1), BINS * len(pixels))
-    return votes.reshape(len(pixels), BINS)
-
-
-def _highest(votes: np.ndarray) -> np.ndarray:
-    """Return the directions of the highest bins of smoothed histograms, (N,) float32 degrees."""
-    near = np.roll(votes, 1, 1) + np.roll(votes, -1, 1)
-    far = np.roll(votes, 2, 1) + np.roll(votes, -2, 1)
-    smooth = (6 * votes + 4 * near + far) / 16
-    every, best = np.arange(len(votes)), smooth.argmax(1)
-    left, middle, right = (smooth[every, (best + step) % BINS] for step in (-1, 0, 1))
-    curvature = left - 2 * middle + right
-    peaked = curvature < 0
-    shift = np.where(peaked, (left - right) / np.where(peaked, 2 * curvature, 1), 0)
-    degrees = ((best + shift) * (360 / BINS)).astype(np.float32)
-    degrees[degrees < 0] += 360
-    degrees[degrees >= 360] = 0
-    return degrees

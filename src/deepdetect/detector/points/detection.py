@@ -66,17 +66,18 @@ def detect_points(
     if not len(candidates):
         none = np.empty(0, np.float32)
         return Keypoints(np.empty((0, 2)), none, size, logits=none, sizes=none, angles=none)
-    strength = candidates.strength(space)
-    rows = np.arange(len(candidates))
+    rows = np.argsort(candidates.rank)
     if ignore is not None:
-        rows = rows[~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]]
+        wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
+        rows = rows[wanted[rows]]
     # The strongest alone would leave nothing to spread over dim regions.
-    if max_keypoints is not None and spread == "none":
-        most = max(CANDIDATES_PER_KEYPOINT * max_keypoints, MIN_CANDIDATES)
-        rows = rows[np.argsort(-strength[rows], kind="stable")[:most]]
-    logits = (ranker or load_ranker()).rank(describe_candidates(space, candidates, rows))
-    candidates = candidates[rows]
-    kept = suppress_neighbors(candidates.xy, logits, least_distances(candidates.sigma_px))
+    limited = max_keypoints is not None and spread == "none"
+    if limited:
+        rows = rows[: max(CANDIDATES_PER_KEYPOINT * max_keypoints, MIN_CANDIDATES)]
+    candidates = candidates[np.sort(rows)]  # those side by side share the processor's cache
+    logits = (ranker or load_ranker()).rank(describe_candidates(space, candidates))
+    radii = least_distances(candidates.sigma_px)
+    kept = suppress_neighbors(candidates.xy, logits, radii, max_keypoints if limited else None)
     kept = kept[_choose(candidates.xy[kept], logits[kept], size, max_keypoints, spread)]
     xy, sizes = candidates.xy[kept], SIZE_PER_SIGMA * candidates.sigma_px[kept]
     angles = dominant_angles(gray, xy, sizes)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
 from ..._shared.machine import parallel_for
 from ..._shared.opencv import cv2
-from ...features.selection import peak_offset
+from ...features.spacing import descending_order
 
 NMS_RADIUS = 2
 """A candidate is the maximum of a window of 5x5 in its level."""
@@ -20,103 +21,66 @@ coarser ones, which only the ranking looks at."""
 LEAST_RESPONSE = 1e-8
 """Of a candidate, in an image with values in [0, 1]: less is rounding."""
 
-PIXELS_AT_ONCE = 1 << 14
-"""Derivatives of so many are computed together: they stay in the processor's cache."""
-
-
 @dataclass(frozen=True, eq=False)
 class ScaleSpace:
     """Smoothed copies of an image in [0, 1], with derivatives normalised by their scale.
 
-    All but the sigmas are (L, H, W) float32. `determinant` and `trace` are the Hessian's, the
-    gradient is squared, `highest` is the largest |determinant| within `NMS_RADIUS` in x and y.
+    All but the sigmas are (L, H, W) float32; the determinant is the Hessian's.
     """
 
     sigmas_px: np.ndarray
     smooth: np.ndarray
     determinant: np.ndarray
-    trace: np.ndarray
-    gradient: np.ndarray
-    highest: np.ndarray
+
+    @property
+    def variances(self) -> np.ndarray:
+        """(L,) float32 variances of the Gaussians, by which derivatives are normalised."""
+        return (self.sigmas_px**2).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Maxima of |det Hessian| in each level of a scale space, with sub-pixel positions `xy`."""
+    """Maxima of |det Hessian| in each level of a scale space.
+
+    Attributes:
+        level, row, column: (N,) int64 pixels.
+        xy: (N, 2) float64 sub-pixel positions.
+        sigma_px: (N,) float64 of their levels.
+        strength: (N,) float32 |det Hessian| sigma^4.
+        rank: (N,) int64 places in the order of strength, from 0, among all of the image.
+    """
 
     level: np.ndarray
     row: np.ndarray
     column: np.ndarray
     xy: np.ndarray
     sigma_px: np.ndarray
+    strength: np.ndarray
+    rank: np.ndarray
 
     def __len__(self) -> int:
         return len(self.level)
 
-    def strength(self, space: ScaleSpace) -> np.ndarray:
-        """Return |det Hessian| sigma^4 of each, (N,) float32."""
-        return np.abs(space.determinant[self.level, self.row, self.column])
-
     def __getitem__(self, rows: np.ndarray) -> Candidates:
         """Return some of them, by a mask or by rows."""
-        parts = (self.level, self.row, self.column, self.xy, self.sigma_px)
-        return Candidates(*(part[rows] for part in parts))
+        return Candidates(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 def build_scale_space(gray: np.ndarray) -> ScaleSpace:
     """Smooth a (H, W) uint8 image at all scales, and differentiate it."""
-    maps = [np.empty((len(SIGMAS_PX), *gray.shape), np.float32) for _ in range(5)]
-    smooth, determinant, trace, gradient, highest = maps
-    window = np.ones((2 * NMS_RADIUS + 1,) * 2, np.uint8)
-    strength = np.empty(gray.shape, np.float32)
+    from .kernels import differentiate
+
+    smooth, determinant = (np.empty((len(SIGMAS_PX), *gray.shape), np.float32) for _ in range(2))
+    space = ScaleSpace(SIGMAS_PX, smooth, determinant)
     current, reached = gray.astype(np.float32) / np.float32(255), 0.0
     for k, sigma in enumerate(SIGMAS_PX):
         # Gaussians add up by their variances: each level smooths the one before.
-        current = cv2.GaussianBlur(current, (0, 0), float(np.sqrt(sigma**2 - reached**2)))
-        reached = sigma
-        smooth[k] = current
+        step = float(np.sqrt(sigma**2 - reached**2))
+        current, reached = cv2.GaussianBlur(current, (0, 0), step, dst=smooth[k]), sigma
         parallel_for(
-            gray.shape[0],
-            _differentiate,
-            cv2.copyMakeBorder(current, 1, 1, 1, 1, cv2.BORDER_REFLECT_101),
-            np.float32(sigma**2),
-            *(maps[k] for maps in (determinant, trace, gradient)),
-            strength,
+            gray.shape[0], differentiate, smooth[k], space.variances[k], determinant[k]
         )
-        cv2.dilate(strength, window, dst=highest[k])
-    return ScaleSpace(SIGMAS_PX, smooth, determinant, trace, gradient, highest)
-
-
-def _differentiate(
-    start: int,
-    stop: int,
-    padded: np.ndarray,
-    variance: np.float32,
-    determinant: np.ndarray,
-    trace: np.ndarray,
-    gradient: np.ndarray,
-    strength: np.ndarray,
-) -> None:
-    """Compute the derivatives of rows `start` to before `stop`, by central differences.
-
-    The smoothed image has a border of one pixel. Determinant, trace and squared gradient, which are
-    normalised by the variance, and |determinant| are written.
-    """
-    step = max(1, PIXELS_AT_ONCE // determinant.shape[1])
-    for first in range(start, stop, step):
-        rows = slice(first, min(first + step, stop))
-        near = padded[first : rows.stop + 2]
-        above, here, below = near[:-2, 1:-1], near[1:-1, 1:-1], near[2:, 1:-1]
-        # In this order: the differences are small, so that little is rounded.
-        xx = (near[1:-1, :-2] - 2 * here) + near[1:-1, 2:]
-        yy = (above - 2 * here) + below
-        dx, dy = near[:, 2:] - near[:, :-2], below - above
-        xy = dx[2:] - dx[:-2]
-        trace[rows] = (xx + yy) * variance
-        determinant[rows] = (xx * yy - xy * xy * np.float32(1 / 16)) * (variance * variance)
-        strength[rows] = np.abs(determinant[rows])
-        dx = dx[1:-1]
-        gradient[rows] = (dx * dx + dy * dy) * (variance * np.float32(1 / 4))
+    return space
 
 
 def find_candidates(space: ScaleSpace) -> Candidates:
@@ -125,14 +89,19 @@ def find_candidates(space: ScaleSpace) -> Candidates:
     Their positions are refined by a parabola in x and in y. There are none in the outermost rows
     and columns.
     """
-    found, positions = [], []
-    for k in range(1, len(space.sigmas_px) - 2):
-        response = np.abs(space.determinant[k])
-        peak = (response == space.highest[k]) & (response > LEAST_RESPONSE)
-        row, column = np.add(np.nonzero(peak[1:-1, 1:-1]), 1)
-        x = column + peak_offset(response, row, column, axis=1)
-        y = row + peak_offset(response, row, column, axis=0)
-        found.append(np.stack([np.full(len(row), k), row, column]))
-        positions.append(np.stack([x, y], 1))
-    level, row, column = np.concatenate(found, 1)
-    return Candidates(level, row, column, np.concatenate(positions), space.sigmas_px[level])
+    from .kernels import find_peaks
+
+    found: list[Any] = [None] * (len(space.sigmas_px) - 3)
+
+    def find(first: int, last: int) -> None:
+        for k in range(first, last):
+            found[k] = find_peaks(space.determinant[k + 1])
+
+    parallel_for(len(found), find)
+    pixels, xy = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    level = np.repeat(np.arange(1, 1 + len(found)), [len(part) for part, _ in found])
+    row, column = pixels.T
+    strength = np.abs(space.determinant[level, row, column])
+    rank = np.empty(len(level), np.int64)
+    rank[descending_order(strength)] = np.arange(len(level))
+    return Candidates(level, row, column, xy, space.sigmas_px[level], strength, rank)

@@ -16,7 +16,8 @@ from .candidate_features import FEATURES
 MAX_DEVIATIONS = 6.0
 """Features further from their mean are taken as this many standard deviations away."""
 
-_CHUNK = 65_536
+_CHUNK = 2048
+"""Candidates at a time: their features stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +38,14 @@ class Ranker:
         logits = np.empty(len(features), np.float32)
         for start in range(0, len(features), _CHUNK):
             part = features[start : start + _CHUNK]
-            values = (part - self.mean) / self.deviation
-            values = np.clip(values, -MAX_DEVIATIONS, MAX_DEVIATIONS)
+            values = part - self.mean
+            values /= self.deviation
+            np.clip(values, -MAX_DEVIATIONS, MAX_DEVIATIONS, out=values)
             for k, (weight, bias) in enumerate(self.layers):
-                values = values @ weight.T + bias
+                values = values @ weight.T
+                values += bias
                 if k + 1 < len(self.layers):
-                    values = np.maximum(values, 0)
+                    np.maximum(values, 0, out=values)
             logits[start : start + _CHUNK] = part[:, 0] + values[:, 0]
         return logits
 
