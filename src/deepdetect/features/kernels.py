@@ -13,7 +13,6 @@ import math
 import numpy as np
 
 from .._shared.kernels import compiled
-from .scale_space import BINS, RADIUS_PER_WINDOW
 
 TILE_COLUMNS = 32
 """Columns of the lattice in a tile."""
@@ -23,6 +22,12 @@ TILE_HEIGHT = 96
 
 TAPS_AT_ONCE = 4
 """Spans of taps are multiples of this."""
+
+BINS = 36
+"""Directions that gradients vote for."""
+
+RADIUS_PER_WINDOW = 3.0
+"""Of the pixels that vote, over the sigma of their Gaussian window."""
 
 MIN_SQUARED_NORMS = 1e-3
 """Of the product of the squared norms: below it a descriptor is the mean."""
@@ -295,7 +300,7 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
             distances[query, 0], distances[query, 1] = nearer, farther
 
 
-@compiled(nogil=True)
+@compiled(nogil=True, error_model="numpy")
 def keep_distant(x, y, radii, most):  # type: ignore[no-untyped-def]
     """Return which points, best first, have no kept one closer than the smaller of their radii.
 
@@ -328,6 +333,53 @@ def keep_distant(x, y, radii, most):  # type: ignore[no-untyped-def]
     return kept[:count]
 
 
+# Products and sums are fused where OpenCV fuses them: its results, to the last bit.
+@compiled(nogil=True, fastmath={"contract"})
+def blur_rows(first, last, image, taps, mirrored, out):  # type: ignore[no-untyped-def]
+    """Weigh the pixels along some rows by `taps`, in fours, and write them from column 0.
+
+    `mirrored` are the columns under the first tap, then the second, ... of all of a row.
+    """
+    width = image.shape[1]
+    padded = np.zeros(width + len(taps) + 4, np.float32)
+    radius = (len(mirrored) - width) // 2
+    for row in range(first, last):
+        here, inner, sums = image[row], padded[radius:], out[row]
+        for x in range(radius):
+            padded[x] = here[mirrored[x]]
+            inner[width + x] = here[mirrored[radius + width + x]]
+        for x in range(width):
+            inner[x] = here[x]
+            sums[x] = 0
+        for k in range(0, len(taps), 4):
+            a, b, c, d = padded[k:], padded[k + 1 :], padded[k + 2 :], padded[k + 3 :]
+            wa, wb, wc, wd = taps[k], taps[k + 1], taps[k + 2], taps[k + 3]
+            for x in range(width):
+                sums[x] = sums[x] + wa * a[x] + wb * b[x] + wc * c[x] + wd * d[x]
+
+
+@compiled(nogil=True, fastmath={"contract"})
+def blur_columns(first, last, image, taps, mirrored, out):  # type: ignore[no-untyped-def]
+    """Weigh the pixels along the columns, of some rows of the result.
+
+    `taps` are the middle one, and the next in fours; `mirrored` as of `blur_rows`, but of rows.
+    """
+    height, width = out.shape
+    radius = (len(mirrored) - height) // 2
+    for row in range(first, last):
+        sums, middle = out[row], image[row]
+        for x in range(width):
+            sums[x] = taps[0] * middle[x]
+        for k in range(1, radius + 1, 4):
+            above, below = mirrored[radius + row - k :: -1], mirrored[radius + row + k :]
+            a0, a1, a2, a3 = image[above[0]], image[above[1]], image[above[2]], image[above[3]]
+            b0, b1, b2, b3 = image[below[0]], image[below[1]], image[below[2]], image[below[3]]
+            w0, w1, w2, w3 = taps[k], taps[k + 1], taps[k + 2], taps[k + 3]
+            for x in range(width):
+                some = sums[x] + w0 * (b0[x] + a0[x]) + w1 * (b1[x] + a1[x])
+                sums[x] = some + w2 * (b2[x] + a2[x]) + w3 * (b3[x] + a3[x])
+
+
 # Of OpenCV's arctangent, in degrees: the same bins are voted for.
 _ATAN = tuple(
     np.float32(np.float32(c) * np.float32(180 / np.pi))
@@ -335,7 +387,7 @@ _ATAN = tuple(
 )
 
 
-@compiled(nogil=True)
+@compiled(nogil=True, error_model="numpy")
 def strongest_directions(image, pixels, windows):  # type: ignore[no-untyped-def]
     """Return the directions of most of the gradients around (N, 2) pixels, (N,) float32 degrees.
 
@@ -348,10 +400,10 @@ def strongest_directions(image, pixels, windows):  # type: ignore[no-untyped-def
     for window in windows:
         side = max(side, 2 * int(np.rint(RADIUS_PER_WINDOW * window)) + 1)
     room = min(side, height) * min(side, width)
-    dx, dy, weights = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room)
+    dx, dy, weights = np.empty((3, room), np.float32)
     bins = np.empty(room, np.int32)
-    across = np.empty(min(side, width))
-    votes, smooth = np.empty((2, BINS)), np.empty(BINS)
+    across = np.empty(min(side, width), np.float32)
+    votes, smooth = np.empty((2, BINS + 1)), np.empty(BINS)
     p1, p3, p5, p7 = _ATAN
     for n in range(len(pixels)):
         column, row = pixels[n]
@@ -361,12 +413,12 @@ def strongest_directions(image, pixels, windows):  # type: ignore[no-untyped-def
             across[x - left] = math.exp(-0.5 * ((x - column) / windows[n]) ** 2)
         count = 0
         for y in range(max(row - radius, 1), min(row + radius + 1, height - 1)):
-            down = math.exp(-0.5 * ((y - row) / windows[n]) ** 2)
-            for x in range(left, right):
-                at = count + x - left
-                dx[at] = image[y, x + 1] - image[y, x - 1]
-                dy[at] = image[y + 1, x] - image[y - 1, x]
-                weights[at] = down * across[x - left]
+            down = np.float32(math.exp(-0.5 * ((y - row) / windows[n]) ** 2))
+            above, here, below = image[y - 1, left:], image[y, left - 1 :], image[y + 1, left:]
+            for x in range(right - left):
+                dx[count + x] = here[x + 2] - here[x]
+                dy[count + x] = below[x] - above[x]
+                weights[count + x] = down * across[x]
             count += max(right - left, 0)
         for k in range(count):
             x, y = abs(dx[k]), abs(dy[k])
@@ -381,13 +433,13 @@ def strongest_directions(image, pixels, windows):  # type: ignore[no-untyped-def
             weights[k] *= np.sqrt(x * x + y * y)
         votes[:] = 0
         for k in range(count):
-            bin_ = bins[k]
-            votes[k & 1, bin_ if bin_ < BINS else 0] += weights[k]
+            votes[k & 1, bins[k]] += weights[k]
         votes[0] += votes[1]
+        votes[0, 0] += votes[0, BINS]
         best = 0
         for k in range(BINS):
-            near = votes[0, k - 1] + votes[0, (k + 1) % BINS]
-            far = votes[0, k - 2] + votes[0, (k + 2) % BINS]
+            near = votes[0, (k - 1) % BINS] + votes[0, (k + 1) % BINS]
+            far = votes[0, (k - 2) % BINS] + votes[0, (k + 2) % BINS]
             smooth[k] = (6 * votes[0, k] + 4 * near + far) / 16
             best = k if smooth[k] > smooth[best] else best
         before, after = smooth[best - 1], smooth[(best + 1) % BINS]

@@ -14,11 +14,10 @@ from .hessian_scales import Candidates, ScaleSpace
 RING_RADII = (1.0, 2.0, 3.5, 6.0)
 """Of the rings around a candidate that are looked at, in sigmas."""
 
-RING_POINTS = 8
 FEATURES = 23 + 8 * len(RING_RADII)
 """Number of features of a candidate."""
 
-DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR = 1e-7, 1e-6, 1e-8
+DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR = map(np.float32, (1e-7, 1e-6, 1e-8))
 """Added before logarithms and divisions: responses of noise and rounding look like nothing."""
 
 
@@ -31,18 +30,23 @@ def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray
     neighbouring scales, relative to it; mean, largest and smallest of |det Hessian|, grey value and
     gradient on rings; its rank among all candidates per pixel; its level.
     """
-    from .kernels import measure_candidates
+    from .kernels import RING_POINTS, RINGS, measure_candidates
 
-    angle = np.arange(RING_POINTS) * (2 * np.pi / RING_POINTS)
-    circle = np.stack([np.cos(angle), np.sin(angle)], 1)
-    rings = np.multiply.outer(np.multiply.outer(space.sigmas_px, RING_RADII), circle)
+    angle = np.arange(RING_POINTS)[:, None] * (2 * np.pi / RING_POINTS)
+    reach = space.sigmas_px[:, None, None, None] * RING_RADII
+    odd = np.arange(2)[:, None, None]  # halves are rounded to even columns and rows
+    rings = [np.rint(reach * turn(angle) + odd) - odd for turn in (np.cos, np.sin)]
     pixels = np.stack([candidates.level, candidates.row, candidates.column], 1)
-    floors = tuple(np.float32([DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR]))
+    floors = DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR
     features = np.empty((len(candidates), FEATURES), np.float32)
     parallel_for(
         len(candidates),
         measure_candidates,
-        *(space.smooth, space.determinant, space.variances, rings, pixels, floors, features),
+        space.smooth.shape,
+        *(maps.reshape(-1) for maps in (space.smooth, space.determinant)),
+        space.variances,
+        np.array(rings, np.int64).reshape(2, -1, 2, RINGS * RING_POINTS),
+        *(pixels, floors, features),
     )
     features[:, -2] = np.log((candidates.rank + 1) / space.smooth[0].size) / 2 + 3
     features[:, -1] = (candidates.level - 4) / 3

@@ -22,6 +22,8 @@ CANDIDATES_PER_KEYPOINT, MIN_CANDIDATES = 6, 8192
 """Where a limited number of keypoints is wanted, and not spread, only the strongest candidates are
 ranked: so many for each keypoint, and at least so many."""
 
+TILE_PX = 32
+
 GRID_CELLS = 16
 """Of the spread "grid", along the longer side."""
 
@@ -71,13 +73,15 @@ def detect_points(
         wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
         rows = rows[wanted[rows]]
     # The strongest alone would leave nothing to spread over dim regions.
-    limited = max_keypoints is not None and spread == "none"
-    if limited:
-        rows = rows[: max(CANDIDATES_PER_KEYPOINT * max_keypoints, MIN_CANDIDATES)]
-    candidates = candidates[np.sort(rows)]  # those side by side share the processor's cache
+    limit = max_keypoints if spread == "none" else None
+    if limit is not None:
+        rows = rows[: max(CANDIDATES_PER_KEYPOINT * limit, MIN_CANDIDATES)]
+    # Those of all scales in one tile share the processor's cache.
+    tiles = (candidates.row // TILE_PX << 8) + candidates.column // TILE_PX
+    candidates = candidates[rows[np.argsort(tiles[rows].astype(np.uint16), kind="stable")]]
     logits = (ranker or load_ranker()).rank(describe_candidates(space, candidates))
     radii = least_distances(candidates.sigma_px)
-    kept = suppress_neighbors(candidates.xy, logits, radii, max_keypoints if limited else None)
+    kept = suppress_neighbors(candidates.xy, logits, radii, limit)
     kept = kept[_choose(candidates.xy[kept], logits[kept], size, max_keypoints, spread)]
     xy, sizes = candidates.xy[kept], SIZE_PER_SIGMA * candidates.sigma_px[kept]
     angles = dominant_angles(gray, xy, sizes)

@@ -8,18 +8,13 @@ from typing import Any
 import numpy as np
 
 from ..._shared.machine import parallel_for
-from ..._shared.opencv import cv2
+from ...features.scale_space import gaussian_blur
 from ...features.spacing import descending_order
-
-NMS_RADIUS = 2
-"""A candidate is the maximum of a window of 5x5 in its level."""
 
 SIGMAS_PX = 1.5 * 1.35 ** np.arange(-1.0, 9)
 """Of the Gaussians of all levels, in pixels: seven that have candidates, and one finer and two
 coarser ones, which only the ranking looks at."""
 
-LEAST_RESPONSE = 1e-8
-"""Of a candidate, in an image with values in [0, 1]: less is rounding."""
 
 @dataclass(frozen=True, eq=False)
 class ScaleSpace:
@@ -76,10 +71,8 @@ def build_scale_space(gray: np.ndarray) -> ScaleSpace:
     for k, sigma in enumerate(SIGMAS_PX):
         # Gaussians add up by their variances: each level smooths the one before.
         step = float(np.sqrt(sigma**2 - reached**2))
-        current, reached = cv2.GaussianBlur(current, (0, 0), step, dst=smooth[k]), sigma
-        parallel_for(
-            gray.shape[0], differentiate, smooth[k], space.variances[k], determinant[k]
-        )
+        current, reached = gaussian_blur(current, step, out=smooth[k]), sigma
+        parallel_for(gray.shape[0], differentiate, smooth[k], space.variances[k], determinant[k])
     return space
 
 

@@ -1,4 +1,7 @@
-"""Compiled parts of the detection of points: derivatives, maxima, measurements of candidates."""
+"""Compiled parts of the detection of points: derivatives, maxima, measurements of candidates.
+
+Loops over neighbours in memory are written so that the compiler does several at once.
+"""
 
 from __future__ import annotations
 
@@ -8,22 +11,16 @@ import numpy as np
 
 from ..._shared.kernels import compiled
 from ...features.selection import MAX_OFFSET_PX
-from .hessian_scales import LEAST_RESPONSE, NMS_RADIUS
 
-_WINDOW = 2 * NMS_RADIUS + 1
+LEAST_RESPONSE = 1e-8
+"""Of a candidate, in an image with values in [0, 1]: less is rounding."""
 
-
-@compiled(nogil=True)
-def _determinant(above, here, below, left, x, right):  # type: ignore[no-untyped-def]
-    # In this order: the differences are small, so that little is rounded.
-    double = np.float32(2) * here[x]
-    xx = (here[left] - double) + here[right]
-    yy = (above[x] - double) + below[x]
-    xy = (below[right] - below[left]) - (above[right] - above[left])
-    return xx * yy - xy * xy * np.float32(1 / 16)
+RINGS, RING_POINTS = 4, 8
+_POINTS = RINGS * RING_POINTS
+_LOGARITHMS = -(-(11 + 7 * RINGS) // 8) * 8
 
 
-@compiled(nogil=True)
+@compiled(nogil=True, error_model="numpy")
 def differentiate(first, last, smooth, variance, determinant):  # type: ignore[no-untyped-def]
     """Compute the determinant of the Hessian, normalised by the variance, of some rows.
 
@@ -35,57 +32,71 @@ def differentiate(first, last, smooth, variance, determinant):  # type: ignore[n
         here, out = smooth[row], determinant[row]
         above = smooth[row - 1 if row else min(1, height - 1)]
         below = smooth[row + 1 if row + 1 < height else max(height - 2, 0)]
-        for x in range(1, width - 1):
-            out[x] = _determinant(above, here, below, x - 1, x, x + 1) * scale
-        near, end = min(1, width - 1), width - 1
-        out[0] = _determinant(above, here, below, near, 0, near) * scale
-        out[end] = _determinant(above, here, below, end - near, end, end - near) * scale
+        before, after, inner = here[:-2], here[2:], here[1:-1]
+        above_before, above_inner, above_after = above[:-2], above[1:-1], above[2:]
+        below_before, below_inner, below_after = below[:-2], below[1:-1], below[2:]
+        responses = out[1:-1]
+        for x in range(width - 2):
+            # In this order: the differences are small, so that little is rounded.
+            double = np.float32(2) * inner[x]
+            xx = (before[x] - double) + after[x]
+            yy = (above_inner[x] - double) + below_inner[x]
+            xy = (below_after[x] - below_before[x]) - (above_after[x] - above_before[x])
+            responses[x] = (xx * yy - xy * xy * np.float32(1 / 16)) * scale
+        for x, beside in ((0, min(1, width - 1)), (width - 1, max(width - 2, 0))):
+            double = np.float32(2) * here[x]
+            xx, yy = (here[beside] - double) + here[beside], (above[x] - double) + below[x]
+            out[x] = xx * yy * scale
 
 
-@compiled(nogil=True)
+@compiled(nogil=True, error_model="numpy")
+def _largest(a, b, c, d, e, out):  # type: ignore[no-untyped-def]
+    for x in range(len(out)):
+        first = a[x] if a[x] > b[x] else b[x]
+        second = c[x] if c[x] > d[x] else d[x]
+        first = first if first > second else second
+        out[x] = first if first > e[x] else e[x]
+
+
+@compiled(nogil=True, error_model="numpy")
 def find_peaks(determinant):  # type: ignore[no-untyped-def]
     """Return (N, 2) pixels (row, column), and (N, 2) positions (x, y), of maxima of |determinant|.
 
-    Of all windows of `NMS_RADIUS`, but none in the outermost rows and columns.
+    In windows of 5x5, and none in the outermost rows and columns.
     """
     height, width = determinant.shape
-    padded = np.zeros(width + _WINDOW - 1, np.float32)
-    across = np.zeros((_WINDOW, width), np.float32)  # maxima along the last rows
+    lines = np.zeros((5, width), np.float32)  # magnitudes in five rows
+    highest = np.zeros((2, width + 4), np.float32)
+    down, across = highest[0, 2:-2], highest[1, 2:-2]
     is_peak = np.zeros((width + 7) // 8 * 8, np.bool_)
     eight = is_peak.view(np.uint64)
-    places = np.empty(height * width, np.int32)
+    places = np.empty((2, height * width), np.int32)
     count = 0
-    least = np.float32(LEAST_RESPONSE)
-    for row in range(-NMS_RADIUS, height - 1):
-        below = row + NMS_RADIUS
-        highest = across[below % _WINDOW]
-        highest[:] = 0
-        if below < height:
+    for row in range(-2, height - 1):
+        last = lines[(row + 2) % 5]
+        last[:] = 0
+        if row + 2 < height:
+            values = determinant[row + 2]
             for x in range(width):
-                padded[NMS_RADIUS + x] = abs(determinant[below, x])
-            for x in range(width):
-                high = padded[x]
-                for k in range(1, _WINDOW):
-                    high = padded[x + k] if padded[x + k] > high else high
-                highest[x] = high
+                last[x] = abs(values[x])
         if row < 1:
             continue
-        here = determinant[row]
-        for x in range(1, width - 1):
-            high = across[0, x]
-            for k in range(1, _WINDOW):
-                high = across[k, x] if across[k, x] > high else high
-            is_peak[x] = (abs(here[x]) == high) & (high > least)
+        _largest(lines[0], lines[1], lines[2], lines[3], lines[4], down)
+        every = highest[0]
+        _largest(every, every[1:], every[2:], every[3:], every[4:], across)
+        here = lines[row % 5]
+        for x in range(width):
+            is_peak[x] = (here[x] == across[x]) & (here[x] > np.float32(LEAST_RESPONSE))
         for part in range(len(eight)):
             if eight[part]:
-                for x in range(8 * part, min(8 * part + 8, width - 1)):
+                for x in range(max(8 * part, 1), min(8 * part + 8, width - 1)):
                     if is_peak[x]:
-                        places[count] = row * width + x
+                        places[0, count], places[1, count] = row, x
                         count += 1
     pixels = np.empty((count, 2), np.int64)
     xy = np.empty((count, 2))
     for k in range(count):
-        row, x = places[k] // width, places[k] % width
+        row, x = places[0, k], places[1, k]
         middle = determinant[row, x]
         pixels[k, 0], pixels[k, 1] = row, x
         xy[k, 0] = x + _offset(determinant[row, x - 1], middle, determinant[row, x + 1])
@@ -93,7 +104,7 @@ def find_peaks(determinant):  # type: ignore[no-untyped-def]
     return pixels, xy
 
 
-@compiled(nogil=True)
+@compiled(nogil=True, error_model="numpy")
 def _offset(before, middle, after):  # type: ignore[no-untyped-def]
     """Return where a parabola through the magnitudes of three pixels has its maximum."""
     before, middle = np.float64(abs(before)), np.float64(abs(middle))
@@ -104,84 +115,151 @@ def _offset(before, middle, after):  # type: ignore[no-untyped-def]
     return min(max((after - before) / (2 * bend), -MAX_OFFSET_PX), MAX_OFFSET_PX)
 
 
-@compiled(nogil=True)
-def _slope(image, row, column, variance):  # type: ignore[no-untyped-def]
-    """Return the squared gradient, normalised by the variance."""
-    height, width = image.shape
-    dx, dy = np.float32(0), np.float32(0)
-    if 0 < column < width - 1:
-        dx = image[row, column + 1] - image[row, column - 1]
-    if 0 < row < height - 1:
-        dy = image[row + 1, column] - image[row - 1, column]
-    return (dx * dx + dy * dy) * (variance * np.float32(0.25))
+@compiled(nogil=True, error_model="numpy")
+def _logarithms(values, bits, exponents):  # type: ignore[no-untyped-def]
+    """Replace positive float32 numbers by their logarithms, several at once (Cephes).
+
+    `bits` are the same memory as int32, `exponents` room for as many float32.
+    """
+    for k in range(len(values)):
+        exponents[k] = (bits[k] >> np.int32(23)) - np.int32(127)
+        bits[k] = (bits[k] & np.int32(0x7FFFFF)) | np.int32(0x3F800000)
+    for k in range(len(values)):
+        large = values[k] > np.float32(1.41421356)
+        x = (values[k] * np.float32(0.5) if large else values[k]) - np.float32(1)
+        power = exponents[k] + (np.float32(1) if large else np.float32(0))
+        series = np.float32(7.0376836292e-2) * x - np.float32(1.1514610310e-1)
+        series = series * x + np.float32(1.1676998740e-1)
+        series = series * x - np.float32(1.2420140846e-1)
+        series = series * x + np.float32(1.4249322787e-1)
+        series = series * x - np.float32(1.6668057665e-1)
+        series = series * x + np.float32(2.0000714765e-1)
+        series = series * x - np.float32(2.4999993993e-1)
+        series = series * x + np.float32(3.3333331174e-1)
+        small = series * x * x * x - np.float32(2.12194440e-4) * power
+        values[k] = (small - np.float32(0.5) * x * x) + x + np.float32(0.693359375) * power
 
 
-@compiled(nogil=True)
+@compiled(nogil=True, error_model="numpy")
+def _arctangents(values):  # type: ignore[no-untyped-def]
+    """Replace float32 numbers by their arctangents, several at once (Cephes)."""
+    for k in range(len(values)):
+        x = abs(values[k])
+        steep, medium = x > np.float32(2.41421356), x > np.float32(0.41421356)
+        angle = np.float32(np.pi / 4) if medium else np.float32(0)
+        angle = np.float32(np.pi / 2) if steep else angle
+        above = x - np.float32(1) if medium else x
+        below = x + np.float32(1) if medium else np.float32(1)
+        t = (np.float32(-1) if steep else above) / (x if steep else below)
+        square = t * t
+        series = np.float32(8.05374449538e-2) * square - np.float32(1.38776856032e-1)
+        series = series * square + np.float32(1.99777106478e-1)
+        series = series * square - np.float32(3.33329491539e-1)
+        angle += series * square * t + t
+        values[k] = angle if values[k] >= 0 else -angle
+
+
+@compiled(nogil=True, error_model="numpy")
 def measure_candidates(  # type: ignore[no-untyped-def]
-    first, last, smooth, determinant, variances, rings, candidates, floors, features
+    first, last, shape, smooth, determinant, variances, rings, candidates, floors, features
 ):
     """Compute the features, but those that `describe_candidates` adds, of some candidates.
 
-    `rings` are (L, R, P, 2) offsets in x and y of the points of rings in each level, `candidates`
-    (N, 3): level, row and column.
+    The maps are flat, of a `shape` (L, H, W). `rings` are (2, L, 2, R P) offsets in x and y of the
+    first points of all rings, then of their second points and so on, by the level and by whether
+    the column, or row, is odd; `candidates` (N, 3): level, row and column.
     """
-    levels, height, width = smooth.shape
+    levels, height, width = shape
     floor, slope_floor, strength_floor = floors
     half, quarter = np.float32(0.5), np.float32(0.25)
+    places, right, down = np.empty((3, _POINTS), np.int64)
+    response, slope, light = np.empty((3, _POINTS), np.float32)
+    # Of these: itself; three neighbours, the highest there; four gradients; the rings.
+    logs, exponents = np.ones((2, _LOGARITHMS), np.float32)
+    bits = logs.view(np.int32)
+    bent = np.empty(4 + 3 * RINGS, np.float32)
     for n in range(first, last):
-        level, row, column = candidates[n]
-        own_determinant, own_smooth = determinant[level, row, column], smooth[level, row, column]
-        own = math.log(abs(own_determinant) + floor)
+        level, row, column = candidates[n, 0], candidates[n, 1], candidates[n, 2]
+        pixel, start = row * width + column, level * height * width
+        own_determinant, own_smooth = determinant[start + pixel], smooth[start + pixel]
         strength = math.sqrt(abs(own_determinant) + strength_floor)
-        out = features[n]
-        out[0] = (own + np.float32(9)) / np.float32(3)
-        out[4] = np.sign(own_determinant)
+        logs[0] = abs(own_determinant) + floor
         for k in range(4):
             near = min(max(level + k - 1, 0), levels - 1)
-            image, response = smooth[near], determinant[near]
-            here = image[row, column]
-            xx = (image[row, column - 1] - np.float32(2) * here) + image[row, column + 1]
-            yy = (image[row - 1, column] - np.float32(2) * here) + image[row + 1, column]
-            bent = math.atan((xx + yy) * variances[near] / strength * half)
-            out[5 + 2 * k], out[6 + 2 * k] = bent, abs(bent)
-            slope = math.log(_slope(image, row, column, variances[near]) + slope_floor)
-            out[13 + k] = (slope - own) * quarter
+            here = near * height * width + pixel
+            double = np.float32(2) * smooth[here]
+            xx = (smooth[here - 1] - double) + smooth[here + 1]
+            yy = (smooth[here - width] - double) + smooth[here + width]
+            bent[k] = (xx + yy) * variances[near] / strength * half
+            dx = smooth[here + 1] - smooth[here - 1]
+            dy = smooth[here + width] - smooth[here - width]
+            logs[7 + k] = (dx * dx + dy * dy) * (variances[near] * quarter) + slope_floor
             if k != 1:
                 highest = np.float32(0)
-                for y in range(max(row - NMS_RADIUS, 0), min(row + NMS_RADIUS + 1, height)):
-                    for x in range(max(column - NMS_RADIUS, 0), min(column + NMS_RADIUS + 1, width)):
-                        highest = max(highest, abs(response[y, x]))
-                there = math.log(abs(response[row, column]) + floor)
-                place = k - (k > 1)
-                out[1 + place] = (there - own) * half
-                out[18 + place] = (math.log(highest + floor) - there) * half
-        out[17] = np.float32(2) * own_smooth - np.float32(1)
-        image, response, variance = smooth[level], determinant[level], variances[level]
-        for k in range(rings.shape[1]):
-            product, slopes, light = 1.0, 1.0, np.float32(0)
-            most, least = np.float32(0), np.float32(np.inf)
-            steepest, brightest, darkest = np.float32(0), np.float32(-np.inf), np.float32(np.inf)
-            for point in range(rings.shape[2]):
-                x = int(np.rint(column + rings[level, k, point, 0]))
-                y = int(np.rint(row + rings[level, k, point, 1]))
-                x, y = min(max(x, 0), width - 1), min(max(y, 0), height - 1)
-                value = abs(response[y, x])
-                product *= value + floor
-                most, least = max(most, value), min(least, value)
-                value = _slope(image, y, x, variance)
-                slopes *= value + slope_floor
-                steepest = max(steepest, value)
-                value = image[y, x] - own_smooth
-                light += value
-                brightest, darkest = max(brightest, value), min(darkest, value)
-            # The mean of logarithms is the logarithm of a product.
-            count = rings.shape[2]
-            at = 21 + 8 * k
-            out[at] = (math.log(product) / count - own) / 2
-            out[at + 1] = (math.log(most + floor) - own) * half
-            out[at + 2] = (math.log(least + floor) - own) * quarter
-            out[at + 3] = math.atan(light / count / strength / 2)
-            out[at + 4] = math.atan(brightest / strength * half)
-            out[at + 5] = math.atan(darkest / strength * half)
-            out[at + 6] = (math.log(slopes) / count - own) / 4
-            out[at + 7] = (math.log(steepest + slope_floor) - own) * quarter
+                for j in range(-2, 3):
+                    y = min(max(row + j, 0), height - 1)
+                    for i in range(-2, 3):
+                        x = min(max(column + i, 0), width - 1)
+                        value = abs(determinant[(near * height + y) * width + x])
+                        highest = value if value > highest else highest
+                logs[1 + k - (k > 1)] = abs(determinant[here]) + floor
+                logs[4 + k - (k > 1)] = highest + floor
+        for k in range(_POINTS):
+            x = column + rings[0, level, column & 1, k]
+            y = row + rings[1, level, row & 1, k]
+            x, y = min(max(x, 0), width - 1), min(max(y, 0), height - 1)
+            places[k] = start + y * width + x
+            # A gradient has no part across the border.
+            right[k] = 1 if 0 < x < width - 1 else 0
+            down[k] = width if 0 < y < height - 1 else 0
+        for k in range(_POINTS):
+            here = places[k]
+            dx = smooth[here + right[k]] - smooth[here - right[k]]
+            dy = smooth[here + down[k]] - smooth[here - down[k]]
+            response[k] = abs(determinant[here])
+            slope[k] = (dx * dx + dy * dy) * (variances[level] * quarter)
+            light[k] = smooth[here] - own_smooth
+        for k in range(RINGS):
+            most, least, steepest = response[k], response[k], slope[k]
+            total, brightest, darkest = light[k], light[k], light[k]
+            for j in range(k + RINGS, _POINTS, RINGS):
+                most = response[j] if response[j] > most else most
+                least = response[j] if response[j] < least else least
+                steepest = slope[j] if slope[j] > steepest else steepest
+                total += light[j]
+                brightest = light[j] if light[j] > brightest else brightest
+                darkest = light[j] if light[j] < darkest else darkest
+            logs[11 + k], logs[11 + RINGS + k] = most + floor, least + floor
+            logs[11 + 2 * RINGS + k] = steepest + slope_floor
+            bent[4 + k] = total / np.float32(RING_POINTS) / strength * half
+            bent[4 + RINGS + k] = brightest / strength * half
+            bent[4 + 2 * RINGS + k] = darkest / strength * half
+        # The sum of four logarithms is that of the product, which is no less than 1e-28.
+        for k in range(2 * RINGS):
+            product, slopes = np.float32(1), np.float32(1)
+            for j in range(k, _POINTS, 2 * RINGS):
+                product *= response[j] + floor
+                slopes *= slope[j] + slope_floor
+            logs[11 + 3 * RINGS + k], logs[11 + 5 * RINGS + k] = product, slopes
+        _logarithms(logs, bits, exponents)
+        _arctangents(bent)
+        own = logs[0]
+        features[n, 0] = (own + np.float32(9)) / np.float32(3)
+        features[n, 4] = np.sign(own_determinant)
+        features[n, 17] = np.float32(2) * own_smooth - np.float32(1)
+        for k in range(3):
+            features[n, 1 + k] = (logs[1 + k] - own) * half
+            features[n, 18 + k] = (logs[4 + k] - logs[1 + k]) * half
+        for k in range(4):
+            features[n, 5 + 2 * k], features[n, 6 + 2 * k] = bent[k], abs(bent[k])
+            features[n, 13 + k] = (logs[7 + k] - own) * quarter
+        for k in range(RINGS):
+            at, of_ring = 21 + 8 * k, logs[11 + k :: RINGS]
+            features[n, at] = ((of_ring[3] + of_ring[4]) / np.float32(RING_POINTS) - own) * half
+            features[n, at + 1] = (of_ring[0] - own) * half
+            features[n, at + 2] = (of_ring[1] - own) * quarter
+            for j in range(3):
+                features[n, at + 3 + j] = bent[4 + j * RINGS + k]
+            mean = (of_ring[5] + of_ring[6]) / np.float32(RING_POINTS)
+            features[n, at + 6] = (mean - own) * quarter
+            features[n, at + 7] = (of_ring[2] - own) * quarter
