@@ -43,8 +43,8 @@ BYTES_PER = {
     # Blending a panorama: a pixel of the canvas, and of the box of one image on it.
     "canvas_pixel": 22,
     "blended_pixel": 25,
-    # Five maps of float32, and room for what is made of them.
-    "pixel_of_level": 24,
+    # Two maps of float32, and room for what is made of them.
+    "pixel_of_level": 16,
     # Dense matching, at its peak.
     "dense_pixel": 700,
 }

@@ -301,26 +301,23 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
 
 
 @compiled(nogil=True, error_model="numpy")
-def keep_distant(x, y, radii, most):  # type: ignore[no-untyped-def]
-    """Return which points, best first, have no kept one closer than the smaller of their radii.
+def keep_distant(cell, columns, x, y, radii, last, before, kept):  # type: ignore[no-untyped-def]
+    """Find points, best first, that have no kept one closer than the smaller of their radii.
 
-    At most so many; positions are 0 or more. Kept points are chained by square cells: `newest`
-    holds the last one of each cell, `before` the one before each point; both -1 where there is
-    none.
+    Writes as many as there are, or as `kept` has room for, and returns their number. Positions are
+    0 or more. Kept points are chained by square cells: `last` holds the last one of each cell,
+    `before` the one before each point; both are -1 where there is none.
     """
-    cell = radii.min()
-    columns, rows = int(x.max() / cell) + 1, int(y.max() / cell) + 1
-    newest, before = np.full(rows * columns, -1), np.full(len(x), -1)
-    kept, count = np.empty(len(x), np.int64), 0
+    rows, count = len(last) // columns, 0
     for k in range(len(x)):
-        if count == most:
+        if count == len(kept):
             break
         row, column, reach = int(y[k] / cell), int(x[k] / cell), math.ceil(radii[k] / cell)
         left, right = max(column - reach, 0), min(column + reach + 1, columns)
         free = True
         for r in range(max(row - reach, 0), min(row + reach + 1, rows)):
             for near in range(r * columns + left, r * columns + right):
-                other = newest[near]
+                other = last[near]
                 while other >= 0 and free:
                     radius = min(radii[k], radii[other])
                     free = (x[other] - x[k]) ** 2 + (y[other] - y[k]) ** 2 >= radius * radius
@@ -329,8 +326,8 @@ def keep_distant(x, y, radii, most):  # type: ignore[no-untyped-def]
             kept[count] = k
             count += 1
             own = row * columns + column
-            before[k], newest[own] = newest[own], k
-    return kept[:count]
+            before[k], last[own] = last[own], k
+    return count
 
 
 # Products and sums are fused where OpenCV fuses them: its results, to the last bit.
@@ -400,13 +397,17 @@ def strongest_directions(image, pixels, windows):  # type: ignore[no-untyped-def
     for window in windows:
         side = max(side, 2 * int(np.rint(RADIUS_PER_WINDOW * window)) + 1)
     room = min(side, height) * min(side, width)
-    dx, dy, weights = np.empty((3, room), np.float32)
+    dx, dy, weights = (
+        np.empty(room, np.float32),
+        np.empty(room, np.float32),
+        np.empty(room, np.float32),
+    )
     bins = np.empty(room, np.int32)
     across = np.empty(min(side, width), np.float32)
     votes, smooth = np.empty((2, BINS + 1)), np.empty(BINS)
     p1, p3, p5, p7 = _ATAN
     for n in range(len(pixels)):
-        column, row = pixels[n]
+        column, row = pixels[n, 0], pixels[n, 1]
         radius = int(np.rint(RADIUS_PER_WINDOW * windows[n]))
         left, right = max(column - radius, 1), min(column + radius + 1, width - 1)
         for x in range(left, right):
@@ -431,11 +432,13 @@ def strongest_directions(image, pixels, windows):  # type: ignore[no-untyped-def
             angle = angle if dy[k] >= 0 else np.float32(360) - angle
             bins[k] = np.int32(np.rint(angle * np.float32(BINS / 360)))
             weights[k] *= np.sqrt(x * x + y * y)
-        votes[:] = 0
+        for k in range(BINS + 1):
+            votes[0, k] = votes[1, k] = 0
         for k in range(count):
             votes[k & 1, bins[k]] += weights[k]
-        votes[0] += votes[1]
-        votes[0, 0] += votes[0, BINS]
+        for k in range(BINS):
+            votes[0, k] += votes[1, k]
+        votes[0, 0] += votes[0, BINS] + votes[1, BINS]
         best = 0
         for k in range(BINS):
             near = votes[0, (k - 1) % BINS] + votes[0, (k + 1) % BINS]

@@ -76,7 +76,11 @@ def suppress_neighbors(
     positions = np.asarray(xy, np.float64).reshape(-1, 2)[order]
     x, y = np.ascontiguousarray((positions - positions.min(0)).T)
     radii = np.broadcast_to(np.asarray(radius_px, np.float64), len(order))[order]
-    return order[keep_distant(x, y, radii, len(order) if max_count is None else max_count)]
+    cell = float(radii.min())
+    columns, rows = int(x.max() / cell) + 1, int(y.max() / cell) + 1
+    kept = np.empty(len(order) if max_count is None else min(max_count, len(order)), np.int64)
+    chains = np.full(rows * columns, -1), np.full(len(order), -1)
+    return order[kept[: keep_distant(cell, columns, x, y, radii, *chains, kept)]]
 
 
 def spread_by_distance(xy: np.ndarray, scores: np.ndarray, count: int) -> np.ndarray:

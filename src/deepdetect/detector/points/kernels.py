@@ -66,23 +66,20 @@ def find_peaks(determinant):  # type: ignore[no-untyped-def]
     """
     height, width = determinant.shape
     lines = np.zeros((5, width), np.float32)  # magnitudes in five rows
-    highest = np.zeros((2, width + 4), np.float32)
-    down, across = highest[0, 2:-2], highest[1, 2:-2]
+    every, across = np.zeros(width + 4, np.float32), np.empty(width, np.float32)
+    down = every[2:-2]
     is_peak = np.zeros((width + 7) // 8 * 8, np.bool_)
     eight = is_peak.view(np.uint64)
     places = np.empty((2, height * width), np.int32)
     count = 0
     for row in range(-2, height - 1):
         last = lines[(row + 2) % 5]
-        last[:] = 0
-        if row + 2 < height:
-            values = determinant[row + 2]
-            for x in range(width):
-                last[x] = abs(values[x])
+        values = determinant[min(row + 2, height - 1)]
+        for x in range(width):
+            last[x] = abs(values[x]) if row + 2 < height else np.float32(0)
         if row < 1:
             continue
         _largest(lines[0], lines[1], lines[2], lines[3], lines[4], down)
-        every = highest[0]
         _largest(every, every[1:], every[2:], every[3:], every[4:], across)
         here = lines[row % 5]
         for x in range(width):
@@ -172,10 +169,11 @@ def measure_candidates(  # type: ignore[no-untyped-def]
     levels, height, width = shape
     floor, slope_floor, strength_floor = floors
     half, quarter = np.float32(0.5), np.float32(0.25)
-    places, right, down = np.empty((3, _POINTS), np.int64)
-    response, slope, light = np.empty((3, _POINTS), np.float32)
+    steps, values = np.empty((3, _POINTS), np.int64), np.empty((3, _POINTS), np.float32)
+    places, right, down = steps[0], steps[1], steps[2]
+    response, slope, light = values[0], values[1], values[2]
     # Of these: itself; three neighbours, the highest there; four gradients; the rings.
-    logs, exponents = np.ones((2, _LOGARITHMS), np.float32)
+    logs, exponents = np.ones(_LOGARITHMS, np.float32), np.empty(_LOGARITHMS, np.float32)
     bits = logs.view(np.int32)
     bent = np.empty(4 + 3 * RINGS, np.float32)
     for n in range(first, last):
