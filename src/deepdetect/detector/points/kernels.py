@@ -17,7 +17,6 @@ LEAST_RESPONSE = 1e-8
 
 RINGS, RING_POINTS = 4, 8
 _POINTS = RINGS * RING_POINTS
-_LOGARITHMS = -(-(11 + 7 * RINGS) // 8) * 8
 
 
 @compiled(nogil=True, error_model="numpy")
@@ -32,17 +31,14 @@ def differentiate(first, last, smooth, variance, determinant):  # type: ignore[n
         here, out = smooth[row], determinant[row]
         above = smooth[row - 1 if row else min(1, height - 1)]
         below = smooth[row + 1 if row + 1 < height else max(height - 2, 0)]
-        before, after, inner = here[:-2], here[2:], here[1:-1]
-        above_before, above_inner, above_after = above[:-2], above[1:-1], above[2:]
-        below_before, below_inner, below_after = below[:-2], below[1:-1], below[2:]
-        responses = out[1:-1]
+        above1, above2, here1, here2 = above[1:], above[2:], here[1:], here[2:]
+        below1, below2, inner = below[1:], below[2:], out[1:]
         for x in range(width - 2):
             # In this order: the differences are small, so that little is rounded.
-            double = np.float32(2) * inner[x]
-            xx = (before[x] - double) + after[x]
-            yy = (above_inner[x] - double) + below_inner[x]
-            xy = (below_after[x] - below_before[x]) - (above_after[x] - above_before[x])
-            responses[x] = (xx * yy - xy * xy * np.float32(1 / 16)) * scale
+            double = np.float32(2) * here1[x]
+            xx, yy = (here[x] - double) + here2[x], (above1[x] - double) + below1[x]
+            xy = (below2[x] - below[x]) - (above2[x] - above[x])
+            inner[x] = (xx * yy - xy * xy * np.float32(1 / 16)) * scale
         for x, beside in ((0, min(1, width - 1)), (width - 1, max(width - 2, 0))):
             double = np.float32(2) * here[x]
             xx, yy = (here[beside] - double) + here[beside], (above[x] - double) + below[x]
@@ -113,31 +109,6 @@ def _offset(before, middle, after):  # type: ignore[no-untyped-def]
 
 
 @compiled(nogil=True, error_model="numpy")
-def _logarithms(values, bits, exponents):  # type: ignore[no-untyped-def]
-    """Replace positive float32 numbers by their logarithms, several at once (Cephes).
-
-    `bits` are the same memory as int32, `exponents` room for as many float32.
-    """
-    for k in range(len(values)):
-        exponents[k] = (bits[k] >> np.int32(23)) - np.int32(127)
-        bits[k] = (bits[k] & np.int32(0x7FFFFF)) | np.int32(0x3F800000)
-    for k in range(len(values)):
-        large = values[k] > np.float32(1.41421356)
-        x = (values[k] * np.float32(0.5) if large else values[k]) - np.float32(1)
-        power = exponents[k] + (np.float32(1) if large else np.float32(0))
-        series = np.float32(7.0376836292e-2) * x - np.float32(1.1514610310e-1)
-        series = series * x + np.float32(1.1676998740e-1)
-        series = series * x - np.float32(1.2420140846e-1)
-        series = series * x + np.float32(1.4249322787e-1)
-        series = series * x - np.float32(1.6668057665e-1)
-        series = series * x + np.float32(2.0000714765e-1)
-        series = series * x - np.float32(2.4999993993e-1)
-        series = series * x + np.float32(3.3333331174e-1)
-        small = series * x * x * x - np.float32(2.12194440e-4) * power
-        values[k] = (small - np.float32(0.5) * x * x) + x + np.float32(0.693359375) * power
-
-
-@compiled(nogil=True, error_model="numpy")
 def _arctangents(values):  # type: ignore[no-untyped-def]
     """Replace float32 numbers by their arctangents, several at once (Cephes)."""
     for k in range(len(values)):
@@ -173,9 +144,7 @@ def measure_candidates(  # type: ignore[no-untyped-def]
     places, right, down = steps[0], steps[1], steps[2]
     response, slope, light = values[0], values[1], values[2]
     # Of these: itself; three neighbours, the highest there; four gradients; the rings.
-    logs, exponents = np.ones(_LOGARITHMS, np.float32), np.empty(_LOGARITHMS, np.float32)
-    bits = logs.view(np.int32)
-    bent = np.empty(4 + 3 * RINGS, np.float32)
+    logs, bent = np.empty(11 + 7 * RINGS, np.float32), np.empty(4 + 3 * RINGS, np.float32)
     for n in range(first, last):
         level, row, column = candidates[n, 0], candidates[n, 1], candidates[n, 2]
         pixel, start = row * width + column, level * height * width
@@ -239,7 +208,8 @@ def measure_candidates(  # type: ignore[no-untyped-def]
                 product *= response[j] + floor
                 slopes *= slope[j] + slope_floor
             logs[11 + 3 * RINGS + k], logs[11 + 5 * RINGS + k] = product, slopes
-        _logarithms(logs, bits, exponents)
+        for k in range(len(logs)):
+            logs[k] = math.log(logs[k])
         _arctangents(bent)
         own = logs[0]
         features[n, 0] = (own + np.float32(9)) / np.float32(3)
