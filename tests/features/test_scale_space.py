@@ -7,12 +7,7 @@ import numpy as np
 import pytest
 
 from deepdetect.features.keypoints import Keypoints
-from deepdetect.features.scale_space import (
-    dominant_angles,
-    gaussian_blur,
-    gaussian_layers,
-    nearest_layers,
-)
+from deepdetect.features.scale_space import dominant_angles, gaussian_layers, nearest_layers
 from deepdetect.io.image import luma
 
 
@@ -50,15 +45,6 @@ def test_layers_are_the_blurred_image_at_their_scale() -> None:
         for row, column in inner:
             expected = whole[int(row * step), int(column * step)]
             assert image[row, column] == pytest.approx(expected, abs=3)
-
-
-@pytest.mark.parametrize("shape", [(60, 96), (70, 45), (5, 120), (3, 2), (1, 1)], ids=str)
-@pytest.mark.parametrize("sigma", [0.9, 2.5, 11.1])
-def test_the_blur_is_that_of_opencv(shape: tuple[int, int], sigma: float) -> None:
-    image = np.random.default_rng(0).uniform(0, 255, shape).astype(np.float32)
-    expected = cv2.GaussianBlur(image, (0, 0), sigma)
-    np.testing.assert_allclose(gaussian_blur(image, sigma), expected, rtol=1e-6)
-    np.testing.assert_array_equal(gaussian_blur(image, sigma, np.empty_like(image)), expected)
 
 
 def gap(first: np.ndarray, second: np.ndarray) -> np.ndarray:

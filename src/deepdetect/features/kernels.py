@@ -330,53 +330,6 @@ def keep_distant(cell, columns, x, y, radii, last, before, kept):  # type: ignor
     return count
 
 
-# Products and sums are fused where OpenCV fuses them: its results, to the last bit.
-@compiled(nogil=True, fastmath={"contract"})
-def blur_rows(first, last, image, taps, mirrored, out):  # type: ignore[no-untyped-def]
-    """Weigh the pixels along some rows by `taps`, in fours, and write them from column 0.
-
-    `mirrored` are the columns under the first tap, then the second, ... of all of a row.
-    """
-    width = image.shape[1]
-    padded = np.zeros(width + len(taps) + 4, np.float32)
-    radius = (len(mirrored) - width) // 2
-    for row in range(first, last):
-        here, inner, sums = image[row], padded[radius:], out[row]
-        for x in range(radius):
-            padded[x] = here[mirrored[x]]
-            inner[width + x] = here[mirrored[radius + width + x]]
-        for x in range(width):
-            inner[x] = here[x]
-            sums[x] = 0
-        for k in range(0, len(taps), 4):
-            a, b, c, d = padded[k:], padded[k + 1 :], padded[k + 2 :], padded[k + 3 :]
-            wa, wb, wc, wd = taps[k], taps[k + 1], taps[k + 2], taps[k + 3]
-            for x in range(width):
-                sums[x] = sums[x] + wa * a[x] + wb * b[x] + wc * c[x] + wd * d[x]
-
-
-@compiled(nogil=True, fastmath={"contract"})
-def blur_columns(first, last, image, taps, mirrored, out):  # type: ignore[no-untyped-def]
-    """Weigh the pixels along the columns, of some rows of the result.
-
-    `taps` are the middle one, and the next in fours; `mirrored` as of `blur_rows`, but of rows.
-    """
-    height, width = out.shape
-    radius = (len(mirrored) - height) // 2
-    for row in range(first, last):
-        sums, middle = out[row], image[row]
-        for x in range(width):
-            sums[x] = taps[0] * middle[x]
-        for k in range(1, radius + 1, 4):
-            above, below = mirrored[radius + row - k :: -1], mirrored[radius + row + k :]
-            a0, a1, a2, a3 = image[above[0]], image[above[1]], image[above[2]], image[above[3]]
-            b0, b1, b2, b3 = image[below[0]], image[below[1]], image[below[2]], image[below[3]]
-            w0, w1, w2, w3 = taps[k], taps[k + 1], taps[k + 2], taps[k + 3]
-            for x in range(width):
-                some = sums[x] + w0 * (b0[x] + a0[x]) + w1 * (b1[x] + a1[x])
-                sums[x] = some + w2 * (b2[x] + a2[x]) + w3 * (b3[x] + a3[x])
-
-
 # Of OpenCV's arctangent, in degrees: the same bins are voted for.
 _ATAN = tuple(
     np.float32(np.float32(c) * np.float32(180 / np.pi))

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
 
 LAYERS = 3
@@ -21,40 +20,8 @@ CAMERA_SIGMA_PX = 0.5
 SIZE_PER_SIGMA = 2.0
 """OpenCV's keypoints of SIFT have this many times the sigma of their scale as their size."""
 
-LEAST_OWN_SIGMA_PX = 2.0
-"""Of `gaussian_blur`: OpenCV is quicker below it."""
-
 MIN_SIDE_PX = 8
 """Octaves with a shorter side are not used."""
-
-
-def gaussian_blur(image: np.ndarray, sigma: float, out: np.ndarray | None = None) -> np.ndarray:
-    """Blur a (H, W) float32 image as OpenCV's `GaussianBlur` does, in half its time.
-
-    The results are equal where the processor has the instructions AVX2 and FMA.
-    """
-    from .kernels import blur_columns, blur_rows
-
-    if sigma < LEAST_OWN_SIGMA_PX:
-        return cv2.GaussianBlur(image, (0, 0), sigma, dst=out)
-    radius = round(8 * sigma + 1) // 2
-    more = -(-radius // 4) * 4  # taps are weighed in fours
-    taps = np.zeros(2 * more + 4, np.float32)
-    taps[more - radius : more + radius + 1] = cv2.getGaussianKernel(
-        2 * radius + 1, sigma, cv2.CV_32F
-    )[:, 0]
-    columns, rows = (
-        np.pad(np.arange(side, dtype=np.int32), more, "reflect") for side in image.shape[::-1]
-    )
-    out = np.empty_like(image) if out is None else out
-    # Wider, as rows that are a power of two apart would share a part of the cache.
-    across = np.empty((len(image), image.shape[1] + 16), np.float32)
-    parallel_for(len(image), blur_rows, image, taps, columns, across)
-    parallel_for(len(image), blur_columns, across, taps[more:], rows, out)
-    if last := image.shape[1] % 8:  # OpenCV does not fuse these
-        left = max(0, (image.shape[1] - radius) // 8 * 8 - 8)
-        out[:, -last:] = cv2.GaussianBlur(image[:, left:], (0, 0), sigma)[:, -last:]
-    return out
 
 
 def nearest_layers(sizes: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -98,7 +65,7 @@ def gaussian_layers(
         for layer in range(LAYERS + 1):
             wanted = BASE_SIGMA_PX * 2 ** (layer / LAYERS)
             if wanted > sigma:
-                image = gaussian_blur(image, (wanted**2 - sigma**2) ** 0.5)
+                image = cv2.GaussianBlur(image, (0, 0), (wanted**2 - sigma**2) ** 0.5)
                 sigma = wanted
             yield octave, layer, image
         image = np.ascontiguousarray(image[::2, ::2])

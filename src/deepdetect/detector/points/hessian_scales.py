@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 
-from ..._shared.machine import parallel_for
-from ...features.scale_space import gaussian_blur
+from ..._shared.opencv import cv2
+from ...features.selection import peak_offset
 from ...features.spacing import descending_order
+
+NMS_RADIUS = 2
+"""A candidate is the maximum of a window of 5x5 in its level."""
 
 SIGMAS_PX = 1.5 * 1.35 ** np.arange(-1.0, 9)
 """Of the Gaussians of all levels, in pixels: seven that have candidates, and one finer and two
 coarser ones, which only the ranking looks at."""
+
+LEAST_RESPONSE = 1e-8
+"""Of a candidate, in an image with values in [0, 1]: less is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +76,8 @@ def build_scale_space(gray: np.ndarray) -> ScaleSpace:
     for k, sigma in enumerate(SIGMAS_PX):
         # Gaussians add up by their variances: each level smooths the one before.
         step = float(np.sqrt(sigma**2 - reached**2))
-        current, reached = gaussian_blur(current, step, out=smooth[k]), sigma
-        parallel_for(gray.shape[0], differentiate, smooth[k], space.variances[k], determinant[k])
+        current, reached = cv2.GaussianBlur(current, (0, 0), step, dst=smooth[k]), sigma
+        differentiate(smooth[k], space.variances[k], determinant[k])
     return space
 
 
@@ -82,19 +87,20 @@ def find_candidates(space: ScaleSpace) -> Candidates:
     Their positions are refined by a parabola in x and in y. There are none in the outermost rows
     and columns.
     """
-    from .kernels import find_peaks
-
-    found: list[Any] = [None] * (len(space.sigmas_px) - 3)
-
-    def find(first: int, last: int) -> None:
-        for k in range(first, last):
-            found[k] = find_peaks(space.determinant[k + 1])
-
-    parallel_for(len(found), find)
-    pixels, xy = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    level = np.repeat(np.arange(1, 1 + len(found)), [len(part) for part, _ in found])
-    row, column = pixels.T
-    strength = np.abs(space.determinant[level, row, column])
+    pixels, positions, strengths = [], [], []
+    window = np.ones((2 * NMS_RADIUS + 1,) * 2, np.uint8)
+    for k in range(1, len(space.sigmas_px) - 2):
+        response = np.abs(space.determinant[k])
+        peak = (response == cv2.dilate(response, window)) & (response > LEAST_RESPONSE)
+        row, column = np.add(np.divmod(np.flatnonzero(peak[1:-1, 1:-1]), response.shape[1] - 2), 1)
+        x = column + peak_offset(response, row, column, axis=1)
+        y = row + peak_offset(response, row, column, axis=0)
+        pixels.append(np.stack([np.full(len(row), k), row, column]))
+        positions.append(np.stack([x, y], 1))
+        strengths.append(response[row, column])
+    level, row, column = np.concatenate(pixels, 1)
+    strength = np.concatenate(strengths)
     rank = np.empty(len(level), np.int64)
     rank[descending_order(strength)] = np.arange(len(level))
+    xy = np.concatenate(positions)
     return Candidates(level, row, column, xy, space.sigmas_px[level], strength, rank)

@@ -1,4 +1,4 @@
-"""Compiled parts of the detection of points: derivatives, maxima, measurements of candidates.
+"""Compiled parts of the detection of points: derivatives, measurements of candidates.
 
 Loops over neighbours in memory are written so that the compiler does several at once.
 """
@@ -10,24 +10,20 @@ import math
 import numpy as np
 
 from ..._shared.kernels import compiled
-from ...features.selection import MAX_OFFSET_PX
-
-LEAST_RESPONSE = 1e-8
-"""Of a candidate, in an image with values in [0, 1]: less is rounding."""
 
 RINGS, RING_POINTS = 4, 8
 _POINTS = RINGS * RING_POINTS
 
 
 @compiled(nogil=True, error_model="numpy")
-def differentiate(first, last, smooth, variance, determinant):  # type: ignore[no-untyped-def]
-    """Compute the determinant of the Hessian, normalised by the variance, of some rows.
+def differentiate(smooth, variance, determinant):  # type: ignore[no-untyped-def]
+    """Compute the determinant of the Hessian, normalised by the variance.
 
     By central differences in a (H, W) float32 image that is mirrored at its outermost pixels.
     """
     height, width = smooth.shape
     scale = variance * variance
-    for row in range(first, last):
+    for row in range(height):
         here, out = smooth[row], determinant[row]
         above = smooth[row - 1 if row else min(1, height - 1)]
         below = smooth[row + 1 if row + 1 < height else max(height - 2, 0)]
@@ -43,69 +39,6 @@ def differentiate(first, last, smooth, variance, determinant):  # type: ignore[n
             double = np.float32(2) * here[x]
             xx, yy = (here[beside] - double) + here[beside], (above[x] - double) + below[x]
             out[x] = xx * yy * scale
-
-
-@compiled(nogil=True, error_model="numpy")
-def _largest(a, b, c, d, e, out):  # type: ignore[no-untyped-def]
-    for x in range(len(out)):
-        first = a[x] if a[x] > b[x] else b[x]
-        second = c[x] if c[x] > d[x] else d[x]
-        first = first if first > second else second
-        out[x] = first if first > e[x] else e[x]
-
-
-@compiled(nogil=True, error_model="numpy")
-def find_peaks(determinant):  # type: ignore[no-untyped-def]
-    """Return (N, 2) pixels (row, column), and (N, 2) positions (x, y), of maxima of |determinant|.
-
-    In windows of 5x5, and none in the outermost rows and columns.
-    """
-    height, width = determinant.shape
-    lines = np.zeros((5, width), np.float32)  # magnitudes in five rows
-    every, across = np.zeros(width + 4, np.float32), np.empty(width, np.float32)
-    down = every[2:-2]
-    is_peak = np.zeros((width + 7) // 8 * 8, np.bool_)
-    eight = is_peak.view(np.uint64)
-    places = np.empty((2, height * width), np.int32)
-    count = 0
-    for row in range(-2, height - 1):
-        last = lines[(row + 2) % 5]
-        values = determinant[min(row + 2, height - 1)]
-        for x in range(width):
-            last[x] = abs(values[x]) if row + 2 < height else np.float32(0)
-        if row < 1:
-            continue
-        _largest(lines[0], lines[1], lines[2], lines[3], lines[4], down)
-        _largest(every, every[1:], every[2:], every[3:], every[4:], across)
-        here = lines[row % 5]
-        for x in range(width):
-            is_peak[x] = (here[x] == across[x]) & (here[x] > np.float32(LEAST_RESPONSE))
-        for part in range(len(eight)):
-            if eight[part]:
-                for x in range(max(8 * part, 1), min(8 * part + 8, width - 1)):
-                    if is_peak[x]:
-                        places[0, count], places[1, count] = row, x
-                        count += 1
-    pixels = np.empty((count, 2), np.int64)
-    xy = np.empty((count, 2))
-    for k in range(count):
-        row, x = places[0, k], places[1, k]
-        middle = determinant[row, x]
-        pixels[k, 0], pixels[k, 1] = row, x
-        xy[k, 0] = x + _offset(determinant[row, x - 1], middle, determinant[row, x + 1])
-        xy[k, 1] = row + _offset(determinant[row - 1, x], middle, determinant[row + 1, x])
-    return pixels, xy
-
-
-@compiled(nogil=True, error_model="numpy")
-def _offset(before, middle, after):  # type: ignore[no-untyped-def]
-    """Return where a parabola through the magnitudes of three pixels has its maximum."""
-    before, middle = np.float64(abs(before)), np.float64(abs(middle))
-    after = np.float64(abs(after))
-    bend = 2 * middle - before - after
-    if bend <= 0:
-        return 0.0
-    return min(max((after - before) / (2 * bend), -MAX_OFFSET_PX), MAX_OFFSET_PX)
 
 
 @compiled(nogil=True, error_model="numpy")
