@@ -31,23 +31,24 @@ RESULTS_FOLDER = ROOT / "docs" / "results"
 BLOCK = re.compile(r"(<!-- results:([\w-]+)(?: (.*?))? -->\n).*?(<!-- /results -->)", re.DOTALL)
 
 BENCHMARK = "-m deepdetect benchmark {} --data {{data}} -o {{output}}"
+XFEAT = " --method {published}/peers/xfeat_2048_600x800.onnx"
 STAGES = {
     **{
         name: BENCHMARK.format(words)
         for name, words in {
             "oxford-paper": "oxford --protocol paper",
-            "oxford-standard": "oxford --protocol standard",
+            "oxford-standard": "oxford --protocol standard" + XFEAT,
             "oxford-points": "oxford --protocol standard --baselines "
             "sift,fast,harris,hessian,hessian-scales",
             "oxford-guided": "oxford --protocol guided",
             "hpatches": "hpatches --protocol paper",
-            "foreground": "foreground",
-            "low-visibility": "low-visibility --protocol paper",
+            "foreground": "foreground" + XFEAT,
+            "low-visibility": "low-visibility --protocol paper" + XFEAT,
             "oxford-published": "oxford --protocol paper --baselines none --preset published "
             "--weights {published}/published_matching.safetensors",
             "middlebury": "middlebury --geometry-weights dense "
             "--geometry-weights {published}/published_reconstruction.safetensors",
-            "speed": "speed",
+            "speed": "speed" + XFEAT,
         }.items()
     },
     "label-prediction": "-m deepdetect evaluate {data}/label-samples/val --json "
@@ -242,7 +243,7 @@ def main() -> None:
     """Run what is asked for, then fill the blocks."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("data", nargs="?", type=Path, help="folder of the data sets")
-    parser.add_argument("--published", type=Path, help="folder of the authors' weights")
+    parser.add_argument("--published", type=Path, help="folder of others' weights")
     parser.add_argument("--only", nargs="+", choices=sorted(RESULTS), default=sorted(RESULTS))
     parser.add_argument("--work", type=Path, default=ROOT / "build" / "results")
     parser.add_argument("--check", action="store_true", help="fill no block, compare them")
@@ -261,7 +262,7 @@ def run_stage(stage: str, data: Path, published: Path | None, work: Path) -> Non
     """Run what makes a report; of a benchmark what its cache holds is not made again."""
     folder = work / stage
     if published is None and "{published}" in STAGES[stage]:
-        raise SystemExit(f"the stage {stage} needs the authors' weights: give --published")
+        raise SystemExit(f"the stage {stage} needs weights of others: give --published")
     places = {"data": data, "output": folder, "published": published}
     words = [word.format(**places) for word in STAGES[stage].split()]
     print(shlex.join(words), flush=True)
