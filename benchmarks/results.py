@@ -124,6 +124,9 @@ RESULTS = {
     "correct-matches": Result(
         "oxford-paper", "oxford_matches", {pair: (pair, ".0f") for pair in PAIRS}
     ),
+    "correct-matches-figure-6": Result(
+        "oxford-paper", "oxford_figure6", {pair: (pair, ".0f") for pair in ("graf 1-3", *PAIRS[1:])}
+    ),
     "published-weights": Result(
         "oxford-published",
         "oxford_density",
@@ -216,6 +219,9 @@ RESULTS = {
             "over random": ("over that of random points", ".2f"),
             "density": ("keypoints per pixel", ".3f"),
         },
+    ),
+    "low-visibility-density": Result(
+        "low-visibility", "low_visibility_density", {s: (s, ".3f") for s in ("dusty", "smoky")}
     ),
     "low-visibility-matches": Result(
         "low-visibility",
