@@ -3,12 +3,11 @@
     python benchmarks/published_pipeline.py DATA [--geometry-weights dense] [--rounds 5]
 
 DATA holds oxford/ and middlebury/. End to end, from two images in memory to the count of correct
-matches (wall 1-6, graf 1-3, cones), and to the points of a stereo scene (all of middlebury/).
+matches (wall 1-6, graf 1-3, cones). `deepdetect benchmark middlebury` has both pipelines' points.
 
 Published: torch without compilation, lists of `cv2.KeyPoint`, OpenCV's SIFT, FLANN, loops in
-Python. Ours: the default backend, dense RootSIFT, patchmatch, descriptors alone; `reconstruct` for
-stereo. Both sides run the same weights in turn, matching on images squashed to 480x480; the first
-round compiles and is not counted.
+Python. Ours: the default backend, dense RootSIFT, patchmatch, descriptors alone. Both sides run the
+same weights in turn, on images squashed to 480x480; the first round compiles and is not counted.
 """
 
 from __future__ import annotations
@@ -28,12 +27,9 @@ from deepdetect import (
     WeightsError,
     load_image,
     match_images,
-    reconstruct,
 )
 from deepdetect.datasets.middlebury import (
-    CalibratedStereoPair,
     StereoPair,
-    load_calibrated_pair,
     load_middlebury,
 )
 from deepdetect.datasets.planar import PlanarPair, load_oxford
@@ -42,12 +38,6 @@ from deepdetect.detector.pretrained import PRETRAINED
 from deepdetect.evaluation.profiling import profiled
 from deepdetect.evaluation.protocols.paper import CORRECT_PX
 from deepdetect.evaluation.protocols.planar import select_pairs
-from deepdetect.evaluation.protocols.stereo_pipelines import (
-    PAPER_FLANN_CHECKS,
-    PAPER_FLANN_TREES,
-    essential_inliers,
-    paper_settings,
-)
 from deepdetect.evaluation.report import Row, Table
 from deepdetect.geometry import disparity_errors, transform_points
 
@@ -64,7 +54,7 @@ Judge = Callable[[float, float, float, float], bool]
 
 
 def main() -> None:
-    """Print a table of matches, and one of stereo points."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--weights", default="default")
@@ -78,18 +68,12 @@ def main() -> None:
     stereo = load_middlebury(arguments.data / "middlebury" / STEREO)
     sides[STEREO] = stereo_sides(stereo, dense.configured(HeatmapOptions(480)))
     rows = [{"pair": name, **compare(*both, arguments.rounds)} for name, both in sides.items()]
-    print(table("correct", rows).to_markdown())
-    rows = []
-    for folder in sorted(
-        path.parent for path in (arguments.data / "middlebury").glob("*/calib.json")
-    ):
-        scene = load_calibrated_pair(folder)
-        rows.append({"pair": folder.name, **compare(*reconstruction_sides(scene, dense), 1)})
-    print("\n" + table("points", rows).to_markdown())
+    print(table(rows).to_markdown())
 
 
-def table(counted: str, rows: Sequence[Row]) -> Table:
-    """Tabulate the rows of `compare`, whose counts are `counted`."""
+def table(rows: Sequence[Row]) -> Table:
+    """Tabulate the rows of `compare`."""
+    counted = "correct"
     columns = {"pair": "", **{f"{side}, s": ".2f" for side in SIDES}}
     columns |= dict.fromkeys(("times faster", "lowest", "highest"), ".1f")
     columns |= {f"{side}: {counted}": ",d" for side in SIDES}
@@ -176,19 +160,6 @@ def _sides(
     return partial(published_pipeline, images, torch_detector, one), ours
 
 
-def reconstruction_sides(
-    scene: CalibratedStereoPair, detector: DeepDetect
-) -> tuple[Callable[[], int], Callable[[], int]]:
-    """Return both sides' counts of points of a stereo scene."""
-    squashed = published_detector(detector.configured(HeatmapOptions(480, "bgr")))
-
-    def ours() -> int:
-        images = scene.left, scene.right
-        return len(reconstruct(*images, detector, calibration=scene.calibration, rectified=True))
-
-    return lambda: len(published_points(scene, squashed)[0]), ours
-
-
 def published_detector(detector: DeepDetect) -> DeepDetect:
     """Return a detector of the same weights run by torch without compilation.
 
@@ -219,23 +190,9 @@ def published_pipeline(images: Images, detector: DeepDetect, correct: Judge) -> 
 
 
 def published_matches(
-    images: Images,
-    detector: DeepDetect,
-    ratio: float = RATIO,
-    trees: int = TREES,
-    checks: int = CHECKS,
+    images: Images, detector: DeepDetect
 ) -> tuple[Sequence[cv2.KeyPoint], Sequence[cv2.KeyPoint], list[cv2.DMatch]]:
-    """Detect, describe and match two images.
-
-    Args:
-        images: two, (H, W, 3) uint8 RGB.
-        detector: of `published_detector`.
-        ratio: of the ratio test.
-        trees, checks: of FLANN.
-
-    Returns:
-        The keypoints of both images and the matches that pass.
-    """
+    """Return the keypoints of both images, and the matches that pass the ratio test."""
     sift = cv2.SIFT_create()
     keypoints = []
     for image in images:
@@ -247,29 +204,12 @@ def published_matches(
     )
     if not first or not second:
         return first, second, []
-    matcher = cv2.FlannBasedMatcher({"algorithm": 1, "trees": trees}, {"checks": checks})
+    matcher = cv2.FlannBasedMatcher({"algorithm": 1, "trees": TREES}, {"checks": CHECKS})
     good = []
     for best, next_best in matcher.knnMatch(descriptors0, descriptors1, k=2):
-        if best.distance / (next_best.distance + 1e-12) < ratio:
+        if best.distance / (next_best.distance + 1e-12) < RATIO:
             good.append(best)
     return first, second, good
-
-
-def published_points(
-    scene: CalibratedStereoPair, detector: DeepDetect
-) -> tuple[np.ndarray, np.ndarray]:
-    """Match a stereo pair and keep what the essential matrix leaves, with the authors' settings.
-
-    Returns:
-        (M, 2) and (M, 2) float64 positions of the matches that are left.
-    """
-    ratio, camera_matrix = paper_settings(scene)
-    first, second, good = published_matches(
-        (scene.left, scene.right), detector, ratio, PAPER_FLANN_TREES, PAPER_FLANN_CHECKS
-    )
-    points0 = np.array([first[match.queryIdx].pt for match in good]).reshape(-1, 2)
-    points1 = np.array([second[match.trainIdx].pt for match in good]).reshape(-1, 2)
-    return essential_inliers(points0, points1, camera_matrix)
 
 
 if __name__ == "__main__":

@@ -54,6 +54,6 @@ def test_both_sides_are_run_in_turn(script: ModuleType) -> None:
 
     found = script.compare(side("published", 3), side("ours", 5), rounds=2)
     assert ran == ["published", "ours"] * 3
-    (row,) = script.table("correct", [{"pair": "wall 1-6", **found}]).values()
+    (row,) = script.table([{"pair": "wall 1-6", **found}]).values()
     assert (row["published: correct"], row["ours: correct"]) == (3, 5)
     assert row["lowest"] <= row["times faster"] <= row["highest"]
