@@ -28,7 +28,7 @@ from deepdetect._shared.provenance import provenance
 
 ROOT = Path(__file__).parents[1]
 RESULTS_FOLDER = ROOT / "docs" / "results"
-BLOCK = re.compile(r"(<!-- results:([\w-]+)(?: (.*?))? -->\n).*?(<!-- /results -->)", re.DOTALL)
+BLOCK = re.compile(r"(<!-- results:([\w-]+)(?: ([^\n]*?))? -->\n).*?(<!-- /results -->)", re.DOTALL)
 
 BENCHMARK = "-m deepdetect benchmark {} --data {{data}} -o {{output}}"
 XFEAT = " --method {published}/peers/xfeat_2048_600x800.onnx"
