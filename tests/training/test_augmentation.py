@@ -115,6 +115,32 @@ def test_all_of_it_comes_from_inside() -> None:
     assert max(edges) > 1.6
 
 
+def test_views_that_are_not_turned_keep_the_pixels_of_an_image_of_their_size() -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (96, 96, 3), np.uint8)
+    turned = [np.rot90(rgb[:, ::step], k) for step in (1, -1) for k in range(4)]
+    drawn = set()
+    for seed in range(60):
+        view = augmentation._upright_crop(rgb, 96, np.random.default_rng(seed))
+        drawn |= {k for k, expected in enumerate(turned) if np.array_equal(view, expected)}
+        assert any(np.array_equal(view, expected) for expected in turned)
+    assert drawn == set(range(8))
+
+
+def test_views_that_are_not_turned_are_cut_from_the_sizes_asked_for() -> None:
+    rows, columns = np.mgrid[0:200, 0:240].astype(np.uint8)
+    scales = []
+    for seed in range(60):
+        view = augmentation._upright_crop(
+            np.dstack([columns, rows, rows]), 100, np.random.default_rng(seed)
+        ).astype(float)
+        across, down = view[50, 75, :2] - view[50, 25, :2], view[75, 50, :2] - view[25, 50, :2]
+        assert np.count_nonzero(across) == np.count_nonzero(down) == 1
+        assert np.linalg.norm(across) == pytest.approx(np.linalg.norm(down), abs=2)
+        scales.append(np.linalg.norm(across) / 50)
+    assert min(scales) == pytest.approx(1.4, abs=0.1)  # CROP_SCALE of the shorter side
+    assert max(scales) == pytest.approx(2, abs=0.1)
+
+
 def test_compression_is_that_of_pillow(photo: np.ndarray) -> None:
     """Channels in their order: with red and blue swapped the luma would lose more."""
     file = io.BytesIO()

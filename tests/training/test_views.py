@@ -40,7 +40,7 @@ def images(count: int) -> list[SourceImage]:
         (View(240, Darkening(0.3, 0.4)), "240_b0.300c0.400"),
         (View(240, Darkening(0.2345, 1)), "240_b0.234c1.000"),
         (View(240, None, True), "240x_normal"),
-        (View(240, Darkening(0.3, 0.4), False, 255), "240v2-000000ff_b0.300c0.400"),
+        (View(240, Darkening(0.3, 0.4), False, 255), "240v3-000000ff_b0.300c0.400"),
     ],
 )
 def test_names(view: View, name: str) -> None:

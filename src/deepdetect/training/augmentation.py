@@ -13,7 +13,7 @@ from ..io.image import luma
 
 RED, GREEN, BLUE = 0.299, 0.587, 0.114  # of the luma (BT.601)
 
-AUGMENTATION_VERSION = 2
+AUGMENTATION_VERSION = 3
 """Part of the names of augmented views: when `augment` draws otherwise, old labels do not fit."""
 
 
@@ -33,8 +33,20 @@ BRIGHTNESS, CONTRAST = (0.2, 0.45), (0.3, 0.55)
 darkened image spans fewer than the 64 grey levels under which an image is of low visibility."""
 
 # What `augment` draws from.
+TURN_PROBABILITY = 0.5
+"""Of any angle; other views keep the sharpness of the image, which turning blurs."""
+
 CROP_SCALE = (0.7, 1.0)
 """Side of the cut-out square, as a fraction of the largest that fits."""
+
+INTERPOLATIONS = (
+    cv2.INTER_NEAREST,
+    cv2.INTER_LINEAR,
+    cv2.INTER_CUBIC,
+    cv2.INTER_AREA,
+    cv2.INTER_LANCZOS4,
+)
+"""What views that are not turned are made smaller by."""
 
 RELIGHT_PROBABILITY = 0.5
 MAX_LOG_GAMMA = 0.5
@@ -109,13 +121,14 @@ def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
 
 
 def augment(rgb: np.ndarray, side: int, seed: int) -> np.ndarray:
-    """Make a (side, side, 3) view of a part of an image: rotated, relit, blurred, compressed.
+    """Make a (side, side, 3) view of a part of an image: turned, relit, blurred, compressed.
 
     Its label is made from the view itself. Other versions of NumPy and OpenCV may give slightly
     different views for the same seed.
     """
     generator = np.random.default_rng([AUGMENTATION_VERSION, seed])
-    view = _rotated_crop(rgb, side, generator)
+    turned = generator.random() < TURN_PROBABILITY
+    view = (_rotated_crop if turned else _upright_crop)(rgb, side, generator)
     if generator.random() < RELIGHT_PROBABILITY:
         view = _relight(view, generator)
     if generator.random() < BLUR_PROBABILITY:
@@ -156,6 +169,19 @@ def _rotated_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) ->
         flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REFLECT_101,
     )
+
+
+def _upright_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) -> np.ndarray:
+    """Cut out a square, mirrored and turned by right angles, that is enlarged only if it must be."""
+    largest = min(rgb.shape[:2])
+    window = max(round(largest * generator.uniform(*CROP_SCALE)), min(side, largest))
+    top, left = (int(generator.integers(length - window + 1)) for length in rgb.shape[:2])
+    view = rgb[top : top + window, left : left + window]
+    view = np.rot90(view[:, :: int(generator.choice([-1, 1]))], int(generator.integers(4)))
+    interpolation = cv2.INTER_CUBIC
+    if window > side:
+        interpolation = INTERPOLATIONS[int(generator.integers(len(INTERPOLATIONS)))]
+    return cv2.resize(np.ascontiguousarray(view), (side, side), interpolation=interpolation)
 
 
 def _relight(rgb: np.ndarray, generator: np.random.Generator) -> np.ndarray:
