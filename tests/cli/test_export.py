@@ -19,16 +19,16 @@ def test_the_default_is_the_shipped_file(run, tmp_path: Path) -> None:
     assert "MIT" in result.output
 
 
-def test_size_and_precision(run, tmp_path: Path) -> None:
+def test_size(run, tmp_path: Path) -> None:
     result = run(
         *("export", "onnx", "dense", "-o", "a/made.onnx", "--size", "48x64", "--batch", 2),
-        *("--precision", "fp16", "--licence", "CC0", "--json"),
+        *("--licence", "CC0", "--json"),
     )
     assert result.exit_code == 0, result.output
     summary = json.loads(result.output)
     path = tmp_path / summary["file"]
     assert summary["bytes"] == path.stat().st_size
-    wanted = {"size": "48x64", "batch": "2", "precision": "fp16", "licence": "CC0"}
+    wanted = {"size": "48x64", "batch": "2", "licence": "CC0"}
     assert wanted.items() <= summary["metadata"].items()
     sides = onnx.load(path).graph.output[0].type.tensor_type.shape.dim
     assert [side.dim_value for side in sides] == [2, 1, 48, 64]
@@ -47,8 +47,6 @@ def test_keypoints(run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("-o a.onnx --precision int8", "give --calibration"),
-        ("-o a.onnx --calibration {photos}", "--calibration is for int8"),
         ("-o a.onnx --batch 2", "--batch needs --size"),
         ("-o a.onnx --size 480", "'480' is no height and width"),
         ("-o a.onnx --max-keypoints 100001", "--max-keypoints must lie in"),
@@ -56,14 +54,13 @@ def test_keypoints(run, tmp_path: Path) -> None:
         ("densse -o a.onnx", "did you mean 'dense'"),
         ("text.onnx -o a.onnx", "is not an ONNX file that can be read"),
         ("text.onnx -o text.onnx", "which is an input"),
-        ("-o a.onnx --precision int8 --calibration text.onnx", "text.onnx"),
     ],
 )
 def test_a_mistake_is_one_sentence_and_leaves_nothing(
-    run, words: str, message: str, photos: Path, tmp_path: Path
+    run, words: str, message: str, tmp_path: Path
 ) -> None:
     (tmp_path / "text.onnx").write_text("I am no network")
-    result = run("export", "onnx", *(word.format(photos=photos) for word in words.split()))
+    result = run("export", "onnx", *words.split())
     assert result.exit_code == 2
     assert message in result.output.replace("\n", " ")
     assert one_sentence(result.output) or result.output.startswith("Usage:")

@@ -54,7 +54,7 @@ CAMERAS = cli.From(
 SHARED_CAMERA = replace(MANY, more="single_camera")
 ONNX = cli.From(
     OnnxOptions,
-    "size precision",
+    "size",
     types={
         "size": Annotated[
             tuple[int, int] | None,
@@ -217,36 +217,28 @@ def onnx(
     /,
     *,
     output: cli.Output,
-    calibration: list[Path] | None = None,
     licence: str | None = None,
     **values: Any,
 ) -> cli.Result:
     """Write weights as an ONNX file, for ONNX Runtime, OpenVINO, OpenCV and others.
 
-    WEIGHTS are default, dense, free, an ONNX file that this package has written in fp32 for any
-    size, or a .safetensors file, which needs torch. Input `image`: RGB from 0 to 1; outputs
+    WEIGHTS are default, dense, free, an ONNX file that this package has written for any size,
+    or a .safetensors file, which needs torch. Input `image`: RGB from 0 to 1; outputs
     `probability` and `logits` for each pixel, and the best `keypoints` with `keypoint_logits`.
     docs/other-programs.md says which file is for which runtime.
 
         deepdetect export onnx -o deepdetect.onnx
         deepdetect export onnx dense -o dense-480x640.onnx --size 480x640 --max-keypoints 0
-        deepdetect export onnx run/best.safetensors -o half.onnx --precision fp16
+        deepdetect export onnx run/best.safetensors -o own.onnx
         deepdetect export onnx -o maps.onnx --max-keypoints 0
-        deepdetect export onnx -o small.onnx --precision int8 --calibration photos/
 
     Args:
         weights: Name or file of the weights.
         output: The .onnx file, or a folder for deepdetect.onnx.
-        calibration: Images or folders for int8, like those that it will be used on.
         licence: What the file says of the licence of the weights.
     """
     file = cli.output_file(output, "deepdetect.onnx")
     options = OnnxOptions(**values)
-    images = [
-        image
-        for path in calibration or ()
-        for image in (find_images(path) if path.is_dir() else [path])
-    ]
-    cli.check_outputs([file], [resolve_weights(weights), *images])
-    metadata = write_onnx(weights, file, options, calibration=images, licence=licence)
+    cli.check_outputs([file], [resolve_weights(weights)])
+    metadata = write_onnx(weights, file, options, licence=licence)
     return cli.Result({"file": file, "bytes": file.stat().st_size, "metadata": metadata})

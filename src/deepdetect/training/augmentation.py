@@ -172,7 +172,7 @@ def _rotated_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) ->
 
 
 def _upright_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) -> np.ndarray:
-    """Cut out a square, mirrored and turned by right angles, that is enlarged only if it must be."""
+    """Cut out a square, mirrored and turned by right angles; enlarge it only if it must be."""
     largest = min(rgb.shape[:2])
     window = max(round(largest * generator.uniform(*CROP_SCALE)), min(side, largest))
     top, left = (int(generator.integers(length - window + 1)) for length in rgb.shape[:2])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ onnx = pytest.importorskip("onnx", reason="needs onnx, which is for exporting on
 import cv2  # noqa: E402
 import onnxruntime  # noqa: E402
 
-from deepdetect import DeepDetect, OptionError, WeightsError  # noqa: E402
+from deepdetect import OptionError, WeightsError  # noqa: E402
 from deepdetect.detector.backends.onnx_parts import cut_onnx  # noqa: E402
 from deepdetect.detector.network.onnx_export import OnnxOptions, write_onnx  # noqa: E402
 from deepdetect.detector.network.onnx_graph import read_metadata  # noqa: E402
@@ -155,61 +154,16 @@ def test_normalisation_is_folded_and_numbers_for_each_channel_have_four_dimensio
 
 
 def test_metadata(tmp_path: Path) -> None:
-    found = write_onnx(
-        "default", tmp_path / "one.onnx", OnnxOptions((48, 64), precision="fp16"), licence="CC0"
-    )
+    found = write_onnx("default", tmp_path / "one.onnx", OnnxOptions((48, 64)), licence="CC0")
     read = session_of(tmp_path / "one.onnx").get_modelmeta().custom_metadata_map
     assert read == found
-    expected = {"channels": "RGB", "range": "0 to 1", "stride": "8", "precision": "fp16"}
+    expected = {"channels": "RGB", "range": "0 to 1", "stride": "8", "precision": "fp32"}
     assert read.items() >= {**expected, "licence": "CC0", "size": "48x64"}.items()
-
-
-@pytest.mark.parametrize("size", [None, (123, 157)])
-def test_half_precision(
-    size: tuple[int, int] | None,
-    tmp_path: Path,
-    photo: np.ndarray,
-    network: onnxruntime.InferenceSession,
-) -> None:
-    path = tmp_path / "half.onnx"
-    write_onnx("default", path, OnnxOptions(size, precision="fp16"))
-    assert path.stat().st_size < 0.55 * pretrained_weights().stat().st_size
-    onnx.checker.check_model(onnx.load(path), full_check=True)
-    images = images_of(photo, *(size or (77, 90)), 1)
-    logits = session_of(path).run(["logits"], {"image": images})[0]
-    expected = expected_logits(network, images)
-    assert logits.dtype == np.float32
-    assert 0 < np.abs(logits - expected).max() < 0.5
-    assert np.mean((logits > 0) == (expected > 0)) > 0.998
-
-
-@pytest.mark.slow
-def test_eight_bits(
-    tmp_path: Path, photo: np.ndarray, network: onnxruntime.InferenceSession
-) -> None:
-    from PIL import Image
-
-    for k in range(3):
-        Image.fromarray(photo[20 * k : 20 * k + 150, 30 * k : 30 * k + 180]).save(
-            tmp_path / f"{k}.png"
-        )
-    paths = sorted(tmp_path.glob("*.png"))
-    path = tmp_path / "small.onnx"
-    write_onnx("default", path, OnnxOptions(precision="int8"), calibration=paths)
-    assert path.stat().st_size < 0.5 * pretrained_weights().stat().st_size
-    onnx.checker.check_model(onnx.load(path), full_check=True)
-    images = images_of(photo, 123, 157, 2)
-    logits = session_of(path).run(["logits"], {"image": images})[0]
-    expected = expected_logits(network, images)
-    assert np.mean((logits > 0) == (expected > 0)) > 0.97
-    # The package's own backend takes it, too.
-    assert DeepDetect(path, backend="onnxruntime").heatmap(photo).shape == photo.shape[:2]
 
 
 @pytest.mark.parametrize(
     "values",
     [
-        {"precision": "fp8"},
         {"batch": 2},
         {"size": (4, 64)},
         {"size": (64,)},
@@ -222,17 +176,7 @@ def test_options_are_checked(values: dict[str, object]) -> None:
 
 
 def test_a_changed_file_is_not_changed_again(tmp_path: Path) -> None:
-    write_onnx("default", tmp_path / "half.onnx", OnnxOptions(precision="fp16"))
-    with pytest.raises(WeightsError, match="precision fp16: give the file that it was made from"):
-        write_onnx(tmp_path / "half.onnx", tmp_path / "again.onnx")
+    write_onnx("default", tmp_path / "one.onnx", OnnxOptions((64, 64)))
+    with pytest.raises(WeightsError, match="size 64x64: give the file that it was made from"):
+        write_onnx(tmp_path / "one.onnx", tmp_path / "again.onnx")
     assert not (tmp_path / "again.onnx").exists()
-
-
-@pytest.mark.parametrize(("precision", "calibration"), [("int8", []), ("fp32", [Path("a.png")])])
-def test_calibration_is_for_eight_bits(
-    precision: Any, calibration: list[Path], tmp_path: Path
-) -> None:
-    options = OnnxOptions(precision=precision)
-    with pytest.raises(OptionError, match="calibration"):
-        write_onnx("default", tmp_path / "a.onnx", options, calibration=calibration)
-    assert not list(tmp_path.iterdir())

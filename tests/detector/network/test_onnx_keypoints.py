@@ -111,14 +111,11 @@ def test_a_batch_gives_those_of_each_image(session: Any, count: int, photo: np.n
     assert np.isfinite(values).sum(1)[1] < count
 
 
-@pytest.mark.parametrize("precision", ["fp32", "fp16"])
 @pytest.mark.parametrize(("size", "batch"), [((123, 157), 2), ((17, 23), 1)])
-def test_one_size(
-    size: tuple[int, int], batch: int, precision: str, tmp_path: Path, photo: np.ndarray
-) -> None:
+def test_one_size(size: tuple[int, int], batch: int, tmp_path: Path, photo: np.ndarray) -> None:
     height, width = size
     # More than there are pixels in the smallest.
-    options = OnnxOptions(size, batch, precision, max_keypoints=500)
+    options = OnnxOptions(size, batch, max_keypoints=500)
     made = tmp_path / "one.onnx"
     assert write_onnx("default", made, options)["max_keypoints"] == "500"
     model = onnx.load(made)
@@ -135,8 +132,7 @@ def test_one_size(
     for k in range(batch):
         selected = select_keypoints(sigmoid(logits[k, 0]), best_of(500), logits[k, 0])
         check_keypoints(xy[k], values[k], selected, 500)
-        if precision == "fp32":
-            check_keypoints(xy[k], values[k], best(images[k], 500), 500)
+        check_keypoints(xy[k], values[k], best(images[k], 500), 500)
 
 
 def same_share(xy: np.ndarray, values: np.ndarray, expected: Keypoints) -> float:

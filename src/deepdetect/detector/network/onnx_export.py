@@ -1,4 +1,4 @@
-"""ONNX files for other programs: any size or one, in three precisions, with or without keypoints.
+"""ONNX files for other programs: any size or one, with or without keypoints.
 
 Their input is `image`; outputs are `probability`, `logits` and those of `add_keypoints`.
 """
@@ -9,41 +9,25 @@ import io
 import logging
 import warnings
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from ..._shared.atomic import atomic_path
-from ..._shared.errors import OptionError, WeightsError, check_name, require_packages
+from ..._shared.errors import OptionError, WeightsError, require_packages
 from ..._shared.options import check_ranges, suggest_keywords
 from ...features.selection import check_max_keypoints
-from ...io.image import load_image
 from ..pretrained import LOGITS, resolve_weights
-from .onnx_graph import (
-    IMAGE,
-    PROBABILITY,
-    add_padding,
-    fix_size,
-    read_metadata,
-    to_float16,
-    to_int8,
-    write_metadata,
-)
+from .onnx_graph import IMAGE, PROBABILITY, add_padding, fix_size, read_metadata, write_metadata
 from .onnx_keypoints import MAX_KEYPOINTS, add_keypoints, remove_keypoints
 
 if TYPE_CHECKING:
     from onnx import ModelProto
     from torch import nn
 
-PRECISIONS = ("fp32", "fp16", "int8")
-ANY_SIZE = {"precision": "fp32", "size": "any", "batch": "any"}
+ANY_SIZE = {"size": "any", "batch": "any"}
 OPSET = 17
-
-MAX_CALIBRATION_IMAGES = 32
-"""At most this many images calibrate int8, evenly chosen."""
 
 
 @suggest_keywords
@@ -55,8 +39,6 @@ class OnnxOptions:
         size: height and width in pixels of a file that takes this size only, for OpenCV 4 and other
             runtimes without dynamic shapes. None: any height and width.
         batch: number of images that a file with a size takes; without a size it is free.
-        precision: "fp32", "fp16" (half the bytes), or "int8" (quantised, for
-            which it needs calibration images; it marks other pixels).
         max_keypoints: the file gives this many dense keypoints, too, the best ones: what
             `DeepDetect.detect` finds with the same `max_keypoints`, `nms_radius=1` and
             `subpixel=True`. 0: maps only; OpenCV 4 refuses files with keypoints.
@@ -67,11 +49,9 @@ class OnnxOptions:
 
     size: tuple[int, int] | None = None
     batch: int = 1
-    precision: Literal["fp32", "fp16", "int8"] = "fp32"
     max_keypoints: int = MAX_KEYPOINTS
 
     def __post_init__(self) -> None:
-        check_name("precision", self.precision, PRECISIONS)
         if self.size is not None and len(self.size) != 2:
             raise OptionError(f"`size` must be height and width, not {self.size}")
         ranges = {"size": (8, 16384), "batch": (1, 1024), "max_keypoints": (0, 100_000)}
@@ -84,7 +64,7 @@ class OnnxOptions:
     @property
     def metadata(self) -> dict[str, str]:
         """What the file says of its options."""
-        values = {**ANY_SIZE, "precision": self.precision}
+        values = dict(ANY_SIZE)
         if self.size is not None:
             height, width = self.size
             values |= {"size": f"{height}x{width}", "batch": str(self.batch)}
@@ -103,44 +83,28 @@ def write_onnx(
     path: str | Path,
     options: OnnxOptions = OnnxOptions(),
     *,
-    calibration: Sequence[Path] = (),
     licence: str | None = None,
 ) -> dict[str, str]:
     """Write weights as an ONNX file for other programs, whole or not at all; return its metadata.
 
-    The weights are named, a safetensors file, or an ONNX file that this package has written in fp32
-    for any size. Images for int8 should be like those that it will be used on. Without a licence
-    the file says that of the given one.
+    The weights are named, a safetensors file, or an ONNX file that this package has written for any
+    size. Without a licence the file says that of the given one.
     """
     if Path(path).suffix.lower() != ".onnx":
         raise OptionError(f"the name of an ONNX file ends in .onnx, not {Path(path).name}")
-    if (options.precision == "int8") != bool(calibration):
-        raise OptionError(
-            "int8 needs images to take the ranges of values from: give `calibration`"
-            if not calibration
-            else f"`calibration` is for int8, not {options.precision}: leave one of them out"
-        )
     require_packages("exporting to ONNX", "onnx")
     model, origin = _load(resolve_weights(weights))
     if licence is not None:
         origin["licence"] = licence
-    return _write(model, path, options, origin, calibration)
+    return _write(model, path, options, origin)
 
 
 def _write(
-    model: ModelProto,
-    path: str | Path,
-    options: OnnxOptions,
-    origin: Mapping[str, str],
-    calibration: Sequence[Path] = (),
+    model: ModelProto, path: str | Path, options: OnnxOptions, origin: Mapping[str, str]
 ) -> dict[str, str]:
-    """Write what the options make of a network in fp32 for any size; return its metadata."""
-    if options.precision == "int8":
-        model = to_int8(model, _images(calibration))
+    """Write what the options make of a network for any size; return its metadata."""
     if options.size is not None:
         fix_size(model, *options.size, options.batch)
-    if options.precision == "fp16":
-        to_float16(model)
     if options.max_keypoints:
         add_keypoints(model, options.max_keypoints)
     write_metadata(model, {**options.metadata, **origin})
@@ -150,7 +114,7 @@ def _write(
 
 
 def _load(path: Path) -> tuple[ModelProto, dict[str, str]]:
-    """Return weights as a network in fp32 for any size, and where they come from."""
+    """Return weights as a network for any size, and where they come from."""
     import onnx
 
     suffix = path.suffix.lower()
@@ -177,15 +141,14 @@ def _load(path: Path) -> tuple[ModelProto, dict[str, str]]:
     found = read_metadata(model)
     if any(found.get(name, value) != value for name, value in ANY_SIZE.items()):
         raise WeightsError(
-            f"{path} has the size {found.get('size')} and the precision {found.get('precision')}: "
-            "give the file that it was made from"
+            f"{path} has the size {found.get('size')}: give the file that it was made from"
         )
     kept = {name: value for name, value in found.items() if name in ("weights", "licence")}
     return model, {"weights": path.name, **kept}
 
 
 def _of_torch(network: nn.Module) -> ModelProto:
-    """Return a network of torch as one that pads its image, in fp32 for any size."""
+    """Return a network of torch as one that pads its image, for any size."""
     import onnx
     import torch
 
@@ -212,10 +175,3 @@ def _of_torch(network: nn.Module) -> ModelProto:
     model = onnx.load_model_from_string(written.getvalue())
     add_padding(model)
     return model
-
-
-def _images(paths: Sequence[Path]) -> Iterator[np.ndarray]:
-    """Yield some of the images, evenly chosen."""
-    step = max(1, len(paths) / MAX_CALIBRATION_IMAGES)
-    for k in range(min(len(paths), MAX_CALIBRATION_IMAGES)):
-        yield load_image(paths[int(k * step)])

@@ -1,15 +1,11 @@
-"""The graph of an ONNX file: padding and cropping inside it, a fixed size, precision, metadata.
+"""The graph of an ONNX file: padding and cropping inside it, a fixed size, metadata.
 
 The package `onnx` is needed, torch is not: files are made from files.
 """
 
 from __future__ import annotations
 
-import logging
-import tempfile
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
-from types import SimpleNamespace
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,17 +28,11 @@ METADATA = {
     "range": "0 to 1",
     "stride": str(STRIDE),
     "padding": "inside: the last row and column are repeated up to the stride, the maps cropped",
+    "precision": "fp32",
     "pixel_origin": "x right, y down, the centre of the first pixel is (0, 0)",
     "producer": "deepdetect",
 }
-"""What every file says of itself, beside version, weights, licence, precision and size."""
-
-QUANTIZED = "/network/encoder/level3"
-"""Beginning of the names of the convolutions that int8 changes: those at an eighth of the size.
-
-Three quarters of all weights are there. Before and behind them rounding to 255 steps costs more
-marks than it saves time (docs/other-programs.md#onnx).
-"""
+"""What every file says of itself, beside version, weights, licence and size."""
 
 _FACTOR_SHAPES = {"Conv": (-1, 1, 1, 1), "ConvTranspose": (-1, 1, 1)}
 """What a number for each output channel is multiplied with a kernel as."""
@@ -95,62 +85,6 @@ def fix_size(model: ModelProto, height: int, width: int, batch: int) -> None:
             rename(node, PADDED_LOGITS, LOGITS)
     replace_nodes(graph, [*before, *inner, *_ending(graph, crop=bool(below or right))])
     _set_sides(graph, "dim_value", batch=batch, height=height, width=width)
-
-
-def to_float16(model: ModelProto) -> None:
-    """Turn the weights of a network with padding into float16, and compute with them.
-
-    Images, padding, logits and probabilities stay float32, here and in `to_int8`.
-    """
-    from onnx import TensorProto, helper, numpy_helper
-
-    graph = model.graph
-    before, inner, behind = split_nodes(graph)
-    weights = {name for node in inner for name in node.input}
-    for one in graph.initializer:
-        if one.name in weights:
-            halved = numpy_helper.to_array(one).astype(np.float16)
-            one.CopyFrom(numpy_helper.from_array(halved, one.name))
-    image, logits = (PADDED_IMAGE, PADDED_LOGITS) if before else (IMAGE, LOGITS)
-    for node in inner:
-        rename(node, image, f"{image}_float16")
-        rename(node, logits, f"{logits}_float16")
-    down = helper.make_node("Cast", [image], [f"{image}_float16"], to=TensorProto.FLOAT16)
-    up = helper.make_node("Cast", [f"{logits}_float16"], [logits], to=TensorProto.FLOAT)
-    replace_nodes(graph, [*before, down, *inner, up, *behind])
-
-
-def to_int8(model: ModelProto, images: Iterable[np.ndarray]) -> ModelProto:
-    """Quantise the convolutions named `QUANTIZED`: weights per channel, activations per tensor.
-
-    Their ranges are those of the (H, W, 3) uint8 images. The result is in ONNX's QDQ format.
-    """
-    import onnx
-    from onnxruntime.quantization import QuantFormat, QuantType, quantize_static
-
-    inputs = (
-        {IMAGE: np.ascontiguousarray(rgb.transpose(2, 0, 1)[None] / np.float32(255))}
-        for rgb in images
-    )
-    convolutions = [node.name for node in model.graph.node if node.op_type == "Conv"]
-    logging.disable(logging.WARNING)  # advice of the quantiser
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            made = Path(folder) / "int8.onnx"
-            quantize_static(
-                model,
-                made,
-                SimpleNamespace(get_next=lambda: next(inputs, None)),
-                quant_format=QuantFormat.QDQ,
-                op_types_to_quantize=["Conv"],
-                per_channel=True,
-                activation_type=QuantType.QUInt8,
-                weight_type=QuantType.QInt8,
-                nodes_to_exclude=[name for name in convolutions if not name.startswith(QUANTIZED)],
-            )
-            return onnx.load_model(str(made))
-    finally:
-        logging.disable(logging.NOTSET)
 
 
 def write_metadata(model: ModelProto, values: Mapping[str, str]) -> None:

@@ -30,7 +30,7 @@ NO_POSITION, NO_LOGIT = -1.0, -np.inf
 CANDIDATES = 2
 """Pixels that are looked at for each wanted keypoint: of neighbours that are equal one is kept.
 
-Logits in float32 hardly ever are; rounded to float16, one pixel of a hundred has an equal one.
+Logits in float32 hardly ever are.
 """
 
 NEIGHBOURS = np.array([[-1, 0], [0, -1], [1, 0], [0, 1], [-1, -1], [1, -1], [-1, 1], [1, 1]])
