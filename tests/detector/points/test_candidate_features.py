@@ -57,7 +57,7 @@ def test_measurements_are_those_of_maps() -> None:
             dx, dy = cv2.filter2D(image, -1, first), cv2.filter2D(image, -1, first.T)
             slopes.append(np.log((dx**2 + dy**2) * variance + 1e-6) / 2)
         values += [(each[row, column] - own / 2) / 2 for each in slopes]
-        values += [2 * space.smooth[level, row, column] - 1]
+        values += [2 * (space.smooth[level, row, column] + space.gray) - 1]
         for k in beside:
             window = response[k, max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
             values += [np.log((window.max() + 1e-7) / (response[k, row, column] + 1e-7)) / 2]

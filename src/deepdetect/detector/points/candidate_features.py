@@ -48,6 +48,7 @@ def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray
         np.array(rings, np.int64).reshape(2, -1, 2, RINGS * RING_POINTS),
         *(pixels, floors, features),
     )
+    features[:, 17] += 2 * space.gray - 1
     features[:, -2] = np.log((candidates.rank + 1) / space.smooth[0].size) / 2 + 3
     features[:, -1] = (candidates.level - 4) / 3
     return features

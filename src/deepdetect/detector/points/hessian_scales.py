@@ -25,10 +25,12 @@ LEAST_RESPONSE = 1e-8
 class ScaleSpace:
     """Smoothed copies of an image in [0, 1], with derivatives normalised by their scale.
 
-    All but the sigmas are (L, H, W) float32; the determinant is the Hessian's.
+    `smooth` and the Hessian's `determinant` are (L, H, W) float32; `gray`, the mean of the image in
+    whole levels, is taken off.
     """
 
     sigmas_px: np.ndarray
+    gray: np.float32
     smooth: np.ndarray
     determinant: np.ndarray
 
@@ -71,8 +73,10 @@ def build_scale_space(gray: np.ndarray) -> ScaleSpace:
     from .kernels import differentiate
 
     smooth, determinant = (np.empty((len(SIGMAS_PX), *gray.shape), np.float32) for _ in range(2))
-    space = ScaleSpace(SIGMAS_PX, smooth, determinant)
-    current, reached = gray.astype(np.float32) / np.float32(255), 0.0
+    # Around 0 the least is rounded away: other implementations of the filters find the same maxima.
+    mean = np.float32(np.rint(gray.mean()))
+    space = ScaleSpace(SIGMAS_PX, mean / np.float32(255), smooth, determinant)
+    current, reached = (gray - mean) / np.float32(255), 0.0
     for k, sigma in enumerate(SIGMAS_PX):
         # Gaussians add up by their variances: each level smooths the one before.
         step = float(np.sqrt(sigma**2 - reached**2))

@@ -147,7 +147,7 @@ def measure_candidates(  # type: ignore[no-untyped-def]
         own = logs[0]
         features[n, 0] = (own + np.float32(9)) / np.float32(3)
         features[n, 4] = np.sign(own_determinant)
-        features[n, 17] = np.float32(2) * own_smooth - np.float32(1)
+        features[n, 17] = np.float32(2) * own_smooth
         for k in range(3):
             features[n, 1 + k] = (logs[1 + k] - own) * half
             features[n, 18 + k] = (logs[4 + k] - logs[1 + k]) * half

@@ -40,7 +40,7 @@ export function describeOwnLevel(level, pixels, maps) {
     const first = k * FEATURES;
     features[first] = (logDeterminant(determinants[k]) + 9) / 3;
     features[first + SIGN] = Math.sign(determinants[k]);
-    features[first + LIGHT] = 2 * maps.smooth[pixels[k]] - 1;
+    features[first + LIGHT] = 2 * (maps.smooth[pixels[k]] + maps.gray) - 1;
     features[first + LEVEL] = (level - 4) / 3;
     for (let ring = 0; ring < RING_RADII.length; ring++) {
       const reach = RING_RADII[ring] * SIGMAS_PX[level];

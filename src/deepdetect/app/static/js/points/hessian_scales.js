@@ -1,6 +1,7 @@
 // The scale space of a picture, level by level, and its candidates for keypoints: maxima of
 // |det Hessian|, as `deepdetect.detector.points.hessian_scales` finds them.
 import { blur } from "../gaussian.js";
+import { roundHalfEven } from "../selection.js";
 
 const FIRST_SIGMA_PX = 1.5;
 const RATIO = 1.35;
@@ -18,7 +19,8 @@ export const hasCandidates = (level) => level >= 1 && level <= LEVELS;
 /**
  * @typedef {object} Level
  * @property {number} width @property {number} height
- * @property {Float32Array} smooth the picture from 0 to 1, smoothed
+ * @property {number} gray the mean of the picture from 0 to 1, in whole levels
+ * @property {Float32Array} smooth the picture from 0 to 1 less that grey, smoothed
  * @property {Float32Array} determinant of the Hessian, times sigma^4
  * @property {Float32Array} trace of the Hessian, times sigma^2
  * @property {Float32Array} gradient its squared magnitude, times sigma^2
@@ -32,11 +34,12 @@ export const hasCandidates = (level) => level >= 1 && level <= LEVELS;
  */
 export function* buildLevels(gray, width, height) {
   const pixels = width * height;
-  const newMaps = () => ({ width, height, ...Object.fromEntries(
+  const mean = roundHalfEven(gray.reduce((sum, value) => sum + value, 0) / pixels);
+  const newMaps = () => ({ width, height, gray: mean / 255, ...Object.fromEntries(
     ["smooth", "determinant", "trace", "gradient"].map((name) => [name, new Float32Array(pixels)])) });
   const room = new Float32Array(pixels);
   let [maps, finer, reached] = [newMaps(), null, 0];
-  const unit = Float32Array.from(gray, (value) => value / 255);
+  const unit = Float32Array.from(gray, (value) => (value - mean) / 255);
   for (const [level, sigma] of SIGMAS_PX.entries()) {
     // Gaussians add up by their variances: each level smooths the one before.
     blur(finer?.smooth ?? unit, width, height, Math.sqrt(sigma ** 2 - reached ** 2), maps.smooth, room);
