@@ -1,9 +1,9 @@
-"""Unguided matching of the Motorcycle pair by several options: how many matches, how many right.
+"""Matching of the Motorcycle pair by several options: how many matches, how many right.
 
     python benchmarks/motorcycle_matching.py [--weights FILE]
 
 The pair lies inside scikit-image. Right: within 1 px of the true disparity, of those where it is
-known; of all matches, and of those that fit the geometry.
+known; of all matches, and of those that fit the geometry. Last, as many random points as keypoints.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from deepdetect import DeepDetect, MatchingOptions, match_images
 from deepdetect.datasets.middlebury import load_motorcycle
 from deepdetect.evaluation.metrics.stereo import stereo_score
+from deepdetect.evaluation.protocols.stereo_matches import match_random_points
 
 
 def _unguided(mutual: bool = False, **options: Any) -> dict[str, Any]:
@@ -42,14 +43,22 @@ def main() -> None:
     parser.add_argument("--weights", default="default")
     detector = DeepDetect(parser.parse_args().weights)
     pair = load_motorcycle()
-    print("| options | matches, within 1 px | inliers, within 1 px |\n|---|---|---|")
-    for name, options in WAYS.items():
-        found = match_images(pair.left, pair.right, detector, **options)
+    print(
+        "| options | matches | within 1 px | inliers | of these within 1 px |\n|---|---|---|---|---|"
+    )
+    found = {
+        name: match_images(pair.left, pair.right, detector, **options)
+        for name, options in WAYS.items()
+    }
+    both = found["guided"].keypoints0, found["guided"].keypoints1
+    density = sum(each.density for each in both) / 2
+    found["random points, unguided"] = match_random_points(pair, density)
+    for name, matches in found.items():
         cells = []
-        for kept in (np.ones(len(found), bool), found.inliers):
-            score = stereo_score(found.points0[kept], found.points1[kept], pair.disparity)
-            cells.append(f"{score['matches']:,}, {score['precision']:.1%}")
-        print(f"| `{name}` | {' | '.join(cells)} |", flush=True)
+        for kept in (np.ones(len(matches), bool), matches.inliers):
+            score = stereo_score(matches.points0[kept], matches.points1[kept], pair.disparity)
+            cells += [f"{score['matches']:,}", f"{score['precision']:.1%}"]
+        print(f"| {name} | {' | '.join(cells)} |")
 
 
 if __name__ == "__main__":
