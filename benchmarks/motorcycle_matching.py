@@ -43,9 +43,8 @@ def main() -> None:
     parser.add_argument("--weights", default="default")
     detector = DeepDetect(parser.parse_args().weights)
     pair = load_motorcycle()
-    print(
-        "| options | matches | within 1 px | inliers | of these within 1 px |\n|---|---|---|---|---|"
-    )
+    print("| options | matches | within 1 px | inliers | of these within 1 px |")
+    print("|---|---|---|---|---|")
     found = {
         name: match_images(pair.left, pair.right, detector, **options)
         for name, options in WAYS.items()
