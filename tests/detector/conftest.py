@@ -50,3 +50,33 @@ def onnx_file(tmp_path: Path) -> Callable[..., Path]:
         return tmp_path / "made.onnx"
 
     return make
+
+
+@pytest.fixture(scope="session")
+def fast_network(photo: np.ndarray) -> Any:
+    """A random `FastNetwork` in evaluation mode that has seen photographs: all of its parts act."""
+    torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
+    from deepdetect.detector.network.fast import FastNetwork
+
+    with torch.random.fork_rng(devices=()), torch.no_grad():
+        torch.manual_seed(2)
+        network = FastNetwork().train()
+        torch.nn.init.normal_(network.gain[2].weight, std=0.3)
+        views = np.stack([photo, photo[::-1] // 2]).transpose(0, 3, 1, 2)
+        for _ in range(20):
+            network(torch.from_numpy(views / np.float32(255)))
+        return network.eval()
+
+
+@pytest.fixture(scope="session")
+def fast_files(fast_network: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Weights of the fast network as ONNX and safetensors."""
+    pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
+    from deepdetect.detector.network.onnx_export import export_onnx
+    from deepdetect.detector.network.weights import save_tensors
+
+    folder = tmp_path_factory.mktemp("fast")
+    files = folder / "fast.onnx", folder / "fast.safetensors"
+    export_onnx(fast_network, files[0])
+    save_tensors(fast_network.state_dict(), files[1], {})
+    return files

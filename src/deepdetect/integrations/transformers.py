@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import OptionError, require_packages
+from .._shared.errors import OptionError, check_name, require_packages
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.heatmap import MAX_AUTO_PIXELS
@@ -28,22 +28,21 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, pad
 from transformers.utils import ModelOutput
 
-from ..detector.network.espnet import ESPNet
-from ..detector.network.weights import load_network
+from ..detector.network.weights import NETWORKS, load_network
 
 
 class DeepDetectConfig(transformers.PretrainedConfig):
-    """The shape of the network, and which pixels of its heat map become keypoints.
+    """The name of the network, and which pixels of its heat map become keypoints.
 
     Args:
         keypoint_threshold: pixels with a probability above it.
         max_keypoints: at most this many, the best ones; None: all.
         nms_radius: of non-maximum suppression in pixels (0: none).
-        p, q, decoder_channels: of `ESPNet`.
+        network: "espnet" or "fast".
         **keywords: of every configuration of transformers.
 
     Raises:
-        OptionError: a number is out of its range.
+        OptionError: the network is unknown, or a number out of its range.
     """
 
     model_type = "deepdetect"
@@ -53,15 +52,14 @@ class DeepDetectConfig(transformers.PretrainedConfig):
         keypoint_threshold: float = 0.5,
         max_keypoints: int | None = None,
         nms_radius: int = 0,
-        p: int = 5,
-        q: int = 9,
-        decoder_channels: int = 10,
+        network: str = "espnet",
         **keywords: Any,
     ) -> None:
         self.keypoint_threshold = keypoint_threshold
         self.max_keypoints = max_keypoints
         self.nms_radius = nms_radius
-        self.p, self.q, self.decoder_channels = p, q, decoder_channels
+        check_name("network", network, NETWORKS)
+        self.network = network
         self.selection()
         super().__init__(**keywords)
 
@@ -105,7 +103,7 @@ class DeepDetectForKeypointDetection(transformers.PreTrainedModel):
     `from_pretrained` are those of transformers, and need no network.
 
     Args:
-        config: the shape of the network, whose weights are random.
+        config: the name of the network, whose weights are random.
     """
 
     config_class = DeepDetectConfig
@@ -114,7 +112,7 @@ class DeepDetectForKeypointDetection(transformers.PreTrainedModel):
 
     def __init__(self, config: DeepDetectConfig) -> None:
         super().__init__(config)
-        self.network = ESPNet(config.p, config.q, config.decoder_channels)
+        self.network = NETWORKS[config.network]()
         self.post_init()
 
     @classmethod
@@ -138,8 +136,9 @@ class DeepDetectForKeypointDetection(transformers.PreTrainedModel):
             WeightsError: the weights are missing, damaged or do not fit.
             OptionError: an option is unknown or out of its range.
         """
-        model = cls(DeepDetectConfig(keypoint_threshold, max_keypoints, nms_radius))
         network = load_network(resolve_weights(weights, ".safetensors"))
+        name = next(name for name, make in NETWORKS.items() if type(network) is make)
+        model = cls(DeepDetectConfig(keypoint_threshold, max_keypoints, nms_radius, name))
         model.network.load_state_dict(network.state_dict())
         return model.eval()
 

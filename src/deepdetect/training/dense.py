@@ -10,7 +10,7 @@ import datetime
 import logging
 import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +27,9 @@ from torch.utils.data import DataLoader
 from .._shared.errors import OptionError, first_line
 from .._shared.machine import disable_malloc_trim
 from .._shared.options import look_up
-from ..detector.network.espnet import ESPNet
 from ..detector.network.onnx_export import export_onnx
 from ..detector.network.weights import (
+    NETWORKS,
     average_weights,
     load_network,
     read_notes,
@@ -47,9 +47,6 @@ from .recipe import DeviceOptions, InitWeights, TrainingOptions
 from .sampler import CropSampler, Schedule, milestones
 from .trainer import Trainer
 
-NETWORKS: dict[str, Callable[[], nn.Module]] = {"espnet": ESPNet}
-"""What can be trained: from (B, 3, H, W) float32 RGB in [0, 1], sides multiples of 8, to logits."""
-
 ONNX = "deepdetect.onnx"
 
 LABELS_TIMEOUT = datetime.timedelta(hours=24)
@@ -66,7 +63,13 @@ def initial_network(
             options = dataclasses.replace(options, frozen_batch_norm=True)
         chosen = [init_weights] if isinstance(init_weights, (str, Path)) else list(init_weights)
         paths = [resolve_weights(name, ".safetensors") for name in chosen]
-        return options, average_weights(paths, make)
+        network = average_weights(paths)
+        if type(network) is not make:
+            raise OptionError(
+                f"the initial weights are not of the network {options.network}: give others, or "
+                "another `network`"
+            )
+        return options, network
     for name, what in (("frozen_batch_norm", "batch statistics"), ("freeze_encoder", "encoder")):
         if getattr(options, name):
             raise OptionError(
@@ -135,7 +138,7 @@ class DenseTrainer(Trainer):
         kind, alone = device.accelerator, fabric.world_size == 1
         initial_weights = weights_digest(network)
         if options.freeze_encoder:  # before it is compiled, which then leaves its gradients out
-            network.get_submodule("encoder").requires_grad_(False)
+            _encoder(network).requires_grad_(False)
         self.bfloat16 = device.precision == "bfloat16" or (
             device.precision == "auto" and _computes_bfloat16(kind)
         )
@@ -230,7 +233,7 @@ class DenseTrainer(Trainer):
         if self.options.frozen_batch_norm:
             freeze_batch_norm(self.network)
         elif self.options.freeze_encoder:
-            freeze_batch_norm(self.network.get_submodule("encoder"))
+            freeze_batch_norm(_encoder(self.network))
         truth = self.to_device(masks)[:, None].float()
         logits = self.logits(self.to_float(images))
         weight = self._pos_weight(images)
@@ -295,7 +298,7 @@ class DenseTrainer(Trainer):
         return read_notes(path)
 
     def export(self, folder: Path) -> Path:
-        best = load_network(folder / self.weights_file, NETWORKS[self.options.network])
+        best = load_network(folder / self.weights_file)
         export_onnx(best, folder / ONNX)
         return folder / ONNX
 
@@ -312,6 +315,12 @@ class DenseTrainer(Trainer):
             f"- normal: {best['normal_loss']:.4f} / {best['normal_iou']:.3f}",
             f"- darkened: {best['dark_loss']:.4f} / {best['dark_iou']:.3f}",
         ]
+
+
+def _encoder(network: nn.Module) -> nn.ModuleList:
+    """Return the parts of a network whose names say that they encode."""
+    parts = network.named_children()
+    return nn.ModuleList(part for name, part in parts if name.startswith("encode"))
 
 
 def freeze_batch_norm(network: nn.Module) -> None:

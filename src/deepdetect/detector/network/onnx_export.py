@@ -74,7 +74,7 @@ class OnnxOptions:
 
 
 def export_onnx(network: nn.Module, path: str | Path) -> None:
-    """Write a network, as `ESPNet`, for any size; whole or not at all."""
+    """Write a network for any size; whole or not at all."""
     _write(_of_torch(network), path, OnnxOptions(), {})
 
 

@@ -1,9 +1,9 @@
-"""Weights as safetensors files: a plain state dict, with notes in the header."""
+"""The networks by name, and their weights as safetensors files: state dicts with notes."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
@@ -13,6 +13,14 @@ from torch import Tensor, nn
 from ..._shared.atomic import atomic_path
 from ..._shared.errors import MissingWeightsError, WeightsError
 from .espnet import ESPNet
+from .fast import FastNetwork
+
+NETWORKS: dict[str, type[nn.Module]] = {"espnet": ESPNet, "fast": FastNetwork}
+"""Made without arguments, they map (B, 3, H, W) float32 RGB in [0, 1] to (B, 1, H, W) logits.
+
+Sides are multiples of `STRIDE`. To add a network, write its module beside this one, and its name
+here.
+"""
 
 
 def save_tensors(tensors: Mapping[str, Tensor], path: str | Path, notes: dict[str, str]) -> None:
@@ -25,14 +33,19 @@ def save_tensors(tensors: Mapping[str, Tensor], path: str | Path, notes: dict[st
             raise OSError(str(error)) from None
 
 
-def load_network(path: str | Path, make: Callable[[], nn.Module] = ESPNet) -> nn.Module:
-    """Make a network from a weights file, in evaluation mode."""
+def load_network(path: str | Path) -> nn.Module:
+    """Make a network from a weights file, in evaluation mode.
+
+    It is the one of `NETWORKS` that has most of the file's tensors.
+    """
     if not Path(path).is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")
-    network = make()
+    networks = [make() for make in NETWORKS.values()]
     try:
         with safe_open(path, framework="pt") as file:
-            network.load_state_dict({name: file.get_tensor(name) for name in file.keys()})  # noqa: SIM118
+            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        network = max(networks, key=lambda each: len(each.state_dict().keys() & state.keys()))
+        network.load_state_dict(state)
     except (SafetensorError, OSError, RuntimeError) as error:
         # torch names the first wrong tensor on its second line.
         reason = " ".join(str(error).split("\n\t")[:2]).strip()
@@ -44,15 +57,18 @@ def load_network(path: str | Path, make: Callable[[], nn.Module] = ESPNet) -> nn
     return network.eval()
 
 
-def average_weights(
-    paths: Sequence[str | Path], make: Callable[[], nn.Module] = ESPNet
-) -> nn.Module:
+def average_weights(paths: Sequence[str | Path]) -> nn.Module:
     """Make a network, as `load_network` does, from the mean of several weights files.
 
     The mean of runs that went on from one another is often better than each of them
     (Wortsman et al., "Model soups", 2022). Counts, which have no mean, are the first file's.
     """
-    networks = [load_network(path, make) for path in paths]
+    networks = [load_network(path) for path in paths]
+    for path, network in zip(paths, networks, strict=True):
+        if type(network) is not type(networks[0]):
+            raise WeightsError(
+                f"{path} is of another network than {paths[0]}: give weights of one network"
+            )
     states = [network.state_dict() for network in networks]
     mean = {
         name: sum(state[name] for state in states) / len(states)

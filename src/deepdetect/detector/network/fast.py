@@ -1,0 +1,151 @@
+"""The fast network: plain 3x3 convolutions of the luma, and a global term of the whole image.
+
+A label is made of the luma by detectors of small windows, so a few plain convolutions see enough;
+runtimes compute these at their best, as they do not dilated branches and sums. But its thresholds
+are relative to the strongest response anywhere and to the range of the grey levels. So a global
+term (histogram of the luma, means and maxima of the features) scales the luma at the start, and
+shifts the features before they are enlarged again.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import (
+    adaptive_avg_pool2d,
+    adaptive_max_pool2d,
+    interpolate,
+    pixel_shuffle,
+    pixel_unshuffle,
+    relu,
+)
+
+HALF, QUARTER, EIGHTH = 16, 32, 40
+"""Channels at these sizes of the image; most of the time is spent at half of it."""
+
+RED, GREEN, BLUE = 9798, 19235, 3735
+"""Weights of the luma (BT.601) in parts of 32,768, by which OpenCV computes it."""
+
+BINS = 24
+"""Of the histogram of the luma; a value counts for the two bins beside it."""
+
+HISTOGRAM_STEP_PX = 8
+"""One pixel in so many, in both directions, is counted."""
+
+GAIN_RANGE = (-1, 5)
+"""Of the logarithm of the gain; dark images span a hundredth of the grey levels."""
+
+
+class Luma(nn.Module):
+    """Maps (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W), OpenCV's 8-bit luma divided by 255.
+
+    Labels are made of that luma, and in dark images one grey level decides. The numbers are whole
+    and below 2^24, so float32 holds them; convolutions would be rounded by GPUs (TF32).
+    """
+
+    def forward(self, image: Tensor) -> Tensor:
+        red, green, blue = (image * 255).round().split(1, 1)
+        total = RED * red + GREEN * green + BLUE * blue
+        return ((total + 16384) * (1 / 32768)).floor() / 255
+
+
+class Exposure(nn.Module):
+    """Maps (B, 1, H, W) luma to (B, BINS + 2, 1, 1) features and its (B, 1, 1, 1) mean.
+
+    The features are logarithms of the histogram, the mean, and the logarithm of the variance.
+    """
+
+    def forward(self, luma: Tensor) -> tuple[Tensor, Tensor]:
+        luma = luma[:, :, ::HISTOGRAM_STEP_PX, ::HISTOGRAM_STEP_PX]
+        mean = luma.mean((2, 3), keepdim=True)
+        variance = (luma - mean).square().mean((2, 3), keepdim=True)
+        bins = torch.arange(BINS, device=luma.device, dtype=luma.dtype)[None, :, None, None]
+        shares = relu(1 - (luma * (BINS - 1) - bins).abs()).mean((2, 3), keepdim=True)
+        histogram = (shares * BINS + 1e-3).log() * 0.3
+        return torch.cat([histogram, mean, (variance + 1e-6).log() * 0.25], 1), mean
+
+
+class Perceptron(nn.Sequential):
+    """Two linear layers, with ReLU between them, of (B, C, 1, 1) features."""
+
+    def __init__(self, inputs: int, hidden: int, outputs: int) -> None:
+        super().__init__(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
+
+    def forward(self, features: Tensor) -> Tensor:
+        features = features.flatten(1)
+        for layer in self:
+            features = layer(features)
+        return features[:, :, None, None]
+
+
+class Convolution(nn.Module):
+    """A 3x3 convolution, batch normalisation, ReLU; stride 2 halves the size."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
+        self.norm = nn.BatchNorm2d(outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return relu(self.norm(self.conv(x)))
+
+
+class FastNetwork(nn.Module):
+    """A logit for each pixel of an image whose sides are multiples of 8.
+
+    57,613 parameters, 632 million multiply-adds at 640x480.
+
+    Example:
+        >>> FastNetwork()(torch.zeros(1, 3, 16, 24)).shape
+        torch.Size([1, 1, 16, 24])
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.luma, self.exposure = Luma(), Exposure()
+        self.gain = Perceptron(BINS + 2, 32, 1)
+        nn.init.zeros_(self.gain.get_parameter("2.weight"))
+        nn.init.ones_(self.gain.get_parameter("2.bias"))
+        self.encode_half = nn.Sequential(Convolution(4, HALF), Convolution(HALF, HALF))
+        self.encode_quarter = Convolution(HALF, QUARTER, stride=2)
+        self.encode_eighth = nn.Sequential(
+            Convolution(QUARTER, EIGHTH, stride=2), Convolution(EIGHTH, EIGHTH)
+        )
+        features = HALF + QUARTER + EIGHTH
+        self.shifts = Perceptron(BINS + 2 + 1 + 2 * features, 64, features)
+        self.to_quarter = nn.Conv2d(EIGHTH, QUARTER, 1)
+        self.to_half = nn.Conv2d(QUARTER, HALF, 1)
+        self.at_half = Convolution(HALF, HALF)
+        self.logits = nn.Conv2d(HALF, 4, 1)
+        nn.init.constant_(
+            self.get_parameter("logits.bias"), -1.0
+        )  # about the share of marked pixels
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Map (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W) logits."""
+        # Autocast would round the luma, of which low thresholds are a grey level.
+        with torch.autocast(image.device.type, enabled=False):
+            luma = self.luma(image)
+            exposure, mean = self.exposure(luma)
+            gain = self.gain(exposure)
+            scaled = (luma - mean) * gain.clamp(*GAIN_RANGE).exp()
+        half = self.encode_half(pixel_unshuffle(scaled, 2))
+        quarter = self.encode_quarter(half)
+        eighth = self.encode_eighth(quarter)
+        with torch.autocast(image.device.type, enabled=False):
+            pooled = [
+                pool(features, 1)
+                for features in (half, quarter, eighth)
+                for pool in (adaptive_avg_pool2d, adaptive_max_pool2d)
+            ]
+            shifts = self.shifts(torch.cat([exposure, gain, *pooled], 1)).to(half.dtype)
+        at_eighth, at_quarter, at_half = shifts.split((EIGHTH, QUARTER, HALF), 1)
+        eighth = relu(eighth + at_eighth)
+        quarter = relu(quarter + _doubled(self.to_quarter(eighth)) + at_quarter)
+        half = relu(half + _doubled(self.to_half(quarter)) + at_half)
+        return pixel_shuffle(self.logits(self.at_half(half)), 2)
+
+
+def _doubled(features: Tensor) -> Tensor:
+    """Repeat each pixel in both directions."""
+    return interpolate(features, scale_factor=2, mode="nearest")
