@@ -70,7 +70,8 @@ class DeepDetect:
         tta: "flip": a flipped or turned image gives the same keypoints of the heat map, in eight
             times the time.
         tile_megapixels: with `resolution="native"`, larger images are run in tiles of so many
-            megapixels: less memory, four to six times the time. "auto": where it is needed.
+            megapixels: less memory, about twice the time. "auto": where it is needed. Only weights
+            of the network `fast` can be tiled.
 
     Attributes:
         backend: name of the backend that runs.

@@ -19,7 +19,7 @@ from .._shared.options import check_ranges, suggest_keywords
 from ..features.selection import Maps, Rows, bands, sigmoid
 from .backends import Network
 from .pretrained import STRIDE
-from .tiling import fill_planes, open_tiled
+from .tiling import BYTES_PER_PIXEL, fill_planes, open_tiled
 
 MAX_AUTO_PIXELS = 2_000_000
 """Size of the largest image that the resolution "auto" takes as it is."""
@@ -47,7 +47,7 @@ class HeatmapOptions:
             were trained on RGB. It says nothing of the images that are given.
         tta: "none"; "flip" takes the mean of the logits in eight flips and quarter turns.
         tile_megapixels: from 1.5 on; "auto": 2.7 where the image is too large for the free memory.
-            Only weights of this package's training in ONNX files can be tiled.
+            Only ONNX weights of the network `fast` can be tiled.
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -172,10 +172,8 @@ def _tiled(network: Network, shape: tuple[int, ...], options: HeatmapOptions) ->
     """Return what runs the network in tiles, or None for an image that is run whole."""
     path = getattr(network, "onnx_path", None)  # torch, bfloat16 and others run whole
     area = None if options.tile_megapixels == "auto" else float(options.tile_megapixels)
-    if not is_native(shape, options) or (area is None and path is None):
-        return None
-    most = available_memory() / network.bytes_per_pixel if area is None else area * 1e6  # type: ignore[attr-defined]
-    if shape[0] * shape[1] <= most:
+    most = available_memory() / BYTES_PER_PIXEL if area is None else area * 1e6
+    if not is_native(shape, options) or shape[0] * shape[1] <= most:
         return None
     tiled = None if path is None else open_tiled(path, network.threads)  # type: ignore[attr-defined]
     if tiled is not None:
@@ -183,8 +181,8 @@ def _tiled(network: Network, shape: tuple[int, ...], options: HeatmapOptions) ->
     if area is None:
         return None
     raise OptionError(
-        "this network cannot be run in tiles: leave `tile_megapixels` out, or use ONNX weights "
-        "that deepdetect has trained, in float32"
+        "this network cannot be run in tiles: leave `tile_megapixels` out, or use ONNX weights of "
+        "the network fast, in float32"
     )
 
 

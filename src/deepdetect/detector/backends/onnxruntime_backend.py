@@ -28,9 +28,6 @@ PROVIDERS = {"cpu": CPU, "cuda": "CUDAExecutionProvider"}
 class OnnxRuntimeNetwork:
     """A network run by ONNX Runtime."""
 
-    bytes_per_pixel = 150
-    """Of memory that a run takes, about."""
-
     def __init__(self, session: Any, path: Path, threads: int | None) -> None:
         self._session = session
         self._input_name = session.get_inputs()[0].name
@@ -46,7 +43,7 @@ class OnnxRuntimeNetwork:
         return as_logits(output, self._output_name, image.shape, self.onnx_path)
 
     def release_memory(self) -> None:
-        """Release the memory that is kept between runs: 150 bytes a pixel."""
+        """Release the memory that is kept between runs."""
         settings = import_onnxruntime().RunOptions()
         settings.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
         smallest = np.zeros((1, 3, *PROBE_SHAPE), np.float32)

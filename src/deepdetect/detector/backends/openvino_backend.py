@@ -34,9 +34,6 @@ class OpenVinoNetwork:
     and one compiled from the same graph crashes.
     """
 
-    bytes_per_pixel = 260
-    """Of memory that a run takes, about."""
-
     def __init__(
         self, compile_model: Callable[[], Any], path: Path, options: RuntimeOptions
     ) -> None:
@@ -68,7 +65,7 @@ class OpenVinoNetwork:
         return logits
 
     def release_memory(self) -> None:
-        """Release the memory that is kept between runs: 260 bytes a pixel."""
+        """Release the memory that is kept between runs."""
         # It refuses while another thread runs it, and versions before 2025 do not have it.
         with contextlib.suppress(Exception):
             self._model.release_memory()
