@@ -4,11 +4,35 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = {
+    page.name: page.read_text("utf-8")
+    for page in (DOCS.parent / "README.md", *DOCS.glob("*.md"))
+    if page.name != "history.md"  # which is of its time
+}
+NOT_PROSE = re.compile(
+    r"<!-- results:.*?<!-- /results -->|^ *```.*?^ *```$|`[^`]*`|\]\([^)]*\)",
+    re.DOTALL | re.MULTILINE,
+)
+FIGURE = re.compile(
+    r"\d (?:%|[kMGT]i?B|m?s|seconds|minutes|hours|days)(?!\w)|\d times (?:as|faster)|(?<!\w)\.\d{3}"
+)
+"""A number with a unit of what is measured, or a fraction of many digits."""
+
+CONSTANTS = (
+    "density .616",  # of the paper
+    *("(3 GB,", "(19 GB)"),  # of data sets
+    "need 1.1 TB",  # 535 bytes times the number of points
+    *("8 GB of address space", "over 60 % of the tracks", "over 1 % or", "# 5 % of"),  # of the code
+    *("within .002", "99.95 %", "99.5 %", "(95 %"),  # what `make test-web` asks for
+)
 
 
 @pytest.fixture(scope="module")
@@ -19,6 +43,15 @@ def script(load_script: Callable[[str], ModuleType]) -> ModuleType:
 def test_readme_and_pages_show_what_the_results_hold(script: ModuleType) -> None:
     assert script.fill_blocks(write=False) == []
     assert "0.5403" in script.block("readme", None)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_figures_stand_in_results_alone(page: str) -> None:
+    assert re.findall(r"\b(?=[a-f]*\d)[\da-f]{7,40}:\w+", PAGES[page]) == []
+    text = NOT_PROSE.sub("", PAGES[page])
+    for phrase in CONSTANTS:
+        text = text.replace(phrase, "")
+    assert [text[m.start() - 40 : m.end()] for m in FIGURE.finditer(text)] == []
 
 
 def test_each_result_names_its_command_and_commit(script: ModuleType) -> None:
