@@ -58,6 +58,7 @@ STAGES = {
     "--weights dense",
     "disparity": "benchmarks/row_matching.py {data}/middlebury",
     "motorcycle": "benchmarks/motorcycle_matching.py",
+    "costs": "benchmarks/costs.py {data}/fountain/0004.jpg {data}/fountain/0005.jpg",
     "published-pipeline": "benchmarks/published_pipeline.py {data}",
     "fuzz": "-m fuzz",
 }
@@ -208,6 +209,7 @@ RESULTS = {
     "labels-stereo": Result("labels-stereo", "0"),
     "disparity": Result("disparity", "0"),
     "motorcycle": Result("motorcycle", "0"),
+    "costs": Result("costs", "0"),
     "published-pipeline": Result("published-pipeline", "0"),
     "fuzz": Result("fuzz", "0"),
     "foreground": Result(
@@ -384,7 +386,7 @@ def shown(cell: str) -> str:
         >>> shown("192540 (.971)"), shown("-0.000"), shown("")
         ('192,540 (0.971)', '0.000', '–')
     """
-    apart = re.sub(r"(?<![\d.,])\d{4,}(?![\d.])", lambda m: f"{int(m[0]):,}", cell)
+    apart = re.sub(r"(?<![\d.,x])\d{4,}(?![\d.x])", lambda m: f"{int(m[0]):,}", cell)
     apart = re.sub(r"(?<![\d.])(?=\.\d)", "0", re.sub(r"^-(?=0\.0+$)", "", apart))
     return apart.replace("|", "\\|") if cell else "–"
 

@@ -27,7 +27,6 @@ FIGURE = re.compile(
 """A number with a unit of what is measured, or a fraction of many digits."""
 
 CONSTANTS = (
-    "density .616",  # of the paper
     *("(3 GB,", "(19 GB)"),  # of data sets
     "need 1.1 TB",  # 535 bytes times the number of points
     *("8 GB of address space", "over 60 % of the tracks", "over 1 % or", "# 5 % of"),  # of the code
@@ -86,7 +85,7 @@ def test_a_report_becomes_a_result_and_a_block(
         "| baseline: all pixels | 1.000 |"
     )
     assert script.shown("192540 (.971)") == "192,540 (0.971)"
-    assert (script.shown("0.12345"), script.shown("")) == ("0.12345", "–")
+    assert [script.shown(x) for x in ("0.12345", "6000x4000", "")] == ["0.12345", "6000x4000", "–"]
 
 
 def test_rows_of_own_sizes_become_a_column(
