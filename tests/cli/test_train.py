@@ -57,11 +57,9 @@ def test_train_and_shards(run, images: Path, monkeypatch: pytest.MonkeyPatch) ->
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--freeze-encoder"], "give trained ones as --init"),
         (["--frozen-batch-norm"], "--frozen-batch-norm would keep"),
         (["--val-count", "0"], "--val-count must be a whole number from 1 on"),
         (["--num-workers", "-1"], "--num-workers must be 0 or more"),
-        (["--pos-weight-uncertain"], "--pos-weight-uncertain needs a --pos-weight"),
         (["--stage", "480x8x1@720"], "not among --short-side"),
         (["--learning-rate", "-1"], "--learning-rate must be above 0"),
         (["--optimizer", "sopa"], "did you mean 'soap'"),

@@ -20,6 +20,8 @@ torch = pytest.importorskip("torch", reason="needs torch")
 transformers = pytest.importorskip("transformers", reason="needs transformers")
 drop_in = pytest.importorskip("deepdetect.integrations.transformers")
 
+from deepdetect.detector.network.weights import NETWORKS, save_tensors  # noqa: E402
+
 
 @pytest.fixture(scope="module")
 def model() -> Any:
@@ -49,6 +51,18 @@ def test_it_gives_what_onnx_gives(views: Views, model: Any, processor: Any) -> N
         if len(found["scores"]) == len(expected):
             assert np.abs(found["keypoints"].numpy() - expected.xy).max() < 1e-4
             assert np.abs(found["scores"].numpy() - expected.scores).max() < 1e-5
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_the_network_is_the_one_of_the_weights(name: str, tmp_path: Path) -> None:
+    save_tensors(NETWORKS[name]().state_dict(), tmp_path / "weights.safetensors", {})
+    make = drop_in.DeepDetectForKeypointDetection
+    model = make.from_deepdetect(tmp_path / "weights.safetensors")
+    model.save_pretrained(tmp_path)
+    again = make.from_pretrained(tmp_path)
+    assert type(again.network) is NETWORKS[name]
+    state = again.network.state_dict()
+    assert all(torch.equal(state[key], value) for key, value in model.network.state_dict().items())
 
 
 OFFLINE = """

@@ -1,10 +1,19 @@
 from __future__ import annotations
 
+import dataclasses
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+
+from deepdetect.training import TrainingOptions, training_preset
+
+
+def plain_options(**values: Any) -> TrainingOptions:
+    """The recipe of ESPNet, whose views are but scaled and cropped, with other values."""
+    return dataclasses.replace(training_preset("espnet"), **values)
 
 
 @pytest.fixture(scope="session", autouse=True)

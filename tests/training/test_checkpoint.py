@@ -28,25 +28,27 @@ def small_network(channels: int = 4) -> torch.nn.Module:
 
 def trained(
     optimizer: str = "adam", steps: int = 1
-) -> tuple[torch.nn.Module, list[torch.optim.Optimizer]]:
+) -> tuple[torch.nn.Module, torch.nn.Module, list[torch.optim.Optimizer]]:
     network = small_network()
     optimizers = make_optimizers(optimizer, network)
     for _ in range(steps):
         network(torch.rand(2, 3, 8, 8)).square().mean().backward()
         for each in optimizers:
             each.step()
-    return network, optimizers
+    return network, small_network(), optimizers
 
 
 @pytest.mark.parametrize("optimizer", ["adam", "soap"])
 def test_a_checkpoint_gives_everything_back(tmp_path: Path, optimizer: str) -> None:
-    network, optimizers = trained(optimizer)
+    network, average, optimizers = trained(optimizer)
+    torch.nn.init.normal_(average[0].weight)
     path = tmp_path / "c.safetensors"
-    save_checkpoint(path, network, optimizers, {"step": 1})
-    other, other_optimizers = trained(optimizer, steps=0)
+    save_checkpoint(path, network, average, optimizers, {"step": 1})
+    other, other_average, other_optimizers = trained(optimizer, steps=0)
     tensors, metadata = read_checkpoint(path)
     assert metadata == {"step": 1}
-    restore(tensors, other, other_optimizers)
+    restore(tensors, other, other_average, other_optimizers)
+    assert torch.equal(other_average[0].weight, average[0].weight)
     for name, value in network.state_dict().items():
         assert torch.equal(value, other.state_dict()[name])
     for ours, theirs in zip(optimizers, other_optimizers, strict=True):

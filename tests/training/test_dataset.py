@@ -37,7 +37,9 @@ from deepdetect.training.views import (  # noqa: E402
     render,
 )
 
-OPTIONS = TrainingOptions(
+from .conftest import plain_options  # noqa: E402
+
+OPTIONS = plain_options(
     stages=(Stage(64, 4, 6), Stage(96, 2, 1)),
     short_sides=(96, 64),
     flips=True,
@@ -45,6 +47,7 @@ OPTIONS = TrainingOptions(
     augmentations=1,
     labels=LabelOptions(("fast", "harris", "sobel")),
 )
+
 Batch = tuple[np.ndarray, np.ndarray]
 
 
@@ -170,7 +173,7 @@ class Corners:
 )
 def test_all_mirrors_come_when_asked_for(flips: bool, transpositions: bool, count: int) -> None:
     """Crops of an image that every mirror changes: each of the eight is seen."""
-    options = TrainingOptions(
+    options = plain_options(
         stages=(Stage(64, 4, 60),),
         short_sides=(64,),
         dark_fraction=0.0,
@@ -275,7 +278,7 @@ def test_a_view_is_rendered_once(
 def test_preparation_makes_only_the_labels_that_are_needed(
     photographs: Path, tmp_path: Path
 ) -> None:
-    options = TrainingOptions(
+    options = plain_options(
         stages=(Stage(64, 2, 1),),
         short_sides=(64, 96),
         labels=LabelOptions(("fast",)),

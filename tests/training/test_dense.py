@@ -22,6 +22,8 @@ from deepdetect.training.dense import (  # noqa: E402
 )
 from deepdetect.training.recipe import DeviceOptions, Stage, TrainingOptions  # noqa: E402
 
+from .conftest import plain_options  # noqa: E402
+
 PLAIN = DeviceOptions("cpu", "float32", compile=False, threads=1)
 
 
@@ -30,7 +32,7 @@ def make_trainer(
 ) -> DenseTrainer:
     """A trainer of 150 steps without warm-up, at a learning rate of 0.1 falling to nothing."""
     values = {"stages": (Stage(16, 1, 150),), "learning_rate": 0.1, **options}
-    data, recipe = TrainingData([None], [None], ""), TrainingOptions(**values)
+    data, recipe = TrainingData([None], [None], ""), plain_options(**values)
     return DenseTrainer(network, recipe, data, device, launch(device, recipe))
 
 
@@ -55,15 +57,10 @@ class Constant(torch.nn.Module):
         return self.logit.expand(len(image), 1, *image.shape[2:])
 
 
-@pytest.mark.parametrize(
-    ("marked_rows", "weight", "only_doubtful"),
-    [(4, 1.0, False), (4, 1.3, False), (4, 3.0, True), (12, 2.0, True)],
-)
-def test_a_marked_pixel_counts_by_its_weight(
-    marked_rows: int, weight: float, only_doubtful: bool
-) -> None:
+@pytest.mark.parametrize(("marked_rows", "weight"), [(4, 1.0), (4, 1.3), (12, 2.0)])
+def test_a_marked_pixel_counts_by_its_weight(marked_rows: int, weight: float) -> None:
     """The least loss of a constant is at the odds of the marked pixels times the weight there."""
-    trainer = make_trainer(Constant(), pos_weight=weight, pos_weight_uncertain=only_doubtful)
+    trainer = make_trainer(Constant(), pos_weight=weight)
     rgb = torch.zeros((2, 16, 16, 3), dtype=torch.uint8)
     masks = torch.zeros((2, 16, 16), dtype=torch.bool)
     masks[:, :marked_rows] = True
@@ -73,10 +70,7 @@ def test_a_marked_pixel_counts_by_its_weight(
     for step in range(1, 150):
         trainer.training_step((rgb, masks), step)
     logit = trainer.network.logit.item()
-    probability = 1 / (1 + math.exp(-logit))
-    doubt = 4 * probability * (1 - probability) if only_doubtful else 1
-    there = 1 + (weight - 1) * doubt
-    assert logit == pytest.approx(math.log(there * share / (1 - share)), abs=0.01)
+    assert logit == pytest.approx(math.log(weight * share / (1 - share)), abs=0.01)
 
 
 def test_dark_images_have_a_weight_of_their_own() -> None:
@@ -118,21 +112,46 @@ def test_another_network_is_a_line_of_the_registry(monkeypatch: pytest.MonkeyPat
         initial_network(TrainingOptions(network="esp"), None)
 
 
-@pytest.mark.parametrize("make", [ESPNet, FastNetwork])
-@pytest.mark.parametrize("frozen_batch_norm", [False, True])
-def test_a_frozen_encoder_stays_as_it_is(
-    make: type[torch.nn.Module], frozen_batch_norm: bool
-) -> None:
+def test_what_is_measured_follows_the_weights() -> None:
+    """The mean decays as told, at first faster, and holds the batch statistics, too."""
     torch.manual_seed(0)
-    network = make()
-    before = {name: value.clone() for name, value in network.state_dict().items()}
-    trainer = make_trainer(network, freeze_encoder=True, frozen_batch_norm=frozen_batch_norm)
+    trainer = make_trainer(FastNetwork(), average_decay=0.2, learning_rate=1e-3, optimizer="soap")
+    rgb = torch.randint(0, 256, (2, 32, 32, 3), dtype=torch.uint8)
+    expected = {name: value.clone() for name, value in trainer.network.state_dict().items()}
+    for step in range(4):
+        trainer.training_step((rgb, rgb[..., 0] > 128), step)
+        decay = min(0.2, (1 + step) / (10 + step))
+        for name, value in trainer.network.state_dict().items():
+            mean = expected[name] * decay + value * (1 - decay)
+            expected[name] = mean if value.is_floating_point() else value.clone()
+    for name, value in trainer.average.state_dict().items():
+        torch.testing.assert_close(value, expected[name], rtol=1e-5, atol=1e-7)
+    assert not torch.equal(trainer.average.logits.weight, trainer.network.logits.weight)
+    image, network = rgb[0, :16], trainer.average
+    with torch.inference_mode():
+        logits = network(trainer.to_float(image[None]))[0, 0]
+    np.testing.assert_allclose(trainer.heatmap(image), logits.sigmoid(), atol=1e-6)
+
+
+def test_without_a_decay_the_weights_themselves_are_measured() -> None:
+    trainer = make_trainer(ESPNet(), frozen_batch_norm=False)
     rgb = torch.randint(0, 256, (2, 32, 32, 3), dtype=torch.uint8)
     trainer.training_step((rgb, rgb[..., 0] > 128), 0)
-    changed = {n for n, value in network.state_dict().items() if (value != before[n]).any()}
-    assert not any(name.startswith("encode") for name in changed)
-    assert len([name for name in changed if name.endswith("weight")]) >= 7
-    assert frozen_batch_norm != any("running" in name for name in changed)
+    states = trainer.average.state_dict(), trainer.network.state_dict()
+    assert all(torch.equal(states[0][name], states[1][name]) for name in states[1])
+
+
+def test_gradients_are_scaled_down_to_the_norm_they_may_have() -> None:
+    torch.manual_seed(0)
+    rgb = torch.randint(0, 256, (2, 32, 32, 3), dtype=torch.uint8)
+    norms = []
+    for limit in (None, 1e-3):
+        trainer = make_trainer(FastNetwork(), max_gradient_norm=limit, optimizer="adam")
+        trainer.training_step((rgb, rgb[..., 0] > 128), 0)
+        gradients = [parameter.grad.flatten() for parameter in trainer.network.parameters()]
+        norms.append(float(torch.cat(gradients).norm()))
+    assert norms[0] > 1e-2
+    assert norms[1] == pytest.approx(1e-3, rel=1e-4)
 
 
 def gradients(trainer: DenseTrainer, images: torch.Tensor, truth: torch.Tensor) -> list:

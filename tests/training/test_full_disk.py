@@ -33,7 +33,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
 
 WRITERS: dict[str, Callable[[Path], None]] = {
     "best.safetensors": lambda path: save_tensors(ESPNet().state_dict(), path, {}),
-    "checkpoint.safetensors": lambda path: save_checkpoint(path, ESPNet(), [], {}),
+    "checkpoint.safetensors": lambda path: save_checkpoint(path, ESPNet(), ESPNet(), [], {}),
     "deepdetect.onnx": lambda path: export_onnx(ESPNet(), path),
     "best.npz": lambda path: save_ranker(load_ranker(), path),
 }

@@ -35,7 +35,7 @@ def test_bad_stages_are_refused(text: str) -> None:
         {"dark_fraction": 1.5},
         {"val_fraction": 0.0},
         {"pos_weight": float("nan")},
-        {"pos_weight_uncertain": True},
+        {"square": "cut"},
         {"val_count": 2.5},
         {"warm_up": -1},
         {"short_sides": ()},
@@ -50,7 +50,7 @@ def test_the_papers_recipe() -> None:
     """33,000 + 8,000 images, a quarter darkened, 100 epochs, batch 64, Adam 0.001, 480x480."""
     paper = training_preset("paper")
     assert paper.stages == (Stage(480, 64, 100),)
-    assert (paper.short_sides, paper.square) == ((480,), True)
+    assert (paper.short_sides, paper.square) == ((480,), "squash")
     assert paper.dark_fraction == 0.25
     assert paper.max_images * paper.val_fraction == pytest.approx(8_000)
     schedule = Schedule(paper, 33_000)

@@ -11,16 +11,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from deepdetect import OptionError
-from deepdetect.training.recipe import Stage, TrainingOptions
+from deepdetect.training.recipe import Stage
 from deepdetect.training.sampler import CropSampler, Schedule, epoch_order
 
-OPTIONS = TrainingOptions(stages=(Stage(64, 4, 2), Stage(32, 2, 1)), short_sides=(64,), seed=5)
+from .conftest import plain_options
+
+OPTIONS = plain_options(stages=(Stage(64, 4, 2), Stage(32, 2, 1)), short_sides=(64,), seed=5)
 
 
 def test_the_warm_up_rises_evenly_into_the_cosine() -> None:
     stages = (Stage(64, 2, 10),)
-    plain = Schedule(TrainingOptions(stages=stages, short_sides=(64,)), 20)
-    warm = Schedule(TrainingOptions(stages=stages, short_sides=(64,), warm_up=9), 20)
+    plain = Schedule(plain_options(stages=stages, short_sides=(64,)), 20)
+    warm = Schedule(plain_options(stages=stages, short_sides=(64,), warm_up=0.09), 20)
     shares = [warm.learning_rate(step) / plain.learning_rate(step) for step in range(12)]
     assert shares == pytest.approx([k / 10 for k in range(1, 11)] + [1, 1])
 
@@ -36,7 +38,7 @@ def test_crops_are_counted() -> None:
 )
 def test_interleaved_stages_advance_together(photos: int, stages: list[tuple[int, int]]) -> None:
     made = tuple(Stage(16, batch, epochs) for batch, epochs in stages)
-    options = TrainingOptions(stages=made, short_sides=(16,))
+    options = plain_options(stages=made, short_sides=(16,))
     mixed = Schedule(dataclasses.replace(options, interleave=True), photos)
     plain = Schedule(options, photos)
     positions = [mixed.position(step) for step in range(mixed.steps)]

@@ -17,7 +17,7 @@ from deepdetect.training.augmentation import (
     augment,
     darken,
 )
-from deepdetect.training.recipe import Stage, TrainingOptions
+from deepdetect.training.recipe import Stage
 from deepdetect.training.views import (
     SourceImage,
     View,
@@ -26,7 +26,9 @@ from deepdetect.training.views import (
     views_of,
 )
 
-OPTIONS = TrainingOptions(stages=(Stage(64, 2, 1),), short_sides=(96, 64))
+from .conftest import plain_options
+
+OPTIONS = plain_options(stages=(Stage(64, 2, 1),), short_sides=(96, 64))
 
 
 def images(count: int) -> list[SourceImage]:
@@ -39,8 +41,9 @@ def images(count: int) -> list[SourceImage]:
         (View(480), "480_normal"),
         (View(240, Darkening(0.3, 0.4)), "240_b0.300c0.400"),
         (View(240, Darkening(0.2345, 1)), "240_b0.234c1.000"),
-        (View(240, None, True), "240x_normal"),
-        (View(240, Darkening(0.3, 0.4), False, 255), "240v3-000000ff_b0.300c0.400"),
+        (View(240, None, "squash"), "240x_normal"),
+        (View(240, None, "crop"), "240c_normal"),
+        (View(240, Darkening(0.3, 0.4), None, 255), "240v3-000000ff_b0.300c0.400"),
     ],
 )
 def test_names(view: View, name: str) -> None:
@@ -52,7 +55,7 @@ def test_names(view: View, name: str) -> None:
     short_sides=st.lists(st.integers(64, 999), min_size=1, max_size=4, unique=True).map(tuple),
 )
 def test_views_of_an_image(name: str, short_sides: tuple[int, ...]) -> None:
-    options = TrainingOptions(stages=OPTIONS.stages, short_sides=short_sides)
+    options = plain_options(stages=OPTIONS.stages, short_sides=short_sides)
     normal, dark = views_of(name, options)
     assert normal == tuple(View(side) for side in short_sides)
     assert [view.short_side for view in dark] == list(short_sides)
@@ -79,17 +82,24 @@ def test_augmented_views_come_last_and_leave_the_others_alone() -> None:
 
 
 def test_an_augmented_view_is_darkened_last(photo: np.ndarray) -> None:
-    bright = render(photo, View(80, None, False, 7))
+    bright = render(photo, View(80, None, None, 7))
     np.testing.assert_array_equal(bright, augment(photo, 80, 7))
-    dark = render(photo, View(80, Darkening(0.3, 0.4), False, 7))
+    dark = render(photo, View(80, Darkening(0.3, 0.4), None, 7))
     np.testing.assert_array_equal(dark, darken(bright, Darkening(0.3, 0.4)))
 
 
 def test_a_square_view_is_squashed(photo: np.ndarray) -> None:
     wide = photo[:128]
     expected = cv2.resize(wide, (64, 64), interpolation=cv2.INTER_CUBIC)
-    np.testing.assert_array_equal(render(wide, View(64, square=True)), expected)
-    np.testing.assert_array_equal(render(photo, View(256, square=True)), photo)
+    np.testing.assert_array_equal(render(wide, View(64, square="squash")), expected)
+    np.testing.assert_array_equal(render(photo, View(256, square="squash")), photo)
+
+
+def test_the_middle_square_is_cut_out(photo: np.ndarray) -> None:
+    wide = photo[40:136]
+    found = render(wide, View(48, square="crop"))
+    np.testing.assert_array_equal(found, render(wide[:, 80:176], View(48)))
+    np.testing.assert_array_equal(render(photo, View(256, square="crop")), photo)
 
 
 def test_one_in_twenty_is_held_out_and_nothing_is_in_both() -> None:

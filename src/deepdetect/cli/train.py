@@ -54,8 +54,8 @@ RECIPE = cli.From(
     },
     types={"stages": list[str] | None},
     defaults={
-        "stages": "240x16x44 480x8x10",
-        "short_sides": "480 360 240",
+        "stages": "480x16x40@480 240x64x36@240 352x30x16@352 960x4x2@960",
+        "short_sides": "480 240 352 960",
         "max_images": "all",
         "frozen_batch_norm": "with --init",
         "low_light_pos_weight": "that of --pos-weight",
@@ -96,8 +96,8 @@ def chosen_recipe(
     """Return a preset's training options with the given values changed.
 
     Args:
-        preset: Recipe that the other options change: default (its values are shown here), paper
-            (the paper's own), or dense (normal light only, denser labels).
+        preset: Recipe that the other options change: default (its values are shown here), and of
+            ESPNet espnet, paper (the paper's own), or dense (normal light only, denser labels).
     """
     if "stages" in values:
         values["stages"] = tuple(map(Stage.parse, values["stages"]))

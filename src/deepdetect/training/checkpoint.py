@@ -21,10 +21,15 @@ Point = dict[str, float]
 
 
 def save_checkpoint(
-    path: Path, network: nn.Module, optimizers: Sequence[Optimizer], metadata: Mapping[str, Any]
+    path: Path,
+    network: nn.Module,
+    average: nn.Module,
+    optimizers: Sequence[Optimizer],
+    metadata: Mapping[str, Any],
 ) -> None:
-    """Write "network.NAME" of the network, "optimizer.MOMENT.PARAMETER" of its optimisers, JSON."""
+    """Write "network.NAME", "average.NAME", "optimizer.MOMENT.PARAMETER" of each, and JSON."""
     tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
+    tensors |= {f"average.{name}": value for name, value in average.state_dict().items()}
     for name, parameter in network.named_parameters():
         for optimizer in optimizers:
             for moment, value in optimizer.state.get(parameter, {}).items():
@@ -50,13 +55,17 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def restore(
-    tensors: Mapping[str, Tensor], network: nn.Module, optimizers: Sequence[Optimizer]
+    tensors: Mapping[str, Tensor],
+    network: nn.Module,
+    average: nn.Module,
+    optimizers: Sequence[Optimizer],
 ) -> None:
-    """Bring a network and its optimisers to the state of a checkpoint of the same run.
+    """Bring a network, its average and its optimisers to the state of a checkpoint of the same run.
 
     It must be of the same run: fused optimisers write beyond a moment of another shape.
     """
-    network.load_state_dict({name: tensors[f"network.{name}"] for name in network.state_dict()})
+    for kind, module in (("network", network), ("average", average)):
+        module.load_state_dict({name: tensors[f"{kind}.{name}"] for name in module.state_dict()})
     parameters = dict(network.named_parameters())
     owners = {
         parameter: optimizer

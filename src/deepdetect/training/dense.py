@@ -5,9 +5,11 @@ Lightning Fabric runs it on several GPUs, whose processes `torchrun` starts.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import datetime
 import logging
+import math
 import os
 import shutil
 from collections.abc import Mapping
@@ -70,12 +72,11 @@ def initial_network(
                 "another `network`"
             )
         return options, network
-    for name, what in (("frozen_batch_norm", "batch statistics"), ("freeze_encoder", "encoder")):
-        if getattr(options, name):
-            raise OptionError(
-                f"`{name}` would keep the {what} of random weights: "
-                "give trained ones as `init_weights`, or leave it out"
-            )
+    if options.frozen_batch_norm:
+        raise OptionError(
+            "`frozen_batch_norm` would keep the batch statistics of random weights: "
+            "give trained ones as `init_weights`, or leave it out"
+        )
     with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
         torch.default_generator.manual_seed(options.seed)
         return dataclasses.replace(options, frozen_batch_norm=False), make()
@@ -137,8 +138,6 @@ class DenseTrainer(Trainer):
         self.fabric, self.device, self.is_main = fabric, fabric.device, fabric.is_global_zero
         kind, alone = device.accelerator, fabric.world_size == 1
         initial_weights = weights_digest(network)
-        if options.freeze_encoder:  # before it is compiled, which then leaves its gradients out
-            _encoder(network).requires_grad_(False)
         self.bfloat16 = device.precision == "bfloat16" or (
             device.precision == "auto" and _computes_bfloat16(kind)
         )
@@ -147,6 +146,9 @@ class DenseTrainer(Trainer):
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if not alone and kind == "cuda":
             nn.SyncBatchNorm.convert_sync_batchnorm(self.network)
+        self.average = copy.deepcopy(self.network).eval()
+        self.average_decay = options.average_decay
+        self.max_gradient_norm = options.max_gradient_norm or math.inf
         has_compiler = kind == "cuda" or any(map(shutil.which, ("g++", "clang++")))
         # Sums over processes, inside the batch normalisation, break the graph.
         self.compiled = has_compiler and alone if device.compile is None else device.compile
@@ -232,15 +234,9 @@ class DenseTrainer(Trainer):
         self.network.train()
         if self.options.frozen_batch_norm:
             freeze_batch_norm(self.network)
-        elif self.options.freeze_encoder:
-            freeze_batch_norm(_encoder(self.network))
         truth = self.to_device(masks)[:, None].float()
         logits = self.logits(self.to_float(images))
-        weight = self._pos_weight(images)
-        if self.options.pos_weight_uncertain and weight is not None:
-            probability = logits.detach().sigmoid()
-            weight = 1 + (weight - 1) * 4 * probability * (1 - probability)
-        return binary_cross_entropy_with_logits(logits, truth, pos_weight=weight)
+        return binary_cross_entropy_with_logits(logits, truth, pos_weight=self._pos_weight(images))
 
     def backward(self, loss: Tensor) -> float:
         self.fabric.backward(loss)
@@ -260,7 +256,6 @@ class DenseTrainer(Trainer):
         rank, world = self.fabric.global_rank, self.fabric.world_size
         dataset = ValidationDataset(self.data.validation, rank, world)
         sums = torch.zeros(2, 3, device=self.device, dtype=torch.float64)
-        self.network.eval()
         with loading(self._loader(dataset, batch_size=None)) as pairs:
             for number, (image, mask) in enumerate(pairs):
                 loss, iou = score_heatmap(self.heatmap(image), mask.numpy())
@@ -288,11 +283,11 @@ class DenseTrainer(Trainer):
         batch = self.to_float(image[None])
         batch = pad(batch, (0, -width % 8, 0, -height % 8), mode="replicate")
         batch = batch.contiguous(memory_format=torch.channels_last)
-        logits = self.network(batch)[0, 0, :height, :width]
+        logits = self.average(batch)[0, 0, :height, :width]
         return torch.sigmoid(logits.float()).cpu().numpy()
 
     def save(self, path: Path, notes: Mapping[str, Any]) -> None:
-        save_tensors(self.network.state_dict(), path, dict(notes))
+        save_tensors(self.average.state_dict(), path, dict(notes))
 
     def read_notes(self, path: Path) -> Mapping[str, Any]:
         return read_notes(path)
@@ -315,12 +310,6 @@ class DenseTrainer(Trainer):
             f"- normal: {best['normal_loss']:.4f} / {best['normal_iou']:.3f}",
             f"- darkened: {best['dark_loss']:.4f} / {best['dark_iou']:.3f}",
         ]
-
-
-def _encoder(network: nn.Module) -> nn.ModuleList:
-    """Return the parts of a network whose names say that they encode."""
-    parts = network.named_children()
-    return nn.ModuleList(part for name, part in parts if name.startswith("encode"))
 
 
 def freeze_batch_norm(network: nn.Module) -> None:

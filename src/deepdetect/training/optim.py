@@ -22,15 +22,14 @@ INITIAL_POWER_ITERATIONS = 3
 
 
 def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:
-    """Make the optimisers that together train a network's parameters, except frozen ones.
+    """Make the optimisers that together train a network's parameters.
 
     They are "adam", or "soap": SOAP for the kernels, Adam for biases and the like.
     """
-    trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
     if name == "adam":
-        return [torch.optim.Adam(trained, fused=True)]
-    kernels = [parameter for parameter in trained if parameter.ndim > 1]
-    vectors = [parameter for parameter in trained if parameter.ndim <= 1]
+        return [torch.optim.Adam(network.parameters(), fused=True)]
+    kernels = [parameter for parameter in network.parameters() if parameter.ndim > 1]
+    vectors = [parameter for parameter in network.parameters() if parameter.ndim <= 1]
     return [Soap(kernels), torch.optim.Adam(vectors, fused=True)]
 
 

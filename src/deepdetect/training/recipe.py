@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -69,15 +69,16 @@ class TrainingOptions:
     """Everything that decides which weights come out, given the images.
 
     Attributes:
-        network: name of the network that is trained.
-        stages: what is trained on, one stage after the other. Small crops give many cheap
-            steps first; whole images at the end teach what depends on the whole image
-            (Harris and Sobel labels are relative to the image's largest response).
+        network: name of the network that is trained: "fast" or "espnet".
+        stages: what is trained on, one stage after the other. Crops as large as the view show all
+            that its label depends on (Harris and Sobel labels are relative to the image's largest
+            response), which the global term of `fast` needs; smaller ones give many cheap steps.
         interleave: go through all stages at the same time, their steps evenly mixed, so that
             every size is seen until the end.
         short_sides: sizes in pixels that the shorter side of the images is scaled to. Crops are
             taken from those that are large enough. The first is that of the validation.
-        square: squash the images to squares, as the paper does, instead.
+        square: make the images squares: "crop" cuts the middle out, "squash" squashes them, as the
+            paper does. None: they keep their shape.
         max_images: use at most this many images, including those for validation.
         val_fraction: fraction of the images held out for validation, when no folder is given.
         dark_fraction: fraction of darkened crops (paper: a quarter).
@@ -88,13 +89,16 @@ class TrainingOptions:
             is different, though: OpenCV's Shi-Tomasi, SIFT, ORB and BRISK mark other pixels.
         transpositions: mirror crops along their diagonal, which changes labels of BRISK only.
         color_jitter: fraction of the crops whose colours are removed, or rotated with the same
-            luma, the only thing that labels depend on.
+            luma to a grey level, the only thing that labels and `fast` depend on.
         optimizer: "adam", or "soap", which learns more per image (docs/history.md has the
             measurements).
         learning_rate: at the start of the cosine annealing to 1e-6.
-        warm_up: steps over which the learning rate rises from zero. A run that starts from
-            trained weights needs them: the first steps of Adam, whose moments are not known
-            yet, would undo much.
+        warm_up: fraction of the steps over which the learning rate rises from zero. A run that
+            starts from trained weights needs it: the first steps of Adam, whose moments are not
+            known yet, would undo much.
+        average_decay: decay, in each step, of the exponential average of the weights, which is what
+            is validated and saved; 0: the weights themselves are.
+        max_gradient_norm: larger gradients are scaled down to it; None: none are.
         frozen_batch_norm: normalise by the batch statistics of the initial weights, as the
             finished network does, not by those of each batch, which vary much between batches of a
             few images. None: if the initial weights are trained ones.
@@ -102,12 +106,6 @@ class TrainingOptions:
             where it is uncertain, since most pixels are not marked; above 1 it finds more
             keypoints at a probability of 0.5.
         low_light_pos_weight: weight of marked pixels in crops of low visibility. None: the same.
-        pos_weight_uncertain: scale these weights by the uncertainty p(1 - p): they hold at a
-            probability of one half and fall to 1 where the network is certain. So certain
-            probabilities hardly move.
-        freeze_encoder: train the decoder only. The encoder has nearly all of the weights: a
-            step takes about half of the time, and what the initial weights know is kept. For few
-            images, or to change only how many pixels are marked.
         labels: the label detectors and their settings.
         val_count: how many times the validation loss is computed.
         seed: of the initial weights, the order of the images, the crops and their augmentation.
@@ -116,38 +114,45 @@ class TrainingOptions:
         OptionError: a value is out of its range.
     """
 
-    network: str = "espnet"
-    stages: tuple[Stage, ...] = (Stage(240, 16, 44), Stage(480, 8, 10))
-    interleave: bool = False
-    short_sides: tuple[int, ...] = (480, 360, 240)
-    square: bool = False
+    network: str = "fast"
+    stages: tuple[Stage, ...] = (
+        Stage(480, 16, 40, (480,)),
+        Stage(240, 64, 36, (240,)),
+        Stage(352, 30, 16, (352,)),
+        Stage(960, 4, 2, (960,)),
+    )
+    interleave: bool = True
+    short_sides: tuple[int, ...] = (480, 240, 352, 960)
+    square: Literal["crop", "squash"] | None = "crop"
     max_images: int | None = None
     val_fraction: float = 0.05
-    dark_fraction: float = 0.25
-    augmentations: int = 0
+    dark_fraction: float = 0.5
+    augmentations: int = 4
     flips: bool = False
     transpositions: bool = True
-    color_jitter: float = 0.5
-    optimizer: str = "adam"
-    learning_rate: float = 1e-3
-    warm_up: int = 0
+    color_jitter: float = 0.0
+    optimizer: str = "soap"
+    learning_rate: float = 2e-3
+    warm_up: float = 0.05
+    average_decay: float = 0.999
+    max_gradient_norm: float | None = 1.0
     frozen_batch_norm: bool | None = None
     pos_weight: float = 1.0
     low_light_pos_weight: float | None = None
-    pos_weight_uncertain: bool = False
-    freeze_encoder: bool = False
     labels: LabelOptions = field(default_factory=LabelOptions)
     val_count: int = 12
     seed: int = 0
 
     def __post_init__(self) -> None:
         check_name("optimizer", self.optimizer, ("adam", "soap"))
+        if self.square is not None:
+            check_name("square", self.square, ("crop", "squash"))
         self._check_sizes()
         check_ranges(
             self,
-            positive=("learning_rate",),
-            not_negative=("augmentations", "warm_up"),
-            fractions=("dark_fraction", "color_jitter"),
+            positive=("learning_rate", "max_gradient_norm"),
+            not_negative=("augmentations",),
+            fractions=("dark_fraction", "color_jitter", "warm_up", "average_decay"),
             counts=("val_count",),
             between={
                 "max_images": (2, math.inf),
@@ -158,8 +163,6 @@ class TrainingOptions:
         )
         if not 0 < self.val_fraction < 1:
             raise OptionError(f"`val_fraction` must lie in (0, 1), not {self.val_fraction}")
-        if self.pos_weight_uncertain and {self.pos_weight, self.low_light_pos_weight or 1} == {1}:
-            raise OptionError("`pos_weight_uncertain` needs a `pos_weight` other than 1")
 
     def _check_sizes(self) -> None:
         if not self.stages or not self.short_sides or min(self.short_sides) < 16:
@@ -266,26 +269,44 @@ class PointsTrainingOptions:
             raise OptionError("`min_density` must not be above `max_density`")
 
 
+_ESPNET = TrainingOptions(
+    network="espnet",
+    stages=(Stage(240, 16, 44), Stage(480, 8, 10)),
+    interleave=False,
+    short_sides=(480, 360, 240),
+    square=None,
+    dark_fraction=0.25,
+    augmentations=0,
+    color_jitter=0.5,
+    optimizer="adam",
+    learning_rate=1e-3,
+    warm_up=0.0,
+    average_decay=0.0,
+    max_gradient_norm=None,
+)
+
 PRESETS: dict[str, TrainingOptions] = {
-    # Ours: small crops first, evenly scaled images of several sizes.
+    # Whole views of several sizes and lights, the average of the weights.
     "default": TrainingOptions(),
+    # Small crops first, evenly scaled images of several sizes.
+    "espnet": _ESPNET,
     # The paper's (Section III-B): about 33,000 images to train on and 8,000 for validation,
     # squashed to 480x480, a quarter darkened, 100 epochs in batches of 64.
-    "paper": TrainingOptions(
+    "paper": replace(
+        _ESPNET,
         stages=(Stage(480, 64, 100),),
         short_sides=(480,),
-        square=True,
+        square="squash",
         max_images=41_000,
         val_fraction=8 / 41,
-        dark_fraction=0.25,
         transpositions=False,
         color_jitter=0.0,
-        learning_rate=1e-3,
         val_count=20,
     ),
     # For two-view geometry (the paper's second weights, Figure 8): normal light only, denser
-    # labels. Meant to start from trained weights, those named "default".
-    "dense": TrainingOptions(
+    # labels. Meant to start from trained weights of ESPNet.
+    "dense": replace(
+        _ESPNET,
         stages=(Stage(480, 8, 5, (480,)), Stage(480, 8, 1, (720,)), Stage(240, 32, 3, (240,))),
         interleave=True,
         short_sides=(480, 240, 720),
@@ -293,7 +314,7 @@ PRESETS: dict[str, TrainingOptions] = {
         labels=LABEL_SETTINGS["dense"],
         optimizer="soap",
         learning_rate=1.5e-3,
-        warm_up=100,
+        warm_up=0.044,
         val_count=6,
     ),
 }

@@ -64,15 +64,15 @@ def train(
     Raises:
         MissingExtraError: a package of the extra `train` is not installed.
         ImageError: a folder is missing or empty.
-        OptionError: the folder holds a run with other options, or the batch statistics or the
-            encoder of random weights are to be frozen.
+        OptionError: the folder holds a run with other options, the initial weights are of another
+            network, or the batch statistics of random weights are to be frozen.
         WeightsError: the initial weights are missing or do not fit.
         DeepDetectError: an image cannot be read.
 
     Example:
         >>> from deepdetect.training import Stage
-        >>> options = TrainingOptions(stages=(Stage(crop=240, batch=16, epochs=44),), seed=1)
-        >>> result = train("photos", "run", options, init_weights="default")  # doctest: +SKIP
+        >>> options = TrainingOptions(stages=(Stage(crop=480, batch=16, epochs=20),), seed=1)
+        >>> result = train("photos", "run", options)  # doctest: +SKIP
         >>> detector = DeepDetect(result.onnx)  # doctest: +SKIP
     """
     trainer = _dense_trainer(

@@ -72,7 +72,7 @@ class Schedule:
         options = self.options
         cosine = (1 + math.cos(math.pi * step / self.steps)) / 2
         rate = FINAL_LEARNING_RATE + cosine * (options.learning_rate - FINAL_LEARNING_RATE)
-        return rate * min(1.0, (step + 1) / (options.warm_up + 1))
+        return rate * min(1.0, (step + 1) / (options.warm_up * self.steps + 1))
 
     def crops_until(self, step: int) -> int:
         """Return how many crops the steps before this one have."""

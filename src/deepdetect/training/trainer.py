@@ -68,6 +68,8 @@ class Trainer(abc.ABC):
 
     Attributes:
         network: all of the state that is trained.
+        average: the exponential average of that state, which is what is measured and saved.
+        average_decay: of the average, in each step; 0: it is the network.
         optimizers: what trains it.
         options: the recipe.
         origin: digests of the images and of the initial weights: a run is resumed with the same
@@ -84,6 +86,8 @@ class Trainer(abc.ABC):
     """
 
     network: nn.Module
+    average: nn.Module
+    average_decay: float
     optimizers: list[Optimizer]
     options: Any
     origin: dict[str, str]
@@ -158,6 +162,14 @@ class Trainer(abc.ABC):
             )
         for optimizer in self.optimizers:
             optimizer.step()
+        # At first faster, so that the start is soon forgotten.
+        decay = min(self.average_decay, (1 + step) / (10 + step))
+        states = (module.state_dict().values() for module in (self.average, self.network))
+        for mean, state in zip(*states, strict=True):
+            if mean.is_floating_point():
+                mean.lerp_(state, 1 - decay)
+            else:  # a count
+                mean.copy_(state)
         return value
 
     def fit(self, folder: Path, log: Callable[[str], None] | None = None) -> TrainingResult:
@@ -224,7 +236,8 @@ class Trainer(abc.ABC):
     def _save(self, state: TrainingState, folder: Path) -> None:
         if self.is_main:
             metadata = {**dataclasses.asdict(state), "inputs": self._inputs(), **self._all_notes()}
-            save_checkpoint(folder / CHECKPOINT, self.network, self.optimizers, metadata)
+            modules = self.network, self.average
+            save_checkpoint(folder / CHECKPOINT, *modules, self.optimizers, metadata)
 
     def _resume(self, folder: Path) -> TrainingState:
         if not (folder / CHECKPOINT).exists():
@@ -234,7 +247,7 @@ class Trainer(abc.ABC):
         check_same(folder, metadata.get("inputs"), self._inputs(), advice)
         names = [each.name for each in dataclasses.fields(TrainingState)]
         state = TrainingState(**{name: metadata[name] for name in names})
-        restore(tensors, self.network, self.optimizers)
+        restore(tensors, self.network, self.average, self.optimizers)
         if state.points:
             self.read_notes(folder / self.weights_file)  # an error now rather than at the end
         return state

@@ -6,6 +6,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -23,12 +24,13 @@ from .recipe import TrainingOptions
 class View:
     """How an image is shown to the network: its shorter side in pixels, and its light.
 
-    It is scaled evenly, or squashed to a square, or it is the augmented square of a seed.
+    It is scaled evenly, its middle square is, or it is squashed to a square, or it is the augmented
+    square of a seed.
     """
 
     short_side: int
     darkening: Darkening | None = None
-    square: bool = False
+    square: Literal["crop", "squash"] | None = None
     augmentation: int | None = None
 
     @property
@@ -37,7 +39,7 @@ class View:
         light = "normal"
         if self.darkening is not None:
             light = f"b{self.darkening.brightness:.3f}c{self.darkening.contrast:.3f}"
-        shape = "x" * self.square
+        shape = {None: "", "crop": "c", "squash": "x"}[self.square]
         if self.augmentation is not None:
             shape = f"v{AUGMENTATION_VERSION}-{self.augmentation:08x}"
         return f"{self.short_side}{shape}_{light}"
@@ -82,7 +84,11 @@ def render(image: object, view: View) -> np.ndarray:
     rgb = load_image(image)
     if view.augmentation is not None:
         rgb = augment(rgb, view.short_side, view.augmentation)
-    elif not view.square:
+    elif view.square != "squash":
+        if view.square == "crop":
+            side = min(rgb.shape[:2])
+            top, left = ((length - side) // 2 for length in rgb.shape[:2])
+            rgb = np.ascontiguousarray(rgb[top : top + side, left : left + side])
         rgb = scale_short_side(rgb, view.short_side)
     elif rgb.shape[:2] != (view.short_side, view.short_side):
         size = (view.short_side, view.short_side)

@@ -75,9 +75,7 @@ def test_training_changes_the_weights_and_measures(
     whole: TrainingResult, untrained: RankerTrainer
 ) -> None:
     after = load_file(whole.weights.parent / CHECKPOINT)
-    assert all(
-        (after[f"network.ranker.{n}"] != p).any() for n, p in untrained.ranker.named_parameters()
-    )
+    assert all((after[f"network.{n}"] != p).any() for n, p in untrained.network.named_parameters())
     assert [point["step"] for point in whole.points] == [0, 2]
     assert whole.best["score"] == max(point["score"] for point in whole.points)
     assert "perceptron of" in (whole.weights.parent / "MODEL_CARD.md").read_text()
@@ -106,7 +104,7 @@ def test_the_best_weights_are_those_of_the_best_measure(
 
 
 def test_an_untrained_ranker_ranks_by_the_first_feature(untrained: RankerTrainer) -> None:
-    module = untrained.ranker
+    module = untrained.network
     features = module.mean + module.deviation * torch.randn(
         200, len(module.mean), generator=torch.Generator().manual_seed(1)
     )

@@ -100,6 +100,9 @@ class RankerTrainer(Trainer):
     objective, sign = "score", -1
     weights_file = "best.npz"
     max_gradient_norm = 1.0
+    average_decay = AVERAGE_DECAY
+    network: RankerModule
+    average: RankerModule
 
     def __init__(
         self, images: Path, validation: Path, options: PointsTrainingOptions, num_workers: int = 0
@@ -110,12 +113,11 @@ class RankerTrainer(Trainer):
         statistics = self._statistics()
         with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
             torch.default_generator.manual_seed(options.seed)
-            self.ranker = RankerModule(*statistics)
-        self.average = copy.deepcopy(self.ranker).requires_grad_(False)
-        self.network = torch.nn.ModuleDict({"ranker": self.ranker, "average": self.average})
+            self.network = RankerModule(*statistics)
+        self.average = copy.deepcopy(self.network)
         self.optimizers = [
             torch.optim.AdamW(
-                self.ranker.parameters(), options.learning_rate, weight_decay=WEIGHT_DECAY
+                self.network.parameters(), options.learning_rate, weight_decay=WEIGHT_DECAY
             )
         ]
         self.steps = options.steps
@@ -151,24 +153,13 @@ class RankerTrainer(Trainer):
     def loss(self, batch: Sequence[CandidatePair]) -> Tensor:
         """Return the mean loss of some pairs; those with nothing to see count as 0."""
         losses = [
-            pair_loss(self.ranker, pair, self.options.match_weight)
+            pair_loss(self.network, pair, self.options.match_weight)
             for pair in batch
             if min(len(view.xy) for view in pair.views) > 1
         ]
         if not losses:
-            return torch.stack([p.sum() for p in self.ranker.parameters()]).sum() * 0
+            return torch.stack([p.sum() for p in self.network.parameters()]).sum() * 0
         return torch.stack(losses).sum() / len(batch)
-
-    def training_step(self, batch: Sequence[CandidatePair], step: int) -> float:
-        """Make one optimiser step, and let the average of the weights follow."""
-        loss = super().training_step(batch, step)
-        # At first faster, so that the start is soon forgotten.
-        decay = min(AVERAGE_DECAY, (1 + step) / (10 + step))
-        with torch.no_grad():
-            weights = zip(self.average.parameters(), self.ranker.parameters(), strict=True)
-            for mean, parameter in weights:
-                mean.lerp_(parameter, 1 - decay)
-        return loss
 
     def learning_rate(self, step: int) -> float:
         """Return the learning rate of a step: a linear warm-up into cosine annealing."""
@@ -188,7 +179,7 @@ class RankerTrainer(Trainer):
         return notes
 
     def card(self, best: Point) -> tuple[str, list[str]]:
-        count = sum(parameter.numel() for parameter in self.ranker.parameters())
+        count = sum(parameter.numel() for parameter in self.network.parameters())
         network = (
             f"a perceptron of {count:,} parameters that ranks maxima of |det Hessian| in a scale\n"
             "space by how surely they are found again."
