@@ -11,8 +11,8 @@ from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
 from tests.cli.conftest import one_sentence  # noqa: E402
 
 
-def test_the_default_is_the_shipped_file(run, tmp_path: Path) -> None:
-    result = run("export", "onnx", "-o", "made.onnx")
+def test_without_points_it_is_the_shipped_file(run, tmp_path: Path) -> None:
+    result = run("export", "onnx", "-o", "made.onnx", "--max-keypoints", 0)
     assert result.exit_code == 0, result.output
     model, shipped = onnx.load(tmp_path / "made.onnx"), onnx.load(pretrained_weights())
     assert model.graph == shipped.graph
@@ -34,12 +34,12 @@ def test_size(run, tmp_path: Path) -> None:
     assert [side.dim_value for side in sides] == [2, 1, 48, 64]
 
 
-def test_keypoints(run, tmp_path: Path) -> None:
+def test_points(run, tmp_path: Path) -> None:
     result = run("export", "onnx", "-o", "made.onnx", "--max-keypoints", 70, "--json")
     assert result.exit_code == 0, result.output
     assert json.loads(result.output)["metadata"]["max_keypoints"] == "70"
     outputs = {value.name: value for value in onnx.load(tmp_path / "made.onnx").graph.output}
-    assert list(outputs) == ["probability", "logits", "keypoints", "keypoint_logits"]
+    assert list(outputs) == ["probability", "logits", "keypoints", "scores", "sizes"]
     sides = outputs["keypoints"].type.tensor_type.shape.dim
     assert [side.dim_param or side.dim_value for side in sides] == ["batch", 70, 2]
 
@@ -50,6 +50,7 @@ def test_keypoints(run, tmp_path: Path) -> None:
         ("-o a.onnx --batch 2", "--batch needs --size"),
         ("-o a.onnx --size 480", "'480' is no height and width"),
         ("-o a.onnx --max-keypoints 100001", "--max-keypoints must lie in"),
+        ("-o a.onnx --no-maps --max-keypoints 0", "--max-keypoints must be a whole number from 1"),
         ("-o a.png", "ends in .onnx"),
         ("densse -o a.onnx", "did you mean 'dense'"),
         ("text.onnx -o a.onnx", "is not an ONNX file that can be read"),

@@ -11,12 +11,12 @@ from PIL import Image
 
 pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
 
-from deepdetect import DeepDetect
+from deepdetect import PointDetector
 from deepdetect.detector.network.onnx_export import write_onnx
 from tests.docs.test_pages import blocks
 
 
-def test_keypoints_in_the_file(
+def test_points_in_the_file(
     photo: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -25,9 +25,8 @@ def test_keypoints_in_the_file(
     block = blocks("other-programs.md", "python")[-1]
     found: dict[str, Any] = {}
     exec(compile(block, "other-programs.md", "exec"), found)
-    expected = DeepDetect(backend="onnxruntime").detect(
-        "photo.jpg", max_keypoints=1000, nms_radius=1, subpixel=True
-    )
-    order = np.argsort(-expected.logits, kind="stable")
-    assert 100 < len(expected) < 1000
-    np.testing.assert_allclose(found["xy"], expected.xy[order], atol=1e-3)
+    expected = PointDetector(2048).detect("photo.jpg")
+    assert 300 < len(expected) < 2048
+    assert abs(len(found["xy"]) - len(expected)) <= 2
+    gaps = np.linalg.norm(found["xy"][:, None] - expected.xy, axis=2)
+    assert (gaps.min(0) < 0.05).mean() > 0.99

@@ -12,6 +12,9 @@ FOLDER = Path(__file__).parent / "weights"
 RANKER = Path(__file__).parent / "points" / "ranker.npz"
 """The trained ranker of points; its card is beside it."""
 
+POINTS_GRAPH = RANKER.with_name("points.onnx")
+"""The whole detection of points, for ONNX files."""
+
 PRETRAINED: dict[str, str] = {
     "default": "default",  # photographs in any light
     "dense": "dense",  # two views of a scene in normal light, denser
@@ -28,8 +31,8 @@ PADDED_IMAGE = "padded_image"
 LOGITS = "logits"
 """Name of the output that holds logits; an output of another name holds probabilities."""
 
-KEYPOINTS, KEYPOINT_LOGITS = "keypoints", "keypoint_logits"
-"""Outputs of files that give keypoints, too: these are not read by the package."""
+KEYPOINTS, SCORES, SIZES = POINTS = "keypoints", "scores", "sizes"
+"""Outputs of files that give points, too: these are not read by the package."""
 
 
 def pretrained_weights(name: str = "default", suffix: str = ".onnx") -> Path:

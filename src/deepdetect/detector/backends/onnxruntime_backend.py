@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import OptionError, first_line, unknown_name
-from ..pretrained import KEYPOINT_LOGITS, KEYPOINTS
+from ..pretrained import POINTS
 from .interface import (
     PROBE_SHAPE,
     RuntimeOptions,
@@ -104,7 +104,7 @@ def _maps_only(path: Path) -> str | bytes:
     """Return the content of a file that gives keypoints, too, without them; else its path."""
     with contextlib.suppress(Exception):  # of a damaged file: ONNX Runtime says what is wrong
         model = path.read_bytes()
-        without = leave_out_outputs(model, {KEYPOINTS, KEYPOINT_LOGITS})
+        without = leave_out_outputs(model, set(POINTS))
         if without is not model:
             return without
     return str(path)

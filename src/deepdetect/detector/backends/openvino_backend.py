@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import OptionError
-from ..pretrained import KEYPOINT_LOGITS, KEYPOINTS, LOGITS, PADDED_IMAGE
+from ..pretrained import LOGITS, PADDED_IMAGE, POINTS
 from .interface import (
     RuntimeOptions,
     as_logits,
@@ -107,7 +107,7 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
 def _keep_what_is_read(graph: Any) -> None:
     """Take out outputs that nobody reads, and the padding: images come padded."""
     names = {name for value in graph.outputs for name in value.get_names()}
-    unread = names - {LOGITS} if LOGITS in names else {KEYPOINTS, KEYPOINT_LOGITS}
+    unread = names - {LOGITS} if LOGITS in names else set(POINTS)
     for result in graph.get_results():
         own = result.output(0).get_names()
         if own & unread and LOGITS not in own:  # versions before 2025 have several names for one

@@ -1,6 +1,6 @@
-"""ONNX files for other programs: any size or one, with or without keypoints.
+"""ONNX files for other programs: any size or one, with or without points.
 
-Their input is `image`; outputs are `probability`, `logits` and those of `add_keypoints`.
+Their input is `image`; outputs are `probability`, `logits` and those of `add_points`.
 """
 
 from __future__ import annotations
@@ -19,8 +19,16 @@ from ..._shared.errors import OptionError, WeightsError, require_packages
 from ..._shared.options import check_ranges, suggest_keywords
 from ...features.selection import check_max_keypoints
 from ..pretrained import LOGITS, resolve_weights
-from .onnx_graph import IMAGE, PROBABILITY, add_padding, fix_size, read_metadata, write_metadata
-from .onnx_keypoints import MAX_KEYPOINTS, add_keypoints, remove_keypoints
+from .onnx_graph import (
+    IMAGE,
+    PROBABILITY,
+    add_padding,
+    fix_size,
+    read_metadata,
+    replace_nodes,
+    write_metadata,
+)
+from .onnx_points import add_points, remove_points
 
 if TYPE_CHECKING:
     from onnx import ModelProto
@@ -39,9 +47,9 @@ class OnnxOptions:
         size: height and width in pixels of a file that takes this size only, for OpenCV 4 and other
             runtimes without dynamic shapes. None: any height and width.
         batch: number of images that a file with a size takes; without a size it is free.
-        max_keypoints: the file gives this many dense keypoints, too, the best ones: what
-            `DeepDetect.detect` finds with the same `max_keypoints`, `nms_radius=1` and
-            `subpixel=True`. 0: maps only; OpenCV 4 refuses files with keypoints.
+        maps: the file gives the network's probability and logits of all pixels.
+        max_keypoints: the file gives this many points, too, those of `PointDetector`. 0: none;
+            OpenCV refuses files with points.
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -49,14 +57,15 @@ class OnnxOptions:
 
     size: tuple[int, int] | None = None
     batch: int = 1
-    max_keypoints: int = MAX_KEYPOINTS
+    maps: bool = True
+    max_keypoints: int = 2048
 
     def __post_init__(self) -> None:
         if self.size is not None and len(self.size) != 2:
             raise OptionError(f"`size` must be height and width, not {self.size}")
         ranges = {"size": (8, 16384), "batch": (1, 1024), "max_keypoints": (0, 100_000)}
         check_ranges(self, counts=("size", "batch"), between=ranges)
-        if self.max_keypoints:
+        if self.max_keypoints or not self.maps:
             check_max_keypoints(self.max_keypoints)
         if self.batch > 1 and self.size is None:
             raise OptionError("`batch` needs `size`: a file for any size takes any batch")
@@ -75,7 +84,7 @@ class OnnxOptions:
 
 def export_onnx(network: nn.Module, path: str | Path) -> None:
     """Write a network for any size; whole or not at all."""
-    _write(_of_torch(network), path, OnnxOptions(), {})
+    _write(_of_torch(network), path, OnnxOptions(max_keypoints=0), {})
 
 
 def write_onnx(
@@ -105,8 +114,11 @@ def _write(
     """Write what the options make of a network for any size; return its metadata."""
     if options.size is not None:
         fix_size(model, *options.size, options.batch)
+    if not options.maps:
+        replace_nodes(model.graph, [])
+        del model.graph.output[:]
     if options.max_keypoints:
-        add_keypoints(model, options.max_keypoints)
+        add_points(model, options.max_keypoints)
     write_metadata(model, {**options.metadata, **origin})
     with atomic_path(path) as temporary:
         temporary.write_bytes(model.SerializeToString())
@@ -131,7 +143,7 @@ def _load(path: Path) -> tuple[ModelProto, dict[str, str]]:
         raise WeightsError(
             f"{path} is not an ONNX file that can be read ({error}): download it again"
         ) from None
-    remove_keypoints(model)
+    remove_points(model)
     tensors = [value.name for value in (*model.graph.input, *model.graph.output)]
     if tensors != [IMAGE, PROBABILITY, LOGITS]:
         raise WeightsError(

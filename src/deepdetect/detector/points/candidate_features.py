@@ -9,16 +9,31 @@ from __future__ import annotations
 import numpy as np
 
 from ..._shared.machine import parallel_for
-from .hessian_scales import Candidates, ScaleSpace
+from .hessian_scales import SIGMAS_PX, Candidates, ScaleSpace
 
 RING_RADII = (1.0, 2.0, 3.5, 6.0)
 """Of the rings around a candidate that are looked at, in sigmas."""
+
+RING_POINTS = 8
+"""Of each ring: in the directions of a compass rose."""
 
 FEATURES = 23 + 8 * len(RING_RADII)
 """Number of features of a candidate."""
 
 DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR = map(np.float32, (1e-7, 1e-6, 1e-8))
 """Added before logarithms and divisions: responses of noise and rounding look like nothing."""
+
+
+def ring_offsets() -> np.ndarray:
+    """Return (2, L, 2, P) int64 offsets in x and in y: to the first points of all rings, and so on.
+
+    By the level, and by whether the column, or the row, of the candidate is odd.
+    """
+    angle = np.arange(RING_POINTS)[:, None] * (2 * np.pi / RING_POINTS)
+    reach = SIGMAS_PX[:, None, None, None] * RING_RADII
+    odd = np.arange(2)[:, None, None]  # halves are rounded to even columns and rows
+    rings = [np.rint(reach * turn(angle) + odd) - odd for turn in (np.cos, np.sin)]
+    return np.array(rings, np.int64).reshape(2, len(SIGMAS_PX), 2, -1)
 
 
 def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray:
@@ -30,12 +45,8 @@ def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray
     neighbouring scales, relative to it; mean, largest and smallest of |det Hessian|, grey value and
     gradient on rings; its rank among all candidates per pixel; its level.
     """
-    from .kernels import RING_POINTS, RINGS, measure_candidates
+    from .kernels import measure_candidates
 
-    angle = np.arange(RING_POINTS)[:, None] * (2 * np.pi / RING_POINTS)
-    reach = space.sigmas_px[:, None, None, None] * RING_RADII
-    odd = np.arange(2)[:, None, None]  # halves are rounded to even columns and rows
-    rings = [np.rint(reach * turn(angle) + odd) - odd for turn in (np.cos, np.sin)]
     pixels = np.stack([candidates.level, candidates.row, candidates.column], 1)
     floors = DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR
     features = np.empty((len(candidates), FEATURES), np.float32)
@@ -45,8 +56,7 @@ def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray
         space.smooth.shape,
         *(maps.reshape(-1) for maps in (space.smooth, space.determinant)),
         space.variances,
-        np.array(rings, np.int64).reshape(2, -1, 2, RINGS * RING_POINTS),
-        *(pixels, floors, features),
+        *(ring_offsets(), pixels, floors, features),
     )
     features[:, 17] += 2 * space.gray - 1
     features[:, -2] = np.log((candidates.rank + 1) / space.smooth[0].size) / 2 + 3

@@ -1,0 +1,480 @@
+"""The graph of the points in ONNX files.
+
+    python tools/points_graph.py
+    python tools/points_graph.py --candidates web/dist/model/points.onnx
+
+The first command makes the file of the package that `deepdetect export onnx` adds to a network, the
+second one what the page in the browser runs. Steps, constants and weights are those of
+`deepdetect.detector.points`: after a change there, make the file of the package again.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import onnx
+from onnx import helper, numpy_helper
+
+from deepdetect.detector.network.onnx_points import MAX_KEYPOINTS, PREFIX
+from deepdetect.detector.points.candidate_features import (
+    DETERMINANT_FLOOR,
+    GRADIENT_FLOOR,
+    RING_POINTS,
+    RING_RADII,
+    STRENGTH_FLOOR,
+    ring_offsets,
+)
+from deepdetect.detector.points.detection import (
+    CANDIDATES_PER_KEYPOINT,
+    MIN_CANDIDATES,
+    SIZE_PER_SIGMA,
+    least_distances,
+)
+from deepdetect.detector.points.hessian_scales import LEAST_RESPONSE, NMS_RADIUS, SIGMAS_PX
+from deepdetect.detector.points.ranker import MAX_DEVIATIONS, load_ranker
+from deepdetect.detector.pretrained import KEYPOINTS, POINTS_GRAPH, SCORES, SIZES
+from deepdetect.features.selection import MAX_OFFSET_PX
+
+OPSET, IR_VERSION = 17, 8
+"""Those of the network's file."""
+
+LUMA, LUMA_UNIT = (4899.0, 9617.0, 1868.0), 16384.0
+"""Red, green and blue in OpenCV's grey: in whole numbers, whose sums are exact."""
+
+REACH_PER_SIGMA = 4
+"""Of OpenCV's Gaussian filters of float32."""
+
+VARIANCES = (SIGMAS_PX**2).astype(np.float32)
+
+MARGIN = NMS_RADIUS + 1
+"""Pixels around a candidate that are looked at: a window, and one more to differentiate."""
+
+NEAR, OTHERS = np.arange(-1, 3), [0, 2, 3]
+"""Levels that are looked at, from that of a candidate, and which of them are others."""
+
+CHUNK = 2048
+"""Candidates that are measured at a time: all the pixels around them would take 70 MB and more."""
+
+BLOCK = 256
+"""Points that are compared with each other at a time."""
+
+END = 1 << 40
+"""Of any axis."""
+
+FLOAT, UINT8, INT64, BOOL = 1, 2, 7, 9
+"""As ONNX numbers the types of elements."""
+
+
+def main() -> None:
+    """Write a file."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--candidates", type=Path, metavar="FILE")
+    path = parser.parse_args().candidates
+    model = candidates_model() if path else points_model()
+    (path or POINTS_GRAPH).write_bytes(model.SerializeToString())
+
+
+def points_model() -> onnx.ModelProto:
+    """Make the graph that maps images to their best points, as many as an initializer says."""
+    graph = Graph(PREFIX)
+    count = graph.constant([2048], MAX_KEYPOINTS)
+    gray = (Tensor(graph, "image") * 255.0).Round().Conv(np.reshape(LUMA, (1, 3, 1, 1)))
+    gray = ((gray + LUMA_UNIT / 2) / LUMA_UNIT).Floor()
+    limit = (count * CANDIDATES_PER_KEYPOINT).Max([MIN_CANDIDATES])
+    x, y, scores, sizes = choose(*rank_candidates(gray, limit), count)
+    xy = graph.join([x.Unsqueeze([2]), y.Unsqueeze([2])], axis=2)
+    shape = ["batch", "count"]
+    outputs = [(KEYPOINTS, FLOAT, [*shape, 2]), (SCORES, FLOAT, shape), (SIZES, FLOAT, shape)]
+    image = "image", FLOAT, ["batch", 3, "height", "width"]
+    return graph.model(image, outputs, [xy, scores, sizes])
+
+
+def candidates_model() -> onnx.ModelProto:
+    """Make the graph that maps grey images to all of their candidates, ranked."""
+    graph = Graph(PREFIX)
+    found = rank_candidates(Tensor(graph, "gray").Cast(to=FLOAT))
+    kinds = {"x": FLOAT, "y": FLOAT, "level": INT64, "logits": FLOAT}
+    outputs = [(name, kind, ["batch", "count"]) for name, kind in kinds.items()]
+    return graph.model(("gray", UINT8, ["batch", 1, "height", "width"]), outputs, found)
+
+
+def _operator(kind: str) -> Callable[[Tensor, Any], Any]:
+    return lambda tensor, other: tensor.graph.add(kind, tensor, other)
+
+
+class Tensor:
+    """A tensor of a graph: `tensor.Kind(...)` is a node that reads it, and so is an operator."""
+
+    def __init__(self, graph: Graph, name: str) -> None:
+        self.graph, self.name = graph, name
+
+    def __getattr__(self, kind: str) -> Any:
+        return lambda *inputs, **values: self.graph.add(kind, self, *inputs, **values)
+
+    __add__, __sub__, __mul__, __truediv__ = map(_operator, ("Add", "Sub", "Mul", "Div"))
+
+
+class Graph:
+    """Nodes and constants, of a model or of the body of a loop; a prefix begins their names."""
+
+    def __init__(self, prefix: str) -> None:
+        self.prefix, self.nodes = prefix, []
+        self.made: dict[tuple[Any, ...], list[Tensor]] = {}
+        self.constants: dict[Any, onnx.TensorProto] = {}
+
+    def constant(self, value: Any, name: str | None = None) -> Tensor:
+        """Return a constant of float32, int64 or bool; equal ones without a name are one."""
+        array = np.asarray(value)
+        array = array.astype({"f": np.float32, "b": np.bool_}.get(array.dtype.kind, np.int64))
+        key = name or (array.dtype, array.shape, array.tobytes())
+        if key not in self.constants:
+            name = name or f"{self.prefix}constant{len(self.constants)}"
+            self.constants[key] = numpy_helper.from_array(array, name)
+        return Tensor(self, self.constants[key].name)
+
+    def tensor(self, value: Any) -> Tensor:
+        """Return a tensor of this graph: a constant, or one of the graph around it."""
+        return Tensor(self, value.name) if isinstance(value, Tensor) else self.constant(value)
+
+    def add(self, kind: str, *inputs: Any, outputs: int = 1, **values: Any) -> Any:
+        """Return the output of a node, or a list of several; equal nodes are one."""
+        read = [self.tensor(value).name for value in inputs]
+        key = kind, *read, repr(values)
+        if key not in self.made:
+            names = [f"{self.prefix}{kind}{len(self.nodes)}.{k}" for k in range(outputs)]
+            self.nodes.append(helper.make_node(kind, read, names, **values))
+            self.made[key] = [Tensor(self, name) for name in names]
+        return self.made[key] if outputs > 1 else self.made[key][0]
+
+    def join(self, inputs: Sequence[Any], axis: int) -> Any:
+        """Concatenate tensors."""
+        return self.add("Concat", *inputs, axis=axis)
+
+    def loop(self, count: Any, step: Callable[..., Sequence[Any]], *state: Any) -> list[Any]:
+        """Repeat a step; return its last state, and what it has found each time, stacked.
+
+        It maps the number of the step, whether the loop goes on, and the int64 state, tensors of
+        its own graph, to: whether it goes on, the state, and float32 that it has found.
+        """
+        body = Graph(f"{self.prefix}loop{len(self.nodes)}/")
+        given = [Tensor(body, f"{body.prefix}given{k}") for k in range(2 + len(state))]
+        results = step(*given)
+        kinds = [(INT64, ()), (BOOL, ()), *[(INT64, None)] * len(state)]
+        made = [*kinds[1:], *[(FLOAT, None)] * (len(results) - 1 - len(state))]
+        inputs, outputs = (
+            [
+                helper.make_tensor_value_info(tensor.name, *kind)
+                for tensor, kind in zip(tensors, types, strict=True)
+            ]
+            for tensors, types in ((given, kinds), (results, made))
+        )
+        graph = helper.make_graph(body.nodes, "step", inputs, outputs, [*body.constants.values()])
+        return self.add("Loop", count, True, *state, outputs=len(results) - 1, body=graph)
+
+    def model(
+        self, given: tuple[Any, ...], outputs: list[tuple[Any, ...]], tensors: Sequence[Tensor]
+    ) -> onnx.ModelProto:
+        """Return the model with an input and outputs of names, types and shapes."""
+        for output, tensor in zip(outputs, tensors, strict=True):
+            self.nodes.append(helper.make_node("Identity", [tensor.name], [output[0]]))
+        first, *others = (helper.make_tensor_value_info(*each) for each in (given, *outputs))
+        constants = [*self.constants.values()]
+        graph = helper.make_graph(self.nodes, "points", [first], others, constants)
+        opsets = [helper.make_opsetid("", OPSET)]
+        return helper.make_model(graph, opset_imports=opsets, ir_version=IR_VERSION)
+
+
+def rank_candidates(gray: Any, limit: Any = None) -> tuple[Any, Any, Any, Any]:
+    """Find the strongest candidates of (B, 1, H, W) grey images, at most so many, and rank them.
+
+    Returns:
+        x, y, level and logit, (B, K) each, the strongest first. Behind the last candidate of an
+        image there is at least one more, whose logit is -infinity.
+    """
+    graph = gray.graph
+    height, width = (gray.Shape(start=axis, end=axis + 1) for axis in (2, 3))
+    mean = gray.ReduceMean(axes=[1, 2, 3]).Round()
+    maps, strengths, places = [], [], []
+    for k, (smooth, peaks) in enumerate(_levels((gray - mean) / 255.0, height, width)):
+        maps.append(smooth)
+        if peaks is not None:
+            most = peaks.Greater(0.0).Cast(to=FLOAT).ReduceSum([1], keepdims=0)
+            most = most.ReduceMax(axes=[0]).Cast(to=INT64).Max([1])
+            most = most.Min(limit) if limit else most
+            strength, place = peaks.TopK(most, axis=1, outputs=2)
+            strengths.append(strength)
+            places.append(place + height * width * k)
+    strength = graph.join(strengths, axis=1)
+    count = strength.Shape(start=1)
+    count = count.Min(limit) if limit else count
+    strength, order = strength.TopK(count, axis=1, outputs=2)
+    missing = count.Mod(CHUNK) * -1 + CHUNK
+    padding = graph.join([[0, 0, 0], missing], axis=0)
+    strength = strength.Pad(padding)
+    place = graph.join(places, axis=1).GatherElements(order, axis=1).Pad(padding)
+    level, pixel = place / (height * width), place.Mod(height * width)
+    pixels = level, pixel / width, pixel.Mod(width)
+    flat = graph.join(maps, axis=1).Flatten()
+
+    def measure(number: Any, going: Any) -> tuple[Any, ...]:
+        start = number.Reshape([1]) * CHUNK
+        own = (number.graph.tensor(each).Slice(start, start + CHUNK, [1]) for each in pixels)
+        ranks = start + np.arange(1, CHUNK + 1)
+        around = (number.graph.tensor(each) for each in (flat, height, width, mean))
+        return going.Identity(), *_measure(*around, *own, ranks)
+
+    x, y, logits = (
+        each.Transpose(perm=[1, 0, 2]).Reshape([0, -1])
+        for each in graph.loop(((count + missing) / CHUNK).Squeeze(), measure)
+    )
+    return x, y, level, strength.Greater(0.0).Where(logits, -np.inf)
+
+
+def _levels(smooth: Any, height: Any, width: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield levels with a frame of `MARGIN`, and (B, H W) strengths: of maxima, else 0; or None.
+
+    The frame is mirrored at the outermost rows and columns, as the filters see the image.
+    """
+    graph, steps = smooth.graph, np.sqrt(np.diff(SIGMAS_PX**2, prepend=0.0))
+    radii = [round(2 * REACH_PER_SIGMA * step + 1) // 2 for step in steps]
+    inner, mirrored = [], []
+    for side in (height, width):
+        place = graph.add("Range", 0, side.Squeeze(), 1)
+        inner.append(place.Greater(0).And(place.Less(side - 1)))
+        period = (side * 2 - 2).Max([1])
+        place = graph.add("Range", -max(radii), side.Squeeze() + max(radii), 1).Mod(period)
+        mirrored.append(place.Min(period - place))
+    inside = inner[0].Unsqueeze([1]).And(inner[1])
+
+    def framed(values: Any, radius: int, axis: int) -> Any:
+        cut = max(radii) - radius
+        return values.Gather(mirrored[axis - 2].Slice([cut], [-cut or END], [0]), axis=axis)
+
+    for k, (step, radius) in enumerate(zip(steps, radii, strict=True)):
+        # Gaussians add up by their variances: each level smooths the one before.
+        kernel = cv2.getGaussianKernel(2 * radius + 1, float(step), cv2.CV_32F)
+        smooth = framed(smooth, radius, 3).Conv(kernel.reshape(1, 1, 1, -1))
+        smooth = framed(smooth, radius, 2).Conv(kernel.reshape(1, 1, -1, 1))
+        frame = framed(framed(smooth, MARGIN, 2), MARGIN, 3)
+        if not 0 < k < len(SIGMAS_PX) - 2:
+            yield frame, None
+            continue
+        response = _determinant(frame, MARGIN, VARIANCES[k]).Abs()
+        window = {"kernel_shape": [2 * NMS_RADIUS + 1] * 2, "pads": [NMS_RADIUS] * 4}
+        peak = response.Equal(response.MaxPool(**window)).And(inside)
+        peak = peak.And(response.Greater(LEAST_RESPONSE))
+        yield frame, peak.Where(response, 0.0).Flatten()
+
+
+def _measure(
+    flat: Any, height: Any, width: Any, mean: Any, level: Any, row: Any, column: Any, ranks: Any
+) -> tuple[Any, Any, Any]:
+    """Return x, y and logits of candidates, as `describe_candidates` and the ranker find them.
+
+    `flat` has all levels of an image with their frames in a row.
+    """
+    graph, variances = level.graph, level.graph.tensor(VARIANCES)
+    down = width + 2 * MARGIN
+    deeper = down * (height + 2 * MARGIN)
+
+    def look(level: Any, row: Any, column: Any, steps: Sequence[Any], *shape: int) -> Any:
+        """Return the smoothed image at pixels and at steps in levels, rows and columns."""
+        steps = [each.ravel() for each in np.meshgrid(*steps, indexing="ij")]
+        pixels = deeper * level + down * (row + MARGIN) + (column + MARGIN)
+        pixels = pixels.Unsqueeze([-1]) + (deeper * steps[0] + down * steps[1] + steps[2])
+        return flat.GatherElements(pixels.Reshape([0, -1]), axis=1).Reshape([0, -1, *shape])
+
+    # Windows around each candidate, in its own and in other levels.
+    side, shape = np.arange(-MARGIN, MARGIN + 1), [0, -1, len(NEAR)]
+    values = look(level, row, column, (NEAR, side, side), len(NEAR), len(side), len(side))
+    scale = variances.Gather(level.Unsqueeze([2]) + NEAR).Unsqueeze([3, 4])
+    windows = _determinant(values, 1, scale).Abs()
+    highest = _log(windows.ReduceMax(axes=[3, 4], keepdims=0)).Gather(OTHERS, axis=2)
+    determinant, light, slope = (
+        _determinant(values, MARGIN, scale).Reshape(shape),
+        _at(values, MARGIN, 0, 0).Reshape(shape),
+        _log_slope(values, MARGIN, scale).Reshape(shape),
+    )
+    xx, yy = _bends(values, MARGIN)
+    own_determinant, own_light = (each.Slice([1], [2], [2]) for each in (determinant, light))
+    strength = (own_determinant.Abs() + STRENGTH_FLOOR).Sqrt()
+    trace = (((xx + yy) * scale).Reshape(shape) / strength / 2.0).Atan()
+    own, others = _log(own_determinant), _log(determinant).Gather(OTHERS, axis=2)
+
+    # Rings around it in its own level, (B, K, 8, 4, 1, 1).
+    right, below = (
+        (each.Unsqueeze([2]) + graph.tensor(table).Gather(level * 2 + each.Mod(2))).Max(0).Min(last)
+        for each, table, last in (
+            (column, np.concatenate(ring_offsets()[0]), width - 1),
+            (row, np.concatenate(ring_offsets()[1]), height - 1),
+        )
+    )
+    near = np.arange(-1, 2)
+    values = look(
+        level.Unsqueeze([2]), below, right, ([0], near, near), RING_POINTS, len(RING_RADII), 3, 3
+    )
+    scale = variances.Gather(level).Unsqueeze([2, 3, 4, 5])
+    responses, slopes = _log(_determinant(values, 1, scale)), _log_slope(values, 1, scale)
+    lights = (_at(values, 1, 0, 0) - own_light.Unsqueeze([3, 4, 5])) / strength.Unsqueeze([3, 4, 5])
+
+    def over(ring: Any, kind: str) -> Any:
+        return getattr(ring, f"Reduce{kind}")(axes=[2, 4, 5], keepdims=0)
+
+    ring = 21 + 8 * np.arange(len(RING_RADII))
+    ranks = (ranks.Cast(to=FLOAT) / (height * width).Cast(to=FLOAT)).Log() / 2.0 + 3.0
+    features = {  # by their columns
+        (0,): (own + 9.0) / 3.0,
+        (1, 2, 3): (others - own) / 2.0,
+        (4,): own_determinant.Sign(),
+        (5, 7, 9, 11): trace,
+        (6, 8, 10, 12): trace.Abs(),
+        (13, 14, 15, 16): (slope - own) / 4.0,
+        (17,): (own_light + mean.Squeeze([3]) / 255.0) * 2.0 - 1.0,
+        (18, 19, 20): (highest - others) / 2.0,
+        (*ring,): (over(responses, "Mean") - own) / 2.0,
+        (*ring + 1,): (over(responses, "Max") - own) / 2.0,
+        (*ring + 2,): (over(responses, "Min") - own) / 4.0,
+        (*ring + 3,): (over(lights, "Mean") / 2.0).Atan(),
+        (*ring + 4,): (over(lights, "Max") / 2.0).Atan(),
+        (*ring + 5,): (over(lights, "Min") / 2.0).Atan(),
+        (*ring + 6,): (over(slopes, "Mean") - own) / 4.0,
+        (*ring + 7,): (over(slopes, "Max") - own) / 4.0,
+        (53,): own * 0.0 + ranks.Unsqueeze([1]),
+        (54,): ((level - 4).Cast(to=FLOAT) / 3.0).Unsqueeze([2]),
+    }
+    response = windows.Slice([1], [2], [2])
+    x, y = (
+        each.Cast(to=FLOAT) + _peak_offset(response, *axis).Reshape([0, -1])
+        for each, axis in ((column, (0, 1)), (row, (1, 0)))
+    )
+    return x, y, _rank(graph, features)
+
+
+def _at(values: Any, margin: int, down: int, right: int) -> Any:
+    """Return the neighbours of all pixels but those in the margins of the last two axes."""
+    start, stop = np.add(margin, (down, right)), np.subtract((down, right), margin)
+    return values.Slice(start, np.where(stop, stop, END), [-2, -1])
+
+
+def _bends(values: Any, margin: int) -> tuple[Any, Any]:
+    """Return the second differences in x and in y."""
+    double = _at(values, margin, 0, 0) * 2.0
+    xx = (_at(values, margin, 0, -1) - double) + _at(values, margin, 0, 1)
+    yy = (_at(values, margin, -1, 0) - double) + _at(values, margin, 1, 0)
+    return xx, yy
+
+
+def _determinant(values: Any, margin: int, variance: Any) -> Any:
+    """Return the determinant of the Hessian, in the order of `kernels.differentiate`."""
+    xx, yy = _bends(values, margin)
+    below = _at(values, margin, 1, 1) - _at(values, margin, 1, -1)
+    xy = below - (_at(values, margin, -1, 1) - _at(values, margin, -1, -1))
+    variance = values.graph.tensor(variance)
+    return (xx * yy - xy * xy * (1 / 16)) * (variance * variance)
+
+
+def _log(determinant: Any) -> Any:
+    return (determinant.Abs() + DETERMINANT_FLOOR).Log()
+
+
+def _log_slope(values: Any, margin: int, variance: Any) -> Any:
+    """Return the logarithm of the squared gradient."""
+    dx = _at(values, margin, 0, 1) - _at(values, margin, 0, -1)
+    dy = _at(values, margin, 1, 0) - _at(values, margin, -1, 0)
+    return ((dx * dx + dy * dy) * (variance * 0.25) + GRADIENT_FLOOR).Log()
+
+
+def _peak_offset(response: Any, down: int, right: int) -> Any:
+    """Return where the maximum of a parabola is, from the middle of windows along an axis."""
+    before, middle, after = (
+        _at(response, NMS_RADIUS, step * down, step * right) for step in (-1, 0, 1)
+    )
+    bend = (middle - before) + (middle - after)
+    offset = ((after - before) / (bend * 2.0)).Clip(-MAX_OFFSET_PX, MAX_OFFSET_PX)
+    return bend.Greater(0.0).Where(offset, 0.0)
+
+
+def _rank(graph: Graph, features: dict[tuple[int, ...], Any]) -> Any:
+    """Return the (B, K) logits of features, as `Ranker.rank` does."""
+    ranker, order = load_ranker(), np.concatenate([*map(np.array, features)])
+    values = graph.join([*features.values()], axis=2)
+    values = (values - ranker.mean[order]) / ranker.deviation[order]
+    values = values.Clip(-MAX_DEVIATIONS, MAX_DEVIATIONS)
+    for k, (weight, bias) in enumerate(ranker.layers):
+        values = values.Relu() if k else values
+        values = values.MatMul(weight.T if k else weight.T[order]) + bias
+    return (values + features[0,]).Squeeze([2])
+
+
+def choose(x: Any, y: Any, level: Any, logits: Any, count: Any) -> list[Any]:
+    """Go through candidates from the best, and drop those that a kept one is near.
+
+    Returns x, y, scores and sizes of the first kept ones, (B, `count`) each.
+    """
+    graph = x.graph
+    logits, order = logits.TopK(logits.Shape(start=1), axis=1, outputs=2)
+    valid = logits.Greater(-np.finfo(np.float32).max)
+    level = level.GatherElements(order, axis=1)
+    tail = (logits.Abs() + 1.0).Reciprocal() * 0.5
+    x, y, scores, sizes, radii = (
+        valid.Where(each, nothing)
+        for each, nothing in (
+            (x.GatherElements(order, axis=1), -1.0),
+            (y.GatherElements(order, axis=1), -1.0),
+            (logits.Less(0.0).Where(tail, tail * -1.0 + 1.0), 0.0),
+            (graph.tensor(SIZE_PER_SIGMA * SIGMAS_PX).Gather(level), 0.0),
+            (graph.tensor(least_distances(SIGMAS_PX)).Gather(level), 0.0),
+        )
+    )
+    last = x.Shape(start=1) - 1
+
+    def suppress(number: Any, _: Any, rows: Any, found: Any) -> tuple[Any, Any, Any]:
+        """Add those of a block that no better one is near, as `suppress_neighbors` does."""
+        start, numbers = number.Reshape([1]) * BLOCK, np.arange(BLOCK)
+        places = [number.graph.tensor(each) for each in (x, y, radii)]
+        here = [each.Slice(start, start + BLOCK, [1]) for each in places]
+        known = rows.Slice([0], found.ReduceMax(keepdims=0).Reshape([1]) + 1, [1])
+        there = [each.GatherElements(known, axis=1) for each in places]
+        free = _near(here, there).ReduceMax(axes=[2], keepdims=1).Less(0.5)
+        free = free.And(here[2].Greater(0.0).Unsqueeze([2])).Cast(to=FLOAT)
+        better = number.graph.tensor(numbers).Less(numbers[:, None]).Cast(to=FLOAT)
+        better = better * _near(here, here)
+
+        def settle(_: Any, __: Any, kept: Any) -> tuple[Any, Any]:
+            """Suppress none any longer that are near suppressed ones only, until that is all."""
+            first, near = (kept.graph.tensor(each) for each in (free, better))
+            settled = near.MatMul(kept.Cast(to=FLOAT)).Greater(0.0).Where(0.0, first)
+            settled = settled.Cast(to=INT64)
+            return (settled - kept).Abs().ReduceMax(keepdims=0).Cast(to=BOOL), settled
+
+        kept = number.graph.loop(BLOCK, settle, free.Cast(to=INT64)).Squeeze([2])
+        slots, is_kept = (kept.CumSum(1) + found - 1).Min(count), kept.Cast(to=BOOL)
+        rows = rows.ScatterElements(
+            is_kept.Where(slots, count), is_kept.Where(start + numbers, last), axis=1
+        )
+        found = (found + kept.ReduceSum([1])).Min(count)
+        return found.Less(count).Cast(to=FLOAT).ReduceMax(keepdims=0).Cast(to=BOOL), rows, found
+
+    # Rows of the kept ones, and behind them the last, which is none; how many are kept.
+    images = x.Shape(end=1)
+    rows = last.Expand(graph.join([images, count + 1], axis=0))
+    found = graph.tensor([[0]]).Expand(graph.join([images, [1]], axis=0))
+    rows, _ = graph.loop(((last + 1) / BLOCK).Squeeze(), suppress, rows, found)
+    rows = rows.Slice([0], count, [1])
+    return [each.GatherElements(rows, axis=1) for each in (x, y, scores, sizes)]
+
+
+def _near(one: list[Any], other: list[Any]) -> Any:
+    """Return 1 where the first points are near the second ones, else 0: (B, K, L)."""
+    x, y, radius = ((a.Unsqueeze([2]), b.Unsqueeze([1])) for a, b in zip(one, other, strict=True))
+    dx, dy, least = x[0] - x[1], y[0] - y[1], radius[0].Min(radius[1])
+    return (dx * dx + dy * dy).Less(least * least).Cast(to=FLOAT)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,10 @@
+import { readFileSync } from "node:fs";
+import { rankCandidates } from "../src/deepdetect/app/static/js/points/ranking.js";
+import { readRanker } from "../src/deepdetect/app/static/js/points/ranker.js";
+const [data, w, h] = process.argv.slice(2);
+const planes = new Float32Array(readFileSync(data).buffer.slice(0)); const n=w*h;
+const gray = Uint8Array.from({length:n},(_, k)=>Math.floor((Math.round(255*planes[k])*4899+Math.round(255*planes[n+k])*9617+Math.round(255*planes[2*n+k])*1868+8192)/16384));
+const ranker = readRanker(new Uint8Array(readFileSync("../src/deepdetect/detector/points/ranker.npz")).buffer);
+console.log("rss", process.memoryUsage.rss()/1e6);
+const c=process.cpuUsage(); const r = rankCandidates(gray, Number(w), Number(h), ranker);
+console.log("cpu", process.cpuUsage(c), r.logits.length, "maxrss", process.resourceUsage().maxRSS/1e3);

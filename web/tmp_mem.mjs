@@ -1,0 +1,13 @@
+import * as ort from "onnxruntime-web";
+import { readFileSync, writeFileSync } from "node:fs";
+const [model, data, w, h, out] = process.argv.slice(2);
+ort.env.wasm.numThreads = 1;
+const width = Number(w), height = Number(h);
+const planes = new Float32Array(readFileSync(data).buffer.slice(0));
+const session = await ort.InferenceSession.create(readFileSync(model));
+console.log("rss before", process.memoryUsage.rss() / 1e6);
+const image = new ort.Tensor("float32", planes.subarray(0, 3 * width * height), [1, 3, height, width]);
+const cpu0 = process.cpuUsage(); let t = performance.now();
+const found = await session.run({ image });
+console.log("cpu", process.cpuUsage(cpu0), "s", (performance.now() - t) / 1e3, "maxrss", process.resourceUsage().maxRSS / 1e3);
+for (const [name, tensor] of Object.entries(found)) writeFileSync(`${out}.${name}`, new Uint8Array(tensor.data.buffer, tensor.data.byteOffset, tensor.data.byteLength));

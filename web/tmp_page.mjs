@@ -1,0 +1,11 @@
+import { readFileSync } from "node:fs";
+import * as ort from "onnxruntime-web";
+const [model, data, w, h] = process.argv.slice(2);
+ort.env.wasm.numThreads = 1;
+const planes = readFileSync(data); const n=w*h;
+const f = new Float32Array(planes.buffer, planes.byteOffset, 3*n);
+const gray = Uint8Array.from({length:n},(_, k)=>Math.floor((Math.round(255*f[k])*4899+Math.round(255*f[n+k])*9617+Math.round(255*f[2*n+k])*1868+8192)/16384));
+const session = await ort.InferenceSession.create(readFileSync(model));
+console.log("rss", process.memoryUsage.rss()/1e6);
+const c=process.cpuUsage(); const r = await session.run({gray: new ort.Tensor("uint8", gray, [1,1,Number(h),Number(w)])});
+console.log("cpu", process.cpuUsage(c), r.logits.data.length, "maxrss", process.resourceUsage().maxRSS/1e3);
