@@ -59,7 +59,7 @@ def test_files_of_another_run_are_not_written_over(run, tmp_path: Path) -> None:
     trained.write_bytes(pretrained_weights("default", ".safetensors").read_bytes())
     before = trained.read_bytes()
     for words, message in (
-        ((trained, "dense"), "would be written over, which is an input"),
+        ((trained, "dense"), "would replace an input"),
         (("default", "dense"), "best.safetensors exists"),
     ):
         result = run("average", *words, "-o", folder)

@@ -54,7 +54,7 @@ def test_points(run, tmp_path: Path) -> None:
         ("-o a.png", "ends in .onnx"),
         ("densse -o a.onnx", "did you mean 'dense'"),
         ("text.onnx -o a.onnx", "is not an ONNX file that can be read"),
-        ("text.onnx -o text.onnx", "which is an input"),
+        ("text.onnx -o text.onnx", "would replace an input"),
     ],
 )
 def test_a_mistake_is_one_sentence_and_leaves_nothing(

@@ -88,7 +88,7 @@ def test_a_photograph_is_never_replaced_by_its_mask(run, photos: Path, tmp_path:
     for more in ([], ["--overwrite"]):
         result = run("label", "photo.png", "-o", ".", *more)
         assert result.exit_code == 2
-        assert "which is an input" in result.stderr
+        assert "would replace an input" in result.stderr
     assert photograph.read_bytes() == (photos / "left.png").read_bytes()
 
 

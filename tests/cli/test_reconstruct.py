@@ -266,7 +266,7 @@ def test_inputs_are_not_written_over(run, folder: Path) -> None:
     pair = folder / "left.png", folder / "right.png"
     result = run("reconstruct", *pair, "--calibration", "calib.json", "-o", "calib.ply")
     assert result.exit_code == 2
-    assert "calib.json would be written over" in result.stderr
+    assert "calib.json would replace an input" in result.stderr
     assert Path("calib.json").read_bytes() == content
     assert [path.name for path in Path().iterdir()] == ["calib.json"]
 

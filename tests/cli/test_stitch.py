@@ -67,11 +67,9 @@ def test_photographs_are_not_written_over(files: list[Path]) -> None:
     Path("link.png").symlink_to("b.png")
     before = {path: path.read_bytes() for path in files}
     for output in ("a.png", Path("a.png").resolve(), "link.png"):
-        assert "would be written over, which is an input: choose another place" in refused(
-            *files, "-o", output
-        )
+        assert "would replace an input: choose another place" in refused(*files, "-o", output)
     Path("panorama.jpg").write_bytes(files[0].read_bytes())  # of the time before
-    assert "panorama.jpg would be written over" in refused(*files, "panorama.jpg")
+    assert "panorama.jpg would replace an input" in refused(*files, "panorama.jpg")
     assert Path("panorama.jpg").read_bytes() == before[files[0]]
     assert {path: path.read_bytes() for path in files} == before
 

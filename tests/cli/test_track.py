@@ -78,7 +78,7 @@ def test_nothing_is_replaced_silently(run, frames: Path, tmp_path: Path) -> None
     assert run(*words).exit_code == 0  # our own, of the same frames
     result = run("track", "out.mp4", "-o", "out.mp4")
     assert result.exit_code == 2
-    assert "which is an input" in result.output
+    assert "would replace an input" in result.output
 
 
 def test_recordings_of_a_camera_are_kept(run, tmp_path: Path, monkeypatch) -> None:

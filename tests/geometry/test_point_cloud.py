@@ -29,7 +29,7 @@ def test_slices_masks_and_numbers_select_points() -> None:
     [
         (np.zeros((3, 2)), np.zeros((3, 2), np.uint8), "mm", "(N, 3)"),
         (np.zeros((3, 3), int), np.zeros((3, 3), np.uint8), "mm", "float32"),
-        (np.zeros((3, 3)), np.zeros((3, 3)), "mm", "uint8"),
+        (np.zeros((3, 3)), np.zeros((3, 3)), "mm", "whole numbers"),
         (np.zeros((1, 3)), [[0, 0, 256]], "mm", "255"),
         (np.full((1, 3), np.nan), [[0, 0, 0]], "mm", "finite"),
         (np.full((1, 3), 1e39), [[0, 0, 0]], "mm", "finite"),

@@ -411,7 +411,7 @@ BAD_ARRAYS = {
     "above 1": (with_value(1.01), "[0.5, 1.01]"),
     "below 0": (with_value(-0.01), "[-0.01, 0.5]"),
     "int64": (np.zeros((20, 20), np.int64), "int64"),
-    "words": (np.full((20, 20), "a"), "not understood"),
+    "words": (np.full((20, 20), "a"), "cannot be of type"),
     "nothing": (None, "the image is None"),
     "a number": (5, "shape ()"),
 }

@@ -210,9 +210,9 @@ def test_rows_bent_by_a_lens_are_not_taken_for_level(motorcycle: Any) -> None:
 def test_disparities_that_do_not_differ(shared: Path, one_line) -> None:
     noise = np.random.default_rng(0).normal(0, 0.1, 1000)
     for disparity, message in (
-        (noise, "without a baseline"),
-        (5 * noise, "without a baseline"),
-        (np.zeros(10), "without a baseline"),
+        (noise, "taken from one place"),
+        (5 * noise, "taken from one place"),
+        (np.zeros(10), "taken from one place"),
         (noise + 40, "all disparities are 40"),
         (noise - 7, "all disparities are -7"),
     ):

@@ -52,8 +52,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         raise
     except OSError as error:
         raise DeepDetectError(
-            f"cannot write {final} ({error.strerror or error}): "
-            "free some space, or choose another place"
+            f"cannot write {final} ({error.strerror or error}): free space, or choose another place"
         ) from error
     finally:
         with contextlib.suppress(OSError):

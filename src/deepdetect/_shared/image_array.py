@@ -68,8 +68,7 @@ def _channels_last(array: np.ndarray) -> np.ndarray:
     shape = array.shape
     if array.ndim == 4:
         raise ImageError(
-            f"an image array has shape {shape}, which is a batch: give one image of it, as "
-            "batch[0], or the batch to `detect_batch`"
+            f"an array of shape {shape} is a batch: give batch[0], or use `detect_batch`"
         )
     if array.ndim == 3 and shape[2] not in CHANNEL_COUNTS and shape[0] in CHANNEL_COUNTS:
         array = np.moveaxis(array, 0, 2)
@@ -97,10 +96,7 @@ def _to_uint8(array: np.ndarray, name: str) -> np.ndarray:
             raise ImageError(f"{name} holds NaN or infinite values: replace them first")
         if array.size and (array.min() < 0 or array.max() > 1):
             raise ImageError(
-                f"a float image must lie in [0, 1], {name} spans "
-                f"[{array.min():g}, {array.max():g}]: scale it first"
+                f"{name} spans [{array.min():g}, {array.max():g}]: scale floats to [0, 1] first"
             )
         return np.rint(array * np.float32(255)).astype(np.uint8)
-    raise ImageError(
-        f"an image array of type {array.dtype} is not understood: use uint8, uint16 or float"
-    )
+    raise ImageError(f"an image cannot be of type {array.dtype}: use uint8, uint16 or float")

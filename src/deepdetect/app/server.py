@@ -224,8 +224,7 @@ class AppServer:
         if not hmac.compare_digest(given.encode(), self.key.encode()):
             raise HTTPException(
                 401,
-                "the key of this page is not that of deepdetect app: open the address that it has "
-                "printed",
+                "the key of this page is wrong: open the address that deepdetect app has printed",
             )
         if request.headers.get("Sec-Fetch-Site", "same-origin") != "same-origin":
             raise HTTPException(403, "only the page of deepdetect app may ask this")

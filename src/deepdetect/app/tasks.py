@@ -120,9 +120,7 @@ def run_match(images: Images, options: Options, folder: Path, report: Report) ->
     first, second = (load_image(one.path) for one in images)
     matches = match_images(first, second, progress=stages)
     if not matches.success:
-        raise DeepDetectError(
-            "no geometry between these images can be trusted: they must show the same scene"
-        )
+        raise DeepDetectError("no geometry can be trusted: both images must show the same scene")
     save_matches(matches, folder / "matches.csv")
     save_matches(matches, folder / "matches.npz")
     picture = matches.draw(first, second, by_position=True)

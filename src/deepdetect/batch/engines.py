@@ -84,8 +84,7 @@ def map_on_ray(
                 yield outcome
         except (ray.exceptions.RayActorError, ray.exceptions.RaySystemError) as error:
             raise DeepDetectError(
-                f"the Ray cluster failed ({first_line(error)}): "
-                "look at its machines, then run this again"
+                f"the Ray cluster failed ({first_line(error)}): look at it, then run this again"
             ) from error
 
 
@@ -130,8 +129,7 @@ def _start_cluster(ray: Any, processors: int, quiet: dict[str, Any]) -> None:
     except Exception as error:  # it waits half a minute for its parts, and raises many kinds
         ray.shutdown()
         raise DeepDetectError(
-            f"Ray does not start ({first_line(error)}): wait until the machine is less busy, or "
-            "use the engine processes"
+            f"Ray does not start ({first_line(error)}): try later, or use the engine processes"
         ) from error
 
 

@@ -222,13 +222,10 @@ def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
     seen: set[Path] = set()
     for output in outputs:
         if output.exists() and (output.stat().st_dev, output.stat().st_ino) in files:
-            raise OptionError(
-                f"{output} would be written over, which is an input: choose another place with -o"
-            )
+            raise OptionError(f"{output} would replace an input: choose another place with -o")
         if output in seen:
             raise OptionError(
-                f"two images would both write {output}: rename one, or do them one after the other "
-                "into two folders"
+                f"two images would both write {output}: rename one, or use two folders"
             )
         seen.add(output)
 

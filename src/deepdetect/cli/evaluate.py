@@ -202,9 +202,7 @@ def benchmark(
     """
     output = cli.output_folder(output)
     if values.get("resolution") not in (None, "auto", "native"):
-        raise OptionError(
-            "the protocols fix the resolution (480x480 and native): leave out --resolution"
-        )
+        raise OptionError("the protocols fix the resolution: leave out --resolution")
     names = list(BENCHMARKS) if name == "all" else [name]
     for each in names:
         look_up("benchmark", each, BENCHMARKS)

@@ -58,8 +58,7 @@ def track(
     for path in files if live and not overwrite else ():
         if path.exists():
             raise OptionError(
-                f"{path} exists, of an earlier recording: choose another name with -o, or "
-                "replace it with --overwrite"
+                f"{path} is of an earlier recording: choose another -o, or --overwrite it"
             )
     if Path(source).is_file():
         cli.check_outputs(files, [Path(source)])

@@ -169,8 +169,7 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
             if file.checksum is not None and not has_checksum(part, file.checksum):
                 part.unlink()
                 raise DeepDetectError(
-                    f"{url} does not have the checksum {file.checksum}: it has changed or was "
-                    "damaged on the way; try again later"
+                    f"{url} does not have the checksum {file.checksum}: try again later"
                 )
             part.replace(path)
             return
@@ -258,8 +257,7 @@ def _check(dataset: RemoteDataset, folder: Path, subject: str) -> None:
         if found != digest:
             state = "is missing" if found is None else "is not the one of the data set"
             raise DeepDetectError(
-                f"{subject} holds another {dataset.name}: {name} {state}; "
-                "it has changed or was damaged on the way"
+                f"{subject} holds another {dataset.name}, whose {name} {state}: get it again"
             )
 
 

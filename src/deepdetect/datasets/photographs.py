@@ -144,13 +144,10 @@ def _cut(sources: Path, crops: Sequence[Crop]) -> Iterator[tuple[Crop, Image.Ima
         try:
             content = (sources / source / path).read_bytes()
         except OSError:
-            raise DeepDetectError(
-                f"{source} has no {path}: the archive is not the one that is listed"
-            ) from None
+            raise DeepDetectError(f"{source} has no {path}: get the archive again") from None
         if hashlib.sha256(content).hexdigest() != sha256:
             raise DeepDetectError(
-                f"{path} of {source} is not the picture that is listed: it has changed or was "
-                "damaged on the way"
+                f"{path} of {source} is not the picture that is listed: get the archive again"
             )
         picture = Image.fromarray(load_image(content))
         for crop in of_picture:

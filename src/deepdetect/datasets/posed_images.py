@@ -147,9 +147,7 @@ def _load_scene(
         for a, b in unordered_pairs(len(images), max_pairs):
             pairs.append(PosedPair(name, images[a], images[b]))
     if not pairs:
-        raise ImageError(
-            f"there are no two images with cameras{distances} in {folder}: put more images there"
-        )
+        raise ImageError(f"there are no two images with cameras{distances} in {folder}: add some")
     return PosedScene(name, tuple(images), tuple(pairs))
 
 
@@ -183,8 +181,7 @@ def _read_kitti(folder: Path) -> list[PosedImage]:
         frame = int(path.stem)
         if frame >= len(lines):
             raise ImageError(
-                f"{poses} has {len(lines)} lines and so no pose of {path.name}: line 1 belongs to "
-                "image 000000"
+                f"{poses} has {len(lines)} lines and no pose of {path.name}: line 1 is of 000000"
             )
         where = f"line {frame + 1} of {poses}"
         pose = _numbers(lines[frame].split(), 12, where).reshape(3, 4)
@@ -222,8 +219,7 @@ def _read_colmap(folder: Path) -> list[PosedImage]:
     lines = [line for line in _text(model / "images.txt").splitlines() if line[:1] != "#"]
     if any(len(points.split()) % 3 for points in lines[1::2]):
         raise ImageError(
-            f"{model / 'images.txt'} must hold two lines for each image, the second with its "
-            "points or empty: write it with COLMAP"
+            f"{model / 'images.txt'} must hold two lines for each image: write it with COLMAP"
         )
     images = []
     for line in lines[::2]:
@@ -313,8 +309,7 @@ def _image_size(path: Path) -> tuple[int, int]:
         turned = opened.getexif().get(ORIENTATION_TAG, 1) != 1
     if turned:
         raise ImageError(
-            f"{path} is to be turned by its EXIF orientation, its camera is not: save it upright "
-            "without that tag"
+            f"{path} is to be turned by its EXIF orientation: save it upright without that tag"
         )
     return size
 

@@ -79,8 +79,7 @@ class BenchmarkOptions:
         stems = [Path(weights).stem for weights in self.geometry_weights]
         if len(set(stems)) < len(stems):
             raise OptionError(
-                f"two weights for stereo pairs have the same name ({', '.join(stems)}): rename a "
-                "file"
+                f"two geometry_weights have one name ({', '.join(stems)}): rename a file"
             )
 
     def deepdetect_480(self, threshold: float = 0.5) -> LocalFeature:
@@ -151,7 +150,5 @@ def without_repeats(features: Sequence[LocalFeature]) -> list[LocalFeature]:
     by_name: dict[str, LocalFeature] = {}
     for feature in features:
         if by_name.setdefault(feature.name, feature).version != feature.version:
-            raise OptionError(
-                f"two methods are named {feature.name}: rename one of the files they come from"
-            )
+            raise OptionError(f"two methods are named {feature.name}: rename the file of one")
     return list(by_name.values())

@@ -106,6 +106,5 @@ def run_in_child(function: Callable[..., Outcome], *arguments: Any) -> Outcome:
             return pool.submit(function, *arguments).result()
         except BrokenProcessPool:
             raise DeepDetectError(
-                "its process was ended by the system, probably for lack of memory: take fewer or "
-                "smaller images"
+                "its process was ended, probably for lack of memory: take fewer or smaller images"
             ) from None

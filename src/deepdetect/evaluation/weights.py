@@ -145,8 +145,7 @@ def evaluate(
         raise OptionError("scales are of the images in samples: name their folder, too")
     if equal_density and oxford is None and foreground is None:
         raise OptionError(
-            "`equal_density` is for the keypoints of `oxford` and `foreground`: name a folder of "
-            "one of them, too"
+            "`equal_density` needs keypoints: name a folder as `oxford` or `foreground`, too"
         )
     if oxford is not None:  # what is missing is said before hours of work
         require_packages("the Oxford protocol", "scipy")

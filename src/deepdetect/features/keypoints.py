@@ -91,8 +91,7 @@ class Keypoints:
                 fields[name] = values = np.asarray(getattr(self, name), dtype)
                 if values.shape != scores.shape:
                     raise OptionError(
-                        f"keypoints need as many {name} as scores, not {values.shape} and "
-                        f"{scores.shape}"
+                        f"{len(scores)} keypoints need (N,) {name}, not {values.shape}"
                     )
         if self.descriptors is not None:
             descriptors = np.asarray(self.descriptors)
@@ -100,8 +99,7 @@ class Keypoints:
                 descriptors = descriptors.astype(np.float32)
             if descriptors.ndim != 2 or len(descriptors) != len(scores):
                 raise OptionError(
-                    f"{len(scores)} keypoints need ({len(scores)}, D) descriptors, "
-                    f"not {descriptors.shape}"
+                    f"{len(scores)} keypoints need (N, D) descriptors, not {descriptors.shape}"
                 )
             fields["descriptors"] = descriptors
         for name, values in fields.items():

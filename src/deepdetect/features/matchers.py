@@ -118,9 +118,7 @@ def hamming_neighbours(
 ) -> Neighbours:
     """Find nearest neighbours of binary descriptors (ORB, BRISK) by Hamming, as a `Matcher`."""
     if queries.dtype != np.uint8 or base.dtype != np.uint8:
-        raise OptionError(
-            "the matcher hamming compares binary descriptors, such as ORB's: use exact or flann"
-        )
+        raise OptionError("the matcher hamming compares binary descriptors: use exact or flann")
     if not len(queries):
         return np.empty((0, count), np.int32), np.empty((0, count), np.float32)
     distances, rows = cv2.batchDistance(
@@ -199,8 +197,7 @@ def patchmatch_neighbours(
     """
     if queries.dtype != np.uint8 or base.dtype != np.uint8:
         raise OptionError(
-            "the matcher patchmatch needs descriptors of bytes, such as sift and rootsift: use "
-            "flann, faiss or exact"
+            "the matcher patchmatch needs descriptors of bytes: use flann, faiss or exact"
         )
     if positions is None or not all(on_pixels(xy) for xy in positions):
         raise OptionError(

@@ -182,8 +182,7 @@ class Matches:
         counts = [len(self.points0), len(self.points1), len(self.scores), len(self.inliers)]
         if len(set(counts)) > 1:
             raise OptionError(
-                "matches need as many points0, points1, scores and inliers, not "
-                f"{', '.join(map(str, counts))}"
+                f"matches need as many points0, points1, scores and inliers, not {counts}"
             )
         for name, dtype in _COLUMNS.items():
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype))

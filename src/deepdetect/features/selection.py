@@ -99,9 +99,7 @@ class SelectionOptions:
             raise OptionError(f"the density must lie in (0, 1], not {self.density}")
         check_max_keypoints(self.max_keypoints)
         if not (self.nms_radius >= 0 and self.nms_radius % 1 == 0):
-            raise OptionError(
-                f"`nms_radius` must be a whole number of pixels from 0 on, not {self.nms_radius}"
-            )
+            raise OptionError(f"`nms_radius` must be whole and 0 or more, not {self.nms_radius}")
 
 
 @suggest_keywords
@@ -143,8 +141,7 @@ def select_keypoints(
     ranking = heatmap if logits is None else logits
     if ranking.shape != heatmap.shape:
         raise OptionError(
-            f"the logits have shape {ranking.shape}, the heat map {heatmap.shape}: "
-            "they must be equal"
+            f"the logits must have the shape {heatmap.shape} of the map, not {ranking.shape}"
         )
     maps = Maps(ranking.shape, lambda: heatmap.__getitem__, lambda: ranking)
     keypoints = select_from_maps(maps, options, ignore)
@@ -331,8 +328,7 @@ def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     mask = np.asarray(ignore)
     if mask.shape != shape:
         raise OptionError(
-            f"the ignore mask has shape {mask.shape}, the image (height, width) {shape}: they "
-            "must be equal"
+            f"the ignore mask must have the shape {shape} of the image, not {mask.shape}"
         )
     return mask.astype(bool)
 

@@ -71,8 +71,7 @@ class Camera:
         focal = _numbers("the focal length", focal_px, 2)
         if min(focal) <= 0:
             raise ReconstructionError(
-                f"the focal length must be above 0 pixels, not {min(focal):g}: give it in pixels "
-                "of this image"
+                f"the focal length must be above 0 pixels, not {min(focal):g}"
             )
         if centre is None:
             centre = (width - 1) / 2, (height - 1) / 2

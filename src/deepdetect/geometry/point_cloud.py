@@ -59,16 +59,13 @@ class PointCloud:
             points, colors = np.empty((0, 3)), np.empty((0, 3), np.uint8)
         if points.ndim != 2 or points.shape[1] != 3 or colors.shape != points.shape:
             raise OptionError(
-                f"a point cloud needs (N, 3) points and as many (N, 3) colors, "
-                f"not {points.shape} and {colors.shape}"
+                f"points and colors must be (N, 3), not {points.shape} and {colors.shape}"
             )
         if points.dtype not in (np.float32, np.float64):
             raise OptionError(f"points must be float32 or float64, not {points.dtype}")
         if colors.dtype != np.uint8:
             if colors.dtype.kind not in "iu" or colors.min() < 0 or colors.max() > 255:
-                raise OptionError(
-                    f"colors must be whole numbers from 0 to 255 (uint8), not {colors.dtype}"
-                )
+                raise OptionError(f"colors must be whole numbers from 0 to 255, not {colors.dtype}")
             colors = colors.astype(np.uint8)
         # Written so that NaN fails too.
         if not (np.abs(points) < np.finfo(np.float32).max).all():

@@ -89,8 +89,7 @@ def write_colmap_text(collection: Collection, output: str | Path) -> tuple[Path,
     check_names(name for pair in collection.matches for name in pair)
     if MATCHES_NAME in collection.keypoints:
         raise OptionError(
-            f"the keypoints of {MATCHES_NAME!r} would have the file of the matches: rename their "
-            "file, or name the folder of the images as `images`"
+            f"the keypoints of {MATCHES_NAME!r} need the file of the matches: rename that image"
         )
     folder = Path(output)
     written = []

@@ -48,8 +48,7 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
         other = taken.setdefault(pair_name(*pair), pair)
         if other != pair:
             raise OptionError(
-                f"hloc would have one group for the matches of {' '.join(pair)} and of "
-                f"{' '.join(other)}: rename an image"
+                f"hloc has one group for {' '.join(pair)} and {' '.join(other)}: rename an image"
             )
     keypoints = collection.keypoints
     write_groups(features, (feature_group(name, points) for name, points in keypoints.items()))

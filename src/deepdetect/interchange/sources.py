@@ -56,10 +56,7 @@ def read_collection(
     folder = None if images is None else Path(images)
     archives = [path for path in paths if path.suffix.lower() == ".npz"]
     if not paths or (archives and len(archives) < len(paths)) or (not archives and len(paths) > 1):
-        raise OptionError(
-            "give one HDF5 file of features, or npz files of keypoints and matches, or a folder "
-            "of images"
-        )
+        raise OptionError("give one HDF5 file of features, or npz files, or a folder of images")
     if archives:
         if matches is not None:
             raise OptionError("npz files of matches are named with the others: leave out `matches`")
@@ -156,8 +153,7 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
             before = keypoints.setdefault(name, own)
             if not (np.array_equal(before.xy, own.xy) and before.image_size == own.image_size):
                 raise InvalidFileError(
-                    f"{path} has other keypoints of {name} than another file: make all files with "
-                    "the same options"
+                    f"{path} has other keypoints of {name} than another file: make all files alike"
                 )
         kept = loaded.inliers
         rows = np.column_stack([loaded.indices0[kept], loaded.indices1[kept]])
@@ -239,8 +235,7 @@ def match_folder(
         pairs = read_pairs(pairs)  # what is wrong with them is said before the work
     if pairs is None and sequential is None and len(names) > MAX_ALL_PAIRS:
         raise OptionError(
-            f"all pairs of {len(names)} images would take long: name them by `pairs`, or "
-            "give `sequential`"
+            f"all pairs of {len(names)} images would take long: give `pairs` or `sequential`"
         )
     with tempfile.TemporaryDirectory(prefix="deepdetect-") as temporary:
         features, found = Path(temporary, "features.h5"), Path(temporary, "matches.h5")

@@ -92,8 +92,7 @@ def load_image(
     if min(rgb.shape[:2]) < MINIMUM_SIDE:
         height, width = rgb.shape[:2]
         raise ImageError(
-            f"{name} is {width}x{height} pixels: "
-            f"both sides must be at least {MINIMUM_SIDE}, use a larger image"
+            f"{name} is {width}x{height} pixels: both sides must be at least {MINIMUM_SIDE}"
         )
     return rgb
 
@@ -102,8 +101,7 @@ def load_each(images: Images, channels: Channels) -> Iterator[tuple[int, np.ndar
     """Load images when they are asked for, each with its place in the list, tuple or batch."""
     if not isinstance(images, (list, tuple)) and getattr(images, "ndim", 0) != 4:
         raise OptionError(
-            "a batch is a list of images, or an array of four dimensions: of one image use the "
-            "method without _batch"
+            "a batch is a list or a 4-D array: give one image to the method without _batch"
         )
     for number, image in enumerate(images):
         with image_named(number):
@@ -174,8 +172,7 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     )
     if not found:
         raise ImageError(
-            f"there is no image in {root}: put files ending in "
-            f"{', '.join(suffix[1:] for suffix in IMAGE_SUFFIXES)} there"
+            f"there is no image in {root}: put files ending in {', '.join(IMAGE_SUFFIXES)} there"
         )
     return found
 

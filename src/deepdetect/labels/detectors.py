@@ -265,7 +265,5 @@ def select_detectors(names: Iterable[str]) -> tuple[str, ...]:
     for name in sorted(wanted - DETECTORS.keys()):
         raise unknown_name("label detector", name, DETECTOR_NAMES)
     if not wanted:
-        raise OptionError(
-            f"no label detector was chosen: name at least one of {', '.join(DETECTOR_NAMES)}"
-        )
+        raise OptionError(f"no label detector was chosen: name some of {', '.join(DETECTOR_NAMES)}")
     return tuple(name for name in DETECTOR_NAMES if name in wanted)

@@ -58,8 +58,7 @@ class LabelOptions:
         object.__setattr__(self, "settings", checked)
         if idle := sorted(checked.keys() - set(self.detectors)):
             raise OptionError(
-                f"settings of {idle[0]} are given, but it is not among the detectors: "
-                "add it to them, or remove its settings"
+                f"{idle[0]} has settings and is not among the detectors: add it, or remove them"
             )
 
     def with_detectors(self, names: tuple[str, ...]) -> LabelOptions:
@@ -96,15 +95,11 @@ def _checked_value(detector: str, name: str, value: Any) -> Value:
     default, limits = settings[name]
     kind = type(default)
     if type(value) is not kind and not (kind is float and type(value) is int):
-        raise OptionError(
-            f"the setting {name} of {detector} must be of type {kind.__name__}, not {value!r}"
-        )
+        raise OptionError(f"{name} of {detector} must be of type {kind.__name__}, not {value!r}")
     if limits is None:
         return bool(value)
     if not limits[0] <= value <= limits[-1]:  # nor NaN
-        raise OptionError(
-            f"the setting {name} of {detector} must lie in [{limits[0]:.12g}, {limits[-1]:.12g}]"
-        )
+        raise OptionError(f"{name} of {detector} must lie in [{limits[0]:.12g}, {limits[-1]:.12g}]")
     if isinstance(limits, range) and value not in limits:
         raise OptionError(f"the setting {name} of {detector} must be odd, not {value}")
     return kind(value)

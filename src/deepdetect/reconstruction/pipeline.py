@@ -178,8 +178,7 @@ def _from_disparities(
     keypoints = replace(keypoints, xy=np.rint(keypoints.xy))
     if not len(keypoints):
         raise NoDepthError(
-            "the left image has no keypoint: lower `threshold`, or give a larger `density` (an "
-            "image of one grey level shows nothing)"
+            "the left image has no keypoint: lower `threshold`, or give a larger `density`"
         )
     with timer.stage("matching"):
         found = compute_disparity(*grays, options).at(keypoints)
@@ -213,8 +212,7 @@ def _from_disparities(
         kept[kept] = inliers
     if not kept.any():
         raise ReconstructionError(
-            "no disparity gives a depth: all are too small, the scene is too far away for cameras "
-            "so close together"
+            "no disparity gives a depth: the scene is too far away for cameras so close together"
         )
     return {
         "points": (rays[kept] * depth[kept, None]).astype(np.float32),

@@ -284,9 +284,7 @@ def check_cameras(calibration: Calibration) -> None:
 def check_disparities(disparity: np.ndarray) -> None:
     """Refuse disparities of a rectified pair that are all one value."""
     if is_static(disparity):
-        raise NoDepthError(
-            "all disparities are 0: both images were taken from one place, without a baseline"
-        )
+        raise NoDepthError("all disparities are 0: both images were taken from one place")
     low, middle, high = np.quantile(disparity, [0.05, 0.5, 0.95])
     if high - low < MIN_DEPTH_SPREAD_PX:
         raise NoDepthError(

@@ -108,8 +108,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
             return capture
         if self.live:
             raise MissingFileError(
-                f"there is no camera {self.camera}, or another program uses it: try another "
-                "number, or close that program"
+                f"there is no camera {self.camera}, or another program uses it: try another number"
             )
         raise InvalidFileError(
             f"{path} is no video that the installed OpenCV can read: convert it to MP4 "

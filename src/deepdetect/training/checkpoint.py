@@ -48,8 +48,7 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             raise ValueError("its content is not what was written")
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise WeightsError(
-            f"{path} is not a whole checkpoint ({first_line(error)}): "
-            "delete it, or train into another folder"
+            f"{path} is not a whole checkpoint ({first_line(error)}): delete it"
         ) from None
     return tensors, json.loads(header["state"])
 

@@ -77,8 +77,7 @@ class FolderSource:
         image, mask = render(source.path, view), load_mask(self.label_path(source, view))
         if mask.shape != image.shape[:2]:
             raise ImageError(
-                f"the label of {source.path} has another size than the image: "
-                f"delete {self.label_folder} and start again"
+                f"the label of {source.path} has another size: delete {self.label_folder}"
             )
         self._keep(index, view, image, mask)
         return image, mask

@@ -83,9 +83,7 @@ def onnx_feature(path: str | Path) -> LocalFeature:
         data = file.read_bytes()
         session = import_onnxruntime().InferenceSession(data, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exceptions have no common base
-        raise WeightsError(
-            f"{file} is no ONNX file that can be run ({first_line(error)})"
-        ) from None
+        raise WeightsError(f"{file} is no ONNX file that runs ({first_line(error)})") from None
     outputs = [output.name for output in session.get_outputs()]
     shapes = [entry.shape for entry in session.get_inputs()]
     if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
@@ -138,8 +136,7 @@ def _external_feature(
             )
         except Exception as error:  # anyone's code
             raise BaselineError(
-                f"{name} made no dict of keypoints and scores: {type(error).__name__}: "
-                f"{first_line(error)}"
+                f"{name} made no keypoints and scores: {type(error).__name__}: {first_line(error)}"
             ) from error
 
     def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:

@@ -59,9 +59,7 @@ def middlebury(run: Run, options: BenchmarkOptions) -> list[Section]:
     folder = run.folder("middlebury")
     scenes = {path.parent.name: path.parent for path in sorted(folder.glob("*/left.png"))}
     if not scenes:
-        raise ImageError(
-            f"there are no stereo scenes in {folder}: it must hold SCENE/left.png and right.png"
-        )
+        raise ImageError(f"there is no SCENE/left.png with right.png in {folder}: put scenes there")
     compared = pipelines(options)
     rows = run.rows("", compared, scenes, partial(reconstruct_points, run))
     tables: list[Table] = []

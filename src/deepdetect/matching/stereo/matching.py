@@ -88,8 +88,7 @@ class DisparityOptions:
         whole = self.disparity_range
         if whole and (np.shape(whole) != (2,) or any(d % 1 for d in whole) or whole[0] > whole[1]):
             raise OptionError(
-                "disparity_range takes the smallest and the largest disparity, as (0, 63), not "
-                f"{whole}"
+                f"disparity_range must be the smallest and the largest disparity, not {whole}"
             )
         check_ranges(
             self,
@@ -157,8 +156,7 @@ class DisparityMap:
         height, width = self.disparity.shape
         if (xy != np.rint(xy)).any() or ((xy < 0) | (xy >= (width, height))).any():
             raise OptionError(
-                "rectified matching takes keypoints on whole pixels of the left view: detect them "
-                "with subpixel=False"
+                "keypoints must be whole pixels of the left view: detect them with subpixel=False"
             )
         column, row = xy.astype(np.int64).T
         disparity = self.disparity[row, column]

@@ -154,8 +154,7 @@ def stitch(
         raise OptionError("a panorama needs two images or more: give more images")
     if reference is not None and not 0 <= reference < len(images):
         raise OptionError(
-            f"`reference` must be the number of an image, from 0 to {len(images) - 1}, "
-            f"not {reference}"
+            f"`reference` must number an image, 0 to {len(images) - 1}, not {reference}"
         )
     timer = StageTimer(progress)
     small: dict[int, tuple[np.ndarray, float]] = {}
