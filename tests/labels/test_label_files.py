@@ -33,7 +33,8 @@ def test_an_image_is_labelled_in_several_ways(
     for task in tasks:
         report = label_file(task)
         label = fuse(luma(photo[:60, :80]), task.options)
-        assert (report.mask, report.density) == (task.mask, label.density)
+        assert isinstance(report, dict)
+        assert (report["mask"], report["density"]) == (task.mask, label.density)
         np.testing.assert_array_equal(load_mask(task.mask), label.mask)
     assert (tmp_path / "figure.png").exists()
 
@@ -43,9 +44,9 @@ def test_a_bad_image_is_reported(image: Path, tmp_path: Path) -> None:
     paths = (tmp_path / "bad.png", image)
     tasks = [LabelTask(path, tmp_path / "masks" / path.name, FAST) for path in paths]
     bad, good = map(label_file, tasks)
-    assert "bad.png" in str(bad.error)
-    assert np.isnan(bad.density)
-    assert good.error is None
+    assert isinstance(bad, str)
+    assert "bad.png" in bad
+    assert isinstance(good, dict)
     assert [path.name for path in (tmp_path / "masks").glob("*.png")] == ["photo.png"]
 
 

@@ -86,7 +86,7 @@ def map_in_processes(
     most = 61 if os.name == "nt" else len(tasks)  # Windows cannot wait for more
     count = min(workers or processor_count(), most, len(tasks))
     if count <= 1:
-        with _one_opencv_thread():
+        with one_opencv_thread():
             yield from map(function, tasks)
         return
     import multiprocessing
@@ -190,7 +190,8 @@ def end_with_parent(end: Callable[[], object] = lambda: None) -> None:
 
 
 @contextmanager
-def _one_opencv_thread() -> Iterator[None]:
+def one_opencv_thread() -> Iterator[None]:
+    """Let OpenCV use one thread while the block runs."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

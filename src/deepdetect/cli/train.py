@@ -15,7 +15,7 @@ from .._shared.provenance import provenance
 from ..batch.engines import get_engine
 from ..detector.pretrained import resolve_weights
 from ..labels import LabelOptions, find_label_settings
-from ..labels.fusion import LabelReport, LabelTask, label_file
+from ..labels.fusion import LabelTask, label_file
 from ..training import (
     DeviceOptions,
     PointsTrainingOptions,
@@ -243,24 +243,23 @@ def label(
         [path for task in tasks for path in task.outputs.paths], [task.image for task in tasks]
     )
     left = [task for task in tasks if task.outputs.find() is None]
-    reports: list[LabelReport] = []
+    done: list[dict[str, Any]] = []
+    failures: list[str] = []
     with progress(len(left), "labelling", "image") as bar:
         for report in how["map_tasks"](label_file, left, how["workers"]):
-            reports.append(report)
+            (failures if isinstance(report, str) else done).append(report)
             bar.update(1)
-    done = sorted((r for r in reports if r.error is None), key=lambda r: str(r.image))
-    failures = [report.error for report in reports if report.error is not None]
-    names = ("image", "mask", "visibility", "density")
+    done.sort(key=lambda report: str(report["image"]))
     skipped = len(tasks) - len(left)
     found = {
-        "labelled": [{name: getattr(report, name) for name in names} for report in done],
+        "labelled": done,
         "skipped": skipped,
-        "mean_density": sum(report.density for report in done) / len(done) if done else None,
+        "mean_density": sum(each["density"] for each in done) / len(done) if done else None,
         "failures": failures,
     }
     text = f"{len(done)} labelled, {skipped} already done"
     if done:
-        low = sum(report.visibility == "low" for report in done)
+        low = sum(each["visibility"] == "low" for each in done)
         text += f"; mean density {found['mean_density']:.3f}, {low} of low visibility"
     return cli.Result(found, f"{text} -> {folder}", failures, len(tasks))
 

@@ -5,7 +5,6 @@ Of images, and of files, whose labels are 1-bit PNG masks.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +18,7 @@ from .._shared.options import suggest_keywords
 from .._shared.records import Outputs
 from ..io.image import load_image, luma
 from ..io.masks import save_mask
-from ..viz.draw import draw_masks, save_picture
+from ..viz.draw import add_caption, hstack, save_picture
 from .detectors import DETECTORS
 from .settings import LabelOptions, Visibility
 
@@ -104,20 +103,15 @@ def fuse(
         >>> bool(label.mask[8, 8]), bool(label.mask[0, 0])
         (True, False)
     """
-    gray = _luma(image, channels)
+    check_channels(channels)
+    is_gray = isinstance(image, np.ndarray) and image.ndim == 2 and image.dtype == np.uint8
+    gray = image if is_gray else luma(load_image(image, channels=channels))
     visibility = visibility_of(gray) if options.visibility == "auto" else options.visibility
     marked = {"keypoint": np.zeros(gray.shape, bool), "edge": np.zeros(gray.shape, bool)}
     for name in options.detectors:
         settings = options.parameters(name, visibility)
         marked[DETECTORS[name].kind] |= DETECTORS[name].mask(gray, **settings)
     return Label(marked["keypoint"], marked["edge"], visibility)
-
-
-def _luma(image: Any, channels: Channels) -> np.ndarray:
-    check_channels(channels)
-    if isinstance(image, np.ndarray) and image.ndim == 2 and image.dtype == np.uint8:
-        return image
-    return luma(load_image(image, channels=channels))
 
 
 @suggest_keywords
@@ -127,8 +121,12 @@ def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
     Returns:
         Four panels in a row, each mask captioned with its density.
     """
+    panels = [add_caption(rgb, f"image ({label.visibility} visibility settings)")]
     masks = {"keypoints": label.keypoints, "edges": label.edges, "combined": label.mask}
-    return draw_masks(rgb, masks, f"image ({label.visibility} visibility settings)")
+    for name, mask in masks.items():
+        picture = np.repeat((mask * np.uint8(255))[:, :, None], 3, 2)
+        panels.append(add_caption(picture, f"{name}: {mask.mean():.1%} of pixels"))
+    return hstack(panels)
 
 
 @dataclass(frozen=True)
@@ -148,28 +146,18 @@ class LabelTask:
         return Outputs(paths, [self.image], {"label": self.options}, self.overwrite)
 
 
-@dataclass(frozen=True)
-class LabelReport:
-    """The result for one mask: its settings and the marked fraction, or an error."""
-
-    image: Path
-    mask: Path
-    visibility: str | None = None
-    density: float = math.nan
-    error: str | None = None
-
-
-def label_file(task: LabelTask) -> LabelReport:
-    """Make the mask of an image file; what is wrong with the image is reported."""
+def label_file(task: LabelTask) -> dict[str, Any] | str:
+    """Make the mask of an image file; return its numbers, or what is wrong with the image."""
     try:
         rgb = load_image(task.image)
         label = fuse(luma(rgb), task.options)
     except MissingExtraError:  # concerns all images
         raise
     except DeepDetectError as error:
-        return LabelReport(task.image, task.mask, error=str(error))
+        return str(error)
     with task.outputs.writing():
         if task.figure is not None:
             save_picture(draw_label(rgb, label), task.figure)
         save_mask(label.mask, task.mask)
-    return LabelReport(task.image, task.mask, label.visibility, label.density)
+    files = {"image": task.image, "mask": task.mask}
+    return {**files, "visibility": label.visibility, "density": label.density}

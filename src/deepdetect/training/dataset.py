@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,8 +15,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from .._shared.errors import BatchError, DeepDetectError, ImageError
-from .._shared.machine import available_memory, map_in_processes
-from .._shared.opencv import cv2
+from .._shared.machine import available_memory, map_in_processes, one_opencv_thread
 from .._shared.progress import progress
 from .._shared.records import key
 from ..io.image import load_image
@@ -102,15 +102,16 @@ class FolderSource:
             files = {view: self.label_path(image, view) for view in needed}
             if missing := {view: path for view, path in files.items() if not path.exists()}:
                 memory -= sum(4 * view.short_side**2 for view in missing)  # at least
-                tasks.append(_LabelTask(index, image.path, missing, self.label_options, memory > 0))
-        total = sum(len(task.labels) for task in tasks)
+                tasks.append((index, image.path, missing, memory > 0))
+        total = sum(len(missing) for _, _, missing, _ in tasks)
         failures = []
+        work = partial(_make_labels, options=self.label_options)
         with progress(total, "labels", "label", quiet) as bar:
-            for task, made, error in map_in_processes(_make_labels, tasks, workers):
+            for (index, _, missing, _), made, error in map_in_processes(work, tasks, workers):
                 for view, pair in made.items():
-                    self._keep(task.number, view, *pair)
+                    self._keep(index, view, *pair)
                 failures += [error] if error else []
-                bar.update(len(task.labels))
+                bar.update(len(missing))
         if failures:
             raise BatchError(
                 f"{len(failures)} of {len(self.images)} images cannot be read, the labels of the "
@@ -120,28 +121,23 @@ class FolderSource:
         return total
 
 
-class _LabelTask(NamedTuple):
-    """An image whose labels are written, and whether its views are sent back."""
-
-    number: int
-    image: Path
-    labels: dict[View, Path]
-    options: LabelOptions
-    keep: bool
+LabelTask = tuple[int, Path, dict[View, Path], bool]
+"""An image, by number and file, the labels to be written, and whether its views are sent back."""
 
 
 def _make_labels(
-    task: _LabelTask,
-) -> tuple[_LabelTask, dict[View, tuple[np.ndarray, np.ndarray]], str]:
+    task: LabelTask, options: LabelOptions
+) -> tuple[LabelTask, dict[View, tuple[np.ndarray, np.ndarray]], str]:
     """Write the labels of an image; return the views with their labels, and the error, if any."""
+    _, file, labels, keep = task
     made = {}
     try:
-        image = load_image(task.image)
-        for view, path in task.labels.items():
+        image = load_image(file)
+        for view, path in labels.items():
             rgb = render(image, view)
-            mask = label_view(rgb, view, task.options)
+            mask = label_view(rgb, view, options)
             save_mask(mask, path)
-            if task.keep:
+            if keep:
                 made[view] = rgb, mask
     except ImageError as error:
         return task, made, str(error)
@@ -276,13 +272,11 @@ def loading(loader: DataLoader[Any]) -> Iterator[Iterator[Any]]:
 
     OpenCV has one thread meanwhile: a forked process cannot use the threads of its parent.
     """
-    threads = cv2.getNumThreads()
-    if loader.num_workers:
-        cv2.setNumThreads(1)
     batches: Any = None
     try:
-        batches = iter(loader)
-        yield batches
+        with one_opencv_thread() if loader.num_workers else contextlib.nullcontext():
+            batches = iter(loader)
+            yield batches
     except DeepDetectError as error:
         # torch puts the whole traceback into the message.
         text = str(error).strip()
@@ -290,7 +284,6 @@ def loading(loader: DataLoader[Any]) -> Iterator[Iterator[Any]]:
             raise
         raise type(error)(text.splitlines()[-1].partition(": ")[2]) from None
     finally:
-        cv2.setNumThreads(threads)
         # torch ends the processes with the iterator, which an error keeps alive; left to the
         # garbage collector, that takes five seconds (their queues are collected first).
         if loader.num_workers and batches is not None:

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .._shared.errors import require_packages
 from .._shared.options import suggest_keywords
@@ -75,9 +75,8 @@ def train(
         >>> result = train("photos", "run", options)  # doctest: +SKIP
         >>> detector = DeepDetect(result.onnx)  # doctest: +SKIP
     """
-    trainer = _dense_trainer(
-        images, output, options, validation, labels, init_weights, device, workers, log
-    )
+    data = {"validation": validation, "labels": labels, "workers": workers}
+    trainer = _dense_trainer(images, output, options, init_weights, device, log, data)
     return trainer.fit(Path(output), log)
 
 
@@ -122,33 +121,29 @@ def _dense_trainer(
     images: str | Path,
     output: str | Path,
     options: TrainingOptions,
-    validation: str | Path | None,
-    labels: str | Path | None,
     init_weights: InitWeights | None,
     device: DeviceOptions,
-    workers: int | None,
     log: Log | None,
+    data: Mapping[str, Any],
 ) -> DenseTrainer:
-    """Make the labels, and what is trained on them; arguments of `train`."""
+    """Make the labels, and what is trained on them; `data` are further arguments of `train`."""
     require_packages("training", *TRAINING_PACKAGES)
     from .dataset import prepare_data
     from .dense import DenseTrainer, initial_network, launch
 
     options, network = initial_network(options, init_weights)  # before the labels, for its errors
     fabric = launch(device, options)
-    data = prepare_data(
+    prepared = prepare_data(
         images,
         options,
         output,
-        validation=validation,
-        labels=labels,
-        workers=workers,
+        **data,
         processes=fabric.world_size * max(1, device.worker_count),
         make_labels=fabric.local_rank == 0,
         quiet=log is None or not fabric.is_global_zero,
     )
     fabric.barrier()
-    return DenseTrainer(network, options, data, device, fabric)
+    return DenseTrainer(network, options, prepared, device, fabric)
 
 
 TIMED_STEPS = 30
@@ -210,9 +205,8 @@ def profile(
         >>> profile("photos", "run")[0].images_per_second  # doctest: +SKIP
     """
     options = dataclasses.replace(options, interleave=False)  # each stage by itself
-    trainer = _dense_trainer(
-        images, output, options, validation, labels, init_weights, device, workers, log
-    )
+    data = {"validation": validation, "labels": labels, "workers": workers}
+    trainer = _dense_trainer(images, output, options, init_weights, device, log, data)
     steps_of_stage = trainer.schedule.steps_of_stage
     lengths = [min(n, TIMED_STEPS + WARM_UP_STEPS) for n in steps_of_stage]
     log = log if trainer.is_main else None

@@ -17,7 +17,7 @@ import tarfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -158,7 +158,7 @@ def write_shards(
         _read_index(output, options)
     listed = list_images(images, options, (output,), options.max_images)
     files: dict[str, list[tuple[Path, int]]] = {"training": [], "validation": []}
-    tasks = []
+    tasks: list[ShardTask] = []
     for kind, part in zip(files, train_val_split(listed, options.val_fraction), strict=True):
         for number, chosen in enumerate(_deal(part, images, shard_size)):
             if not chosen:
@@ -175,11 +175,12 @@ def write_shards(
             path = output / f"{kind}-{number:06d}-{digest}.tar"
             files[kind].append((path, len(rows)))
             if not path.exists():
-                tasks.append(_ShardTask(path, rows, options.labels))
+                tasks.append((path, rows))
     failures: list[str] = []
-    total = sum(len(task.rows) for task in tasks)
+    total = sum(len(rows) for _, rows in tasks)
+    work = functools.partial(_write_shard, labels=options.labels)
     with progress(total, "shards", "image", quiet) as bar:
-        for count, unread in map_tasks(_write_shard, tasks, workers):
+        for count, unread in map_tasks(work, tasks, workers):
             bar.update(count)
             failures += unread
     if failures:
@@ -196,12 +197,8 @@ def write_shards(
     return Shards(output, tuple(files["training"]), tuple(files["validation"]))
 
 
-class _ShardTask(NamedTuple):
-    """A shard to be written: its path, and the name of each image, the image, its views."""
-
-    path: Path
-    rows: Sequence[tuple[str, SourceImage, Sequence[View]]]
-    labels: LabelOptions
+ShardTask = tuple[Path, Sequence[tuple[str, SourceImage, Sequence[View]]]]
+"""A shard to be written: its path, and the name of each image, the image, its views."""
 
 
 def _deal(
@@ -216,14 +213,15 @@ def _deal(
     return shards
 
 
-def _write_shard(task: _ShardTask) -> tuple[int, list[str]]:
+def _write_shard(task: ShardTask, labels: LabelOptions) -> tuple[int, list[str]]:
     """Write one shard, if all of its images can be read; return their number, and what fails."""
+    shard, rows = task
     failures: list[str] = []
-    with contextlib.suppress(BatchError), atomic_path(task.path) as temporary:
+    with contextlib.suppress(BatchError), atomic_path(shard) as temporary:
         with tarfile.open(temporary, "w") as tar:
-            for k, (name, image, views) in enumerate(task.rows):
+            for k, (name, image, views) in enumerate(rows):
                 try:
-                    files = _files_of(name, image.path, views, task.labels)
+                    files = _files_of(name, image.path, views, labels)
                 except ImageError as error:
                     failures.append(str(error))
                     continue
@@ -234,7 +232,7 @@ def _write_shard(task: _ShardTask) -> tuple[int, list[str]]:
                     tar.addfile(member, io.BytesIO(content))
         if failures:
             raise BatchError("the shard is not complete", failures)
-    return len(task.rows), failures
+    return len(rows), failures
 
 
 def _files_of(

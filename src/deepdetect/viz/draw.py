@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -178,15 +178,6 @@ def _viridis(levels: np.ndarray) -> np.ndarray:
     """Return the (N, 3) colours of levels in [0, 1]."""
     colors: np.ndarray = draw_heatmap(np.asarray(levels).reshape(1, -1))[0]
     return colors
-
-
-def draw_masks(rgb: np.ndarray, masks: Mapping[str, np.ndarray], title: str) -> np.ndarray:
-    """Draw an image and (H, W) bool masks of it by title, with their densities, in a row."""
-    panels = [add_caption(rgb, title)]
-    for name, mask in masks.items():
-        picture = np.repeat((mask * np.uint8(255))[:, :, None], 3, 2)
-        panels.append(add_caption(picture, f"{name}: {mask.mean():.1%} of pixels"))
-    return hstack(panels)
 
 
 def add_caption(rgb: np.ndarray, text: str) -> np.ndarray:
