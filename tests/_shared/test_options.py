@@ -45,7 +45,6 @@ class Ranges:
     offsets_px: tuple[float, ...] = (1, 2)
     count: int = 0
     shares: tuple[tuple[float, float], ...] = ((0, 0.5), (1, 0.2))
-    window_px: int = 3
     ratio: float = 1.5
 
     def __post_init__(self) -> None:
@@ -54,7 +53,6 @@ class Ranges:
             positive=("size_px", "offsets_px"),
             not_negative=("count",),
             fractions=("shares",),
-            odd=("window_px",),
             between={"ratio": (1, math.inf), "count": (0, 9)},
         )
 
@@ -72,7 +70,6 @@ class Ranges:
         ({"count": 1.5}, "`count` must be 0 or more, not 1.5"),
         ({"count": 10}, "`count` must lie in [0, 9], not 10"),
         ({"shares": ((0, 1.1),)}, "`shares` must lie in [0, 1], not ((0, 1.1),)"),
-        ({"window_px": 4}, "`window_px` must be odd and at least 1, not 4"),
         ({"ratio": 0.99}, "`ratio` must be at least 1, not 0.99"),
     ],
 )

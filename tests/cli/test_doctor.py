@@ -29,7 +29,8 @@ def opencv_of(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., None]]:
         vars(module).update({"__version__": version, **dict.fromkeys(modules)})
         monkeypatch.setitem(sys.modules, "cv2", module if version else None)
         named = {name.replace("_", "-"): number for name, number in packages.items()}
-        monkeypatch.setattr(opencv, "installed_distributions", lambda: list(named))
+        for place in (doctor, opencv):
+            monkeypatch.setattr(place, "installed_distributions", lambda: list(named))
         real = importlib.metadata.version
         monkeypatch.setattr(
             importlib.metadata, "version", lambda name: named.get(name) or real(name)

@@ -62,7 +62,7 @@ def import_opencv() -> ModuleType:
             "the folder cv2 of the installed OpenCV is not complete, as after the removal of "
             "another package of it: pip install --force-reinstall opencv-python-headless"
         )
-    if _numbers(version) < _numbers(LOWEST_VERSION):
+    if version_numbers(version) < version_numbers(LOWEST_VERSION):
         raise MissingExtraError(
             f"OpenCV {version} is installed, and {LOWEST_VERSION} or later is needed: "
             f"pip install --upgrade {' '.join(installed_distributions()) or 'opencv-python'}"
@@ -106,5 +106,6 @@ def installed_distributions() -> list[str]:
     return [name for name in DISTRIBUTIONS if name in installed]
 
 
-def _numbers(version: str) -> list[int]:
-    return [int(part) for part in re.findall(r"\d+", version)[:2]]
+def version_numbers(version: str) -> list[int]:
+    """Return what versions are compared by."""
+    return [int(part) for part in re.findall(r"\d+", version)]

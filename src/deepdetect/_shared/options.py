@@ -64,14 +64,13 @@ def check_ranges(
     positive: Sequence[str] = (),
     not_negative: Sequence[str] = (),
     fractions: Sequence[str] = (),
-    odd: Sequence[str] = (),
     counts: Sequence[str] = (),
     between: Mapping[str, tuple[float, float]] = {},
 ) -> None:
     """Check the numbers in fields of options, in tuples each of them; None always passes.
 
-    The names of fields above 0, from 0, in [0, 1], odd from 1, and whole from 1; and the smallest
-    and largest allowed value by the name of a field. Where the default is whole, values must be.
+    The names of fields above 0, from 0, in [0, 1], and whole from 1; and the smallest and largest
+    allowed value by the name of a field. Where the default is whole, values must be.
 
     Raises:
         OptionError: a value is not a number, or out of its range.
@@ -79,7 +78,6 @@ def check_ranges(
     bounds = [(name, math.ulp(0), LARGEST, "be above 0") for name in positive]
     bounds += [(name, 0, LARGEST, "be 0 or more") for name in not_negative]
     bounds += [(name, 0, 1, "lie in [0, 1]") for name in fractions]
-    bounds += [(name, 1, math.inf, "be odd and at least 1") for name in odd]
     bounds += [(name, 1, math.inf, "be a whole number from 1 on") for name in counts]
     for name, (smallest, largest) in between.items():
         limits = f"lie in [{smallest:.12g}, {largest:.12g}]"
@@ -91,7 +89,6 @@ def check_ranges(
             continue
         values = _numbers(value)
         fits = bool(values) and all(smallest <= one <= largest for one in values)
-        fits &= name not in odd or all(one % 2 == 1 for one in values)
         if name in counts or type(getattr(type(options), name, None)) is int:
             fits &= all(float(one).is_integer() for one in values)
         if not fits:

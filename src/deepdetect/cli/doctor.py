@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 from .._shared.errors import DeepDetectError, first_line, install_command
+from .._shared.opencv import import_opencv, installed_distributions, version_numbers
 from ._options import Result, command, table
 
 PURPOSES = {
@@ -80,7 +81,7 @@ def packages() -> Iterator[Finding]:
         except importlib.metadata.PackageNotFoundError:
             absent.append(name)
             continue
-        if _numbers(version) < _numbers(lowest):
+        if version_numbers(version) < version_numbers(lowest):
             absent.append(f"'{name}>={lowest}'")
         elif not extra:
             yield Finding(name, "ok", version)
@@ -93,15 +94,13 @@ def packages() -> Iterator[Finding]:
 
 def opencv() -> Iterator[Finding]:
     """Say which OpenCV is imported: packages of it install over one another."""
-    from .._shared.opencv import import_opencv, installed_distributions
-
     module, names = import_opencv(), installed_distributions()
     contrib = hasattr(module, "xfeatures2d") or hasattr(module, "AgastFeatureDetector_create")
     value = f"{module.__version__} ({', '.join(names) or 'of no package'}), "
     value += "with contrib modules" if contrib else "without contrib modules, as labels need"
     last = max(names, key=lambda name: "contrib" in name, default="")
     installed = importlib.metadata.version(last) if last else module.__version__
-    same = _numbers(installed)[:3] == _numbers(module.__version__)[:3]
+    same = version_numbers(installed)[:3] == version_numbers(module.__version__)[:3]
     if same and contrib >= ("contrib" in last):
         yield Finding("OpenCV", "ok", value)
     else:
@@ -144,7 +143,3 @@ def self_test() -> Iterator[Finding]:
 
 
 CHECKS = (packages, opencv, self_test)
-
-
-def _numbers(version: str) -> list[int]:
-    return [int(part) for part in re.findall(r"\d+", version)]
