@@ -21,7 +21,7 @@ from .._shared.records import file_state
 from ..detector.detector import DeepDetect, check_selection, find_keypoints
 from ..detector.heatmap import MAX_AUTO_PIXELS
 from ..detector.point_detector import PointDetector
-from ..features.keypoints import UNSET_ANGLE, Keypoints
+from ..features.keypoints import UNSET_ANGLE, Keypoints, unit_length
 from ..features.selection import SelectionOptions
 from ..features.sift import describe_keypoints
 from ..io.image import find_images, load_image, luma
@@ -160,10 +160,7 @@ def feature_group(
         "image_size": np.array(keypoints.image_size, np.int32),
     }
     if keypoints.descriptors is not None:
-        descriptors = keypoints.descriptors.astype(np.float32)
-        norms = np.linalg.norm(descriptors, axis=1, keepdims=True)
-        descriptors /= np.where(norms > 0, norms, 1)
-        arrays["descriptors"] = np.ascontiguousarray(descriptors.T)
+        arrays["descriptors"] = np.ascontiguousarray(unit_length(keypoints.descriptors).T)
     if keypoints.sizes is not None and keypoints.angles is not None:
         arrays |= {"scales": keypoints.sizes / 2, "oris": keypoints.angles}
     return Group(name, arrays, state, {"keypoints": {"uncertainty": np.float32(uncertainty)}})

@@ -5,9 +5,10 @@ To add a matcher, write a function of the signature of `Matcher` and add it to `
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -57,22 +58,9 @@ Positions = tuple[np.ndarray, np.ndarray] | None
 neighbours need not match alike."""
 
 
-class Matcher(Protocol):
-    """Finds the `count` nearest neighbours of descriptors."""
-
-    def __call__(
-        self,
-        queries: np.ndarray,
-        base: np.ndarray,
-        count: int,
-        seed: int,
-        positions: Positions = None,
-    ) -> Neighbours:
-        """Find for (N, D) queries the nearest rows of an (M, D) base, M >= count.
-
-        Both are uint8 or float32. The same seed gives the same result.
-        """
-        ...
+Matcher = Callable[[np.ndarray, np.ndarray, int, int, Positions], Neighbours]
+"""Finds for (N, D) queries the `count` nearest rows of an (M, D) base, M >= count, both uint8 or
+float32: `matcher(queries, base, count, seed, positions)`. The same seed gives the same result."""
 
 
 def exact_neighbours(
@@ -311,7 +299,7 @@ def match_descriptors(
         if _is_exhaustive(matcher, len(descriptors0), len(descriptors1)):
             asked = np.unique(rows[kept, 0])  # the way back of the others changes nothing
             nearest = np.full(len(descriptors1), -1)
-            nearest[asked] = matcher(descriptors1[asked], descriptors0, 1, seed)[0][:, 0]
+            nearest[asked] = matcher(descriptors1[asked], descriptors0, 1, seed, None)[0][:, 0]
         else:
             back = None if positions is None else positions[::-1]
             nearest = matcher(descriptors1, descriptors0, 1, seed, back)[0][:, 0]

@@ -12,7 +12,7 @@ from .._shared.errors import InvalidFileError, OptionError
 from .._shared.options import suggest_keywords
 from ..batch.extraction import extract_features, read_keypoints
 from ..batch.hdf5 import feature_names, import_h5py, open_hdf5
-from ..batch.pair_list import Pair, read_pairs, sequential_pairs
+from ..batch.pair_list import Pair, read_pairs
 from ..batch.pair_matching import match_pairs
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
@@ -153,7 +153,7 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
             before = keypoints.setdefault(name, own)
             if not (np.array_equal(before.xy, own.xy) and before.image_size == own.image_size):
                 raise InvalidFileError(
-                    f"{path} has other keypoints of {name} than another file: make all files alike"
+                    f"{path} has other keypoints of {name} than others: use the same options"
                 )
         kept = loaded.inliers
         rows = np.column_stack([loaded.indices0[kept], loaded.indices1[kept]])
@@ -244,14 +244,11 @@ def match_folder(
             extracted.check()
         keypoints = read_features_file(features)
         unread = set(names) - keypoints.keys()
-        if pairs is None:
-            good = [name for name in names if name in keypoints]
-            reach = len(good) if sequential is None else sequential
-            wanted = sequential_pairs(good, reach)
-        else:  # an image that cannot be read is one failure, not one for each of its pairs
+        wanted: str | list[Pair] = "exhaustive" if sequential is None else "sequential"
+        if pairs is not None:  # an image that cannot be read is one failure, its pairs are none
             wanted = [pair for pair in pairs if unread.isdisjoint(pair)]
-        if not wanted:
-            return Collection(keypoints, {}, root, extracted.failures)
-        matched = match_pairs(features, wanted, found, workers=workers, quiet=quiet)
+        matched = match_pairs(
+            features, wanted, found, workers=workers, sequential=sequential or 1, quiet=quiet
+        )
         matches = read_matches_file(found, keypoints) if matched.counts else {}
         return Collection(keypoints, matches, root, (*extracted.failures, *matched.failures))

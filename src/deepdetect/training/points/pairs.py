@@ -11,6 +11,7 @@ from torch.utils.data import Dataset
 
 from ...detector.points.candidate_features import describe_candidates
 from ...detector.points.hessian_scales import build_scale_space, find_candidates
+from ...features.keypoints import unit_length
 from ...features.sift import root_sift_descriptors
 from ...geometry.transforms import transform_points
 from ...io.image import load_image, luma
@@ -79,9 +80,7 @@ def candidate_pair(pair: ViewPair, density: float, with_descriptors: bool) -> Ca
         sides.append((candidates.xy[rows], candidates.sigma_px[rows], features[rows]))
         if with_descriptors:
             xy = candidates.xy[rows].astype(np.float32)
-            found = root_sift_descriptors(image, xy, DESCRIPTOR_SIZE_PX).astype(np.float32)
-            length = np.linalg.norm(found, axis=1, keepdims=True)
-            described.append(found / np.maximum(length, 1e-6))
+            described.append(unit_length(root_sift_descriptors(image, xy, DESCRIPTOR_SIZE_PX)))
     views = []
     for k, homography in enumerate((pair.homography, np.linalg.inv(pair.homography))):
         here, there = sides[k][0], sides[1 - k][0]
