@@ -81,7 +81,7 @@ def test_the_key_is_needed_and_a_request_of_the_page(serve: Any) -> None:
         headers = {"Authorization": key}
         answer = client.ask("POST", "/api/jobs?kind=match", b"abc", headers)
         assert answer.status == 401
-        assert "open the address that it has printed" in answer.values["error"]
+        assert "open the address that deepdetect app has printed" in answer.values["error"]
         assert client.ask("POST", "/api/heatmap?width=16&height=16", b"", headers).status == 401
     for site in ("cross-site", "same-site", "none"):
         headers = {"Sec-Fetch-Site": site}
