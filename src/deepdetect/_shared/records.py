@@ -155,8 +155,7 @@ class Outputs:
         """Refuse to replace what was made otherwise; call it before long work.
 
         Raises:
-            OptionError: an output was made from other files, with other settings, or by something
-                else.
+            OptionError: an output was made from other files, with other settings, or otherwise.
         """
         if not self.overwrite:
             for path in self.paths:

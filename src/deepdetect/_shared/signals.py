@@ -20,8 +20,7 @@ def handle_signals(
 ) -> Iterator[None]:
     """Have a function called for signals while the block runs, in the main thread.
 
-    A signal that is ignored, as by `nohup`, is left alone, and one that has a handler already,
-    but for Ctrl+C.
+    Signals that are ignored, as by `nohup`, are left alone; so are handled ones but Ctrl+C.
     """
     before = {}
     if threading.current_thread() is threading.main_thread():

@@ -64,8 +64,7 @@ def extract_features(
     Args:
         folder: of the images.
         path: the file.
-        detector: a `PointDetector` or a `DeepDetect`; every process has one, so give the latter
-            `threads=1`.
+        detector: a `PointDetector` or a `DeepDetect` (with `threads=1`: every process has one).
         selection: which pixels of a `DeepDetect`; None: those over 0.5.
         max_megapixels: of an image, as of `load_image`; larger ones are failures.
         engine: "processes" of this machine, or "ray" for a cluster.

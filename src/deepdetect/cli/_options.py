@@ -40,8 +40,7 @@ class From:
         target: the function or class.
         common: names of those that --help shows, with blanks between.
         more: of those that --help-all shows; None: all others.
-        flags: flags that are not the name, as {"focal_px": "--focal"}, or with the negative one
-            after a slash.
+        flags: flags that are not the name, as {"focal_px": "--focal"}, or "--flag/--negative".
         types: types of parameters that are wider than what can be typed.
         defaults: what the help says of the default, where the value does not say it.
     """

@@ -192,10 +192,8 @@ def benchmark(
         data: Folder of the data sets.
         output: Folder for the report.
         protocol: May be repeated.  [default: all but degraded]
-        method: A further method, NAME, FILE.onnx or MODULE:FUNCTION, as one more row; may be
-            repeated.
-        baselines: Classical methods to compare with, with commas between; none for none.
-            [default: all]
+        method: A further method, NAME, FILE.onnx or MODULE:FUNCTION; may be repeated.
+        baselines: Classical methods, with commas between; none for none. [default: all]
         preset: published: show the network the channels as the paper's code does (BGR).
         cache: Folder of the stages' results.  [default: cache in the output]
         geometry_weights: Weights for stereo pairs, as --weights; may be repeated.  [default: dense]

@@ -31,8 +31,7 @@ class Degradation:
     Attributes:
         name: as "dark-8".
         title: how tables name it.
-        apply: from (H, W, 3) float32 linear light in [0, 1], and random numbers, to (H, W, 3) uint8
-            sRGB.
+        apply: makes uint8 sRGB of float32 linear light in [0, 1], (H, W, 3), and random numbers.
         version: raise it when a change of the code changes the result.
     """
 

@@ -47,8 +47,7 @@ class RemoteFile:
         size: in bytes, roughly.
         checksum: "md5:..." or "sha256:..."; None where none is known: then the contents of the
             data set are checked.
-        into: in the data set, the folder that an archive is unpacked into, or the path of a
-            single file.
+        into: in the data set, the folder that an archive is unpacked into, or a file's path.
         inside: folder of the archive whose contents are taken.
         suffixes: endings of the files that are taken from a tar archive; empty for all files.
     """

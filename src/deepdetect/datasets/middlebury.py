@@ -32,8 +32,7 @@ class StereoPair:
     Attributes:
         name: the scene's name.
         left, right: (H, W, 3) uint8 RGB.
-        disparity: (H, W) float32 true disparity of the left view in pixels, NaN where it is
-            unknown.
+        disparity: (H, W) float32 true disparity of the left view in pixels, NaN if unknown.
     """
 
     name: str

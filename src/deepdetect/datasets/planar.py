@@ -100,8 +100,7 @@ def load_oxford(
 def load_hpatches(folder: str | Path) -> list[PlanarScene]:
     """List the scenes that are there (Balntas et al., 2017): 116 in the whole set.
 
-    The folders i_NAME change the light, v_NAME the viewpoint; they hold 1.ppm (or .png) to 6, and
-    H_1_2 to H_1_6.
+    The folders i_NAME (light) and v_NAME (viewpoint) hold 1.ppm (or .png) to 6, H_1_2 to H_1_6.
     """
     root = Path(folder)
     homographies = [f"H_1_{number}" for number in range(2, 7)]

@@ -1,7 +1,6 @@
 """The benchmarks, and how they are run.
 
-To add one, write a function from a run and its options to sections of a report, and add its line
-to `BENCHMARKS`.
+To add one, write a function from a run and options to sections, and its line in `BENCHMARKS`.
 """
 
 from __future__ import annotations

@@ -125,8 +125,7 @@ def evaluate(
     Raises:
         ImageError: there is no sample, scene or photograph that can be read, or a homography or a
             photograph is missing.
-        OptionError: a scale is not above 0, or there are no samples to scale, or no images for
-            `equal_density`.
+        OptionError: a scale is not above 0, or `scales` or `equal_density` has no images.
         MissingExtraError: `oxford` needs the extra "benchmark".
 
     Example:

@@ -68,8 +68,7 @@ def draw_matches(
 
     The lower image is enlarged to the height of the other, and both are scaled down where the
     picture would be wider or higher than `PICTURE_SIDE_PX`. Good matches are green, the others red;
-    by position the good ones are coloured by where they are in the first image, and more are dots
-    than lines.
+    by position the good ones are coloured by their place in the first image, and most are dots.
     """
     height = max(rgb0.shape[0], rgb1.shape[0])
     width = sum(rgb.shape[1] * height / len(rgb) for rgb in (rgb0, rgb1))

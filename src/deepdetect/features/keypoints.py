@@ -47,8 +47,7 @@ class Keypoints:
         sizes: (N,) float32 diameters in pixels, or None where all keypoints have the same.
         angles: (N,) float32 orientations in degrees (-1: unset), or None where all have the same.
         octaves: (N,) int32 as OpenCV packs them, or None.
-        descriptors: (N, D) uint8 or float32, of a detector that describes its own keypoints, or
-            None.
+        descriptors: (N, D) uint8 or float32 where the detector describes its keypoints, or None.
         descriptor_type: what these are, as "rootsift"; None without any, or of unknown ones.
 
     `len`, iteration over (x, y) rows and indexing by slices, masks and index arrays work.

@@ -47,8 +47,7 @@ BAND_HEIGHT_PX = 96
 """Of a part that one thread works on; the result depends on it."""
 
 SEARCH_SHRINK = 3
-"""Random tries begin in the whole image around the best neighbour; each next one is so many times
-nearer."""
+"""Random tries begin in the whole image around the best neighbour; each next is so much nearer."""
 
 Neighbours = tuple[np.ndarray, np.ndarray]
 """(N, count) int32 rows and (N, count) float32 distances, nearest first."""

@@ -31,8 +31,7 @@ class TwoViewGeometry:
     """The geometry that guided the matching of two images.
 
     Attributes:
-        model: "homography", "fundamental", or "none": no geometry could be trusted, and there are
-            no matches.
+        model: "homography", "fundamental", or "none": no geometry is trusted, no matches.
         matrix: (3, 3) float64, refined, of the first image to the second; None without one.
         tentative_matches: number of tentative matches that it was first estimated from.
         tentative_inliers: number of those that agree with it, and of more along its lines.
@@ -135,8 +134,7 @@ class Matches:
         keypoints0, keypoints1: all keypoints of the two images. Of a pair without success they may
             be lazy: they are found when they are first asked for.
         seconds: time of each stage, both images together.
-        two_view_geometry: the geometry that guided the matching; None when guided matching was not
-            asked for.
+        two_view_geometry: the geometry that guided the matching; None without guided matching.
         subpixel: whether the matching itself found sub-pixel positions in the second image, by
             rectification: they need no refinement.
         indices0, indices1: (M,) int32 rows of `keypoints0` and `keypoints1`: the keypoints that are

@@ -95,8 +95,7 @@ def dense_sift(
 def sift_gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute the gradient of a (H, W) uint8 image that `dense_sift` describes.
 
-    Returns its magnitude, 0 on the border, and its orientation in units of 45 degrees, both (H, W)
-    float32.
+    Returns (H, W) float32: its magnitude, 0 on the border, and its orientation in 45 degrees.
     """
     blur = float(np.sqrt(BASE_SIGMA_PX**2 - CAMERA_SIGMA_PX**2))
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), blur)

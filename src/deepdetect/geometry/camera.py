@@ -10,8 +10,7 @@ A calib.json is one JSON object. Only `focal_px` is required; lengths are in pix
      "disparity_offset_px": 66.7,   cx of the right camera minus cx of the left; default: 0
      "left": {...}, "right": {...}} what differs in one view: focal_px, cx, cy, width, height
 
-Other keys are ignored. The names follow the calib.txt of Middlebury 2014, where the offset is
-`doffs`.
+Other keys are ignored. The names follow Middlebury 2014, where the offset is `doffs`.
 """
 
 from __future__ import annotations

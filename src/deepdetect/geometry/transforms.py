@@ -96,8 +96,7 @@ def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.nda
     """Return the distances of a rectified pair's matches from the true disparity.
 
     Args:
-        points0: (N, 2) positions in the left image; the disparity is read at the
-            nearest pixel.
+        points0: (N, 2) positions in the left image; the nearest pixel is read.
         points1: (N, 2) matched positions in the right image.
         disparity: (H, W) true disparity of the left image in pixels: the true match of
             (x, y) is (x - d, y). Not finite where it is unknown.

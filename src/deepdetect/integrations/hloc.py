@@ -138,8 +138,7 @@ class DeepDetectDenseMatcher(BaseModel):
     """Dense guided matches of two images, for `hloc.match_dense`.
 
     Its options in hloc's configuration: `max_keypoints` of a `PointDetector`, or None for the dense
-    ones of a `DeepDetect`, and the `weights` of that. Where no geometry can be trusted there are
-    no matches.
+    ones of a `DeepDetect`, and its `weights`. Without a trusted geometry there are no matches.
     """
 
     default_conf: dict[str, Any] = {"weights": "default", "max_keypoints": None}  # noqa: RUF012

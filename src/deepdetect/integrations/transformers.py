@@ -154,8 +154,7 @@ class DeepDetectForKeypointDetection(transformers.PreTrainedModel):
 
         Args:
             pixel_values: (B, 3, H, W) RGB in [0, 1], as the image processor returns them.
-            pixel_mask: (B, H, W), 1 for pixels of the image, which lies at the upper left; None:
-                all are.
+            pixel_mask: (B, H, W), 1 for pixels of the image, at the upper left; None: all are.
             labels: (B, H, W), 1 for keypoints, to train on.
             return_dict: False for a tuple instead of the output by names.
             **keywords: not used; programs that go through all models give some.

@@ -26,8 +26,7 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
     They are the arguments of `hloc.reconstruction.main`. Each file appears whole, or not at all.
 
     Args:
-        collection: the images. Those without descriptors get none, which hloc needs to match,
-            not to map.
+        collection: the images; hloc needs their descriptors to match, not to map.
         output: folder.
 
     Returns:

@@ -30,8 +30,7 @@ def encode_mask(mask: np.ndarray) -> bytes:
 def load_mask(source: Any, *, max_megapixels: float | None = None) -> np.ndarray:
     """Read a mask of any bit depth as (H, W) bool: True where a pixel is brighter than half.
 
-    In a file that holds only zeros and ones, the ones are True. Arguments and errors are those of
-    `open_image`.
+    In a file of zeros and ones alone, the ones are True. Arguments and errors: see `open_image`.
     """
     with open_image(source, what="mask", max_megapixels=max_megapixels) as opened:
         deep = opened.mode.startswith("I")  # 16 bits per pixel

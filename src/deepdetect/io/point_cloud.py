@@ -23,8 +23,7 @@ VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
 def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> None:
     """Write binary PLY (Turk, 1994): float x y z, uchar red green blue; 15 bytes per point.
 
-    Frame, unit and metadata are comments, which the writers of libraries lack; what is not ASCII
-    becomes "?".
+    Frame, unit and metadata are comments, which libraries do not write; non-ASCII becomes "?".
     """
     vertices = np.empty(len(cloud), VERTEX)
     vertices["xyz"] = cloud.points
@@ -76,8 +75,7 @@ def save_point_cloud(cloud: PointCloud, path: str | Path, metadata: Metadata | N
             "seconds": 2.5}: as PLY comments, as glTF extras, or as the page's caption.
 
     Raises:
-        OptionError: the suffix is unknown (the nearest right one is named), or the cloud is
-            empty.
+        OptionError: the suffix is unknown (a near one is named), or the cloud is empty.
         DeepDetectError: the file cannot be written.
 
     Example:

@@ -128,8 +128,7 @@ def find_label_settings(settings: str | Path) -> LabelOptions:
         settings: a name of `LABEL_SETTINGS`, or the path of a file.
 
     Raises:
-        OptionError: the name is unknown, the file cannot be read, or a name or value in it is
-            wrong.
+        OptionError: the name is unknown, or the file cannot be read or has a wrong entry.
 
     Example:
         >>> find_label_settings("dense").settings

@@ -118,14 +118,12 @@ def match_images(
         image0, image1: anything `load_image` takes.
         detector: a `DeepDetect` or a `PointDetector`, or anything with a method `heatmap` or
             `detect`, as these have; default `DeepDetect()`.
-        channels: order of the colours in images that are arrays, as of `load_image`: "bgr" for
-            those of OpenCV.
+        channels: order of the colours in arrays, as of `load_image`: "bgr" for OpenCV's.
         selection: which pixels of a heat map become keypoints; None: those over 0.5. A
             `PointDetector` has none.
         ignore: a mask for each image, or None, in a tuple; or one array for both: true where no
             keypoint is wanted.
-        guided_matching: whether a geometry from a few matches guides the matching, or descriptors
-            alone decide.
+        guided_matching: whether a geometry from a few matches guides the matching.
         model: the geometry, "homography" (planes, pure rotation), "fundamental" (any static
             scene), "essential" (with both cameras in `options.geometry`), "auto" (one of the first
             two) or "none"; it also chooses what guides.

@@ -101,8 +101,7 @@ def register(
     Raises:
         ImageError: an image cannot be read or is not fit.
         OptionError: an option is unknown or out of its range.
-        RegistrationError: no homography between the images can be trusted, or the images contradict
-            it.
+        RegistrationError: no homography can be trusted, or the images contradict it.
 
     Example:
         >>> from deepdetect.evaluation.baselines.random import RandomDetector

@@ -84,8 +84,7 @@ def reconstruct(
             takes every pixel, and `DENSE` disparities; `subpixel` does not apply.
         ignore: as of `match_images`; of a rectified pair only the mask of the left image counts.
         seed: of all random choices.
-        disparity: of rectified pairs; "auto": `DENSE` where every pixel is asked for, else the
-            strict default.
+        disparity: of rectified pairs; "auto": `DENSE` for every pixel, else the strict default.
         point_filter: which points are kept.
         progress: called with the name of each stage when it ends.
 

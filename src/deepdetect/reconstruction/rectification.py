@@ -42,8 +42,7 @@ COARSE_SIDE_PX, COARSE_KEYPOINTS = 480, 1000
 """Longer side of the copies of the coarse pass, and keypoints of each."""
 
 MIN_COARSE_INLIERS = 50
-"""Matches of the coarse pass that a fundamental matrix explains, with fewer of which it does not
-decide."""
+"""Fewest matches of the coarse pass that a fundamental matrix must explain to decide."""
 
 MAX_COARSE_ROW_ERROR_PX = 0.6
 """A pair is rectified after the coarse pass only where its rows are off by less than this at
@@ -242,8 +241,7 @@ def _best_other_rows(
 ) -> np.ndarray:
     """Fit the vertical shift as a plane over the image, robustly; (M,) bool that agree with it.
 
-    Three matches give it, where a fundamental matrix takes seven: it is found among many wrong
-    matches too.
+    Three matches give it, not seven as for a fundamental matrix: it stands more wrong matches.
     """
     shift = points1[:, 1] - points0[:, 1]
     best = np.zeros(len(points0), bool)

@@ -31,8 +31,7 @@ MAX_REPROJECTION_ERROR_PX = 0.5
 """Of a point that is kept (root mean square of both images)."""
 
 POSE_CELLS = 10_000
-"""Of matches that are sub-pixel already, the best corner of each of this many cells is refined, for
-the pose."""
+"""Of sub-pixel matches, the best corner of each of this many cells is refined for the pose."""
 
 GRID_SIZE_PX = 16
 """Cells of the first image of this size give one match each: matches side by side are no

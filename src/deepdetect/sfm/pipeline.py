@@ -81,8 +81,7 @@ def reconstruct_many(
     Raises:
         ImageError: the folder is missing or holds no image.
         OptionError: an option is unknown or out of its range, or the results were made with others.
-        ReconstructionError: fewer than three images can be read, or (a `NoDepthError`) they do not
-            hang together.
+        ReconstructionError: fewer than three images can be read, or (`NoDepthError`) hang together.
         MissingExtraError: pycolmap or h5py is not installed.
 
     Example:

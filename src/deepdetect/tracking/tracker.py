@@ -48,12 +48,9 @@ class TrackingOptions:
 
     Attributes:
         max_keypoints: tracks at a time.
-        detect_every: new points are looked for after this many frames, or earlier where many tracks
-            are lost.
-        min_kept: share of the tracks after the last search; with fewer, new points are looked for
-            at once.
-        max_return_error_px: largest distance of a point from where it is found when it is followed
-            back.
+        detect_every: new points are looked for after this many frames, or once many are lost.
+        min_kept: share of the tracks after the last search; with fewer, a search follows.
+        max_return_error_px: largest distance of a point from where following it back ends.
 
     Raises:
         OptionError: a value is out of its range.

@@ -61,8 +61,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
     Attributes:
         live: whether it is a camera, which has no end.
         fps: frames per second of what is taken.
-        count: number of frames that will be taken, as far as the file states it; None where it is
-            not known.
+        count: number of frames that will be taken, as the file states; None where unknown.
         failures: a sentence on each image of a folder that was left out until now: it cannot be
             read, or has another size than the first one.
 

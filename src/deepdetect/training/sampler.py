@@ -92,8 +92,7 @@ class CropSampler(Sampler[list[CropIndex]]):
         shard_sizes: number of images in each shard, whose images are read together; None if
             images can be read in any order.
         first_step, last_step: from which step on, and before which; default: all.
-        rank, world_size: number of this process, which gets its part of each batch, and how many
-            there are.
+        rank, world_size: number of this process, for its part of each batch, and of all.
 
     Raises:
         OptionError: a batch cannot be divided evenly among the processes.

@@ -54,8 +54,7 @@ def epipolar_inlier_ratio(
 ) -> float:
     """Return the fraction of the matches whose Sampson distance is under the threshold.
 
-    A match that slid along its line agrees too: this is an upper bound of the precision. 0 without
-    matches.
+    A match that slid along its line agrees too: an upper bound of the precision. 0 without any.
     """
     if not len(points0):
         return 0.0

@@ -406,8 +406,7 @@ def _times() -> np.ndarray:
 def _unpacked(model: Any) -> Row:
     """Return what is kept of a model of pycolmap, or of None.
 
-    The "names" of the registered images, (N, 12) "poses", rotation and translation, and the
-    `MODEL_COLUMNS`.
+    The "names" and (N, 12) "poses" (rotation, translation) of its images, and `MODEL_COLUMNS`.
     """
     if model is None:
         nothing = {"names": np.empty(0, np.str_), "poses": np.empty((0, 12))}

@@ -63,8 +63,7 @@ class DisparityOptions:
     Attributes:
         disparity_range: smallest and largest disparity in whole pixels; None: found on a small
             copy of the pair.
-        uniqueness_ratio: the cost of any other place on the row, over that of the match, is at
-            least this.
+        uniqueness_ratio: least cost of any other place on the row, over that of the match.
         discontinuity_margin_px: pixels this near to a disparity discontinuity are left out: the
             windows that are compared extend so far, and give what lies beside a near object its
             disparity. Objects up to twice as wide vanish. 0 keeps them.
@@ -128,8 +127,7 @@ class DisparityMap:
         matched: (H, W) bool: seen in both views, so that (x - disparity, y) lies in the right one;
             False where the disparity is NaN or filled in from the surface beside: hidden in the
             right view, outside of it, or on the edge of what hides.
-        disparity_range: smallest and largest disparity that were tried; None where the views agree
-            on nothing.
+        disparity_range: smallest and largest disparity tried; None where the views do not agree.
     """
 
     disparity: np.ndarray

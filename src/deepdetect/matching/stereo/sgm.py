@@ -77,8 +77,7 @@ NOISE_LEVELS = 2.0
 """Grey levels; where the image has no stronger gradients the smoothed surface stays."""
 
 MIN_GAIN = 0.2
-"""Least contrast of the right view over the left: below, it shows something else, and the disparity
-stays."""
+"""Least contrast of the right view over the left: below, it shows something else: no refinement."""
 
 UNKNOWN = np.float32(1e9)
 """An unknown disparity, so far from any other that it is never on the same surface."""

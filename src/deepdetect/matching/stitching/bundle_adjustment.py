@@ -43,8 +43,7 @@ Links = list[tuple[int, int, np.ndarray, np.ndarray]]
 class RegisteredPair:
     """Two images, by their numbers, related by a homography that dense keypoints confirm.
 
-    `points` are some of the keypoints of the first that have a match in the second, of so many
-    `matches`.
+    `points` are some of the first image's keypoints with a match, of so many `matches`.
     """
 
     first: int

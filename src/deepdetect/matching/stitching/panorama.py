@@ -65,13 +65,11 @@ class Panorama:
         valid: (H, W) bool, where one is.
         homographies: (3, 3) from each image, by its number: of a flat panorama to `image`, of a
             curved one to the reference; in the order in which they were connected.
-        reference: number of the image that is not distorted, or that a curved panorama has in the
-            middle.
+        reference: number of the image that is not distorted, or is in the middle of a curve.
         unregistered: why each other image has no part in it, by its number.
         matches: number of dense matches of each pair that was registered.
         residual_px: root mean square of the distances that the homographies of the pairs are
-            from those of the panorama, in pixels of the registration; of a flat panorama 0 without
-            closed loops.
+            from the panorama's, in pixels of the registration; flat: 0 without closed loops.
         gains: factor that the brightness of each image was multiplied by.
         seconds: time of each stage.
     """
