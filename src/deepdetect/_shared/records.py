@@ -34,8 +34,7 @@ def key(*values: Any) -> str:
     """Return 32 hexadecimal digits of values, the same in every process and on every machine.
 
     Values are None, booleans, numbers, text, bytes, arrays (by type, shape and content), paths (by
-    the content of their files), dataclasses (by name and fields), and lists, sets and dictionaries
-    of these. A tuple is a list.
+    the content of their files), dataclasses (by name and fields), lists or tuples, sets and dicts.
 
     Raises:
         MissingFileError: a file is missing.

@@ -1,7 +1,6 @@
 """What the page can ask Python for: one function and one line of `TASKS` each.
 
-A task reads images, tells its progress, writes files into a folder, and returns what the page
-shows beside them.
+A task reads images, tells its progress, writes files, and returns what the page shows beside.
 """
 
 from __future__ import annotations

@@ -29,8 +29,7 @@ from .._shared.machine import (
 from .._shared.options import look_up
 
 MAX_BLOCKS = 4096
-"""Parts of the work that Ray schedules: each costs a few milliseconds, and is repeated as a whole
-where its worker dies."""
+"""Parts of the work that Ray schedules: each costs milliseconds, and is redone if a worker dies."""
 
 PROCESSORS_PER_WORKER = 0.5
 """That are reserved. A worker uses one; when half of the machines are lost, those that are left

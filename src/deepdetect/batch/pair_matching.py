@@ -114,8 +114,7 @@ def match_pairs(
         stop the others: see `failures`.
 
     Raises:
-        OptionError: an option is unknown, or a pair is none; or the file exists, made with other
-            settings.
+        OptionError: an option is unknown, a pair is none, or the file has other settings.
         MissingExtraError: h5py, or what the engine needs, is not installed.
         DeepDetectError: a file cannot be read or written.
 

@@ -181,8 +181,7 @@ def benchmark(
 ) -> cli.Result:
     """Write a report on the detectors: report.md with figures, tables/*.csv, report.json.
 
-    A second run does only what is new. What cannot be measured does not stop the rest: it is listed
-    at the end, with exit code 1.
+    A second run does only what is new. What cannot be measured is listed at the end (exit code 1).
 
         deepdetect benchmark oxford --data data --max-pairs 1 --baselines sift -o quick
         deepdetect benchmark oxford --data data -o report --method xfeat.onnx

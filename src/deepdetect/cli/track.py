@@ -46,8 +46,7 @@ def track(
         deepdetect track 0 -o webcam.mp4 --max-side 640
 
     Args:
-        output: Video to be written (.mp4, .mov, .mkv, .avi), .csv for the table of tracks alone,
-            or a folder for both.
+        output: Video (.mp4, .mov, .mkv, .avi), .csv for the tracks alone, or a folder for both.
     """
     file = cli.output_file(output, "tracks.mp4")
     files = [path for path in output_files(file) if path is not None]

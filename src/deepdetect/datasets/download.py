@@ -1,7 +1,6 @@
 """Data sets on the web: downloaded with resuming and checksums, unpacked, and checked.
 
-The downloader is our own, on `requests`: pooch does not resume a download that broke off, which
-COCO with its 19 GB needs.
+It is our own, on `requests`: pooch does not resume a broken download, as COCO's 19 GB need.
 """
 
 from __future__ import annotations
@@ -45,8 +44,7 @@ class RemoteFile:
     Attributes:
         urls: its official host first, then mirrors; the next one is tried when one fails.
         size: in bytes, roughly.
-        checksum: "md5:..." or "sha256:..."; None where none is known: then the contents of the
-            data set are checked.
+        checksum: "md5:..." or "sha256:..."; None: the contents of the data set are checked.
         into: in the data set, the folder that an archive is unpacked into, or a file's path.
         inside: folder of the archive whose contents are taken.
         suffixes: endings of the files that are taken from a tar archive; empty for all files.

@@ -1,8 +1,7 @@
 """Photographs to train on: crops of pictures in public repositories, each with its licence.
 
 Their list, `known/photographs.csv.gz`, was made by `benchmarks/list_photographs.py` of commit
-81b8253, without pictures that are nearly the same as another and without the data sets that the
-network is measured on.
+81b8253, without near copies and without the data sets that the network is measured on.
 """
 
 from __future__ import annotations

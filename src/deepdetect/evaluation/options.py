@@ -45,13 +45,11 @@ class BenchmarkOptions:
         protocols: of `PROTOCOLS`.
         classical: names of the classical baselines.
         others: further local features.
-        channels: order of the colours in the paper's protocol; "bgr" is what the paper's code
-            feeds its own weights.
+        channels: order of the colours in the paper's protocol; "bgr" in the paper's code.
         geometry_weights: the weights for stereo pairs, one or more.
         max_pairs: of each scene at most this many pairs, evenly spaced; of one the last.
         degraded_images: which images of a pair the protocol "degraded" degrades.
-        max_images: of each scene at most this many are reconstructed: of a sequence the first,
-            else evenly spaced ones.
+        max_images: at most this many of a scene: of a sequence the first, else evenly spaced.
         ranker: of the points, as of `PointDetector`.
 
     Raises:

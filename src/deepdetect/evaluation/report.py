@@ -47,8 +47,7 @@ class Table:
     """A table; its key, as "oxford_matches", is the name of its file.
 
     The columns say how numbers are written, as ".3f", ",d" or ".1%", by title. The rows have cells
-    by title; one that is missing, None or NaN is a dash. A table that is not `in_text` is named in
-    report.md, not shown.
+    by title; one that is missing, None or NaN is a dash. report.md only names one not `in_text`.
     """
 
     key: str

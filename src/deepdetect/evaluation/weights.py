@@ -112,8 +112,7 @@ def evaluate(
         samples: folder of images `image_NAME.png` with known masks `mask_image_NAME.png`; with
             `scales` any images, without masks.
         scales: factors above 0: the samples scaled by each are compared with labels of their own.
-        oxford: folder of the eight Oxford scenes: density, repeatability and correct matches by
-            the paper's protocol.
+        oxford: folder of the eight Oxford scenes, for `OxfordScore`.
         foreground: folder of photographs NAME.jpg with their foreground NAME_mask.png: the fraction
             of the keypoints that lies on it.
         equal_density: of each image of `oxford` and `foreground` as many keypoints are taken as its
@@ -123,8 +122,7 @@ def evaluate(
         quiet: show no progress bars.
 
     Raises:
-        ImageError: there is no sample, scene or photograph that can be read, or a homography or a
-            photograph is missing.
+        ImageError: no sample, scene or photograph can be read, or a file of one is missing.
         OptionError: a scale is not above 0, or `scales` or `equal_density` has no images.
         MissingExtraError: `oxford` needs the extra "benchmark".
 

@@ -37,8 +37,7 @@ class Keypoints:
     """Keypoints of one image.
 
     Attributes:
-        xy: (N, 2) float32 positions, x right and y down in pixels, centre of the
-            first pixel (0, 0).
+        xy: (N, 2) float32 pixels, x right, y down, centre of the first pixel (0, 0).
         scores: (N,) float32, the higher the better: of `PointDetector` in (0, 1), no two equal; of
             `DeepDetect` probabilities, of which float32 rounds the highest to 1: `best` ranks
             pixels by their logits.

@@ -240,8 +240,7 @@ class Matches:
     def unique(self) -> Matches:
         """Return one-to-one matches: those that score highest at both of their ends.
 
-        Ends are the same keypoint; where no keypoint is near, the same nearest pixel. Of equal
-        scores the first match counts.
+        Ends are one keypoint, or without one near one pixel. The first of equal scores counts.
 
         Example:
             >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))

@@ -79,8 +79,7 @@ class SelectionOptions:
         max_keypoints: at most this many are kept, the most probable ones.
         nms_radius: of non-maximum suppression in pixels: a pixel is kept when it ranks highest
             within this distance in x and y (0: no suppression).
-        subpixel: refine positions to the maximum of a parabola through the pixel and its two
-            neighbours, in x and in y.
+        subpixel: refine to the maximum of a parabola through three pixels in x and in y.
 
     Raises:
         OptionError: a value is out of its range.

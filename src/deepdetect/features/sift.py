@@ -1,7 +1,6 @@
 """SIFT descriptors of any keypoints (paper, Section III-C), and well-spread keypoints of SIFT.
 
-To add a descriptor, write a function `(gray, xy, size, angle) -> (N, D) uint8 or float32` and add
-it to `DESCRIPTORS`.
+A new one is a function `(gray, xy, size, angle) -> (N, D) uint8 or float32` in `DESCRIPTORS`.
 """
 
 from __future__ import annotations

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 GRID_CELLS = 24
-"""Along the longer side of the image; each cell gives its strongest keypoints in turn, so that all
-parts of the image have some."""
+"""Along the longer side; each cell gives its strongest keypoints in turn: all parts have some."""
 
 DISTANCE_STEP_PX = 0.25
 """To which the distance of `spread_by_distance` is found."""
@@ -86,8 +85,7 @@ def suppress_neighbors(
 def spread_by_distance(xy: np.ndarray, scores: np.ndarray, count: int) -> np.ndarray:
     """Choose the best points that are as far from each other as their number allows, best first.
 
-    Adaptive non-maximal suppression (Brown, Szeliski and Winder, 2005), by bisection of the
-    distance (Bailo et al., 2018).
+    Adaptive non-maximal suppression (Brown et al., 2005), by bisection (Bailo et al., 2018).
     """
     best = descending_order(np.asarray(scores))
     if count >= len(best):

@@ -97,8 +97,7 @@ class Collection:
 def describe_collection(collection: Collection, quiet: bool = True) -> Collection:
     """Return a collection whose keypoints have RootSIFT descriptors, as far as images allow.
 
-    Keypoints with sizes and angles are described at these, others as dense keypoints are: upright,
-    with a diameter of 3 pixels.
+    Those without sizes and angles are described upright, with a diameter of 3 pixels.
 
     Args:
         collection: whose images without descriptors are read.

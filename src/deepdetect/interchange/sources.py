@@ -41,8 +41,7 @@ def read_collection(
         files: one HDF5 file of `deepdetect extract` or hloc; or npz files of `deepdetect detect`
             (STEM.npz) and `deepdetect match` (STEM0_STEM1_matches.npz), which are read all.
         matches: HDF5 file of `deepdetect match-many` or hloc.
-        images: folder of the images: names of npz files are completed by it, and what needs
-            the images finds them.
+        images: folder of the images, which also completes the names of npz files.
 
     Returns:
         The collection. Matches of npz files are those that agree with their geometry, at the

@@ -29,8 +29,7 @@ class LabelOptions:
         detectors: names of the detectors to fuse (default: all nine).
         visibility: settings for "normal" or "low" light, or "auto": low where the luma spans fewer
             than 64 grey levels from the 1st to the 99th percentile.
-        settings: settings of detectors that differ from the paper's, for normal images and for
-            those of low visibility.
+        settings: those that differ from the paper's, for normal and for low visibility.
 
     Raises:
         OptionError: a name is unknown (the nearest right one is named), or a value has another

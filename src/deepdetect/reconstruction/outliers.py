@@ -62,8 +62,7 @@ def sor_inliers(
 def mean_neighbor_distances(points: np.ndarray, neighbors: int) -> np.ndarray:
     """Return the mean distance of each of (N, 3) finite points to its nearest others, (N,) float64.
 
-    By OpenCV's FLANN, whose single kd-tree is exact and, on 850,000 points of a surface, faster
-    than SciPy's on two cores.
+    By OpenCV's FLANN: its single kd-tree is exact, and faster than SciPy's on 850,000 points.
     """
     points = np.asarray(points, np.float64)
     centred = np.ascontiguousarray(points - points.mean(0), np.float32)

@@ -25,12 +25,10 @@ MIN_INLIER_RATIO = 0.9
 """Matches on rows per match that the best other model explains."""
 
 MIN_DISPARITY_SPREAD_PX = 2.0
-"""Between the 5th and 95th percentile of the disparities of a pair with depth; whole pixels differ
-by one for no reason."""
+"""5th to 95th percentile of the disparities of a pair with depth; whole pixels differ by 1."""
 
 MIN_PLANAR_SPREAD_PX = 8.0
-"""The same for a pair that one homography explains: a slanted plane has as much, a camera that
-rotated a little does not."""
+"""The same where one homography explains the pair: a slanted plane has it, a small rotation not."""
 
 GRID_SIZE_PX = 8
 """Cells of the left image of this size give one match each."""
@@ -96,8 +94,7 @@ class Rectification:
         matches: number of matches that were used.
         vertical_offset: median of y in the second less y in the first image, in pixels, of those
             that the fundamental matrix explains.
-        disparities: 5th percentile, median and 95th percentile of those on rows, in pixels; NaN
-            when there are none.
+        disparities: 5th percentile, median, 95th percentile of those on rows in pixels, or NaN.
     """
 
     rectified: bool

@@ -34,15 +34,13 @@ POSE_CELLS = 10_000
 """Of sub-pixel matches, the best corner of each of this many cells is refined for the pose."""
 
 GRID_SIZE_PX = 16
-"""Cells of the first image of this size give one match each: matches side by side are no
-independent evidence."""
+"""Cells of this size in the first image give one match each: near ones are no further evidence."""
 
 MAX_SCENE_DISTANCE_PX = SCENE_THRESHOLDS_PX["fundamental"]
 """Within which a match agrees with a pose that is compared with the fundamental matrix."""
 
 MIN_POSE_RATIO = 0.75
-"""Matches of the essential matrix per match of the fundamental matrix: with a correct calibration
-the first explains as much."""
+"""Matches of the essential over the fundamental matrix: a correct calibration explains as many."""
 
 MIN_IN_FRONT_FRACTION = 0.75
 """Of the inliers of a pose, in front of both cameras."""
@@ -78,8 +76,7 @@ def reconstruct_two_view(
 ) -> dict[str, Any]:
     """Reconstruct the points of a pair; return what `Reconstruction` says of them.
 
-    Matches that are not sub-pixel are refined, from whole pixels of the left image; `images` are
-    (H, W) uint8 luma.
+    Matches not sub-pixel are refined from whole pixels of the left image; `images` are uint8 luma.
     """
     points0, points1 = matches.points0.astype(np.float64), matches.points1.astype(np.float64)
     indices = pose_indices = np.arange(len(points0))

@@ -74,8 +74,7 @@ of all of them), its sRGB colour, and how many these are."""
 def find_references(sparse: SparseModel) -> list[list[RegisteredImage]]:
     """Choose the neighbours of each image: those that share many points at a good angle.
 
-    Returns each image that has enough neighbours with these behind it, the best first; images that
-    see most points come first.
+    Returns images, those that see most points first, each with its neighbours, the best first.
     """
     found = []
     for image in sorted(sparse.images.values(), key=lambda image: -len(image.points)):

@@ -44,8 +44,7 @@ ROBUST_SCALE_PX = 1.0
 """Of the loss (Cauchy) of the last adjustment: larger errors count less."""
 
 MIN_VIEWS_OF_PRINCIPAL_POINT = 8
-"""Images of each camera from which that adjustment also estimates its principal point: with fewer
-it is in the middle."""
+"""From so many images of a camera its principal point is estimated, too; else it is the middle."""
 
 
 @dataclass(frozen=True, eq=False)

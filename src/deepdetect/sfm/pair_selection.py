@@ -51,8 +51,7 @@ def largest_component(pairs: Sequence[Pair]) -> int:
 def vlad_vectors(descriptors: Sequence[np.ndarray], seed: int = 0) -> np.ndarray:
     """Describe each image by one vector: VLAD with the square roots of what each word sums.
 
-    Descriptors are (N_i, D) float32 of length 1; so are the vectors (images, WORDS * D), or 0 for
-    an image without keypoints.
+    Descriptors (N_i, D) float32 have length 1; so have vectors (images, WORDS * D), or 0 if empty.
     """
     centres = _vocabulary(np.concatenate(descriptors), seed)
     vectors = np.zeros((len(descriptors), centres.size), np.float32)

@@ -42,8 +42,7 @@ class TrackingReport:
         fps: frames per second of the work, drawing and writing included.
         seconds: of all the work.
         files: that were written.
-        expected: number of frames that the source states; None where it is not known. A file that
-            is cut off gives fewer.
+        expected: number of frames that the source states, or None; a file cut off gives fewer.
         failures: a sentence on each frame of a folder that was left out.
     """
 
@@ -133,8 +132,7 @@ def track(
         What was tracked.
 
     Raises:
-        DeepDetectError: the source cannot be read, an option is out of its range, or the files
-            cannot be written.
+        DeepDetectError: the source cannot be read, files cannot be written, or an option is wrong.
 
     Example:
         >>> track("drive.mp4", "tracks.mp4")  # doctest: +SKIP

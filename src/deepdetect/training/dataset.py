@@ -151,8 +151,7 @@ ImageSource = FolderSource | ShardSource
 class CropDataset(Dataset[tuple[Tensor, Tensor]]):
     """Random crops of views, augmented. Its indices come from a `CropSampler`.
 
-    Each crop is a pure function of its index and the seed: (crop, crop, 3) uint8 RGB, and
-    (crop, crop) bool label.
+    A crop is a function of index and seed: (crop, crop, 3) uint8 RGB, (crop, crop) bool label.
     """
 
     def __init__(self, source: ImageSource, options: TrainingOptions) -> None:

@@ -24,8 +24,7 @@ from .recipe import TrainingOptions
 class View:
     """How an image is shown to the network: its shorter side in pixels, and its light.
 
-    It is scaled evenly, its middle square is, or it is squashed to a square, or it is the augmented
-    square of a seed.
+    Scaled evenly, its middle square, squashed to a square, or the augmented square of a seed.
     """
 
     short_side: int

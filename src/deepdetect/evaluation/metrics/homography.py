@@ -78,8 +78,7 @@ def match_accuracy(
 def corner_error(estimated: np.ndarray | None, true: np.ndarray, size: tuple[int, int]) -> float:
     """Return the mean distance of the first image's corners under two homographies, in pixels.
 
-    The corners are the centres of the corner pixels (SuperPoint's metric, DeTone 2018). Infinite
-    without an estimate.
+    Of centres of corner pixels (SuperPoint's metric, DeTone 2018). Infinite without an estimate.
     """
     if estimated is None:
         return float("inf")

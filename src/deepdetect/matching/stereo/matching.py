@@ -61,8 +61,7 @@ class DisparityOptions:
     """How the disparities of a rectified pair are found, and which of them are kept.
 
     Attributes:
-        disparity_range: smallest and largest disparity in whole pixels; None: found on a small
-            copy of the pair.
+        disparity_range: smallest and largest disparity in whole pixels; None: found from the pair.
         uniqueness_ratio: least cost of any other place on the row, over that of the match.
         discontinuity_margin_px: pixels this near to a disparity discontinuity are left out: the
             windows that are compared extend so far, and give what lies beside a near object its

@@ -154,8 +154,7 @@ def matching_cost(
 ) -> np.ndarray:
     """Return the cost of so many disparities of each pixel of two censuses, (H, W, count) uint8.
 
-    It is a quarter of the sum of the distances over 3 x 3 pixels; `outside` is the distance to a
-    place outside the right view.
+    A quarter of the sum over 3 x 3 pixels; `outside` is the distance to places off the right view.
     """
     from .kernels import cost_rows
 

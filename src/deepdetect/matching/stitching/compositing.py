@@ -43,8 +43,7 @@ MIN_OVERLAP_PX = 100
 """Pixels there by which two images must overlap for their brightness to be compared."""
 
 GAIN_ERROR_STD, GAIN_PRIOR_STD = 0.05, 0.5
-"""Standard deviations of the logarithm of brightness: of what an overlap says about two images, and
-of the images themselves."""
+"""Standard deviations of log brightness: of what an overlap says of two, and of images."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,8 +316,7 @@ def _upscale_mask(seam: np.ndarray, corner: tuple[int, int], scale: float, box: 
 def crop_box(valid: np.ndarray) -> Box:
     """Return the largest rectangle of a mask, (H, W) bool, that is true everywhere.
 
-    Row by row, for each column: the run that ends there, and how far its whole height reaches to
-    the left and to the right.
+    Row by row, for each column: the run that ends there, and how far its height reaches sideways.
     """
     width = valid.shape[1]
     column = np.arange(width)

@@ -35,8 +35,7 @@ class StitchingOptions:
 
     Attributes:
         scale: pixels of the panorama per pixel in the middle of the reference.
-        max_canvas_megapixels: a larger panorama is refused before it is drawn. It takes 22 to 56
-            bytes of memory per pixel.
+        max_canvas_megapixels: larger ones are refused; a pixel takes 22 to 56 bytes of memory.
         registration_side: longer side in pixels to which images are reduced for registration.
 
     Raises:
