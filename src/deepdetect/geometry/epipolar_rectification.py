@@ -42,7 +42,8 @@ MIN_RADIUS_PX = 8.0
 class PlanarFrame:
     """Two views rectified by homographies (3, 3), from their pixels to those of the frame.
 
-    Its size is (width, height); `view` is 0 for the first view and 1 for the second.
+    Its size is (width, height); `view` is 0 for the first view and 1 for the second. What lies
+    beyond the horizon of a homography is not shown.
     """
 
     homographies: tuple[np.ndarray, np.ndarray]
@@ -60,10 +61,11 @@ class PlanarFrame:
         """Show a view in the frame: its image, and the (H, W) bool mask of what it shows."""
         matrix = self.homographies[view]
         whole = np.full(image.shape[:2], 255, np.uint8)
-        return (
-            cv2.warpPerspective(image, matrix, self.size, flags=cv2.INTER_CUBIC),
-            cv2.warpPerspective(whole, matrix, self.size, flags=cv2.INTER_NEAREST) > 0,
-        )
+        shown = cv2.warpPerspective(whole, matrix, self.size, flags=cv2.INTER_NEAREST) > 0
+        inverse = np.linalg.inv(matrix) * np.linalg.det(matrix)  # positive before the horizon
+        x, y = (np.arange(length) for length in self.size)
+        shown &= inverse[2, 0] * x + inverse[2, 1] * y[:, None] + inverse[2, 2] > 0
+        return cv2.warpPerspective(image, matrix, self.size, flags=cv2.INTER_CUBIC), shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +75,8 @@ class PolarFrame:
     The orientation is 1 or -1: which half of an epipolar line of the second view belongs to the
     half of the first. `middle` is the angle of the middle row in the first view, `first_angle` that
     of the first row relative to it, and `min_radius_px` the radius of the first column; the step is
-    in radians between rows, and in natural logarithms of the radius between columns.
+    in radians between rows, and in natural logarithms of the radius between columns. The second
+    view is seen as the homography `plane` shows it in the first, where there is one.
     """
 
     fundamental: np.ndarray
@@ -84,9 +87,12 @@ class PolarFrame:
     step: float
     min_radius_px: float
     size: Size
+    plane: np.ndarray | None = None
 
     def to_frame(self, points: np.ndarray, view: int) -> np.ndarray:
         """Take positions of a view into the frame; not finite for those at the epipole."""
+        if view and self.plane is not None:
+            points = transform_points(points, np.linalg.inv(self.plane))
         offset = np.asarray(points, np.float64).reshape(-1, 2) - self.epipoles[view]
         angle = np.arctan2(offset[:, 1], offset[:, 0])
         if view:  # the direction in the first view whose epipolar line this point lies on
@@ -104,17 +110,16 @@ class PolarFrame:
         points = np.asarray(points, np.float64).reshape(-1, 2)
         directions = self._directions(self._angles(points[:, 1]), view)
         radius = self.min_radius_px * np.exp(points[:, :1] * self.step)
-        return self.epipoles[view] + directions * radius
+        positions = self.epipoles[view] + directions * radius
+        if view and self.plane is not None:
+            return transform_points(positions, self.plane)
+        return positions
 
     def warp(self, image: np.ndarray, view: int) -> tuple[np.ndarray, np.ndarray]:
         """Show a view in the frame."""
         width, height = self.size
-        directions = self._directions(self._angles(np.arange(height)), view)
-        radius = self.min_radius_px * np.exp(np.arange(width) * self.step)
-        x, y = (
-            (self.epipoles[view][axis] + directions[:, axis, None] * radius).astype(np.float32)
-            for axis in (0, 1)
-        )
+        grid = np.mgrid[:height, :width][::-1].reshape(2, -1).T
+        x, y = self.from_frame(grid, view).T.reshape(2, height, width).astype(np.float32)
         rows, columns = image.shape[:2]
         shown = (x >= -0.5) & (x <= columns - 0.5) & (y >= -0.5) & (y <= rows - 0.5)
         return cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), shown
@@ -143,12 +148,21 @@ def rectified_frame(
     fundamental: np.ndarray,
     size0: Size,
     size1: Size,
+    plane: np.ndarray | None = None,
 ) -> RectifiedFrame | None:
     """Choose a frame in which (N, 2) matches that fit a fundamental matrix lie on rows.
 
     A planar frame where one distorts the views, of these (width, height), little, else a polar one;
-    None where neither is possible.
+    None where neither is possible. The homography of a plane in the scene takes its slant out: the
+    second view is rectified as the plane shows it in the first.
     """
+    if plane is not None:
+        shown = transform_points(points1, np.linalg.inv(plane))
+        frame = rectified_frame(points0, shown, plane.T @ fundamental, size0, size0)
+        if not isinstance(frame, PlanarFrame):
+            return frame and replace(frame, plane=plane)
+        first, second = frame.homographies
+        return replace(frame, homographies=(first, second @ np.linalg.inv(plane)))
     points = np.asarray(points0, np.float64), np.asarray(points1, np.float64)
     if len(points0) < 8:
         return None

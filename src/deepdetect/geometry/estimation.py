@@ -304,10 +304,14 @@ class Parallax:
     agreeing: int
     log10_nfa: float
 
+    @property
+    def significant(self) -> bool:
+        """Whether more agree than chance explains."""
+        return self.log10_nfa < MAX_LOG10_NFA
+
     def exceeds(self, fraction_of_plane: float) -> bool:
         """Whether more agree than chance explains, and as many relative to those on the plane."""
-        significant = self.log10_nfa < MAX_LOG10_NFA
-        return significant and self.agreeing >= fraction_of_plane * self.on_plane
+        return self.significant and self.agreeing >= fraction_of_plane * self.on_plane
 
     @property
     def shows_depth(self) -> bool:

@@ -65,10 +65,6 @@ MIN_COARSE_DEPTH_INLIERS = 200
 MIN_COARSE_FRACTION = 0.5
 """Of the matches of the coarse pass that must agree as well."""
 
-MIN_PARALLAX_FRACTION = 0.1
-"""With as many matches that agree on an epipole off the plane, relative to those on it, the coarse
-pass does not decide, and a plane must be verified better."""
-
 SIMULATED_SIDE_PX, SIMULATED_KEYPOINTS = 320, 1000
 """Longer side and keypoints of images of which views are simulated; each view gets half as many."""
 
@@ -287,9 +283,7 @@ def _is_clear(geometry: InitialGeometry) -> bool:
     depth = geometry.model == "fundamental"
     least = MIN_COARSE_DEPTH_INLIERS if depth else MIN_COARSE_INLIERS
     most = len(geometry.points0) >= max(least, MIN_COARSE_FRACTION * len(geometry.inliers))
-    parallax = geometry.parallax
-    doubtful = parallax is not None and parallax.exceeds(MIN_PARALLAX_FRACTION)
-    return geometry.matrix is not None and most and (depth or not doubtful)
+    return geometry.matrix is not None and most
 
 
 def checked_positions(points: Any) -> Pair:

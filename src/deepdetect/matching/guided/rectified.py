@@ -19,7 +19,12 @@ from ...geometry.camera import Size
 from ...geometry.epipolar_rectification import PolarFrame, RectifiedFrame, rectified_frame
 from ...geometry.images import downscale, equalise, gaussian_blur, local_zncc, track_round_trip
 from ...geometry.semi_calibrated import refine_fundamental
-from ...geometry.transforms import epipolar_errors, scaled_fundamental, scaled_points
+from ...geometry.transforms import (
+    epipolar_errors,
+    scaled_fundamental,
+    scaled_homography,
+    scaled_points,
+)
 from ..stereo.matching import (
     DisparityOptions,
     compute_disparity,
@@ -86,8 +91,9 @@ match counts."""
 MAX_DISAGREEMENT_PX = 3.0
 """By which the disparity of a right sparse match, found in images of another scale, may differ."""
 
-MIN_AGREEMENT = 0.75
-"""This fraction of the sparse matches must lie where the disparities say."""
+MIN_AGREEMENT = 0.6
+"""This fraction of the sparse matches must lie where the disparities say: on facades a quarter of
+them belong to the next window of their lines."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,17 +129,23 @@ class RectifiedView:
 
 
 def match_by_rectification(
-    grays: Pair, xy0: np.ndarray, sparse: Pair, fundamental: np.ndarray, exact: bool = False
+    grays: Pair,
+    xy0: np.ndarray,
+    sparse: Pair,
+    fundamental: np.ndarray,
+    exact: bool = False,
+    plane: np.ndarray | None = None,
 ) -> tuple[np.ndarray, GuidedMatches] | None:
     """Match (N, 2) keypoints of the first image by rectifying the pair.
 
     The `sparse` matches, (M, 2) in both images, fit the fundamental matrix, x1^T F x0 = 0. An
     `exact` matrix is known: it is not corrected, and sparse matches that contradict do not matter.
+    The homography of a `plane` of the scene brings the second view near to the first.
     Returns the refined matrix and the matches, which fit it exactly; None where the pair cannot be
     rectified, too few corners can be tracked, or the sparse matches contradict.
     """
     sizes = (grays[0].shape[::-1], grays[1].shape[::-1])
-    view = rectified_view(grays, sparse, fundamental)
+    view = rectified_view(grays, sparse, fundamental, plane)
     tracks = None if view is None else _track(view)
     if view is None or tracks is None:
         return None
@@ -142,7 +154,7 @@ def match_by_rectification(
     errors = epipolar_errors(tracked[0], on_rows, fundamental)
     near = float(np.quantile(errors, ROW_QUANTILE)) < MAX_ROW_ERROR_PX
     if not exact and (not near or _is_range_too_wide(view)):
-        again = rectified_view(grays, tracked, fundamental)
+        again = rectified_view(grays, tracked, fundamental, plane)
         tracks = None if again is None else _track(again)
         if again is not None and tracks is not None:
             counts = [np.count_nonzero(each.relied) for each in (view, again)]
@@ -160,13 +172,18 @@ def match_by_rectification(
 
 
 def rectified_view(
-    grays: Pair, sparse: Pair, fundamental: np.ndarray, scale: float | None = None
+    grays: Pair,
+    sparse: Pair,
+    fundamental: np.ndarray,
+    plane: np.ndarray | None = None,
+    scale: float | None = None,
 ) -> RectifiedView | None:
     """Rectify both images, smaller where there would be too much to search, and match rows.
 
     Images that have been made smaller for that already come with their `scale`.
     """
-    frame = rectified_frame(*sparse, fundamental, grays[0].shape[::-1], grays[1].shape[::-1])
+    sizes = grays[0].shape[::-1], grays[1].shape[::-1]
+    frame = rectified_frame(*sparse, fundamental, *sizes, plane)
     if frame is None:
         return None
     low, high = _range_of_matches(frame, sparse)
@@ -177,7 +194,8 @@ def rectified_view(
         small0, small1 = (downscale(gray, round(max(gray.shape) * scale))[0] for gray in grays)
         points0, points1 = (scaled_points(points, scale) for points in sparse)
         fundamental = scaled_fundamental(fundamental, scale, scale)
-        return rectified_view((small0, small1), (points0, points1), fundamental, scale)
+        plane = None if plane is None else scaled_homography(plane, scale, scale)
+        return rectified_view((small0, small1), (points0, points1), fundamental, plane, scale)
     (first, valid0), (second, valid1) = frame.warp(grays[0], 0), frame.warp(grays[1], 1)
     # About an epipole everything grows, or everything shrinks: what small copies of the two views
     # agree on in the other direction is wrong.
