@@ -77,6 +77,17 @@ class GuidedMatches:
     def __len__(self) -> int:
         return len(self.indices0)
 
+    def joined(self, other: GuidedMatches, chosen: np.ndarray) -> GuidedMatches:
+        """Return these matches and those of the (M,) bool `chosen` of others."""
+        order = np.argsort(np.append(self.indices0, other.indices0[chosen]), kind="stable")
+
+        def both(name: str) -> np.ndarray:
+            return np.concatenate([getattr(self, name), getattr(other, name)[chosen]])[order]
+
+        indices1 = None if self.indices1 is None or other.indices1 is None else both("indices1")
+        columns = both("indices0"), both("points1"), both("scores")
+        return GuidedMatches(*columns, self.subpixel, indices1)
+
     def unique(self) -> GuidedMatches:
         """Keep the best match of those that end on the same pixel of the second image."""
         pixels = np.rint(self.points1).astype(np.int64)

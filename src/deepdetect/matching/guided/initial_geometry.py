@@ -202,19 +202,27 @@ def _separate(*matches: np.ndarray) -> tuple[np.ndarray, ...]:
 class InitialGeometry(TwoViewModel):
     """A model of tentative matches, at the images' own size; "none" when none can be trusted.
 
-    `points0` and `points1` are the matches that agree with it; `num_views` were simulated for them.
-    Another model would be found from the `source`.
+    `points0` and `points1` are the matches that agree with it, `others` those that do not, None
+    where the model was asked for; `num_views` were simulated for them. Another model would be found
+    from the `source`.
     """
 
     points0: np.ndarray
     points1: np.ndarray
+    others: Pair | None
     num_views: int = 0
     source: Source = None
 
     @classmethod
-    def of(cls, model: TwoViewModel, points0: np.ndarray, points1: np.ndarray) -> InitialGeometry:
-        """Return a model with those of the matches that agree with it."""
-        return cls(**vars(model), points0=points0[model.inliers], points1=points1[model.inliers])
+    def of(
+        cls, model: TwoViewModel, points0: np.ndarray, points1: np.ndarray, asked: str
+    ) -> InitialGeometry:
+        """Return a model with the matches that agree with it, and the others."""
+        agreeing, rest = model.inliers, ~model.inliers
+        others = (points0[rest], points1[rest]) if asked == "auto" else None
+        return cls(
+            **vars(model), points0=points0[agreeing], points1=points1[agreeing], others=others
+        )
 
     def untrusted(self) -> InitialGeometry:
         """Return that there is none, and how near it was."""
@@ -230,6 +238,11 @@ class InitialGeometry(TwoViewModel):
             matrix=convert(self.matrix, 1 / scale0, 1 / scale1),
             points0=scaled_points(self.points0, 1 / scale0),
             points1=scaled_points(self.points1, 1 / scale1),
+            others=self.others
+            and (
+                scaled_points(self.others[0], 1 / scale0),
+                scaled_points(self.others[1], 1 / scale1),
+            ),
         )
 
     def as_two_view_geometry(self) -> TwoViewGeometry:
@@ -311,7 +324,7 @@ def _geometry_of_positions(grays: Pair, points: Pair, model: str, seed: int) -> 
     )
     scaled0, scaled1 = _separate(scaled_points(points[0], scale0), scaled_points(points[1], scale1))
     chosen = choose_model(scaled0, scaled1, (size0, size1), model, seed)
-    geometry = InitialGeometry.of(chosen, scaled0, scaled1)
+    geometry = InitialGeometry.of(chosen, scaled0, scaled1, model)
     return geometry.rescaled(scale0, scale1) if geometry.trusted else geometry.untrusted()
 
 
@@ -331,14 +344,14 @@ def estimate_initial_geometry(
     sizes = tentative.views[0].shape[::-1], tentative.views[1].shape[::-1]
     nowhere = np.empty((0, 2))
     nothing = TwoViewModel("none", None, np.zeros(0, bool), float("inf"))
-    best = InitialGeometry.of(nothing, nowhere, nowhere)
+    best = InitialGeometry.of(nothing, nowhere, nowhere, model)
     num_views = 0
     for points, ratios, views in _more_and_more_matches(tentative, view_keypoints):
         num_views += views
         for ratio in MAX_RATIOS:
             chosen = points[0][ratios < ratio], points[1][ratios < ratio]
             two_view = choose_model(*chosen, sizes, model, seed, semi_calibrated)
-            geometry = InitialGeometry.of(two_view, *chosen)
+            geometry = InitialGeometry.of(two_view, *chosen, model)
             geometry = _with_further_evidence(geometry, chosen[0], tentative)
             if geometry.log10_nfa < best.log10_nfa:
                 best = replace(geometry, num_views=num_views)

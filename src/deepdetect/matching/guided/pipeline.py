@@ -14,7 +14,12 @@ from ...features.keypoints import nearest_keypoints
 from ...features.matches import GuidedMatches, TwoViewGeometry
 from ...geometry.homography_refinement import refine_homography
 from ...geometry.images import downscale, warp_to_reference
-from ...geometry.transforms import scaled_homography, transfer_errors, transform_points
+from ...geometry.transforms import (
+    epipolar_errors,
+    scaled_homography,
+    transfer_errors,
+    transform_points,
+)
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model
 from .initial_geometry import InitialGeometry, Pair, guiding_geometry
 from .rectified import match_by_rectification
@@ -22,6 +27,10 @@ from .verification import dissimilarity
 
 MIN_VERIFIED_FRACTION = 0.5
 """Of what a homography proposes, this must be the same patches for the scene to be its plane."""
+
+MIN_UNMATCHED_FRACTION = 0.5
+"""Of the matches of a further plane, those that nothing else matches: a repeated pattern that is
+shifted by a period is matched already."""
 
 OFF_PLANE_PX = 6.0
 """Matches that end this far from where the homography takes them are off the plane."""
@@ -66,28 +75,75 @@ def guided_matches(
     Returns the geometry that guided, and the matches; None when no geometry could be trusted.
     """
     enough = MIN_MATCHED_FRACTION * min(len(xy) for xy in pixels)
-    if first.model != "homography":
-        return _match_depth(grays, pixels[0], first, enough)
+    if first.model == "homography":
+        geometry, matches = _plane_or_depth(grays, pixels, first, enough, seed)
+    else:
+        geometry, matches = _match_depth(grays, pixels[0], first, enough)
+    if matches is None:
+        return geometry, None
+    further = _with_further_planes(grays, pixels, geometry, matches, first, enough, seed)
+    return geometry, further
+
+
+def _plane_or_depth(
+    grays: Pair, pixels: Pair, first: InitialGeometry, enough: float, seed: int
+) -> tuple[TwoViewGeometry, GuidedMatches | None]:
+    """Match by the homography, and by epipolar lines where matches off its plane agree on them."""
     assert first.matrix is not None
     matrix = _refine_homography(grays, first.matrix)
     on_plane, verified = match_by_homography(grays, pixels, matrix, seed)
-    asked, parallax = first.parallax is None, first.parallax
-    planar = asked or verified >= MIN_VERIFIED_FRACTION
-    if asked or (planar and not parallax.significant):
-        return _trusted(first, matrix, on_plane, max(enough, MIN_MATCHES))
+    planar = first.parallax is None or verified >= MIN_VERIFIED_FRACTION
+    off_plane = first.parallax is not None and first.parallax.significant
+    plane = _trusted(first, matrix, on_plane, max(enough, MIN_MATCHES))
+    if planar and not off_plane:
+        return plane
     depth = guiding_geometry(grays, "fundamental", seed, first.source)
     depth = replace(depth, num_views=depth.num_views + first.num_views)
     geometry, matches = _match_depth(grays, pixels[0], depth, enough, matrix if planar else None)
-    if matches is not None:
-        xy0 = pixels[0][matches.indices0]
-        off = np.count_nonzero(transfer_errors(xy0, matches.points1, matrix) > OFF_PLANE_PX)
-        if off >= MIN_OFF_PLANE_FRACTION * len(on_plane) and (
-            planar or len(matches) >= len(on_plane)
-        ):
-            return geometry, matches
-    if planar or len(on_plane) >= enough:
-        return _trusted(first, matrix, on_plane, max(enough, MIN_MATCHES))
-    return geometry, matches
+    if matches is None:
+        return plane if planar or plane[1] is not None else (geometry, None)
+    errors = transfer_errors(pixels[0][matches.indices0], matches.points1, matrix)
+    off = int(np.count_nonzero(errors > OFF_PLANE_PX))
+    if planar:
+        shown = off >= MIN_OFF_PLANE_FRACTION * len(on_plane)
+    else:
+        shown = off > len(on_plane) or (off_plane and len(matches) >= len(on_plane))
+    return (geometry, matches) if shown or plane[1] is None else plane
+
+
+def _with_further_planes(
+    grays: Pair,
+    pixels: Pair,
+    geometry: TwoViewGeometry,
+    matches: GuidedMatches,
+    first: InitialGeometry,
+    enough: float,
+    seed: int,
+) -> GuidedMatches:
+    """Add the matches of planes that move otherwise, by sparse matches that nothing explains."""
+    if first.others is None:
+        return matches
+    assert geometry.matrix is not None
+    points0, points1 = (
+        np.concatenate(both)
+        for both in zip((first.points0, first.points1), first.others, strict=True)
+    )
+    errors = transfer_errors if geometry.model == "homography" else epipolar_errors
+    rest = errors(points0, points1, geometry.matrix) > OFF_PLANE_PX
+    threshold_px = GUIDING_THRESHOLDS_PX["homography"]
+    while np.count_nonzero(rest) >= MIN_MATCHES:
+        points0, points1 = points0[rest], points1[rest]
+        size1 = grays[1].shape[::-1]
+        plane = fit_model(points0, points1, "homography", size1, threshold_px, seed)
+        if plane.matrix is None or not plane.trusted:
+            break
+        rest = ~plane.inliers
+        matrix = _refine_homography(grays, plane.matrix)
+        further, _ = match_by_homography(grays, pixels, matrix, seed)
+        new = ~np.isin(further.indices0, matches.indices0)
+        if np.count_nonzero(new) >= max(enough, MIN_UNMATCHED_FRACTION * len(further)):
+            matches = matches.joined(further, new)
+    return matches
 
 
 def _match_depth(
