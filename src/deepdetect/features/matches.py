@@ -37,6 +37,11 @@ class TwoViewGeometry:
         tentative_inliers: number of those that agree with it, and of more along its lines.
         log10_nfa: decimal logarithm of its number of false alarms (a contrario).
         simulated_views: number of views that were simulated to find it, as in ASIFT.
+        scene: "planar", "rotation" (a turning camera explains the homography as well; a flat scene
+            may look so), "depth", "depth with a dominant plane", or "none". Matches of a planar
+            scene tell two poses from known cameras, those of a rotation no translation.
+        on_plane, off_plane: number of matches on the plane that most of them lie on, where there
+            is one, and of the others.
     """
 
     model: str
@@ -45,6 +50,9 @@ class TwoViewGeometry:
     tentative_inliers: int
     log10_nfa: float
     simulated_views: int
+    scene: str = "none"
+    on_plane: int = 0
+    off_plane: int = 0
 
     def swapped(self) -> TwoViewGeometry:
         """Return the geometry from the second image to the first."""

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .camera import Calibration, Size
+from .camera import Calibration, Camera, Size
 from .estimation import (
     MAX_LOG10_NFA,
     MIN_FRACTION_OF_PLANE,
@@ -20,7 +20,7 @@ from .estimation import (
     log10_nfa,
     measure_parallax,
 )
-from .semi_calibrated import estimate_semi_calibrated
+from .semi_calibrated import START_FOCAL_LENGTHS, estimate_semi_calibrated
 from .transforms import transfer_errors
 
 GUIDING_THRESHOLDS_PX = {"homography": 3.0, "fundamental": 1.5}
@@ -187,3 +187,15 @@ def is_pure_rotation(points0: np.ndarray, points1: np.ndarray, calibration: Cali
     seen = calibration.camera1.project(rays0 @ rotation.T)
     errors = np.linalg.norm(seen - points1, axis=1)
     return bool(np.median(errors) < SCENE_THRESHOLDS_PX["fundamental"])
+
+
+def is_usual_rotation(points0: np.ndarray, points1: np.ndarray, sizes: tuple[Size, Size]) -> bool:
+    """Return whether a turn of one camera of a usual focal length explains (M, 2) matches."""
+    for focal in START_FOCAL_LENGTHS:
+        cameras = [
+            Camera(size, focal * max(size), ((size[0] - 1) / 2, (size[1] - 1) / 2))
+            for size in sizes
+        ]
+        if is_pure_rotation(points0, points1, Calibration(cameras[0], cameras[1])):
+            return True
+    return False

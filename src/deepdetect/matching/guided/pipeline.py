@@ -20,7 +20,7 @@ from ...geometry.transforms import (
     transfer_errors,
     transform_points,
 )
-from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model
+from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model, is_usual_rotation
 from .initial_geometry import InitialGeometry, Pair, guiding_geometry
 from .rectified import match_by_rectification
 from .verification import dissimilarity
@@ -35,9 +35,16 @@ shifted by a period is matched already."""
 OFF_PLANE_PX = 6.0
 """Matches that end this far from where the homography takes them are off the plane."""
 
-MIN_OFF_PLANE_FRACTION = 0.015
-"""As many dense matches, relative to those on the plane, show depth where the sparse ones do, too:
-the planes of Oxford and HPatches, which are not quite flat, have up to 0.013."""
+MIN_OFF_PLANE_FRACTION = 0.02
+"""As many dense matches, of keypoints whose patches the plane does not explain, relative to those on
+the plane, show depth where the sparse ones do, too: the planes of Oxford, which are not quite flat,
+have up to 0.013, facades from 0.032 on."""
+
+SCENE_MATCHES = 1000
+"""Of the dense matches, drawn at random, say what a scene is like."""
+
+DOMINANT_FRACTION = 0.5
+"""Of them on one plane: a dominant one."""
 
 MIN_MATCHED_FRACTION = 0.02
 """With a smaller fraction of the keypoints of a scene with depth matched, only the sparse matches
@@ -81,8 +88,29 @@ def guided_matches(
         geometry, matches = _match_depth(grays, pixels[0], first, enough)
     if matches is None:
         return geometry, None
+    geometry = _with_scene(grays, pixels[0], geometry, matches, seed)
     further = _with_further_planes(grays, pixels, geometry, matches, first, enough, seed)
     return geometry, further
+
+
+def _with_scene(
+    grays: Pair, xy0: np.ndarray, geometry: TwoViewGeometry, matches: GuidedMatches, seed: int
+) -> TwoViewGeometry:
+    """Say what the dense matches show, by the homography that most of some of them agree with."""
+    sizes = grays[0].shape[::-1], grays[1].shape[::-1]
+    points0, points1 = xy0[matches.indices0].astype(np.float64), matches.points1
+    some = np.random.default_rng(seed).permutation(len(points0))[:SCENE_MATCHES]
+    if geometry.model == "homography":
+        rotation = is_usual_rotation(points0[some], points1[some], sizes)
+        scene = "rotation" if rotation else "planar"
+        return replace(geometry, scene=scene, on_plane=len(matches))
+    threshold_px = GUIDING_THRESHOLDS_PX["homography"]
+    plane = fit_model(points0[some], points1[some], "homography", sizes[1], threshold_px, seed)
+    if plane.matrix is None or np.mean(plane.inliers) < DOMINANT_FRACTION:
+        return replace(geometry, scene="depth")
+    off = int(np.count_nonzero(transfer_errors(points0, points1, plane.matrix) > OFF_PLANE_PX))
+    scene = "depth with a dominant plane"
+    return replace(geometry, scene=scene, on_plane=len(matches) - off, off_plane=off)
 
 
 def _plane_or_depth(
@@ -103,7 +131,8 @@ def _plane_or_depth(
     if matches is None:
         return plane if planar or plane[1] is not None else (geometry, None)
     errors = transfer_errors(pixels[0][matches.indices0], matches.points1, matrix)
-    off = int(np.count_nonzero(errors > OFF_PLANE_PX))
+    new = ~np.isin(matches.indices0, on_plane.indices0)
+    off = int(np.count_nonzero(new & (errors > OFF_PLANE_PX)))
     if planar:
         shown = off >= MIN_OFF_PLANE_FRACTION * len(on_plane)
     else:
