@@ -36,12 +36,24 @@ def two_views(motion: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.nda
     return places[0][seen], places[1][seen], inverse.T @ cross @ rotation @ inverse
 
 
-def frame_of(motion: tuple[np.ndarray, np.ndarray]) -> tuple[RectifiedFrame, list[np.ndarray]]:
+def plane_between(motion: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Return the homography of a slanted plane in front of both cameras."""
+    turn, translation = motion
+    rotation = cv2.Rodrigues(turn)[0]
+    normal, distance = np.array([0.1, 0.05, 1.0]), 10.0
+    return CAMERA @ (rotation + np.outer(translation, normal) / distance) @ np.linalg.inv(CAMERA)
+
+
+def frame_of(
+    motion: tuple[np.ndarray, np.ndarray], by_plane: bool = False
+) -> tuple[RectifiedFrame, list[np.ndarray]]:
     points0, points1, fundamental = two_views(motion)
-    frame = rectified_frame(points0, points1, fundamental, SIZE, SIZE)
+    plane = plane_between(motion) if by_plane else None
+    frame = rectified_frame(points0, points1, fundamental, SIZE, SIZE, plane)
     return frame, [points0, points1]
 
 
+@pytest.mark.parametrize("by_plane", [False, True])
 @pytest.mark.parametrize(
     ("motion", "kind"),
     [
@@ -52,8 +64,8 @@ def frame_of(motion: tuple[np.ndarray, np.ndarray]) -> tuple[RectifiedFrame, lis
     ],
     ids=["sideways", "rolled", "forward", "backward"],
 )
-def test_matches_lie_on_the_same_row(motion, kind) -> None:
-    frame, points = frame_of(motion)
+def test_matches_lie_on_the_same_row(motion, kind, by_plane: bool) -> None:
+    frame, points = frame_of(motion, by_plane)
     assert isinstance(frame, kind)
     first, second = (frame.to_frame(places, view) for view, places in enumerate(points))
     np.testing.assert_allclose(first[:, 1], second[:, 1], atol=0.01)
@@ -62,20 +74,22 @@ def test_matches_lie_on_the_same_row(motion, kind) -> None:
     assert inside.mean() > 0.98  # those next to an epipole are in no frame
 
 
+@pytest.mark.parametrize("by_plane", [False, True])
 @pytest.mark.parametrize("motion", [SIDEWAYS, FORWARD, BACKWARD, ROLLED])
-def test_there_and_back_is_the_same_place(motion) -> None:
-    frame, points = frame_of(motion)
+def test_there_and_back_is_the_same_place(motion, by_plane: bool) -> None:
+    frame, points = frame_of(motion, by_plane)
     for view, places in enumerate(points):
         np.testing.assert_allclose(
             frame.from_frame(frame.to_frame(places, view), view), places, atol=1e-6
         )
 
 
+@pytest.mark.parametrize("by_plane", [False, True])
 @pytest.mark.parametrize("motion", [SIDEWAYS, FORWARD])
 @pytest.mark.parametrize("view", [0, 1])
-def test_a_pixel_of_the_warped_view_shows_its_place(motion, view: int) -> None:
+def test_a_pixel_of_the_warped_view_shows_its_place(motion, view: int, by_plane: bool) -> None:
     """The view is a ramp along x and y, so that its grey levels say where they come from."""
-    frame, _ = frame_of(motion)
+    frame, _ = frame_of(motion, by_plane)
     y, x = np.mgrid[: SIZE[1], : SIZE[0]]
     for ramp, axis in ((x * 0.75, 0), (y * 1.0, 1)):
         image, shown = frame.warp(np.rint(ramp).astype(np.uint8), view)

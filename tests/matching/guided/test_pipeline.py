@@ -11,8 +11,12 @@ import pytest
 
 from deepdetect import DeepDetect, OptionError
 from deepdetect.datasets.middlebury import load_middlebury
+from deepdetect.datasets.posed_images import PosedPair, load_posed_scenes
+from deepdetect.evaluation.metrics.pose import translation_error
 from deepdetect.evaluation.metrics.stereo import stereo_score
+from deepdetect.evaluation.protocols.pose import estimate_pose
 from deepdetect.geometry import transform_points
+from deepdetect.geometry.transforms import epipolar_errors
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import guided_matches, guiding_geometry
 from deepdetect.matching.guided.pipeline import match_by_homography
@@ -65,27 +69,53 @@ def test_a_plane_guides_no_scene_with_depth(shared: Path, pair: str) -> None:
     assert matches.two_view_geometry.model != "homography"
 
 
-def test_a_plane_that_the_images_do_not_show_does_not_guide(photo: np.ndarray) -> None:
+def test_a_small_plane_is_matched_and_nothing_else(photo: np.ndarray) -> None:
     # A poster that fills a sixth of an otherwise different picture, and all of the first one.
     gray = luma(photo)[20:236, 20:236]
     other = np.random.default_rng(0).integers(0, 256, gray.shape).astype(np.uint8)
     other[65:151, 65:151] = gray[65:151, 65:151]
     grays = gray, other
     every = np.stack(np.meshgrid(np.arange(216), np.arange(216)), -1).reshape(-1, 2)
-    first, plane = (guiding_geometry(grays, model) for model in ("auto", "homography"))
     # Few keypoints have another where the plane would take them; that decides nothing.
     for fraction in (1.0, 0.05):
         xy = every[np.random.default_rng(1).random(len(every)) < fraction]
-        guide, found = guided_matches(grays, (xy, xy), first)
-        assert guide.model != "homography"
-        if found is not None:  # what the poster shows agrees with a fundamental matrix, too
-            inside = ((xy[found.indices0] > 60) & (xy[found.indices0] < 156)).all(axis=1)
-            errors = np.linalg.norm(found.points1 - xy[found.indices0], axis=1)
-            assert (inside & (errors < 1)).mean() > 0.9
-        asked, found = guided_matches(grays, (xy, xy), plane)
-        assert asked.model == "homography"
-        inside = ((xy[found.indices0] > 60) & (xy[found.indices0] < 156)).all(axis=1)
-        assert inside.mean() > 0.95
+        poster = ((xy >= 65) & (xy < 151)).all(axis=1)
+        guide, found = guided_matches(grays, (xy, xy), guiding_geometry(grays))
+        assert guide.scene in ("planar", "rotation")
+        errors = np.linalg.norm(found.points1 - xy[found.indices0], axis=1)
+        assert (poster[found.indices0] & (errors < 1)).mean() > 0.95
+        assert len(found) > 0.3 * np.count_nonzero(poster)  # the rest of it is smooth
+
+
+def test_a_plane_that_moves_otherwise_keeps_its_matches(shared: Path, photo: np.ndarray) -> None:
+    pair = load_middlebury(shared / "data" / "middlebury" / "cones")
+    left, right = luma(pair.left), luma(pair.right)
+    poster = cv2.resize(luma(photo), (140, 140), interpolation=cv2.INTER_AREA)
+    left[30:170, 40:180], right[200:340, 250:390] = poster, poster
+    every = np.stack(np.meshgrid(np.arange(0, 450, 2), np.arange(0, 375, 2)), -1).reshape(-1, 2)
+    guide, found = guided_matches((left, right), (every, every), guiding_geometry((left, right)))
+    assert guide.scene.startswith("depth")
+    moved = found.points1 - every[found.indices0]
+    of_poster = (np.abs(moved - (210, 170)) < 1).all(axis=1)
+    assert np.count_nonzero(of_poster) > 0.8 * 70 * 70
+    assert np.count_nonzero(~of_poster) > 0.4 * len(every)
+
+
+@pytest.mark.slow
+def test_a_dominant_plane_does_not_hide_the_depth_beside_it(shared: Path) -> None:
+    (scene,) = load_posed_scenes(shared / "data" / "entry")
+    first, second = scene.images[:2]
+    matches = match(first.path, second.path)
+    guide = matches.two_view_geometry
+    assert guide.model == "fundamental"
+    assert guide.scene == "depth with a dominant plane"
+    assert guide.on_plane > 10 * guide.off_plane > 10_000
+    pair = PosedPair("entry", first, second)
+    errors = epipolar_errors(matches.points0, matches.points1, pair.fundamental)
+    assert (errors < 3).mean() > 0.99
+    pose = estimate_pose(matches.points0, matches.points1, first.intrinsics, second.intrinsics)
+    assert pose is not None
+    assert translation_error(pose[1], pair.translation) < 1
 
 
 def test_of_few_keypoints_those_without_a_partner_are_verified_too(

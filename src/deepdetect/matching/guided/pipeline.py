@@ -36,9 +36,9 @@ OFF_PLANE_PX = 6.0
 """Matches that end this far from where the homography takes them are off the plane."""
 
 MIN_OFF_PLANE_FRACTION = 0.02
-"""As many dense matches, of keypoints whose patches the plane does not explain, relative to those on
-the plane, show depth where the sparse ones do, too: the planes of Oxford, which are not quite flat,
-have up to 0.013, facades from 0.032 on."""
+"""As many dense matches, of keypoints whose patches the plane does not explain, relative to those
+on the plane, show depth where the sparse ones do, too: the planes of Oxford, which are not quite
+flat, have up to 0.013, facades from 0.032 on."""
 
 SCENE_MATCHES = 1000
 """Of the dense matches, drawn at random, say what a scene is like."""
@@ -128,6 +128,10 @@ def _plane_or_depth(
     depth = guiding_geometry(grays, "fundamental", seed, first.source)
     depth = replace(depth, num_views=depth.num_views + first.num_views)
     geometry, matches = _match_depth(grays, pixels[0], depth, enough, matrix if planar else None)
+    if not planar and (matches is None or len(matches) < len(on_plane)) and first.others:
+        # What moves otherwise can spoil a matrix that explains a part of it, too.
+        depth = guiding_geometry(grays, "fundamental", seed, first.others)
+        geometry, matches = _match_depth(grays, pixels[0], depth, enough)
     if matches is None:
         return plane if planar or plane[1] is not None else (geometry, None)
     errors = transfer_errors(pixels[0][matches.indices0], matches.points1, matrix)
