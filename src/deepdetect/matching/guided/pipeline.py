@@ -20,7 +20,12 @@ from ...geometry.transforms import (
     transfer_errors,
     transform_points,
 )
-from ...geometry.two_view import GUIDING_THRESHOLDS_PX, fit_model, is_usual_rotation
+from ...geometry.two_view import (
+    GUIDING_THRESHOLDS_PX,
+    MIN_PLANAR_RATIO,
+    fit_model,
+    is_usual_rotation,
+)
 from .initial_geometry import InitialGeometry, Pair, guiding_geometry
 from .rectified import match_by_rectification
 from .verification import dissimilarity
@@ -128,10 +133,12 @@ def _plane_or_depth(
     depth = guiding_geometry(grays, "fundamental", seed, first.source)
     depth = replace(depth, num_views=depth.num_views + first.num_views)
     geometry, matches = _match_depth(grays, pixels[0], depth, enough, matrix if planar else None)
-    if not planar and (matches is None or len(matches) < len(on_plane)) and first.others:
+    if not planar and (matches is None or len(matches) < enough) and first.others:
         # What moves otherwise can spoil a matrix that explains a part of it, too.
-        depth = guiding_geometry(grays, "fundamental", seed, first.others)
-        geometry, matches = _match_depth(grays, pixels[0], depth, enough)
+        other = guiding_geometry(grays, "fundamental", seed, first.others)
+        found = _match_depth(grays, pixels[0], other, enough)
+        if found[1] is not None and len(found[1]) >= enough:
+            depth, (geometry, matches) = other, found
     if matches is None:
         return plane if planar or plane[1] is not None else (geometry, None)
     errors = transfer_errors(pixels[0][matches.indices0], matches.points1, matrix)
@@ -140,7 +147,8 @@ def _plane_or_depth(
     if planar:
         shown = off >= MIN_OFF_PLANE_FRACTION * len(on_plane)
     else:
-        shown = off > len(on_plane) or (off_plane and len(matches) >= len(on_plane))
+        fractions = [len(each.points0) / max(len(each.inliers), 1) for each in (first, depth)]
+        shown = fractions[0] < MIN_PLANAR_RATIO * fractions[1]
     return (geometry, matches) if shown or plane[1] is None else plane
 
 
