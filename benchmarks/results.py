@@ -49,6 +49,7 @@ STAGES = {
             "middlebury": "middlebury --geometry-weights dense "
             "--geometry-weights {published}/published_reconstruction.safetensors",
             "speed": "speed" + XFEAT,
+            "sfm": "sfm",
         }.items()
     },
     "label-prediction": "-m deepdetect evaluate {data}/label-samples/val --json "
@@ -204,6 +205,29 @@ RESULTS = {
             "half-occluded: within 1 px": ("of these within 1 px", ".3f"),
             "s": ("seconds", ".2f"),
             "MB": ("all, MB", ".0f"),
+        },
+    ),
+    "cameras": Result(
+        "sfm",
+        "sfm",
+        {
+            "keypoints": ("keypoints", ""),
+            "intrinsics": ("intrinsics", ""),
+            "registered": ("registered", ""),
+            "AUC 5°": ("AUC at 5°", ".3f"),
+            "centres, m": ("centres, unit of the truth", ".4f"),
+            "sparse points": ("sparse points", ".0f"),
+            "their error, px": ("reprojection error, px", ".2f"),
+        },
+    ),
+    "cameras-cost": Result(
+        "sfm",
+        "sfm_cost",
+        {
+            "keypoints": ("keypoints", ""),
+            "keypoints and matches, CPU s": ("keypoints and matches, CPU s", ".1f"),
+            "mapping, CPU s": ("mapping, true intrinsics, CPU s", ".1f"),
+            "MB": ("memory, MB", ".0f"),
         },
     ),
     "labels-stereo": Result("labels-stereo", "0"),
