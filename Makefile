@@ -86,12 +86,13 @@ test-integrations: $(VENV_INTEGRATIONS)/.test
 test-lowest: $(VENV_LOWEST)/.test
 	$(VENV_LOWEST)/bin/python $(PYTEST) -p no:cacheprovider $(TESTS_LOWEST)
 
-# The page for any web server, with ONNX Runtime and the network, in web/dist.
-web: web/node_modules/.package-lock.json
+# The page for any web server, with ONNX Runtime, the network and the graph of the points, in web/dist.
+web: web/node_modules/.package-lock.json $(VENV)/.test
+	$(VENV)/bin/python tools/points_graph.py --candidates web/points.onnx
 	cd web && npm run --silent build
 
 # The page in Chromium: alone, and with `deepdetect app`.
-test-web: $(VENV)/.test web
+test-web: web
 	cd web && DEEPDETECT_PYTHON=$(abspath $(VENV))/bin/python npx playwright test $(TESTS_WEB)
 
 coverage: $(VENV)/.test
@@ -170,7 +171,7 @@ release-check: $(VENV_DOCS)/.test
 
 clean:
 	rm -rf $(VENV) $(VENV_OPENCV4) $(VENV_LOWEST) $(VENV_RAY) $(VENV_INTEGRATIONS) $(VENV_DOCS) $(DEMO_OUTPUT)
-	rm -rf web/dist web/node_modules web/test-results
+	rm -rf web/dist web/node_modules web/points.onnx web/test-results
 	rm -rf build dist sbom.json htmlcov .coverage .coverage.* .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
 
 web/node_modules/.package-lock.json: web/package-lock.json

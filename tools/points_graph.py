@@ -1,7 +1,7 @@
 """The graph of the points in ONNX files.
 
     python tools/points_graph.py
-    python tools/points_graph.py --candidates web/dist/model/points.onnx
+    python tools/points_graph.py --candidates web/points.onnx
 
 The first command makes the file of the package that `deepdetect export onnx` adds to a network, the
 second one what the page in the browser runs. Steps, constants and weights are those of
@@ -43,7 +43,7 @@ from deepdetect.features.selection import MAX_OFFSET_PX
 OPSET, IR_VERSION = 17, 8
 """Those of the network's file."""
 
-LUMA, LUMA_UNIT = (4899.0, 9617.0, 1868.0), 16384.0
+LUMA, LUMA_UNIT = (9798.0, 19235.0, 3735.0), 32768.0
 """Red, green and blue in OpenCV's grey: in whole numbers, whose sums are exact."""
 
 REACH_PER_SIGMA = 4
@@ -83,8 +83,7 @@ def points_model() -> onnx.ModelProto:
     """Make the graph that maps images to their best points, as many as an initializer says."""
     graph = Graph(PREFIX)
     count = graph.constant([2048], MAX_KEYPOINTS)
-    gray = (Tensor(graph, "image") * 255.0).Round().Conv(np.reshape(LUMA, (1, 3, 1, 1)))
-    gray = ((gray + LUMA_UNIT / 2) / LUMA_UNIT).Floor()
+    gray = gray_of(Tensor(graph, "image"))
     limit = (count * CANDIDATES_PER_KEYPOINT).Max([MIN_CANDIDATES])
     x, y, scores, sizes = choose(*rank_candidates(gray, limit), count)
     xy = graph.join([x.Unsqueeze([2]), y.Unsqueeze([2])], axis=2)
@@ -97,10 +96,10 @@ def points_model() -> onnx.ModelProto:
 def candidates_model() -> onnx.ModelProto:
     """Make the graph that maps grey images to all of their candidates, ranked."""
     graph = Graph(PREFIX)
-    found = rank_candidates(Tensor(graph, "gray").Cast(to=FLOAT))
-    kinds = {"x": FLOAT, "y": FLOAT, "level": INT64, "logits": FLOAT}
-    outputs = [(name, kind, ["batch", "count"]) for name, kind in kinds.items()]
-    return graph.model(("gray", UINT8, ["batch", 1, "height", "width"]), outputs, found)
+    x, y, level, logits = rank_candidates(Tensor(graph, "gray").Cast(to=FLOAT))
+    tensors = x, y, graph.tensor(SIGMAS_PX).Gather(level), logits
+    outputs = [(name, FLOAT, ["batch", "count"]) for name in ("x", "y", "sigmas", "logits")]
+    return graph.model(("gray", UINT8, ["batch", 1, "height", "width"]), outputs, tensors)
 
 
 def _operator(kind: str) -> Callable[[Tensor, Any], Any]:
@@ -187,6 +186,12 @@ class Graph:
         graph = helper.make_graph(self.nodes, "points", [first], others, constants)
         opsets = [helper.make_opsetid("", OPSET)]
         return helper.make_model(graph, opset_imports=opsets, ir_version=IR_VERSION)
+
+
+def gray_of(image: Any) -> Any:
+    """Return the grey levels of (B, 3, H, W) images in [0, 1], (B, 1, H, W), as OpenCV has them."""
+    gray = (image * 255.0).Round().Conv(np.reshape(LUMA, (1, 3, 1, 1)))
+    return ((gray + LUMA_UNIT / 2) / LUMA_UNIT).Floor()
 
 
 def rank_candidates(gray: Any, limit: Any = None) -> tuple[Any, Any, Any, Any]:

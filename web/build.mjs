@@ -1,4 +1,4 @@
-// Makes web/dist: the page with ONNX Runtime and the network, for any web server.
+// Makes web/dist: the page with ONNX Runtime, the network and the graph of the points, for any web server.
 import { createHash } from "node:crypto";
 import { cpSync, mkdirSync, readFileSync, readdirSync, rmSync, writeFileSync } from "node:fs";
 import { dirname, join, relative } from "node:path";
@@ -28,7 +28,7 @@ for (const name of [...RUNTIME_FILES, ...WEBGPU_FILES]) {
 }
 mkdirSync(join(dist, "model"));
 cpSync(join(packaged, "detector/weights/default.onnx"), join(dist, "model/default.onnx"));
-cpSync(join(packaged, "detector/points/ranker.npz"), join(dist, "model/ranker.npz"));
+cpSync(join(here, "points.onnx"), join(dist, "model/points.onnx"));
 writeFileSync(join(dist, "config.json"),
               JSON.stringify({ engine: "browser", offline: true, webgpu: true }) + "\n");
 

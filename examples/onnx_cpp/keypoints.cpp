@@ -1,5 +1,7 @@
-// Dense keypoints of an image by ONNX Runtime: keypoints MODEL.onnx PHOTO.ppm [PROBABILITY]
-// prints "x y probability" of each pixel over the threshold (0.5 unless given).
+// Keypoints of an image by ONNX Runtime, with a file of `deepdetect export onnx`:
+// keypoints MODEL.onnx PHOTO.ppm [PROBABILITY]
+// prints "x y size score" of the best points of all scales; with a probability "x y probability" of
+// each pixel over it.
 #include <onnxruntime_cxx_api.h>
 
 #include <algorithm>
@@ -33,7 +35,7 @@ Image read_ppm(const char* path) {
 
 int main(int count, char** words) try {
     char* end = nullptr;
-    const float threshold = count > 3 ? std::strtof(words[3], &end) : 0.5f;
+    const float threshold = count > 3 ? std::strtof(words[3], &end) : 0;
     if (count < 3 || (end && (end == words[3] || *end)))
         throw std::runtime_error("usage: keypoints MODEL.onnx PHOTO.ppm [PROBABILITY]");
     const Image image = read_ppm(words[2]);
@@ -47,12 +49,22 @@ int main(int count, char** words) try {
     const int64_t shape[] = {1, 3, image.height, image.width};  // any height and width
     auto memory = Ort::MemoryInfo::CreateCpu(OrtArenaAllocator, OrtMemTypeDefault);
     auto input = Ort::Value::CreateTensor<float>(memory, planes.data(), planes.size(), shape, 4);
-    const char *inputs[] = {"image"}, *outputs[] = {"probability"};
-    auto found = session.Run(Ort::RunOptions(), inputs, &input, 1, outputs, 1);
-    const float* probability = found[0].GetTensorData<float>();
-    for (int64_t k = 0; k < pixels; k++)
-        if (probability[k] > threshold)
-            std::printf("%d %d %.6f\n", int(k % image.width), int(k / image.width), probability[k]);
+    const char *inputs[] = {"image"}, *maps[] = {"probability"};
+    const char* points[] = {"keypoints", "scores", "sizes"};
+    if (threshold > 0) {
+        auto found = session.Run(Ort::RunOptions(), inputs, &input, 1, maps, 1);
+        const float* probability = found[0].GetTensorData<float>();
+        for (int64_t k = 0; k < pixels; k++)
+            if (probability[k] > threshold)
+                std::printf("%d %d %.6f\n", int(k % image.width), int(k / image.width), probability[k]);
+        return 0;
+    }
+    auto found = session.Run(Ort::RunOptions(), inputs, &input, 1, points, 3);
+    const float *xy = found[0].GetTensorData<float>(), *scores = found[1].GetTensorData<float>();
+    const float* sizes = found[2].GetTensorData<float>();
+    const int64_t most = found[1].GetTensorTypeAndShapeInfo().GetElementCount();
+    for (int64_t k = 0; k < most && scores[k] > 0; k++)  // 0 behind the last point
+        std::printf("%.3f %.3f %.2f %.6f\n", xy[2 * k], xy[2 * k + 1], sizes[k], scores[k]);
 } catch (const std::exception& error) {
     std::fprintf(stderr, "keypoints: %s\n", error.what());
     return 2;

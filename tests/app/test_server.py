@@ -21,6 +21,8 @@ from deepdetect._shared.errors import OptionError
 from deepdetect.app import jobs
 from deepdetect.app.jobs import AppOptions, Job
 from deepdetect.app.server import AppServer
+from deepdetect.detector.points.detection import rank_candidates
+from deepdetect.io.image import luma
 
 from .conftest import Client, packed
 
@@ -40,7 +42,7 @@ def test_the_page_is_served_with_a_strict_policy_at_the_loopback_address(serve: 
     client, _ = serve()
     assert client.server._socket.getsockname()[0] == "127.0.0.1"
     assert client.server.address.startswith(f"http://{client.host}/#key=")
-    for path in ("/", "/config.json", "/js/main.js", "/examples/coffee.jpg", "/model/ranker.npz"):
+    for path in ("/", "/config.json", "/js/main.js", "/examples/coffee.jpg"):
         answer = client.ask("GET", path, headers={"Authorization": None})
         assert answer.status == 200
         policy = answer.headers["Content-Security-Policy"]
@@ -113,6 +115,20 @@ def test_the_logits_are_those_of_the_package(serve: Any, photo: np.ndarray) -> N
     assert answer.status == 200
     found = np.frombuffer(answer.content, "<f4").reshape(100, 91)
     np.testing.assert_array_equal(found, DeepDetect().heatmap_and_logits(rgb)[1])
+
+
+def test_the_candidates_are_those_of_the_package(serve: Any, photo: np.ndarray) -> None:
+    client, _ = serve()
+    gray = luma(np.ascontiguousarray(photo[:100, :91]))
+    answer = client.ask("POST", "/api/candidates?width=91&height=100", gray.tobytes())
+    assert answer.status == 200
+    found = np.frombuffer(answer.content, "<f4").reshape(4, -1)
+    candidates, logits = rank_candidates(gray)
+    order = np.argsort(candidates.rank)
+    np.testing.assert_array_equal(found[:2].T, candidates.xy[order].astype(np.float32))
+    np.testing.assert_array_equal(found[2], candidates.sigma_px[order].astype(np.float32))
+    np.testing.assert_array_equal(found[3], logits[order])
+    assert (np.diff(candidates.strength[order]) <= 0).all()
 
 
 @pytest.mark.parametrize(

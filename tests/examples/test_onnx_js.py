@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial import cKDTree
 
-from deepdetect import DeepDetect
+from deepdetect import DeepDetect, PointDetector
 from deepdetect.detector.pretrained import pretrained_weights
 
 FOLDER = Path(__file__).parents[2] / "examples/onnx_js"
@@ -51,3 +52,22 @@ def test_the_keypoints_are_those_of_the_package(
     assert len(expected) > 20
     np.testing.assert_array_equal(found[:, :2], expected.xy)
     np.testing.assert_allclose(found[:, 2], expected.scores, atol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("height", "width"), [(256, 256), (123, 157), (17, 23)])
+def test_the_points_are_those_of_the_package(
+    height: int, width: int, installed: Path, photo: np.ndarray, tmp_path: Path
+) -> None:
+    pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
+    from deepdetect.detector.network.onnx_export import OnnxOptions, write_onnx
+
+    write_onnx("default", tmp_path / "points.onnx", OnnxOptions(maps=False))
+    Image.fromarray(photo[:height, :width]).save(tmp_path / "photo.png")
+    found = run_example(installed, tmp_path / "points.onnx", tmp_path / "photo.png")
+    expected = PointDetector(2048).detect(photo[:height, :width])
+    assert abs(len(found) - len(expected)) <= 0.02 * len(expected)
+    places = np.column_stack([expected.xy, expected.sizes])
+    gaps, nearest = cKDTree(found[:, :3]).query(places)
+    assert (gaps < 0.05).mean() > 0.98
+    assert np.median(np.abs(found[nearest, 3] - expected.scores)) < 1e-4

@@ -46,17 +46,28 @@ def test_the_file_of_the_package_is_made_by_the_script(script: Any) -> None:
     assert made == shipped, "run python tools/points_graph.py"
 
 
+def test_gray_is_that_of_opencv(script: Any) -> None:
+    graph = script.Graph("")
+    gray = script.gray_of(script.Tensor(graph, "image"))
+    given = "image", script.FLOAT, [1, 3, 512, 512]
+    model = graph.model(given, [("gray", script.FLOAT, None)], [gray])
+    rgb = np.random.default_rng(0).integers(0, 256, (512, 512, 3), np.uint8)
+    rgb[:4, :64] = np.arange(256).reshape(4, 64, 1)
+    image = np.ascontiguousarray(rgb.transpose(2, 0, 1)[None] / np.float32(255))
+    np.testing.assert_array_equal(run(model, image=image)[0][0, 0], luma(rgb))
+
+
 def test_candidates_of_the_page_are_all_those_of_the_package(
     script: Any, photo: np.ndarray
 ) -> None:
     gray = luma(np.ascontiguousarray(photo[:150, :200]))
-    x, y, level, logits = (
+    x, y, sigmas, logits = (
         each[0] for each in run(script.candidates_model(), gray=gray[None, None])
     )
     found = np.flatnonzero(np.isfinite(logits))
     np.testing.assert_array_equal(found, np.arange(len(found)))  # none behind the last
     assert len(found) < len(logits)
-    xy, radii = np.column_stack([x, y])[found], least_distances(SIGMAS_PX[level[found]])
+    xy, radii = np.column_stack([x, y])[found], least_distances(sigmas[found])
     kept = suppress_neighbors(xy, logits[found], radii)
     expected = detect_points(gray)
     assert abs(len(kept) - len(expected)) <= 2

@@ -1,34 +1,28 @@
 // What the page says where files are missing or damaged, or the browser is too old: one sentence each.
-import { readFileSync, writeFileSync } from "node:fs";
+import { writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { gunzipSync } from "node:zlib";
-import { NO_BROWSER, choose, chromium, example, examples, expect, openExample, test, web } from "./page.mjs";
+import { NO_BROWSER, choose, chromium, example, examples, expect, openExample, test } from "./page.mjs";
 
 test.skip(!chromium, NO_BROWSER);
 test.use({ serviceWorkers: "block" }); // it would answer instead of the routes here
 
-const RANKER = "**/model/ranker.npz";
+const MODEL = "**/model/points.onnx";
 const PACKED = "**/*.wasm.packed";
-const ranker = readFileSync(join(web, "../src/deepdetect/detector/points/ranker.npz"));
-const damaged = Buffer.from(ranker);
-damaged[ranker.length >> 1] ^= 1;
-
 const openCoffee = async (page) => {
   await page.goto("./");
   await example(page, "Coffee").click();
 };
 
 for (const { name, answer, said } of [
-  { name: "missing", answer: { status: 404 }, said: "is missing where this page comes from" },
-  { name: "damaged", answer: { body: damaged }, said: "is damaged (its checksum is wrong)" },
-  { name: "cut off", answer: { body: ranker.subarray(0, 20_000) }, said: "is damaged (it ends early)" },
-  { name: "another page", answer: { body: "<!doctype html>" }, said: "is damaged (it holds no ranker" },
+  { name: "missing", answer: { status: 404 }, said: "(model/points.onnx is missing)" },
+  { name: "damaged", answer: { body: "<!doctype html>" }, said: "(" },
 ]) {
-  test(`the ranker's file is ${name}`, async ({ page }) => {
-    await page.route(RANKER, (route) => route.fulfill(answer));
+  test(`the file that finds points is ${name}`, async ({ page }) => {
+    await page.route(MODEL, (route) => route.fulfill(answer));
     await openExample(page, "Coffee");
     await choose(page, "kind", "points");
-    await expect(page.getByRole("alert")).toContainText(`Points need model/ranker.npz, which ${said}`);
+    await expect(page.getByRole("alert")).toContainText(`What finds points could not be loaded ${said}`);
     await expect(page.locator("#busy")).toBeHidden();
     await choose(page, "kind", "dense");
     await expect(page.locator("#count")).toContainText("keypoint");
@@ -45,18 +39,18 @@ test("points can be found once the connection is there again", async ({ page, co
   await expect(page.locator("#count")).toHaveText("1,000 points");
 });
 
-test("a browser that unpacks nothing is too old for the network, not for points", async ({ page }) => {
-  await page.route("**/picture_worker.js", async (route) => {
+test("a browser that unpacks nothing is too old", async ({ page }) => {
+  await page.route(/(picture|points)_worker.js/, async (route) => {
     const response = await route.fetch();
     await route.fulfill({ response, body: `self.DecompressionStream = undefined;\n${await response.text()}` });
   });
   await page.goto("./");
-  const sentence = "This browser is too old to run the network: use one of 2023 or later.";
+  const sentence = "This browser is too old for ONNX Runtime: use one of 2023 or later.";
   await expect(page.getByRole("alert").locator("p")).toHaveText(sentence);
   await example(page, "Coffee").click();
   await expect(page.getByRole("alert").locator("p")).toHaveText(sentence);
   await choose(page, "kind", "points");
-  await expect(page.locator("#count")).toHaveText("1,000 points");
+  await expect(page.getByRole("alert").locator("p")).toHaveText(sentence);
 });
 
 test("web servers may unpack ONNX Runtime themselves", async ({ page }) => {

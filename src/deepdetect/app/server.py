@@ -15,7 +15,7 @@ import secrets
 import shutil
 import socket
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from starlette.staticfiles import StaticFiles
 from .. import __version__
 from .._shared.errors import DeepDetectError, OptionError, unknown_name
 from ..detector.detector import DeepDetect
-from ..detector.pretrained import RANKER
+from ..detector.points.detection import rank_candidates
 from ..io.image import IMAGE_SUFFIXES
 from .jobs import AppOptions, Jobs
 from .tasks import TASKS, Order, SentImage
@@ -52,7 +52,7 @@ SHUTDOWN_S = 1
 CHECK_EVERY_S = 1.0
 """How often it is looked for tasks that last too long or are forgotten."""
 
-MAX_HEATMAP_PIXELS = 2_100_000
+MAX_IMAGE_PIXELS = 2_100_000
 """The page reduces images to two megapixels, with sides that are multiples of 8."""
 
 MIN_SIDE = 16
@@ -104,7 +104,7 @@ class AppServer:
     def __init__(self, options: AppOptions = AppOptions()) -> None:
         self.options = options
         self.key = secrets.token_urlsafe(24)
-        self._network = threading.Lock()  # one image at a time: it takes all processors
+        self._processors = threading.Lock()  # one image at a time: it takes all processors
         self.jobs = Jobs(options)
         try:
             self._socket = socket.create_server((HOST, options.port))
@@ -154,9 +154,8 @@ class AppServer:
         return Starlette(
             routes=[
                 Route("/config.json", lambda _: JSONResponse(self._description())),
-                # Where a build for other servers has it, too.
-                Route("/model/ranker.npz", lambda _: FileResponse(RANKER)),
                 Route("/api/heatmap", self._heatmap, methods=["POST"]),
+                Route("/api/candidates", self._candidates, methods=["POST"]),
                 Route("/api/jobs", self._new_job, methods=["POST"]),
                 Route("/api/jobs/{name}", self._job_state, methods=["GET"]),
                 Route("/api/jobs/{name}", self._remove_job, methods=["DELETE"]),
@@ -236,23 +235,47 @@ class AppServer:
 
     async def _heatmap(self, request: Request) -> Response:
         """Answer the pixels of an image, (H, W, 3) uint8, with its logits, (H, W) float32."""
+
+        def logits(rgb: np.ndarray) -> np.ndarray:
+            return self._detector.heatmap_and_logits(rgb)[1]
+
+        return await self._answer(request, 3, logits)
+
+    async def _candidates(self, request: Request) -> Response:
+        """Answer the grey levels of an image, (H, W) uint8, with its candidates for points.
+
+        They are (4, N) float32: x, y, sigmas and logits, the strongest first.
+        """
+
+        def ranked(gray: np.ndarray) -> np.ndarray:
+            candidates, logits = rank_candidates(gray[..., 0])
+            columns = np.column_stack([candidates.xy, candidates.sigma_px, logits])
+            return columns[np.argsort(candidates.rank)].T
+
+        return await self._answer(request, 1, ranked)
+
+    async def _answer(
+        self, request: Request, channels: int, compute: Callable[[np.ndarray], np.ndarray]
+    ) -> Response:
+        """Answer the pixels of an image, (H, W, C) uint8, with float32 computed of them."""
         self._check_key(request)
         try:
             width, height = (int(request.query_params[name]) for name in ("width", "height"))
         except (KeyError, ValueError):
             raise HTTPException(400, "the size of the image is missing") from None
-        if min(width, height) < MIN_SIDE or width * height > MAX_HEATMAP_PIXELS:
+        if min(width, height) < MIN_SIDE or width * height > MAX_IMAGE_PIXELS:
             raise HTTPException(400, f"an image cannot be {width}x{height} here")
-        if _body_length(request, 3 * width * height) != 3 * width * height:
+        length = channels * width * height
+        if _body_length(request, length) != length:
             raise HTTPException(400, "these are not the pixels of such an image")
         async with asyncio.timeout(self.options.max_request_s):
-            rgb = np.frombuffer(await request.body(), np.uint8).reshape(height, width, 3)
+            body = np.frombuffer(await request.body(), np.uint8)
 
-        def logits() -> bytes:
-            with self._network:
-                return self._detector.heatmap_and_logits(rgb)[1].astype("<f4").tobytes()
+        def answer() -> bytes:
+            with self._processors:
+                return compute(body.reshape(height, width, channels)).astype("<f4").tobytes()
 
-        return Response(await run_in_threadpool(logits), media_type="application/octet-stream")
+        return Response(await run_in_threadpool(answer), media_type="application/octet-stream")
 
     async def _new_job(self, request: Request) -> Response:
         """Start a task: a length, a description in JSON of that length, and the images."""

@@ -12,7 +12,7 @@ from ...features.scale_space import dominant_angles
 from ...features.selection import check_ignore
 from ...features.spacing import spread_by_distance, spread_over_grid, suppress_neighbors
 from .candidate_features import describe_candidates
-from .hessian_scales import SIGMAS_PX, build_scale_space, find_candidates
+from .hessian_scales import SIGMAS_PX, Candidates, build_scale_space, find_candidates
 from .ranker import Ranker, load_ranker
 
 Spread = Literal["none", "grid", "anms"]
@@ -56,6 +56,31 @@ def detect_points(
 
     Their logits rank them, and so do their scores in (0, 1), of which no two are equal.
     """
+    # The strongest alone would leave nothing to spread over dim regions.
+    limit = max_keypoints if spread == "none" else None
+    strongest = None if limit is None else max(CANDIDATES_PER_KEYPOINT * limit, MIN_CANDIDATES)
+    candidates, logits = rank_candidates(gray, strongest, ignore=ignore, ranker=ranker)
+    size = gray.shape[1], gray.shape[0]
+    if not len(candidates):
+        none = np.empty(0, np.float32)
+        return Keypoints(np.empty((0, 2)), none, size, logits=none, sizes=none, angles=none)
+    radii = least_distances(candidates.sigma_px)
+    kept = suppress_neighbors(candidates.xy, logits, radii, limit)
+    kept = kept[_choose(candidates.xy[kept], logits[kept], size, max_keypoints, spread)]
+    xy, sizes = candidates.xy[kept], SIZE_PER_SIGMA * candidates.sigma_px[kept]
+    angles = dominant_angles(gray, xy, sizes)
+    scores = ranking_scores(logits[kept])
+    return Keypoints(xy, scores, size, logits=logits[kept], sizes=sizes, angles=angles)
+
+
+def rank_candidates(
+    gray: np.ndarray,
+    strongest: int | None = None,
+    *,
+    ignore: np.ndarray | None = None,
+    ranker: Ranker | None = None,
+) -> tuple[Candidates, np.ndarray]:
+    """Return the strongest candidates of a (H, W) uint8 image, None: all, and their logits."""
     height, width = gray.shape
     require_memory(
         f"points of an image of {width}x{height} pixels",
@@ -64,29 +89,15 @@ def detect_points(
     )
     space = build_scale_space(gray)
     candidates = find_candidates(space)
-    size = (width, height)
-    if not len(candidates):
-        none = np.empty(0, np.float32)
-        return Keypoints(np.empty((0, 2)), none, size, logits=none, sizes=none, angles=none)
     rows = np.argsort(candidates.rank)
     if ignore is not None:
         wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
         rows = rows[wanted[rows]]
-    # The strongest alone would leave nothing to spread over dim regions.
-    limit = max_keypoints if spread == "none" else None
-    if limit is not None:
-        rows = rows[: max(CANDIDATES_PER_KEYPOINT * limit, MIN_CANDIDATES)]
+    rows = rows[:strongest]
     # Those of all scales in one tile share the processor's cache.
     tiles = (candidates.row // TILE_PX << 8) + candidates.column // TILE_PX
     candidates = candidates[rows[np.argsort(tiles[rows].astype(np.uint16), kind="stable")]]
-    logits = (ranker or load_ranker()).rank(describe_candidates(space, candidates))
-    radii = least_distances(candidates.sigma_px)
-    kept = suppress_neighbors(candidates.xy, logits, radii, limit)
-    kept = kept[_choose(candidates.xy[kept], logits[kept], size, max_keypoints, spread)]
-    xy, sizes = candidates.xy[kept], SIZE_PER_SIGMA * candidates.sigma_px[kept]
-    angles = dominant_angles(gray, xy, sizes)
-    scores = ranking_scores(logits[kept])
-    return Keypoints(xy, scores, size, logits=logits[kept], sizes=sizes, angles=angles)
+    return candidates, (ranker or load_ranker()).rank(describe_candidates(space, candidates))
 
 
 def ranking_scores(logits: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 // What is found in a picture, each once, when it is first asked for: its heat map, for which the
 // network is run, and its points, for which it is not.
 import { Background, CancellableBackground } from "./background.js";
-import { during } from "./page.js";
+import { during, page } from "./page.js";
 
 const pictureWorker = new Background(new URL("picture_worker.js", import.meta.url));
 const pointsWorker = new CancellableBackground(new URL("points_worker.js", import.meta.url));
@@ -55,7 +55,8 @@ export async function findPoints(picture) {
   if (picture.ranking) return;
   await once(picture, "ranking", async () => {
     const { file, name, rgba, width, height, original } = picture;
-    const values = { file, name, rgba, width, height, original };
+    const token = page.server ? page.token : null;
+    const values = { file, name, rgba, width, height, original, token };
     const found = pointsWorker.call("rank", values, picture.removal.signal);
     const ranking = await during("Finding points…", found);
     counted("points");

@@ -10,8 +10,8 @@ export const element = (id) => document.getElementById(id);
  * @property {Uint8ClampedArray} rgba @property {HTMLCanvasElement} canvas
  * @property {AbortController} removal ends what is done for it alone
  * @property {import("./selection.js").HeatMap} [map] once the network was run (`findHeatMap`)
- * @property {import("./points/ranking.js").Ranking & {gray: Uint8Array}} [ranking] once its points
- *   were ranked (`findPoints`)
+ * @property {import("./points/ranking.js").Ranking & {gray: Uint8Array, width: number, height: number}}
+ *   [ranking] once its points were ranked (`findPoints`)
  */
 
 export const page = {

@@ -1,27 +1,33 @@
-// Ranks the points of pictures, and finds their angles, beside the page. The network is not needed.
+// Ranks the points of pictures, by ONNX Runtime here or by Python, and finds their angles, beside the
+// page. The network is not needed.
 import { UserError, answer } from "./background.js";
 import { decode } from "./decoding.js";
 import { dominantAngles } from "./orientation.js";
 import { GRAY, luma, pointsSize, reduceByArea } from "./pixels.js";
-import { readRanker } from "./points/ranker.js";
-import { rankCandidates } from "./points/ranking.js";
+import { rankingOf } from "./points/ranking.js";
+import { askPython, openModel } from "./runtime.js";
 
-let ranker = null;
+let model = null;
 
-async function loadRanker() {
-  const problem = (what) => new UserError(`Points need model/ranker.npz, which ${what}.`);
-  let response;
+async function openedModel() {
   try {
-    response = await fetch(new URL("../model/ranker.npz", import.meta.url));
-  } catch {
-    throw problem("could not be loaded: check the connection, and try again");
-  }
-  if (!response.ok) throw problem("is missing where this page comes from: install it there again");
-  try {
-    return readRanker(await response.arrayBuffer());
+    return await openModel("points.onnx");
   } catch (error) {
-    throw problem(`is damaged (${error.message}): install it again where this page comes from`);
+    if (error instanceof UserError) throw error;
+    throw new UserError(`What finds points could not be loaded (${error.message}): load the page again.`);
   }
+}
+
+/** Candidates, the strongest first: x, y, sigmas and logits. */
+async function candidatesOf({ gray, width, height }, token) {
+  if (token !== null) {
+    const rows = await askPython("candidates", width, height, gray, token);
+    const count = rows.length / 4;
+    const [x, y, sigmas, logits] = [0, 1, 2, 3].map((k) => rows.subarray(k * count, (k + 1) * count));
+    return { x, y, sigmas, logits };
+  }
+  model ??= await openedModel();
+  return model("gray", "uint8", gray, [1, 1, height, width]);
 }
 
 /** The luma of a file at the size at which points are looked for. */
@@ -35,12 +41,14 @@ function reducedLuma(file, name) {
 }
 
 answer({
-  /** Ranks the candidates of a picture; what the network sees is enough where it is the whole. */
-  async rank({ file, name, rgba, width, height, original }) {
-    ranker ??= await loadRanker();
+  /**
+   * Ranks the candidates of a picture; what the network sees is enough where it is the whole. The
+   * token is that of Python, null where the browser is alone.
+   */
+  async rank({ file, name, rgba, width, height, original, token }) {
     const whole = width === original.width && height === original.height;
     const seen = whole ? { gray: luma(rgba), width, height } : await reducedLuma(file, name);
-    return { gray: seen.gray, ...rankCandidates(seen.gray, seen.width, seen.height, ranker) };
+    return { ...seen, ...rankingOf(await candidatesOf(seen, token)) };
   },
 
   /** @returns {Float32Array} angles of points in degrees */

@@ -5,7 +5,7 @@ const DISTANCE_STEP_PX = 0.25; // to which the distance of `spreadByDistance` is
 /**
  * Goes through points, best first, and keeps those that are not near a kept one.
  *
- * @param {Float64Array} xy x0, y0, x1, y1, ... inside of the picture
+ * @param {Float32Array} xy x0, y0, x1, y1, ... inside of the picture
  * @param {{width: number, height: number}} picture
  * @param {Uint32Array} rows of the points, in the order in which they are gone through
  * @param {Float64Array} radii of all points: near is closer than the smaller radius of both
