@@ -42,7 +42,7 @@ def test_tensors_of_any_layout_and_type(photo: np.ndarray) -> None:
 @pytest.mark.parametrize(
     ("shape", "words"),
     [
-        ((1, 3, 20, 30), "a batch: give one image of it"),
+        ((1, 3, 20, 30), "is a batch: give batch[0]"),
         ((5, 20, 30), "give several grey images as a list to `detect_batch`"),
         ((20, 30, 2), "1, 3 or 4 channels"),
         ((20,), "(height, width)"),

@@ -161,7 +161,7 @@ def test_sizes_are_limited(serve: Any, photo: np.ndarray) -> None:
     pixel = ("a.png", b"x")
     for files, said in (
         ([("big.png", bytes(10_001))] * 2, "big.png is over 0.01 MB"),
-        ([pixel] * 4, "there are 4 images, over 3"),
+        ([pixel] * 4, "4 images are over 3"),
         ([("a.png", bytes(9_000))] * 60, "this is over"),
     ):
         answer = client.start("stitch", files)
@@ -264,7 +264,7 @@ def test_a_task_is_cancelled(serve: Any) -> None:
     job = long_task(client)
     process = client.server.jobs.find(job).process
     refused = client.start("folder-keypoints", [("a.png", b"x")])
-    assert "as many tasks as are allowed (1) are at work" in refused.values["error"]
+    assert "the most tasks (1) are at work" in refused.values["error"]
     assert client.ask("DELETE", f"/api/jobs/{job}").status == 200
     assert not process.is_alive()
     assert folders(temporary) == []

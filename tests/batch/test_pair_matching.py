@@ -114,7 +114,7 @@ def test_two_pairs_of_one_name_are_not_mixed_up(features: Path, tmp_path: Path) 
     pairs = [PAIR, ("a-00.png", "b/01.png")]
     report = match_pairs(features, pairs, tmp_path / "m.h5", workers=1)
     assert list(report.counts) == [PAIR]
-    assert "is that of a/00.png b/01.png, too" in report.failures[0]
+    assert "is of a/00.png b/01.png, too" in report.failures[0]
 
 
 def test_features_of_other_programs(tmp_path: Path) -> None:

@@ -170,7 +170,7 @@ def test_a_folder_of_something_else_is_refused(
 ) -> None:
     (tmp_path / "tiny").mkdir()
     (tmp_path / "tiny" / "mine.jpg").touch()
-    with pytest.raises(DeepDetectError, match="holds 1 images, not the 5 of tiny"):
+    with pytest.raises(DeepDetectError, match="holds 1 images, not 5"):
         get_dataset(dataset, tmp_path / "tiny")
     assert server.ranges == []
 

@@ -331,7 +331,7 @@ def test_a_small_rotation_said_to_be_rectified_gives_no_cloud(
         warp = camera.matrix @ rotation @ np.linalg.inv(camera.matrix)
         other = cv2.warpPerspective(level.left, warp, camera.size, flags=cv2.INTER_CUBIC)
         message = refusal(one_line, level.left, other, density=density, **known)
-        assert "a rotation of the camera explains most disparities" in message
+        assert "a rotation explains most disparities" in message
 
 
 def test_what_is_wrong_is_said(level: Any, one_line: Any, tmp_path: Path) -> None:

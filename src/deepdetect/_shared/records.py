@@ -327,8 +327,7 @@ def lock(path: Path, final: Path) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise OptionError(
-                f"{final} is being written by another process: wait for it, or choose another "
-                "place with -o"
+                f"{final} is being written by another process: wait, or choose another with -o"
             ) from None
         except OSError:  # a network folder without locks
             pass

@@ -126,8 +126,7 @@ class Jobs:
         """Raise an OptionError where too many tasks are at work."""
         if sum(job.process.is_alive() for job in self._jobs.values()) >= self.limits.max_tasks:
             raise OptionError(
-                f"as many tasks as are allowed ({self.limits.max_tasks}) are at work: wait for one "
-                "of them, or cancel it"
+                f"the most tasks ({self.limits.max_tasks}) are at work: wait, or cancel one"
             )
 
     def start(self, order: Order) -> Job:

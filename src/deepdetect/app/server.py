@@ -111,8 +111,7 @@ class AppServer:
         except OSError as error:
             self.jobs.close()
             raise OptionError(
-                f"port {options.port} cannot be used ({error.strerror}): give another `port`, or 0 "
-                "for any that is free"
+                f"port {options.port} cannot be used ({error.strerror}): give another, or 0 for any"
             ) from None
         self.port = self._socket.getsockname()[1]
         self._server = uvicorn.Server(
@@ -296,8 +295,7 @@ class AppServer:
         files, given = _described(await body.read(size))
         if len(files) > options.max_files:
             raise OptionError(
-                f"there are {len(files)} images, over {options.max_files}: give fewer, or "
-                "allow more by --max-files"
+                f"{len(files)} images are over {options.max_files}: allow more by --max-files"
             )
         for name, length in files:
             if length > options.max_file_mb * 1e6:
@@ -310,7 +308,9 @@ class AppServer:
             made.callback(shutil.rmtree, folder, ignore_errors=True)
             images = []
             for number, (name, length) in enumerate(files):
-                images.append(SentImage(folder / f"{number:04d}{_suffix(name)}", name))
+                suffix = Path(name).suffix.lower()
+                suffix = suffix if suffix in IMAGE_SUFFIXES else ""
+                images.append(SentImage(folder / f"{number:04d}{suffix}", name))
                 with images[-1].path.open("xb") as file:
                     async for piece in body.pieces(length):
                         file.write(piece)
@@ -393,9 +393,3 @@ def _described(text: bytes) -> tuple[list[tuple[str, int]], dict[str, object]]:
 def _clean(name: str) -> str:
     """Return a name that can be shown: not too long, and of one line."""
     return "".join(c if c.isprintable() else "_" for c in name[-MAX_NAME_LENGTH:]) or "image"
-
-
-def _suffix(name: str) -> str:
-    """Return the ending of an image's file, empty where it is another."""
-    suffix = Path(name).suffix.lower()
-    return suffix if suffix in IMAGE_SUFFIXES else ""

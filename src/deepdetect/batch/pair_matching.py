@@ -174,8 +174,7 @@ def _find_pairs(
                 gone |= {name, reversed_name}
             elif taken.setdefault(name, pair) != pair:
                 failures.append(
-                    f"{' '.join(pair)}: its group {name} is that of {' '.join(taken[name])}, too: "
-                    "rename an image"
+                    f"{' '.join(pair)}: {name} is of {' '.join(taken[name])}, too: rename an image"
                 )
             else:
                 wanted[pair] = {name: state0 + state1, reversed_name: state1 + state0}

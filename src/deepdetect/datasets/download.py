@@ -246,8 +246,7 @@ def _check(dataset: RemoteDataset, folder: Path, subject: str) -> None:
     count = len(find_images(folder))
     if count != dataset.images:
         raise DeepDetectError(
-            f"{subject} holds {count:,} images, not the {dataset.images:,} of {dataset.name}: "
-            "choose another folder"
+            f"{subject} holds {count:,} images, not {dataset.images:,}: choose another folder"
         )
     for name, digest in dataset.contents.items():
         found = content_digest(folder, name)

@@ -38,7 +38,6 @@ def load_foreground(folder: str | Path) -> list[MaskedPhotograph]:
             found.append(MaskedPhotograph(images[0], mask))
     if not found:
         raise ImageError(
-            f"there are no photographs with masks in {folder}: it must hold NAME.jpg with "
-            "NAME_mask.png"
+            f"there are no photographs with masks in {folder}: put NAME.jpg and NAME_mask.png there"
         )
     return found

@@ -188,8 +188,7 @@ def patchmatch_neighbours(
         )
     if positions is None or not all(on_pixels(xy) for xy in positions):
         raise OptionError(
-            "the matcher patchmatch needs dense keypoints of one scale and angle, on whole pixels: "
-            "use auto, flann, faiss or exact"
+            "patchmatch needs dense keypoints of one scale and angle, on whole pixels: use auto"
         )
     from . import kernels
 

@@ -77,8 +77,7 @@ class DeepDetectExtractor(BaseModel):
         check_name("angle unit", conf["angle_unit"], ("degrees", "radians"))
         if conf["max_keypoints"] > MAX_KEYPOINTS:
             raise OptionError(
-                f"hloc can match up to {MAX_KEYPOINTS} keypoints, not {conf['max_keypoints']}: "
-                "give fewer as `max_keypoints`"
+                f"hloc takes `max_keypoints` up to {MAX_KEYPOINTS}, not {conf['max_keypoints']}"
             )
         self._detector = PointDetector(conf["max_keypoints"], spread=conf["spread"])
         self._radians = conf["angle_unit"] == "radians"
@@ -118,8 +117,7 @@ class DeepDetectMatcher(BaseModel):
         described = [data[name][0].T.cpu().float().numpy() for name in self.required_inputs]
         if len(described[1]) > MAX_KEYPOINTS:
             raise OptionError(
-                f"hloc can match up to {MAX_KEYPOINTS} keypoints, not {len(described[1])}: "
-                "extract fewer"
+                f"hloc takes {MAX_KEYPOINTS} keypoints at most, not {len(described[1])}: use fewer"
             )
         first, second = (np.ascontiguousarray(descriptors) for descriptors in described)
         found = match_descriptors(

@@ -27,7 +27,10 @@ def write_glb(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> Non
     Colours become linear as glTF requires, with 16 bits, which keep each of the 256 sRGB levels
     apart. The metadata are in the asset's extras, with unit and frame.
     """
-    positions = to_gltf_frame(cloud).astype("<f4")
+    # A half turn about the x axis makes y point up and z backward. Units of unknown length become
+    # metres, and the file says so.
+    half_turn = np.array([1, -1, -1]) * (1e-3 if cloud.unit == "mm" else 1.0)
+    positions = (cloud.points * half_turn).astype("<f4")
     colors = np.full((len(cloud), 4), 65535, "<u2")
     colors[:, :3] = np.rint(65535 * srgb_to_linear()).astype("<u2")[cloud.colors]
     text = json.dumps(_tree(cloud, positions, metadata), separators=(",", ":")).encode("ascii")
@@ -40,14 +43,6 @@ def write_glb(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> Non
         file.write(struct.pack("<I4s", size, b"BIN\0"))
         positions.tofile(file)
         colors.tofile(file)
-
-
-def to_gltf_frame(cloud: PointCloud) -> np.ndarray:
-    """Return the points with x right, y up, z backward, in metres: a half turn about the x axis.
-
-    Units of unknown length become metres, and the file says so.
-    """
-    return cloud.points * (np.array([1, -1, -1]) * (1e-3 if cloud.unit == "mm" else 1.0))
 
 
 def _tree(cloud: PointCloud, positions: np.ndarray, metadata: Mapping[str, str]) -> dict[str, Any]:

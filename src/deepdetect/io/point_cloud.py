@@ -28,29 +28,21 @@ def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> Non
     vertices = np.empty(len(cloud), VERTEX)
     vertices["xyz"] = cloud.points
     vertices["rgb"] = cloud.colors
-    with path.open("wb") as file:
-        file.write(_ply_header(cloud, metadata).encode("ascii", "replace"))
-        vertices.tofile(file)
-
-
-def _ply_header(cloud: PointCloud, metadata: Mapping[str, str]) -> str:
-    comments = [
-        "written by deepdetect",
-        f"unit: {UNITS[cloud.unit]}",
-        f"frame: {cloud.frame}, x right, y down, z forward, origin at its centre",
-        *(f"{name}: {text}" for name, text in metadata.items()),
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment written by deepdetect",
+        f"comment unit: {UNITS[cloud.unit]}",
+        f"comment frame: {cloud.frame}, x right, y down, z forward, origin at its centre",
+        *(f"comment {name}: {text}" for name, text in metadata.items()),
+        f"element vertex {len(cloud)}",
+        *(f"property float {axis}" for axis in "xyz"),
+        *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
+        "end_header\n",
     ]
-    return "\n".join(
-        [
-            "ply",
-            "format binary_little_endian 1.0",
-            *(f"comment {comment}" for comment in comments),
-            f"element vertex {len(cloud)}",
-            *(f"property float {axis}" for axis in "xyz"),
-            *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
-            "end_header\n",
-        ]
-    )
+    with path.open("wb") as file:
+        file.write("\n".join(header).encode("ascii", "replace"))
+        vertices.tofile(file)
 
 
 POINT_CLOUD_WRITERS: dict[str, PointCloudWriter] = {

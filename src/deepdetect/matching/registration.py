@@ -127,8 +127,7 @@ def register(
     homography = matches.homography
     if not matches.guided or homography is None:
         raise RegistrationError(
-            "no homography can be trusted between these images: they must overlap, and show a "
-            "plane or be taken from one place"
+            "no homography can be trusted: both images must show a plane, or be from one place"
         )
     grays = luma(first), luma(second)
     if not agree(*grays, homography):

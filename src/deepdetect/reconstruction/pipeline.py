@@ -186,8 +186,7 @@ def _from_disparities(
     if np.count_nonzero(matched) < least * len(keypoints):
         raise NoDepthError(
             f"only {np.count_nonzero(matched):,} of {len(keypoints):,} keypoints have a match on "
-            "their row: the images hardly overlap or show different scenes, or the pair is not "
-            "rectified"
+            "their row: the images hardly overlap, show different scenes, or are not rectified"
         )
     check_disparities(disparity)
     pixels = keypoints.xy[found.indices]

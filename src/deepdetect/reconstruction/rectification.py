@@ -310,8 +310,7 @@ def check_pure_rotation(
     explained = np.mean(by_rotation < MAX_ROTATION_ERROR_PX)
     if better and explained > MIN_ROTATION_FRACTION:
         raise NoDepthError(
-            "a rotation of the camera explains most disparities and there is no depth: move it "
-            "sideways between the images"
+            "a rotation explains most disparities: move the camera sideways between the images"
         )
 
 

@@ -125,6 +125,10 @@ class Reconstruction:
         errors, disparity = self.reprojection_errors, self.disparity
         rows, pose, calibration = self.rectification, self.pose, self.calibration
         cameras = {"left": calibration.camera0, "right": calibration.camera1}
+        why = "as asked for"
+        if rows is not None:
+            on_rows = f"{rows.on_rows:,} of {rows.matches:,} sparse matches are on the same row"
+            why = rows.reason or on_rows
         return {
             "points": len(self),
             "filled": int(np.count_nonzero(~self.matched)),
@@ -135,7 +139,7 @@ class Reconstruction:
             "height": self.size[1],
             "density": round(len(self) / (self.size[0] * self.size[1]), 6),
             "rectified": self.rectified,
-            "rectified_why": self._why(),
+            "rectified_why": why,
             "rectification": None if rows is None else _finite(dataclasses.asdict(rows)),
             "unit": self.unit,
             "scale": SCALE[self.unit],
@@ -159,14 +163,6 @@ class Reconstruction:
             | {side: _camera_values(camera) for side, camera in cameras.items()},
             "seconds": {stage: round(value, 4) for stage, value in self.seconds.items()},
         }
-
-    def _why(self) -> str:
-        """Say why the pair was treated as rectified or not."""
-        rows = self.rectification
-        if rows is None:
-            return "as asked for"
-        on_rows = f"{rows.on_rows:,} of {rows.matches:,} sparse matches are on the same row"
-        return on_rows if rows.rectified else rows.reason
 
     def _map(self, values: np.ndarray) -> np.ndarray:
         """Return values of the points at their pixels, (H, W) float32, NaN elsewhere."""

@@ -56,10 +56,8 @@ GOOD_ERROR_PX = 0.1
 """Median error at which no other focal length is tried."""
 
 NO_DEPTH = {
-    "static": "nothing moves between the images: they show the same view, depth needs two images "
-    "from two places",
-    "rotation": "a rotation of the camera explains all the matches and there is no depth: move it "
-    "sideways between the images",
+    "static": "nothing moves between the images: depth needs two images from two places",
+    "rotation": "a rotation explains all the matches: move the camera sideways between the images",
     "plane": "one homography explains all the matches: the images show a plane, or the camera only "
     "rotated, and there is no depth",
 }
@@ -186,13 +184,11 @@ def check_pose(
     explained = np.count_nonzero(pose.errors[indices] < MAX_SCENE_DISTANCE_PX)
     if explained < MIN_POSE_RATIO * possible:
         raise ReconstructionError(
-            f"with this calibration only {explained:,} of {possible:,} matches fit one pose of "
-            f"the cameras: {wrong_focal}"
+            f"only {explained:,} of {possible:,} matches fit one pose of the cameras: {wrong_focal}"
         )
     if pose.cheirality_ratio < MIN_IN_FRONT_FRACTION:
         raise ReconstructionError(
-            f"only {pose.cheirality_ratio:.0%} of the points would lie in front of both cameras: "
-            f"{wrong_focal}"
+            f"only {pose.cheirality_ratio:.0%} of the points lie before both cameras: {wrong_focal}"
         )
     return pose
 

@@ -195,14 +195,10 @@ def _why_unregistered(
     for names in components:
         if name in names:
             return (
-                f"it hangs together with {len(names) - 1} others only, which show something else, "
-                "or too little of the same"
+                f"it hangs together with {len(names) - 1} others only, which show too little else"
             )
     if partners := sum(name in pair for pair in verified):
-        return (
-            f"it matches {partners} of the others, but its pose cannot be told from them: take "
-            "more images between"
-        )
+        return f"it matches {partners} others, but they give no pose: take more images between"
     return "it matches none of the others: it shows something else, or from too far away"
 
 

@@ -57,8 +57,7 @@ MANY_SEEDS = 64
 
 REPEATABILITY_NOTE = (
     "Points of the first image that land under 1 px from some point of the second, over the "
-    "smaller of the two counts, clipped at 1. It grows with the density: the baselines say what it "
-    "is worth."
+    "smaller of the two counts, clipped at 1. It grows with the density: see the baselines."
 )
 
 MATCHES_NOTE = (
@@ -180,8 +179,7 @@ def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
     covered = {row["item"]: row["covered"] for row in rows}
     note = (
         f"{len(covered)} images; their foreground is {mean_of(covered.values()) or 0:.1%} of the "
-        "pixels, which is what random points reach. The paper's numbers are of 18 images that are "
-        "not published."
+        "pixels, which is what random points reach. The paper used 18 unpublished images."
     )
     table = tabulate("foreground", "Keypoints on the foreground", features, rows, columns, note)
     table = with_paper_column(table, title, FOREGROUND)

@@ -161,7 +161,9 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
     methods = sfm_methods(options)
     rows = run.rows("", methods, chosen, partial(measure_scene, run))
     rows = [row for name in chosen for row in where(rows, item=name)]
-    tables = [camera_table(rows), image_table(rows), cost_table(rows)]
+    costs = [{**row, "scene": row["scene"].name, "keypoints": row["method"]} for row in rows]
+    cost_table = Table("sfm_cost", "Seconds and memory", COST_COLUMNS, costs, COST_NOTE)
+    tables = [camera_table(rows), image_table(rows), cost_table]
     figures = []
     for name, scene in chosen.items():
         errors = {
@@ -286,12 +288,6 @@ def _extent(truth: Views) -> float:
     """Return the largest distance of two true cameras."""
     centres = np.array([view.centre for view in truth.values()])
     return float(np.linalg.norm(centres[:, None] - centres, axis=2).max())
-
-
-def cost_table(rows: Rows) -> Table:
-    """Tabulate what each method takes."""
-    lines = [{**row, "scene": row["scene"].name, "keypoints": row["method"]} for row in rows]
-    return Table("sfm_cost", "Seconds and memory", COST_COLUMNS, lines, COST_NOTE)
 
 
 def find_points(detector: PointDetector, stages: Stages, folder: Path) -> None:

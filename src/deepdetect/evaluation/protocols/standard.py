@@ -63,9 +63,8 @@ STAGES = ("detect", "describe", "match")
 
 MATCHING_NOTE = (
     f"The best {MATCHING_BUDGET:,} keypoints of each image; the same upright RootSIFT of size "
-    "4 for all, except in the rows that name others; mutual nearest neighbours, "
-    f"ratio {RATIO} (none for learned descriptors). Means over the pairs; no matches count as "
-    "a precision of 0."
+    f"4 for all, except in the rows that name others; mutual nearest neighbours, ratio {RATIO} "
+    "(none for learned descriptors). Means over the pairs; no matches count as a precision of 0."
 )
 
 

@@ -217,8 +217,7 @@ def compute_disparity(
     low, high = (int(disparity) for disparity in disparities)
     if max(abs(low), abs(high)) >= left.shape[1]:
         raise OptionError(
-            f"disparities from {low} to {high} do not fit images {left.shape[1]} pixels wide: "
-            "narrow disparity_range"
+            f"disparities {low} to {high} exceed {left.shape[1]} pixels: narrow disparity_range"
         )
     coarse = semi_global_matching(left, right, (low, high))
     clear = coarse.uniqueness_ratio >= options.uniqueness_ratio
