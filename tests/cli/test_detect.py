@@ -248,7 +248,7 @@ def test_an_input_is_never_written_over(run, photos: Path) -> None:
     before = contents(Path())
     result = run("detect", "a.png", "a_heatmap.jpg", "-o", ".", "--overwrite")
     assert result.exit_code == 2
-    assert "is an input" in result.stderr
+    assert "replace an input" in result.stderr
     assert contents(Path()) == before
 
 

@@ -163,5 +163,5 @@ def test_masks_of_a_list(detector: DeepDetect, images: list[np.ndarray]) -> None
         assert [keypoints.xy[:, 0].min() >= 10 for keypoints in both] == [True, True]
     with pytest.raises(OptionError, match="2 masks for 3 images"):
         detector.detect_batch(images, ignore=masks[:2])
-    with pytest.raises(OptionError, match=r"images\[1\]: the ignore mask has shape"):
+    with pytest.raises(OptionError, match=r"images\[1\]: the ignore mask must have the shape"):
         detector.detect_batch(images, ignore=masks[0])
