@@ -59,7 +59,10 @@ def test_the_command_lines_run(folder: Path, line: str) -> None:
 @pytest.mark.parametrize("line", re.findall(r"\| `([^`]*\([^`]*\))` \|$", README, re.M))
 def test_the_calls_of_the_table_run(folder: Path, line: str) -> None:
     import deepdetect
+    from deepdetect.detector.network.onnx_export import write_onnx
 
+    if "fast.onnx" in line:
+        write_onnx(ROOT / "benchmarks" / "fast_network" / "fast.safetensors", "fast.onnx")
     left = deepdetect.load_image("left.png")
     names = {
         **{name: getattr(deepdetect, name) for name in deepdetect.__all__},
