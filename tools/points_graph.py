@@ -228,7 +228,10 @@ def rank_candidates(gray: Any, limit: Any = None) -> tuple[Any, Any, Any, Any]:
 
     def measure(number: Any, going: Any) -> tuple[Any, ...]:
         start = number.Reshape([1]) * CHUNK
-        own = (number.graph.tensor(each).Slice(start, start + CHUNK, [1]) for each in pixels)
+        own = (
+            number.graph.tensor(each).Slice(start, start + CHUNK, [1]).Unsqueeze([1])
+            for each in pixels
+        )
         ranks = start + np.arange(1, CHUNK + 1)
         around = (number.graph.tensor(each) for each in (flat, height, width, mean))
         return going.Identity(), *_measure(*around, *own, ranks)
@@ -281,7 +284,8 @@ def _measure(
 ) -> tuple[Any, Any, Any]:
     """Return x, y and logits of candidates, as `describe_candidates` and the ranker find them.
 
-    `flat` has all levels of an image with their frames in a row.
+    `flat` has all levels of an image with their frames in a row. Candidates are the last axis of
+    all tensors, so that what is beside them can be cut out in long rows.
     """
     graph, variances = level.graph, level.graph.tensor(VARIANCES)
     down = width + 2 * MARGIN
@@ -289,49 +293,60 @@ def _measure(
 
     def look(level: Any, row: Any, column: Any, steps: Sequence[Any], *shape: int) -> Any:
         """Return the smoothed image at pixels and at steps in levels, rows and columns."""
-        steps = [each.ravel() for each in np.meshgrid(*steps, indexing="ij")]
+        steps = [each.reshape(-1, 1) for each in np.meshgrid(*steps, indexing="ij")]
         pixels = deeper * level + down * (row + MARGIN) + (column + MARGIN)
-        pixels = pixels.Unsqueeze([-1]) + (deeper * steps[0] + down * steps[1] + steps[2])
-        return flat.GatherElements(pixels.Reshape([0, -1]), axis=1).Reshape([0, -1, *shape])
+        pixels = pixels.Unsqueeze([2]) + (deeper * steps[0] + down * steps[1] + steps[2])
+        return flat.GatherElements(pixels.Reshape([0, -1]), axis=1).Reshape([0, *shape, -1])
 
-    # Windows around each candidate, in its own and in other levels.
-    side, shape = np.arange(-MARGIN, MARGIN + 1), [0, -1, len(NEAR)]
+    # Windows around each candidate in its own and in other levels, (B, 4, 7, 7, K).
+    side = np.arange(-MARGIN, MARGIN + 1)
     values = look(level, row, column, (NEAR, side, side), len(NEAR), len(side), len(side))
-    scale = variances.Gather(level.Unsqueeze([2]) + NEAR).Unsqueeze([3, 4])
+    scale = variances.Gather(level + NEAR[:, None]).Unsqueeze([2, 3])
     windows = _determinant(values, 1, scale).Abs()
-    highest = _log(windows.ReduceMax(axes=[3, 4], keepdims=0)).Gather(OTHERS, axis=2)
+    highest = _log(windows.ReduceMax(axes=[2, 3], keepdims=0)).Gather(OTHERS, axis=1)
     determinant, light, slope = (
-        _determinant(values, MARGIN, scale).Reshape(shape),
-        _at(values, MARGIN, 0, 0).Reshape(shape),
-        _log_slope(values, MARGIN, scale).Reshape(shape),
+        _determinant(values, MARGIN, scale).Squeeze([2, 3]),
+        _at(values, MARGIN, 0, 0).Squeeze([2, 3]),
+        _log_slope(values, MARGIN, scale).Squeeze([2, 3]),
     )
     xx, yy = _bends(values, MARGIN)
-    own_determinant, own_light = (each.Slice([1], [2], [2]) for each in (determinant, light))
+    own_determinant, own_light = (each.Slice([1], [2], [1]) for each in (determinant, light))
     strength = (own_determinant.Abs() + STRENGTH_FLOOR).Sqrt()
-    trace = (((xx + yy) * scale).Reshape(shape) / strength / 2.0).Atan()
-    own, others = _log(own_determinant), _log(determinant).Gather(OTHERS, axis=2)
+    trace = (((xx + yy) * scale).Squeeze([2, 3]) / strength / 2.0).Atan()
+    own, others = _log(own_determinant), _log(determinant).Gather(OTHERS, axis=1)
 
-    # Rings around it in its own level, (B, K, 8, 4, 1, 1).
+    # Rings around it in its own level, (B, 32, 3, 3, K).
     right, below = (
-        (each.Unsqueeze([2]) + graph.tensor(table).Gather(level * 2 + each.Mod(2))).Max(0).Min(last)
+        (
+            graph.tensor(table)
+            .Gather(level * 2 + each.Mod(2))
+            .Squeeze([1])
+            .Transpose(perm=[0, 2, 1])
+            + each
+        )
+        .Max(0)
+        .Min(last)
         for each, table, last in (
             (column, np.concatenate(ring_offsets()[0]), width - 1),
             (row, np.concatenate(ring_offsets()[1]), height - 1),
         )
     )
-    near = np.arange(-1, 2)
-    values = look(
-        level.Unsqueeze([2]), below, right, ([0], near, near), RING_POINTS, len(RING_RADII), 3, 3
+    near, points = np.arange(-1, 2), RING_POINTS * len(RING_RADII)
+    values = look(level, below, right, ([0], near, near), points, 3, 3)
+    scale = variances.Gather(level).Unsqueeze([2, 3])
+    responses, slopes, lights = (
+        each.Reshape([0, RING_POINTS, len(RING_RADII), -1])
+        for each in (
+            _log(_determinant(values, 1, scale)),
+            _log_slope(values, 1, scale),
+            (_at(values, 1, 0, 0) - own_light.Unsqueeze([2, 3])) / strength.Unsqueeze([2, 3]),
+        )
     )
-    scale = variances.Gather(level).Unsqueeze([2, 3, 4, 5])
-    responses, slopes = _log(_determinant(values, 1, scale)), _log_slope(values, 1, scale)
-    lights = (_at(values, 1, 0, 0) - own_light.Unsqueeze([3, 4, 5])) / strength.Unsqueeze([3, 4, 5])
 
     def over(ring: Any, kind: str) -> Any:
-        return getattr(ring, f"Reduce{kind}")(axes=[2, 4, 5], keepdims=0)
+        return getattr(ring, f"Reduce{kind}")(axes=[1], keepdims=0)
 
     ring = 21 + 8 * np.arange(len(RING_RADII))
-    ranks = (ranks.Cast(to=FLOAT) / (height * width).Cast(to=FLOAT)).Log() / 2.0 + 3.0
     features = {  # by their columns
         (0,): (own + 9.0) / 3.0,
         (1, 2, 3): (others - own) / 2.0,
@@ -349,21 +364,23 @@ def _measure(
         (*ring + 5,): (over(lights, "Min") / 2.0).Atan(),
         (*ring + 6,): (over(slopes, "Mean") - own) / 4.0,
         (*ring + 7,): (over(slopes, "Max") - own) / 4.0,
-        (53,): own * 0.0 + ranks.Unsqueeze([1]),
-        (54,): ((level - 4).Cast(to=FLOAT) / 3.0).Unsqueeze([2]),
+        (53,): own * 0.0
+        + (ranks.Cast(to=FLOAT) / (height * width).Cast(to=FLOAT)).Log() / 2.0
+        + 3.0,
+        (54,): (level - 4).Cast(to=FLOAT) / 3.0,
     }
-    response = windows.Slice([1], [2], [2])
+    response = windows.Slice([1], [2], [1])
     x, y = (
-        each.Cast(to=FLOAT) + _peak_offset(response, *axis).Reshape([0, -1])
+        (each.Cast(to=FLOAT) + _peak_offset(response, *axis).Squeeze([2, 3])).Squeeze([1])
         for each, axis in ((column, (0, 1)), (row, (1, 0)))
     )
     return x, y, _rank(graph, features)
 
 
 def _at(values: Any, margin: int, down: int, right: int) -> Any:
-    """Return the neighbours of all pixels but those in the margins of the last two axes."""
+    """Return the neighbours of all pixels, axes 2 and 3, but those in the margins."""
     start, stop = np.add(margin, (down, right)), np.subtract((down, right), margin)
-    return values.Slice(start, np.where(stop, stop, END), [-2, -1])
+    return values.Slice(start, np.where(stop, stop, END), [2, 3])
 
 
 def _bends(values: Any, margin: int) -> tuple[Any, Any]:
@@ -407,13 +424,13 @@ def _peak_offset(response: Any, down: int, right: int) -> Any:
 def _rank(graph: Graph, features: dict[tuple[int, ...], Any]) -> Any:
     """Return the (B, K) logits of features, as `Ranker.rank` does."""
     ranker, order = load_ranker(), np.concatenate([*map(np.array, features)])
-    values = graph.join([*features.values()], axis=2)
-    values = (values - ranker.mean[order]) / ranker.deviation[order]
+    values = graph.join([*features.values()], axis=1)
+    values = (values - ranker.mean[order, None]) / ranker.deviation[order, None]
     values = values.Clip(-MAX_DEVIATIONS, MAX_DEVIATIONS)
     for k, (weight, bias) in enumerate(ranker.layers):
         values = values.Relu() if k else values
-        values = values.MatMul(weight.T if k else weight.T[order]) + bias
-    return (values + features[0,]).Squeeze([2])
+        values = graph.tensor(weight if k else weight[:, order]).MatMul(values) + bias[:, None]
+    return (values + features[0,]).Squeeze([1])
 
 
 def choose(x: Any, y: Any, level: Any, logits: Any, count: Any) -> list[Any]:
