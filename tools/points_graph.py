@@ -37,7 +37,16 @@ from deepdetect.detector.points.detection import (
 )
 from deepdetect.detector.points.hessian_scales import LEAST_RESPONSE, NMS_RADIUS, SIGMAS_PX
 from deepdetect.detector.points.ranker import MAX_DEVIATIONS, load_ranker
-from deepdetect.detector.pretrained import KEYPOINTS, POINTS_GRAPH, SCORES, SIZES
+from deepdetect.detector.pretrained import POINTS, POINTS_GRAPH
+from deepdetect.features.kernels import ATAN, BINS, RADIUS_PER_WINDOW
+from deepdetect.features.scale_space import (
+    BASE_SIGMA_PX,
+    CAMERA_SIGMA_PX,
+    LAYERS,
+    MIN_SIDE_PX,
+    WINDOW_PER_SIGMA,
+)
+from deepdetect.features.scale_space import SIZE_PER_SIGMA as SIFT_SIZE_PER_SIGMA
 from deepdetect.features.selection import MAX_OFFSET_PX
 
 OPSET, IR_VERSION = 17, 8
@@ -59,6 +68,9 @@ NEAR, OTHERS = np.arange(-1, 3), [0, 2, 3]
 
 CHUNK = 2048
 """Candidates that are measured at a time: all the pixels around them would take 70 MB and more."""
+
+OCTAVES, REACH = 3, 15
+"""Of SIFT's scale space and the windows of gradients in it that points' sizes ask for."""
 
 BLOCK = 256
 """Points that are compared with each other at a time."""
@@ -87,10 +99,10 @@ def points_model() -> onnx.ModelProto:
     limit = (count * CANDIDATES_PER_KEYPOINT).Max([MIN_CANDIDATES])
     x, y, scores, sizes = choose(*rank_candidates(gray, limit), count)
     xy = graph.join([x.Unsqueeze([2]), y.Unsqueeze([2])], axis=2)
-    shape = ["batch", "count"]
-    outputs = [(KEYPOINTS, FLOAT, [*shape, 2]), (SCORES, FLOAT, shape), (SIZES, FLOAT, shape)]
-    image = "image", FLOAT, ["batch", 3, "height", "width"]
-    return graph.model(image, outputs, [xy, scores, sizes])
+    tensors = xy, scores, sizes, directions(gray, x, y, sizes)
+    shapes = [["batch", "count", *last] for last in ([2], [], [], [])]
+    outputs = [(name, FLOAT, shape) for name, shape in zip(POINTS, shapes, strict=True)]
+    return graph.model(("image", FLOAT, ["batch", 3, "height", "width"]), outputs, tensors)
 
 
 def candidates_model() -> onnx.ModelProto:
@@ -248,27 +260,15 @@ def _levels(smooth: Any, height: Any, width: Any) -> Iterator[tuple[Any, Any]]:
 
     The frame is mirrored at the outermost rows and columns, as the filters see the image.
     """
-    graph, steps = smooth.graph, np.sqrt(np.diff(SIGMAS_PX**2, prepend=0.0))
-    radii = [round(2 * REACH_PER_SIGMA * step + 1) // 2 for step in steps]
-    inner, mirrored = [], []
+    inner = []
     for side in (height, width):
-        place = graph.add("Range", 0, side.Squeeze(), 1)
+        place = smooth.graph.add("Range", 0, side.Squeeze(), 1)
         inner.append(place.Greater(0).And(place.Less(side - 1)))
-        period = (side * 2 - 2).Max([1])
-        place = graph.add("Range", -max(radii), side.Squeeze() + max(radii), 1).Mod(period)
-        mirrored.append(place.Min(period - place))
     inside = inner[0].Unsqueeze([1]).And(inner[1])
-
-    def framed(values: Any, radius: int, axis: int) -> Any:
-        cut = max(radii) - radius
-        return values.Gather(mirrored[axis - 2].Slice([cut], [-cut or END], [0]), axis=axis)
-
-    for k, (step, radius) in enumerate(zip(steps, radii, strict=True)):
+    for k, step in enumerate(np.sqrt(np.diff(SIGMAS_PX**2, prepend=0.0))):
         # Gaussians add up by their variances: each level smooths the one before.
-        kernel = cv2.getGaussianKernel(2 * radius + 1, float(step), cv2.CV_32F)
-        smooth = framed(smooth, radius, 3).Conv(kernel.reshape(1, 1, 1, -1))
-        smooth = framed(smooth, radius, 2).Conv(kernel.reshape(1, 1, -1, 1))
-        frame = framed(framed(smooth, MARGIN, 2), MARGIN, 3)
+        smooth = _blur(smooth, step, height, width)
+        frame = _framed(_framed(smooth, MARGIN, 2, height), MARGIN, 3, width)
         if not 0 < k < len(SIGMAS_PX) - 2:
             yield frame, None
             continue
@@ -277,6 +277,21 @@ def _levels(smooth: Any, height: Any, width: Any) -> Iterator[tuple[Any, Any]]:
         peak = response.Equal(response.MaxPool(**window)).And(inside)
         peak = peak.And(response.Greater(LEAST_RESPONSE))
         yield frame, peak.Where(response, 0.0).Flatten()
+
+
+def _framed(values: Any, radius: int, axis: int, side: Any) -> Any:
+    """Return images with more rows (axis 2) or columns (3), mirrored at the outermost ones."""
+    period = (side * 2 - 2).Max([1])
+    place = values.graph.add("Range", -radius, side.Squeeze() + radius, 1).Mod(period)
+    return values.Gather(place.Min(period - place), axis=axis)
+
+
+def _blur(values: Any, sigma: float, height: Any, width: Any) -> Any:
+    """Return images smoothed as `cv2.GaussianBlur` does it."""
+    radius = round(2 * REACH_PER_SIGMA * sigma + 1) // 2
+    kernel = cv2.getGaussianKernel(2 * radius + 1, float(sigma), cv2.CV_32F)
+    values = _framed(values, radius, 3, width).Conv(kernel.reshape(1, 1, 1, -1))
+    return _framed(values, radius, 2, height).Conv(kernel.reshape(1, 1, -1, 1))
 
 
 def _measure(
@@ -489,6 +504,104 @@ def choose(x: Any, y: Any, level: Any, logits: Any, count: Any) -> list[Any]:
     rows, _ = graph.loop(((last + 1) / BLOCK).Squeeze(), suppress, rows, found)
     rows = rows.Slice([0], count, [1])
     return [each.GatherElements(rows, axis=1) for each in (x, y, scores, sizes)]
+
+
+def directions(gray: Any, x: Any, y: Any, sizes: Any) -> Any:
+    """Return the dominant orientations of points, (B, K) degrees, as `dominant_angles` does."""
+    graph, sigma, layers = gray.graph, CAMERA_SIGMA_PX, []
+    for _ in range(OCTAVES):
+        height, width = (gray.Shape(start=axis, end=axis + 1) for axis in (2, 3))
+        for layer in range(LAYERS + 1):
+            wanted = BASE_SIGMA_PX * 2 ** (layer / LAYERS)
+            if wanted > sigma:
+                gray, sigma = _blur(gray, (wanted**2 - sigma**2) ** 0.5, height, width), wanted
+            if layer:
+                layers.append((gray.Flatten(), height, width))
+        gray, sigma = gray.Slice([0, 0], [END, END], [2, 3], [2, 2]), BASE_SIGMA_PX
+    images, heights, widths = zip(*layers, strict=True)
+    flat, heights, widths = (
+        graph.join(each, axis=axis) for each, axis in ((images, 1), (heights, 0), (widths, 0))
+    )
+    starts = (heights * widths).CumSum(0, exclusive=1)
+    least = heights.Slice([0], [1]).Min(widths.Slice([0], [1]))
+    last = (least.Greater(2 * MIN_SIDE_PX - 1).Cast(to=INT64) + 1) * LAYERS
+    last = least.Greater(4 * MIN_SIDE_PX - 1).Where(OCTAVES * LAYERS, last)
+    count = x.Shape(start=1)
+    padding = graph.join([[0, 0, 0], count.Mod(BLOCK) * -1 + BLOCK], axis=0)
+    x, y, sizes = (each.Pad(padding) for each in (x, y, sizes))
+
+    def turn(number: Any, going: Any) -> tuple[Any, Any]:
+        start = number.Reshape([1]) * BLOCK
+        right, below, size = (
+            number.graph.tensor(each).Slice(start, start + BLOCK, [1]).Unsqueeze([1, 2, 3])
+            for each in (x, y, sizes)
+        )
+        sides = (number.graph.tensor(each) for each in (flat, starts, heights, widths, last))
+        return going.Identity(), _turn(*sides, right, below, size)
+
+    blocks = (x.Shape(start=1) / BLOCK).Squeeze()
+    angles = graph.loop(blocks, turn).Transpose(perm=[1, 0, 2]).Reshape([0, -1])
+    return angles.Slice([0], count, [1])
+
+
+def _turn(
+    flat: Any, starts: Any, heights: Any, widths: Any, last: Any, x: Any, y: Any, size: Any
+) -> Any:
+    """Return the orientations (B, K) of points, (B, 1, 1, 1, K), as `strongest_directions` does.
+
+    `flat` has the layers of SIFT's scale space of an image in a row.
+    """
+    graph, reach = flat.graph, np.arange(-REACH - 1, REACH + 2)
+    step = ((size / (SIFT_SIZE_PER_SIGMA * BASE_SIGMA_PX)).Log() * (LAYERS / np.log(2))).Round()
+    layer = step.Clip(1.0, float(OCTAVES * LAYERS)).Cast(to=INT64).Min(last) - 1
+    scale = graph.tensor(2.0 ** np.arange(OCTAVES)).Gather(layer / LAYERS)
+    window = size * (WINDOW_PER_SIGMA / SIFT_SIZE_PER_SIGMA) / scale
+    radius = (window * float(RADIUS_PER_WINDOW)).Round()
+    place, weight = starts.Gather(layer), graph.tensor(1.0)
+    for value, sides, axis, stride in ((y, heights, 0, widths.Gather(layer)), (x, widths, 1, 1)):
+        middle, side = (value / scale).Round().Cast(to=INT64), sides.Gather(layer)
+        steps = reach.reshape((-1, 1, 1) if axis == 0 else (-1, 1))
+        where = middle + steps
+        place = place + where.Max(0).Min(side - 1) * stride
+        # The outermost pixels have no gradient.
+        near = graph.tensor(np.abs(steps) * 1.0).LessOrEqual(radius)
+        near = near.And(where.Greater(0)).And(where.Less(side - 1))
+        weight = weight * near.Where(
+            ((graph.tensor(steps * 1.0) / window).Pow(2.0) * -0.5).Exp(), 0.0
+        )
+    values = flat.GatherElements(place.Reshape([0, -1]), axis=1)
+    values = values.Reshape([0, 1, len(reach), len(reach), -1])
+    dx = _at(values, 1, 0, 1) - _at(values, 1, 0, -1)
+    dy = _at(values, 1, 1, 0) - _at(values, 1, -1, 0)
+    across, down = dx.Abs(), dy.Abs()
+    part = across.Min(down) / (across.Max(down) + float(np.finfo(float).eps))
+    square, angle = part * part, 0.0
+    for factor in ATAN[::-1]:
+        angle = graph.tensor(angle) * square + float(factor)
+    angle = angle * part
+    angle = across.Less(down).Where(angle * -1.0 + 90.0, angle)
+    angle = dx.Less(0.0).Where(angle * -1.0 + 180.0, angle)
+    angle = dy.Less(0.0).Where(angle * -1.0 + 360.0, angle)
+    vote = _at(weight, 1, 0, 0) * (dx * dx + dy * dy).Sqrt()
+    bins = (angle * (BINS / 360)).Round().Cast(to=INT64).Mod(BINS)
+    shape, numbers = [0, (len(reach) - 2) ** 2, -1], np.arange(BINS)
+    bins, vote = (each.Reshape(shape) for each in (bins, vote))
+    votes = vote.Slice([0], [BINS], [1]) * 0.0
+    votes = votes.ScatterElements(bins, vote, axis=1, reduction="add")
+    near, far = (
+        votes.Gather((numbers - k) % BINS, axis=1) + votes.Gather((numbers + k) % BINS, axis=1)
+        for k in (1, 2)
+    )
+    smooth = (votes * 6.0 + near * 4.0 + far) / 16.0
+    best = smooth.ArgMax(axis=1)
+    before, middle, after = (
+        smooth.GatherElements((best + BINS + k).Mod(BINS), axis=1) for k in (-1, 0, 1)
+    )
+    bend = before - middle * 2.0 + after
+    shift = bend.Less(0.0).Where((before - after) / (bend * 2.0), 0.0)
+    degrees = (best.Cast(to=FLOAT) + shift) * (360 / BINS)
+    degrees = degrees.Less(0.0).Where(degrees + 360.0, degrees)
+    return degrees.Less(360.0).Where(degrees, 0.0).Squeeze([1])
 
 
 def _near(one: list[Any], other: list[Any]) -> Any:

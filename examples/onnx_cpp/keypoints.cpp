@@ -1,6 +1,6 @@
 // Keypoints of an image by ONNX Runtime, with a file of `deepdetect export onnx`:
 // keypoints MODEL.onnx PHOTO.ppm [PROBABILITY]
-// prints "x y size score" of the best points of all scales; with a probability "x y probability" of
+// prints "x y size angle score" of the best points of all scales; with a probability "x y probability" of
 // each pixel over it.
 #include <onnxruntime_cxx_api.h>
 
@@ -50,7 +50,7 @@ int main(int count, char** words) try {
     auto memory = Ort::MemoryInfo::CreateCpu(OrtArenaAllocator, OrtMemTypeDefault);
     auto input = Ort::Value::CreateTensor<float>(memory, planes.data(), planes.size(), shape, 4);
     const char *inputs[] = {"image"}, *maps[] = {"probability"};
-    const char* points[] = {"keypoints", "scores", "sizes"};
+    const char* points[] = {"keypoints", "scores", "sizes", "angles"};
     if (threshold > 0) {
         auto found = session.Run(Ort::RunOptions(), inputs, &input, 1, maps, 1);
         const float* probability = found[0].GetTensorData<float>();
@@ -59,12 +59,13 @@ int main(int count, char** words) try {
                 std::printf("%d %d %.6f\n", int(k % image.width), int(k / image.width), probability[k]);
         return 0;
     }
-    auto found = session.Run(Ort::RunOptions(), inputs, &input, 1, points, 3);
+    auto found = session.Run(Ort::RunOptions(), inputs, &input, 1, points, 4);
     const float *xy = found[0].GetTensorData<float>(), *scores = found[1].GetTensorData<float>();
-    const float* sizes = found[2].GetTensorData<float>();
+    const float *sizes = found[2].GetTensorData<float>(), *angles = found[3].GetTensorData<float>();
     const int64_t most = found[1].GetTensorTypeAndShapeInfo().GetElementCount();
     for (int64_t k = 0; k < most && scores[k] > 0; k++)  // 0 behind the last point
-        std::printf("%.3f %.3f %.2f %.6f\n", xy[2 * k], xy[2 * k + 1], sizes[k], scores[k]);
+        std::printf("%.3f %.3f %.2f %.2f %.6f\n", xy[2 * k], xy[2 * k + 1], sizes[k], angles[k],
+                    scores[k]);
 } catch (const std::exception& error) {
     std::fprintf(stderr, "keypoints: %s\n", error.what());
     return 2;

@@ -1,6 +1,6 @@
 // Keypoints of a PNG file by onnxruntime-web, with a file of `deepdetect export onnx`:
 // node keypoints.mjs MODEL.onnx PHOTO.png [PROBABILITY]
-// prints "x y size score" of the best points of all scales; with a probability "x y probability" of
+// prints "x y size angle score" of the best points of all scales; with a probability "x y probability" of
 // each pixel over it.
 import { readFileSync } from "node:fs";
 import * as ort from "onnxruntime-web";
@@ -28,15 +28,16 @@ for (let k = 0; k < pixels; k++) {
 
 const session = await ort.InferenceSession.create(readFileSync(model));
 const image = new ort.Tensor("float32", planes, [1, 3, height, width]); // any height and width
-const outputs = Number(threshold) > 0 ? ["probability"] : ["keypoints", "scores", "sizes"];
-const { probability, keypoints, scores, sizes } = await session.run({ image }, outputs);
+const outputs = Number(threshold) > 0 ? ["probability"] : ["keypoints", "scores", "sizes", "angles"];
+const { probability, keypoints, scores, sizes, angles } = await session.run({ image }, outputs);
 const lines = [];
 for (let k = 0; k < (probability ?? scores).data.length; k++) {
   if (probability?.data[k] > Number(threshold)) {
     lines.push(`${k % width} ${Math.floor(k / width)} ${probability.data[k].toFixed(6)}\n`);
   } else if (scores?.data[k] > 0) { // 0 behind the last point
-    const [x, y] = [keypoints.data[2 * k], keypoints.data[2 * k + 1]];
-    lines.push(`${x.toFixed(3)} ${y.toFixed(3)} ${sizes.data[k].toFixed(2)} ${scores.data[k].toFixed(6)}\n`);
+    const [x, y] = [keypoints.data[2 * k], keypoints.data[2 * k + 1]].map((value) => value.toFixed(3));
+    const [size, angle] = [sizes, angles].map(({ data }) => data[k].toFixed(2));
+    lines.push(`${x} ${y} ${size} ${angle} ${scores.data[k].toFixed(6)}\n`);
   }
 }
 process.stdout.write(lines.join(""));

@@ -39,7 +39,7 @@ def test_points(run, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     assert json.loads(result.output)["metadata"]["max_keypoints"] == "70"
     outputs = {value.name: value for value in onnx.load(tmp_path / "made.onnx").graph.output}
-    assert list(outputs) == ["probability", "logits", "keypoints", "scores", "sizes"]
+    assert list(outputs) == ["probability", "logits", "keypoints", "scores", "sizes", "angles"]
     sides = outputs["keypoints"].type.tensor_type.shape.dim
     assert [side.dim_param or side.dim_value for side in sides] == ["batch", 70, 2]
 

@@ -65,8 +65,9 @@ def test_the_points_are_those_of_the_package(
     printed = subprocess.run(words, capture_output=True, text=True, check=True).stdout
     found = np.array([line.split() for line in printed.splitlines()], float)
     expected = PointDetector(2048).detect(photo)
-    assert found.shape == (len(expected), 4)
+    assert found.shape == (len(expected), 5)
     places = np.column_stack([expected.xy, expected.sizes])
     gaps, nearest = cKDTree(found[:, :3]).query(places)
     assert (gaps < 0.05).mean() > 0.98
-    assert np.median(np.abs(found[nearest, 3] - expected.scores)) < 1e-4
+    assert np.median(np.abs(found[nearest, 4] - expected.scores)) < 1e-4
+    assert np.median(np.abs(found[nearest, 3] - expected.angles)) < 0.01

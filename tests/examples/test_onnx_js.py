@@ -70,4 +70,5 @@ def test_the_points_are_those_of_the_package(
     places = np.column_stack([expected.xy, expected.sizes])
     gaps, nearest = cKDTree(found[:, :3]).query(places)
     assert (gaps < 0.05).mean() > 0.98
-    assert np.median(np.abs(found[nearest, 3] - expected.scores)) < 1e-4
+    assert np.median(np.abs(found[nearest, 4] - expected.scores)) < 1e-4
+    assert np.median(np.abs(found[nearest, 3] - expected.angles)) < 0.01

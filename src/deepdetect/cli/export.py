@@ -225,7 +225,7 @@ def onnx(
     WEIGHTS are default, dense, free, an ONNX file that this package has written for any size,
     or a .safetensors file, which needs torch. Input `image`: RGB from 0 to 1; outputs
     `probability` and `logits` for each pixel, and the points of PointDetector: `keypoints`,
-    `scores` and `sizes`. docs/other-programs.md says which file is for which runtime.
+    `scores`, `sizes`, `angles`. docs/other-programs.md says which file is for which runtime.
 
         deepdetect export onnx -o deepdetect.onnx
         deepdetect export onnx dense -o dense-480x640.onnx --size 480x640 --max-keypoints 0

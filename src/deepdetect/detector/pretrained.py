@@ -31,7 +31,7 @@ PADDED_IMAGE = "padded_image"
 LOGITS = "logits"
 """Name of the output that holds logits; an output of another name holds probabilities."""
 
-KEYPOINTS, SCORES, SIZES = POINTS = "keypoints", "scores", "sizes"
+POINTS = "keypoints", "scores", "sizes", "angles"
 """Outputs of files that give points, too: these are not read by the package."""
 
 

@@ -330,11 +330,11 @@ def keep_distant(cell, columns, x, y, radii, last, before, kept):  # type: ignor
     return count
 
 
-# Of OpenCV's arctangent, in degrees: the same bins are voted for.
-_ATAN = tuple(
+ATAN = tuple(
     np.float32(np.float32(c) * np.float32(180 / np.pi))
     for c in (0.9997878412794807, -0.3258083974640975, 0.1555786518463281, -0.04432655554792128)
 )
+"""Of OpenCV's arctangent, in degrees: the same bins are voted for."""
 
 
 @compiled(nogil=True, error_model="numpy")
@@ -358,7 +358,7 @@ def strongest_directions(image, pixels, windows):  # type: ignore[no-untyped-def
     bins = np.empty(room, np.int32)
     across = np.empty(min(side, width), np.float32)
     votes, smooth = np.empty((2, BINS + 1)), np.empty(BINS)
-    p1, p3, p5, p7 = _ATAN
+    p1, p3, p5, p7 = ATAN
     for n in range(len(pixels)):
         column, row = pixels[n, 0], pixels[n, 1]
         radius = int(np.rint(RADIUS_PER_WINDOW * windows[n]))

@@ -36,7 +36,7 @@ def planes_of(*images: np.ndarray) -> np.ndarray:
 
 
 def open_in(runtime: str, path: Path) -> Run:
-    """Return what computes keypoints, scores and sizes of images."""
+    """Return what computes keypoints, scores, sizes and angles of images."""
     if runtime == "openvino":
         openvino = pytest.importorskip("openvino", reason="needs OpenVINO")
         settings = {"INFERENCE_PRECISION_HINT": "f32", "INFERENCE_NUM_THREADS": 1}
@@ -69,15 +69,18 @@ def run(request: pytest.FixtureRequest, path: Path) -> Run:
 
 def share(found: Any, number: int, rgb: np.ndarray, count: int = 2048) -> float:
     """Check the order and what is behind the last point; return the share of Python's points."""
-    xy, scores, sizes = (each[number] for each in found)
-    assert (xy.shape, scores.shape, sizes.shape) == ((count, 2), (count,), (count,))
+    xy, scores, sizes, angles = (each[number] for each in found)
+    assert xy.shape == (count, 2)
+    assert scores.shape == sizes.shape == angles.shape == (count,)
     expected = PointDetector(count).detect(rgb)
     assert expected.sizes is not None
+    assert expected.angles is not None
     here = int((scores > 0).sum())
     assert abs(here - len(expected)) <= (1 - LEAST_SHARE) * max(here, len(expected))
     assert (np.diff(scores) <= 0).all()
     assert (xy[here:] == -1).all()
     assert (sizes[here:] == 0).all()
+    assert (angles[here:] == 0).all()
     if not here:
         return 1.0
     # Sizes differ by at least a pixel, so that levels lie apart as a third coordinate.
@@ -86,6 +89,8 @@ def share(found: Any, number: int, rgb: np.ndarray, count: int = 2048) -> float:
     same = distances < NEAR_PX
     differences = np.abs(scores[nearest[same]] - expected.scores[same])
     assert np.median(differences) < 1e-4
+    turns = np.abs((angles[nearest[same]] - expected.angles[same] + 180) % 360 - 180)
+    assert np.mean(turns < 1) > 0.99
     return float(same.mean())
 
 
@@ -110,7 +115,7 @@ def test_a_batch_gives_those_of_each_image(run: Run, photo: np.ndarray) -> None:
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (2, 30), (3, 3), (9, 4)])
 def test_the_smallest_images_have_none(shape: tuple[int, int], run: Run) -> None:
     image = np.random.default_rng(0).random((1, 3, *shape), np.float32)
-    xy, scores, _ = run(image)
+    xy, scores, *_ = run(image)
     assert scores.max() == 0
     assert xy.max() == -1
 
@@ -126,7 +131,7 @@ def test_one_size_with_maps(tmp_path: Path, photo: np.ndarray) -> None:
     }
     assert list(shapes) == ["probability", "logits", *POINTS]
     assert shapes["keypoints"] == [2, 300, 2]
-    assert shapes["scores"] == shapes["sizes"] == [2, 300]
+    assert shapes["scores"] == shapes["sizes"] == shapes["angles"] == [2, 300]
     images = [photo[:123, :157], photo[9:132, 5:162]]
     found = open_in("onnxruntime", made)(planes_of(*images))
     for k, rgb in enumerate(images):

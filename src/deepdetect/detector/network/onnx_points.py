@@ -25,8 +25,8 @@ MAX_KEYPOINTS = f"{PREFIX}max_keypoints"
 def add_points(model: ModelProto, max_keypoints: int) -> None:
     """Let a model with the input `image` give points, too.
 
-    `keypoints` are (batch, N, 2) float32, x and y in pixels, best first; `scores` and `sizes`
-    (batch, N) float32. Behind the last point of an image they are -1, 0 and 0.
+    `keypoints` are (batch, N, 2) float32, x and y in pixels, best first; `scores`, `sizes` and
+    `angles` (batch, N) float32. Behind the last point of an image they are -1, 0, 0 and 0.
     """
     import onnx
 
