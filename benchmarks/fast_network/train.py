@@ -1,4 +1,4 @@
-"""Train the network `fast` on the views that `views.py` makes meanwhile, for a number of seconds.
+"""Train the network `fast` on views that `views.py` makes meanwhile, for CPU seconds.
 
     python benchmarks/fast_network/train.py VIEWS OUTPUT SECONDS [--init WEIGHTS] [--rate 0.002]
 
@@ -131,8 +131,8 @@ def main() -> None:
         [value for value in each.state_dict().values() if value.is_floating_point()]
         for each in (average, network)
     ]
-    begun, step, seen, shown, taken, losses = time.time(), 0, 0.0, 0.0, time.time(), []
-    while (progress := (time.time() - begun) / given.seconds) < 1:
+    begun, step, seen, shown, taken, losses = time.process_time(), 0, 0.0, 0.0, time.time(), []
+    while (progress := (time.process_time() - begun) / given.seconds) < 1:
         batch = views.batch(rng)
         with torch.autocast("cpu", torch.bfloat16):
             logits = network(images(batch))
@@ -155,7 +155,7 @@ def main() -> None:
         if progress > shown + 0.04:
             shown = progress
             numbers = *scores(average, views.validation()), views.count
-            seconds, rate = time.time() - begun, learning_rate(given.rate, progress)
+            seconds, rate = time.process_time() - begun, learning_rate(given.rate, progress)
             print(step, seen, seconds, rate, np.mean(losses), *numbers, sep=",", flush=True)
             losses = []
     tensors = {name: value.contiguous() for name, value in average.state_dict().items()}
