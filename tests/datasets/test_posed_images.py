@@ -61,6 +61,13 @@ def write_kitti(folder: Path, label: str = "P0: ") -> Path:
     return folder
 
 
+def write_kitti_with_a_matrix(folder: Path) -> Path:
+    write_kitti(folder)
+    (folder / "calib.txt").unlink()
+    (folder / "K.txt").write_text("\n".join(map(text, INTRINSICS)))
+    return folder
+
+
 def write_colmap(folder: Path, model: str = "sparse/0", images: str = "images") -> Path:
     write_images(folder / images, "{:04d}.png")
     place = folder / model
@@ -92,6 +99,7 @@ def near_frames(monkeypatch: pytest.MonkeyPatch) -> None:
 WRITERS: dict[str, Callable[[Path], Path]] = {
     "strecha": write_strecha,
     "kitti": write_kitti,
+    "kitti with K.txt": write_kitti_with_a_matrix,
     "colmap": write_colmap,
 }
 
@@ -176,7 +184,7 @@ def test_scenes_are_the_folder_or_its_subfolders(tmp_path: Path) -> None:
     for name, write in WRITERS.items():
         write(tmp_path / name)
     (tmp_path / "empty").mkdir()
-    assert [scene.name for scene in load_posed_scenes(tmp_path)] == ["colmap", "kitti", "strecha"]
+    assert [scene.name for scene in load_posed_scenes(tmp_path)] == sorted(WRITERS)
     assert [scene.name for scene in load_posed_scenes(tmp_path / "kitti")] == ["kitti"]
 
 

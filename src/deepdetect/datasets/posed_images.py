@@ -2,7 +2,8 @@
 
 - Strecha's (Strecha et al., 2008): NNNN.jpg or .png with NNNN.camera (or NNNN.jpg.camera).
 - KITTI odometry (Geiger et al., 2012): NNNNNN.png or .jpg with calib.txt, whose first line is the
-  projection matrix of the images' camera, and poses.txt, whose line N belongs to image N.
+  projection matrix of the images' camera, or K.txt, its camera matrix, and poses.txt, whose line N
+  belongs to image N.
 - COLMAP's text model (Schönberger and Frahm, 2016): cameras.txt and images.txt in the folder, or
   in its sparse/ or sparse/0/; the images in the folder or in its images/. Without distortion.
 
@@ -117,8 +118,8 @@ def load_posed_scenes(folder: str | Path, max_pairs: int = 60) -> list[PosedScen
     if not readers:
         raise ImageError(
             f"there are no images with cameras in {folder}: it, or each of its folders, must hold "
-            "NNNN.camera files (Strecha), calib.txt and poses.txt (KITTI), or cameras.txt and "
-            "images.txt (COLMAP)"
+            "NNNN.camera files (Strecha), calib.txt or K.txt and poses.txt (KITTI), or cameras.txt "
+            "and images.txt (COLMAP)"
         )
     return [_load_scene(path, read, max_pairs) for path, read in readers.items()]
 
@@ -127,7 +128,7 @@ def _reader(folder: Path) -> Callable[[Path], list[PosedImage]] | None:
     """Return the function that reads the layout of a folder."""
     if any(folder.glob("*.camera")):
         return _read_strecha
-    if (folder / "calib.txt").is_file() and (folder / "poses.txt").is_file():
+    if (folder / "poses.txt").is_file() and _kitti_calibration(folder).is_file():
         return _read_kitti
     return None if _colmap_model(folder) is None else _read_colmap
 
@@ -167,12 +168,21 @@ def _read_strecha(folder: Path) -> list[PosedImage]:
     return images
 
 
+def _kitti_calibration(folder: Path) -> Path:
+    calibration = folder / "calib.txt"
+    return calibration if calibration.is_file() else folder / "K.txt"
+
+
 def _read_kitti(folder: Path) -> list[PosedImage]:
-    calibration, poses = folder / "calib.txt", folder / "poses.txt"
-    words = (_text(calibration).splitlines() or [""])[0].split()
-    if words and words[0].endswith(":"):
-        words = words[1:]
-    projection = _numbers(words, 12, f"the first line of {calibration}").reshape(3, 4)
+    calibration, poses = _kitti_calibration(folder), folder / "poses.txt"
+    if calibration.name == "K.txt":
+        matrix = _numbers(_text(calibration).split(), 9, str(calibration)).reshape(3, 3)
+        projection = np.column_stack([matrix, np.zeros(3)])
+    else:
+        words = (_text(calibration).splitlines() or [""])[0].split()
+        if words and words[0].endswith(":"):
+            words = words[1:]
+        projection = _numbers(words, 12, f"the first line of {calibration}").reshape(3, 4)
     lines = [line for line in _text(poses).splitlines() if line.strip()]
     images = []
     for path in sorted(folder.iterdir()):
