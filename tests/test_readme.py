@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 from skimage import data
 
+from deepdetect.detector.pretrained import PRETRAINED
 from tests.command_line import run_command
 
 ROOT = Path(__file__).parents[1]
@@ -59,10 +60,7 @@ def test_the_command_lines_run(folder: Path, line: str) -> None:
 @pytest.mark.parametrize("line", re.findall(r"\| `([^`]*\([^`]*\))` \|$", README, re.M))
 def test_the_calls_of_the_table_run(folder: Path, line: str) -> None:
     import deepdetect
-    from deepdetect.detector.network.onnx_export import write_onnx
 
-    if "fast.onnx" in line:
-        write_onnx(ROOT / "benchmarks" / "fast_network" / "fast.safetensors", "fast.onnx")
     left = deepdetect.load_image("left.png")
     names = {
         **{name: getattr(deepdetect, name) for name in deepdetect.__all__},
@@ -107,10 +105,10 @@ def test_the_wheel_installs_and_detects(folder: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     weights = target / "deepdetect" / "detector" / "weights"
-    for name in ("default", "dense", "free"):
+    for name in PRETRAINED:
         assert 0 < (weights / f"{name}.onnx").stat().st_size < 2_000_000
         assert 0 < (weights / f"{name}.safetensors").stat().st_size < 2_000_000
-    for name in ("MODEL_CARD.md", "DENSE_CARD.md", "FREE_CARD.md"):
+    for name in ("MODEL_CARD.md", "DENSE_CARD.md", "FREE_CARD.md", "ESPNET_CARD.md"):
         assert (weights / name).exists()
     code = (
         f"import sys; sys.path.insert(0, {str(target)!r}); import deepdetect;"

@@ -87,7 +87,7 @@ def test_tiles_of_a_given_size(
 
 def test_other_networks_are_not_tiled(onnx_file: Callable[..., Path]) -> None:
     assert open_tiled(onnx_file()) is None
-    assert open_tiled(pretrained_weights("default")) is None
+    assert open_tiled(pretrained_weights("espnet")) is None
 
 
 def test_a_size_of_tiles_is_never_ignored(photo: np.ndarray) -> None:
@@ -95,7 +95,7 @@ def test_a_size_of_tiles_is_never_ignored(photo: np.ndarray) -> None:
     with pytest.raises(OptionError, match="resolution='native'"):
         DeepDetect(tile_megapixels=2.0)
     pytest.importorskip("torch", reason="needs torch, which is for training only")
-    torch_weights = pretrained_weights("default", ".safetensors")
+    torch_weights = pretrained_weights("espnet", ".safetensors")
     with pytest.raises(OptionError, match="cannot be run in tiles"):
         DeepDetect(
             torch_weights, backend="torch", resolution="native", tile_megapixels=2.0

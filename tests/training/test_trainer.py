@@ -189,7 +189,7 @@ def test_another_run_in_the_same_folder_is_refused(
     for changes, match in (
         ({"options": dataclasses.replace(OPTIONS, seed=5)}, "`seed`"),
         ({"validation": photographs}, r"\(`images_digest`\)"),
-        ({"init_weights": "default"}, r"\(`frozen_batch_norm`, `initial_weights`\)"),
+        ({"init_weights": "espnet"}, r"\(`frozen_batch_norm`, `initial_weights`\)"),
     ):
         with pytest.raises(OptionError, match=match) as caught:
             fit(run, **changes)
@@ -207,8 +207,8 @@ def test_missing_best_weights_are_told(run: Path, tmp_path: Path, fit, one_line)
 def test_trained_weights_keep_their_batch_statistics_and_learn(
     tmp_path: Path, fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    start = pretrained_weights("default", ".safetensors")
-    fit(tmp_path / "moved", TINY, init_weights="default")
+    start = pretrained_weights("espnet", ".safetensors")
+    fit(tmp_path / "moved", TINY, init_weights="espnet")
     before, after = load_file(start), load_file(tmp_path / "moved" / "best.safetensors")
     kept = {name for name in before if torch.equal(before[name], after[name])}
     statistics = {name for name in before if name.rpartition(".")[2].startswith(("running", "num"))}
@@ -318,7 +318,7 @@ def test_own_images_and_settings_from_the_pretrained_weights(
         "--preset",
         "espnet",
         "--init",
-        "default",
+        "espnet",
         "--label-settings",
         str(settings),
     ]
@@ -342,7 +342,7 @@ def test_two_processes_train_as_one(photographs: Path, labels: Path, tmp_path: P
     for count in (1, 2):
         torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}"]
         arguments = command(
-            photographs, tmp_path / str(count), labels, "--preset", "espnet", "--init", "default"
+            photographs, tmp_path / str(count), labels, "--preset", "espnet", "--init", "espnet"
         )
         arguments[1:1] = torchrun if count > 1 else []
         arguments += ["--device", "cpu", "--learning-rate", "0.0003"]

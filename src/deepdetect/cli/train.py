@@ -96,8 +96,8 @@ def chosen_recipe(
     """Return a preset's training options with the given values changed.
 
     Args:
-        preset: Recipe that the other options change: default (its values are shown here), and of
-            ESPNet espnet, paper (the paper's own), or dense (normal light only, denser labels).
+        preset: Recipe that the other options change: default (its values are shown here), dense
+            (normal light only, denser labels), and of ESPNet espnet or paper (the paper's own).
     """
     if "stages" in values:
         values["stages"] = tuple(map(Stage.parse, values["stages"]))

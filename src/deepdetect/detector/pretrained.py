@@ -19,6 +19,7 @@ PRETRAINED: dict[str, str] = {
     "default": "default",  # photographs in any light
     "dense": "dense",  # two views of a scene in normal light, denser
     "free": "free",  # as default, from photographs of free licences alone
+    "espnet": "espnet",  # the paper's network, for photographs in any light
 }
 """File names without ending, by the names that users choose them by."""
 

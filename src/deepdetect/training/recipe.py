@@ -304,18 +304,9 @@ PRESETS: dict[str, TrainingOptions] = {
         val_count=20,
     ),
     # For two-view geometry (the paper's second weights, Figure 8): normal light only, denser
-    # labels. Meant to start from trained weights of ESPNet.
-    "dense": replace(
-        _ESPNET,
-        stages=(Stage(480, 8, 5, (480,)), Stage(480, 8, 1, (720,)), Stage(240, 32, 3, (240,))),
-        interleave=True,
-        short_sides=(480, 240, 720),
-        dark_fraction=0.0,
-        labels=LABEL_SETTINGS["dense"],
-        optimizer="soap",
-        learning_rate=1.5e-3,
-        warm_up=0.044,
-        val_count=6,
+    # labels. Meant to start from trained weights.
+    "dense": TrainingOptions(
+        dark_fraction=0.0, labels=LABEL_SETTINGS["dense"], learning_rate=1.5e-3
     ),
 }
 

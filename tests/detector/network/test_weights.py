@@ -39,7 +39,7 @@ def test_weights_with_a_tensor_of_another_shape_are_refused(
 
 
 def test_networks_are_not_mixed(fast_files: tuple[Path, Path], tmp_path: Path) -> None:
-    fast, espnet = fast_files[1], pretrained_weights("default", ".safetensors")
+    fast, espnet = fast_files[1], pretrained_weights("espnet", ".safetensors")
     with pytest.raises(WeightsError, match="another network"):
         average_weights([espnet, fast])
     with pytest.raises(OptionError, match="not of the network espnet"):

@@ -16,7 +16,6 @@ from torch.nn.functional import (
     adaptive_max_pool2d,
     interpolate,
     pixel_shuffle,
-    pixel_unshuffle,
     relu,
 )
 
@@ -129,7 +128,7 @@ class FastNetwork(nn.Module):
             exposure, mean = self.exposure(luma)
             gain = self.gain(exposure)
             scaled = (luma - mean) * gain.clamp(*GAIN_RANGE).exp()
-        half = self.encode_half(pixel_unshuffle(scaled, 2))
+        half = self.encode_half(_unshuffled(scaled))
         quarter = self.encode_quarter(half)
         eighth = self.encode_eighth(quarter)
         with torch.autocast(image.device.type, enabled=False):
@@ -144,6 +143,11 @@ class FastNetwork(nn.Module):
         quarter = relu(quarter + _doubled(self.to_quarter(eighth)) + at_quarter)
         half = relu(half + _doubled(self.to_half(quarter)) + at_half)
         return pixel_shuffle(self.logits(self.at_half(half)), 2)
+
+
+def _unshuffled(image: Tensor) -> Tensor:
+    """Return (B, 4, H / 2, W / 2) as `pixel_unshuffle` does, whose ONNX nodes OpenCV misreads."""
+    return torch.cat([image[:, :, y::2, x::2] for y in (0, 1) for x in (0, 1)], 1)
 
 
 def _doubled(features: Tensor) -> Tensor:

@@ -28,7 +28,6 @@ METADATA = {
     "range": "0 to 1",
     "stride": str(STRIDE),
     "padding": "inside: the last row and column are repeated up to the stride, the maps cropped",
-    "precision": "fp32",
     "pixel_origin": "x right, y down, the centre of the first pixel is (0, 0)",
     "producer": "deepdetect",
 }
