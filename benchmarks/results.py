@@ -6,7 +6,7 @@
 The first line (`make results DATA=... ONLY=...`) runs the benchmarks that the results are made of,
 each with a cache, so that what was interrupted goes on, and writes `docs/results/NAME.csv` with the
 command, commit, versions and machine of each in `docs/results/index.json`. The second one fills the
-blocks of README.md and docs/*.md between `<!-- results:NAME -->` and `<!-- /results -->` from these
+blocks of the pages between `<!-- results:NAME -->` and `<!-- /results -->` from these
 files; `<!-- results:NAME first|second -->` names the columns. With --check it only says whether
 the blocks are as the files have them. Some results need the authors' weights.
 """
@@ -32,6 +32,13 @@ BLOCK = re.compile(r"(<!-- results:([\w-]+)(?: ([^\n]*?))? -->\n).*?(<!-- /resul
 
 BENCHMARK = "-m deepdetect benchmark {} --data {{data}} -o {{output}}"
 XFEAT = " --method {published}/peers/xfeat_2048_600x800.onnx"
+PAGES = [
+    page
+    for folder in (".", "docs", "src/deepdetect/detector/weights")
+    for page in sorted((ROOT / folder).glob("*.md"))
+]
+"""In which blocks are filled."""
+
 STAGES = {
     **{
         name: BENCHMARK.format(words)
@@ -44,6 +51,7 @@ STAGES = {
             "hpatches": "hpatches --protocol paper",
             "foreground": "foreground" + XFEAT,
             "low-visibility": "low-visibility --protocol paper" + XFEAT,
+            "oxford-espnet": "oxford --protocol paper --baselines none --weights espnet",
             "oxford-published": "oxford --protocol paper --baselines none --preset published "
             "--weights {published}/published_matching.safetensors",
             "middlebury": "middlebury --geometry-weights dense "
@@ -52,8 +60,11 @@ STAGES = {
             "sfm": "sfm",
         }.items()
     },
-    "label-prediction": "-m deepdetect evaluate {data}/label-samples/val --json "
+    "label-prediction": "-m deepdetect evaluate {data}/label-samples/val --json --scale 0.5 "
+    "--scale 2 --compare espnet --compare free "
     "--compare {published}/published_matching.safetensors",
+    "validation": "benchmarks/validation_photographs.py {data}/photos/val --weights default "
+    "--weights espnet",
     "labels-stereo": "-m deepdetect evaluate-stereo {data}/middlebury/cones "
     "{data}/middlebury/teddy --label-settings paper --label-settings dense --weights default "
     "--weights dense",
@@ -129,17 +140,21 @@ RESULTS = {
     "correct-matches-figure-6": Result(
         "oxford-paper", "oxford_figure6", {pair: (pair, ".0f") for pair in ("graf 1-3", *PAIRS[1:])}
     ),
-    "published-weights": Result(
-        "oxford-published",
-        "oxford_density",
-        {
-            "density": ("mean", ".4f"),
-            "repeatability": ("mean", ".4f", "oxford_repeatability"),
-            **{pair: (pair, ".0f", "oxford_matches") for pair in PAIRS},
-        },
-        rows="DeepDetect, threshold 0.5",
-    ),
+    **{
+        f"{name}-weights": Result(
+            f"oxford-{name}",
+            "oxford_density",
+            {
+                "density": ("mean", ".4f"),
+                "repeatability": ("mean", ".4f", "oxford_repeatability"),
+                **{pair: (pair, ".0f", "oxford_matches") for pair in PAIRS},
+            },
+            rows="DeepDetect, threshold 0.5",
+        )
+        for name in ("espnet", "published")
+    },
     "label-prediction": Result("label-prediction", "0"),
+    "validation": Result("validation", "0"),
     "repeatability-one-to-one": Result(
         "oxford-standard",
         "oxford_refined_repeatability_1px",
@@ -311,11 +326,13 @@ def run_stage(stage: str, data: Path, published: Path | None, work: Path) -> Non
 def evaluated(text: str) -> list[dict[str, Any]]:
     """Return the rows of what `deepdetect evaluate --json` prints, one for each of the weights."""
     report = json.loads(text)
-    names = [(light, name) for light in ("normal", "low") for name in MASKS]
-    return [
-        {"weights": Path(of["weights"]).stem, **{f"{n[0]}, {n[1]}": of[n[0]][n[1]] for n in names}}
-        for of in (report, *report["compare"])
-    ]
+    rows = []
+    for of in (report, *report["compare"]):
+        scores = {light: of[light] for light in LIGHTS}
+        scores |= {f"{of['visibility']} x{of['scale']:g}": of for of in of["scales"]}
+        values = {f"{n}, {name}": score[name] for n, score in scores.items() for name in MASKS}
+        rows.append({"weights": Path(of["weights"]).stem, **values})
+    return rows
 
 
 def printed_tables(text: str) -> list[list[dict[str, str]]]:
@@ -380,7 +397,7 @@ def read_result(name: str) -> list[list[str]]:
 def fill_blocks(write: bool) -> list[str]:
     """Fill the blocks of all pages, or say which pages have blocks that are out of date."""
     stale = []
-    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+    for page in PAGES:
         text = page.read_text(encoding="utf-8")
         filled = BLOCK.sub(lambda m: f"{m[1]}{block(m[2], m[3])}\n{m[4]}", text)
         if filled != text:

@@ -1,6 +1,6 @@
 """Print the scores of weights on a training's validation photographs, and how calibrated they are.
 
-    python benchmarks/validation_photographs.py PHOTOS [--weights default] [--short-side 480]
+    python benchmarks/validation_photographs.py PHOTOS --weights default [--weights espnet ...]
 
 The views, the darkening and the labels are those of `deepdetect train --validation PHOTOS`: in
 normal light, and darkened, with the labels of low visibility. BCE and IoU are means over
@@ -27,26 +27,26 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("photographs", type=Path)
-    parser.add_argument("--weights", default="default", help="name or file")
+    parser.add_argument("--weights", action="append", required=True, help="name or file")
     parser.add_argument("--short-side", type=int, default=480, help="in pixels (default 480)")
     parser.add_argument("--every", type=int, default=1, help="take every n-th (default 1: all)")
     arguments = parser.parse_args()
     options = options_of(arguments.short_side)
     images = list_images(arguments.photographs, options, ())[:: arguments.every]
-    score_one = partial(score, weights=arguments.weights, labels=options.labels)
-    with ProcessPoolExecutor(processor_count()) as pool:
-        scored = list(pool.map(score_one, images))
     print(
-        "| light | photographs | BCE / IoU | calibration error | density | of the labels |\n"
-        "|---|--:|--:|--:|--:|--:|"
+        "| weights | light | photographs | BCE | IoU | calibration error | density "
+        "| of the labels |\n"
+        "|---|---|--:|--:|--:|--:|--:|--:|"
     )
-    for light, rows in zip(("normal", "darkened"), zip(*scored, strict=True), strict=True):
-        found = mean_score(rows)
-        print(
-            f"| {light} | {len(rows)} | {found.loss:.4f} / {found.iou:.3f} | "
-            f"{found.calibration_error:.4f} | "
-            f"{found.density:.4f} | {found.label_density:.4f} |"
-        )
+    for weights in arguments.weights:
+        score_one = partial(score, weights=weights, labels=options.labels)
+        with ProcessPoolExecutor(processor_count()) as pool:
+            scored = list(pool.map(score_one, images))
+        for light, rows in zip(("normal", "darkened"), zip(*scored, strict=True), strict=True):
+            found = mean_score(rows)
+            values = found.loss, found.iou, found.calibration_error, found.density
+            cells = " | ".join(f"{value:.4f}" for value in (*values, found.label_density))
+            print(f"| {weights} | {light} | {len(rows)} | {cells} |")
 
 
 def options_of(short_side_px: int) -> TrainingOptions:
