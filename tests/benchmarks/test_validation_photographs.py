@@ -20,16 +20,17 @@ BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "validation_photographs.p
 def test_scores_both_lights_against_their_own_labels(photo_path: Path) -> None:
     side = 320
     command = [sys.executable, str(BENCHMARK), str(photo_path.parent), "--short-side", str(side)]
+    command += ["--weights", "default"]
     printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     rows = [line.strip("| ").split(" | ") for line in printed.splitlines()[2:]]
-    assert [row[0] for row in rows] == ["normal", "darkened"]
+    assert [row[:2] for row in rows] == [["default", "normal"], ["default", "darkened"]]
     options = TrainingOptions(stages=(Stage(240, 1, 1),), short_sides=(side,))
     normal, dark = list_images(photo_path.parent, options, ())[0].validation_views
     bright = render(load_image(photo_path), normal)
     assert min(bright.shape[:2]) == side
     assert dark.darkening is not None
     views = bright, darken(bright, dark.darkening)
-    for (_, count, scores, error, density, of_labels), view in zip(rows, views, strict=True):
+    for (*_, count, _, iou, error, density, of_labels), view in zip(rows, views, strict=True):
         visibility = "normal" if view is bright else "low"
         label = fuse(luma(view))
         heatmap = DeepDetect(resolution="native").heatmap(view)
@@ -37,6 +38,6 @@ def test_scores_both_lights_against_their_own_labels(photo_path: Path) -> None:
         assert float(of_labels) == pytest.approx(label.mask.mean(), abs=1e-4)
         assert float(density) == pytest.approx((heatmap > 0.5).mean(), abs=1e-3)
         both, either = label.mask & (heatmap > 0.5), label.mask | (heatmap > 0.5)
-        assert float(scores.split(" / ")[1]) == pytest.approx(both.sum() / either.sum(), abs=2e-3)
+        assert float(iou) == pytest.approx(both.sum() / either.sum(), abs=2e-3)
         # The whole error is no smaller than that of the mean.
         assert float(error) >= abs(np.float64(heatmap.mean()) - label.mask.mean()) - 1e-3
