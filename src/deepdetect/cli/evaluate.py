@@ -140,7 +140,7 @@ def evaluate_stereo(
         deepdetect evaluate-stereo cones/ teddy/ --label-settings paper --label-settings mine.toml
 
     Args:
-        weights: default, dense or free, the pretrained weights, or a file; may be repeated.
+        weights: default, dense, free or espnet, the pretrained weights, or a file; may be repeated.
         label_settings: Label settings whose labels are the keypoints, without a network: paper or
             dense, or a file; may be repeated.
     """

@@ -269,7 +269,7 @@ def average(
     *weights: Annotated[
         str,
         Parameter(
-            help=".safetensors files, or default, dense or free; one twice counts double.",
+            help=".safetensors files, or default, dense, free or espnet; one twice counts double.",
             required=True,
         ),
     ],
