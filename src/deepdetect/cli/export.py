@@ -222,8 +222,8 @@ def onnx(
 ) -> cli.Result:
     """Write weights as an ONNX file, for ONNX Runtime, OpenVINO, OpenCV and others.
 
-    WEIGHTS are default, dense, free, espnet, an ONNX file that this package has written for any size,
-    or a .safetensors file, which needs torch. Input `image`: RGB from 0 to 1; outputs
+    WEIGHTS are default, dense, free, espnet, an ONNX file that this package has written for any
+    size, or a .safetensors file, which needs torch. Input `image`: RGB from 0 to 1; outputs
     `probability` and `logits` for each pixel, and the points of PointDetector: `keypoints`,
     `scores`, `sizes`, `angles`. docs/other-programs.md says which file is for which runtime.
 
