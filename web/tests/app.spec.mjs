@@ -152,7 +152,7 @@ test("the address of a new start is taken where the page is open", async ({ page
   await page.goto(app.address.replace(/key=.*/, "key=old"));
   await expect(page.locator("#examples button").first()).toBeVisible();
   await example(page, "Coffee").click();
-  await expect(page.getByRole("alert")).toContainText("key of this page is not that of deepdetect app");
+  await expect(page.getByRole("alert")).toContainText("key of this page is wrong");
   await page.goto(app.address); // the browser only changes what follows the #
   await expect(page.locator("#error")).toBeHidden();
   await example(page, "Coffee").click();

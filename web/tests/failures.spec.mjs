@@ -88,3 +88,16 @@ test("a file that cannot be read does not hide the one before it", async ({ page
   await expect(page.locator("#count")).toContainText("keypoint");
   await expect(page.getByRole("alert")).toContainText("letter.jpg is not a picture");
 });
+
+test("a picture that comes before the page is ready is taken when it is", async ({ page }) => {
+  let answer;
+  const asked = new Promise((resolve) => { answer = resolve; });
+  await page.route("**/config.json", async (route) => {
+    await asked;
+    await route.continue();
+  });
+  await page.goto("./");
+  await page.locator("#file").setInputFiles(join(examples, "coffee.jpg"));
+  answer();
+  await expect(page.locator("#files li")).toHaveCount(1);
+});

@@ -118,6 +118,7 @@ async function guarded(task) {
 
 /** Reads files; what is found in them is asked for by the view. */
 async function addPictures(files) {
+  await starting; // pictures may come before it has asked for the network
   if (!isOpened()) return;
   const room = MAX_PICTURES - page.pictures.length;
   if (files.length > room) {
@@ -309,4 +310,5 @@ function setUpDropping() {
 
 setUp();
 showView("keypoints");
-start().catch(() => showError("The page could not be loaded completely: load it again."));
+const starting = start()
+  .catch(() => showError("The page could not be loaded completely: load it again."));
