@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from deepdetect import OptionError, WeightsError
 from deepdetect.evaluation.baselines.external import find_feature, onnx_feature, plugin_feature
@@ -254,6 +255,54 @@ def test_descriptors_of_the_network_are_kept_and_count_as_learned(
     assert method.describe(rgb, found).tolist() == [[0, 0, 3, 7], [0, 0, 9, 20]]
     best = found[np.array([1])]
     assert method.describe(rgb, best).tolist() == [[0, 0, 9, 20]]
+
+
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
+def test_maxima_of_a_map_of_logits_are_described_between_the_cells(
+    tmp_path: Path, backend: str
+) -> None:
+    onnx = pytest.importorskip("onnx", reason="needs onnx to make networks")
+    pytest.importorskip(backend)
+    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
+    # Logits from -10 to 10 of the grey image, and per 4x4 pixels their mean and its square.
+    nodes = [
+        helper.make_node("Mul", ["image", "twenty"], ["scaled"]),
+        helper.make_node("Sub", ["scaled", "ten"], ["scores"]),
+        helper.make_node("AveragePool", ["image"], ["mean"], kernel_shape=[4, 4], strides=[4, 4]),
+        helper.make_node("Mul", ["mean", "mean"], ["square"]),
+        helper.make_node("Concat", ["mean", "square"], ["descriptors"], axis=1),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "maps",
+        [helper.make_tensor_value_info("image", kind, [1, 1, "height", "width"])],
+        [helper.make_tensor_value_info(name, kind, None) for name in ("descriptors", "scores")],
+        [helper.make_tensor(n, kind, [], [v]) for n, v in (("twenty", 20.0), ("ten", 10.0))],
+    )
+    opset = [helper.make_opsetid("", 13)]
+    path = tmp_path / "maps.onnx"
+    path.write_bytes(
+        helper.make_model(graph, opset_imports=opset, ir_version=8).SerializeToString()
+    )
+    rgb = np.random.default_rng(0).integers(0, 40, (64, 96, 3), np.uint8)
+    bright = {(4, 4): 200, (91, 59): 180, (50, 30): 250, (52, 32): 240, (3, 20): 255, (20, 60): 255}
+    for (x, y), value in bright.items():
+        rgb[y, x] = value
+    method = onnx_feature(path, backend, threads=1)
+    assert method.learned
+    found = method.detect(rgb)
+    # (52, 32) is in the window of a higher one, the last two are nearer than 4 px to the border.
+    assert found.xy.tolist() == [[4, 4], [50, 30], [91, 59]]
+    np.testing.assert_allclose(found.scores, 20 * np.array([200, 250, 180]) / 255 - 10, atol=1e-4)
+    mean = rgb.mean(axis=2).reshape(16, 4, 24, 4).mean(axis=(1, 3)) / 255
+    places = (found.xy.T[::-1] + 0.5) / 4 - 0.5
+    expected = np.stack([map_coordinates(each, places, order=1) for each in (mean, mean**2)])
+    expected /= np.linalg.norm(expected, axis=0)
+    np.testing.assert_allclose(method.describe(rgb, found), expected.T, atol=1e-5)
+    # Of other sizes the nearest multiples of 32 are looked at.
+    larger = np.zeros((72, 100, 3), np.uint8)
+    larger[36:45, 50:60] = 255
+    np.testing.assert_allclose(method.detect(larger).xy.mean(axis=0), [54.5, 40], atol=1)
 
 
 def test_points_without_descriptors_get_upright_rootsift_of_size_4(

@@ -6,31 +6,38 @@ function say more: `learned` (descriptors that need no ratio test), `binary` (co
 distance), and `version`, to be changed when its results change: of its sources only the module's
 own file is watched.
 
-An ONNX file, like XFeat's, has one input, 1x3xHxW RGB in [0, 1] of any or of a fixed size, and
-outputs with the names of that dict in that frame; each may have a leading dimension of 1. An image
-is resized to a fixed size, and the keypoints are scaled back.
+An ONNX file has one input, 1x3xHxW RGB or 1x1xHxW grey (the mean of the three) in [0, 1], of any or
+of a fixed size, and the outputs of that dict in that frame, like XFeat's; each may have a leading
+dimension of 1. Or it has maps, like EdgePoint2's: `scores` 1x1xHxW, logits of which the maxima are
+keypoints, and `descriptors` 1xDxhxw. An image is resized to a fixed size, or for maps to sides that
+are multiples of 32, and the keypoints are scaled back.
 """
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..._shared.errors import OptionError, WeightsError, first_line
 from ..._shared.opencv import cv2
 from ..._shared.options import look_up
-from ...detector.backends.interface import import_onnxruntime
+from ..._shared.records import file_digest
+from ...detector.backends.interface import import_openvino
+from ...detector.backends.onnxruntime_backend import start_session
 from ...features.keypoints import Keypoints
 from .hessian import HESSIAN
 from .method import COMMON_DESCRIPTOR, BaselineError, LocalFeature
 from .opencv import CLASSICAL
+
+MAP_SIDE, MAP_BORDER_PX, MAP_LEAST_LOGIT, MAP_WINDOW = 32, 4, -5, np.ones((5, 5), np.uint8)
+"""EdgePoint2's, of files with maps: sides are multiples of it; keypoints are so far from the border
+or farther, have more than such a logit, and are the highest of such a window."""
 
 
 def find_feature(word: str) -> LocalFeature:
@@ -72,50 +79,114 @@ def plugin_feature(target: str) -> LocalFeature:
     return _external_feature(target, function, version, learned, binary)
 
 
-def onnx_feature(path: str | Path) -> LocalFeature:
-    """Make a local feature of an ONNX file.
+def onnx_feature(
+    path: str | Path, backend: str = "onnxruntime", threads: int | None = None
+) -> LocalFeature:
+    """Make a local feature of an ONNX file, run by "onnxruntime" or "openvino".
 
     Raises:
         WeightsError: the file cannot be opened, or has other inputs or outputs.
     """
     file = Path(path)
     try:
-        data = file.read_bytes()
-        session = import_onnxruntime().InferenceSession(data, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's exceptions have no common base
+        version = file_digest(file)[:16]
+        network = _OPENERS[backend](file, threads)
+    except Exception as error:  # the exceptions of runtimes have no common base
         raise WeightsError(f"{file} is no ONNX file that runs ({first_line(error)})") from None
-    outputs = [output.name for output in session.get_outputs()]
-    shapes = [entry.shape for entry in session.get_inputs()]
-    if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
-        raise WeightsError(f"{file} must have one input 1x3xHxW, RGB, not {shapes}")
-    if not {"keypoints", "scores"} <= set(outputs):
-        raise WeightsError(f"{file} must have the outputs keypoints and scores, not {outputs}")
-    version = hashlib.sha256(data).hexdigest()[:16]
-    detect = partial(_run_onnx, session, outputs)
-    return _external_feature(file.stem, detect, version, learned="descriptors" in outputs)
+    shapes = network.shapes
+    if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] not in (1, 3):
+        raise WeightsError(f"{file} must have one input 1x3xHxW, RGB, or 1x1xHxW, not {shapes}")
+    if "scores" not in network.outputs or not {"keypoints", "descriptors"} & {*network.outputs}:
+        raise WeightsError(
+            f"{file} must have the outputs scores and keypoints, or maps scores and descriptors, "
+            f"not {network.outputs}"
+        )
+    learned = "descriptors" in network.outputs
+    return _external_feature(file.stem, partial(_run_onnx, network), version, learned)
 
 
-def _run_onnx(session: Any, outputs: list[str], rgb: np.ndarray) -> dict[str, np.ndarray]:
+class _Network(NamedTuple):
+    """An ONNX file that is open; sides that are not fixed are no ints."""
+
+    shapes: list[list[Any]]
+    outputs: list[str]
+    run: Callable[[np.ndarray], Iterable[np.ndarray]]
+
+
+def _open_onnxruntime(path: Path, threads: int | None) -> _Network:
+    session = start_session(str(path), threads)
+    shapes, outputs = [x.shape for x in session.get_inputs()], session.get_outputs()
+    name = session.get_inputs()[0].name
+    return _Network(
+        shapes, [x.name for x in outputs], lambda planes: session.run(None, {name: planes})
+    )
+
+
+def _open_openvino(path: Path, threads: int | None) -> _Network:
+    settings: dict[str, object] = {"INFERENCE_PRECISION_HINT": "f32"}
+    if threads is not None:
+        settings["INFERENCE_NUM_THREADS"] = threads
+    model = import_openvino().Core().compile_model(str(path), "CPU", settings)
+    shapes = [
+        [side.get_length() if side.is_static else None for side in x.partial_shape]
+        for x in model.inputs
+    ]
+    outputs = [x.get_any_name() for x in model.outputs]
+    return _Network(shapes, outputs, lambda planes: model([planes]).to_tuple())
+
+
+_OPENERS = {"onnxruntime": _open_onnxruntime, "openvino": _open_openvino}
+
+
+def _run_onnx(network: _Network, rgb: np.ndarray) -> dict[str, np.ndarray]:
     height, width = rgb.shape[:2]
-    entry = session.get_inputs()[0]
+    channels, *sides = network.shapes[0][1:]
+    maps = "keypoints" not in network.outputs
     wanted = [
-        fixed if isinstance(fixed, int) else own
-        for fixed, own in zip(entry.shape[2:], (height, width), strict=True)
+        side if isinstance(side, int) else max(1, round(own / MAP_SIDE)) * MAP_SIDE if maps else own
+        for side, own in zip(sides, (height, width), strict=True)
     ]
     # Area averaging where pixels fall together; where the image grows, that would repeat pixels.
     smaller = wanted[0] <= height and wanted[1] <= width
     method = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
     resized = cv2.resize(rgb, (wanted[1], wanted[0]), interpolation=method)
     planes = np.ascontiguousarray(resized.transpose(2, 0, 1)[None], np.float32) / 255
-    found = dict(zip(outputs, session.run(None, {entry.name: planes}), strict=True))
-    parts = {
-        name: value[0] if value.ndim == rank + 1 else value
-        for name, rank in (("keypoints", 2), ("scores", 1), ("descriptors", 2))
-        if (value := found.get(name)) is not None
-    }
+    if channels == 1:
+        planes = planes.mean(axis=1, keepdims=True)
+    found = dict(zip(network.outputs, network.run(planes), strict=True))
+    if maps:
+        parts = _maxima(found["scores"][0, 0], found["descriptors"][0])
+    else:
+        parts = {
+            name: value[0] if value.ndim == rank + 1 else value
+            for name, rank in (("keypoints", 2), ("scores", 1), ("descriptors", 2))
+            if (value := found.get(name)) is not None
+        }
     # The borders of both frames are the same lines, half a pixel before the first centre.
     scale = np.array([width / wanted[1], height / wanted[0]])
     return {**parts, "keypoints": (parts["keypoints"] + 0.5) * scale - 0.5}
+
+
+def _maxima(logits: np.ndarray, descriptors: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the maxima of (H, W) logits, with descriptors of a (D, h, w) map."""
+    peaks = (logits == cv2.dilate(logits, MAP_WINDOW)) & (logits > MAP_LEAST_LOGIT)
+    inner = slice(MAP_BORDER_PX, -MAP_BORDER_PX)
+    xy = np.argwhere(peaks[inner, inner])[:, ::-1] + MAP_BORDER_PX
+    scale = np.divide(descriptors.shape[:0:-1], logits.shape[::-1])
+    place = (xy + 0.5) * scale - 0.5
+    column, row = np.maximum(np.floor(place), 0).astype(int).T
+    right, below = place.T - (column, row)
+    values = sum(
+        descriptors[:, row + down, column + aside]
+        * (np.abs(1 - down - below) * np.abs(1 - aside - right)).astype(np.float32)
+        for down, aside in np.ndindex(2, 2)
+    )
+    scores = logits[xy[:, 1], xy[:, 0]]
+    return {
+        "keypoints": xy,
+        "scores": scores,
+        "descriptors": (values / np.linalg.norm(values, axis=0)).T,
+    }
 
 
 def _external_feature(
