@@ -149,13 +149,14 @@ test-docs: $(VENV_DOCS)/.test
 notebooks: $(VENV_DOCS)/.test
 	$(VENV_DOCS)/bin/python docs/notebooks/run.py
 
-# Draws the pictures of the README and of docs/method.md again.
+# Draws the pictures of the README, of docs/method.md and of docs/points.md again.
 figures: $(VENV)/.test
 	$(VENV)/bin/python docs/figures/day_dark_blurred.py
 	$(VENV)/bin/python docs/figures/method.py
+	$(VENV)/bin/python docs/figures/times.py
 
 # The tables that README.md and the pages quote, from the data sets in DATA: hours on two cores, and
-# what was interrupted goes on. ONLY="density speed" makes some; DATA= fills the pages alone.
+# what was interrupted goes on. ONLY="density times" makes some; DATA= fills the pages alone.
 results: $(VENV)/.test
 	$(VENV)/bin/python benchmarks/results.py $(DATA) $(if $(PUBLISHED),--published $(PUBLISHED)) \
 		$(if $(ONLY),--only $(ONLY))

@@ -31,14 +31,14 @@ RESULTS_FOLDER = ROOT / "docs" / "results"
 BLOCK = re.compile(r"(<!-- results:([\w-]+)(?: ([^\n]*?))? -->\n).*?(<!-- /results -->)", re.DOTALL)
 
 BENCHMARK = "-m deepdetect benchmark {} --data {{data}} -o {{output}}"
-XFEAT = " --method {published}/peers/xfeat_2048_600x800.onnx"
+PEERS = ("xfeat_2048_600x800", "edgepoint2_t32", "edgepoint2_e64")
+XFEAT = f" --method {{published}}/peers/{PEERS[0]}.onnx"
 PAGES = [
     page
     for folder in (".", "docs", "src/deepdetect/detector/weights")
     for page in sorted((ROOT / folder).glob("*.md"))
 ]
 """In which blocks are filled."""
-
 STAGES = {
     **{
         name: BENCHMARK.format(words)
@@ -56,7 +56,6 @@ STAGES = {
             "--weights {published}/published_matching.safetensors",
             "middlebury": "middlebury --geometry-weights dense "
             "--geometry-weights {published}/published_reconstruction.safetensors",
-            "speed": "speed" + XFEAT,
             "sfm": "sfm",
         }.items()
     },
@@ -71,6 +70,8 @@ STAGES = {
     "disparity": "benchmarks/row_matching.py {data}/middlebury",
     "motorcycle": "benchmarks/motorcycle_matching.py",
     "costs": "benchmarks/costs.py {data}/fountain/0004.jpg {data}/fountain/0005.jpg",
+    "times": "benchmarks/times.py {data} --cache {output}/cache"
+    + "".join(f" --method {{published}}/peers/{name}.onnx" for name in PEERS),
     "published-pipeline": "benchmarks/published_pipeline.py {data}",
     "fuzz": "-m fuzz",
 }
@@ -249,6 +250,7 @@ RESULTS = {
     "disparity": Result("disparity", "0"),
     "motorcycle": Result("motorcycle", "0"),
     "costs": Result("costs", "0"),
+    "times": Result("times", "0"),
     "published-pipeline": Result("published-pipeline", "0"),
     "fuzz": Result("fuzz", "0"),
     "foreground": Result(
@@ -274,15 +276,6 @@ RESULTS = {
             "smoky, precision": ("smoky 1-2, precision", ".1%"),
         },
     ),
-    "speed": Result(
-        "speed",
-        "speed",
-        {
-            "keypoints": ("keypoints", ".0f"),
-            **{f"{s}, s": (f"{s}, s", ".3f") for s in ("detect", "describe", "match")},
-            "match, MB": ("match, MB", ".0f"),
-        },
-    ),
 }
 
 
@@ -300,6 +293,8 @@ def main() -> None:
             run_stage(stage, arguments.data, arguments.published, arguments.work)
         for name in arguments.only:
             write_result(name, arguments.work)
+        if "times" in arguments.only:
+            subprocess.run([sys.executable, ROOT / "docs" / "figures" / "times.py"], check=True)
     stale = fill_blocks(write=not arguments.check)
     if arguments.check and stale:
         raise SystemExit(f"run python benchmarks/results.py: {', '.join(stale)} is out of date")
@@ -339,13 +334,14 @@ def printed_tables(text: str) -> list[list[dict[str, str]]]:
     r"""Return the rows of the Markdown tables in a text.
 
     Example:
-        >>> printed_tables("| a | b |\n|---|--:|\n| x | 1,024 |\n| y | – |\n")
-        [[{'a': 'x', 'b': '1024'}, {'a': 'y', 'b': ''}]]
+        >>> printed_tables("| a | b |\n|---|--:|\n| x\\|y | 1,024 |\n| y | – |\n")
+        [[{'a': 'x|y', 'b': '1024'}, {'a': 'y', 'b': ''}]]
     """
     tables = []
     for block in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
         head, _, *rows = (
-            [cell.strip() for cell in line[1:-1].split("|")] for line in block.splitlines()
+            [cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line[1:-1])]
+            for line in block.splitlines()
         )
         plain = [[re.sub(r"(?<=\d),(?=\d{3})|^–$", "", cell) for cell in row] for row in rows]
         tables.append([dict(zip(head, row, strict=True)) for row in plain])

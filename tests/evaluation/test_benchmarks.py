@@ -21,7 +21,7 @@ from deepdetect.evaluation.baselines.opencv import CLASSICAL
 from deepdetect.evaluation.benchmarks import BENCHMARKS, run_benchmarks
 from deepdetect.evaluation.metrics import repeatability
 from deepdetect.evaluation.options import DEFAULT_PROTOCOLS, BenchmarkOptions
-from deepdetect.evaluation.protocols import speed
+from deepdetect.evaluation.protocols import masks
 from deepdetect.evaluation.report import Report
 from deepdetect.features.keypoints import Keypoints
 
@@ -230,23 +230,6 @@ def test_hpatches_has_the_tables_of_all_protocols(
     assert rows[ALL_PIXELS]["viewpoint, 1 scenes"] == 1
 
 
-def test_the_speed_reads_nothing_from_the_cache(
-    oxford_folder: Path, options: BenchmarkOptions, tmp_path: Path
-) -> None:
-    few = dataclasses.replace(options, classical=("fast-low",))
-    report = run_benchmarks(["speed"], oxford_folder, few, cache=tmp_path / "cache")
-    assert not (tmp_path / "cache").exists()
-    rows = table(report, "speed")
-    picture = gray(images(oxford_folder, "graf")[0])
-    fast = cv2.FastFeatureDetector_create(1, False).detect(picture, None)
-    assert rows["FAST, low settings"]["keypoints"] == len(fast)
-    assert rows["FAST, low settings"]["slowest over fastest round"] >= 1
-    for name, row in rows.items():
-        assert all(row[f"{stage}, s"] > 0 for stage in ("describe", "match"))
-        # To know how many random points are wanted, the detector runs that they follow.
-        assert (row["detect, s"] is None) == name.startswith("baseline")
-
-
 def test_unknown_names_and_missing_data_are_said(
     tmp_path: Path, options: BenchmarkOptions, one_line
 ) -> None:
@@ -254,8 +237,6 @@ def test_unknown_names_and_missing_data_are_said(
         run_benchmarks(["oxfrod"], tmp_path, options)
     one_line(caught.value)
     for name in BENCHMARKS:
-        if name == "speed":
-            continue
         with pytest.raises(ImageError) as missing:
             run_benchmarks([name], tmp_path, options)
         assert str(tmp_path) in one_line(missing.value)
@@ -267,10 +248,10 @@ def test_a_missing_package_stops_only_the_benchmark_that_needs_it(
     def lacks(run: object, options: object) -> list:
         raise MissingExtraError("this needs pycolmap")
 
-    known = {"one": ("speed", "lacks"), "other": ("speed", "works")}
+    known = {"one": ("masks", "lacks"), "other": ("masks", "works")}
     monkeypatch.setattr(benchmarks, "BENCHMARKS", known)
-    monkeypatch.setattr(speed, "lacks", lacks, raising=False)
-    monkeypatch.setattr(speed, "works", lambda *_: [], raising=False)
+    monkeypatch.setattr(masks, "lacks", lacks, raising=False)
+    monkeypatch.setattr(masks, "works", lambda *_: [], raising=False)
     options = BenchmarkOptions(edge_detector, ("paper", "guided"))
     report = run_benchmarks(["one", "other"], tmp_path, options)
     notes = "the benchmark one: this needs pycolmap", "other: it has no protocol paper or guided"

@@ -28,7 +28,6 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "sfm": ("sfm", "sfm"),
     "foreground": ("paper", "foreground"),
     "low-visibility": ("planar", "low_visibility"),
-    "speed": ("speed", "speed"),
 }
 """Module of `protocols`, imported when it is run, and its function, by the benchmark's name."""
 

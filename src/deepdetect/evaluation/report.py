@@ -112,18 +112,12 @@ def average(style: str, name: Any, **wanted: Any) -> tuple[str, Measure]:
 
 def median(style: str, name: Any) -> tuple[str, Measure]:
     """Make the column of the median of a value, over the rows where it is not None."""
-    return style, lambda rows: median_of(rows, name)
 
+    def of_known(rows: Rows) -> Cell:
+        known = [row[name] for row in rows if row[name] is not None]
+        return float(np.median(known)) if known else None
 
-def median_of(rows: Iterable[Row], name: Any) -> float | None:
-    """Return the median of the values of this name that are not None; None without any."""
-    known = [row[name] for row in rows if row[name] is not None]
-    return float(np.median(known)) if known else None
-
-
-def largest(style: str, name: Any) -> tuple[str, Measure]:
-    """Make the column of the largest value."""
-    return style, lambda rows: max((row[name] for row in rows), default=None)
+    return style, of_known
 
 
 def tabulate(

@@ -33,7 +33,6 @@ class LocalFeature:
         describe: function from the image and its keypoints to (N, D) descriptors.
         binary: the descriptors are compared by Hamming's distance, else by Euclid's.
         learned: the descriptors were learned for their detector and need no ratio test.
-        chance: the points know nothing about the image, and the time they take means nothing.
         version: what results depend on besides the name: cached ones of another are not used.
         detection: what the keypoints depend on, where several features share them.
         own_scale: how keypoints with sizes of their own are described at these.
@@ -45,7 +44,6 @@ class LocalFeature:
     describe: Callable[[np.ndarray, Keypoints], np.ndarray]
     binary: bool = False
     learned: bool = False
-    chance: bool = False
     version: str = "1"
     detection: str = ""
     own_scale: OwnScaleDescriptor | None = None

@@ -47,9 +47,7 @@ def random_feature(like: LocalFeature, name: str = "random") -> LocalFeature:
 
     title = f"baseline: as many random points as {like.title}"
     version = f"{like.name} {like.version} 0"
-    return LocalFeature(
-        name, title, detect, PAPER_DESCRIPTOR.describe, chance=True, version=version
-    )
+    return LocalFeature(name, title, detect, PAPER_DESCRIPTOR.describe, version=version)
 
 
 def all_pixels_feature() -> LocalFeature:
@@ -62,4 +60,4 @@ def all_pixels_feature() -> LocalFeature:
         return Keypoints(xy, 1 - bayer_order(xy, (width, height)), (width, height))
 
     title = "baseline: all pixels (a grid, where there is a budget)"
-    return LocalFeature("all-pixels", title, detect, PAPER_DESCRIPTOR.describe, chance=True)
+    return LocalFeature("all-pixels", title, detect, PAPER_DESCRIPTOR.describe)

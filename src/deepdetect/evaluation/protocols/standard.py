@@ -23,7 +23,6 @@ from ..metrics.homography import (
 )
 from ..metrics.repeatability import coverage, mutual_nn_repeatability
 from ..options import BenchmarkOptions
-from ..profiling import Profile
 from ..report import (
     Cell,
     Columns,
@@ -34,15 +33,12 @@ from ..report import (
     Section,
     Table,
     average,
-    largest,
     line_chart,
     mean,
-    median,
-    median_of,
     tabulate,
     where,
 )
-from ..run import MatchSettings, PairMatches, Run
+from ..run import MatchSettings, Run
 
 BUDGETS: tuple[int | None, ...] = (512, 1024, 2048, 4096, 8192, None)
 """Numbers of keypoints; None: all."""
@@ -58,8 +54,6 @@ MIN_FILLED = 0.9
 
 MAX_CHANCE = 0.95
 """Chance beyond which nothing can be distinguished from it."""
-
-STAGES = ("detect", "describe", "match")
 
 MATCHING_NOTE = (
     f"The best {MATCHING_BUDGET:,} keypoints of each image; the same upright RootSIFT of size "
@@ -102,10 +96,10 @@ def pair_row(
         By name: "kind"; ("keypoints", budget) in the image that has fewer; ("repeated", budget,
         radius), and the same of "chance" and "localization"; ("coverage", budget) of the first
         image; "matches", and ("correct", px), ("precision", px) and ("score", px); "all matches"
-        and ("accuracy", px) without a ratio test; "corner errors" by seed; and `stage_costs`.
+        and ("accuracy", px) without a ratio test; and "corner errors" by seed.
     """
     images = (pair.first, pair.second)
-    (first, detected), (second, _) = (run.keypoints(feature, image) for image in images)
+    first, second = (run.keypoints(feature, image)[0] for image in images)
     sizes = first.image_size, second.image_size
     ratio = 1.0 if feature.learned else RATIO
     settings = MatchSettings("exact", ratio, mutual=True, budget=MATCHING_BUDGET)
@@ -140,19 +134,7 @@ def pair_row(
     places = [first.distinct(), second.distinct()]
     for budget in budgets:
         row |= _at_budget(run, feature, pair, places, budget)
-    return row | stage_costs(feature, detected, matches)
-
-
-def stage_costs(feature: LocalFeature, detected: Profile, matches: PairMatches) -> Row:
-    """Return ("seconds", stage), ("MB", stage), and the "seconds" of a pair, detected in twice.
-
-    Without seconds of detecting random points: they are those of the detector that they follow.
-    """
-    row: Row = {}
-    for stage, profile in zip(STAGES, (detected, matches.describe, matches.match), strict=True):
-        row["seconds", stage], row["MB", stage] = profile.seconds, profile.memory / 1e6
-    row["seconds"] = detected.seconds + sum(row["seconds", stage] for stage in STAGES)
-    return row | ({"seconds": None, ("seconds", "detect"): None} if feature.chance else {})
+    return row
 
 
 def _at_budget(
@@ -219,7 +201,7 @@ def standard_tables(
         ("matching", f"Matches, {what}", MATCHING_COLUMNS, MATCHING_NOTE),
         ("homography", f"Homographies, {what}", _homography_columns(), HOMOGRAPHY_NOTE),
         ("accuracy", f"Mean matching accuracy, {what}", ACCURACY_COLUMNS, ACCURACY_NOTE),
-        ("cost", "Coverage, time and memory", COST_COLUMNS, COST_NOTE),
+        ("coverage", f"Coverage, {what}", COVERAGE_COLUMNS, COVERAGE_NOTE),
     ]
     return [
         tabulate(f"{key}_{name}", title, features, rows, {**PAIRS, **columns}, note)
@@ -300,17 +282,7 @@ ACCURACY_COLUMNS: Columns = {
     **{f"{px} px": average(".3f", ("accuracy", px)) for px in MATCH_THRESHOLDS_PX},
 }
 
-SECONDS_COLUMNS: Columns = {f"{s}, s": median(".3f", ("seconds", s)) for s in STAGES}
-
-MEMORY_COLUMNS: Columns = {f"{s}, MB": largest(",.0f", ("MB", s)) for s in STAGES}
-
-COST_COLUMNS: Columns = {
-    **{f"coverage, {budget_name(b)}": average(".3f", ("coverage", b)) for b in BUDGETS},
-    **SECONDS_COLUMNS,
-    "pair, s": median(".3f", "seconds"),
-    "correct at 1 px": (",.0f", correct),
-    **MEMORY_COLUMNS,
-}
+COVERAGE_COLUMNS: Columns = {budget_name(b): average(".3f", ("coverage", b)) for b in BUDGETS}
 
 REPEATABILITY_NOTE = (
     "Keypoints that are mutual nearest neighbours, at most the radius apart, over the fewer of "
@@ -338,20 +310,13 @@ ACCURACY_NOTE = (
     "any method: fraction of the matches within each distance, mean over the pairs."
 )
 
-COST_NOTE = (
-    "Coverage: fraction of the cells of 32x32 px that hold a keypoint of the first image. "
-    "Seconds: the median when the results were made, on whatever else the machine did then; "
-    "detecting in one image, describing both, matching the pair at "
-    f"{MATCHING_BUDGET:,} keypoints (`deepdetect benchmark speed` compares on equal terms). "
-    "Pair: detecting in both images, describing and matching them. "
-    "Memory: the largest growth of the process."
-)
+COVERAGE_NOTE = "Fraction of the cells of 32x32 px that hold a keypoint of the first image."
 
 
 def standard_figures(
     features: Sequence[LocalFeature], rows: Rows, key: str, what: str
 ) -> list[Figure]:
-    """Draw accuracy, repeatability and time; their numbers are in the tables."""
+    """Draw accuracy and repeatability; their numbers are in the tables."""
     measured = [(feature, own) for feature in features if (own := where(rows, method=feature.name))]
     accuracy = {
         feature.title: (
@@ -375,12 +340,4 @@ def standard_figures(
         png = line_chart(lines, "keypoints per image", label, logarithmic=True, ticks=budgets)
         title = f"Repeatability within {radius:g} px against the number of keypoints, {what}"
         figures.append(Figure(f"{key}_repeatability_{radius:g}px", title, png))
-    points = {
-        feature.title: ([seconds], [count])
-        for feature, own in measured
-        if (seconds := median_of(own, "seconds")) and (count := correct(own)) is not None
-    }
-    label = f"correct matches at 1 px of {MATCHING_BUDGET:,} keypoints"
-    x_label = "detecting, describing and matching a pair, s"
-    png = line_chart(points, x_label, label, logarithmic=True)
-    return [*figures, Figure(f"{key}_time", f"Time against correct matches, {what}", png)]
+    return figures
