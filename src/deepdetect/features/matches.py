@@ -74,6 +74,8 @@ class GuidedMatches:
         scores: (M,) float32 in [0, 1], higher is better.
         subpixel: whether the positions are sub-pixel ones, of a rectified pair.
         indices1: (M,) int64 keypoints of the second image; None where the positions are others.
+        points0: (M, 2) float64 positions in the first image where they are not those of keypoints:
+            then the index of a match that no keypoint is near is -1.
     """
 
     indices0: np.ndarray
@@ -81,12 +83,17 @@ class GuidedMatches:
     scores: np.ndarray
     subpixel: bool = False
     indices1: np.ndarray | None = None
+    points0: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.indices0)
 
+    def starts(self, xy0: np.ndarray) -> np.ndarray:
+        """Return the positions in the first image, (M, 2), of keypoints at `xy0`."""
+        return xy0[self.indices0] if self.points0 is None else self.points0
+
     def joined(self, other: GuidedMatches, chosen: np.ndarray) -> GuidedMatches:
-        """Return these matches and those of the (M,) bool `chosen` of others."""
+        """Return these matches and those of the (M,) bool `chosen` of others, of keypoints."""
         order = np.argsort(np.append(self.indices0, other.indices0[chosen]), kind="stable")
 
         def both(name: str) -> np.ndarray:
@@ -104,7 +111,8 @@ class GuidedMatches:
         kept = np.sort(best_first[first])
         columns = self.indices0[kept], self.points1[kept], self.scores[kept]
         indices1 = None if self.indices1 is None else self.indices1[kept]
-        return GuidedMatches(*columns, self.subpixel, indices1)
+        points0 = None if self.points0 is None else self.points0[kept]
+        return GuidedMatches(*columns, self.subpixel, indices1, points0)
 
 
 class _Lazy:

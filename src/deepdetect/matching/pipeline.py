@@ -202,11 +202,11 @@ def match_images(
         return _no_matches(*keypoints, guide, timer)
     if mutual:
         matched = matched.unique()
-    points = keypoints0.xy[matched.indices0], matched.points1.astype(np.float32)
+    # Where a keypoint of the second image is none of a match, its end is where the pixel of the
+    # first one is seen.
+    points = matched.starts(pixels[0]).astype(np.float32), matched.points1.astype(np.float32)
     if matched.indices1 is not None:
-        points = points[0], keypoints1.xy[matched.indices1]
-    else:  # the end in the second image is where the pixel of the first one is seen
-        points = np.rint(points[0]), points[1]
+        points = keypoints0.xy[matched.indices0], keypoints1.xy[matched.indices1]
     points = _ordered(points, swapped)
     indices0, indices1 = _ordered((matched.indices0, matched.indices1), swapped)
     with timer.stage("geometry"):

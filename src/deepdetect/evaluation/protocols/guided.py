@@ -171,7 +171,7 @@ def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -
         return {
             "model": trusted.model,
             "matrix": np.empty((0, 3)) if trusted.matrix is None else trusted.matrix,
-            "points0": np.empty((0, 2)) if found is None else first[found.indices0],
+            "points0": np.empty((0, 2)) if found is None else found.starts(first),
             "points1": np.empty((0, 2)) if found is None else found.points1,
             "seconds": profiler.total.seconds,
         }

@@ -28,6 +28,7 @@ from ...geometry.two_view import (
 )
 from .initial_geometry import InitialGeometry, Pair, guiding_geometry
 from .rectified import match_by_rectification
+from .repetition import is_repeated
 from .verification import dissimilarity
 
 MIN_VERIFIED_FRACTION = 0.5
@@ -57,6 +58,13 @@ that agree with its geometry are taken."""
 
 MIN_MATCHES = 8
 """With fewer the geometry is not trusted after all."""
+
+NEIGHBOURS, MIN_MOVING_ALIKE = 8, 0.6
+"""Sparse matches around one that verify it, and the fraction of them that must move alike."""
+
+MAX_MOVE_DIFFERENCE, MOVE_NOISE_PX = 0.35, 2.0
+"""By which turn and scale of two steps between matches may differ, relative to the scale: what is
+tilted or has depth moves so; and by which a step may be wrong."""
 
 MAX_DISTANCE_PX = 1.0
 """From where the homography takes a keypoint to its partner."""
@@ -93,29 +101,38 @@ def guided_matches(
         geometry, matches = _match_depth(grays, pixels[0], first, enough)
     if matches is None:
         return geometry, None
-    geometry = _with_scene(grays, pixels[0], geometry, matches, seed)
+    geometry, plane = _with_scene(grays, pixels[0], geometry, matches, seed)
+    if plane is not None and is_repeated(grays, *plane):
+        return replace(geometry, model="none", matrix=None, scene="none"), None
     further = _with_further_planes(grays, pixels, geometry, matches, first, enough, seed)
     return geometry, further
 
 
 def _with_scene(
     grays: Pair, xy0: np.ndarray, geometry: TwoViewGeometry, matches: GuidedMatches, seed: int
-) -> TwoViewGeometry:
-    """Say what the dense matches show, by the homography that most of some of them agree with."""
+) -> tuple[TwoViewGeometry, Pair | None]:
+    """Say what the dense matches show, by the homography that most of some of them agree with.
+
+    Returns the matched points of the first image that lie on its plane, and it, too.
+    """
     sizes = grays[0].shape[::-1], grays[1].shape[::-1]
-    points0, points1 = xy0[matches.indices0].astype(np.float64), matches.points1
+    points0, points1 = matches.starts(xy0).astype(np.float64), matches.points1
     some = np.random.default_rng(seed).permutation(len(points0))[:SCENE_MATCHES]
     if geometry.model == "homography":
+        assert geometry.matrix is not None
         rotation = is_usual_rotation(points0[some], points1[some], sizes)
         scene = "rotation" if rotation else "planar"
-        return replace(geometry, scene=scene, on_plane=len(matches))
+        told = replace(geometry, scene=scene, on_plane=len(matches))
+        return told, (points0, geometry.matrix)
     threshold_px = GUIDING_THRESHOLDS_PX["homography"]
     plane = fit_model(points0[some], points1[some], "homography", sizes[1], threshold_px, seed)
     if plane.matrix is None or np.mean(plane.inliers) < DOMINANT_FRACTION:
-        return replace(geometry, scene="depth")
-    off = int(np.count_nonzero(transfer_errors(points0, points1, plane.matrix) > OFF_PLANE_PX))
+        return replace(geometry, scene="depth"), None
+    near = transfer_errors(points0, points1, plane.matrix) <= OFF_PLANE_PX
+    on = int(np.count_nonzero(near))
     scene = "depth with a dominant plane"
-    return replace(geometry, scene=scene, on_plane=len(matches) - off, off_plane=off)
+    geometry = replace(geometry, scene=scene, on_plane=on, off_plane=len(matches) - on)
+    return geometry, (points0[near], plane.matrix)
 
 
 def _plane_or_depth(
@@ -141,7 +158,7 @@ def _plane_or_depth(
             depth, (geometry, matches) = other, found
     if matches is None:
         return plane if planar or plane[1] is not None else (geometry, None)
-    errors = transfer_errors(pixels[0][matches.indices0], matches.points1, matrix)
+    errors = transfer_errors(matches.starts(pixels[0]), matches.points1, matrix)
     new = ~np.isin(matches.indices0, on_plane.indices0)
     off = int(np.count_nonzero(new & (errors > OFF_PLANE_PX)))
     if planar:
@@ -162,7 +179,7 @@ def _with_further_planes(
     seed: int,
 ) -> GuidedMatches:
     """Add the matches of planes that move otherwise, by sparse matches that nothing explains."""
-    if first.others is None:
+    if first.others is None or matches.points0 is not None:
         return matches
     assert geometry.matrix is not None
     points0, points1 = (
@@ -222,13 +239,33 @@ def _trusted(
 
 
 def _sparse_matches(gray0: np.ndarray, xy0: np.ndarray, first: InitialGeometry) -> GuidedMatches:
-    """Return the sparse matches that agree with the geometry, moved to the keypoints near them."""
-    height, width = gray0.shape
-    rows, distances = nearest_keypoints(first.points0, xy0, (width, height))
-    near = np.isfinite(distances)
-    moved = first.points1[near] + xy0[rows[near]] - first.points0[near]
-    rows, order = np.unique(rows[near].astype(np.int64), return_index=True)
-    return GuidedMatches(rows, moved[order], np.full(len(rows), 0.5, np.float32))
+    """Return the sparse matches that move as those around them do, where they are."""
+    scores = moving_alike(first.points0, first.points1)
+    kept = scores >= MIN_MOVING_ALIKE
+    points0 = first.points0[kept]
+    rows, distances = nearest_keypoints(points0, xy0, gray0.shape[::-1])
+    rows = np.where(np.isfinite(distances), rows, -1).astype(np.int64)
+    ends = first.points1[kept], scores[kept].astype(np.float32)
+    return GuidedMatches(rows, *ends, subpixel=True, points0=points0)
+
+
+def moving_alike(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
+    """Return the fraction of the matches nearest to each of (M, 2) that move as it does.
+
+    Each of them and the match itself give a turn and a scale; those count that agree with one.
+    """
+    neighbours = min(NEIGHBOURS, len(points0) - 1)
+    if neighbours < 1:
+        return np.zeros(len(points0))
+    first, second = points0 @ [1, 1j], points1 @ [1, 1j]
+    distances = np.abs(first[:, None] - first)
+    nearest = np.argsort(distances, axis=1)[:, 1 : neighbours + 1]
+    steps = first[nearest] - first[:, None]
+    moves = (second[nearest] - second[:, None]) / steps
+    allowed = MAX_MOVE_DIFFERENCE * np.abs(moves)[:, :, None]
+    allowed = allowed + MOVE_NOISE_PX / np.abs(steps)[:, None]
+    alike = np.abs(moves[:, :, None] - moves[:, None]) < allowed
+    return np.asarray(alike.sum(axis=2).max(axis=1) / neighbours)
 
 
 def match_by_homography(

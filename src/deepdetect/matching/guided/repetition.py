@@ -1,0 +1,96 @@
+"""Whether a homography is one of several that a repeated pattern allows: windows, tiles, fences.
+
+Patches cannot tell: they are as much alike one period further on. So the aligned images are
+correlated at all shifts, and where one of these is nearly as good, the places that only one of the
+two homographies explains decide.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..._shared.opencv import cv2
+from ...geometry.homography_refinement import refine_homography
+from ...geometry.images import (
+    BLUR_SIGMA_PX,
+    downscale,
+    erode_mask,
+    gaussian_blur,
+    local_zncc,
+    normalise_local_contrast,
+    warp_to_reference,
+)
+from ...geometry.transforms import scaled_homography, scaled_points
+from .initial_geometry import Pair
+
+COMPARED_SIDE_PX = 320
+"""Longer side to which images are reduced: periods of a pattern are many pixels."""
+
+MIN_SHIFT_PX = 10
+"""Of the reduced images: nearer the correlation is that of what is aligned."""
+
+MAX_SHIFTS = 4
+"""That are compared, the best."""
+
+MIN_RELATIVE_CORRELATION = 0.5
+"""Of a shift, relative to that without one, for it to be compared. Planes of Oxford have up to
+0.27, those of Strecha's entry up to 0.40, made facades of one window from 0.54 on."""
+
+MIN_OVERLAP = 0.6
+"""Of the overlap without a shift, that there is after it: else what tells them apart is hidden."""
+
+MIN_ZNCC, MIN_ZNCC_GAIN = 0.5, 0.2
+"""A place is explained with this correlation, and by one homography alone where that of the other
+is lower by this."""
+
+MIN_OWN_FRACTION, MIN_OWN_RATIO = 0.02, 2.0
+"""Of the explained places, those that a homography explains alone, and how many times those that
+its shifted copy explains alone."""
+
+
+def is_repeated(grays: Pair, points0: np.ndarray, homography: np.ndarray) -> bool:
+    """Return whether a shifted copy of a homography explains (N, 2) points as well as it does."""
+    (first, scale0), (second, scale1) = (downscale(gray, COMPARED_SIDE_PX) for gray in grays)
+    matrix = scaled_homography(homography, scale0, scale1)
+    last = np.array(first.shape[::-1]) - 1
+    places = np.unique(np.rint(scaled_points(points0, scale0)).clip(0, last), axis=0)
+    x, y = places.astype(np.int64).T
+    own = _correlation(first, second, matrix)[y, x]
+    for shift in _similar_shifts(first, *warp_to_reference(second, matrix, first.shape[::-1])):
+        shifted = np.eye(3)
+        shifted[:2, 2] = shift
+        other = refine_homography(first, second, matrix @ shifted)
+        others = _correlation(first, second, other)[y, x]
+        explained = np.fmax(own, others) > MIN_ZNCC  # not for NaN in both
+        gain = (own - others)[explained & np.isfinite(own) & np.isfinite(others)]
+        alone, other_alone = np.sum(gain > MIN_ZNCC_GAIN), np.sum(gain < -MIN_ZNCC_GAIN)
+        if alone < max(MIN_OWN_FRACTION * len(gain), MIN_OWN_RATIO * other_alone):
+            return True
+    return False
+
+
+def _correlation(first: np.ndarray, second: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    """Return the local ZNCC of two images in the frame of the first, (H, W)."""
+    warped, valid = warp_to_reference(second, homography, first.shape[::-1])
+    first, warped = (gaussian_blur(gray, BLUR_SIGMA_PX) for gray in (first, warped))
+    return local_zncc(first, warped, erode_mask(valid, BLUR_SIGMA_PX))
+
+
+def _similar_shifts(first: np.ndarray, warped: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Return the shifts (dx, dy) after which aligned images correlate nearly as without one."""
+    size = [cv2.getOptimalDFTSize(2 * side) for side in first.shape]
+
+    def correlate(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.fft.irfft2(np.conj(np.fft.rfft2(a, size)) * np.fft.rfft2(b, size), size)
+
+    a, b = normalise_local_contrast(first), normalise_local_contrast(warped) * valid
+    energy = np.maximum(correlate(a * a, valid), 1) * np.maximum(correlate(a * 0 + 1, b * b), 1)
+    overlap = correlate(np.ones(first.shape), valid) >= MIN_OVERLAP * np.count_nonzero(valid)
+    values = np.where(overlap, correlate(a, b) / np.sqrt(energy), -1.0)
+    side = 2 * MIN_SHIFT_PX + 1
+    peaks = (cv2.dilate(values, np.ones((side, side))) == values) & overlap
+    peaks &= values > MIN_RELATIVE_CORRELATION * values[0, 0]
+    shifts = np.argwhere(peaks)
+    shifts = shifts[np.argsort(-values[peaks], kind="stable")]
+    shifts = np.where(shifts > np.array(size) / 2, shifts - size, shifts)[:, ::-1]
+    return shifts[np.abs(shifts).max(axis=1) > MIN_SHIFT_PX][:MAX_SHIFTS]
