@@ -60,6 +60,9 @@ REACH_PER_SIGMA = 4
 
 VARIANCES = (SIGMAS_PX**2).astype(np.float32)
 
+FIRST, LAST = 1, len(SIGMAS_PX) - 3
+"""Levels that have candidates."""
+
 MARGIN = NMS_RADIUS + 1
 """Pixels around a candidate that are looked at: a window, and one more to differentiate."""
 
@@ -176,14 +179,11 @@ class Graph:
         given = [Tensor(body, f"{body.prefix}given{k}") for k in range(2 + len(state))]
         results = step(*given)
         kinds = [(INT64, ()), (BOOL, ()), *[(INT64, None)] * len(state)]
-        made = [*kinds[1:], *[(FLOAT, None)] * (len(results) - 1 - len(state))]
-        inputs, outputs = (
-            [
-                helper.make_tensor_value_info(tensor.name, *kind)
-                for tensor, kind in zip(tensors, types, strict=True)
-            ]
-            for tensors, types in ((given, kinds), (results, made))
-        )
+        inputs = [
+            helper.make_tensor_value_info(each.name, *kind)
+            for each, kind in zip(given, kinds, strict=True)
+        ]
+        outputs = [helper.make_empty_tensor_value_info(each.name) for each in results]
         graph = helper.make_graph(body.nodes, "step", inputs, outputs, [*body.constants.values()])
         return self.add("Loop", count, True, *state, outputs=len(results) - 1, body=graph)
 
@@ -216,25 +216,15 @@ def rank_candidates(gray: Any, limit: Any = None) -> tuple[Any, Any, Any, Any]:
     graph = gray.graph
     height, width = (gray.Shape(start=axis, end=axis + 1) for axis in (2, 3))
     mean = gray.ReduceMean(axes=[1, 2, 3]).Round()
-    maps, strengths, places = [], [], []
-    for k, (smooth, peaks) in enumerate(_levels((gray - mean) / 255.0, height, width)):
-        maps.append(smooth)
-        if peaks is not None:
-            most = peaks.Greater(0.0).Cast(to=FLOAT).ReduceSum([1], keepdims=0)
-            most = most.ReduceMax(axes=[0]).Cast(to=INT64).Max([1])
-            most = most.Min(limit) if limit else most
-            strength, place = peaks.TopK(most, axis=1, outputs=2)
-            strengths.append(strength)
-            places.append(place + height * width * k)
-    strength = graph.join(strengths, axis=1)
-    count = strength.Shape(start=1)
-    count = count.Min(limit) if limit else count
-    strength, order = strength.TopK(count, axis=1, outputs=2)
+    maps, peaks = zip(*_levels((gray - mean) / 255.0, height, width), strict=True)
+    strength = graph.join(peaks[FIRST : LAST + 1], axis=1)
+    count = strength.Greater(0.0).Cast(to=FLOAT).ReduceSum([1], keepdims=0)
+    count = count.ReduceMax(axes=[0]).Cast(to=INT64)
+    count = (count.Min(limit) if limit else count).Max([1])
     missing = count.Mod(CHUNK) * -1 + CHUNK
     padding = graph.join([[0, 0, 0], missing], axis=0)
-    strength = strength.Pad(padding)
-    place = graph.join(places, axis=1).GatherElements(order, axis=1).Pad(padding)
-    level, pixel = place / (height * width), place.Mod(height * width)
+    strength, place = (each.Pad(padding) for each in strength.TopK(count, axis=1, outputs=2))
+    level, pixel = place / (height * width) + FIRST, place.Mod(height * width)
     pixels = level, pixel / width, pixel.Mod(width)
     flat = graph.join(maps, axis=1).Flatten()
 
@@ -269,7 +259,7 @@ def _levels(smooth: Any, height: Any, width: Any) -> Iterator[tuple[Any, Any]]:
         # Gaussians add up by their variances: each level smooths the one before.
         smooth = _blur(smooth, step, height, width)
         frame = _framed(_framed(smooth, MARGIN, 2, height), MARGIN, 3, width)
-        if not 0 < k < len(SIGMAS_PX) - 2:
+        if not FIRST <= k <= LAST:
             yield frame, None
             continue
         response = _determinant(frame, MARGIN, VARIANCES[k]).Abs()
