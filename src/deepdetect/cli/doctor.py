@@ -20,7 +20,7 @@ PURPOSES = {
     "heif": "images of iPhones (.heic)",
     "labels": "label and train, with all nine detectors",
     "onnx": "export onnx",
-    "openvino": "a faster network on CPUs",
+    "openvino": "--backend openvino and --precision bfloat16",
     "ray": "extract, match-many, label and shards on a cluster",
     "sfm": "reconstruct of three images and more, extract, match-many and export",
     "train": "train, average, and weights in .safetensors",

@@ -7,7 +7,6 @@ To add a backend, write its module beside this one with a function
 from __future__ import annotations
 
 import functools
-import importlib.util
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -104,9 +103,4 @@ def _choose(path: Path, options: RuntimeOptions) -> str:
         return "torch"
     if suffix != ".onnx":
         raise WeightsError(f"{path} is no weights file: it must end in .onnx or .safetensors")
-    if options.precision != "float32":
-        return "openvino"
-    # OpenVINO is 1.5 times as fast on CPUs and gives the same probabilities to 1e-3.
-    if options.device == "cpu" and importlib.util.find_spec("openvino") is not None:
-        return "openvino"
-    return "onnxruntime"
+    return "onnxruntime" if options.precision == "float32" else "openvino"

@@ -1,4 +1,4 @@
-"""The fast network: plain 3x3 convolutions of the luma, and a global term of the whole image.
+"""The fast network: plain convolutions of the luma, and a global term of the whole image.
 
 A label is made of the luma by detectors of small windows, so a few plain convolutions see enough;
 runtimes compute these at their best, as they do not dilated branches and sums. But its thresholds
@@ -78,11 +78,11 @@ class Perceptron(nn.Sequential):
 
 
 class Convolution(nn.Module):
-    """A 3x3 convolution, batch normalisation, ReLU; stride 2 halves the size."""
+    """A convolution, batch normalisation, ReLU; stride 2 halves the size."""
 
-    def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
+    def __init__(self, inputs: int, outputs: int, stride: int = 1, kernel: int = 3) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
+        self.conv = nn.Conv2d(inputs, outputs, kernel, stride, (kernel - 1) // 2, bias=False)
         self.norm = nn.BatchNorm2d(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -105,7 +105,9 @@ class FastNetwork(nn.Module):
         self.gain = Perceptron(BINS + 2, 32, 1)
         nn.init.zeros_(self.gain.get_parameter("2.weight"))
         nn.init.ones_(self.gain.get_parameter("2.bias"))
-        self.encode_half = nn.Sequential(Convolution(4, HALF), Convolution(HALF, HALF))
+        self.encode_half = nn.Sequential(
+            Convolution(1, HALF, stride=2, kernel=6), Convolution(HALF, HALF)
+        )
         self.encode_quarter = Convolution(HALF, QUARTER, stride=2)
         self.encode_eighth = nn.Sequential(
             Convolution(QUARTER, EIGHTH, stride=2), Convolution(EIGHTH, EIGHTH)
@@ -128,7 +130,7 @@ class FastNetwork(nn.Module):
             exposure, mean = self.exposure(luma)
             gain = self.gain(exposure)
             scaled = (luma - mean) * gain.clamp(*GAIN_RANGE).exp()
-        half = self.encode_half(_unshuffled(scaled))
+        half = self.encode_half(scaled)
         quarter = self.encode_quarter(half)
         eighth = self.encode_eighth(quarter)
         with torch.autocast(image.device.type, enabled=False):
@@ -140,14 +142,9 @@ class FastNetwork(nn.Module):
             shifts = self.shifts(torch.cat([exposure, gain, *pooled], 1)).to(half.dtype)
         at_eighth, at_quarter, at_half = shifts.split((EIGHTH, QUARTER, HALF), 1)
         eighth = relu(eighth + at_eighth)
-        quarter = relu(quarter + _doubled(self.to_quarter(eighth)) + at_quarter)
-        half = relu(half + _doubled(self.to_half(quarter)) + at_half)
+        quarter = relu(quarter + _doubled(self.to_quarter(eighth) + at_quarter))
+        half = relu(half + _doubled(self.to_half(quarter) + at_half))
         return pixel_shuffle(self.logits(self.at_half(half)), 2)
-
-
-def _unshuffled(image: Tensor) -> Tensor:
-    """Return (B, 4, H / 2, W / 2) as `pixel_unshuffle` does, whose ONNX nodes OpenCV misreads."""
-    return torch.cat([image[:, :, y::2, x::2] for y in (0, 1) for x in (0, 1)], 1)
 
 
 def _doubled(features: Tensor) -> Tensor:
