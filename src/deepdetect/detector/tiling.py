@@ -37,7 +37,7 @@ AVERAGES, MAXIMA = (
     tuple(f"/network/Global{kind}Pool{number}_output_0" for number in ("", "_1", "_2"))
     for kind in ("Average", "Max")
 )
-SHIFTS = "/network/shifts/Unsqueeze_1_output_0"
+THRESHOLDS = "/network/thresholds/Unsqueeze_1_output_0"
 """Tensors at which the network is cut, as `export_onnx` names them: all have four dimensions."""
 
 SCALES = (4, 2, 1)
@@ -59,13 +59,13 @@ class TiledNetwork:
     """A network in parts.
 
     `expose` maps the luma that is counted to its mean and the gain; `encode` an image and these to
-    features; `shift` that luma, averages and maxima to what is added to the features; `decode` an
-    image, mean, gain and shifts to logits.
+    features; `threshold` that luma, averages and maxima to the features' thresholds; `decode` an
+    image, mean, gain and thresholds to logits.
     """
 
     expose: Part
     encode: Part
-    shift: Part
+    threshold: Part
     decode: Part
 
     def __call__(self, rgb: np.ndarray, tile_megapixels: float | None = None) -> np.ndarray:
@@ -91,9 +91,9 @@ class TiledNetwork:
                 (total / (height * width * scale**2)).astype(np.float32)
                 for total, scale in zip(sums, SCALES, strict=True)
             ]
-            shifts = self.shift(counted, *averages, *maxima)
+            thresholds = self.threshold(counted, *averages, *maxima)
             for rows, columns in tiles:
-                (found,) = self.decode(_planes(rgb, rows.seen, columns.seen), *light, *shifts)
+                (found,) = self.decode(_planes(rgb, rows.seen, columns.seen), *light, *thresholds)
                 inner = _times(rows.inner, STRIDE), _times(columns.inner, STRIDE)
                 logits[_times(rows.core, STRIDE), _times(columns.core, STRIDE)] = found[0, 0][inner]
                 bar.update(1)
@@ -131,8 +131,8 @@ def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwo
         return TiledNetwork(
             part((COUNTED,), LIGHT),
             part(("image", *LIGHT), FEATURES),
-            part((COUNTED, *AVERAGES, *MAXIMA), (SHIFTS,)),
-            part(("image", *LIGHT, SHIFTS), (LOGITS,)),
+            part((COUNTED, *AVERAGES, *MAXIMA), (THRESHOLDS,)),
+            part(("image", *LIGHT, THRESHOLDS), (LOGITS,)),
         )
     except Exception:  # parts that are not there or not alone in the file
         return None

@@ -63,7 +63,7 @@ def test_the_global_term_sees_the_whole_image(fast_network: FastNetwork) -> None
     assert (before - after)[..., :256].abs().mean() > 1e-3
     # What the convolutions see is less than the 32 px by which tiles overlap.
     fast_network = copy.deepcopy(fast_network)
-    fast_network.shifts[2].weight.data.zero_()
+    fast_network.thresholds[2].weight.data.zero_()
     fast_network.gain[2].weight.data.zero_()
     changed = image.clone()
     changed[0, 1, 1::8, 257::8] = 1 - changed[0, 1, 1::8, 257::8]  # not counted: the mean stays

@@ -4,7 +4,7 @@ A label is made of the luma by detectors of small windows, so a few plain convol
 runtimes compute these at their best, as they do not dilated branches and sums. But its thresholds
 are relative to the strongest response anywhere and to the range of the grey levels. So a global
 term (histogram of the luma, means and maxima of the features) scales the luma at the start, and
-shifts the features before they are enlarged again.
+gives thresholds of the features before they are enlarged again.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class FastNetwork(nn.Module):
             Convolution(QUARTER, EIGHTH, stride=2), Convolution(EIGHTH, EIGHTH)
         )
         features = HALF + QUARTER + EIGHTH
-        self.shifts = Perceptron(BINS + 2 + 1 + 2 * features, 64, features)
+        self.thresholds = Perceptron(BINS + 2 + 1 + 2 * features, 64, features)
         self.to_quarter = nn.Conv2d(EIGHTH, QUARTER, 1)
         self.to_half = nn.Conv2d(QUARTER, HALF, 1)
         self.at_half = Convolution(HALF, HALF)
@@ -139,11 +139,11 @@ class FastNetwork(nn.Module):
                 for features in (half, quarter, eighth)
                 for pool in (adaptive_avg_pool2d, adaptive_max_pool2d)
             ]
-            shifts = self.shifts(torch.cat([exposure, gain, *pooled], 1)).to(half.dtype)
-        at_eighth, at_quarter, at_half = shifts.split((EIGHTH, QUARTER, HALF), 1)
-        eighth = relu(eighth + at_eighth)
-        quarter = relu(quarter + _doubled(self.to_quarter(eighth) + at_quarter))
-        half = relu(half + _doubled(self.to_half(quarter) + at_half))
+            thresholds = self.thresholds(torch.cat([exposure, gain, *pooled], 1)).to(half.dtype)
+        at_eighth, at_quarter, at_half = thresholds.split((EIGHTH, QUARTER, HALF), 1)
+        eighth = relu(eighth - at_eighth)
+        quarter = relu(quarter + _doubled(self.to_quarter(eighth) - at_quarter))
+        half = relu(half + _doubled(self.to_half(quarter) - at_half))
         return pixel_shuffle(self.logits(self.at_half(half)), 2)
 
 
