@@ -148,6 +148,8 @@ def match(
         "density1": round(matches.keypoints1.density, 6),
         "matches": len(matches),
         "inliers": int(matches.inliers.sum()),
+        "one_to_one": len(matches.unique()),
+        "confidence": matches.confidence,
         "model": matches.model,
         "matrix": None if matches.matrix is None else matches.matrix.tolist(),
         "guided": matches.guided,

@@ -42,6 +42,12 @@ class TwoViewGeometry:
             scene tell two poses from known cameras, those of a rotation no translation.
         on_plane, off_plane: number of matches on the plane that most of them lie on, where there
             is one, and of the others.
+        verified: fraction of what it proposed that the images confirm: of a homography the partners
+            of keypoints, else the keypoints of the first image that are matched, or, where only
+            sparse matches are returned, these.
+        correlation: median local ZNCC of both images, after the homography of `on_plane`, or around
+            the matches.
+        confidence: "high", "fair" (only sparse matches, or weak evidence) or "none".
     """
 
     model: str
@@ -53,6 +59,9 @@ class TwoViewGeometry:
     scene: str = "none"
     on_plane: int = 0
     off_plane: int = 0
+    verified: float = 0.0
+    correlation: float = 0.0
+    confidence: str = "none"
 
     def swapped(self) -> TwoViewGeometry:
         """Return the geometry from the second image to the first."""
@@ -184,7 +193,7 @@ class Matches:
         >>> ends = points.xy, points.xy
         >>> m = Matches(*ends, [0.5, 0.2], [True, False], "none", None, points, points)
         >>> m
-        Matches(2 matches of 2 and 2 keypoints, 1 inliers, model='none', guided=False)
+        Matches(2 matches of 2 and 2 keypoints, 1 inliers, model='none', confidence='none')
         >>> m[m.inliers].indices1.tolist()
         [0]
     """
@@ -238,6 +247,14 @@ class Matches:
     def success(self) -> bool:
         """False where a geometry was to guide these matches and none could be trusted."""
         return self.two_view_geometry is None or self.guided
+
+    @property
+    def confidence(self) -> str:
+        """How far these matches can be trusted as a whole: "high", "fair" or "none".
+
+        By their `two_view_geometry`; without one "none".
+        """
+        return "none" if self.two_view_geometry is None else self.two_view_geometry.confidence
 
     @property
     def homography(self) -> np.ndarray | None:
@@ -355,7 +372,7 @@ class Matches:
         return (
             f"Matches({len(self)} matches of {len(self.keypoints0)} and {len(self.keypoints1)} "
             f"keypoints, {np.count_nonzero(self.inliers)} inliers, model={self.model!r}, "
-            f"guided={self.guided})"
+            f"confidence={self.confidence!r})"
         )
 
     def _checked_indices(self, indices: np.ndarray, side: int) -> np.ndarray:

@@ -161,19 +161,19 @@ def test_a_second_run_reads_what_the_first_has_kept(folder: Path, tmp_path: Path
     world = np.random.default_rng(0).uniform((-3, -2, 5), (3, 2, 10), (60, 3))
     seen = world, world @ pair.rotation.T + pair.translation
     points = [(p @ pair.first.intrinsics.T / p[:, 2:])[:, :2] for p in seen]
-    method = PoseMethod("made up", "Made up", lambda _: (*points, 2.5, "fundamental"))
+    method = PoseMethod("made up", "Made up", lambda _: (*points, 2.5, "fundamental", "high"))
     runs = Run(folder, tmp_path), Run(folder, tmp_path)
     once, again = (pose_row(run, method, pair) for run in runs)
     assert [run.made for run in runs] == [1, 0]
     assert once == again
     assert once["pose error, °"] < 0.1
     assert (once["matches"], once["agreeing within 1 px"], once["seconds"]) == (60, 1.0, 2.5)
-    assert once["guided by"] == "fundamental"
+    assert (once["guided by"], once["confidence"]) == ("fundamental", "high")
 
 
 def test_too_few_matches_are_a_failure_not_an_error(folder: Path) -> None:
     (pair,) = load_posed_scenes(folder)[0].pairs
-    nothing = np.empty((0, 2)), np.empty((0, 2)), 1.0, ""
+    nothing = np.empty((0, 2)), np.empty((0, 2)), 1.0, "", ""
     found = pose_row(Run(folder), PoseMethod("nothing", "Nothing", lambda _: nothing), pair)
     assert found["rotation error, °"] == found["pose error, °"] == INF
     assert (found["matches"], found["agreeing within 1 px"]) == (0, 0.0)

@@ -54,6 +54,9 @@ def test_nearly_all_points_of_a_plane_are_matched_right(
     assert len(matches) > 0.85 * seen.sum()
     assert ((matches.scores > 0) & (matches.scores <= 1)).all()
     assert matches.inliers.all()
+    assert matches.confidence == "high"
+    assert matches.two_view_geometry.verified > 0.8
+    assert matches.two_view_geometry.correlation > 0.9
     assert len(np.unique(matches.points0, axis=0)) == len(matches)
 
 

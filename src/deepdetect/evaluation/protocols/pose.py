@@ -84,9 +84,9 @@ NOTE = (
     "the pairs; no matches count as 0."
 )
 
-Found = tuple[np.ndarray, np.ndarray, float, str]
-"""The (M, 2) matched positions of two images, the seconds that it took, and what guided:
-"homography", "fundamental" or "none"; "" for methods that are never guided."""
+Found = tuple[np.ndarray, np.ndarray, float, str, str]
+"""The (M, 2) matched positions of two images, the seconds that it took, what guided: "homography",
+"fundamental" or "none", and the confidence; "" for methods that are never guided."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,8 +156,9 @@ def pose_methods(run: Run, options: BenchmarkOptions) -> list[PoseMethod]:
 def _match_images(detector: DeepDetect, way: dict[str, Any], images: tuple[Path, Path]) -> Found:
     options = MatchingOptions(matcher="patchmatch")
     found = match_images(*images, detector, model="none", options=options, **way)
-    guided_by = found.two_view_geometry.model if found.two_view_geometry is not None else ""
-    return found.points0, found.points1, sum(found.seconds.values()), guided_by
+    geometry, seconds = found.two_view_geometry, sum(found.seconds.values())
+    told = ("", "") if geometry is None else (geometry.model, geometry.confidence)
+    return found.points0, found.points1, seconds, *told
 
 
 def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
@@ -169,7 +170,7 @@ def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
         detect = [run.keypoints(feature, image)[1].seconds for image in images]
         found = run.matches(feature, images, settings)
         seconds = sum(detect) + found.describe.seconds + found.match.seconds
-        return found.points0, found.points1, seconds, ""
+        return found.points0, found.points1, seconds, "", ""
 
     title = f"{feature.title}, {test}"
     return PoseMethod(feature.name, title, match, (*feature.key, settings))
@@ -186,22 +187,23 @@ def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
 
     def make() -> Row:
         assert match is not None
-        points0, points1, seconds, guided_by = match(images)
+        points0, points1, seconds, guided_by, confidence = match(images)
         return {
             **_errors(estimate_pose(points0, points1, *cameras), pair),
             "matches": len(points0),
             AGREEING: epipolar_inlier_ratio(points0, points1, pair.fundamental),
             "seconds": seconds,
             "guided by": guided_by,
+            "confidence": confidence,
         }
 
     if match is None:
-        nothing: Row = dict.fromkeys(("matches", AGREEING, "seconds", "guided by"))
+        nothing: Row = dict.fromkeys(("matches", AGREEING, "seconds", "guided by", "confidence"))
         return _errors((np.eye(3), np.array([0.0, 0.0, -1.0])), pair) | nothing
     truth = (*cameras, pair.rotation, pair.translation)
     estimate = (THRESHOLD_PX, CONFIDENCE, EPIPOLAR_THRESHOLD_PX)
     row = run.cached("pose", (method.name, method.version, images, truth, estimate), make)
-    return row | {"guided by": row["guided by"] or None}
+    return row | {name: row[name] or None for name in ("guided by", "confidence")}
 
 
 def _errors(pose: tuple[np.ndarray, np.ndarray] | None, pair: PosedPair) -> Row:
@@ -316,6 +318,7 @@ PAIR_COLUMNS = {
     "matches": ",d",
     AGREEING: ".1%",
     "guided by": "",
+    "confidence": "",
     "seconds": ".2f",
 }
 

@@ -49,8 +49,11 @@ flat, have up to 0.013, facades from 0.032 on."""
 SCENE_MATCHES = 1000
 """Of the dense matches, drawn at random, say what a scene is like."""
 
-DOMINANT_FRACTION = 0.5
-"""Of them on one plane: a dominant one."""
+DOMINANT_FRACTION, MIN_PLANE_FRACTION = 0.5, 0.2
+"""Of them on one plane: a dominant one; one that is looked at for repeated patterns."""
+
+MAX_CLEAR_LOG10_NFA, MIN_CLEAR_CORRELATION = -12.0, 0.5
+"""Of matches of high confidence."""
 
 MIN_MATCHED_FRACTION = 0.02
 """With a smaller fraction of the keypoints of a scene with depth matched, only the sparse matches
@@ -61,6 +64,9 @@ MIN_MATCHES = 8
 
 NEIGHBOURS, MIN_MOVING_ALIKE = 8, 0.6
 """Sparse matches around one that verify it, and the fraction of them that must move alike."""
+
+MIN_ALIKE_FRACTION = 0.3
+"""Of the sparse matches, that must be verified: at random places up to a tenth is."""
 
 MAX_MOVE_DIFFERENCE, MOVE_NOISE_PX = 0.35, 2.0
 """By which turn and scale of two steps between matches may differ, relative to the scale: what is
@@ -102,8 +108,14 @@ def guided_matches(
     if matches is None:
         return geometry, None
     geometry, plane = _with_scene(grays, pixels[0], geometry, matches, seed)
-    if plane is not None and is_repeated(grays, *plane):
-        return replace(geometry, model="none", matrix=None, scene="none"), None
+    correlation = float(np.median(matches.scores))
+    if plane is not None:
+        repeated, correlation = is_repeated(grays, *plane)
+        if repeated:
+            return replace(geometry, model="none", matrix=None, scene="none"), None
+    clear = geometry.log10_nfa < MAX_CLEAR_LOG10_NFA and correlation > MIN_CLEAR_CORRELATION
+    confidence = "high" if clear and matches.points0 is None else "fair"
+    geometry = replace(geometry, correlation=correlation, confidence=confidence)
     further = _with_further_planes(grays, pixels, geometry, matches, first, enough, seed)
     return geometry, further
 
@@ -124,14 +136,17 @@ def _with_scene(
         scene = "rotation" if rotation else "planar"
         told = replace(geometry, scene=scene, on_plane=len(matches))
         return told, (points0, geometry.matrix)
+    proposed = len(xy0) if matches.points0 is None else geometry.tentative_inliers
+    geometry = replace(geometry, scene="depth", verified=len(matches) / max(proposed, 1))
     threshold_px = GUIDING_THRESHOLDS_PX["homography"]
     plane = fit_model(points0[some], points1[some], "homography", sizes[1], threshold_px, seed)
-    if plane.matrix is None or np.mean(plane.inliers) < DOMINANT_FRACTION:
-        return replace(geometry, scene="depth"), None
+    if plane.matrix is None or np.mean(plane.inliers) < MIN_PLANE_FRACTION:
+        return geometry, None
     near = transfer_errors(points0, points1, plane.matrix) <= OFF_PLANE_PX
     on = int(np.count_nonzero(near))
-    scene = "depth with a dominant plane"
-    geometry = replace(geometry, scene=scene, on_plane=on, off_plane=len(matches) - on)
+    if np.mean(plane.inliers) >= DOMINANT_FRACTION:
+        scene, off = "depth with a dominant plane", len(matches) - on
+        geometry = replace(geometry, scene=scene, on_plane=on, off_plane=off)
     return geometry, (points0[near], plane.matrix)
 
 
@@ -144,7 +159,8 @@ def _plane_or_depth(
     on_plane, verified = match_by_homography(grays, pixels, matrix, seed)
     planar = first.parallax is None or verified >= MIN_VERIFIED_FRACTION
     off_plane = first.parallax is not None and first.parallax.significant
-    plane = _trusted(first, matrix, on_plane, max(enough, MIN_MATCHES))
+    plane = _trusted(first, matrix, on_plane, enough)
+    plane = replace(plane[0], verified=verified), plane[1]
     if planar and not off_plane:
         return plane
     depth = guiding_geometry(grays, "fundamental", seed, first.source)
@@ -225,15 +241,16 @@ def _match_depth(
             dense = match_by_rectification(grays, xy0, sparse, first.matrix, plane=plane)
     if dense is None or len(dense[1]) < enough:
         # Too little around the sparse matches is alike, but they are distinct, and agree.
-        dense = first.matrix, _sparse_matches(grays[0], xy0, first)
-    return _trusted(first, *dense, MIN_MATCHES)
+        alike = _sparse_matches(grays[0], xy0, first)
+        return _trusted(first, first.matrix, alike, MIN_ALIKE_FRACTION * len(first.points0))
+    return _trusted(first, *dense, enough)
 
 
 def _trusted(
     first: InitialGeometry, matrix: np.ndarray, matches: GuidedMatches, least: float
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
     """Return a geometry with its matches; with fewer than `least` it is not trusted after all."""
-    if len(matches) < least:
+    if len(matches) < max(least, MIN_MATCHES):
         return first.untrusted().as_two_view_geometry(), None
     return replace(first, matrix=matrix).as_two_view_geometry(), matches
 

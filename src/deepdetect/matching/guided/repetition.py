@@ -48,14 +48,19 @@ MIN_OWN_FRACTION, MIN_OWN_RATIO = 0.02, 2.0
 its shifted copy explains alone."""
 
 
-def is_repeated(grays: Pair, points0: np.ndarray, homography: np.ndarray) -> bool:
-    """Return whether a shifted copy of a homography explains (N, 2) points as well as it does."""
+def is_repeated(grays: Pair, points0: np.ndarray, homography: np.ndarray) -> tuple[bool, float]:
+    """Return whether a shifted copy of a homography explains (N, 2) points as well as it does.
+
+    And the median correlation of both images around these points.
+    """
     (first, scale0), (second, scale1) = (downscale(gray, COMPARED_SIDE_PX) for gray in grays)
     matrix = scaled_homography(homography, scale0, scale1)
     last = np.array(first.shape[::-1]) - 1
     places = np.unique(np.rint(scaled_points(points0, scale0)).clip(0, last), axis=0)
     x, y = places.astype(np.int64).T
     own = _correlation(first, second, matrix)[y, x]
+    known = own[np.isfinite(own)]
+    correlation = float(np.median(known)) if len(known) else 0.0
     for shift in _similar_shifts(first, *warp_to_reference(second, matrix, first.shape[::-1])):
         shifted = np.eye(3)
         shifted[:2, 2] = shift
@@ -65,8 +70,8 @@ def is_repeated(grays: Pair, points0: np.ndarray, homography: np.ndarray) -> boo
         gain = (own - others)[explained & np.isfinite(own) & np.isfinite(others)]
         alone, other_alone = np.sum(gain > MIN_ZNCC_GAIN), np.sum(gain < -MIN_ZNCC_GAIN)
         if alone < max(MIN_OWN_FRACTION * len(gain), MIN_OWN_RATIO * other_alone):
-            return True
-    return False
+            return True, correlation
+    return False, correlation
 
 
 def _correlation(first: np.ndarray, second: np.ndarray, homography: np.ndarray) -> np.ndarray:

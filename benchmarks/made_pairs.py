@@ -1,0 +1,206 @@
+"""Pairs that are made of photographs: small planes, unrelated scenes, facades that repeat.
+
+    python benchmarks/made_pairs.py DATA [--only planes|refusal] [--every N]
+
+DATA holds oxford, middlebury and foreground. A line for each kind of pair: how many pairs, how many
+were answered (the matches are at least half right), how many answers are wrong (less than half),
+and how many of these were called of high confidence. Planes: a photograph covers 10, 20 or 40 % of
+both images, seen from two places; the rest is unrelated, or a rectified pair of a scene with depth.
+Refusal: unrelated photographs, and facades of one window that repeats, of which the second image
+begins a window later, so that it looks as if nothing had moved; alone, between unrelated things, or
+with a window that occurs once between things that both images show: only these can be answered.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from deepdetect import DeepDetect, match_images
+from deepdetect._shared.opencv import cv2
+from deepdetect.geometry.transforms import transfer_errors
+from deepdetect.io.image import load_image
+
+PAIRS = 60
+"""Made pairs of planes, and of facades; the number of a pair is its seed."""
+
+SIZE = (720, 600)
+"""Width and height of a made image."""
+
+RIGHT_PX = 3.0
+"""Matches on a plane end within this of where it is, those of a rectified scene on their row."""
+
+NOISE = 3.0
+"""Standard deviation of the noise of made images, in grey values."""
+
+
+@dataclass(frozen=True, eq=False)
+class MadePair:
+    """Two images, and what is right: (3, 3) homography of what the (H, W) bool mask shows.
+
+    Beside it nothing is right, or, of a rectified scene, what stays on its row.
+    """
+
+    kind: str
+    images: tuple[np.ndarray, np.ndarray]
+    homography: np.ndarray
+    mask: np.ndarray
+    rectified: bool = False
+
+    def right(self, points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
+        """Say which of (M, 2) matches are right; (M,) bool."""
+        x, y = np.rint(points0).astype(np.int64).T
+        on_row = np.abs(points0[:, 1] - points1[:, 1]) < RIGHT_PX
+        on_plane = transfer_errors(points0, points1, self.homography) < RIGHT_PX
+        return np.where(self.mask[y, x], on_plane, self.rectified & on_row)
+
+
+class Photographs:
+    """The photographs of a data folder that pairs are made of."""
+
+    def __init__(self, data: Path) -> None:
+        self.planes = sorted(data.glob("oxford/*/img1.*"))
+        self.scenes = sorted(data.glob("middlebury/*/left.png"))
+        self.others = sorted(data.glob("foreground/*.jpg"))
+
+    def any(self, rng: np.random.Generator, size: tuple[int, int] = SIZE) -> np.ndarray:
+        """Return one of the others in this size."""
+        return resized(load_image(self.others[rng.integers(len(self.others))]), size)
+
+
+def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return a smaller or larger copy."""
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+
+
+def corners(width: float, height: float) -> np.ndarray:
+    """Return the (4, 2) corners of a rectangle from the origin on."""
+    return np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+
+
+def planes(photographs: Photographs) -> Iterator[MadePair]:
+    """Put a plane into two images, seen from two places."""
+    for number in range(PAIRS):
+        rng = np.random.default_rng([0, number])
+        share, rectified = (0.1, 0.2, 0.4)[number % 3], number % 2 == 1
+        texture = load_image(photographs.planes[rng.integers(len(photographs.planes))])
+        if rectified:
+            left = photographs.scenes[rng.integers(len(photographs.scenes))]
+            views = [
+                resized(load_image(left.with_name(f"{s}.png")), SIZE) for s in ("left", "right")
+            ]
+        else:
+            views = [photographs.any(rng) for _ in range(2)]
+        side = float(np.sqrt(share * SIZE[0] * SIZE[1]))
+        size = np.array([1.15 * side, side / 1.15])
+        texture = resized(texture, (round(size[0]), round(size[1])))
+        outline, placed = corners(*size), []
+        for view in views:
+            moved = outline + rng.uniform(0, 1, 2) * (np.array(SIZE) - size)
+            moved = (moved + rng.uniform(-0.07, 0.07, (4, 2)) * side).clip(0, np.array(SIZE) - 1)
+            placed.append(cv2.getPerspectiveTransform(outline, moved.astype(np.float32)))
+            mask = cv2.warpPerspective(np.ones(texture.shape[:2], np.uint8), placed[-1], SIZE) > 0
+            view[mask] = cv2.warpPerspective(texture, placed[-1], SIZE)[mask]
+        whole = np.ones(texture.shape[:2], np.uint8)
+        mask = cv2.warpPerspective(whole, placed[0], SIZE) > 0
+        rest = "a scene with depth" if rectified else "unrelated"
+        homography = placed[1] @ np.linalg.inv(placed[0])
+        kind = f"plane of {share:.0%}, the rest {rest}"
+        yield MadePair(kind, (views[0], views[1]), homography, mask, rectified)
+
+
+def unrelated(photographs: Photographs) -> Iterator[MadePair]:
+    """Pair all photographs of planes and scenes with each other."""
+    for first, second in combinations([*photographs.planes, *photographs.scenes], 2):
+        images = load_image(first), load_image(second)
+        nothing = np.zeros(images[0].shape[:2], bool)
+        yield MadePair("different scenes", images, np.eye(3), nothing)
+
+
+def facades(photographs: Photographs) -> Iterator[MadePair]:
+    """Look at a facade of one window twice, the second time one window further to the right."""
+    kinds = "facade alone", "facade between unrelated things", "facade with what occurs once"
+    for number in range(PAIRS):
+        rng = np.random.default_rng([1, number])
+        kind = kinds[number % 3]
+        columns, rows = int(rng.integers(5, 9)), int(rng.integers(3, 6))
+        part = 1.0 if kind == kinds[0] else 0.75
+        period = np.array([int(part * SIZE[0] / (columns - 1)), int(part * SIZE[1] / rows)])
+        inner = (0.7 * period).astype(int)
+        top, left = (period - inner)[::-1] // 2
+        texture = load_image(photographs.planes[rng.integers(len(photographs.planes))])
+        side = min(texture.shape[:2]) // 2
+        y, x = rng.integers(0, np.array(texture.shape[:2]) - side)
+        window = resized(texture[y : y + side, x : x + side], tuple(inner.tolist()))
+        cell = cv2.GaussianBlur(photographs.any(rng, tuple(period.tolist())), (0, 0), 3)
+        cell[top : top + inner[1], left : left + inner[0]] = window
+        facade = np.tile(cell, (rows + 1, columns + 2, 1))
+        if kind == kinds[2]:
+            row, column = rng.integers(rows), rng.integers(1, columns - 1)
+            y, x = row * period[1] + top, column * period[0] + left
+            once = photographs.any(rng, tuple(inner.tolist()))
+            facade[y : y + inner[1], x : x + inner[0]] = once
+        width, height = (columns * period[0], rows * period[1])
+        around = photographs.any(rng, (SIZE[0] + int(period[0]), SIZE[1]))
+        views, placed = [], []
+        for view in range(2):
+            start = view * period[0]
+            canvas = np.array(around[:, start : start + SIZE[0]])
+            if kind == kinds[0]:
+                canvas = facade[period[1] // 2 :, period[0] // 2 + start :][: SIZE[1], : SIZE[0]]
+                missing = SIZE[1] - canvas.shape[0], SIZE[0] - canvas.shape[1]
+                canvas = np.pad(canvas, [(0, missing[0]), (0, missing[1]), (0, 0)], "symmetric")
+            elif kind == kinds[1]:
+                canvas = photographs.any(rng)
+                canvas[60 : 60 + height, 50 : 50 + width] = facade[:height, start:][:, :width]
+            else:
+                around_ = np.array(around)
+                around_[60 : 60 + height, 90 : 90 + width] = facade[:height, :width]
+                canvas = around_[:, start : start + SIZE[0]]
+            outline = corners(*SIZE)
+            moved = outline + rng.uniform(-0.05, 0.05, (4, 2)) * SIZE[1]
+            seen = cv2.getPerspectiveTransform(outline, moved.astype(np.float32))
+            warped = cv2.warpPerspective(canvas, seen, SIZE).astype(np.float32)
+            warped = warped * rng.uniform(0.85, 1.15) + rng.normal(0, NOISE, warped.shape)
+            views.append(np.clip(warped, 0, 255).astype(np.uint8))
+            shift = np.eye(3)
+            shift[0, 2] = -start
+            placed.append(seen @ shift)
+        homography = placed[1] @ np.linalg.inv(placed[0])
+        yield MadePair(kind, (views[0], views[1]), homography, np.ones(SIZE[::-1], bool))
+
+
+def main() -> None:
+    """Match all pairs and print a table of them by their kinds."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--only", choices=("planes", "refusal"))
+    parser.add_argument("--every", type=int, default=1, help="only every Nth pair")
+    arguments = parser.parse_args()
+    photographs, detector = Photographs(arguments.data), DeepDetect()
+    makers = {"planes": (planes,), "refusal": (unrelated, facades)}
+    rows: dict[str, list[tuple[bool, bool, bool]]] = {}
+    for name, functions in makers.items():
+        for make in functions if arguments.only in (None, name) else ():
+            for number, pair in enumerate(make(photographs)):
+                if number % arguments.every:
+                    continue
+                matches = match_images(*pair.images, detector)
+                right = pair.right(matches.points0, matches.points1)
+                wrong = len(matches) > 0 and right.mean() < 0.5
+                high = matches.confidence == "high"
+                counts = len(matches) > 0 and not wrong, wrong, wrong and high
+                rows.setdefault(pair.kind, []).append(counts)
+    print("| kind | pairs | answered | wrong | wrong, of high confidence |")
+    print("|---|---:|---:|---:|---:|")
+    for kind, values in rows.items():
+        print(f"| {kind} | {len(values)} | {' | '.join(map(str, np.sum(values, axis=0)))} |")
+
+
+if __name__ == "__main__":
+    main()
