@@ -164,7 +164,7 @@ def main() -> None:
             seconds, rate = time.process_time() - begun, learning_rate(given.rate, progress)
             print(step, seen, seconds, rate, np.mean(losses), *numbers, sep=",", flush=True)
             losses = []
-    average.logits.bias.data += BIAS
+    average.get_parameter("logits.bias").data += BIAS
     tensors = {name: value.contiguous() for name, value in average.state_dict().items()}
     save_file(tensors, given.output)
 
