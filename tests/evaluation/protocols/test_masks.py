@@ -196,16 +196,13 @@ def test_bundled_weights_score_as_the_results_say(shared: Path, backend: str) ->
 
 @pytest.mark.slow
 def test_bundled_weights_reach_the_bar(shared: Path) -> None:
-    """What was asked of them on the published samples: BCE, IoU and calibrated probabilities.
-
-    The error of calibration is that of five images: on 257 photographs it is .002 and .005.
-    """
+    """What was asked of them on the published samples: BCE, IoU and calibrated probabilities."""
     scores = bundled_scores(shared, "onnxruntime")
     assert scores["normal"].loss <= 0.115
     assert scores["normal"].iou >= 0.84
     assert scores["low"].loss <= 0.152
     assert scores["low"].iou >= 0.675
-    assert max(score.calibration_error for score in scores.values()) <= 0.011
+    assert max(score.calibration_error for score in scores.values()) <= 0.01
 
 
 def test_labels_are_those_of_the_image_as_the_network_sees_it() -> None:
