@@ -31,9 +31,8 @@ KINDS = {"S": SMALL, "T": SMALL, "M": (0, 0.3, 0.42, 0.28), "L": (0.45, 0.25, 0.
 NORMAL_KINDS = (0.4, 0, 0.6, 0)
 """Shares of: as it is, darkened, augmented, augmented and darkened."""
 
-FREE = ("boofcv", "cid22", "clic2025", "gb82", "budgie", "deepin")
-FREE += ("cutefish", "ukui", "endless", "elementary")
-"""Beginnings of the names of photographs under free licences."""
+FREE = ("boofcv", "cid22", "clic2025", "gb82", "budgie", "cutefish", "ukui", "elementary")
+"""Beginnings of the names of photographs under CC0, CC BY, CC BY-SA or Unsplash's licence."""
 
 
 def labelled(rgb: np.ndarray, dense: bool) -> np.ndarray:
