@@ -45,8 +45,6 @@ STAGES = {
         for name, words in {
             "oxford-paper": "oxford --protocol paper",
             "oxford-standard": "oxford --protocol standard" + XFEAT,
-            "oxford-points": "oxford --protocol standard --baselines "
-            "sift,fast,harris,hessian,hessian-scales",
             "oxford-guided": "oxford --protocol guided",
             "hpatches": "hpatches --protocol paper",
             "foreground": "foreground" + XFEAT,
@@ -194,7 +192,7 @@ RESULTS = {
     ),
     "repeatability-hpatches": Result("hpatches", "hpatches_table3"),
     "points": Result(
-        "oxford-points",
+        "oxford-standard",
         "oxford_refined_repeatability_1px",
         {
             "@1 512": ("512", ".3f"),
@@ -207,7 +205,7 @@ RESULTS = {
             OWN[2:]: ("accuracy at 1 px", ".3f", "oxford_refined_homography", OWN),
         },
     ),
-    "points-by-change": Result("oxford-points", "oxford_refined_kinds"),
+    "points-by-change": Result("oxford-standard", "oxford_refined_kinds"),
     "middlebury": Result(
         "middlebury",
         "middlebury_*",
