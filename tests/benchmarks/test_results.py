@@ -102,8 +102,8 @@ def test_rows_of_own_sizes_become_a_column(
         ],
     }
     report = {"metadata": {}, "tables": {key: {"rows": rows} for key, rows in tables.items()}}
-    (tmp_path / "oxford-points").mkdir()
-    (tmp_path / "oxford-points" / "report.json").write_text(json.dumps(report))
+    (tmp_path / "oxford-standard").mkdir()
+    (tmp_path / "oxford-standard" / "report.json").write_text(json.dumps(report))
     script.write_result("points", tmp_path)
     assert script.block("points", "@1 2048|within 1 px|own size and angle").splitlines()[2:] == [
         "| points | 0.500 | 0.250 | 0.750 |"
