@@ -275,8 +275,9 @@ def moving_alike(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
     if neighbours < 1:
         return np.zeros(len(points0))
     first, second = points0 @ [1, 1j], points1 @ [1, 1j]
-    distances = np.abs(first[:, None] - first)
-    nearest = np.argsort(distances, axis=1)[:, 1 : neighbours + 1]
+    blocks = np.array_split(first, len(first) // 500 + 1)  # all distances of many fill the memory
+    distances = (np.abs(block[:, None] - first) for block in blocks)
+    nearest = np.concatenate([np.argsort(each)[:, 1 : neighbours + 1] for each in distances])
     steps = first[nearest] - first[:, None]
     moves = (second[nearest] - second[:, None]) / steps
     allowed = MAX_MOVE_DIFFERENCE * np.abs(moves)[:, :, None]

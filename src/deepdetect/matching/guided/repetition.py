@@ -56,16 +56,17 @@ def is_repeated(grays: Pair, points0: np.ndarray, homography: np.ndarray) -> tup
     (first, scale0), (second, scale1) = (downscale(gray, COMPARED_SIDE_PX) for gray in grays)
     matrix = scaled_homography(homography, scale0, scale1)
     last = np.array(first.shape[::-1]) - 1
-    places = np.unique(np.rint(scaled_points(points0, scale0)).clip(0, last), axis=0)
-    x, y = places.astype(np.int64).T
-    own = _correlation(first, second, matrix)[y, x]
+    x, y = np.rint(scaled_points(points0, scale0)).clip(0, last).astype(np.int64).T
+    places = np.zeros(first.shape, bool)
+    places[y, x] = True
+    own = _correlation(first, second, matrix)[places]
     known = own[np.isfinite(own)]
     correlation = float(np.median(known)) if len(known) else 0.0
     for shift in _similar_shifts(first, *warp_to_reference(second, matrix, first.shape[::-1])):
         shifted = np.eye(3)
         shifted[:2, 2] = shift
         other = refine_homography(first, second, matrix @ shifted)
-        others = _correlation(first, second, other)[y, x]
+        others = _correlation(first, second, other)[places]
         explained = np.fmax(own, others) > MIN_ZNCC  # not for NaN in both
         gain = (own - others)[explained & np.isfinite(own) & np.isfinite(others)]
         alone, other_alone = np.sum(gain > MIN_ZNCC_GAIN), np.sum(gain < -MIN_ZNCC_GAIN)
