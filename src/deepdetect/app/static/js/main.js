@@ -47,7 +47,8 @@ async function start() {
   const open = (processor) => openNetwork({ engine: config.engine, token: page.token, processor });
   open("processor").then(sayWhere, (error) => showError(error.message));
   await showExamples();
-  if (config.webgpu && await hasGraphics()) offerGraphics(() => open("graphics"));
+  if (!config.webgpu) return;
+  hasGraphics().then((found) => { if (found) offerGraphics(() => open("graphics")); }); // pictures do not wait
 }
 
 function sayWhere(words) {
