@@ -119,14 +119,15 @@ def test_a_plane_that_moves_otherwise_keeps_its_matches(shared: Path, photo: np.
 
 
 @pytest.mark.slow
-def test_a_dominant_plane_does_not_hide_the_depth_beside_it(shared: Path) -> None:
+@pytest.mark.parametrize("number", [1, 8])  # of the ninth all disparities are too many
+def test_a_dominant_plane_does_not_hide_the_depth_beside_it(shared: Path, number: int) -> None:
     (scene,) = load_posed_scenes(shared / "data" / "entry")
-    first, second = scene.images[:2]
+    first, second = scene.images[0 if number == 1 else 2], scene.images[number]
     matches = match(first.path, second.path)
     guide = matches.two_view_geometry
     assert guide.model == "fundamental"
     assert guide.scene == "depth with a dominant plane"
-    assert guide.on_plane > 10 * guide.off_plane > 10_000
+    assert guide.on_plane > 5 * guide.off_plane > 10_000
     pair = PosedPair("entry", first, second)
     errors = epipolar_errors(matches.points0, matches.points1, pair.fundamental)
     assert (errors < 3).mean() > 0.99

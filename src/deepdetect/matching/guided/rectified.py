@@ -24,6 +24,7 @@ from ...geometry.transforms import (
     scaled_fundamental,
     scaled_homography,
     scaled_points,
+    transfer_errors,
 )
 from ..stereo.matching import (
     DisparityOptions,
@@ -88,6 +89,10 @@ MIN_TRACKS = 50
 """That a matrix is estimated from; where fewer corners can be tracked to where they are matched, no
 match counts."""
 
+NEAR_PLANE_FRACTION = 0.8
+"""Where all disparities are too many to search, those of this fraction of the sparse matches, the
+nearest to a known plane, are searched alone: what is far in front of it is left out."""
+
 MAX_DISAGREEMENT_PX = 3.0
 """By which the disparity of a right sparse match, found in images of another scale, may differ."""
 
@@ -147,6 +152,11 @@ def match_by_rectification(
     sizes = (grays[0].shape[::-1], grays[1].shape[::-1])
     view = rectified_view(grays, sparse, fundamental, plane)
     tracks = None if view is None else _track(view)
+    if tracks is None and plane is not None:
+        errors = transfer_errors(*sparse, plane)
+        near = errors <= np.quantile(errors, NEAR_PLANE_FRACTION)
+        view = rectified_view(grays, (sparse[0][near], sparse[1][near]), fundamental, plane)
+        tracks = None if view is None else _track(view)
     if view is None or tracks is None:
         return None
     tracked, on_rows = tracks
