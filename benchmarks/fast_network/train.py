@@ -13,10 +13,9 @@ and their thresholds with the other sign.) The first, 5,400 s of one thread (AMD
 beside other work), began with weights of the network before, which had a convolution at a quarter
 of the size in place of one at half of it (60c01c10, 465 s of a third of an NVIDIA H100, from random
 numbers), fitted to the new form by least squares. The second, 2,400 s, began with the first, at a
-rate of 0.0014, seed 4. On all of photos/val they have .0813 / .894 and .1075 / .776, on the
-authors' samples .1123 / .851 and .1480 / .681 (ESPNet .0915 / .872, .1205 / .756, .1133 / .842,
-.1495 / .678). `dense` began with the first run: 1,800 s, labels `dense`, rate 0.0015; .0868 / .942
-on photos/val (ESPNet .1105 / .921).
+rate of 0.0014, seed 4. `dense` began with the first run: 1,800 s, labels `dense`, rate 0.0015.
+`free` is one run of 2,000 s from random numbers. Their scores: `docs/results/validation.csv` and
+`label-prediction.csv`.
 """
 
 from __future__ import annotations
