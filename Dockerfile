@@ -14,12 +14,11 @@ RUN pip install --no-cache-dir "build>=1.2" \
     && python -m build --wheel --outdir /wheels
 
 FROM python:${PYTHON}-slim
-# openvino runs the network about 1.5 times as fast on CPUs.
-ARG EXTRAS=openvino
+# Extras beside demo, which brings two photographs to compile with, below.
+ARG EXTRAS=demo
 ENV NUMBA_CACHE_DIR=/opt/deepdetect/numba \
     PYTHONDONTWRITEBYTECODE=1
 COPY --from=build /wheels /wheels
-# The extra demo brings two photographs to compile with, below.
 RUN pip install --no-cache-dir "$(ls /wheels/*.whl)[${EXTRAS},demo]" \
     && rm -r /wheels \
     && useradd --create-home --uid 1000 deepdetect \
