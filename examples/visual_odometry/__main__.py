@@ -2,9 +2,9 @@
 
     python examples/visual_odometry ../shared/data/kitti-clip -o odometry/
 
-The folder holds frames, calib.txt and poses.txt as KITTI's odometry benchmark has them. All methods
-go the same road: keypoints followed by Lucas-Kanade, then `odometry`. The truth is used for one
-number, the scale, and to measure the errors.
+The folder holds frames, calib.txt or K.txt, and poses.txt as KITTI's odometry benchmark has them.
+All keypoints go the same roads: followed by Lucas-Kanade, or matched by RootSIFT, then `odometry`.
+The truth is used for one number, the scale of each path, and to measure the errors.
 """
 
 from __future__ import annotations
@@ -22,19 +22,21 @@ import numpy as np
 from matplotlib.figure import Figure
 from odometry import VisualOdometry
 
-from deepdetect import Camera, DeepDetectError, Keypoints, load_image
+from deepdetect import Camera, DeepDetectError, Keypoints, load_image, match_features
+from deepdetect.datasets.posed_images import load_posed_scenes
+from deepdetect.features.sift import describe_keypoints
 from deepdetect.geometry.relative_pose import rotation_angle
-from deepdetect.io.image import find_images, luma
-from deepdetect.tracking import Tracker, TrackingOptions, point_candidates
+from deepdetect.io.image import luma
+from deepdetect.tracking import TrackedFrame, Tracker, TrackingOptions, point_candidates
 from deepdetect.tracking.tracker import CANDIDATES
 
 SEGMENTS_M = (10.0, 20.0, 30.0, 40.0, 50.0)  # KITTI's own, 100 to 800 m, are longer than a clip
-COLORS = {"DeepDetect": "C0", "SIFT": "C1", "ORB": "C2"}
-HEADER = "method               frames    end %    mean %   end °/m  segments % seg. °/m CPU s  wall"
+FEATURES = ("DeepDetect", "SIFT", "ORB")
+HEADER = "method and frames              end %    mean %   end °/m    seg. %  seg. °/m     CPU s"
 
 
-def methods(count: int) -> dict[str, Callable[[np.ndarray], Keypoints]]:
-    """Return what finds keypoints of an RGB image, by name."""
+def trackers(count: int) -> dict[str, Tracker | Matcher]:
+    """Return what makes tracks of keypoints, followed or matched, by name."""
     options = TrackingOptions(max_keypoints=count)
     sift, orb = (make(CANDIDATES * count) for make in (cv2.SIFT_create, cv2.ORB_create))
 
@@ -42,33 +44,37 @@ def methods(count: int) -> dict[str, Callable[[np.ndarray], Keypoints]]:
         points = feature.detect(luma(rgb), None)
         return Keypoints.from_opencv(points, (rgb.shape[1], rgb.shape[0]))
 
-    return {
+    detectors = {
         "DeepDetect": point_candidates(options),
         "SIFT": partial(opencv, sift),
         "ORB": partial(opencv, orb),
     }
+    followed = {name: Tracker(detect, options) for name, detect in detectors.items()}
+    matched = {f"{name}, matched": Matcher(detectors[name]) for name in ("DeepDetect", "SIFT")}
+    return followed | matched
 
 
-def read_matrices(path: Path, count: int | None = None) -> np.ndarray:
-    """Return the first (N, 3, 4) matrices in a file of KITTI's, which may name them before a colon.
+class Matcher:
+    """Makes tracks of the keypoints that frames have in common by their RootSIFT descriptors."""
 
-    Raises:
-        DeepDetectError: it is missing, is another, or has fewer.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()[:count]
-        values = np.array([line.split(":")[-1].split() for line in lines], float)
-        matrices = values.reshape(-1, 3, 4)
-    except OSError:
-        raise DeepDetectError(
-            f"there is no file {path}: give a folder with frames, calib.txt and poses.txt as KITTI "
-            "has them"
-        ) from None
-    except ValueError:
-        raise DeepDetectError(f"{path} must have twelve numbers on each line") from None
-    if len(matrices) < (count or 0):
-        raise DeepDetectError(f"{path} has {len(matrices)} lines, fewer than the {count} frames")
-    return matrices
+    def __init__(self, detect: Callable[[np.ndarray], Keypoints]) -> None:
+        self.detect = detect
+        self.before: Keypoints | None = None
+        self.tracks, self.next_track, self.number = np.empty(0, np.int64), 0, 0
+
+    def update(self, rgb: np.ndarray) -> TrackedFrame:
+        """Match the keypoints of the next frame with those of the frame before."""
+        found = describe_keypoints(luma(rgb), self.detect(rgb))
+        tracks = np.arange(len(found)) + self.next_track
+        self.next_track += len(found)
+        if self.before is not None:
+            matches = match_features(self.before, found)
+            tracks[matches.indices1] = self.tracks[matches.indices0]
+        self.before, self.tracks, self.number = found, tracks, self.number + 1
+        order = np.argsort(tracks)
+        ages = np.zeros(len(order), np.int64)  # odometry needs none
+        xy, scores = found.xy[order], found.scores[order]
+        return TrackedFrame(self.number - 1, tracks[order], xy, scores, ages)
 
 
 def trajectory_errors(poses: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
@@ -116,56 +122,53 @@ def trajectory_errors(poses: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
 
 
 def plot(paths: dict[str, np.ndarray], truth: np.ndarray, file: Path) -> None:
-    """Draw trajectories from above and from the side against the truth."""
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    axes = figure.subplots(2, 1, sharex=True)
-    for axis, row, label in zip(axes, (0, 1), ("right, m", "down, m"), strict=True):
-        axis.plot(truth[:, 2], truth[:, row], "k--", label="truth")
-        for name, centres in paths.items():
-            axis.plot(centres[:, 2], centres[:, row], color=COLORS[name], label=name)
-        axis.set_ylabel(label)
-        axis.grid(alpha=0.3)
-    axes[0].legend()
-    axes[1].set_xlabel("forward, m (other scale than across)")
+    """Draw trajectories from above against the truth."""
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axis = figure.subplots()
+    axis.plot(truth[:, 2], truth[:, 0], "k--", label="truth")
+    for name, centres in paths.items():
+        axis.plot(centres[:, 2], centres[:, 0], label=name)
+    axis.set(xlabel="forward, m (other scale than across)", ylabel="right, m")
+    axis.legend()
     figure.savefig(file, dpi=110)
 
 
 def compare(arguments: argparse.Namespace) -> None:
     """Run all methods, print a table, and write poses and the plot."""
-    last = None if arguments.frames is None else arguments.first + arguments.frames
-    paths = find_images(arguments.folder)[arguments.first : last]
-    if len(paths) < 2:
-        raise DeepDetectError(f"there are not two frames from number {arguments.first} on")
-    matrix = read_matrices(arguments.folder / "calib.txt", 1)[0]
-    truth = read_matrices(arguments.folder / "poses.txt", arguments.first + len(paths))
-    truth = truth[arguments.first :]
-    height, width = load_image(paths[0]).shape[:2]
+    images = load_posed_scenes(arguments.folder)[0].images
+    turns = [image.rotation.T for image in images]
+    centres = [-turn @ i.translation for turn, i in zip(turns, images, strict=True)]
+    truth = np.dstack([turns, centres])
+    matrix = images[0].intrinsics
+    height, width = load_image(images[0].path).shape[:2]
     camera = Camera((width, height), (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))
     arguments.output.mkdir(parents=True, exist_ok=True)
     numbers, shown = {}, {}
-    print(f"{len(paths)} frames\n{HEADER}")
-    for name, detect in methods(arguments.max_keypoints).items():
-        if name not in arguments.methods:
+    print(f"{len(images)} frames\n{HEADER}")
+    for name, tracker in trackers(arguments.max_keypoints).items():
+        if name.partition(",")[0] not in arguments.methods:
             continue
         odometry = VisualOdometry(camera)
-        tracker = Tracker(detect, TrackingOptions(max_keypoints=arguments.max_keypoints))
-        wall, cpu = time.perf_counter(), time.process_time()
-        for path in paths:
-            odometry.update(tracker.update(load_image(path)))
-        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-        frames, poses = odometry.trajectory()
-        if len(frames) < 2:
-            print(f"{name:20} no path was found")
-            continue
-        errors = trajectory_errors(poses, truth[frames])
-        centres = errors.pop("centres")
-        errors |= {"cpu_s_per_frame": cpu / len(paths), "wall_s_per_frame": wall / len(paths)}
-        columns = " ".join(f"{value:9.4f}" for value in errors.values() if value is not None)
-        print(f"{name:20} {len(frames):6} {columns}", flush=True)
-        numbers[name] = {"frames": len(frames), **errors}
-        file = arguments.output / f"{name.lower()}.txt"
-        np.savetxt(file, poses.reshape(-1, 12), fmt="%.9e")  # KITTI's format
-        shown[name] = centres
+        begun = time.process_time()
+        for image in images:
+            odometry.update(tracker.update(load_image(image.path)))
+        seconds = (time.process_time() - begun) / len(images)
+        numbers[name] = {"cpu_s_per_frame": seconds, "lost": odometry.lost, "paths": (paths := [])}
+        for frames, poses in odometry.trajectories():
+            errors = trajectory_errors(poses, truth[frames])
+            path = f"{name} {frames[0]}-{frames[-1]}"
+            shown[path] = errors.pop("centres")
+            paths.append({"first": int(frames[0]), "frames": len(frames), **errors})
+            columns = " ".join(
+                f"{e:9.4f}" if e is not None else "        -" for e in errors.values()
+            )
+            print(f"{path:26} {columns} {seconds:9.4f}", flush=True)
+            poses = poses.reshape(-1, 12)  # KITTI's format
+            np.savetxt(arguments.output / f"{path.lower()}.txt", poses, fmt="%.9e")
+        for frame in odometry.lost:
+            print(f"{name} was LOST at {frame}: what follows has another scale")
+        if not paths:
+            print(f"{name}: no path was found")
     plot(shown, truth[..., 3], arguments.output / "trajectory.jpg")
     (arguments.output / "errors.json").write_text(json.dumps(numbers, indent=2), encoding="utf-8")
 
@@ -176,9 +179,9 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("odometry"))
     parser.add_argument("--max-keypoints", type=int, default=TrackingOptions.max_keypoints)
-    parser.add_argument("--first", type=int, default=0, help="first frame")
-    parser.add_argument("--frames", type=int, help="how many  [default: all]")
-    parser.add_argument("--methods", nargs="+", choices=COLORS, default=COLORS, help="some of them")
+    parser.add_argument(
+        "--methods", nargs="+", choices=FEATURES, default=FEATURES, help="some of them"
+    )
     try:
         compare(parser.parse_args())
     except DeepDetectError as error:

@@ -14,7 +14,7 @@ import numpy as np
 
 from deepdetect import Calibration, Camera
 from deepdetect.geometry.relative_pose import triangulate
-from deepdetect.sfm.colmap import PIXEL_CENTRE, import_pycolmap, quiet_pycolmap
+from deepdetect.sfm.colmap import PIXEL_CENTRE, CameraIntrinsics, import_pycolmap, quiet_pycolmap
 from deepdetect.tracking import TrackedFrame
 
 pycolmap = import_pycolmap("visual odometry")
@@ -24,6 +24,7 @@ MIN_FIRST_MOTION_PX = 15.0  # the same of the two frames that make the first poi
 MIN_TRACKED = 0.7  # a frame that sees a smaller share of the last keyframe's points is a keyframe
 MAX_ERROR_PX = 2.0  # of a position that agrees with a pose and a point
 MIN_INLIERS = 20  # points that must agree with a pose
+MIN_FIRST_POINTS = 50  # that two frames must give to begin with them
 MIN_ANGLE_DEG = 1.0  # between the rays to a new point
 WINDOW = 10  # keyframes that are adjusted together
 ANCHORS = 5  # keyframes before these, which stay where they are
@@ -44,30 +45,25 @@ class VisualOdometry:
     """Estimates the path of a camera, frame by frame.
 
     Its world is the camera of the first frame; its unit is the distance between the two frames that
-    made the first points.
+    made the first points. Where no pose can be found it begins again: what follows is another path,
+    in a world and a unit of its own.
 
     Args:
         camera: of all frames, without distortion.
 
     Attributes:
-        lost: number of the frame from which on no pose could be found, or None. Later frames have
-            no poses: their scale would be another.
+        lost: numbers of the frames for which no pose could be found by what was seen before.
     """
 
     def __init__(self, camera: Camera) -> None:
         self.camera = camera
-        self.lost: int | None = None
-        (fx, fy), (cx, cy) = camera.focal_px, camera.centre
-        self._colmap_camera = pycolmap.Camera(
-            camera_id=1,
-            model="PINHOLE",
-            width=camera.size[0],
-            height=camera.size[1],
-            params=[fx, fy, cx + PIXEL_CENTRE, cy + PIXEL_CENTRE],
-        )
+        self.lost: list[int] = []
+        self._colmap_camera = CameraIntrinsics.of_camera(camera).colmap_camera()
+        self._colmap_camera.camera_id = 1
         self._waiting: list[TrackedFrame] = []
         self._keyframes: list[Keyframe] = []
         self._placed: list[tuple[int, int, pycolmap.Rigid3d]] = []  # frame, keyframe, from it
+        self._before: list[tuple[np.ndarray, np.ndarray]] = []  # paths that were lost
         self._points = np.empty((0, 3))  # by the number of the track, NaN where it has none
         self._strikes = np.empty(0, np.int64)
         self._pose = self._motion = pycolmap.Rigid3d()
@@ -77,36 +73,39 @@ class VisualOdometry:
 
         The first frames get theirs when the camera has moved enough.
         """
-        if self.lost is not None:
-            return False
         new = int(frame.tracks.max(initial=-1)) + 1 - len(self._points)
         if new > 0:
             self._points = np.concatenate([self._points, np.full((new, 3), np.nan)])
             self._strikes = np.append(self._strikes, np.zeros(new, np.int64))
         with quiet_pycolmap():
+            if self._keyframes and not self._place(frame):
+                self.lost.append(frame.number)
+                self._before = self.trajectories()
+                self._keyframes, self._placed, self._waiting = [], [], []
             if not self._keyframes:
                 self._waiting.append(frame)
                 return self._begin()
-            if not self._place(frame):
-                self.lost = frame.number
-        return self.lost is None
+        return True
 
-    def trajectory(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (F,) numbers of frames and (F, 3, 4) float64 poses, camera to world."""
+    def trajectories(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return (F,) numbers of frames and (F, 3, 4) float64 poses, camera to world, of each path.
+
+        There is one, or none, if the camera was never lost.
+        """
         poses = [
             (relative * self._keyframes[keyframe].pose).inverse().matrix()
             for _, keyframe, relative in self._placed
         ]
         numbers = [number for number, _, _ in self._placed]
-        return np.array(numbers, np.int64), np.array(poses).reshape(-1, 3, 4)
+        return [*self._before, (np.array(numbers), np.array(poses))] if poses else self._before
 
     def _begin(self) -> bool:
         """Make the first points, where the last frame shows that the camera has moved enough."""
         first, last = self._waiting[0], self._waiting[-1]
         tracks, rows0, rows1 = np.intersect1d(first.tracks, last.tracks, True, True)
-        if len(tracks) < MIN_INLIERS:  # too much has changed: begin here
-            self._waiting = [last]
-            return False
+        if len(tracks) < MIN_FIRST_POINTS:  # too much has changed: begin later
+            del self._waiting[0]
+            return bool(self._waiting) and self._begin()
         xy0, xy1 = first.xy[rows0].astype(float), last.xy[rows1].astype(float)
         if np.median(np.linalg.norm(xy1 - xy0, axis=1)) < MIN_FIRST_MOTION_PX:
             return False
@@ -122,8 +121,9 @@ class VisualOdometry:
             return False
         keyframes = [Keyframe(first, pycolmap.Rigid3d())]
         keyframes.append(Keyframe(last, geometry.cam2_from_cam1))
+        self._points[:], self._strikes[:] = np.nan, 0
         self._triangulate(*keyframes, tracks[agreeing], MAX_ERROR_PX)
-        if np.isfinite(self._points[tracks, 0]).sum() < MIN_INLIERS:
+        if np.isfinite(self._points[:, 0]).sum() < MIN_FIRST_POINTS:
             return False
         self._keyframes = keyframes
         self._adjust()
@@ -160,8 +160,8 @@ class VisualOdometry:
             unknown = frame.tracks[
                 ~self._known(frame) & (self._strikes[frame.tracks] < MAX_STRIKES)
             ]
-            tracks = np.intersect1d(keyframe.frame.tracks, unknown, True)
-            self._triangulate(keyframe, new, tracks, MAX_ERROR_PX / 2)
+            common = np.intersect1d(keyframe.frame.tracks, unknown, True)
+            self._triangulate(keyframe, new, common, MAX_ERROR_PX / 2)
         self._adjust()
         return True
 
@@ -242,17 +242,13 @@ class VisualOdometry:
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = ROBUST_SCALE_PX
         options.ceres.solver_options.max_num_iterations = MAX_ITERATIONS
-        before = np.linalg.norm((window[1].pose * window[0].pose.inverse()).translation)
+        if len(window) <= WINDOW + 1:  # a single fixed camera leaves the scale free
+            config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         pycolmap.create_default_bundle_adjuster(options, config, model).solve()
         for k, keyframe in enumerate(window, 1):
             keyframe.pose = model.images[k].cam_from_world()
         for track, number in numbers.items():
             self._points[track] = model.points3D[number].xyz
-        if len(window) <= WINDOW + 1:  # a single fixed camera leaves the scale free
-            after = np.linalg.norm((window[1].pose * window[0].pose.inverse()).translation)
-            self._points *= before / after
-            for keyframe in window:
-                keyframe.pose.translation *= before / after
         counts = np.zeros(len(self._points), np.int64)
         for keyframe in window:
             used = self._errors(keyframe.frame, keyframe.pose) < MAX_ERROR_PX
