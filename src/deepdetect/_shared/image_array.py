@@ -64,7 +64,6 @@ def srgb_to_linear() -> np.ndarray:
 
 
 def _channels_last(array: np.ndarray) -> np.ndarray:
-    """Return an array as (H, W), (H, W, 3) or (H, W, 4)."""
     shape = array.shape
     if array.ndim == 4:
         raise ImageError(

@@ -96,7 +96,6 @@ def check_ranges(
 
 
 def _numbers(value: object) -> list[Any]:
-    """Return a number, or those of nested tuples; NaN for anything else."""
     if isinstance(value, tuple):
         return [number for one in value for number in _numbers(one)]
     return [value if isinstance(value, Real) else math.nan]

@@ -190,8 +190,6 @@ class AppServer:
 
     @contextlib.asynccontextmanager
     async def _watched(self, _: Starlette) -> AsyncIterator[None]:
-        """Look for tasks that have to be ended, while the server runs."""
-
         async def watch() -> None:
             while True:
                 await asyncio.sleep(min(CHECK_EVERY_S, self.options.abandoned_s / 4))
@@ -202,7 +200,6 @@ class AppServer:
         watching.cancel()
 
     def _description(self) -> dict[str, Any]:
-        """Return what the page is told of this server."""
         options = self.options
         names = ("title", "note", "options", "folder", "missing")
         tasks = [
@@ -229,7 +226,6 @@ class AppServer:
 
     @cached_property
     def _detector(self) -> DeepDetect:
-        """The network, opened when it is first needed."""
         return DeepDetect(resolution="native")
 
     async def _heatmap(self, request: Request) -> Response:
@@ -345,8 +341,6 @@ class AppServer:
 
 
 class _Body:
-    """The body of a request, read in parts of known lengths."""
-
     def __init__(self, request: Request) -> None:
         self._chunks, self._read = request.stream(), b""
 
@@ -367,7 +361,6 @@ def _refusal(status: int, sentence: str, headers: dict[str, str] | None = None) 
 
 
 def _body_length(request: Request, largest: int) -> int:
-    """Return the length of the request's body, which must be given and not too large."""
     text = request.headers.get("Content-Length")
     if text is None:
         raise HTTPException(411, "the length of the request is missing")

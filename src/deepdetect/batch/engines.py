@@ -88,8 +88,6 @@ def map_on_ray(
 
 
 class _Worker:
-    """An actor, which does tasks one by one."""
-
     def __init__(self, function: Callable[[Any], Any], folder: str) -> None:
         self.function = function
         with contextlib.suppress(OSError):  # relative paths mean what they mean to the caller

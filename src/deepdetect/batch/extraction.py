@@ -127,7 +127,6 @@ def _extract(
     selection: SelectionOptions | None,
     max_megapixels: float,
 ) -> Iterator[Group]:
-    """Make the groups of images, with their numbers of keypoints."""
     for name, state in images:
         with noted_failures(name, failures):
             rgb = load_image(root / name, max_megapixels=max_megapixels)

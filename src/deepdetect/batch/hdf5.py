@@ -270,7 +270,6 @@ def _shard_files(folder: Path) -> list[Path]:
 
 
 def _states(files: Sequence[Path]) -> dict[str, State]:
-    """Return the states of all groups."""
     states: dict[str, State] = {}
     for path in files:
         with open_hdf5(path) as file:
@@ -288,7 +287,6 @@ def _divided(items: Sequence[Item], folder: Path) -> list[tuple[Path, Sequence[I
 def _write_shard(
     task: tuple[Path, Sequence[Item]], make: MakeGroups
 ) -> tuple[dict[Any, int], list[str]]:
-    """Write a shard; return the counts of its inputs, and what could not be done."""
     path, items = task
     counts: dict[Any, int] = {}
     failures: list[str] = []

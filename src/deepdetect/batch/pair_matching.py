@@ -200,7 +200,6 @@ def _match_pairs(
     features: Path,
     options: PairMatchingOptions,
 ) -> Iterator[Group]:
-    """Make the groups of pairs, with their numbers of matches."""
     with open_hdf5(features) as file:
         kind = DESCRIPTOR if DESCRIPTOR in str(file.attrs.get(SETTINGS)) else None
         first: tuple[str, Keypoints] | None = None  # pairs are sorted by their first image
@@ -229,7 +228,6 @@ def match_group(
 def _match(
     features0: Keypoints, features1: Keypoints, options: PairMatchingOptions
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return (K, 2) rows of the matched keypoints, and (K,) scores."""
     how = {name: getattr(options, name) for name in ("matcher", "ratio", "mutual", "seed")}
     found = match_features(features0, features1, **how)
     kept = found.inliers

@@ -282,7 +282,6 @@ def table(*columns: Mapping[str, Any], title: str = "") -> str:
 
 
 def _table_rows(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the rows of a table."""
     for name, value in values.items():
         if name == "failures":  # listed at the end
             continue

@@ -129,7 +129,6 @@ class _Work:
             cli.note(f"replacing the results of {whose} with other options ({flags})")
 
     def detect(self, path: Path, files: dict[str, Path]) -> dict[str, Any]:
-        """Detect, save and draw the keypoints of one image; return its numbers."""
         shown = {"file": files["file"], "pictures": {n: files[n] for n in files if n != "file"}}
         outputs = Outputs([*files.values()], [path], overwrite=self.overwrite)
         done = outputs.find()  # another command may have done it meanwhile

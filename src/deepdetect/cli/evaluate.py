@@ -101,7 +101,6 @@ def evaluate(
 
 
 def _values(evaluation: Evaluation) -> dict[str, Any]:
-    """Return an evaluation as plain values for JSON."""
     values: dict[str, Any] = {name: asdict(score) for name, score in evaluation.masks.items()}
     if evaluation.scales:
         values["scales"] = [

@@ -304,7 +304,6 @@ def stitch(
 
 
 def _numbers(panorama: Panorama, images: Sequence[Path], output: Path) -> dict[str, Any]:
-    """Make what --json prints."""
     height, width = panorama.valid.shape
     used = sorted(panorama.homographies)
     return {

@@ -100,7 +100,6 @@ def reconstruct(
 def _reconstruct_many(
     images: Sequence[Path], output: Path, kind: Kind, overwrite: bool, values: dict[str, Any]
 ) -> cli.Result:
-    """Reconstruct a folder, or three and more images."""
     if "rectified" in values:
         raise OptionError("--rectified and --not-rectified are for two images")
     detector, selection = chosen_detector(kind, values, max_keypoints=MAX_KEYPOINTS, threads=1)

@@ -314,7 +314,6 @@ def average(
 
 
 def _engine(values: dict[str, Any]) -> dict[str, Any]:
-    """Take what does the work out of the values."""
     chosen = ENGINE.take(values)
     map_tasks = get_engine(chosen.get("engine", "processes"))
     return {"map_tasks": map_tasks, "workers": chosen.get("workers")}

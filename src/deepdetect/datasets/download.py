@@ -213,7 +213,6 @@ def _part(path: Path) -> Path:
 
 
 def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> None:
-    """Append what is missing to a partial file."""
     import requests
 
     have = file_state(part)[0]
@@ -242,7 +241,6 @@ def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> None:
 
 
 def _check(dataset: RemoteDataset, folder: Path, subject: str) -> None:
-    """Make sure that a folder holds the data set."""
     count = len(find_images(folder))
     if count != dataset.images:
         raise DeepDetectError(
@@ -287,7 +285,6 @@ def _assemble(dataset: RemoteDataset, paths: Sequence[Path], final: Path, quiet:
 
 
 def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
-    """Unpack a zip or tar archive, whatever its name; the folder `inside` is moved up."""
     target.mkdir(parents=True, exist_ok=True)
     try:
         if zipfile.is_zipfile(archive):

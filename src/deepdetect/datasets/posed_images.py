@@ -125,7 +125,6 @@ def load_posed_scenes(folder: str | Path, max_pairs: int = 60) -> list[PosedScen
 
 
 def _reader(folder: Path) -> Callable[[Path], list[PosedImage]] | None:
-    """Return the function that reads the layout of a folder."""
     if any(folder.glob("*.camera")):
         return _read_strecha
     if (folder / "poses.txt").is_file() and _kitti_calibration(folder).is_file():
@@ -205,7 +204,6 @@ def _read_kitti(folder: Path) -> list[PosedImage]:
 
 
 def _colmap_model(folder: Path) -> Path | None:
-    """Return where cameras.txt and images.txt lie, or None."""
     places = [folder, folder / "sparse", folder / "sparse" / "0"]
     for place in places:
         if all((place / name).is_file() for name in ("cameras.txt", "images.txt")):
@@ -313,7 +311,6 @@ def _scaled(
 
 
 def _image_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) without decoding the pixels."""
     with open_image(path) as opened:
         size: tuple[int, int] = opened.size
         turned = opened.getexif().get(ORIENTATION_TAG, 1) != 1

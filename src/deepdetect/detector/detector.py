@@ -321,7 +321,6 @@ class DeepDetect:
     def _select(
         self, rgb: np.ndarray, options: SelectionOptions, ignore: np.ndarray | None
     ) -> Keypoints:
-        """Detect the keypoints of an image that `load_image` returned."""
         with memory_named(rgb.shape):
             (maps,) = compute_maps([rgb], self._network, self.heatmap_options)
             del rgb  # the keypoints need the room
@@ -337,7 +336,6 @@ class DeepDetect:
     def _map_batches(
         self, images: Images, channels: Channels, batch_size: int, make: Callable[[int, Maps], Any]
     ) -> list[Any]:
-        """Load images and run the network; call a function with the place and maps of each."""
         if not isinstance(batch_size, (int, np.integer)) or batch_size < 1:
             raise OptionError(f"`batch_size` must be a whole number from 1 on, not {batch_size!r}")
 

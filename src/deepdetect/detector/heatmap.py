@@ -201,7 +201,6 @@ def _run(network: Network, images: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 def _mean_of_flips(run: Run, images: list[np.ndarray], options: HeatmapOptions) -> list[np.ndarray]:
-    """Return the logits of images, with `tta` the mean of those of their flips and turns."""
     if options.tta == "none":
         return run(images)
     means = [np.zeros(rgb.shape[:2], np.float32) for rgb in images]

@@ -156,7 +156,6 @@ class PointDetector:
         )
 
     def _find(self, rgb: np.ndarray, ignore: np.ndarray | None) -> Keypoints:
-        """Detect in an image that `load_image` returned."""
         gray = luma(rgb)
         height, width = gray.shape
         if ignore is not None:

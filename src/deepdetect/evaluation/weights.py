@@ -72,7 +72,6 @@ class ForegroundScore:
     failures: tuple[str, ...] = ()
 
 
-@suggest_keywords
 @dataclass(frozen=True)
 class Evaluation:
     """How good weights are.

@@ -111,7 +111,6 @@ def _colors_of_positions(positions: np.ndarray) -> np.ndarray:
 
 
 def _of_height(rgb: np.ndarray, height: int) -> np.ndarray:
-    """Scale an image to a height."""
     width = max(1, round(rgb.shape[1] * height / len(rgb)))
     interpolation = cv2.INTER_LINEAR if height > len(rgb) else cv2.INTER_AREA
     return cv2.resize(rgb, (width, height), interpolation=interpolation)

@@ -268,7 +268,6 @@ class Keypoints:
         return iter(self.xy)
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: a small table, and where the keypoints are."""
         from .display import html_summary
 
         width, height = self.image_size

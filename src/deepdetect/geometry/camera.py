@@ -221,7 +221,6 @@ def _calibration(values: Any, size0: Size, size1: Size, source: str) -> Calibrat
 
 
 def _camera(view: dict[str, Any], size: Size) -> Camera:
-    """Return one view's camera; defaults come from the image."""
     if "focal_px" not in view:
         raise ReconstructionError('it has no "focal_px": add the focal length in pixels')
     size = view.get("width", size[0]), view.get("height", size[1])

@@ -125,11 +125,9 @@ class PolarFrame:
         return cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), shown
 
     def _angles(self, rows: np.ndarray) -> np.ndarray:
-        """Return the angles of rows in the first view."""
         return self.middle + self.first_angle + rows * self.step
 
     def _directions(self, angles: np.ndarray, view: int) -> np.ndarray:
-        """Return unit vectors from the epipole along the lines of these angles, (N, 2)."""
         first = np.column_stack([np.cos(angles), np.sin(angles)])
         if not view:
             return first

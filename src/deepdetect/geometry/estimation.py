@@ -89,7 +89,6 @@ class GeometryOptions:
 
 
 def _matrix(name: str, value: Any) -> np.ndarray:
-    """Return a copy of a (3, 3) matrix, validated."""
     try:
         matrix = np.array(value, np.float64)
     except (TypeError, ValueError):
@@ -103,7 +102,6 @@ def _matrix(name: str, value: Any) -> np.ndarray:
     return matrix
 
 
-@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Geometry:
     """An estimated geometry.
@@ -285,7 +283,6 @@ def _log10_nfa(
 
 
 def _log_binomial(count: int, chosen: int) -> float:
-    """Return the natural logarithm of a binomial coefficient."""
     return lgamma(count + 1) - lgamma(chosen + 1) - lgamma(count - chosen + 1)
 
 

@@ -148,7 +148,6 @@ def _fit_to_corners(
 
 
 def _fit_to_pixels(gray0: np.ndarray, warped: np.ndarray, valid_mask: np.ndarray) -> Fit:
-    """Return the alignment of all pixels (ECC), which has the least noise."""
     (first, scale), (second, _) = (downscale(gray, ALIGNMENT_SIDE_PX) for gray in (gray0, warped))
     normalised = [
         normalise_local_contrast(gaussian_blur(gray, ALIGNMENT_SIGMA_PX))

@@ -275,5 +275,4 @@ def _cheirality_ratio(
 
 
 def _evenly(rows: np.ndarray) -> np.ndarray:
-    """Return at most `MAX_MATCHES` of the rows."""
     return rows[:: max(1, -(-len(rows) // MAX_MATCHES))]

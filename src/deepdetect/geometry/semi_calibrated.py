@@ -77,7 +77,6 @@ def estimate_semi_calibrated(
         return None
 
     def judge(fundamental: np.ndarray) -> TwoViewModel:
-        """Count the matches that agree, and how likely that is by chance."""
         inliers = epipolar_errors(points0, points1, fundamental) < inlier_threshold
         tried = MODELS_PER_SAMPLE * len(FOCAL_LENGTHS)
         alarms = log10_nfa(inliers, "essential", inlier_threshold, sizes[1], tried)
@@ -172,17 +171,14 @@ class _Cameras:
 
     @cached_property
     def inverses(self) -> tuple[np.ndarray, np.ndarray]:
-        """The inverse camera matrices of both."""
         calibration = self.calibration
         return np.linalg.inv(calibration.camera0.matrix), np.linalg.inv(calibration.camera1.matrix)
 
     def fundamental(self, essential: np.ndarray) -> np.ndarray:
-        """Return the fundamental matrix of an essential one."""
         inverse0, inverse1 = self.inverses
         return np.asarray(inverse1.T @ essential @ inverse0)
 
     def essential(self, fundamental: np.ndarray) -> np.ndarray:
-        """Return the essential matrix of a fundamental one."""
         calibration = self.calibration
         return calibration.camera1.matrix.T @ fundamental @ calibration.camera0.matrix
 
@@ -217,7 +213,6 @@ def _moved(views: Views, change: np.ndarray) -> Views:
 def _fit_essential(
     points0: np.ndarray, points1: np.ndarray, cameras: _Cameras, inlier_threshold: float
 ) -> np.ndarray | None:
-    """Return an essential matrix by MAGSAC."""
     calibration = cameras.calibration
     # Of one camera for both images, in pixels: in normalised coordinates OpenCV 5 is less accurate.
     focal = (calibration.camera0.focal_px[0] + calibration.camera1.focal_px[0]) / 2

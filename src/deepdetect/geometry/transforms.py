@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .._shared.options import suggest_keywords
 
-
-@suggest_keywords
 def transform_points(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Map points by a homography.
 
@@ -32,7 +29,6 @@ def transform_points(points: np.ndarray, homography: np.ndarray) -> np.ndarray:
     return result
 
 
-@suggest_keywords
 def transfer_errors(points0: np.ndarray, points1: np.ndarray, homography: np.ndarray) -> np.ndarray:
     """Return the transfer error of each match under a homography, (N,) float64 in pixels.
 
@@ -43,7 +39,6 @@ def transfer_errors(points0: np.ndarray, points1: np.ndarray, homography: np.nda
     return np.sqrt(np.einsum("ij,ij->i", gaps, gaps))
 
 
-@suggest_keywords
 def epipolar_errors(
     points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
 ) -> np.ndarray:
@@ -91,7 +86,6 @@ def _apply(matrix: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     return coordinates
 
 
-@suggest_keywords
 def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.ndarray) -> np.ndarray:
     """Return the distances of a rectified pair's matches from the true disparity.
 

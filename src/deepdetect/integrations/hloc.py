@@ -184,6 +184,5 @@ def register() -> None:
 
 
 def _check_names(conf: dict[str, Any], known: Iterable[str]) -> None:
-    """Refuse options that a model does not have; "name" is hloc's own."""
     for name in conf:
         check_name("option", name, ("name", *known))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from .._shared.errors import OptionError, require_packages
-from .._shared.options import suggest_keywords
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints, unit_length
 from .tensors import load_tensor, padded
@@ -34,7 +33,6 @@ class DeepDetectDetector(Module):
         OptionError: an option is unknown or out of its range.
     """
 
-    @suggest_keywords
     def __init__(self, detector: PointDetector = PointDetector()) -> None:
         super().__init__()
         self._detector = detector
@@ -57,12 +55,10 @@ class DeepDetectDetector(Module):
         return self._frames(_found(self._detector.detect, img, mask), img)
 
     def _frames(self, found: list[Keypoints], img: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the LAFs and the scores of a batch."""
         lafs = [self._lafs(points) for points in found]
         return padded(lafs, img.device), padded([points.scores for points in found], img.device)
 
     def _lafs(self, points: Keypoints) -> Tensor:
-        """Return (N, 2, 3) frames."""
         assert points.sizes is not None
         assert points.angles is not None
         if not len(points):
@@ -103,7 +99,6 @@ class DeepDetectFeature(DeepDetectDetector):
 
 
 def _found(find: Callable[..., Keypoints], img: Tensor, mask: Tensor | None) -> list[Keypoints]:
-    """Return the keypoints of each image, where the mask is above 0."""
     images = [load_tensor(one) for one in img]
     if mask is None:
         return [find(image) for image in images]

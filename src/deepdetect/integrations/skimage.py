@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import OptionError
-from .._shared.options import suggest_keywords
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
 from ..features.scale_space import SIZE_PER_SIGMA
@@ -53,7 +52,6 @@ class DeepDetectFeatures:
     responses: np.ndarray | None = None
     descriptors: np.ndarray | None = None
 
-    @suggest_keywords
     def __init__(self, detector: PointDetector = PointDetector()) -> None:
         self._detector = detector
 

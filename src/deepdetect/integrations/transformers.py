@@ -310,7 +310,6 @@ def register() -> None:
 
 
 def _sizes(pixel_values: Tensor, pixel_mask: Tensor | None) -> list[tuple[int, int]]:
-    """Return the height and width of each image of a batch."""
     if pixel_mask is None:
         height, width = pixel_values.shape[-2:]
         return [(height, width)] * len(pixel_values)
@@ -320,7 +319,6 @@ def _sizes(pixel_values: Tensor, pixel_mask: Tensor | None) -> list[tuple[int, i
 
 
 def _listed(images: Any) -> list[Any]:
-    """Return one or several images as a list."""
     if isinstance(images, (list, tuple)) or getattr(images, "ndim", 0) == 4:
         if not len(images):
             raise OptionError("there are no images: give one or more")

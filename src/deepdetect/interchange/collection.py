@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from .._shared.errors import ImageError, OptionError
-from .._shared.options import suggest_keywords
 from .._shared.progress import progress
 from ..batch.pair_list import Pair
 from ..features.keypoints import Keypoints
@@ -18,7 +17,6 @@ from ..io.image import ORIENTATION_TAG, load_image, luma
 from ..io.image_file import open_image
 
 
-@suggest_keywords
 @dataclass(frozen=True, eq=False)
 class PairMatches:
     """Matches of two images.
@@ -53,7 +51,6 @@ class PairMatches:
         return len(self.rows)
 
 
-@suggest_keywords
 @dataclass(frozen=True, eq=False)
 class Collection:
     """Images with their keypoints and matches.

@@ -70,7 +70,6 @@ def write_colmap(
     return (path,)
 
 
-@suggest_keywords
 def write_colmap_text(collection: Collection, output: str | Path) -> tuple[Path, ...]:
     """Write the text files of `colmap feature_importer` and `colmap matches_importer`.
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import OptionError
-from .._shared.options import suggest_keywords
 from ..batch.extraction import feature_group
 from ..batch.hdf5 import write_groups
 from ..batch.pair_list import pair_name
@@ -19,7 +18,6 @@ from .collection import Collection, check_names, check_upright
 FILES = ("features.h5", "matches.h5", "pairs.txt")
 
 
-@suggest_keywords
 def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
     """Write features.h5 (keypoints, scores, descriptors (D, N)), matches.h5 and pairs.txt.
 

@@ -136,7 +136,6 @@ def _add_matches(found: dict[Pair, PairMatches], pair: Pair, matches: PairMatche
 
 
 def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
-    """Read npz files of keypoints and of matches."""
     names = _names_by_stem(folder)
     keypoints: dict[str, Keypoints] = {}
     matches: dict[Pair, PairMatches] = {}
@@ -177,7 +176,6 @@ def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
 
 
 def _pair_of_stem(stem: str, names: Mapping[str, str] | None, path: Path) -> Pair:
-    """Return the names of the two images whose stems are joined in one."""
     parts = stem.split("_")
     joined = [("_".join(parts[:k]), "_".join(parts[k:])) for k in range(1, len(parts))]
     if names is not None:

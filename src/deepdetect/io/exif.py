@@ -98,7 +98,6 @@ def _tags(image: Any) -> tuple[dict[int, Any], int]:
 
 
 def _number(value: Any) -> float:
-    """Return a tag as a number; 0 for what is missing, broken or negative."""
     try:
         number = float(value) if not isinstance(value, tuple) else float(Fraction(*value))
     except (TypeError, ValueError, ZeroDivisionError):

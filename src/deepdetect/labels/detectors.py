@@ -81,7 +81,6 @@ def pixels_mask(shape: tuple[int, ...], xy: np.ndarray) -> np.ndarray:
 
 
 def _marked(gray: np.ndarray, detector: cv2.Feature2D) -> np.ndarray:
-    """Mark the pixel of each keypoint of an OpenCV detector."""
     return pixels_mask(gray.shape, cv2.KeyPoint_convert(detector.detect(gray, None)))
 
 

@@ -26,7 +26,6 @@ LOW_VISIBILITY_RANGE = 64
 """An image whose luma spans fewer grey levels than this is of low visibility."""
 
 
-@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Label:
     """A fusion label.
@@ -56,7 +55,6 @@ class Label:
         return float(self.mask.mean())
 
 
-@suggest_keywords
 def visibility_of(gray: np.ndarray) -> Visibility:
     """Decide which detector settings an image gets.
 
@@ -114,7 +112,6 @@ def fuse(
     return Label(marked["keypoint"], marked["edge"], visibility)
 
 
-@suggest_keywords
 def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
     """Draw the paper's Figure 4: image, keypoint mask, edge mask, and both combined.
 

@@ -111,7 +111,6 @@ LABEL_SETTINGS: dict[str, LabelOptions] = {
 }
 
 
-@suggest_keywords
 def find_label_settings(settings: str | Path) -> LabelOptions:
     """Look settings up by name, or read them from a file.
 

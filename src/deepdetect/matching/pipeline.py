@@ -310,7 +310,6 @@ def _match_unguided(
     options: MatchingOptions,
     timer: StageTimer,
 ) -> Matches:
-    """Match all keypoints with all others by their descriptors, then estimate the geometry."""
     check_memory([len(each) for each in keypoints])
     with timer.stage("descriptors"):
         features0, features1 = (
@@ -384,7 +383,6 @@ def _no_matches(
 
 
 def _key(gray: np.ndarray) -> tuple[tuple[int, ...], bytes]:
-    """Return what images are ordered by."""
     return gray.shape, hashlib.sha256(gray.tobytes()).digest()
 
 

@@ -34,7 +34,6 @@ COMPARED_SIDE_PX = 480
 """Longer side to which images are reduced before."""
 
 
-@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Registration:
     """A second image in the frame of a first.

@@ -359,6 +359,5 @@ def _plane_errors(pixels: np.ndarray, disparity: np.ndarray) -> np.ndarray:
 
 
 def _robust_step(design: np.ndarray, error: np.ndarray, pixel: float) -> np.ndarray:
-    """Return the change of parameters that lessens the sum of absolute errors (reweighting)."""
     weight = 1 / np.sqrt(np.maximum(np.abs(error) * pixel, 0.02))
     return np.linalg.lstsq(design * weight[:, None], error * weight, rcond=None)[0]

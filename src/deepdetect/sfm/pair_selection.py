@@ -68,7 +68,6 @@ def vlad_vectors(descriptors: Sequence[np.ndarray], seed: int = 0) -> np.ndarray
 
 
 def _vocabulary(descriptors: np.ndarray, seed: int) -> np.ndarray:
-    """Return the centres of k-means."""
     rng = np.random.default_rng(seed)
     if len(descriptors) > MAX_TRAINING_DESCRIPTORS:
         descriptors = rng.choice(descriptors, MAX_TRAINING_DESCRIPTORS, replace=False)
@@ -80,6 +79,5 @@ def _vocabulary(descriptors: np.ndarray, seed: int) -> np.ndarray:
 
 
 def _nearest(descriptors: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Return the row of the nearest centre of each descriptor."""
     squares = (centres**2).sum(axis=1)
     return np.asarray(np.argmin(squares - 2 * descriptors @ centres.T, axis=1))

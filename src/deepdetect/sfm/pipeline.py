@@ -211,7 +211,6 @@ def _without_registered(
 
 
 def _sparse_colors(features: Path, sparse: SparseModel) -> np.ndarray:
-    """Return the (P, 3) uint8 mean colours of the points in the images that see them."""
     sums = np.zeros((len(sparse.points), 3))
     with open_hdf5(features) as file:
         for name, image in sparse.images.items():

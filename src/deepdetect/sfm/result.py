@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.options import suggest_keywords
 from ..geometry.camera import PosedView
 from ..geometry.point_cloud import PointCloud
 from .colmap import CameraIntrinsics
@@ -18,7 +17,6 @@ SCALE = "lengths are in spacings, the median distance from a camera to the neare
 true scale is not known"
 
 
-@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class MultiViewReconstruction:
     """Cameras and points of many images.

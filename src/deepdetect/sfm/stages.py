@@ -293,7 +293,6 @@ class Stages:
 def _dense_task(
     task: tuple[Path, list[RegisteredImage]], folder: Path, stride_px: int
 ) -> tuple[Path, np.ndarray]:
-    """Write the dense points of one image, and return them."""
     path, images = task
     points = dense_points(folder, images, stride_px)
     save_arrays(path, {"dense": points}, compress=False)

@@ -88,7 +88,6 @@ class Tracker:
         (40, [3.0, 0.0])
     """
 
-    @suggest_keywords
     def __init__(self, detect: Detect, options: TrackingOptions = TrackingOptions()) -> None:
         self.detect, self.options = detect, options
         self._gray: np.ndarray | None = None

@@ -14,7 +14,6 @@ import numpy as np
 from .._shared.atomic import atomic_path
 from .._shared.errors import InvalidFileError, MissingFileError, OptionError, first_line
 from .._shared.opencv import cv2
-from .._shared.options import suggest_keywords
 
 HEADER = "frame,track,x,y,score"
 
@@ -25,7 +24,6 @@ HUE_STEP = 0.61803
 """Of the colours of following tracks: neighbours are far apart (the golden ratio)."""
 
 
-@suggest_keywords
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
     """The tracked points of one frame.
@@ -80,7 +78,6 @@ def write_tracks(path: str | Path) -> Iterator[Callable[[TrackedFrame], None]]:
         yield write
 
 
-@suggest_keywords
 def save_tracks(frames: Iterable[TrackedFrame], path: str | Path) -> None:
     """Write the tracks of frames as CSV: columns frame, track, x, y and score.
 
@@ -97,7 +94,6 @@ def save_tracks(frames: Iterable[TrackedFrame], path: str | Path) -> None:
             write(frame)
 
 
-@suggest_keywords
 def load_tracks(path: str | Path) -> list[TrackedFrame]:
     """Read the CSV file that `save_tracks` or `deepdetect track` wrote.
 

@@ -97,7 +97,6 @@ class FrameSource(AbstractContextManager["FrameSource"]):
         self.count = min((number for number in (taken, max_frames) if number), default=None)
 
     def _opened(self, path: Path) -> Any:
-        """Open a file or a camera by OpenCV."""
         if not self.live and not path.is_file():
             raise MissingFileError(f"there is no video, folder or camera {path}: check the path")
         if not self.live and path.suffix.lower() in IMAGE_SUFFIXES:
@@ -157,7 +156,6 @@ class FrameSource(AbstractContextManager["FrameSource"]):
 
 
 def _camera_number(source: str | Path | int) -> int | None:
-    """Return the number of a camera, None where a path is meant."""
     if isinstance(source, int):
         if source < 0:
             raise OptionError(f"the number of a camera must be 0 or more, not {source}")

@@ -172,7 +172,6 @@ def _rotated_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) ->
 
 
 def _upright_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) -> np.ndarray:
-    """Cut out a square, mirrored and turned by right angles; enlarge it only if it must be."""
     largest = min(rgb.shape[:2])
     window = max(round(largest * generator.uniform(*CROP_SCALE)), min(side, largest))
     top, left = (int(generator.integers(length - window + 1)) for length in rgb.shape[:2])
@@ -185,7 +184,6 @@ def _upright_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) ->
 
 
 def _relight(rgb: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Change gamma, contrast and brightness, by a table of 256 entries."""
     levels = np.arange(256) / 255
     levels = levels ** math.exp(generator.uniform(-MAX_LOG_GAMMA, MAX_LOG_GAMMA))
     levels = 0.5 + (levels - 0.5) * generator.uniform(*RELIGHT_CONTRAST)
@@ -194,7 +192,6 @@ def _relight(rgb: np.ndarray, generator: np.random.Generator) -> np.ndarray:
 
 
 def _compress(rgb: np.ndarray, quality: int) -> np.ndarray:
-    """Encode as JPEG and decode again."""
     bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)  # OpenCV's order, so that luma is luma
     _, stored = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return cv2.cvtColor(cv2.imdecode(stored, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)

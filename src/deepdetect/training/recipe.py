@@ -311,7 +311,6 @@ PRESETS: dict[str, TrainingOptions] = {
 }
 
 
-@suggest_keywords
 def training_preset(name: str) -> TrainingOptions:
     """Look a recipe up by its name.
 

@@ -213,7 +213,6 @@ def _deal(
 
 
 def _write_shard(task: ShardTask, labels: LabelOptions) -> tuple[int, list[str]]:
-    """Write one shard, if all of its images can be read; return their number, and what fails."""
     shard, rows = task
     failures: list[str] = []
     with contextlib.suppress(BatchError), atomic_path(shard) as temporary:
@@ -237,7 +236,6 @@ def _write_shard(task: ShardTask, labels: LabelOptions) -> tuple[int, list[str]]
 def _files_of(
     name: str, path: Path, views: Sequence[View], labels: LabelOptions
 ) -> dict[str, bytes]:
-    """Return the files of an image by their endings."""
     rgb = load_image(path)
     files = {"name.txt": name.encode(), f"image{path.suffix.lower()}": path.read_bytes()}
     for view in views:
@@ -271,7 +269,6 @@ def _read(path: Path, place: tuple[int, int]) -> bytes:
 
 
 def _read_index(folder: Path, options: TrainingOptions) -> Shards:
-    """Read the index of shards; an OptionError where they were made with other options."""
     try:
         index = dict(json.loads((folder / INDEX).read_bytes()))
         training, validation = (

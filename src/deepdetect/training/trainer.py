@@ -260,7 +260,6 @@ class Trainer(abc.ABC):
         return {"options": recipe, **self.origin, **self.notes, **provenance()}
 
     def _write_card(self, folder: Path, points: Sequence[Point], best: Point) -> None:
-        """Write the model card, in Markdown: quality, origin and recipe of the best weights."""
         weights = folder / self.weights_file
         notes, (network, quality) = self.read_notes(weights), self.card(best)
         known = ("command", "options", "point")

@@ -175,7 +175,6 @@ def fit_picture(picture: np.ndarray) -> np.ndarray:
 
 
 def _viridis(levels: np.ndarray) -> np.ndarray:
-    """Return the (N, 3) colours of levels in [0, 1]."""
     colors: np.ndarray = draw_heatmap(np.asarray(levels).reshape(1, -1))[0]
     return colors
 

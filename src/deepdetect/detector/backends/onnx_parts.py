@@ -73,7 +73,6 @@ def _cut(graph: _Graph, inputs: Mapping[str, Bytes], outputs: Mapping[str, Bytes
 
 
 def _read(model: bytes) -> _Graph:
-    """Take an ONNX file apart."""
     parts = _Graph([], [], {}, {}, {})
     named = {
         GRAPH_INITIALIZER: parts.weights,

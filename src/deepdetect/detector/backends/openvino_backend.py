@@ -105,7 +105,6 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
 
 
 def _keep_what_is_read(graph: Any) -> None:
-    """Take out outputs that nobody reads, and the padding: images come padded."""
     names = {name for value in graph.outputs for name in value.get_names()}
     unread = names - {LOGITS} if LOGITS in names else set(POINTS)
     for result in graph.get_results():

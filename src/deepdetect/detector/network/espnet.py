@@ -18,7 +18,6 @@ DILATIONS = (1, 2, 4, 8, 16)
 
 
 def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.Conv2d:
-    """Make a convolution without bias that keeps the size (stride 1) or halves it (stride 2)."""
     return nn.Conv2d(inputs, outputs, kernel, stride=stride, padding=kernel // 2, bias=False)
 
 
@@ -193,5 +192,4 @@ class ESPNet(nn.Module):
 
 
 def _double(inputs: int, outputs: int) -> nn.ConvTranspose2d:
-    """Make the learned upsampling by two."""
     return nn.ConvTranspose2d(inputs, outputs, 2, stride=2, bias=False)

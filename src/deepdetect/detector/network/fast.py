@@ -148,5 +148,4 @@ class FastNetwork(nn.Module):
 
 
 def _doubled(features: Tensor) -> Tensor:
-    """Repeat each pixel in both directions."""
     return interpolate(features, scale_factor=2, mode="nearest")

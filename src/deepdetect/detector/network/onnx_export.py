@@ -111,7 +111,6 @@ def write_onnx(
 def _write(
     model: ModelProto, path: str | Path, options: OnnxOptions, origin: Mapping[str, str]
 ) -> dict[str, str]:
-    """Write what the options make of a network for any size; return its metadata."""
     if options.size is not None:
         fix_size(model, *options.size, options.batch)
     if not options.maps:
@@ -160,7 +159,6 @@ def _load(path: Path) -> tuple[ModelProto, dict[str, str]]:
 
 
 def _of_torch(network: nn.Module) -> ModelProto:
-    """Return a network of torch as one that pads its image, for any size."""
     import onnx
     import torch
 

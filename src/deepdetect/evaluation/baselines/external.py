@@ -196,8 +196,6 @@ def _external_feature(
     learned: bool,
     binary: bool = False,
 ) -> LocalFeature:
-    """Make a local feature of a function; whatever it raises becomes a `BaselineError`."""
-
     def run(rgb: np.ndarray) -> Keypoints:
         size = (rgb.shape[1], rgb.shape[0])
         try:

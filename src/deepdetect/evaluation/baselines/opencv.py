@@ -82,8 +82,6 @@ def _feature(
 
 
 def _opencv(name: str) -> LocalFeature:
-    """Make a local feature of `OPENCV_SETTINGS`; all but ORB and BRISK are described by SIFT."""
-
     def detect(rgb: np.ndarray) -> Keypoints:
         found = _make(name).detect(luma(rgb), None)
         return Keypoints.from_opencv(found, (rgb.shape[1], rgb.shape[0]))

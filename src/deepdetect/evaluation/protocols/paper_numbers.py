@@ -19,7 +19,6 @@ NUMBERS: dict[str, Any] = tomllib.loads(Path(__file__).with_suffix(".toml").read
 
 
 def _by_method(name: str) -> Paper:
-    """Return a printed table, whose rows are columns here."""
     printed = dict(NUMBERS[name])
     methods = printed.pop("methods")
     return {

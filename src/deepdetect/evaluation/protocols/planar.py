@@ -130,7 +130,6 @@ def _figures(
     key: str,
     scenes: Sequence[PlanarScene],
 ) -> tuple[Table, list[Figure]]:
-    """Make Figure 6 with its table, and Figure 2 of some scenes."""
     features = CLASSICAL["sift"], CLASSICAL["sift-low"], options.deepdetect_480()
     table = paper.matches_table(run, features, pairs, f"{key}_figure6", "Figure 6: correct matches")
     keypoints = partial(paper.keypoint_figure, run, features)

@@ -285,7 +285,6 @@ def _apart(views: Views, others: Views, truth: Views) -> float | None:
 
 
 def _extent(truth: Views) -> float:
-    """Return the largest distance of two true cameras."""
     centres = np.array([view.centre for view in truth.values()])
     return float(np.linalg.norm(centres[:, None] - centres, axis=2).max())
 
@@ -395,7 +394,6 @@ def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, 
 
 
 def _times() -> np.ndarray:
-    """Return wall time and CPU time in seconds."""
     return np.array([time.perf_counter(), time.process_time()])
 
 

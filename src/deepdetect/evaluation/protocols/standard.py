@@ -144,7 +144,6 @@ def _at_budget(
     places: Sequence[Keypoints],
     budget: int | None,
 ) -> Row:
-    """Measure repeatability and coverage of the best keypoints of both images."""
     first, second = (each if budget is None else each.best(budget) for each in places)
     sizes = first.image_size, second.image_size
 

@@ -143,7 +143,6 @@ def points_table(
 
 
 def _voxel(pair: CalibratedStereoPair) -> tuple[str, float]:
-    """Return the unit of a scene, and the edge of its voxels."""
     return ("mm", 2.0) if pair.calibration.baseline_mm else ("baseline", 0.05)
 
 
@@ -158,7 +157,6 @@ def count_voxels(
 def _triangulate(
     calibration: Calibration, pixels: np.ndarray, disparity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points with a depth, and which these are."""
     depth = calibration.depth_mm(disparity)
     kept = np.isfinite(depth)
     return calibration.camera0.rays(pixels[kept]) * depth[kept, None], kept

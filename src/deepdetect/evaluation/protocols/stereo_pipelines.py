@@ -101,7 +101,6 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
 def _ours(
     scene: CalibratedStereoPair, *, detector: AnyDetector, density: float | None = None
 ) -> Points:
-    """Reconstruct as `deepdetect reconstruct --rectified`."""
     _compile_kernels()
     profiler = StageProfiler()
     found = reconstruct(
@@ -120,14 +119,11 @@ def _ours(
 
 
 def _random(scene: CalibratedStereoPair, *, like: DeepDetect) -> Points:
-    """Reconstruct as many random pixels as a detector finds keypoints."""
     density = float((like.heatmap(scene.left) > 0.5).mean())
     return _ours(scene, detector=RandomDetector(), density=density)
 
 
 def _paper(feature: LocalFeature, drawn: str = "", paper: Mapping[str, float] = {}) -> Pipeline:
-    """Make the paper's pipeline with the keypoints and descriptors of a local feature."""
-
     def run(scene: CalibratedStereoPair) -> Points:
         feature.detect(scene.left)  # the first run of a size takes longer
         profiler = StageProfiler()

@@ -115,7 +115,6 @@ class RectifiedMatches:
         return len(self.indices)
 
 
-@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class DisparityMap:
     """The disparity of each pixel of the left view of a rectified pair.

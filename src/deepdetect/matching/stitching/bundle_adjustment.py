@@ -217,7 +217,6 @@ def _linearised(
 
 
 def _residual_px(current: Matrices, links: Links) -> float:
-    """Return the root mean square of the residuals in pixels."""
     residuals = [
         _linearised(current[first], current[second], points, targets)[0]
         for first, second, points, targets in links

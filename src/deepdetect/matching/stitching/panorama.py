@@ -54,7 +54,6 @@ class StitchingOptions:
         )
 
 
-@suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Panorama:
     """Images put together.

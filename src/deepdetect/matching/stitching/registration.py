@@ -127,7 +127,6 @@ def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
 
 
 def _registered_pairs(views: Sequence[_Image], seed: int) -> list[RegisteredPair]:
-    """Register the pairs that overlap most, until all are connected and have enough partners."""
     overlaps: list[tuple[InitialGeometry, int, int]] = []
     for first, second in combinations(range(len(views)), 2):
         a, b = views[first], views[second]

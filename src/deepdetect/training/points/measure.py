@@ -85,7 +85,6 @@ def measure(detect: Detect, pairs: Sequence[ViewPair]) -> dict[str, float]:
 
 
 def _correct(pair: ViewPair, points: Sequence[Keypoints], sizes: Sizes) -> int:
-    """Return the number of matches correct to 1 px."""
     described = [
         root_sift_descriptors(image, each.xy, DESCRIPTOR_SIZE_PX)
         for image, each in zip(pair.images, points, strict=True)

@@ -97,7 +97,6 @@ def _correspondences(
     valid: np.ndarray,
     similarity: np.ndarray | None,
 ) -> tuple[np.ndarray, ...]:
-    """Return the last five fields of `ViewCandidates`."""
     mapped = np.column_stack([here, np.ones(len(here))]) @ (homography / homography[2, 2]).T
     depth = mapped[:, 2:]
     before = depth[:, 0] > 0  # others lie behind the camera of the tilted view
