@@ -157,7 +157,8 @@ def facades(photographs: Photographs) -> Iterator[MadePair]:
                 canvas = np.pad(canvas, [(0, missing[0]), (0, missing[1]), (0, 0)], "symmetric")
             elif kind == kinds[1]:
                 canvas = photographs.any(rng)
-                canvas[60 : 60 + height, 50 : 50 + width] = facade[:height, start:][:, :width]
+                left = min(50, SIZE[0] - width)
+                canvas[60 : 60 + height, left : left + width] = facade[:height, start:][:, :width]
             else:
                 around_ = np.array(around)
                 around_[60 : 60 + height, 90 : 90 + width] = facade[:height, :width]

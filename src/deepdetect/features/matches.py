@@ -45,8 +45,8 @@ class TwoViewGeometry:
         verified: fraction of what it proposed that the images confirm: of a homography the partners
             of keypoints, else the keypoints of the first image that are matched, or, where only
             sparse matches are returned, these.
-        correlation: median local ZNCC of both images, after the homography of `on_plane`, or around
-            the matches.
+        correlation: median ZNCC of windows of both images, each where the matches around it say,
+            without its own: right matches predict what looks alike. 0 for few matches.
         confidence: "high", "fair" (only sparse matches, or weak evidence) or "none".
     """
 
@@ -85,6 +85,8 @@ class GuidedMatches:
         indices1: (M,) int64 keypoints of the second image; None where the positions are others.
         points0: (M, 2) float64 positions in the first image where they are not those of keypoints:
             then the index of a match that no keypoint is near is -1.
+        alike: (M,) bool, false where the images contradict: the window around the match, held out
+            from the matches that predict where it is, is no more alike than unrelated ones.
     """
 
     indices0: np.ndarray
@@ -93,6 +95,7 @@ class GuidedMatches:
     subpixel: bool = False
     indices1: np.ndarray | None = None
     points0: np.ndarray | None = None
+    alike: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.indices0)
@@ -118,10 +121,10 @@ class GuidedMatches:
         best_first = np.lexsort((self.indices0, -self.scores))
         _, first = np.unique(pixels[best_first], axis=0, return_index=True)
         kept = np.sort(best_first[first])
-        columns = self.indices0[kept], self.points1[kept], self.scores[kept]
-        indices1 = None if self.indices1 is None else self.indices1[kept]
-        points0 = None if self.points0 is None else self.points0[kept]
-        return GuidedMatches(*columns, self.subpixel, indices1, points0)
+        columns: dict[str, Any] = {
+            n: v[kept] for n, v in vars(self).items() if isinstance(v, np.ndarray)
+        }
+        return replace(self, **columns)
 
 
 class _Lazy:
@@ -162,7 +165,9 @@ class Matches:
             dissimilarity of the two patches (0: only just more similar than unrelated patches); by
             a fundamental matrix, their correlation; else 1 - Lowe's ratio.
         inliers: (M,) bool, the matches whose error under the geometry is below
-            `GeometryOptions.inlier_threshold`; all of them where none was asked for.
+            `GeometryOptions.inlier_threshold`; all of them where none was asked for. Guided ones
+            must not be contradicted by the images: where the matches around the window of 16 pixels
+            that one lies in (of copies of 640) predict it, this must look alike.
         model: which geometry that is: "homography", "fundamental", "essential" or "none".
         matrix: (3, 3) float64, the geometry; None when it could not be estimated, or was not
             asked for. A homography maps the first image to the second; else x1^T M x0 = 0

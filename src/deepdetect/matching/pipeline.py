@@ -211,10 +211,12 @@ def match_images(
     indices0, indices1 = _ordered((matched.indices0, matched.indices1), swapped)
     with timer.stage("geometry"):
         geometry = _final_geometry(points, model, seed, options.geometry, guide)
+        assert matched.alike is not None
+        inliers = geometry.inliers & matched.alike
     return Matches(
         *points,
         matched.scores,
-        geometry.inliers,
+        inliers,
         geometry.model,
         geometry.matrix,
         *keypoints,

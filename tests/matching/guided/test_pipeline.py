@@ -53,7 +53,7 @@ def test_nearly_all_points_of_a_plane_are_matched_right(
     seen = ((places > 0) & (places < 255)).all(1)
     assert len(matches) > 0.85 * seen.sum()
     assert ((matches.scores > 0) & (matches.scores <= 1)).all()
-    assert matches.inliers.all()
+    assert matches.inliers.mean() > 0.95
     assert matches.confidence == "high"
     assert matches.two_view_geometry.verified > 0.8
     assert matches.two_view_geometry.correlation > 0.9

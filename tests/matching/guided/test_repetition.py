@@ -43,22 +43,18 @@ POINTS = np.argwhere(np.ones(SIZE))[::7].astype(np.float64)
 
 @pytest.mark.parametrize("pixels", [0, -PERIOD_PX])
 def test_a_wall_of_one_tile_fits_at_every_period(pixels: float) -> None:
-    repeated, correlation = is_repeated(views(unique=False), POINTS, shift(pixels))
-    assert repeated
-    assert correlation > 0.9
+    assert is_repeated(views(unique=False), POINTS, shift(pixels))
 
 
 def test_a_part_that_occurs_once_tells_the_periods_apart() -> None:
     grays = views(unique=True)
-    assert not is_repeated(grays, POINTS, shift(-PERIOD_PX))[0]
-    assert is_repeated(grays, POINTS, shift(0))[0]
+    assert not is_repeated(grays, POINTS, shift(-PERIOD_PX))
+    assert is_repeated(grays, POINTS, shift(0))
 
 
 def test_a_scene_that_does_not_repeat_is_not_repeated() -> None:
     gray = texture(np.random.default_rng(1), *SIZE[::-1]).astype(np.uint8)
-    assert not is_repeated((gray, gray), POINTS, np.eye(3))[0]
+    assert not is_repeated((gray, gray), POINTS, np.eye(3))
     turned = np.array([[0.9, -0.2, 60], [0.2, 0.9, -10], [0, 0, 1]])
     seen = cv2.warpPerspective(gray, turned, SIZE)
-    assert not is_repeated((gray, seen), POINTS, turned)[0]
-    other = texture(np.random.default_rng(2), *SIZE[::-1]).astype(np.uint8)
-    assert is_repeated((gray, other), POINTS, np.eye(3))[1] < 0.2
+    assert not is_repeated((gray, seen), POINTS, turned)

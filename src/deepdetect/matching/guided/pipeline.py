@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..._shared.opencv import cv2
 from ...features.keypoints import nearest_keypoints
 from ...features.matches import GuidedMatches, TwoViewGeometry
 from ...geometry.homography_refinement import refine_homography
@@ -26,6 +27,7 @@ from ...geometry.two_view import (
     fit_model,
     is_usual_rotation,
 )
+from .held_out import compare_held_out
 from .initial_geometry import InitialGeometry, Pair, guiding_geometry
 from .rectified import match_by_rectification
 from .repetition import is_repeated
@@ -37,6 +39,9 @@ MIN_VERIFIED_FRACTION = 0.5
 MIN_UNMATCHED_FRACTION = 0.5
 """Of the matches of a further plane, those that nothing else matches: a repeated pattern that is
 shifted by a period is matched already."""
+
+MATCHED_PX = 9
+"""Side of the window around a match in which the first image counts as matched."""
 
 OFF_PLANE_PX = 6.0
 """Matches that end this far from where the homography takes them are off the plane."""
@@ -108,16 +113,15 @@ def guided_matches(
     if matches is None:
         return geometry, None
     geometry, plane = _with_scene(grays, pixels[0], geometry, matches, seed)
-    correlation = float(np.median(matches.scores))
-    if plane is not None:
-        repeated, correlation = is_repeated(grays, *plane)
-        if repeated:
-            return replace(geometry, model="none", matrix=None, scene="none"), None
+    if plane is not None and is_repeated(grays, *plane):
+        return replace(geometry, model="none", matrix=None, scene="none"), None
+    matches = _with_further_planes(grays, pixels, geometry, matches, first, enough, seed)
+    ends = matches.starts(pixels[0]), matches.points1
+    correlation, alike = compare_held_out(grays, *ends)
     clear = geometry.log10_nfa < MAX_CLEAR_LOG10_NFA and correlation > MIN_CLEAR_CORRELATION
     confidence = "high" if clear and matches.points0 is None else "fair"
     geometry = replace(geometry, correlation=correlation, confidence=confidence)
-    further = _with_further_planes(grays, pixels, geometry, matches, first, enough, seed)
-    return geometry, further
+    return geometry, replace(matches, alike=alike)
 
 
 def _with_scene(
@@ -205,6 +209,11 @@ def _with_further_planes(
     errors = transfer_errors if geometry.model == "homography" else epipolar_errors
     rest = errors(points0, points1, geometry.matrix) > OFF_PLANE_PX
     threshold_px = GUIDING_THRESHOLDS_PX["homography"]
+    around = np.zeros(grays[0].shape, np.uint8)
+    x, y = pixels[0][matches.indices0].astype(np.int64).T
+    around[y, x] = 1
+    around = cv2.dilate(around, np.ones((MATCHED_PX, MATCHED_PX)))
+    last = np.array(around.shape[::-1]) - 1
     while np.count_nonzero(rest) >= MIN_MATCHES:
         points0, points1 = points0[rest], points1[rest]
         size1 = grays[1].shape[::-1]
@@ -212,6 +221,9 @@ def _with_further_planes(
         if plane.matrix is None or not plane.trusted:
             break
         rest = ~plane.inliers
+        x, y = np.rint(points0[~rest]).clip(0, last).astype(np.int64).T
+        if around[y, x].mean() > 1 - MIN_UNMATCHED_FRACTION:
+            continue
         matrix = _refine_homography(grays, plane.matrix)
         further, _ = match_by_homography(grays, pixels, matrix, seed)
         new = ~np.isin(further.indices0, matches.indices0)

@@ -48,11 +48,8 @@ MIN_OWN_FRACTION, MIN_OWN_RATIO = 0.02, 2.0
 its shifted copy explains alone."""
 
 
-def is_repeated(grays: Pair, points0: np.ndarray, homography: np.ndarray) -> tuple[bool, float]:
-    """Return whether a shifted copy of a homography explains (N, 2) points as well as it does.
-
-    And the median correlation of both images around these points.
-    """
+def is_repeated(grays: Pair, points0: np.ndarray, homography: np.ndarray) -> bool:
+    """Return whether a shifted copy of a homography explains (N, 2) points as well as it does."""
     (first, scale0), (second, scale1) = (downscale(gray, COMPARED_SIDE_PX) for gray in grays)
     matrix = scaled_homography(homography, scale0, scale1)
     last = np.array(first.shape[::-1]) - 1
@@ -60,8 +57,6 @@ def is_repeated(grays: Pair, points0: np.ndarray, homography: np.ndarray) -> tup
     places = np.zeros(first.shape, bool)
     places[y, x] = True
     own = _correlation(first, second, matrix)[places]
-    known = own[np.isfinite(own)]
-    correlation = float(np.median(known)) if len(known) else 0.0
     for shift in _similar_shifts(first, *warp_to_reference(second, matrix, first.shape[::-1])):
         shifted = np.eye(3)
         shifted[:2, 2] = shift
@@ -71,8 +66,8 @@ def is_repeated(grays: Pair, points0: np.ndarray, homography: np.ndarray) -> tup
         gain = (own - others)[explained & np.isfinite(own) & np.isfinite(others)]
         alone, other_alone = np.sum(gain > MIN_ZNCC_GAIN), np.sum(gain < -MIN_ZNCC_GAIN)
         if alone < max(MIN_OWN_FRACTION * len(gain), MIN_OWN_RATIO * other_alone):
-            return True, correlation
-    return False, correlation
+            return True
+    return False
 
 
 def _correlation(first: np.ndarray, second: np.ndarray, homography: np.ndarray) -> np.ndarray:
