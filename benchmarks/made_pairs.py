@@ -72,6 +72,11 @@ class Photographs:
         """Return one of the others in this size."""
         return resized(load_image(self.others[rng.integers(len(self.others))]), size)
 
+    def unlike(self, rng: np.random.Generator) -> list[np.ndarray]:
+        """Return two different ones of the others."""
+        two = rng.choice(len(self.others), 2, replace=False)
+        return [resized(load_image(self.others[number]), SIZE) for number in two]
+
 
 def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Return a smaller or larger copy."""
@@ -95,7 +100,7 @@ def planes(photographs: Photographs) -> Iterator[MadePair]:
                 resized(load_image(left.with_name(f"{s}.png")), SIZE) for s in ("left", "right")
             ]
         else:
-            views = [photographs.any(rng) for _ in range(2)]
+            views = photographs.unlike(rng)
         side = float(np.sqrt(share * SIZE[0] * SIZE[1]))
         size = np.array([1.15 * side, side / 1.15])
         texture = resized(texture, (round(size[0]), round(size[1])))
@@ -147,6 +152,7 @@ def facades(photographs: Photographs) -> Iterator[MadePair]:
             facade[y : y + inner[1], x : x + inner[0]] = once
         width, height = (columns * period[0], rows * period[1])
         around = photographs.any(rng, (SIZE[0] + int(period[0]), SIZE[1]))
+        unlike = photographs.unlike(rng) if kind == kinds[1] else []
         views, placed = [], []
         for view in range(2):
             start = view * period[0]
@@ -156,7 +162,7 @@ def facades(photographs: Photographs) -> Iterator[MadePair]:
                 missing = SIZE[1] - canvas.shape[0], SIZE[0] - canvas.shape[1]
                 canvas = np.pad(canvas, [(0, missing[0]), (0, missing[1]), (0, 0)], "symmetric")
             elif kind == kinds[1]:
-                canvas = photographs.any(rng)
+                canvas = unlike[view]
                 left = min(50, SIZE[0] - width)
                 canvas[60 : 60 + height, left : left + width] = facade[:height, start:][:, :width]
             else:

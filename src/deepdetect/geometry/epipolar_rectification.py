@@ -37,6 +37,9 @@ first view: it is finer nearer to the epipole, and coarser farther away."""
 MIN_RADIUS_PX = 8.0
 """Nearer to the epipole nothing is rectified: nothing moves there."""
 
+MAX_SIDE_PX = 2**15 - 2
+"""Of a frame: OpenCV warps no image to more."""
+
 
 @dataclass(frozen=True, eq=False)
 class PlanarFrame:
@@ -165,7 +168,8 @@ def rectified_frame(
     if len(points0) < 8:
         return None
     sizes = size0, size1
-    return _planar_frame(points, fundamental, sizes) or _polar_frame(points, fundamental, sizes)
+    frame = _planar_frame(points, fundamental, sizes) or _polar_frame(points, fundamental, sizes)
+    return None if frame is None or max(frame.size) > MAX_SIDE_PX else frame
 
 
 def _planar_frame(

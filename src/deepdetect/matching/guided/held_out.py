@@ -26,7 +26,8 @@ MIN_WINDOWS = 20
 """With fewer that can be compared nothing is known."""
 
 FALSE_POSITIVE_RATE = 0.05
-"""Fraction of the unrelated windows that are as much alike as those that do not contradict."""
+"""Fraction of the unrelated windows that are as much alike, with those around them, as those of
+matches that the images do not contradict."""
 
 
 def compare_held_out(
@@ -58,11 +59,21 @@ def compare_held_out(
     shift = rows // 2 * WINDOW_PX, columns // 2 * WINDOW_PX
     others, shown = (np.roll(values, shift, (0, 1)) for values in (seen, inside))
     unrelated = local_zncc(first, others, shown, WINDOW_PX, WINDOW_PX)
-    compared, unrelated = np.isfinite(own), unrelated[np.isfinite(unrelated)]
-    if min(compared.sum(), len(unrelated)) < MIN_WINDOWS:
+    if min(np.isfinite(own).sum(), np.isfinite(unrelated).sum()) < MIN_WINDOWS:
         return 0.0, everything
-    alike = ~(own <= np.quantile(unrelated, 1 - FALSE_POSITIVE_RATE))  # or not known
-    return float(np.median(own[compared])), alike[row, column]
+    bound = np.nanquantile(_mean_around(unrelated), 1 - FALSE_POSITIVE_RATE)
+    alike = ~(_mean_around(own) <= bound)  # or not known
+    return float(np.nanmedian(own)), alike[row, column]
+
+
+def _mean_around(values: np.ndarray) -> np.ndarray:
+    """Average windows with those around them, (rows, columns); NaN where one is not known."""
+    known = np.isfinite(values)
+    total, count = (
+        cv2.boxFilter(part, cv2.CV_64F, (3, 3), borderType=cv2.BORDER_CONSTANT)
+        for part in (np.where(known, values, 0), known.astype(np.float32))
+    )
+    return np.where(known, total / np.maximum(count, 1e-9), np.nan)
 
 
 def _affine_maps(

@@ -20,7 +20,7 @@ from ...geometry.images import (
     normalise_local_contrast,
     warp_to_reference,
 )
-from ...geometry.transforms import scaled_homography, scaled_points
+from ...geometry.transforms import scaled_homography, scaled_points, transfer_errors
 from .initial_geometry import Pair
 
 COMPARED_SIDE_PX = 320
@@ -32,9 +32,9 @@ MIN_SHIFT_PX = 10
 MAX_SHIFTS = 4
 """That are compared, the best."""
 
-MIN_RELATIVE_CORRELATION = 0.5
+MIN_RELATIVE_CORRELATION = 0.4
 """Of a shift, relative to that without one, for it to be compared. Planes of Oxford have up to
-0.27, those of Strecha's entry up to 0.40, made facades of one window from 0.54 on."""
+0.27, those of Strecha's entry up to 0.40, made facades of one window from 0.48 on."""
 
 MIN_OVERLAP = 0.6
 """Of the overlap without a shift, that there is after it: else what tells them apart is hidden."""
@@ -62,9 +62,19 @@ def is_repeated(grays: Pair, points0: np.ndarray, homography: np.ndarray) -> boo
         shifted[:2, 2] = shift
         other = refine_homography(first, second, matrix @ shifted)
         others = _correlation(first, second, other)[places]
+        step = np.linalg.inv(matrix) @ other
+        middle = np.array([last / 2])
+        if transfer_errors(middle, middle, step)[0] < MIN_SHIFT_PX:
+            continue  # it is the first one again
+        # Where the pattern ends in both images, the rest of it may be hidden: only what does not
+        # recur in the first image tells both places apart.
+        recurring = [_correlation(first, first, move) for move in (step, np.linalg.inv(step))]
+        recurs = np.fmax(*recurring)[places] > MIN_ZNCC
         explained = np.fmax(own, others) > MIN_ZNCC  # not for NaN in both
-        gain = (own - others)[explained & np.isfinite(own) & np.isfinite(others)]
-        alone, other_alone = np.sum(gain > MIN_ZNCC_GAIN), np.sum(gain < -MIN_ZNCC_GAIN)
+        known = explained & np.isfinite(own) & np.isfinite(others)
+        gain = (own - others)[known]
+        alone = np.sum((gain > MIN_ZNCC_GAIN) & ~recurs[known])
+        other_alone = np.sum(gain < -MIN_ZNCC_GAIN)
         if alone < max(MIN_OWN_FRACTION * len(gain), MIN_OWN_RATIO * other_alone):
             return True
     return False
