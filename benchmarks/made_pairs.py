@@ -1,14 +1,15 @@
-"""Pairs that are made of photographs: small planes, unrelated scenes, facades that repeat.
+"""How often matches are right, by their confidence: of photographs, and of pairs made of them.
 
-    python benchmarks/made_pairs.py DATA [--only planes|refusal] [--every N]
+    python benchmarks/made_pairs.py DATA [--only photographs|planes|refusal] [--every N]
 
-DATA holds oxford, middlebury and foreground. A line for each kind of pair: how many pairs, how many
-were answered (the matches are at least half right), how many answers are wrong (less than half),
-and how many of these were called of high confidence. Planes: a photograph covers 10, 20 or 40 % of
-both images, seen from two places; the rest is unrelated, or a rectified pair of a scene with depth.
-Refusal: unrelated photographs, and facades of one window that repeats, of which the second image
-begins a window later, so that it looks as if nothing had moved; alone, between unrelated things, or
-with a window that occurs once between things that both images show: only these can be answered.
+DATA holds oxford, middlebury, foreground, and the scenes of `deepdetect benchmark pose`. A line for
+each kind of pair: how many pairs, how many were answered with high and with fair confidence, and
+how many of these answers are wrong (less than half of their matches are right). Photographs: all
+pairs whose truth is known. Planes: a photograph covers 10, 20 or 40 % of both images, seen from two
+places; the rest is unrelated, or a rectified pair of a scene with depth. Refusal: unrelated
+photographs, and facades of one window that repeats, of which the second image begins a window
+later, so that it looks as if nothing had moved; alone, between unrelated things, or with a window
+that occurs once between things that both images show: only these can be answered.
 """
 
 from __future__ import annotations
@@ -16,14 +17,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, islice
 from pathlib import Path
 
 import numpy as np
 
 from deepdetect import DeepDetect, match_images
 from deepdetect._shared.opencv import cv2
-from deepdetect.geometry.transforms import transfer_errors
+from deepdetect.datasets.planar import load_oxford
+from deepdetect.datasets.posed_images import load_posed_scenes
+from deepdetect.geometry.transforms import epipolar_errors, transfer_errors
 from deepdetect.io.image import load_image
 
 PAIRS = 60
@@ -33,7 +36,10 @@ SIZE = (720, 600)
 """Width and height of a made image."""
 
 RIGHT_PX = 3.0
-"""Matches on a plane end within this of where it is, those of a rectified scene on their row."""
+"""Matches on a plane end within this of where it is, others of their epipolar lines."""
+
+ROWS = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0.0]])
+"""Fundamental matrix of a rectified pair."""
 
 NOISE = 3.0
 """Standard deviation of the noise of made images, in grey values."""
@@ -43,21 +49,23 @@ NOISE = 3.0
 class MadePair:
     """Two images, and what is right: (3, 3) homography of what the (H, W) bool mask shows.
 
-    Beside it nothing is right, or, of a rectified scene, what stays on its row.
+    Beside it what fits the (3, 3) fundamental matrix, or nothing without one.
     """
 
     kind: str
     images: tuple[np.ndarray, np.ndarray]
     homography: np.ndarray
     mask: np.ndarray
-    rectified: bool = False
+    fundamental: np.ndarray | None = None
 
     def right(self, points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
         """Say which of (M, 2) matches are right; (M,) bool."""
         x, y = np.rint(points0).astype(np.int64).T
-        on_row = np.abs(points0[:, 1] - points1[:, 1]) < RIGHT_PX
-        on_plane = transfer_errors(points0, points1, self.homography) < RIGHT_PX
-        return np.where(self.mask[y, x], on_plane, self.rectified & on_row)
+        right = self.mask[y, x] & (transfer_errors(points0, points1, self.homography) < RIGHT_PX)
+        if self.fundamental is None:
+            return right
+        near = epipolar_errors(points0, points1, self.fundamental) < RIGHT_PX
+        return np.where(self.mask[y, x], right, near)
 
 
 class Photographs:
@@ -88,6 +96,24 @@ def corners(width: float, height: float) -> np.ndarray:
     return np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
 
 
+def photographs_of(data: Path) -> Iterator[MadePair]:
+    """Return the pairs of photographs of which the truth is known."""
+    for scene in load_oxford(data / "oxford", "refined"):
+        for planar in scene.pairs:
+            images = load_image(planar.first), load_image(planar.second)
+            mask = np.ones(images[0].shape[:2], bool)
+            yield MadePair("oxford", images, planar.homography, mask)
+    for left in sorted(data.glob("middlebury/*/left.png")):
+        images = load_image(left), load_image(left.with_name("right.png"))
+        mask = np.zeros(images[0].shape[:2], bool)
+        yield MadePair("middlebury", images, np.eye(3), mask, ROWS)
+    for posed in load_posed_scenes(data):
+        for pair in posed.pairs:
+            images = load_image(pair.first.path), load_image(pair.second.path)
+            mask = np.zeros(images[0].shape[:2], bool)
+            yield MadePair(posed.name, images, np.eye(3), mask, pair.fundamental)
+
+
 def planes(photographs: Photographs) -> Iterator[MadePair]:
     """Put a plane into two images, seen from two places."""
     for number in range(PAIRS):
@@ -116,7 +142,8 @@ def planes(photographs: Photographs) -> Iterator[MadePair]:
         rest = "a scene with depth" if rectified else "unrelated"
         homography = placed[1] @ np.linalg.inv(placed[0])
         kind = f"plane of {share:.0%}, the rest {rest}"
-        yield MadePair(kind, (views[0], views[1]), homography, mask, rectified)
+        fundamental = ROWS if rectified else None
+        yield MadePair(kind, (views[0], views[1]), homography, mask, fundamental)
 
 
 def unrelated(photographs: Photographs) -> Iterator[MadePair]:
@@ -186,25 +213,27 @@ def main() -> None:
     """Match all pairs and print a table of them by their kinds."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("data", type=Path)
-    parser.add_argument("--only", choices=("planes", "refusal"))
+    parser.add_argument("--only", choices=("photographs", "planes", "refusal"))
     parser.add_argument("--every", type=int, default=1, help="only every Nth pair")
     arguments = parser.parse_args()
     photographs, detector = Photographs(arguments.data), DeepDetect()
-    makers = {"planes": (planes,), "refusal": (unrelated, facades)}
-    rows: dict[str, list[tuple[bool, bool, bool]]] = {}
-    for name, functions in makers.items():
-        for make in functions if arguments.only in (None, name) else ():
-            for number, pair in enumerate(make(photographs)):
-                if number % arguments.every:
-                    continue
+    pairs = {
+        "photographs": (photographs_of(arguments.data),),
+        "planes": (planes(photographs),),
+        "refusal": (unrelated(photographs), facades(photographs)),
+    }
+    rows: dict[str, list[list[bool]]] = {}
+    for name, makers in pairs.items():
+        for maker in makers if arguments.only in (None, name) else ():
+            for pair in islice(maker, 0, None, arguments.every):
                 matches = match_images(*pair.images, detector)
                 right = pair.right(matches.points0, matches.points1)
                 wrong = len(matches) > 0 and right.mean() < 0.5
-                high = matches.confidence == "high"
-                counts = len(matches) > 0 and not wrong, wrong, wrong and high
+                high, fair = (matches.confidence == word for word in ("high", "fair"))
+                counts = [high, high and wrong, fair, fair and wrong]
                 rows.setdefault(pair.kind, []).append(counts)
-    print("| kind | pairs | answered | wrong | wrong, of high confidence |")
-    print("|---|---:|---:|---:|---:|")
+    print("| kind | pairs | high | of these wrong | fair | of these wrong |")
+    print("|---|---:|---:|---:|---:|---:|")
     for kind, values in rows.items():
         print(f"| {kind} | {len(values)} | {' | '.join(map(str, np.sum(values, axis=0)))} |")
 
