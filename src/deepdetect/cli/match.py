@@ -172,7 +172,8 @@ def _two_view_numbers(matches: Matches) -> dict[str, Any] | None:
     found = matches.two_view_geometry
     if found is None:
         return None
-    numbers = {name: value for name, value in vars(found).items() if name != "matrix"}
+    elsewhere = "matrix", "confidence"
+    numbers = {name: value for name, value in vars(found).items() if name not in elsewhere}
     return {**numbers, "log10_nfa": found.log10_nfa if math.isfinite(found.log10_nfa) else None}
 
 

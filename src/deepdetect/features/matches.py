@@ -165,9 +165,9 @@ class Matches:
             dissimilarity of the two patches (0: only just more similar than unrelated patches); by
             a fundamental matrix, their correlation; else 1 - Lowe's ratio.
         inliers: (M,) bool, the matches whose error under the geometry is below
-            `GeometryOptions.inlier_threshold`; all of them where none was asked for. Guided ones
-            must not be contradicted by the images: where the matches around the window of 16 pixels
-            that one lies in (of copies of 640) predict it, this must look alike.
+            `GeometryOptions.inlier_threshold`; all of them where none was asked for. Not those of
+            guided matches that the images contradict: windows that others predict, around them,
+            are no more alike than unrelated ones.
         model: which geometry that is: "homography", "fundamental", "essential" or "none".
         matrix: (3, 3) float64, the geometry; None when it could not be estimated, or was not
             asked for. A homography maps the first image to the second; else x1^T M x0 = 0
