@@ -21,7 +21,7 @@ import numpy as np
 from deepdetect._shared.atomic import atomic_path
 from deepdetect._shared.progress import progress
 from deepdetect._shared.provenance import provenance
-from deepdetect.datasets.planar import PlanarPair, load_oxford, read_homography
+from deepdetect.datasets.planar import PlanarPair, load_oxford, read_matrix
 from deepdetect.evaluation.metrics.homography import project_visible
 from deepdetect.evaluation.report import Report, Row, Section, Table
 from deepdetect.features.matchers import get_matcher, match_descriptors
@@ -159,7 +159,7 @@ def _refine(pair: PlanarPair, path: Path) -> RefinedPair:
     there = pair.first.with_name(path.name)  # read before it may be written over
     apart = None
     if there.exists():
-        apart = displacement(best, read_homography(there), size0, size1)
+        apart = displacement(best, read_matrix(there), size0, size1)
     starts_apart = None
     if len(found) > 1:
         starts_apart = displacement(*found, size0, size1)

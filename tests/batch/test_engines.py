@@ -12,16 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from deepdetect import ImageError, MissingExtraError, OptionError, PointDetector, load_image
-from deepdetect.batch import ENGINES, extract_features, get_engine
+from deepdetect import ImageError, MissingExtraError, PointDetector, load_image
+from deepdetect.batch import ENGINES, extract_features
 from deepdetect.batch.engines import map_on_ray
 
 
 def test_the_engines() -> None:
     assert set(ENGINES) == {"processes", "ray"}
-    assert get_engine("ray") is map_on_ray
-    with pytest.raises(OptionError, match="did you mean 'processes'"):
-        get_engine("process")
+    assert ENGINES["ray"] is map_on_ray
 
 
 def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:

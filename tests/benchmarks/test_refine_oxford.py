@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.datasets.planar import OXFORD_KINDS, PlanarPair, read_homography
+from deepdetect.datasets.planar import OXFORD_KINDS, PlanarPair, read_matrix
 from deepdetect.io.image import luma
 
 MOVE = np.array([[1.01, 0.02, 3.0], [-0.02, 0.99, 2.0], [1e-4, 0, 1.0]])
@@ -27,7 +27,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory, write_scene: Callable[..., 
     for number in range(2, 7):
         path = root / "graf" / f"H1to{number}p"
         shutil.copy(path, path.with_name(f"true{number}"))
-        np.savetxt(path, WRONG @ read_homography(path))
+        np.savetxt(path, WRONG @ read_matrix(path))
     return root
 
 
@@ -51,9 +51,9 @@ def test_wrong_homographies_become_true(
     script: ModuleType, folder: Path, refined: tuple[list, Path]
 ) -> None:
     for number in range(2, 5):  # later ones share little with the first
-        true = read_homography(folder / "graf" / f"true{number}")
-        found = read_homography(refined[1] / "graf" / f"H1to{number}p.refined")
-        published = read_homography(folder / "graf" / f"H1to{number}p")
+        true = read_matrix(folder / "graf" / f"true{number}")
+        found = read_matrix(refined[1] / "graf" / f"H1to{number}p.refined")
+        published = read_matrix(folder / "graf" / f"H1to{number}p")
         assert script.displacement(true, published, (180, 140), (180, 140))[0] > 1.5
         assert script.displacement(true, found, (180, 140), (180, 140))[0] < 0.3
 

@@ -12,7 +12,7 @@ from tests.command_line import run_command
 
 pytest.importorskip("torch", reason="needs torch, which is for training only")
 
-from deepdetect.training import training_preset
+from deepdetect.training import PRESETS
 from deepdetect.training.dense import DenseTrainer
 
 TINY = [
@@ -94,5 +94,5 @@ def test_a_preset_is_changed_by_options(
     assert [stage.epochs for stage in options.stages] == [9]
     assert options.flips
     assert options.frozen_batch_norm is False
-    assert options.max_images == training_preset("paper").max_images
+    assert options.max_images == PRESETS["paper"].max_images
     assert init_weights == ("default", "dense")

@@ -19,11 +19,10 @@ pytest.importorskip("requests", reason="needs requests (pip install '.[data]')")
 from PIL import Image
 
 import deepdetect.datasets.download as download
-from deepdetect import DeepDetectError, OptionError
+from deepdetect import DeepDetectError
 from deepdetect.datasets import (
     RemoteDataset,
     RemoteFile,
-    find_remote_dataset,
     get_dataset,
     remote_datasets,
 )
@@ -273,7 +272,7 @@ def test_damaged_archives_are_one_sentence_and_do_not_stay(
 
 @pytest.mark.parametrize("name", ["oxford", "middlebury", "hpatches"])
 def test_the_known_contents_are_those_of_the_reference_data(shared: Path, name: str) -> None:
-    dataset = find_remote_dataset(name)
+    dataset = remote_datasets()[name]
     assert dataset.contents
     for path, digest in list(dataset.contents.items())[:12]:
         assert content_digest(shared / "data" / name, path) == digest
@@ -284,10 +283,8 @@ def test_the_known_contents_are_those_of_the_reference_data(shared: Path, name: 
         assert truth == pytest.approx({key: reference[key] for key in truth})
 
 
-def test_names_are_looked_up() -> None:
-    assert find_remote_dataset("coco").images == 118_287
-    with pytest.raises(OptionError, match="did you mean 'coco'"):
-        find_remote_dataset("cocoo")
+def test_the_known_data_sets() -> None:
+    assert remote_datasets()["coco"].images == 118_287
     for name, entry in remote_datasets().items():
         assert name == entry.name
         for file in entry.files:

@@ -8,6 +8,7 @@ from PIL import Image
 
 from deepdetect import ImageError
 from deepdetect.datasets.foreground import load_foreground
+from deepdetect.io.masks import load_mask
 
 
 def save(path: Path, value: int = 255, size: tuple[int, int] = (20, 30)) -> None:
@@ -32,7 +33,7 @@ def test_what_is_missing_or_wrong_is_named(tmp_path: Path, one_line) -> None:
     (tmp_path / "a_mask.png").write_text("no picture")
     (photograph,) = load_foreground(tmp_path)
     with pytest.raises(ImageError, match=r"a_mask\.png") as caught:
-        photograph.foreground()
+        load_mask(photograph.mask)
     one_line(caught.value)
 
 
@@ -41,4 +42,4 @@ def test_the_shared_masks_fit_their_photographs(shared: Path) -> None:
     assert len(photographs) >= 60
     for photograph in photographs[:3]:
         with Image.open(photograph.image) as image:
-            assert photograph.foreground().shape == image.size[::-1]
+            assert load_mask(photograph.mask).shape == image.size[::-1]

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetectError
-from deepdetect.datasets import find_remote_dataset
+from deepdetect.datasets import remote_datasets
 from deepdetect.datasets.photographs import (
     CROP_SIDE_PX,
     Crop,
@@ -64,7 +64,7 @@ def test_there_are_8000_photographs_and_more() -> None:
     free = [crop for crop in crops if crop.is_free]
     assert {crop.source for crop in crops} == set(listed_sources())
     for name, part in (("photographs", crops), ("photographs-free", free)):
-        dataset = find_remote_dataset(name)
+        dataset = remote_datasets()[name]
         assert dataset.images == len(part)
         assert len(dataset.files) == len({crop.source for crop in part})
     # A picture is read once for all of its crops.

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect.datasets.planar import read_homography
+from deepdetect.datasets.planar import read_matrix
 from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.geometry import transform_points
 from deepdetect.geometry.homography_refinement import fit_homography_irls, refine_homography
@@ -91,8 +91,8 @@ def test_agrees_with_the_refined_homographies_of_oxford(
     scene, number = name.split("-")
     folder = shared / "data" / "oxford" / scene
     images = [load_image(folder / f"img{k}.png") for k in (1, int(number))]
-    published = read_homography(folder / f"H1to{number}p")
-    expected = read_homography(folder / f"H1to{number}p.refined")
+    published = read_matrix(folder / f"H1to{number}p")
+    expected = read_matrix(folder / f"H1to{number}p.refined")
     found = refine_homography(*map(luma, images), published)
     assert displacement(expected, published, *images)[0] > median
     found_median, found_largest = displacement(expected, found, *images)

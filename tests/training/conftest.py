@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from deepdetect.training import TrainingOptions, training_preset
+from deepdetect.training import PRESETS, TrainingOptions
 
 
 def plain_options(**values: Any) -> TrainingOptions:
     """The recipe of ESPNet, whose views are but scaled and cropped, with other values."""
-    return dataclasses.replace(training_preset("espnet"), **values)
+    return dataclasses.replace(PRESETS["espnet"], **values)
 
 
 @pytest.fixture(scope="session", autouse=True)

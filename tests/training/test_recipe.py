@@ -8,11 +8,11 @@ from deepdetect._shared.errors import OptionError
 from deepdetect.cli.train import chosen_recipe
 from deepdetect.labels import LabelOptions, find_label_settings
 from deepdetect.training.recipe import (
+    PRESETS,
     DeviceOptions,
     PointsTrainingOptions,
     Stage,
     TrainingOptions,
-    training_preset,
 )
 from deepdetect.training.sampler import Schedule
 
@@ -48,7 +48,7 @@ def test_bad_options_are_refused(bad: dict) -> None:
 
 def test_the_papers_recipe() -> None:
     """33,000 + 8,000 images, a quarter darkened, 100 epochs, batch 64, Adam 0.001, 480x480."""
-    paper = training_preset("paper")
+    paper = PRESETS["paper"]
     assert paper.stages == (Stage(480, 64, 100),)
     assert (paper.short_sides, paper.square) == ((480,), "squash")
     assert paper.dark_fraction == 0.25

@@ -1,6 +1,6 @@
 """Collections of images: features and matches of many files, in the files of hloc."""
 
-from .engines import ENGINES, get_engine
+from .engines import ENGINES
 from .extraction import extract_features
 from .hdf5 import BatchReport
 from .pair_list import pair_name, read_pairs
@@ -11,7 +11,6 @@ __all__ = [
     "BatchReport",
     "PairMatchingOptions",
     "extract_features",
-    "get_engine",
     "match_pairs",
     "pair_name",
     "read_pairs",

@@ -26,7 +26,6 @@ from .._shared.machine import (
     processor_count,
     use_one_thread,
 )
-from .._shared.options import look_up
 
 MAX_BLOCKS = 4096
 """Parts of the work that Ray schedules: each costs milliseconds, and is redone if a worker dies."""
@@ -165,16 +164,3 @@ def _connected(ray: Any, workers: int | None) -> Iterator[None]:
 
 
 ENGINES: dict[str, TaskMap] = {"processes": map_in_processes, "ray": map_on_ray}
-
-
-def get_engine(name: str) -> TaskMap:
-    """Return the engine of this name.
-
-    Raises:
-        OptionError: the name is unknown.
-
-    Example:
-        >>> list(get_engine("processes")(abs, [-1], workers=1))
-        [1]
-    """
-    return look_up("engine", name, ENGINES)

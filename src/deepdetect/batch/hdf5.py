@@ -33,9 +33,10 @@ from .._shared.errors import (
     first_line,
     require_packages,
 )
+from .._shared.options import look_up
 from .._shared.progress import progress
 from .._shared.records import check_same, key, lock, plain
-from .engines import get_engine
+from .engines import ENGINES
 
 SETTINGS = "deepdetect"
 """Attribute of the file: what its content depends on besides the inputs, as JSON."""
@@ -204,7 +205,7 @@ def fill_file(
     `others_stay` says which groups of other inputs, and of inputs that fail, stay in the file.
     """
     import_h5py()
-    map_tasks, work = get_engine(engine), partial(_write_shard, make=make)
+    map_tasks, work = look_up("engine", engine, ENGINES), partial(_write_shard, make=make)
     list(map_tasks(work, [], workers))  # what the engine lacks is said before a file is made
     target, settings = Path(path).absolute(), plain(settings)
     if target.is_dir():

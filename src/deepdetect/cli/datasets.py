@@ -7,7 +7,8 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
-from ..datasets import find_remote_dataset, get_dataset, remote_datasets
+from .._shared.options import look_up
+from ..datasets import get_dataset, remote_datasets
 from ..io.image import find_images
 from ._options import Output, Result, command, table
 
@@ -49,7 +50,7 @@ def get(
     Args:
         output: Folder for the images.  [default: data/NAME]
     """
-    dataset = find_remote_dataset(name)
+    dataset = look_up("data set", name, remote_datasets())
     folder = get_dataset(dataset, output or Path("data") / dataset.name, quiet=False)
     images = len(find_images(folder))
     values = {"name": name, "folder": folder, "images": images, "licence": dataset.licence}

@@ -13,6 +13,7 @@ import numpy as np
 from .._shared.errors import ImageError, OptionError, RegistrationError, noted_failures
 from .._shared.progress import stage_progress
 from ..batch.pair_matching import MATCHERS_OF_FLOATS
+from ..datasets.planar import read_matrix
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.matches import Matches
@@ -114,7 +115,7 @@ def match(
         chosen = chosen.configured(replace(chosen.heatmap_options, network_channels="bgr"))
     matrices = {"homography": homography, "camera0": camera0, "camera1": camera1 or camera0}
     known: dict[str, Any] = {
-        name: _read_matrix(path) for name, path in matrices.items() if path is not None
+        name: read_matrix(path) for name, path in matrices.items() if path is not None
     }
     geometry = GeometryOptions(**known, **GEOMETRY.take(values))
     changes = MATCHING.take(values)
@@ -184,17 +185,6 @@ def _draw(rgb0: np.ndarray, rgb1: np.ndarray, matches: Matches, path: Path) -> N
     if others:
         caption += f"; {others:,} that do not fit it: red"
     save_picture(add_caption(picture, caption), path)
-
-
-def _read_matrix(path: Path) -> np.ndarray:
-    try:
-        return np.loadtxt(path, ndmin=2)
-    except FileNotFoundError:
-        raise OptionError(f"there is no file {path}: check the path") from None
-    except (OSError, ValueError):
-        raise OptionError(
-            f"{path} holds no matrix: it must be three rows of three numbers"
-        ) from None
 
 
 @cli.command(SELECTION, POINTS, NETWORK, cli.MEGAPIXELS)

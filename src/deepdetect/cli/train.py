@@ -10,19 +10,20 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from .._shared.errors import OptionError, require_packages
+from .._shared.options import look_up
 from .._shared.progress import progress
 from .._shared.provenance import provenance
-from ..batch.engines import get_engine
+from ..batch.engines import ENGINES
 from ..detector.pretrained import resolve_weights
 from ..labels import LabelOptions, find_label_settings
 from ..labels.fusion import LabelTask, label_file
 from ..training import (
+    PRESETS,
     DeviceOptions,
     PointsTrainingOptions,
     Stage,
     TrainingOptions,
     profile,
-    training_preset,
     write_shards,
 )
 from ..training import train as train_network
@@ -101,7 +102,7 @@ def chosen_recipe(
     """
     if "stages" in values:
         values["stages"] = tuple(map(Stage.parse, values["stages"]))
-    recipe = training_preset(preset)
+    recipe = look_up("training preset", preset, PRESETS)
     labels = chosen_label_settings(detectors, label_settings)
     if label_settings is not None:
         values["labels"] = labels
@@ -315,5 +316,5 @@ def average(
 
 def _engine(values: dict[str, Any]) -> dict[str, Any]:
     chosen = ENGINE.take(values)
-    map_tasks = get_engine(chosen.get("engine", "processes"))
+    map_tasks = look_up("engine", chosen.get("engine", "processes"), ENGINES)
     return {"map_tasks": map_tasks, "workers": chosen.get("workers")}

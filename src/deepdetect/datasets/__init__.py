@@ -5,7 +5,6 @@ from functools import cache, partial
 from importlib import resources
 from typing import Any
 
-from .._shared.options import look_up
 from . import photographs
 from .download import RemoteDataset, RemoteFile, get_dataset
 from .middlebury import StereoPair, load_motorcycle
@@ -37,22 +36,12 @@ def _remote_dataset(name: str, files: Any = (), texts: Any = None, **values: Any
     return RemoteDataset(name, files=made, contents=_known(name), texts=written, **values)
 
 
-def find_remote_dataset(name: str) -> RemoteDataset:
-    """Look a data set on the web up by name.
-
-    Raises:
-        OptionError: the name is unknown.
-    """
-    return look_up("data set", name, remote_datasets())
-
-
 __all__ = [
     "PosedImage",
     "PosedScene",
     "RemoteDataset",
     "RemoteFile",
     "StereoPair",
-    "find_remote_dataset",
     "get_dataset",
     "load_motorcycle",
     "load_posed_scenes",

@@ -8,10 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from .._shared.errors import ImageError
-from ..io.masks import load_mask
 
 SUFFIXES = (".jpg", ".png")
 
@@ -22,10 +19,6 @@ class MaskedPhotograph:
 
     image: Path
     mask: Path
-
-    def foreground(self) -> np.ndarray:
-        """Read the mask, (H, W) bool."""
-        return load_mask(self.mask)
 
 
 def load_foreground(folder: str | Path) -> list[MaskedPhotograph]:

@@ -126,8 +126,8 @@ def load_low_visibility(folder: str | Path) -> list[PlanarScene]:
     ]
 
 
-def read_homography(path: Path) -> np.ndarray:
-    """Read nine numbers from a text file as a (3, 3) float64 matrix."""
+def read_matrix(path: Path) -> np.ndarray:
+    """Read nine numbers from a text file as a (3, 3) float64 matrix that can be inverted."""
     try:
         matrix = np.array(path.read_text().split(), np.float64).reshape(3, 3)
     except OSError as error:
@@ -135,7 +135,7 @@ def read_homography(path: Path) -> np.ndarray:
     except ValueError:
         raise ImageError(f"{path} holds no 3x3 matrix: nine numbers are expected") from None
     if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
-        raise ImageError(f"{path} holds no homography: the matrix cannot be inverted")
+        raise ImageError(f"{path} holds a matrix that cannot be inverted: get the file again")
     return matrix
 
 
@@ -159,7 +159,7 @@ def _load_scene(
             raise ImageError(f"there is no image {prefix}{number} in {folder}: {layout}")
         files.append(found[0])
     pairs = [
-        PlanarPair(folder.name, number, files[0], file, read_homography(folder / name), kind)
+        PlanarPair(folder.name, number, files[0], file, read_matrix(folder / name), kind)
         for number, (file, name) in enumerate(zip(files[1:], homographies, strict=True), start=2)
     ]
     return PlanarScene(folder.name, tuple(pairs))

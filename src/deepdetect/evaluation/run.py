@@ -110,12 +110,11 @@ class Run:
         below = self.data / name
         return below if below.is_dir() else self.data
 
-    def files_folder(self) -> Path:
-        """Return a folder for images that are made: the cache's, or a temporary one."""
-        return self._temporary if self.cache is None else self.cache
-
     @cached_property
-    def _temporary(self) -> Path:
+    def files_folder(self) -> Path:
+        """Folder for images that are made: the cache's, or a temporary one."""
+        if self.cache is not None:
+            return self.cache
         folder = Path(tempfile.mkdtemp(prefix="deepdetect-benchmark-"))
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         return folder

@@ -5,7 +5,6 @@ from .recipe import (
     PointsTrainingOptions as PointsTrainingOptions,
     Stage as Stage,
     TrainingOptions as TrainingOptions,
-    training_preset as training_preset,
 )
 from .run import (
     StageProfile as StageProfile,

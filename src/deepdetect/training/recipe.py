@@ -10,7 +10,7 @@ from typing import Literal
 
 from .._shared.errors import OptionError, check_name
 from .._shared.machine import processor_count
-from .._shared.options import check_ranges, look_up, suggest_keywords
+from .._shared.options import check_ranges, suggest_keywords
 from ..labels import LABEL_SETTINGS, LabelOptions
 
 InitWeights = str | Path | Sequence[str | Path]
@@ -309,16 +309,3 @@ PRESETS: dict[str, TrainingOptions] = {
         dark_fraction=0.0, labels=LABEL_SETTINGS["dense"], learning_rate=1.5e-3
     ),
 }
-
-
-def training_preset(name: str) -> TrainingOptions:
-    """Look a recipe up by its name.
-
-    Raises:
-        OptionError: the name is unknown (the nearest right one is named).
-
-    Example:
-        >>> training_preset("paper").stages
-        (Stage(crop=480, batch=64, epochs=100, sides=()),)
-    """
-    return look_up("training preset", name, PRESETS)

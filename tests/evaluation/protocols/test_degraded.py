@@ -72,7 +72,7 @@ def test_tables_have_scores_and_their_fraction_of_daylight(
     daylight = [pair_row(run, FAST, pair, BUDGETS) for pair in pairs]
     for table, one in zip(tables, lights.values(), strict=True):
         (row,) = table.rows
-        dark = [degraded_pair(pair, one, run.files_folder()) for pair in pairs]
+        dark = [degraded_pair(pair, one, run.files_folder) for pair in pairs]
         scores = [pair_row(run, FAST, pair, BUDGETS) for pair in dark], daylight
         now, then = (np.mean([p["repeated", 512, 1.0] for p in two]) for two in scores)
         assert row["@1 px, 512"] == pytest.approx(now)
@@ -104,4 +104,4 @@ def test_pairs_that_could_not_be_measured_in_both_ways_are_left_out(
     assert len(run.failures) == 1
     tables = {table.key: table for table in degraded_tables([feature], rows, "key", "pairs")}
     assert tables["key_dark-8"].rows[0]["pairs"] == 1
-    assert run.files_folder().is_dir(), "without a cache the copies are in a temporary folder"
+    assert run.files_folder.is_dir(), "without a cache the copies are in a temporary folder"

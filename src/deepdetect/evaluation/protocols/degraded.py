@@ -101,7 +101,7 @@ def degraded_rows(
     def measure(feature: LocalFeature, item: tuple[str, PlanarPair]) -> Row:
         light, pair = item
         if light != DAYLIGHT:
-            pair = degraded_pair(pair, DEGRADATIONS[light], run.files_folder(), images)
+            pair = degraded_pair(pair, DEGRADATIONS[light], run.files_folder, images)
         return {"light": light, "pair": pair.name, **pair_row(run, feature, pair, BUDGETS)}
 
     rows = run.rows("", features, items, measure)

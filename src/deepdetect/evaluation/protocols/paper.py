@@ -15,6 +15,7 @@ from ...features.display import draw_matches
 from ...features.keypoints import Keypoints
 from ...geometry.transforms import transfer_errors
 from ...io.image import load_image, luma
+from ...io.masks import load_mask
 from ...viz.draw import add_caption, hstack
 from ..baselines.method import LocalFeature
 from ..metrics.repeatability import foreground_fraction, repeatability_paper
@@ -196,7 +197,7 @@ def foreground_rows(
 
     def measure(feature: LocalFeature, image: MaskedPhotograph) -> Row:
         keypoints, _ = run.keypoints(feature, image.image)
-        mask = image.foreground()
+        mask = load_mask(image.mask)
         if mask.shape[::-1] != keypoints.image_size:
             raise ImageError(f"{image.mask.name} is not of the photograph's size")
         fraction = foreground_fraction(keypoints.xy, mask)
