@@ -93,22 +93,12 @@ class BatchError(DeepDetectError):
 
 
 def first_line(error: object) -> str:
-    r"""Return the first line of the message of an error, its type where it has none.
-
-    Example:
-        >>> first_line(ValueError("no number\nin line 3")), first_line(MemoryError())
-        ('no number', 'MemoryError')
-    """
+    """Return the first line of the message of an error, its type where it has none."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
-    """Return the error for an unknown name, which suggests the nearest known one.
-
-    Example:
-        >>> print(unknown_name("detector", "siift", ["sift", "orb"]))
-        unknown detector 'siift': did you mean 'sift'? (known: sift, orb)
-    """
+    """Return the error for an unknown name, which suggests the nearest known one."""
     import difflib
 
     names = list(known)
@@ -142,12 +132,7 @@ DISTRIBUTIONS = {
 
 
 def install_command(*packages: str) -> str:
-    """Return the command that installs modules, for the sentence of a `MissingExtraError`.
-
-    Example:
-        >>> install_command("h5py", "faiss")
-        'pip install h5py faiss-cpu'
-    """
+    """Return the command that installs modules, for the sentence of a `MissingExtraError`."""
     names = " ".join(DISTRIBUTIONS.get(package, package) for package in packages)
     command = f"pip install {names}"
     return f"{command}, {WITHOUT_GPU}" if "torch" in packages else command

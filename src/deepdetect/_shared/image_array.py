@@ -43,12 +43,6 @@ def array_to_rgb(image: Any, channels: Channels = "rgb", name: str = "the image"
     Raises:
         ImageError: it has another shape, type or range, or holds NaN; `name` is what it is called.
         OptionError: the order of the channels is unknown.
-
-    Example:
-        >>> red = np.zeros((3, 20, 30), np.float32)
-        >>> red[0] = 1
-        >>> array_to_rgb(red)[0, 0].tolist(), array_to_rgb(red, "bgr")[0, 0].tolist()
-        ([255, 0, 0], [0, 0, 255])
     """
     check_channels(channels)
     values = _to_uint8(_channels_last(as_array(image)), name)

@@ -25,16 +25,6 @@ def suggest_keywords(
 
     It keeps its signature, and a class, decorated above `dataclass`, stays the same class.
     `elsewhere` says what to do instead, by keywords that belong to other functions.
-
-    Example:
-        >>> @suggest_keywords
-        ... def detect(image, *, max_keypoints=None):
-        ...     return max_keypoints
-        >>> detect(None, max_keypoint=5)
-        Traceback (most recent call last):
-        ...
-        deepdetect.OptionError: unknown option 'max_keypoint': did you mean \
-'max_keypoints'? (known: image, max_keypoints)
     """
     if isinstance(function, type):
         kind: Any = function
@@ -112,11 +102,6 @@ def look_up(kind: str, name: str, registry: Mapping[str, Entry]) -> Entry:
 
 
 def is_path(value: str | Path) -> bool:
-    """Return whether a value is a path, not a name: it has a suffix or a separator.
-
-    Example:
-        >>> [is_path(text) for text in ("dense", "dense.onnx", "./dense")]
-        [False, True, True]
-    """
+    """Return whether a value is a path, not a name: it has a suffix or a separator."""
     text = str(value)
     return bool(Path(text).suffix) or any(mark in text for mark in (os.sep, os.altsep) if mark)

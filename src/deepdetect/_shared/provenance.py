@@ -19,12 +19,7 @@ PACKAGES = ("numpy", *DISTRIBUTIONS, "pillow", *RUNTIMES, "lightning-fabric")
 
 
 def provenance() -> dict[str, str]:
-    """Return what is written into every checkpoint, weights file and report, by name.
-
-    Example:
-        >>> sorted(provenance())
-        ['command', 'commit', 'machine', 'versions']
-    """
+    """Return what is written into every checkpoint, weights file and report, by name."""
     program, *arguments = sys.argv or [""]
     name = Path(program).name
     command = ["deepdetect" if name == "__main__.py" else name, *arguments]

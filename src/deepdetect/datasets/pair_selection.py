@@ -15,14 +15,7 @@ FRAME_DISTANCES = (1, 3, 5, 10, 15, 20)
 
 
 def unordered_pairs(count: int, max_pairs: int) -> list[tuple[int, int]]:
-    """Choose pairs of images in no order: all, or `max_pairs` evenly spaced ones of more.
-
-    Example:
-        >>> unordered_pairs(3, 60)
-        [(0, 1), (0, 2), (1, 2)]
-        >>> unordered_pairs(100, 3)
-        [(0, 1), (29, 39), (98, 99)]
-    """
+    """Choose pairs of images in no order: all, or `max_pairs` evenly spaced ones of more."""
     # Counted, not listed: ten thousand images have fifty million pairs.
     ends = np.cumsum(np.arange(count - 1, 0, -1))
     ranks = np.array(evenly_spaced(range(count * (count - 1) // 2), max_pairs), int)
@@ -34,12 +27,7 @@ def unordered_pairs(count: int, max_pairs: int) -> list[tuple[int, int]]:
 def sequence_pairs(
     frames: Sequence[int], max_pairs: int, distances: Sequence[int]
 ) -> list[tuple[int, int]]:
-    """Choose pairs of frame numbers: as many evenly spaced ones at each of the distances.
-
-    Example:
-        >>> sequence_pairs(range(12), 5, (1, 10))
-        [(0, 1), (10, 11), (0, 10), (1, 11)]
-    """
+    """Choose pairs of frame numbers: as many evenly spaced ones at each of the distances."""
     existing = set(frames)
     starts_per_distance = max(1, max_pairs // len(distances))
     pairs = [

@@ -67,12 +67,7 @@ class LabelDetector:
 
 
 def pixels_mask(shape: tuple[int, ...], xy: np.ndarray) -> np.ndarray:
-    """Mark the pixel nearest to each (N, 2) point, halves rounded to even; none is outside.
-
-    Example:
-        >>> pixels_mask((1, 3), np.array([[0.5, 0.0], [1.5, 0.0]])).tolist()
-        [[True, False, True]]
-    """
+    """Mark the pixel nearest to each (N, 2) point, halves rounded to even; none is outside."""
     mask = np.zeros(shape[:2], dtype=bool)
     column, row = np.rint(np.asarray(xy, dtype=np.float64).reshape(-1, 2)).astype(np.intp).T
     inside = (column >= 0) & (column < mask.shape[1]) & (row >= 0) & (row < mask.shape[0])
@@ -254,12 +249,7 @@ DETECTOR_NAMES: tuple[str, ...] = tuple(DETECTORS)
 
 
 def select_detectors(names: Iterable[str]) -> tuple[str, ...]:
-    """Check names of detectors, and put them into the order of the table.
-
-    Example:
-        >>> select_detectors(["sobel", "fast"])
-        ('fast', 'sobel')
-    """
+    """Check names of detectors, and put them into the order of the table."""
     wanted = set(names)
     for name in sorted(wanted - DETECTORS.keys()):
         raise unknown_name("label detector", name, DETECTOR_NAMES)
