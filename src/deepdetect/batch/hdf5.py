@@ -227,7 +227,10 @@ def fill_file(
             f"cannot write {shards} ({error.strerror}): choose another place with -o"
         ) from error
     with lock(folder / "lock", target):
-        states = _states(before + _shard_files(shards))
+        states: dict[str, State] = {}
+        for written in before + _shard_files(shards):
+            with open_hdf5(written) as file:
+                states |= {name: state_of(group) for name, group in _leaves(file)}
         left = [
             (name, next(iter(groups.values())))
             for name, groups in wanted.items()
@@ -268,14 +271,6 @@ def _shard_files(folder: Path) -> list[Path]:
     """List the shards, older ones first: newer ones replace what they hold."""
     shards = [path for path in folder.glob("*.h5") if not path.name.startswith(".")]
     return sorted(shards, key=lambda path: (path.stat().st_mtime_ns, path.name))
-
-
-def _states(files: Sequence[Path]) -> dict[str, State]:
-    states: dict[str, State] = {}
-    for path in files:
-        with open_hdf5(path) as file:
-            states |= {name: state_of(group) for name, group in _leaves(file)}
-    return states
 
 
 def _divided(items: Sequence[Item], folder: Path) -> list[tuple[Path, Sequence[Item]]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -32,7 +31,7 @@ from ..matching.pipeline import (
     match_images,
 )
 from ..matching.registration import register as register_images
-from ..matching.stitching import STAGES, Panorama, StitchingOptions
+from ..matching.stitching import STAGES, StitchingOptions
 from ..matching.stitching import stitch as stitch_images
 from ..viz.draw import add_caption, picture_suffix, save_picture
 from . import _options as cli
@@ -290,14 +289,9 @@ def stitch(
         save_picture(panorama.image, made["file"])
     for number, reason in panorama.unregistered.items():
         cli.note(f"not in the panorama: {images[number]}, as {reason}")
-    numbers = {**_numbers(panorama, images, file), "failures": failures}
-    return cli.Result(numbers, None, failures, len(paths))
-
-
-def _numbers(panorama: Panorama, images: Sequence[Path], output: Path) -> dict[str, Any]:
     height, width = panorama.valid.shape
     used = sorted(panorama.homographies)
-    return {
+    numbers = {
         "images": [images[k] for k in used],
         "unregistered": [
             {"image": images[k], "reason": reason} for k, reason in panorama.unregistered.items()
@@ -314,5 +308,7 @@ def _numbers(panorama: Panorama, images: Sequence[Path], output: Path) -> dict[s
         ],
         "residual_px": round(panorama.residual_px, 4),
         "seconds": {stage: round(value, 4) for stage, value in panorama.seconds.items()},
-        "file": output,
+        "file": file,
+        "failures": failures,
     }
+    return cli.Result(numbers, None, failures, len(paths))

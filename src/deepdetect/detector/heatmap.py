@@ -103,7 +103,7 @@ def compute_maps(
     logits: dict[int, np.ndarray] = {}
     together = []
     for number, rgb in enumerate(images):
-        if _is_constant(rgb):
+        if all((rgb[rows] == rgb[0, 0]).all() for rows in bands(rgb.shape)):
             logits[number] = np.full(rgb.shape[:2], -np.inf, np.float32)
         elif tiled := _tiled(network, rgb.shape, options):
             (logits[number],) = _mean_of_flips(tiled, [_seen(rgb, options)], options)
@@ -184,10 +184,6 @@ def _tiled(network: Network, shape: tuple[int, ...], options: HeatmapOptions) ->
         "this network cannot be run in tiles: leave `tile_megapixels` out, or use ONNX weights of "
         "the network fast, in float32"
     )
-
-
-def _is_constant(rgb: np.ndarray) -> bool:
-    return all((rgb[rows] == rgb[0, 0]).all() for rows in bands(rgb.shape))
 
 
 def _run(network: Network, images: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -146,7 +146,7 @@ class Run:
         items: Mapping[str, Any],
         measure: Callable[[Any, Any], Row],
     ) -> Rows:
-        """Measure each method, which has a name and a title, on each item by its name.
+        """Measure each method, which has a name and perhaps a title, on each item by its name.
 
         `what` is the beginning of what the progress bar shows and of the reason of a failure. The
         rows have the names as "method" and "item"; those that failed are missing.
@@ -155,7 +155,7 @@ class Run:
         with progress(len(methods) * len(items), "benchmark", "task", self.quiet) as bar:
             for method in methods:
                 for name, item in items.items():
-                    task = f"{what}{method.title} on {name}"
+                    task = f"{what}{getattr(method, 'title', method.name)} on {name}"
                     bar.set_postfix_str(task, refresh=False)
                     values = self.attempt(task, measure, method, item)
                     if values is not None:

@@ -294,7 +294,9 @@ def match_descriptors(
     ratios[~np.isfinite(second)] = 1  # no second-best was found
     kept = ratios < ratio
     if mutual:
-        if _is_exhaustive(matcher, len(descriptors0), len(descriptors1)):
+        few = len(descriptors0) * len(descriptors1) <= MAX_EXACT_PRODUCT
+        exact = exact_neighbours, hamming_neighbours, *([automatic_neighbours] if few else [])
+        if matcher in exact:  # it finds for a query what it finds for many
             asked = np.unique(rows[kept, 0])  # the way back of the others changes nothing
             nearest = np.full(len(descriptors1), -1)
             nearest[asked] = matcher(descriptors1[asked], descriptors0, 1, seed, None)[0][:, 0]
@@ -304,10 +306,3 @@ def match_descriptors(
         kept &= nearest[rows[:, 0]] == np.arange(len(rows))
     rows0 = np.flatnonzero(kept).astype(np.int32)
     return DescriptorMatches(rows0, rows[rows0, 0].astype(np.int32), ratios[rows0])
-
-
-def _is_exhaustive(matcher: Matcher, count0: int, count1: int) -> bool:
-    """Whether the matcher compares all, so that it finds for a query what it finds for many."""
-    if matcher is automatic_neighbours:
-        return count0 * count1 <= MAX_EXACT_PRODUCT
-    return matcher in (exact_neighbours, hamming_neighbours)

@@ -111,7 +111,9 @@ class PolarFrame:
     def from_frame(self, points: np.ndarray, view: int) -> np.ndarray:
         """Take positions of the frame into a view."""
         points = np.asarray(points, np.float64).reshape(-1, 2)
-        directions = self._directions(self._angles(points[:, 1]), view)
+        directions = self._directions(
+            self.middle + self.first_angle + points[:, 1] * self.step, view
+        )
         radius = self.min_radius_px * np.exp(points[:, :1] * self.step)
         positions = self.epipoles[view] + directions * radius
         if view and self.plane is not None:
@@ -126,9 +128,6 @@ class PolarFrame:
         rows, columns = image.shape[:2]
         shown = (x >= -0.5) & (x <= columns - 0.5) & (y >= -0.5) & (y <= rows - 0.5)
         return cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), shown
-
-    def _angles(self, rows: np.ndarray) -> np.ndarray:
-        return self.middle + self.first_angle + rows * self.step
 
     def _directions(self, angles: np.ndarray, view: int) -> np.ndarray:
         first = np.column_stack([np.cos(angles), np.sin(angles)])

@@ -123,10 +123,10 @@ def test_images_of_a_sequence_are_its_first(tmp_path: Path) -> None:
 
 def test_options_choose_the_methods() -> None:
     detector = DeepDetect()
-    titles = [method.title for method in sfm.sfm_methods(BenchmarkOptions(detector))]
+    titles = [method.name for method in sfm.sfm_methods(BenchmarkOptions(detector))]
     assert titles == [POINTS, SIFT, RANDOM]
     without = sfm.sfm_methods(BenchmarkOptions(detector, classical=()))
-    assert [method.title for method in without] == [POINTS, RANDOM]
+    assert [method.name for method in without] == [POINTS, RANDOM]
     with pytest.raises(WeightsError, match=r"none\.npz"):
         sfm.sfm_methods(BenchmarkOptions(detector, ranker="none.npz"))
 

@@ -122,7 +122,7 @@ def test_without_a_truth_nothing_is_evaluated(section: Section) -> None:
 def test_the_weights_are_named_in_rows_of_their_own(data: Path) -> None:
     second = DeepDetect().weights
     options = BenchmarkOptions(DeepDetect(), ("paper",), (), geometry_weights=("dense", second))
-    titles = [pipeline.title for pipeline in pipelines(options)]
+    titles = [pipeline.name for pipeline in pipelines(options)]
     assert titles[:2] == ["ours, weights dense", "ours, weights default"]
     assert sum(title.startswith("the paper's pipeline") for title in titles) == 2
     assert len(set(titles)) == len(titles)

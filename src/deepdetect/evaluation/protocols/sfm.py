@@ -127,10 +127,6 @@ class SfmMethod:
     version: str = ""
     chance: bool = False
 
-    @property
-    def title(self) -> str:
-        return self.name
-
 
 @lru_cache
 def true_views(scene: PosedScene) -> dict[str, PosedView]:
@@ -244,7 +240,9 @@ def camera_table(rows: Rows) -> Table:
                 true = [truth[name] for name in views]
                 centres, rotations, _ = camera_errors(list(views.values()), true)
                 line["centres, unit of the truth"] = float(centres.mean())
-                line["centres, ‰ of the extent"] = 1000 * float(centres.mean()) / _extent(truth)
+                places = np.array([view.centre for view in truth.values()])
+                extent = np.linalg.norm(places[:, None] - places, axis=2).max()
+                line["centres, ‰ of the extent"] = 1000 * float(centres.mean()) / float(extent)
                 line["rotations, °"] = float(rotations.mean())
             if first is not row:
                 apart = _apart(views, first[kind]["views"], truth)
@@ -282,11 +280,6 @@ def _apart(views: Views, others: Views, truth: Views) -> float | None:
     own, other, true = ([each[name] for name in names] for each in (views, others, truth))
     unit = camera_errors(other, true)[2]
     return unit * float(camera_errors(own, other)[0].mean())
-
-
-def _extent(truth: Views) -> float:
-    centres = np.array([view.centre for view in truth.values()])
-    return float(np.linalg.norm(centres[:, None] - centres, axis=2).max())
 
 
 def find_points(detector: PointDetector, stages: Stages, folder: Path) -> None:

@@ -50,10 +50,6 @@ class Pipeline:
     drawn: str = ""
     paper: Mapping[str, float] = field(default_factory=dict)
 
-    @property
-    def title(self) -> str:
-        return self.name
-
 
 PAPER_SETTINGS: dict[str, tuple[float, float, float, float]] = {
     "cones": (0.9, 360, 225, 188),

@@ -110,10 +110,13 @@ class RankerTrainer(Trainer):
         self.options, self.num_workers = options, num_workers
         self.files = find_images(images)
         self.pairs = validation_pairs(validation, options.val_pairs)
-        statistics = self._statistics()
+        dataset = PairDataset(self.files, options)
+        pairs = (dataset[2**31, number] for number in range(STATISTICS_PAIRS))  # not trained on
+        features = np.concatenate([view.features for pair in pairs for view in pair.views])
+        features = features.astype(np.float64)
         with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
             torch.default_generator.manual_seed(options.seed)
-            self.network = RankerModule(*statistics)
+            self.network = RankerModule(features.mean(0), features.std(0))
         self.average = copy.deepcopy(self.network)
         self.optimizers = [
             torch.optim.AdamW(
@@ -127,14 +130,6 @@ class RankerTrainer(Trainer):
             "validation_digest": key(find_images(validation))[:16],
         }
         self.notes = {"images": str(len(self.files))}
-
-    def _statistics(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and deviation of the features, over pairs that are not trained on."""
-        dataset = PairDataset(self.files, self.options)
-        pairs = (dataset[2**31, number] for number in range(STATISTICS_PAIRS))
-        features = np.concatenate([view.features for pair in pairs for view in pair.views])
-        features = features.astype(np.float64)
-        return features.mean(0), features.std(0)
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
         """Return the loader of the batches of some steps: lists of `CandidatePair`."""
