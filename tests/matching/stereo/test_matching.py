@@ -218,7 +218,8 @@ def test_no_depth_is_invented_on_photographs(offset: int, shared: Path) -> None:
     known = np.isfinite(errors)
     assert (errors[hidden & known] <= 1).mean() > 0.5
     assert known[hidden].mean() > 0.1
-    assert (found.matched & hidden).sum() < 0.02 * hidden.sum()
+    assert (found.matched & hidden).sum() < 0.001 * hidden.sum()
+    assert (errors[known & ~found.matched] <= 1).mean() > 0.75
     assert (errors[known] <= 1).mean() > 0.9
     assert (errors[known & found.matched] <= 1).mean() > 0.95
 
@@ -230,7 +231,6 @@ def test_the_edge_of_what_hides_has_no_match(two_surfaces, monkeypatch) -> None:
     plain = disparity_map(left, right, DENSE)
     assert found.matched.sum() < 0.99 * plain.matched.sum()
     assert not (found.matched & ~plain.matched).any()
-    assert np.isfinite(found.disparity).sum() > 0.995 * np.isfinite(plain.disparity).sum()
     shares = [np.mean(np.abs(one.disparity - truth)[one.matched] <= 1) for one in (plain, found)]
     assert shares[1] > shares[0]
 

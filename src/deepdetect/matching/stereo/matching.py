@@ -32,8 +32,12 @@ MAX_SPECKLE_AREA_PX = 100
 SPECKLE_SUBDIVISIONS = 4
 """Parts of a pixel in which OpenCV's speckle filter counts."""
 
+BORDER_PX = 4
+"""Matches this near to the border of the right image are not kept: windows there give what it just
+does not show the disparity of what it does."""
+
 OCCLUDING_EDGE_PX = 1
-"""Outermost pixels of a nearer surface that count as hidden where occlusions are filled."""
+"""Outermost pixels of a nearer surface that are left out where occlusions are filled."""
 
 OCCLUSION_SLACK_PX = 8
 """By which a gap may be wider than the step of disparity explains: the windows on both sides."""
@@ -67,11 +71,12 @@ class DisparityOptions:
             windows that are compared extend so far, and give what lies beside a near object its
             disparity. Objects up to twice as wide vanish. 0 keeps them.
         fill_occlusions: give what the right image does not show the disparity of the surface
-            beside it: between two surfaces that of the farther one; where the counterpart lies
-            outside the right image that of the first surface in sight, extrapolated along a line
-            as far as this predicts the surface itself, unless the surfaces above and below suggest
-            another. Such pixels have no match (`DisparityMap.matched`), nor have the outermost of a
-            nearer surface and of the right image, which windows give its disparity too often.
+            beside it: between two surfaces that of the farther one, if those above and below give
+            the same; where the counterpart lies outside the right image that of the first surface
+            in sight, extrapolated along a line as far as this predicts the surface itself, unless
+            the surfaces above and below suggest another. Such pixels have no match
+            (`DisparityMap.matched`), and the outermost of a nearer surface, which windows give its
+            disparity too often, are left out.
 
     Raises:
         OptionError: a value is out of its range.
@@ -95,7 +100,7 @@ class DisparityOptions:
 
 
 DENSE = DisparityOptions(uniqueness_ratio=1.0, discontinuity_margin_px=0, fill_occlusions=True)
-"""As many pixels as possible: those near discontinuities too, and what is hidden is filled."""
+"""Many pixels: those near discontinuities too, and what is hidden is filled where that is sure."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +129,7 @@ class DisparityMap:
             (x - disparity, y). NaN where there is none that can be trusted.
         matched: (H, W) bool: seen in both views, so that (x - disparity, y) lies in the right one;
             False where the disparity is NaN or filled in from the surface beside: hidden in the
-            right view, outside of it, or on the edge of what hides.
+            right view, or outside of it.
         disparity_range: smallest and largest disparity tried; None where the views do not agree.
     """
 
@@ -223,25 +228,25 @@ def compute_disparity(
     trusted = coarse.consistent & clear & is_textured(left)
     known = filter_speckles(coarse.disparity, trusted, MAX_SPECKLE_AREA_PX)
     disparity = refine_disparity(left, right, coarse.disparity, known)
-    known &= _leads_inside(disparity)
-    kept = known
+    known &= _leads_inside(disparity, BORDER_PX)
+    matched = known
     if options.discontinuity_margin_px:
-        kept = known & ~near_discontinuity(disparity, known, options.discontinuity_margin_px)
-    matched = kept
+        matched = known & ~near_discontinuity(disparity, known, options.discontinuity_margin_px)
+    kept = matched
     if options.fill_occlusions:
-        hiding = on_occluding_edge(disparity, known, OCCLUDING_EDGE_PX)
-        sure = known & _leads_inside(disparity, OCCLUDING_EDGE_PX) & ~hiding
-        matched = kept & sure
+        sure = known & ~on_occluding_edge(disparity, known, OCCLUDING_EDGE_PX)
+        matched = matched & sure
         behind, occluded = fill_occlusions(disparity, sure)
+        below = fill_occlusions(disparity.T, sure.T)[0].T
+        occluded &= ~known & (np.abs(behind - below) <= MAX_DIFFERENCE_PX)
         beyond = extrapolate_disparity(disparity, sure, coarse.disparity)
-        occluded &= ~sure
         extrapolated = ~known & np.isfinite(beyond)
         disparity = np.where(occluded, behind, np.where(extrapolated, beyond, disparity))
-        kept = kept | (occluded & ~known) | extrapolated
+        kept = matched | occluded | extrapolated
     return DisparityMap(np.where(kept, disparity, np.float32(np.nan)), matched, (low, high))
 
 
-def _leads_inside(disparity: np.ndarray, margin_px: int = 0) -> np.ndarray:
+def _leads_inside(disparity: np.ndarray, margin_px: float) -> np.ndarray:
     """Return where disparities lead to a column of the right image, less a margin; (H, W) bool."""
     width = disparity.shape[1]
     place = np.arange(width, dtype=np.float32) - disparity
