@@ -15,7 +15,6 @@ that import this package are left as they are.
 """
 
 STOPPED = 130
-"""Exit code after Ctrl-C."""
 
 
 def main() -> None:

@@ -15,7 +15,6 @@ from .opencv import DISTRIBUTIONS
 
 RUNTIMES = ("onnxruntime", "openvino", "torch")
 PACKAGES = ("numpy", *DISTRIBUTIONS, "pillow", *RUNTIMES, "lightning-fabric")
-"""The packages that results depend on."""
 
 
 def provenance() -> dict[str, str]:

@@ -29,8 +29,6 @@ from ..sfm.pipeline import reconstruct_many
 from ..viz.draw import add_caption, save_picture
 
 FOLDER_KEYPOINTS = 2048
-"""Best keypoints of each image of a folder."""
-
 MODEL_STAGES = 9
 """Of a 3D model at most, with its files."""
 
@@ -306,4 +304,3 @@ TASKS: dict[str, Task] = {
         folder=True,
     ),
 }
-"""By the name that the page asks for."""

@@ -27,7 +27,6 @@ from ._app import MORE
 from ._app import NOTHING_FOUND as NOTHING_FOUND
 
 ALIASES = {"max_keypoints": ("--num-keypoints", "--top-k", "--max-num-keypoints")}
-"""What people type."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,6 @@ class From:
 MEGAPIXELS = From(
     load_image, more="max_megapixels", defaults={"max_megapixels": f"{MAX_MEGAPIXELS:g}"}
 )
-"""Of commands that read images."""
 
 Json = Annotated[bool, Parameter("--json", negative="", help="Print the result as JSON.")]
 JSON = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Json)

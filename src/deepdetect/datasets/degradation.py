@@ -103,4 +103,3 @@ DEGRADATIONS: dict[str, Degradation] = {
         Degradation("motion-9", "motion blur, 9 px", partial(blur_motion, length_px=9)),
     )
 }
-"""By name; all of them are computed in linear light."""

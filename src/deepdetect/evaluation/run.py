@@ -46,7 +46,6 @@ version are not used, nor what was made from them.
 """
 
 RECENT_IMAGES = 8
-"""Images whose keypoints are kept in memory."""
 
 
 class CacheError(DeepDetectError):

@@ -14,8 +14,6 @@ ANTIALIASING_SIGMA = 0.5
 """Of the blur before an image is downscaled, in units of sqrt(1 / scale^2 - 1) pixels."""
 
 WINDOW_PX = 15
-"""Side of the square windows."""
-
 BLUR_SIGMA_PX = 1.25
 """Of a blur before images are compared: noise and resampling must not count."""
 

@@ -22,8 +22,6 @@ from ..sfm.mapping import verify_pairs
 from .collection import Collection, check_names
 
 MATCHES_NAME = "matches"
-"""Of the text file of all matches, without its ending."""
-
 DEFAULT_SIZE_PX = 3.0
 """Diameter of keypoints without a size: that of dense keypoints."""
 

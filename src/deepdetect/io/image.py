@@ -27,7 +27,6 @@ MINIMUM_SIDE = 16
 IMAGE_SUFFIXES = (
     *(".bmp", ".heic", ".heif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"),
 )
-"""File name suffixes of the images that `find_images` lists."""
 
 ORIENTATION_TAG = 0x0112
 SAMPLE_FORMAT, SIGNED = 339, 2  # a tag of TIFF, and its value for signed integers

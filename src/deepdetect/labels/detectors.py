@@ -28,14 +28,8 @@ AGAST_OAST_9_16 = 3
 # Beyond these ranges OpenCV ends the process, runs for minutes, takes another number (modulo 256),
 # or raises an error.
 GRAY_LEVELS = (0, 255)
-"""Range of differences of grey levels."""
-
 BLOCK_SIZES = (1, 255)
-"""Range of the widths of windows, in pixels."""
-
 KERNEL_SIZES = range(1, 32, 2)
-"""Widths of Sobel filters, in pixels."""
-
 CANNY_THRESHOLDS = (0, 2040)
 """Range of the sum of both gradients of the 3x3 Sobel filter, in grey levels."""
 

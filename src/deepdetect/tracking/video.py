@@ -32,7 +32,6 @@ MAX_FPS = 1000.0
 
 
 CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
-"""Of the files, by their suffix."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -144,7 +144,6 @@ def _make_labels(
 
 
 ImageSource = FolderSource | ShardSource
-"""Images with labels, in a folder or in shards."""
 
 
 class CropDataset(Dataset[tuple[Tensor, Tensor]]):

@@ -12,8 +12,6 @@ BETA = 0.95
 """Decay of all three means of `Soap`, as in its paper."""
 
 EPS = 1e-8
-"""Keeps the division finite."""
-
 PRECONDITION_FREQUENCY = 10
 """Steps from one update of the basis to the next."""
 

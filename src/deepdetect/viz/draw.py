@@ -38,8 +38,6 @@ CAPTION_MARGIN = 6
 """To the left and to the right of the text, as `CAPTION_HEIGHT`."""
 
 CAPTION_SCALE = 0.5
-"""Of OpenCV's font."""
-
 GAP_PX = 6
 """Between pictures that are joined."""
 

@@ -18,8 +18,6 @@ RING_POINTS = 8
 """Of each ring: in the directions of a compass rose."""
 
 FEATURES = 23 + 8 * len(RING_RADII)
-"""Number of features of a candidate."""
-
 DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR = map(np.float32, (1e-7, 1e-6, 1e-8))
 """Added before logarithms and divisions: responses of noise and rounding look like nothing."""
 

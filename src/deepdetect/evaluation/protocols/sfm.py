@@ -52,8 +52,6 @@ OPTIONS = MultiViewOptions(pairs="all")
 """Of all methods: those of `reconstruct_many`, but every pair is matched."""
 
 KINDS = ("true", "estimated")
-"""Intrinsics that models are made with."""
-
 MODEL_COLUMNS = {"sparse points": ",d", "track length": ".2f", "reprojection error, px": ".3f"}
 
 CAMERA_COLUMNS = {

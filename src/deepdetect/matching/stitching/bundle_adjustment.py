@@ -70,7 +70,6 @@ class RotatingCamera:
 
 
 Cameras = Mapping[int, RotatingCamera]
-"""By the number of the image."""
 
 
 def adjust_homographies(

@@ -22,8 +22,6 @@ from .compositing import Canvas, composite, crop_box, least_distorted, plan_curv
 from .registration import JointRegistration, register_images
 
 STAGES = ("reading", "registration", "compositing")
-"""Of a panorama."""
-
 Projection = Literal["plane", "cylindrical", "spherical"]
 PROJECTIONS = get_args(Projection)
 
