@@ -14,7 +14,8 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from .errors import MissingExtraError, first_line
+from .errors import MissingExtraError, first_line, require_packages
+from .signals import sigterm_kept
 
 LOWEST_VERSION = "4.10"
 """The first one that works with NumPy 2."""
@@ -68,6 +69,18 @@ def import_opencv() -> ModuleType:
             f"pip install --upgrade {' '.join(installed_distributions()) or 'opencv-python'}"
         )
     return found
+
+
+def import_pycolmap(purpose: str = "a reconstruction from many images") -> Any:
+    """Import pycolmap, after OpenCV: the other way round some versions of both crash.
+
+    A MissingExtraError says that it, or h5py, is not installed, and what it is needed for.
+    """
+    import_opencv()
+    require_packages(purpose, "pycolmap", "h5py")
+    with sigterm_kept():  # or a process that is ended would print a stack trace
+        import pycolmap
+    return pycolmap
 
 
 def is_lack_of_memory(error: Exception) -> bool:

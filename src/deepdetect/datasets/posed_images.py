@@ -4,8 +4,8 @@
 - KITTI odometry (Geiger et al., 2012): NNNNNN.png or .jpg with calib.txt, whose first line is the
   projection matrix of the images' camera, or K.txt, its camera matrix, and poses.txt, whose line N
   belongs to image N.
-- COLMAP's text model (Schönberger and Frahm, 2016): cameras.txt and images.txt in the folder, or
-  in its sparse/ or sparse/0/; the images in the folder or in its images/. Without distortion.
+- COLMAP's model, text or binary (Schönberger and Frahm, 2016): in the folder, or in its sparse/ or
+  sparse/0/; the images in the folder or in its images/. Without distortion. pycolmap reads it.
 
 Intrinsics are of the images as they are: where a file names another size, they are scaled to it.
 """
@@ -18,7 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .._shared.errors import ImageError
+from .._shared.errors import ImageError, first_line
+from .._shared.opencv import import_pycolmap
 from ..geometry.camera import cross_matrix
 from ..io.image import ORIENTATION_TAG
 from ..io.image_file import open_image
@@ -32,8 +33,7 @@ MAX_ROTATION_ERROR = 1e-3
 MAX_ASPECT_ERROR = 0.01
 """By which an image may be stretched against the size that its camera is for: sizes are whole."""
 
-COLMAP_MODELS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}
-"""Number of the parameters: focal length, or two, and the principal point."""
+COLMAP_FILES = ("images.bin", "images.txt")
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +110,7 @@ def load_posed_scenes(folder: str | Path, max_pairs: int = 60) -> list[PosedScen
 
     Raises:
         ImageError: there is no scene, or a file of one is missing or damaged.
+        MissingExtraError: pycolmap, which reads COLMAP's layout, is not installed.
     """
     root = Path(folder).resolve()
     below = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
@@ -118,8 +119,8 @@ def load_posed_scenes(folder: str | Path, max_pairs: int = 60) -> list[PosedScen
     if not readers:
         raise ImageError(
             f"there are no images with cameras in {folder}: it, or each of its folders, must hold "
-            "NNNN.camera files (Strecha), calib.txt or K.txt and poses.txt (KITTI), or cameras.txt "
-            "and images.txt (COLMAP)"
+            "NNNN.camera files (Strecha), calib.txt or K.txt and poses.txt (KITTI), or images.txt "
+            "or images.bin (COLMAP)"
         )
     return [_load_scene(path, read, max_pairs) for path, read in readers.items()]
 
@@ -204,76 +205,39 @@ def _read_kitti(folder: Path) -> list[PosedImage]:
 
 
 def _colmap_model(folder: Path) -> Path | None:
+    """Return where a model of COLMAP lies, or None."""
     places = [folder, folder / "sparse", folder / "sparse" / "0"]
-    for place in places:
-        if all((place / name).is_file() for name in ("cameras.txt", "images.txt")):
-            return place
-    for place in places:
-        if (place / "cameras.bin").is_file():
-            raise ImageError(
-                f"{place} holds COLMAP's binary model only: write it as text with "
-                "colmap model_converter --output_type TXT"
-            )
-    return None
+    return next((p for p in places if any((p / name).is_file() for name in COLMAP_FILES)), None)
 
 
 def _read_colmap(folder: Path) -> list[PosedImage]:
-    model = _colmap_model(folder) or folder
-    cameras = {}
-    for line in _text(model / "cameras.txt").splitlines():
-        if line.strip() and line[0] != "#":
-            cameras[line.split()[0]] = line.split()
-    # Two lines an image; the second, triples of its points, may be empty.
-    lines = [line for line in _text(model / "images.txt").splitlines() if line[:1] != "#"]
-    if any(len(points.split()) % 3 for points in lines[1::2]):
+    place = _colmap_model(folder) or folder
+    try:
+        model = import_pycolmap("COLMAP's model").Reconstruction(place)
+    except (ValueError, IndexError, RuntimeError) as error:  # by what is wrong with it
         raise ImageError(
-            f"{model / 'images.txt'} must hold two lines for each image: write it with COLMAP"
-        )
+            f"{place} holds no model that pycolmap can read ({first_line(error)}): write cameras, "
+            "images and points3D with COLMAP"
+        ) from None
     images = []
-    for line in lines[::2]:
-        words = line.split(maxsplit=9)
-        where = f"the line {line[:40]!r} of {model / 'images.txt'}"
-        if not words:
-            continue
-        numbers = _numbers(words[1:8], 7, where)
-        if len(words) < 10 or words[8] not in cameras:
-            raise ImageError(
-                f"{where} names no camera of cameras.txt, or no image: write both files with COLMAP"
-            )
-        name = words[9].strip()
-        paths = [path for part in ("", "images") if (path := folder / part / name).is_file()]
+    for image in model.images.values():
+        paths = [path for part in ("", "images") if (path := folder / part / image.name).is_file()]
         if not paths:
-            raise ImageError(f"there is no image {name} in {folder} or its images: put it there")
-        intrinsics = _colmap_intrinsics(cameras[words[8]], paths[0], model / "cameras.txt")
-        rotation = _rotation_of_quaternion(numbers[:4], where)
-        images.append(_posed_image(paths[0], intrinsics, rotation, numbers[4:], where))
+            raise ImageError(
+                f"there is no image {image.name} in {folder} or its images: put it there"
+            )
+        camera, pose = image.camera, image.cam_from_world()
+        if camera.model_name not in ("SIMPLE_PINHOLE", "PINHOLE"):
+            raise ImageError(
+                f"a camera in {place} is of the model {camera.model_name}, not PINHOLE: undistort "
+                "the images first (colmap image_undistorter)"
+            )
+        # The centre of COLMAP's first pixel is (0.5, 0.5).
+        matrix = camera.calibration_matrix() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        matrix = _scaled(matrix, (camera.width, camera.height), paths[0], place)
+        rotation, translation = pose.rotation.matrix(), np.array(pose.translation)
+        images.append(_posed_image(paths[0], matrix, rotation, translation, place))
     return sorted(images, key=lambda image: image.path)
-
-
-def _colmap_intrinsics(words: Sequence[str], image: Path, file: Path) -> np.ndarray:
-    """Return the intrinsics of a camera: id, model, width, height, parameters."""
-    model = words[1] if len(words) > 1 else ""
-    if model not in COLMAP_MODELS:
-        raise ImageError(
-            f"the camera {words[0]} of {file} is of the model {model}, not PINHOLE: undistort the "
-            "images first (colmap image_undistorter)"
-        )
-    count = COLMAP_MODELS[model]
-    numbers = _numbers(words[2:], 2 + count, f"the camera {words[0]} of {file}")
-    focal = numbers[2:count]
-    cx, cy = numbers[count:] - 0.5  # the centre of COLMAP's first pixel is (0.5, 0.5)
-    matrix = np.array([[focal[0], 0, cx], [0, focal[-1], cy], [0, 0, 1]])
-    return _scaled(matrix, (numbers[0], numbers[1]), image, file)
-
-
-def _rotation_of_quaternion(quaternion: np.ndarray, where: str) -> np.ndarray:
-    """Return the rotation of a quaternion (w, x, y, z) of any length."""
-    length = np.linalg.norm(quaternion)
-    if length == 0:
-        raise ImageError(f"{where} holds no rotation: its quaternion is 0; make the file again")
-    w, *axis = quaternion / length
-    skew = cross_matrix(np.array(axis))
-    return np.eye(3) + 2 * w * skew + 2 * skew @ skew
 
 
 def _posed_image(

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import ReconstructionError, require_packages
-from .._shared.opencv import cv2, import_opencv
-from .._shared.signals import sigterm_kept
+from .._shared.errors import ReconstructionError
+from .._shared.opencv import cv2
+from .._shared.opencv import import_pycolmap as import_pycolmap
 from ..batch.extraction import ROOT_SIFT_NORM
 from ..batch.pair_list import Pair
 from ..features.keypoints import UNSET_ANGLE, Keypoints
@@ -31,18 +31,6 @@ SIFT_NUMBERS = 128
 
 ESTIMATED_FOCAL_FACTOR = 1.2
 """Focal length over the longer side, where nothing is known: where its estimation begins."""
-
-
-def import_pycolmap(purpose: str = "a reconstruction from many images") -> Any:
-    """Import pycolmap, after OpenCV: the other way round some versions of both crash.
-
-    A MissingExtraError says that it, or h5py, is not installed, and what it is needed for.
-    """
-    import_opencv()
-    require_packages(purpose, "pycolmap", "h5py")
-    with sigterm_kept():  # or a process that is ended would print a stack trace
-        import pycolmap
-    return pycolmap
 
 
 @contextmanager
