@@ -227,7 +227,9 @@ def _with_further_planes(
         matrix = _refine_homography(grays, plane.matrix)
         further, _ = match_by_homography(grays, pixels, matrix, seed)
         new = ~np.isin(further.indices0, matches.indices0)
-        if np.count_nonzero(new) >= max(enough, MIN_UNMATCHED_FRACTION * len(further)):
+        if np.count_nonzero(new) < max(enough, MIN_UNMATCHED_FRACTION * len(further)):
+            continue
+        if not is_repeated(grays, further.starts(pixels[0])[new], matrix):
             matches = matches.joined(further, new)
     return matches
 
