@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import itertools
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from .._shared.errors import OptionError
 from .._shared.image_array import Channels
 from .._shared.options import suggest_keywords
+from .._shared.records import file_digest
 from ..features.keypoints import Keypoints
 from ..features.selection import Maps, SelectionOptions, select_from_maps, select_keypoints
 from ..features.sift import describe_keypoints
@@ -132,7 +132,7 @@ class DeepDetect:
         """What its heat maps depend on besides the image: the digest of the weights, options."""
         return {
             "detector": "network",
-            "weights": hashlib.sha256(self.weights.read_bytes()).hexdigest(),
+            "weights": file_digest(self.weights),
             "backend": self.runtime,
             **vars(self.heatmap_options),
         }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,6 +12,7 @@ from .._shared.errors import OptionError, check_name
 from .._shared.image_array import Channels
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
+from .._shared.records import file_digest
 from ..features.keypoints import Keypoints
 from ..features.selection import check_ignore, check_max_keypoints
 from ..features.sift import describe_keypoints
@@ -75,7 +75,7 @@ class PointDetector:
         """What its keypoints depend on besides the image: options, the digest of the ranker."""
         return {
             "detector": "points",
-            "ranker": hashlib.sha256(self.ranker.read_bytes()).hexdigest(),
+            "ranker": file_digest(self.ranker),
             "max_keypoints": self.max_keypoints,
             "spread": self.spread,
             "resolution": self.resolution,

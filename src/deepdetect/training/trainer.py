@@ -22,7 +22,7 @@ from .._shared.errors import OptionError
 from .._shared.progress import progress
 from .._shared.provenance import provenance
 from .._shared.records import check_same, file_digest, plain
-from ..evaluation.report import Table
+from ..evaluation.report import Table, line_chart
 from .checkpoint import Point, read_checkpoint, restore, save_checkpoint
 from .dataset import loading
 
@@ -300,19 +300,14 @@ def save_curves(points: Sequence[Point], folder: Path) -> None:
     """Write curves.csv, and curves.png (paper, Figure 5)."""
     with atomic_path(folder / "curves.csv") as temporary:
         temporary.write_text(_curves(points).to_csv(), newline="")
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    axes = figure.subplots()
     steps = [point["step"] for point in points]
-    for name in points[0]:
-        if name.endswith(("loss", "score", "correct")):
-            axes.plot(steps, [point[name] for point in points], label=name.replace("_", " "))
-    axes.set_xlabel("step")
-    axes.grid(alpha=0.3)
-    axes.legend(fontsize=7)
+    lines = {
+        name.replace("_", " "): (steps, [point[name] for point in points])
+        for name in points[0]
+        if name.endswith(("loss", "score", "correct"))
+    }
     with atomic_path(folder / "curves.png") as temporary:
-        figure.savefig(temporary, dpi=120)
+        temporary.write_bytes(line_chart(lines, "step", ""))
 
 
 def _curves(points: Sequence[Point]) -> Table:

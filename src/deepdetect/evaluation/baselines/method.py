@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import DeepDetectError, OptionError
+from ..._shared.records import file_digest
 from ...detector.detector import find_keypoints
 from ...detector.point_detector import PointDetector
 from ...features.keypoints import Keypoints
@@ -141,7 +141,7 @@ def deepdetect_feature(
 ) -> LocalFeature:
     """Make a local feature of a detector; with a version, of anything with a method `heatmap`."""
     if not version:
-        digest = hashlib.sha256(detector.weights.read_bytes()).hexdigest()[:16]
+        digest = file_digest(detector.weights)[:16]
         version = f"{digest} {detector.runtime} {detector.heatmap_options} {selection} {descriptor}"
 
     def detect(rgb: np.ndarray) -> Keypoints:

@@ -46,7 +46,7 @@ POSE_THRESHOLDS_DEG = (0.5, 1.0, 5.0)
 CURVE_DEG = tuple(0.05 * step for step in range(61))
 """Errors at which the figure is drawn."""
 
-FEATURES, DATABASE = "features.h5", "sift.db"
+DATABASE = "sift.db"
 
 OPTIONS = MultiViewOptions(pairs="all")
 """Of all methods: those of `reconstruct_many`, but every pair is matched."""
@@ -288,7 +288,7 @@ def find_points(detector: PointDetector, stages: Stages, folder: Path) -> None:
 def find_random_points(detector: PointDetector, stages: Stages, folder: Path) -> None:
     """Put as many random points in place of the ranked ones, with their sizes in another order."""
     find_points(detector, stages, folder)
-    with import_h5py().File(stages.work / FEATURES, "r+") as file:
+    with import_h5py().File(stages.features, "r+") as file:
         for number, name in enumerate(sorted(path.name for path in folder.iterdir())):
             rng = np.random.default_rng((0, number))
             group = file[name]
@@ -324,7 +324,7 @@ def find_sift(stages: Stages, folder: Path) -> None:
                     "image_size": np.array([camera.width, camera.height], np.int32),
                 }
                 groups.append(Group(image.name, arrays))
-    write_groups(stages.work / FEATURES, groups)
+    write_groups(stages.features, groups)
 
 
 def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
@@ -358,7 +358,7 @@ def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, 
         start = _times()
         method.find(stages, folder)
         took = _times() - start
-        with open_hdf5(stages.work / FEATURES) as file:
+        with open_hdf5(stages.features) as file:
             sides = {name: file[name]["image_size"][()].tolist() for name in sorted(file)}
             counts = [len(file[name]["keypoints"]) for name in file]
         sizes = {name: (int(width), int(height)) for name, (width, height) in sides.items()}
