@@ -9,7 +9,7 @@ it finds *without* that half correlates the images better than the homography be
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -23,6 +23,7 @@ from .images import (
     erode_mask,
     gaussian_blur,
     local_zncc,
+    median_local_zncc,
     normalise_local_contrast,
     track_round_trip,
     warp_to_reference,
@@ -104,6 +105,18 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
         if correction is not None:
             current = current @ correction
     return current / current[2, 2]
+
+
+def most_alike(
+    gray0: np.ndarray, gray1: np.ndarray, homographies: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Return the homography under which two images, small copies of them, correlate best."""
+    (first, scale0), (second, scale1) = (downscale(g, ALIGNMENT_SIDE_PX) for g in (gray0, gray1))
+
+    def correlation(homography: np.ndarray) -> float:
+        return median_local_zncc(first, second, scaled_homography(homography, scale0, scale1))
+
+    return max(homographies, key=correlation)
 
 
 def _fit_to_corners(

@@ -13,7 +13,8 @@ import numpy as np
 from ..._shared.opencv import cv2
 from ...features.keypoints import nearest_keypoints
 from ...features.matches import GuidedMatches, TwoViewGeometry
-from ...geometry.homography_refinement import refine_homography
+from ...geometry.estimation import estimate_geometry
+from ...geometry.homography_refinement import most_alike, refine_homography
 from ...geometry.images import downscale, warp_to_reference
 from ...geometry.transforms import (
     epipolar_errors,
@@ -159,7 +160,11 @@ def _plane_or_depth(
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
     """Match by the homography, and by epipolar lines where matches off its plane agree on them."""
     assert first.matrix is not None
-    matrix = _refine_homography(grays, first.matrix)
+    # Of a surface that is not quite flat, what most points agree with can be the better plane.
+    consensus = estimate_geometry(first.points0, first.points1, "homography", seed=seed).matrix
+    refined = _refine_homography(grays, first.matrix)
+    known = [refined, first.matrix, *([] if consensus is None else [consensus])]
+    matrix = most_alike(*grays, known)
     on_plane, verified = match_by_homography(grays, pixels, matrix, seed)
     planar = first.parallax is None or verified >= MIN_VERIFIED_FRACTION
     off_plane = first.parallax is not None and first.parallax.significant
