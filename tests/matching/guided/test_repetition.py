@@ -52,6 +52,16 @@ def test_a_part_that_occurs_once_tells_the_periods_apart() -> None:
     assert is_repeated(grays, POINTS, shift(0))
 
 
+def test_where_a_wall_ends_tells_nothing() -> None:
+    rng = np.random.default_rng(3)
+    grays = views(unique=False)
+    for gray in grays:
+        beside = texture(rng, *SIZE[::-1])
+        gray[:, :PERIOD_PX], gray[:, -PERIOD_PX:] = beside[:, :PERIOD_PX], beside[:, -PERIOD_PX:]
+    inside = POINTS[(POINTS[:, 0] >= PERIOD_PX) & (POINTS[:, 0] < SIZE[0] - PERIOD_PX)]
+    assert is_repeated(grays, inside, shift(0))
+
+
 def test_a_scene_that_does_not_repeat_is_not_repeated() -> None:
     gray = texture(np.random.default_rng(1), *SIZE[::-1]).astype(np.uint8)
     assert not is_repeated((gray, gray), POINTS, np.eye(3))
