@@ -54,12 +54,14 @@ def test_a_part_that_occurs_once_tells_the_periods_apart() -> None:
 
 def test_where_a_wall_ends_tells_nothing() -> None:
     rng = np.random.default_rng(3)
-    grays = views(unique=False)
-    for gray in grays:
-        beside = texture(rng, *SIZE[::-1])
-        gray[:, :PERIOD_PX], gray[:, -PERIOD_PX:] = beside[:, :PERIOD_PX], beside[:, -PERIOD_PX:]
-    inside = POINTS[(POINTS[:, 0] >= PERIOD_PX) & (POINTS[:, 0] < SIZE[0] - PERIOD_PX)]
-    assert is_repeated(grays, inside, shift(0))
+    wall = np.zeros(SIZE[::-1], bool)
+    wall[PERIOD_PX:-PERIOD_PX, PERIOD_PX:-PERIOD_PX] = True
+    first, second = (
+        np.where(wall, gray, texture(rng, *SIZE[::-1]).astype(np.uint8))
+        for gray in views(unique=False)
+    )
+    points = np.argwhere(wall)[::7, ::-1].astype(np.float64)
+    assert is_repeated((first, second), points, shift(0))
 
 
 def test_a_scene_that_does_not_repeat_is_not_repeated() -> None:
