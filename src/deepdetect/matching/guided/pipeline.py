@@ -49,8 +49,8 @@ OFF_PLANE_PX = 6.0
 
 MIN_OFF_PLANE_FRACTION = 0.02
 """As many dense matches, of keypoints whose patches the plane does not explain, relative to those
-on the plane, show depth where the sparse ones do, too: the planes of Oxford, which are not quite
-flat, have up to 0.013, facades from 0.032 on."""
+on the plane, show depth where as many of the sparse ones do, too: the planes of Oxford, which are
+not quite flat, have up to 0.013, facades from 0.032 on."""
 
 SCENE_MATCHES = 1000
 """Of the dense matches, drawn at random, say what a scene is like."""
@@ -174,6 +174,9 @@ def _plane_or_depth(
         return plane
     depth = guiding_geometry(grays, "fundamental", seed, first.source)
     depth = replace(depth, num_views=depth.num_views + first.num_views)
+    errors = transfer_errors(depth.points0, depth.points1, matrix)
+    if planar and np.count_nonzero(errors > OFF_PLANE_PX) < MIN_OFF_PLANE_FRACTION * len(errors):
+        return plane
     geometry, matches = _match_depth(grays, pixels[0], depth, enough, matrix if planar else None)
     if not planar and (matches is None or len(matches) < enough) and first.others:
         # What moves otherwise can spoil a matrix that explains a part of it, too.
