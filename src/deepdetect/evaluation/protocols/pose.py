@@ -189,7 +189,7 @@ def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
         assert match is not None
         points0, points1, seconds, guided_by, confidence = match(images)
         return {
-            **_errors(estimate_pose(points0, points1, *cameras), pair),
+            **pose_errors(estimate_pose(points0, points1, *cameras), pair),
             "matches": len(points0),
             AGREEING: epipolar_inlier_ratio(points0, points1, pair.fundamental),
             "seconds": seconds,
@@ -199,14 +199,15 @@ def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
 
     if match is None:
         nothing: Row = dict.fromkeys(("matches", AGREEING, "seconds", "guided by", "confidence"))
-        return _errors((np.eye(3), np.array([0.0, 0.0, -1.0])), pair) | nothing
+        return pose_errors((np.eye(3), np.array([0.0, 0.0, -1.0])), pair) | nothing
     truth = (*cameras, pair.rotation, pair.translation)
     estimate = (THRESHOLD_PX, CONFIDENCE, EPIPOLAR_THRESHOLD_PX)
     row = run.cached("pose", (method.name, method.version, images, truth, estimate), make)
     return row | {name: row[name] or None for name in ("guided by", "confidence")}
 
 
-def _errors(pose: tuple[np.ndarray, np.ndarray] | None, pair: PosedPair) -> Row:
+def pose_errors(pose: tuple[np.ndarray, np.ndarray] | None, pair: PosedPair) -> Row:
+    """Return the errors of a pose in degrees, infinite without one, by the titles of columns."""
     rotation = translation = float("inf")
     if pose is not None:
         rotation = rotation_error(pose[0], pair.rotation)
