@@ -70,6 +70,6 @@ class StageTimer:
         """Time what runs inside as the stage of this name."""
         started = time.perf_counter()
         yield
-        self.seconds[name] = time.perf_counter() - started
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
         if self._progress is not None:
             self._progress(name)

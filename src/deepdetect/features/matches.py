@@ -65,12 +65,15 @@ class TwoViewGeometry:
 
     def swapped(self) -> TwoViewGeometry:
         """Return the geometry from the second image to the first."""
-        if self.matrix is None:
-            return self
-        if self.model != "homography":
-            return replace(self, matrix=self.matrix.T)
-        inverse = np.linalg.inv(self.matrix)
-        return replace(self, matrix=inverse / inverse[2, 2])
+        return replace(self, matrix=_swapped(self.model, self.matrix))
+
+
+def _swapped(model: str, matrix: np.ndarray | None) -> np.ndarray | None:
+    """Return the matrix of a model from the second image to the first."""
+    if matrix is None or model != "homography":
+        return None if matrix is None else matrix.T
+    inverse = np.linalg.inv(matrix)
+    return inverse / inverse[2, 2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,17 +117,6 @@ class GuidedMatches:
         indices1 = None if self.indices1 is None or other.indices1 is None else both("indices1")
         columns = both("indices0"), both("points1"), both("scores")
         return GuidedMatches(*columns, self.subpixel, indices1)
-
-    def unique(self) -> GuidedMatches:
-        """Keep the best match of those that end on the same pixel of the second image."""
-        pixels = np.rint(self.points1).astype(np.int64)
-        best_first = np.lexsort((self.indices0, -self.scores))
-        _, first = np.unique(pixels[best_first], axis=0, return_index=True)
-        kept = np.sort(best_first[first])
-        columns: dict[str, Any] = {
-            n: v[kept] for n, v in vars(self).items() if isinstance(v, np.ndarray)
-        }
-        return replace(self, **columns)
 
 
 class _Lazy:
@@ -307,6 +299,21 @@ class Matches:
             is_best[best_first[best]] = True
             kept &= is_best
         return self[kept]
+
+    def swapped(self) -> Matches:
+        """Return the same matches from the second image to the first."""
+        guide = self.two_view_geometry
+        return replace(
+            self,
+            points0=self.points1,
+            points1=self.points0,
+            matrix=_swapped(self.model, self.matrix),
+            keypoints0=self.keypoints1,
+            keypoints1=self.keypoints0,
+            two_view_geometry=None if guide is None else guide.swapped(),
+            indices0=self.indices1,
+            indices1=self.indices0,
+        )
 
     @suggest_keywords
     def draw(

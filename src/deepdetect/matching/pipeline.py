@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any, TypeVar
+from functools import cache, partial
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from .._shared.machine import require_memory
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.progress import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_keypoints
-from ..features.keypoints import Keypoints
+from ..features.keypoints import Keypoints, nearest_keypoints
 from ..features.matchers import get_matcher, match_descriptors
 from ..features.matches import Matches, TwoViewGeometry, lazy
 from ..features.selection import SelectionOptions
@@ -34,6 +33,10 @@ GUIDED_STAGES = ("initial geometry", "keypoints", "guided matching", "geometry")
 UNGUIDED_STAGES = ("keypoints", "descriptors", "matching", "geometry")
 
 TWO_VIEW_MODELS = ("auto", "homography", "fundamental")
+
+MAX_RETURN_ERROR_PX = 2.0
+"""Of a match that is also found the other way: from the match nearest to its end, up to 1.5 px
+away, the way back ends this near to its start."""
 
 UNGUIDED_ONLY = ("descriptor", "keypoint_size", "angle", "matcher", "ratio")
 """Options of `MatchingOptions` that do not apply to guided matching."""
@@ -92,7 +95,6 @@ PUBLISHED_MATCHING = MatchingOptions(angle=-1.0, ratio=0.99, matcher="flann")
 match is evaluated by the true homography."""
 
 Points = tuple[np.ndarray, np.ndarray]
-Item = TypeVar("Item")
 
 
 @suggest_keywords
@@ -127,8 +129,8 @@ def match_images(
         model: the geometry, "homography" (planes, pure rotation), "fundamental" (any static
             scene), "essential" (with both cameras in `options.geometry`), "auto" (one of the first
             two) or "none"; it also chooses what guides.
-        mutual: keep only mutual nearest neighbours; guided, the best match of each keypoint, and
-            the same matches whichever image comes first.
+        mutual: keep only mutual nearest neighbours; guided, one-to-one matches that are found from
+            either image, the same ones whichever comes first, in twice the time.
         tentative_matches: a few matches of any other matcher (LightGlue, LoFTR, a person's clicks),
             two (K, 2) arrays of positions, row by row; they take the place of our own SIFT matches
             that guide, and some may be wrong. Or what `find_tentative_matches` has made already.
@@ -166,66 +168,24 @@ def match_images(
     grays = luma(rgb[0]), luma(rgb[1])
     timer = StageTimer(progress)
     find = [
-        partial(find_keypoints, detector, image, selection, mask)
+        cache(partial(find_keypoints, detector, image, selection, mask))
         for image, mask in zip(rgb, masks, strict=True)
     ]
     if not guided_matching:
         with timer.stage("keypoints"):
             keypoints = find[0](), find[1]()
         return _match_unguided(grays, keypoints, model, mutual, seed, options, timer)
-    # A pair and the swapped pair are matched alike: images are ordered by their pixels.
-    swapped = mutual and _key(grays[0]) > _key(grays[1])
-    grays = _ordered(grays, swapped)
-    if swapped and source is not None:
-        source = source.swapped() if isinstance(source, TentativeMatches) else source[::-1]
-    first = None
     # Keypoints of the network take no part in the first geometry, and finding them cannot fail:
     # where no geometry can be trusted nobody may ever ask for them.
-    if isinstance(detector, DeepDetect) and all(mask is None for mask in masks):
-        with timer.stage("initial geometry"):
-            first = guiding_geometry(grays, guiding, seed, source)
-        if first.matrix is None:
-            guide = first.as_two_view_geometry()
-            return _no_matches(lazy(find[0]), lazy(find[1]), guide, timer)
-    with timer.stage("keypoints"):
-        keypoints = find[0](), find[1]()
-    with timer.stage("guided matching"):
-        keypoints0, keypoints1 = _ordered(keypoints, swapped)
-        if first is None:
-            source = (keypoints0, keypoints1) if source is None else source
-            first = guiding_geometry(grays, guiding, seed, source)
-        pixels = np.rint(keypoints0.xy), np.rint(keypoints1.xy)
-        guide, matched = guided_matches(grays, pixels, first, seed)
-    if swapped:
-        guide = guide.swapped()
-    if matched is None:
-        return _no_matches(*keypoints, guide, timer)
-    if mutual:
-        matched = matched.unique()
-    # Where a keypoint of the second image is none of a match, its end is where the pixel of the
-    # first one is seen.
-    points = matched.starts(pixels[0]).astype(np.float32), matched.points1.astype(np.float32)
-    if matched.indices1 is not None:
-        points = keypoints0.xy[matched.indices0], keypoints1.xy[matched.indices1]
-    points = _ordered(points, swapped)
-    indices0, indices1 = _ordered((matched.indices0, matched.indices1), swapped)
-    with timer.stage("geometry"):
-        geometry = _final_geometry(points, model, seed, options.geometry, guide)
-        assert matched.alike is not None
-        inliers = geometry.inliers & matched.alike
-    return Matches(
-        *points,
-        matched.scores,
-        inliers,
-        geometry.model,
-        geometry.matrix,
-        *keypoints,
-        timer.seconds,
-        guide,
-        matched.subpixel,
-        indices0,  # type: ignore[arg-type]  # looked up where there are none
-        indices1,  # type: ignore[arg-type]
-    )
+    keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
+    settings = guiding, model, seed, options.geometry, keypoints_last, timer
+    matches = _match_guided(grays, (find[0], find[1]), source, *settings)
+    if not (mutual and matches.success):
+        return matches
+    if source is not None:
+        source = source.swapped() if isinstance(source, TentativeMatches) else source[::-1]
+    back = _match_guided(grays[::-1], (find[1], find[0]), source, *settings)
+    return _found_both_ways(matches, back)
 
 
 @suggest_keywords
@@ -299,8 +259,72 @@ def match_features(
     )
 
 
-def _ordered(both: tuple[Item, Item], swapped: bool) -> tuple[Item, Item]:
-    return (both[1], both[0]) if swapped else both
+def _match_guided(
+    grays: tuple[np.ndarray, np.ndarray],
+    find: tuple[Callable[[], Keypoints], Callable[[], Keypoints]],
+    source: Any,
+    guiding: str,
+    model: str,
+    seed: int,
+    options: GeometryOptions,
+    keypoints_last: bool,
+    timer: StageTimer,
+) -> Matches:
+    """Match the keypoints of the first image where a geometry says."""
+    first = None
+    if keypoints_last:
+        with timer.stage("initial geometry"):
+            first = guiding_geometry(grays, guiding, seed, source)
+        if first.matrix is None:
+            guide = first.as_two_view_geometry()
+            return _no_matches(lazy(find[0]), lazy(find[1]), guide, timer)
+    with timer.stage("keypoints"):
+        keypoints = find[0](), find[1]()
+    with timer.stage("guided matching"):
+        if first is None:
+            first = guiding_geometry(grays, guiding, seed, keypoints if source is None else source)
+        pixels = np.rint(keypoints[0].xy), np.rint(keypoints[1].xy)
+        guide, matched = guided_matches(grays, pixels, first, seed)
+    if matched is None:
+        return _no_matches(*keypoints, guide, timer)
+    # Where a keypoint of the second image is none of a match, its end is where the pixel of the
+    # first one is seen.
+    points = matched.starts(pixels[0]).astype(np.float32), matched.points1.astype(np.float32)
+    if matched.indices1 is not None:
+        points = keypoints[0].xy[matched.indices0], keypoints[1].xy[matched.indices1]
+    with timer.stage("geometry"):
+        geometry = _final_geometry(points, model, seed, options, guide)
+        assert matched.alike is not None
+        inliers = geometry.inliers & matched.alike
+    return Matches(
+        *points,
+        matched.scores,
+        inliers,
+        geometry.model,
+        geometry.matrix,
+        *keypoints,
+        timer.seconds,
+        guide,
+        matched.subpixel,
+        matched.indices0,
+        matched.indices1,  # type: ignore[arg-type]  # looked up where there are none
+    )
+
+
+def _found_both_ways(matches: Matches, back: Matches) -> Matches:
+    """Keep one-to-one matches that are also found from the second image to the first."""
+    if not back.success:
+        return back.swapped()
+    kept = []
+    for one, other in ((matches, back), (back, matches)):
+        size = one.keypoints1.image_size
+        rows, distances = nearest_keypoints(one.points1, other.points0, size)
+        returned = other.points1[rows] - one.points0
+        near = np.isfinite(distances) & (np.linalg.norm(returned, axis=1) <= MAX_RETURN_ERROR_PX)
+        kept.append(one[near].unique())
+    guides = matches.two_view_geometry, back.two_view_geometry
+    assert guides[0] is not None and guides[1] is not None
+    return kept[0] if guides[0].log10_nfa <= guides[1].log10_nfa else kept[1].swapped()
 
 
 def _match_unguided(
@@ -382,10 +406,6 @@ def _no_matches(
 ) -> Matches:
     nothing = np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty(0), "none", None
     return Matches(*nothing, keypoints0, keypoints1, timer.seconds, guide)
-
-
-def _key(gray: np.ndarray) -> tuple[tuple[int, ...], bytes]:
-    return gray.shape, hashlib.sha256(gray.tobytes()).digest()
 
 
 def _final_geometry(
