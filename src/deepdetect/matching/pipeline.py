@@ -322,9 +322,10 @@ def _found_both_ways(matches: Matches, back: Matches) -> Matches:
         returned = other.points1[rows] - one.points0
         near = np.isfinite(distances) & (np.linalg.norm(returned, axis=1) <= MAX_RETURN_ERROR_PX)
         kept.append(one[near].unique())
-    guides = matches.two_view_geometry, back.two_view_geometry
-    assert guides[0] is not None and guides[1] is not None
-    return kept[0] if guides[0].log10_nfa <= guides[1].log10_nfa else kept[1].swapped()
+    guide, back_guide = matches.two_view_geometry, back.two_view_geometry
+    assert guide is not None
+    assert back_guide is not None
+    return kept[0] if guide.log10_nfa <= back_guide.log10_nfa else kept[1].swapped()
 
 
 def _match_unguided(
