@@ -2,8 +2,8 @@
 
     python benchmarks/refine_oxford.py OXFORD OUTPUT
 
-Writes OUTPUT/SCENE/H1toKp.refined where they are clearly better than the published ones, and a
-report to OUTPUT/refinement; OUTPUT may be OXFORD itself. The published ones are up to 26 px off. No
+Writes OUTPUT/SCENE/H1toKp.refined where they are clearly better than the published ones, and prints
+a table; OUTPUT may be OXFORD itself. The published ones are up to 26 px off. No
 keypoint detector that the benchmark evaluates is in the loop at the end: Lucas-Kanade on the warped
 images (`geometry.homography_refinement`) starts from the published homography and from one by SIFT
 and MAGSAC, and what correlates best is taken.
@@ -12,7 +12,6 @@ and MAGSAC, and what correlates best is taken.
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -20,10 +19,9 @@ import numpy as np
 
 from deepdetect._shared.atomic import atomic_path
 from deepdetect._shared.progress import progress
-from deepdetect._shared.provenance import provenance
-from deepdetect.datasets.planar import PlanarPair, load_oxford, read_matrix
+from deepdetect.datasets.planar import PlanarPair, load_oxford
 from deepdetect.evaluation.metrics.homography import project_visible
-from deepdetect.evaluation.report import Report, Row, Section, Table
+from deepdetect.evaluation.report import Row, Table
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.geometry import GeometryOptions, estimate_geometry, transform_points
 from deepdetect.geometry.homography_refinement import refine_homography
@@ -58,92 +56,37 @@ COLUMNS = {
     "moved, largest px": ".1f",
     "windows in which it rises": ".1%",
     "two starts apart, median px": ".3f",
-    "from the file there, median px": ".3f",
-    "from the file there, largest px": ".2f",
     "written": "",
 }
+"""Correlation: median of the local ones over the overlap; moved: from where the published
+homography takes its pixels."""
 
 START_RATIO = 0.85
 START_KEYPOINTS = 8000
 
 
-@dataclass(frozen=True, eq=False)
-class RefinedPair:
-    """A pair of Oxford with its refined homography.
-
-    Attributes:
-        pair: as published.
-        published: median local correlation of the images under the published homography.
-        homography: the best found, from either start.
-        zncc: the correlation under it.
-        moved: how far points of the overlap move from the published place: median and largest,
-            in pixels.
-        risen: fraction of the windows, side by side, in which the correlation rises.
-        starts_apart: how far the results from both starts take points apart, median and largest;
-            None without a second start.
-        apart: the same from the refined homography that the data set has already; None without.
-        written: the file, or None where the published homography is as good.
-    """
-
-    pair: PlanarPair
-    published: float
-    homography: np.ndarray
-    zncc: float
-    moved: tuple[float, float]
-    risen: float
-    starts_apart: tuple[float, float] | None
-    apart: tuple[float, float] | None
-    written: Path | None
-
-    @property
-    def better(self) -> bool:
-        """Whether the refined homography is clearly better than the published one.
-
-        It gains much correlation; or the correlation rises in a clear majority of the windows, and
-        both starts lead to the same place.
-        """
-        if self.zncc - self.published > CLEAR_GAIN:
-            return True
-        same = self.starts_apart is not None and self.starts_apart[0] < MAX_APART * self.moved[0]
-        return same and self.risen > CLEAR_MAJORITY
-
-
 def main() -> None:
-    """Refine the pairs, and write files and report."""
+    """Refine the pairs, write files and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("oxford", type=Path, help="the data set")
     parser.add_argument("output", type=Path, help="where the files go")
     arguments = parser.parse_args()
-    results = refine_oxford(arguments.oxford, arguments.output, quiet=False)
-    section = Section("Oxford's homographies, refined", (), (refinement_table(results),))
-    report = Report("DeepDetect: refined homographies of Oxford", provenance(), (section,))
-    report.save(arguments.output / "refinement")
-    written = sum(result.written is not None for result in results)
-    print(f"{section.tables[0].to_markdown()}\n\n{written} files written to {arguments.output}")
+    rows = refine_oxford(arguments.oxford, arguments.output, quiet=False)
+    print(Table("refined", "", COLUMNS, rows).to_markdown())
 
 
-def refine_oxford(folder: Path, output: Path, *, quiet: bool = True) -> list[RefinedPair]:
-    """Refine all pairs, and write SCENE/H1toKp.refined where it is better than the published.
-
-    Args:
-        folder: the data set; nothing is written into it unless it is the output too.
-        output: where the files go.
-        quiet: show no progress bar.
-
-    Raises:
-        ImageError: a file of the data set is missing.
-        DeepDetectError: a file cannot be written.
-    """
-    results = []
+def refine_oxford(folder: Path, output: Path, *, quiet: bool = True) -> list[Row]:
+    """Refine all pairs, and write SCENE/H1toKp.refined where it is better than the published."""
+    rows = []
     pairs = [pair for scene in load_oxford(folder) for pair in scene.pairs]
     with progress(len(pairs), "refining", "pair", quiet) as bar:
         for pair in pairs:
-            results.append(_refine(pair, output / pair.scene / f"H1to{pair.number}p.refined"))
+            rows.append(_refine(pair, output / pair.scene / f"H1to{pair.number}p.refined"))
             bar.update(1)
-    return results
+    return rows
 
 
-def _refine(pair: PlanarPair, path: Path) -> RefinedPair:
+def _refine(pair: PlanarPair, path: Path) -> Row:
     gray0, gray1 = (luma(load_image(image)) for image in (pair.first, pair.second))
     found = [refine_homography(gray0, gray1, pair.homography)]
     start = sift_homography(gray0, gray1)
@@ -154,22 +97,26 @@ def _refine(pair: PlanarPair, path: Path) -> RefinedPair:
     )
     zncc = max(refined)
     best = found[refined.index(zncc)]
-    size0, size1 = ((gray.shape[1], gray.shape[0]) for gray in (gray0, gray1))
-    moved = displacement(best, pair.homography, size0, size1)
-    there = pair.first.with_name(path.name)  # read before it may be written over
-    apart = None
-    if there.exists():
-        apart = displacement(best, read_matrix(there), size0, size1)
-    starts_apart = None
-    if len(found) > 1:
-        starts_apart = displacement(*found, size0, size1)
+    sizes = (gray0.shape[1], gray0.shape[0]), (gray1.shape[1], gray1.shape[0])
+    moved = displacement(best, pair.homography, *sizes)
+    apart = displacement(*found, *sizes)[0] if len(found) > 1 else None
     risen = risen_fraction(gray0, gray1, pair.homography, best)
-    result = RefinedPair(pair, published, best, zncc, moved, risen, starts_apart, apart, None)
-    if not result.better:
-        return result
-    with atomic_path(path) as temporary:
-        np.savetxt(temporary, best, fmt="%.12e")
-    return replace(result, written=path)
+    written = is_better(zncc - published, moved[0], risen, apart)
+    if written:
+        with atomic_path(path) as temporary:
+            np.savetxt(temporary, best, fmt="%.12e")
+    values = pair.name, published, zncc, *moved, risen, apart, "yes" if written else "no"
+    return dict(zip(COLUMNS, values, strict=True))
+
+
+def is_better(gain: float, moved: float, risen: float, apart: float | None) -> bool:
+    """Whether a refined homography is clearly better than the published one.
+
+    It gains much correlation; or the correlation rises in a clear majority of the windows, and both
+    starts lead to the same place. Lengths are medians in pixels.
+    """
+    same = apart is not None and apart < MAX_APART * moved
+    return gain > CLEAR_GAIN or (same and risen > CLEAR_MAJORITY)
 
 
 def sift_homography(gray0: np.ndarray, gray1: np.ndarray) -> np.ndarray | None:
@@ -230,35 +177,6 @@ def displacement(
     if not len(gaps):
         return float("nan"), float("nan")
     return float(np.median(gaps)), float(gaps.max())
-
-
-def refinement_table(results: list[RefinedPair]) -> Table:
-    """Tabulate the correlations and how far points move."""
-    rows: list[Row] = []
-    for result in results:
-        row = {
-            "pair": result.pair.name,
-            "correlation, published": result.published,
-            "correlation, refined": result.zncc,
-            "moved, median px": result.moved[0],
-            "moved, largest px": result.moved[1],
-            "windows in which it rises": result.risen,
-            "written": "yes" if result.written else "no: not clearly better",
-        }
-        if result.starts_apart:
-            row["two starts apart, median px"] = result.starts_apart[0]
-        if result.apart:
-            row["from the file there, median px"] = result.apart[0]
-            row["from the file there, largest px"] = result.apart[1]
-        rows.append(row)
-    note = (
-        "Median of the local correlations (15x15 pixels) of the images over their overlap. Moved: "
-        "from where the published homography takes the pixels of the overlap. Written where the "
-        f"correlation gains over {CLEAR_GAIN:g}, or where it rises in over {CLEAR_MAJORITY:.0%} of "
-        f"the windows and both starts come within {MAX_APART:g} of the move. From the file there: "
-        "the same from H1toKp.refined, where the data set has that file already."
-    )
-    return Table("oxford_refined", "Oxford's homographies, refined", COLUMNS, rows, note)
 
 
 if __name__ == "__main__":
