@@ -31,7 +31,7 @@ from deepdetect.datasets.degradation import DEGRADATIONS, degrade
 from deepdetect.features.display import draw_circle
 from deepdetect.geometry import disparity_errors
 from deepdetect.reconstruction import Reconstruction
-from deepdetect.viz.draw import _dimmed, draw_heatmap
+from deepdetect.viz.draw import draw_heatmap
 from deepdetect.viz.render import orbit_camera, render
 
 OUTPUT = Path(__file__).parents[1] / "images" / "day-dark-blurred.jpg"
@@ -119,7 +119,7 @@ def stacked(
     """Draw a part of both views above one another, with lines between a sample of the matches."""
     from deepdetect._shared.opencv import cv2
 
-    upper, lower = _dimmed(left[ROWS_SHOWN]), _dimmed(right[ROWS_SHOWN])
+    upper, lower = left[ROWS_SHOWN] // 2, right[ROWS_SHOWN] // 2
     canvas = np.concatenate([upper, lower])
     rows = first[:, 1]
     inside = np.flatnonzero((rows > ROWS_SHOWN.start + 4) & (rows < ROWS_SHOWN.stop - 4))

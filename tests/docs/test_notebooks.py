@@ -43,7 +43,7 @@ def test_output_is_kept_whole_and_small(path: Path) -> None:
     assert all(output.get("name") != "stderr" for output in outputs)
     pictures = [output for output in outputs if "image/jpeg" in output.get("data", {})]
     assert len(pictures) >= 2
-    text = path.read_text("utf-8")
+    text = re.sub(r'"image/jpeg": ".*?"', "", path.read_text("utf-8"))  # its letters are random
     assert not re.search(r"/(home|root|tmp|work|usr)/", text), "a path of this machine"
 
 
