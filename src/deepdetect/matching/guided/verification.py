@@ -35,8 +35,9 @@ of the windows were chosen on nine pairs of Oxford, with parts of their second i
 SMOOTHING_SIGMA_PX = 2.5
 """Of the Gaussian mean over neighbouring points."""
 
-WINDOW_PX = 101
-"""Side of the window around a point in which most points must pass."""
+WINDOWS_PX = (101, 31)
+"""Sides of the windows around a point in each of which most points must pass. The smaller one, for
+chance matches around what is a small plane, was chosen on six made pairs."""
 
 MIN_SUPPORT = 0.5
 """Fraction of the points in the window that must pass."""
@@ -101,11 +102,13 @@ def dissimilarity(
         return result
     means = gaussian_means(described, distances, shape, SMOOTHING_SIGMA_PX, seen)
     ratios = means / np.float32(bound)
-    count, passed = (
-        window_sums(seen, part, shape, WINDOW_PX, dtype=np.float32) for part in (1, ratios < 1)
-    )
-    support = passed / np.maximum(count, 1)
-    result[known] = np.where(support >= MIN_SUPPORT, ratios, np.inf)
+    supported = np.ones(len(seen), bool)
+    for window in WINDOWS_PX:
+        count, passed = (
+            window_sums(seen, part, shape, window, dtype=np.float32) for part in (1, ratios < 1)
+        )
+        supported &= passed >= MIN_SUPPORT * count
+    result[known] = np.where(supported, ratios, np.inf)
     return result
 
 
