@@ -6,6 +6,7 @@ import io
 import json
 import struct
 import tempfile
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +91,7 @@ def checkpoint_content() -> bytes:
         optimizer.step()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "checkpoint.safetensors"
-        save_checkpoint(path, network, optimizers, {"step": 3, "points": []})
+        save_checkpoint(path, network, deepcopy(network), optimizers, {"step": 3, "points": []})
         return path.read_bytes()
 
 
@@ -132,7 +133,7 @@ def checkpoints(generator: np.random.Generator, folder: Path) -> None:
     path.write_bytes(content)
     network, optimizers = small_training()
     tensors, metadata = read_checkpoint(path)
-    restore(tensors, network, optimizers)
+    restore(tensors, network, deepcopy(network), optimizers)
     network(torch.ones(2, 3)).sum().backward()
     for optimizer in optimizers:
         optimizer.step()

@@ -39,14 +39,8 @@ TURN_PROBABILITY = 0.5
 CROP_SCALE = (0.7, 1.0)
 """Side of the cut-out square, as a fraction of the largest that fits."""
 
-INTERPOLATIONS = (
-    cv2.INTER_NEAREST,
-    cv2.INTER_LINEAR,
-    cv2.INTER_CUBIC,
-    cv2.INTER_AREA,
-    cv2.INTER_LANCZOS4,
-)
-"""What views that are not turned are made smaller by."""
+INTERPOLATIONS = ("NEAREST", "LINEAR", "CUBIC", "AREA", "LANCZOS4")
+"""What views that are not turned are made smaller by, as OpenCV names it."""
 
 RELIGHT_PROBABILITY = 0.5
 MAX_LOG_GAMMA = 0.5
@@ -179,7 +173,8 @@ def _upright_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) ->
     view = np.rot90(view[:, :: int(generator.choice([-1, 1]))], int(generator.integers(4)))
     interpolation = cv2.INTER_CUBIC
     if window > side:
-        interpolation = INTERPOLATIONS[int(generator.integers(len(INTERPOLATIONS)))]
+        name = INTERPOLATIONS[int(generator.integers(len(INTERPOLATIONS)))]
+        interpolation = getattr(cv2, f"INTER_{name}")
     return cv2.resize(np.ascontiguousarray(view), (side, side), interpolation=interpolation)
 
 

@@ -12,7 +12,6 @@ from deepdetect import Keypoints, PointDetector, load_image
 from deepdetect.datasets.posed_images import PosedPair, load_posed_scenes
 from deepdetect.evaluation.metrics.pose import epipolar_inlier_ratio
 from deepdetect.evaluation.protocols.sfm import (
-    FEATURES,
     find_points,
     find_random_points,
     find_sift,
@@ -43,7 +42,7 @@ def stages_in(folder: Path, scene, count: int = 3) -> tuple[Stages, Path]:
 def keypoints_of(stages: Stages) -> dict[str, dict[str, np.ndarray]]:
     import h5py
 
-    with h5py.File(stages.work / FEATURES) as file:
+    with h5py.File(stages.features) as file:
         return {name: {kind: file[name][kind][()] for kind in file[name]} for name in file}
 
 
