@@ -52,6 +52,10 @@ MIN_OFF_PLANE_FRACTION = 0.02
 on the plane, show depth where as many of the sparse ones do, too: the planes of Oxford, which are
 not quite flat, have up to 0.013, facades from 0.032 on."""
 
+MAX_PARALLAX_LOG10_NFA = -40.0
+"""Or sparse matches off the plane agree this clearly on an epipole: planes of Oxford have at least
+-22, entry, of which nearly all is a wall, -84."""
+
 SCENE_MATCHES = 1000
 """Of the dense matches, drawn at random, say what a scene is like."""
 
@@ -190,7 +194,8 @@ def _plane_or_depth(
     new = ~np.isin(matches.indices0, on_plane.indices0)
     off = int(np.count_nonzero(new & (errors > OFF_PLANE_PX)))
     if planar:
-        shown = off >= MIN_OFF_PLANE_FRACTION * len(on_plane)
+        clear = first.parallax is not None and first.parallax.log10_nfa < MAX_PARALLAX_LOG10_NFA
+        shown = clear or off >= MIN_OFF_PLANE_FRACTION * len(on_plane)
     else:
         fractions = [len(each.points0) / max(len(each.inliers), 1) for each in (first, depth)]
         shown = fractions[0] < MIN_PLANAR_RATIO * fractions[1]
