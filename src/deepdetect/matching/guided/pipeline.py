@@ -28,10 +28,9 @@ from ...geometry.two_view import (
     fit_model,
     is_usual_rotation,
 )
-from .held_out import compare_held_out
+from .evidence import compare_held_out, is_repeated
 from .initial_geometry import InitialGeometry, Pair, guiding_geometry
 from .rectified import match_by_rectification
-from .repetition import is_repeated
 from .verification import dissimilarity
 
 MIN_VERIFIED_FRACTION = 0.5
