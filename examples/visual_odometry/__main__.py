@@ -179,9 +179,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("odometry"))
     parser.add_argument("--max-keypoints", type=int, default=TrackingOptions.max_keypoints)
-    parser.add_argument(
-        "--methods", nargs="+", choices=FEATURES, default=FEATURES, help="some of them"
-    )
+    parser.add_argument("--methods", nargs="+", choices=FEATURES, default=FEATURES)
     try:
         compare(parser.parse_args())
     except DeepDetectError as error:

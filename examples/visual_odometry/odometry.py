@@ -101,11 +101,14 @@ class VisualOdometry:
 
     def _begin(self) -> bool:
         """Make the first points, where the last frame shows that the camera has moved enough."""
-        first, last = self._waiting[0], self._waiting[-1]
-        tracks, rows0, rows1 = np.intersect1d(first.tracks, last.tracks, True, True)
-        if len(tracks) < MIN_FIRST_POINTS:  # too much has changed: begin later
-            del self._waiting[0]
-            return bool(self._waiting) and self._begin()
+        last = self._waiting[-1]
+        for first in tuple(self._waiting):
+            tracks, rows0, rows1 = np.intersect1d(first.tracks, last.tracks, True, True)
+            if len(tracks) >= MIN_FIRST_POINTS:
+                break
+            del self._waiting[0]  # too much has changed: begin later
+        else:
+            return False
         xy0, xy1 = first.xy[rows0].astype(float), last.xy[rows1].astype(float)
         if np.median(np.linalg.norm(xy1 - xy0, axis=1)) < MIN_FIRST_MOTION_PX:
             return False
