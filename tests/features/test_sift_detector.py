@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from deepdetect.features.selection import GRID_CELLS, spread_over_grid
 from deepdetect.features.sift import detect_sift
-from deepdetect.features.spacing import GRID_CELLS, spread_over_grid
 from deepdetect.io.image import luma
 
 

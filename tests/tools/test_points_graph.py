@@ -17,7 +17,7 @@ import onnxruntime  # noqa: E402
 from deepdetect.detector.points.detection import detect_points, least_distances  # noqa: E402
 from deepdetect.detector.points.hessian_scales import SIGMAS_PX  # noqa: E402
 from deepdetect.detector.pretrained import POINTS_GRAPH  # noqa: E402
-from deepdetect.features.spacing import suppress_neighbors  # noqa: E402
+from deepdetect.features.selection import suppress_neighbors  # noqa: E402
 from deepdetect.io.image import luma  # noqa: E402
 
 

@@ -1,4 +1,4 @@
-"""Images in arrays and tensors of any usual layout and type, as (H, W, 3) uint8 RGB."""
+"""Images in arrays and tensors of any usual layout and type: as (H, W, 3) uint8 RGB, and as planes."""
 
 from __future__ import annotations
 
@@ -49,6 +49,14 @@ def array_to_rgb(image: Any, channels: Channels = "rgb", name: str = "the image"
     if values.ndim == 2:
         return np.repeat(values[:, :, None], 3, axis=2)
     return np.ascontiguousarray(values[:, :, :3] if channels == "rgb" else values[:, :, 2::-1])
+
+
+def fill_planes(rgb: np.ndarray, planes: np.ndarray) -> None:
+    """Write (H, W, 3) uint8 to larger (3, H, W) float32: the last row and column are repeated."""
+    below, right = planes.shape[1] - rgb.shape[0], planes.shape[2] - rgb.shape[1]
+    if below or right:
+        rgb = np.pad(rgb, ((0, below), (0, right), (0, 0)), mode="edge")
+    np.multiply(rgb.transpose(2, 0, 1), np.float32(1 / 255), out=planes)
 
 
 def srgb_to_linear() -> np.ndarray:

@@ -12,14 +12,14 @@ from typing import Literal
 import numpy as np
 
 from .._shared.errors import DeepDetectError, OptionError, check_name
-from .._shared.image_array import Channels, check_channels
+from .._shared.image_array import Channels, check_channels, fill_planes
 from .._shared.machine import available_memory, release_freed_memory
 from .._shared.opencv import cv2, is_lack_of_memory
 from .._shared.options import check_ranges, suggest_keywords
 from ..features.selection import Maps, Rows, bands, sigmoid
 from .backends import Network
 from .pretrained import STRIDE
-from .tiling import BYTES_PER_PIXEL, fill_planes, open_tiled
+from .tiling import BYTES_PER_PIXEL, open_tiled
 
 MAX_AUTO_PIXELS = 2_000_000
 """Size of the largest image that the resolution "auto" takes as it is."""

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from .._shared.errors import DeepDetectError, first_line
+from .._shared.image_array import fill_planes
 from .._shared.machine import release_freed_memory
 from .._shared.progress import progress
 from ..io.image import luma
@@ -170,11 +171,3 @@ def _planes(rgb: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
     planes = np.empty((1, 3, *tile.shape[:2]), np.float32)
     fill_planes(tile, planes[0])
     return planes
-
-
-def fill_planes(rgb: np.ndarray, planes: np.ndarray) -> None:
-    """Write (H, W, 3) uint8 to larger (3, H, W) float32: the last row and column are repeated."""
-    below, right = planes.shape[1] - rgb.shape[0], planes.shape[2] - rgb.shape[1]
-    if below or right:
-        rgb = np.pad(rgb, ((0, below), (0, right), (0, 0)), mode="edge")
-    np.multiply(rgb.transpose(2, 0, 1), np.float32(1 / 255), out=planes)

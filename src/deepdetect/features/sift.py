@@ -16,7 +16,7 @@ from .._shared.opencv import cv2
 from .._shared.options import look_up
 from .keypoints import UNSET_ANGLE, Keypoints, on_pixels
 from .scale_space import BASE_SIGMA_PX, CAMERA_SIGMA_PX, LAYERS, dominant_angles, packed_octaves
-from .spacing import spread_over_grid
+from .selection import spread_over_grid
 
 ROOT_SIFT = "rootsift"
 """`Keypoints.descriptor_type` of RootSIFT."""

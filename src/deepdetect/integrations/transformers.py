@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import OptionError, check_name, require_packages
+from .._shared.image_array import fill_planes
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.heatmap import MAX_AUTO_PIXELS
 from ..detector.pretrained import STRIDE, resolve_weights
-from ..detector.tiling import fill_planes
 from ..features.selection import Maps, SelectionOptions, select_from_maps
 from .tensors import load_tensor, padded
 

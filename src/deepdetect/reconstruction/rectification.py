@@ -12,7 +12,7 @@ import numpy as np
 
 from .._shared.errors import NoDepthError, ReconstructionError
 from .._shared.opencv import cv2
-from ..features.spacing import grid_subsample
+from ..features.selection import grid_subsample
 from ..geometry.camera import Calibration
 from ..geometry.estimation import MAX_LOG10_NFA, log10_nfa
 from ..geometry.two_view import SCENE_THRESHOLDS_PX, fit_model, is_planar, is_static

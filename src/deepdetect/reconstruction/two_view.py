@@ -15,7 +15,7 @@ import numpy as np
 from .._shared.errors import NoDepthError, ReconstructionError
 from .._shared.progress import StageTimer
 from ..features.matches import Matches
-from ..features.spacing import grid_subsample
+from ..features.selection import grid_subsample
 from ..geometry import epipolar_errors
 from ..geometry.camera import Calibration, Camera, fundamental_matrix
 from ..geometry.estimation import TwoViewModel

@@ -13,7 +13,7 @@ from .._shared.errors import DeepDetectError, OptionError
 from .._shared.opencv import cv2
 from ..features.display import PICTURE_SIDE_PX, draw_circle, line_scale
 from ..features.keypoints import Keypoints
-from ..features.spacing import spread_over_grid
+from ..features.selection import spread_over_grid
 from ..geometry.transforms import scaled_points
 
 SUFFIXES = (".png", ".jpg", ".jpeg")

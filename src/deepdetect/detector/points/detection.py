@@ -9,8 +9,12 @@ import numpy as np
 from ..._shared.machine import require_memory
 from ...features.keypoints import Keypoints
 from ...features.scale_space import dominant_angles
-from ...features.selection import check_ignore
-from ...features.spacing import spread_by_distance, spread_over_grid, suppress_neighbors
+from ...features.selection import (
+    check_ignore,
+    spread_by_distance,
+    spread_over_grid,
+    suppress_neighbors,
+)
 from .candidate_features import describe_candidates
 from .hessian_scales import SIGMAS_PX, Candidates, build_scale_space, find_candidates
 from .ranker import Ranker, load_ranker

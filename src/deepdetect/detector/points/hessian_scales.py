@@ -7,8 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from ..._shared.opencv import cv2
-from ...features.selection import peak_offset
-from ...features.spacing import descending_order
+from ...features.selection import descending_order, peak_offset
 
 NMS_RADIUS = 2
 """A candidate is the maximum of a window of 5x5 in its level."""

@@ -9,8 +9,7 @@ import numpy as np
 
 from ..._shared.opencv import cv2
 from ...features.keypoints import Keypoints
-from ...features.selection import SelectionOptions, select_keypoints
-from ...features.spacing import suppress_neighbors
+from ...features.selection import SelectionOptions, select_keypoints, suppress_neighbors
 from ...io.image import luma
 from .method import PAPER_DESCRIPTOR, LocalFeature, OwnScaleDescriptor
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ...detector.points.detection import least_distances
-from ...features.spacing import suppress_neighbors
+from ...features.selection import suppress_neighbors
 from .pairs import CandidatePair, ViewCandidates
 
 CLOSE_PX, NEAR_PX = 1.0, 3.0
