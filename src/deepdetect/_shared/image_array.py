@@ -1,4 +1,4 @@
-"""Images in arrays and tensors of any usual layout and type: as (H, W, 3) uint8 RGB, and as planes."""
+"""Images in arrays and tensors of any usual layout and type, as 8-bit RGB and as planes."""
 
 from __future__ import annotations
 
