@@ -104,18 +104,24 @@ def test_a_small_plane_is_matched_and_nothing_else(photo: np.ndarray) -> None:
         assert len(found) > 0.3 * np.count_nonzero(poster)  # the rest of it is smooth
 
 
-def test_a_plane_that_moves_otherwise_keeps_its_matches(shared: Path, photo: np.ndarray) -> None:
+@pytest.mark.parametrize("side", [140, 230])
+def test_a_plane_that_moves_otherwise_keeps_its_matches_and_spoils_no_others(
+    shared: Path, photo: np.ndarray, side: int
+) -> None:
     pair = load_middlebury(shared / "data" / "middlebury" / "cones")
-    left, right = luma(pair.left), luma(pair.right)
-    poster = cv2.resize(luma(photo), (140, 140), interpolation=cv2.INTER_AREA)
-    left[30:170, 40:180], right[200:340, 250:390] = poster, poster
+    grays = left, right = luma(pair.left), luma(pair.right)
+    poster = cv2.resize(luma(photo), (side, side), interpolation=cv2.INTER_AREA)
+    left[20 : 20 + side, 10 : 10 + side] = right[130 : 130 + side, 220 : 220 + side] = poster
     every = np.stack(np.meshgrid(np.arange(0, 450, 2), np.arange(0, 375, 2)), -1).reshape(-1, 2)
-    guide, found = guided_matches((left, right), (every, every), guiding_geometry((left, right)))
+    guide, found = guided_matches(grays, (every, every), guiding_geometry(grays))
     assert guide.scene.startswith("depth")
-    moved = found.points1 - every[found.indices0]
-    of_poster = (np.abs(moved - (210, 170)) < 1).all(axis=1)
-    assert np.count_nonzero(of_poster) > 0.8 * 70 * 70
-    assert np.count_nonzero(~of_poster) > 0.4 * len(every)
+    starts = every[found.indices0]
+    moved = found.points1 - starts
+    of_poster = (np.abs(moved - (210, 110)) < 1).all(axis=1)
+    assert np.count_nonzero(of_poster) > 0.7 * (side / 2) ** 2
+    beside = (starts > 20 + side).any(axis=1)
+    assert np.count_nonzero(beside) > 0.2 * len(every)
+    assert (np.abs(moved[beside, 1]) < 1).mean() > 0.98
 
 
 @pytest.mark.slow

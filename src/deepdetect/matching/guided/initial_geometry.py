@@ -224,6 +224,13 @@ class InitialGeometry(TwoViewModel):
             **vars(model), points0=points0[agreeing], points1=points1[agreeing], others=others
         )
 
+    @property
+    def all_points(self) -> Pair:
+        """Positions of all matches, those that agree with the model first."""
+        assert self.others is not None
+        points0, points1 = self.others
+        return np.concatenate([self.points0, points0]), np.concatenate([self.points1, points1])
+
     def untrusted(self) -> InitialGeometry:
         """Return that there is none, and how near it was."""
         nowhere = np.empty((0, 2))

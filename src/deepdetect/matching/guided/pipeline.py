@@ -13,7 +13,7 @@ import numpy as np
 from ..._shared.opencv import cv2
 from ...features.keypoints import nearest_keypoints
 from ...features.matches import GuidedMatches, TwoViewGeometry
-from ...geometry.estimation import estimate_geometry
+from ...geometry.estimation import TwoViewModel, estimate_geometry, measure_parallax
 from ...geometry.homography_refinement import most_alike, refine_homography
 from ...geometry.images import downscale, warp_to_reference
 from ...geometry.transforms import (
@@ -29,7 +29,7 @@ from ...geometry.two_view import (
     is_usual_rotation,
 )
 from .evidence import compare_held_out, is_repeated
-from .initial_geometry import InitialGeometry, Pair, guiding_geometry
+from .initial_geometry import MAX_SIDE_PX, InitialGeometry, Pair, guiding_geometry
 from .rectified import match_by_rectification
 from .verification import dissimilarity
 
@@ -50,6 +50,16 @@ MIN_OFF_PLANE_FRACTION = 0.02
 """As many dense matches, of keypoints whose patches the plane does not explain, relative to those
 on the plane, show depth where as many of the sparse ones do, too: the planes of Oxford, which are
 not quite flat, have up to 0.013, facades from 0.032 on."""
+
+MAX_MOVING_PLANES = 3
+"""Planes that are asked whether they move on their own: the first ones may be of the scene."""
+
+MIN_ON_LINES = 0.33
+"""Of the matches of a plane on the epipolar lines of all else, where both stand still: planes put
+into scenes with depth have up to 0.3, large ones of scenes that stand still from 0.36 on."""
+
+MAX_REST_LOG10_NFA = -20.0
+"""Of the agreement on an epipole of what such a plane leaves: planes in place of it have -7."""
 
 MAX_PARALLAX_LOG10_NFA = -40.0
 """Or sparse matches off the plane agree this clearly on an epipole: planes of Oxford have at least
@@ -113,7 +123,8 @@ def guided_matches(
     if first.model == "homography":
         geometry, matches = _plane_or_depth(grays, pixels, first, enough, seed)
     else:
-        geometry, matches = _match_depth(grays, pixels[0], first, enough)
+        depth = _apart_from_plane(grays, first, first, seed) or first
+        geometry, matches = _match_depth(grays, pixels[0], depth, enough)
     if matches is None:
         return geometry, None
     geometry, plane = _with_scene(grays, pixels[0], geometry, matches, seed)
@@ -146,8 +157,7 @@ def _with_scene(
         return told, (points0, geometry.matrix)
     proposed = len(xy0) if matches.points0 is None else geometry.tentative_inliers
     geometry = replace(geometry, scene="depth", verified=len(matches) / max(proposed, 1))
-    threshold_px = GUIDING_THRESHOLDS_PX["homography"]
-    plane = fit_model(points0[some], points1[some], "homography", sizes[1], threshold_px, seed)
+    plane = _fit(points0[some], points1[some], "homography", grays[1], seed)
     if plane.matrix is None or np.mean(plane.inliers) < MIN_PLANE_FRACTION:
         return geometry, None
     near = transfer_errors(points0, points1, plane.matrix) <= OFF_PLANE_PX
@@ -176,17 +186,14 @@ def _plane_or_depth(
     if planar and not off_plane:
         return plane
     depth = guiding_geometry(grays, "fundamental", seed, first.source)
+    apart = _apart_from_plane(grays, first, depth, seed)
+    depth = apart or depth
     depth = replace(depth, num_views=depth.num_views + first.num_views)
     errors = transfer_errors(depth.points0, depth.points1, matrix)
     if planar and np.count_nonzero(errors > OFF_PLANE_PX) < MIN_OFF_PLANE_FRACTION * len(errors):
         return plane
-    geometry, matches = _match_depth(grays, pixels[0], depth, enough, matrix if planar else None)
-    if not planar and (matches is None or len(matches) < enough) and first.others:
-        # What moves otherwise can spoil a matrix that explains a part of it, too.
-        other = guiding_geometry(grays, "fundamental", seed, first.others)
-        found = _match_depth(grays, pixels[0], other, enough)
-        if found[1] is not None and len(found[1]) >= enough:
-            depth, (geometry, matches) = other, found
+    known_plane = matrix if planar and apart is None else None
+    geometry, matches = _match_depth(grays, pixels[0], depth, enough, known_plane)
     if matches is None:
         return plane if planar or plane[1] is not None else (geometry, None)
     errors = transfer_errors(matches.starts(pixels[0]), matches.points1, matrix)
@@ -199,6 +206,58 @@ def _plane_or_depth(
         fractions = [len(each.points0) / max(len(each.inliers), 1) for each in (first, depth)]
         shown = fractions[0] < MIN_PLANAR_RATIO * fractions[1]
     return (geometry, matches) if shown or plane[1] is None else plane
+
+
+def _threshold_px(model: str, gray1: np.ndarray) -> float:
+    """Return within which sparse matches agree with a model, of smaller copies of large images."""
+    return GUIDING_THRESHOLDS_PX[model] * max(1.0, max(gray1.shape) / MAX_SIDE_PX)
+
+
+def _fit(
+    points0: np.ndarray, points1: np.ndarray, model: str, gray1: np.ndarray, seed: int = 0
+) -> TwoViewModel:
+    """Fit a model that guides to (M, 2) sparse matches, trusted or not."""
+    size1, threshold_px = gray1.shape[::-1], _threshold_px(model, gray1)
+    return fit_model(points0, points1, model, size1, threshold_px, seed)
+
+
+def _apart_from_plane(
+    grays: Pair, first: InitialGeometry, depth: InitialGeometry, seed: int
+) -> InitialGeometry | None:
+    """Return the geometry of all but a plane that moves on its own; None if none does.
+
+    The fundamental matrix `depth` of both would fit one of them, and cut through the other.
+    """
+    if first.others is None or depth.matrix is None:
+        return None
+    points0, points1 = first.all_points
+    by_depth = epipolar_errors(points0, points1, depth.matrix)
+    near_px, threshold_px = (
+        _threshold_px(model, grays[1]) for model in ("homography", "fundamental")
+    )
+    left, apart = np.ones(len(points0), bool), None
+    most = np.count_nonzero(by_depth < threshold_px)
+    for _ in range(MAX_MOVING_PLANES):
+        plane = _fit(points0[left], points1[left], "homography", grays[1], seed)
+        if plane.matrix is None or not plane.trusted:
+            break
+        on = transfer_errors(points0, points1, plane.matrix) <= OFF_PLANE_PX
+        left &= ~on
+        rest = _fit(points0[~on], points1[~on], "fundamental", grays[1], seed)
+        explained = np.count_nonzero(on) + np.count_nonzero(rest.inliers)
+        if rest.matrix is None or explained <= most:
+            continue
+        on_lines = epipolar_errors(points0[on], points1[on], rest.matrix) < near_px
+        if np.mean(on_lines) >= MIN_ON_LINES:
+            continue
+        # Any matrix of many fits a plane: what tells of depth is off the plane of the rest, too.
+        rest0, rest1 = points0[~on][rest.inliers], points1[~on][rest.inliers]
+        another = _fit(rest0, rest1, "homography", grays[1], seed)
+        if another.matrix is None or (
+            measure_parallax(rest0, rest1, another.matrix, seed).log10_nfa < MAX_REST_LOG10_NFA
+        ):
+            apart, most = (points0[~on], points1[~on]), explained
+    return apart and guiding_geometry(grays, "fundamental", seed, apart)
 
 
 def _with_further_planes(
@@ -214,13 +273,9 @@ def _with_further_planes(
     if first.others is None or matches.points0 is not None:
         return matches
     assert geometry.matrix is not None
-    points0, points1 = (
-        np.concatenate(both)
-        for both in zip((first.points0, first.points1), first.others, strict=True)
-    )
+    points0, points1 = first.all_points
     errors = transfer_errors if geometry.model == "homography" else epipolar_errors
     rest = errors(points0, points1, geometry.matrix) > OFF_PLANE_PX
-    threshold_px = GUIDING_THRESHOLDS_PX["homography"]
     around = np.zeros(grays[0].shape, np.uint8)
     x, y = pixels[0][matches.indices0].astype(np.int64).T
     around[y, x] = 1
@@ -228,8 +283,7 @@ def _with_further_planes(
     last = np.array(around.shape[::-1]) - 1
     while np.count_nonzero(rest) >= MIN_MATCHES:
         points0, points1 = points0[rest], points1[rest]
-        size1 = grays[1].shape[::-1]
-        plane = fit_model(points0, points1, "homography", size1, threshold_px, seed)
+        plane = _fit(points0, points1, "homography", grays[1], seed)
         if plane.matrix is None or not plane.trusted:
             break
         rest = ~plane.inliers
@@ -260,8 +314,7 @@ def _match_depth(
     dense = match_by_rectification(grays, xy0, sparse, first.matrix, plane=plane)
     if plane is None and (dense is None or len(dense[1]) < enough):
         # Wide pairs, if what they show is mostly a plane.
-        size1 = grays[1].shape[::-1]
-        seen = fit_model(*sparse, "homography", size1, GUIDING_THRESHOLDS_PX["homography"])
+        seen = _fit(*sparse, "homography", grays[1])
         if seen.matrix is not None and seen.trusted:
             plane = _refine_homography(grays, seen.matrix)
             dense = match_by_rectification(grays, xy0, sparse, first.matrix, plane=plane)
