@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deepdetect.geometry.transforms import transform_points
-from deepdetect.matching.guided.evidence import compare_held_out, is_repeated
+from deepdetect.matching.guided.evidence import compare_held_out, is_repeated, moving_alike
 
 PERIOD_PX = 48
 SIZE = (384, 288)
@@ -121,3 +121,17 @@ def test_of_few_matches_nothing_is_known(
     correlation, alike = compare_held_out(grays, points[0][::2000], points[1][::2000])
     assert correlation == 0
     assert alike.all()
+
+
+def test_matches_of_a_pattern_at_random_periods_do_not_move_alike() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, 1000, (130, 2))
+    turned = points @ [[0.6, 0.5], [-0.5, 0.7]] + rng.normal(0, 0.5, points.shape)
+    turned[:20] = rng.uniform(0, 1000, (20, 2))
+    alike = moving_alike(points, turned) >= 0.6
+    assert alike[:20].mean() < 0.2
+    assert alike[20:].mean() > 0.9
+    periods = np.column_stack([120.0 * rng.integers(-3, 4, 130), np.zeros(130)])
+    assert (moving_alike(points, points + periods) >= 0.6).mean() < 0.03
+    steps = np.column_stack([80.0 * (points[:, 0] // 250 % 3), np.zeros(130)])  # of depth
+    assert (moving_alike(points, points + steps) >= 0.6).mean() > 0.8

@@ -19,7 +19,7 @@ from deepdetect.geometry import transform_points
 from deepdetect.geometry.transforms import epipolar_errors
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import guided_matches, guiding_geometry
-from deepdetect.matching.guided.pipeline import match_by_homography, moving_alike
+from deepdetect.matching.guided.pipeline import match_by_homography
 
 from ..conftest import match
 
@@ -70,20 +70,6 @@ def test_a_plane_guides_no_scene_with_depth(shared: Path, pair: str) -> None:
         images = [shared / f"data/kitti-clip/{int(n):06d}.jpg" for n in numbers.split("-")]
     matches = match(*images, density=0.02)
     assert matches.two_view_geometry.model != "homography"
-
-
-def test_matches_of_a_pattern_at_random_periods_do_not_move_alike() -> None:
-    rng = np.random.default_rng(0)
-    points = rng.uniform(0, 1000, (130, 2))
-    turned = points @ [[0.6, 0.5], [-0.5, 0.7]] + rng.normal(0, 0.5, points.shape)
-    turned[:20] = rng.uniform(0, 1000, (20, 2))
-    alike = moving_alike(points, turned) >= 0.6
-    assert alike[:20].mean() < 0.2
-    assert alike[20:].mean() > 0.9
-    periods = np.column_stack([120.0 * rng.integers(-3, 4, 130), np.zeros(130)])
-    assert (moving_alike(points, points + periods) >= 0.6).mean() < 0.03
-    steps = np.column_stack([80.0 * (points[:, 0] // 250 % 3), np.zeros(130)])  # of depth
-    assert (moving_alike(points, points + steps) >= 0.6).mean() > 0.8
 
 
 def test_a_small_plane_is_matched_and_nothing_else(photo: np.ndarray) -> None:

@@ -7,6 +7,8 @@ nearly as good, the places that only one of the two homographies explains decide
 **Held-out windows.** The matches of the windows around one predict, by an affine map, where it is
 seen in the second image. Right matches predict what looks alike there; what was matched by chance
 does not.
+
+**Neighbours** of a sparse match move as it does.
 """
 
 from __future__ import annotations
@@ -66,6 +68,13 @@ MIN_WINDOWS = 20
 FALSE_POSITIVE_RATE = 0.05
 """Fraction of the unrelated windows that are as much alike, with those around them, as those of
 matches that the images do not contradict."""
+
+NEIGHBOURS = 8
+"""Sparse matches around one that are compared with it."""
+
+MAX_MOVE_DIFFERENCE, MOVE_NOISE_PX = 0.35, 2.0
+"""By which turn and scale of two steps between matches may differ, relative to the scale: what is
+tilted or has depth moves so; and by which a step may be wrong."""
 
 
 def is_repeated(grays: Pair, points0: np.ndarray, homography: np.ndarray) -> bool:
@@ -198,3 +207,23 @@ def _affine_maps(
         np.moveaxis(squares[..., known], -1, 0), np.moveaxis(products[..., known], -1, 0)
     )
     return affine, known
+
+
+def moving_alike(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
+    """Return the fraction of the matches nearest to each of (M, 2) that move as it does.
+
+    Each of them and the match itself give a turn and a scale; those count that agree with one.
+    """
+    neighbours = min(NEIGHBOURS, len(points0) - 1)
+    if neighbours < 1:
+        return np.zeros(len(points0))
+    first, second = points0 @ [1, 1j], points1 @ [1, 1j]
+    blocks = np.array_split(first, len(first) // 500 + 1)  # all distances of many fill the memory
+    distances = (np.abs(block[:, None] - first) for block in blocks)
+    nearest = np.concatenate([np.argsort(each)[:, 1 : neighbours + 1] for each in distances])
+    steps = first[nearest] - first[:, None]
+    moves = (second[nearest] - second[:, None]) / steps
+    allowed = MAX_MOVE_DIFFERENCE * np.abs(moves)[:, :, None]
+    allowed = allowed + MOVE_NOISE_PX / np.abs(steps)[:, None]
+    alike = np.abs(moves[:, :, None] - moves[:, None]) < allowed
+    return np.asarray(alike.sum(axis=2).max(axis=1) / neighbours)

@@ -28,7 +28,7 @@ from ...geometry.two_view import (
     fit_model,
     is_usual_rotation,
 )
-from .evidence import compare_held_out, is_repeated
+from .evidence import compare_held_out, is_repeated, moving_alike
 from .initial_geometry import MAX_SIDE_PX, InitialGeometry, Pair, guiding_geometry
 from .rectified import match_by_rectification
 from .verification import dissimilarity
@@ -81,15 +81,11 @@ that agree with its geometry are taken."""
 MIN_MATCHES = 8
 """With fewer the geometry is not trusted after all."""
 
-NEIGHBOURS, MIN_MOVING_ALIKE = 8, 0.6
-"""Sparse matches around one that verify it, and the fraction of them that must move alike."""
+MIN_MOVING_ALIKE = 0.6
+"""Fraction of the sparse matches around one that must move as it does, for it to be verified."""
 
 MIN_ALIKE_FRACTION = 0.3
 """Of the sparse matches, that must be verified: at random places up to a tenth is."""
-
-MAX_MOVE_DIFFERENCE, MOVE_NOISE_PX = 0.35, 2.0
-"""By which turn and scale of two steps between matches may differ, relative to the scale: what is
-tilted or has depth moves so; and by which a step may be wrong."""
 
 MAX_DISTANCE_PX = 1.0
 """From where the homography takes a keypoint to its partner."""
@@ -343,26 +339,6 @@ def _sparse_matches(gray0: np.ndarray, xy0: np.ndarray, first: InitialGeometry) 
     rows = np.where(np.isfinite(distances), rows, -1).astype(np.int64)
     ends = first.points1[kept], scores[kept].astype(np.float32)
     return GuidedMatches(rows, *ends, subpixel=True, points0=points0)
-
-
-def moving_alike(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
-    """Return the fraction of the matches nearest to each of (M, 2) that move as it does.
-
-    Each of them and the match itself give a turn and a scale; those count that agree with one.
-    """
-    neighbours = min(NEIGHBOURS, len(points0) - 1)
-    if neighbours < 1:
-        return np.zeros(len(points0))
-    first, second = points0 @ [1, 1j], points1 @ [1, 1j]
-    blocks = np.array_split(first, len(first) // 500 + 1)  # all distances of many fill the memory
-    distances = (np.abs(block[:, None] - first) for block in blocks)
-    nearest = np.concatenate([np.argsort(each)[:, 1 : neighbours + 1] for each in distances])
-    steps = first[nearest] - first[:, None]
-    moves = (second[nearest] - second[:, None]) / steps
-    allowed = MAX_MOVE_DIFFERENCE * np.abs(moves)[:, :, None]
-    allowed = allowed + MOVE_NOISE_PX / np.abs(steps)[:, None]
-    alike = np.abs(moves[:, :, None] - moves[:, None]) < allowed
-    return np.asarray(alike.sum(axis=2).max(axis=1) / neighbours)
 
 
 def match_by_homography(
