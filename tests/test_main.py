@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
+
+from deepdetect._shared.progress import progress, say, stage_progress
+from deepdetect.io.tables import load_keypoints
 
 # Ctrl-C during an import, which a package may turn into another error.
 INTERRUPTED_IMPORT = """
@@ -56,3 +62,42 @@ def test_opencv_says_nothing_beside_the_sentence(source: str, said: str, tmp_pat
     assert result.returncode == 2
     (line,) = result.stderr.splitlines()
     assert said in line
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+@pytest.mark.parametrize("buffered", ["", "1"])
+@pytest.mark.parametrize(
+    ("streams", "code"),
+    [
+        (">/dev/full", 2),
+        (">/dev/full 2>/dev/full", 2),
+        ("2>/dev/full", 0),
+        ("2>&-", 0),
+        (">&- 2>&- <&-", 0),
+        ("--json >/dev/full", 2),
+    ],
+)
+def test_streams_that_cannot_be_written_cost_no_result(
+    streams: str, code: int, buffered: str, tmp_path: Path
+) -> None:
+    Image.fromarray(np.arange(4096, dtype=np.uint8).reshape(64, 64)).save(tmp_path / "a.png")
+    words = f"{sys.executable} -m deepdetect detect a.png --max-keypoints 9 -o out {streams}"
+    environment = {**os.environ, "PYTHONUNBUFFERED": buffered}
+    done = subprocess.run(
+        words, shell=True, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True
+    )
+    assert done.returncode == code, done.stderr
+    assert len(load_keypoints(tmp_path / "out/a.npz")) == 9
+    assert "Traceback" not in done.stderr
+    assert ("cannot write to standard output" in done.stderr) == (code == 2 and "2>" not in streams)
+
+
+def test_without_standard_error_a_long_task_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    for stream in (None, io.StringIO()):
+        monkeypatch.setattr(sys, "stderr", stream)
+        if stream is not None:
+            stream.close()
+        with stage_progress("working", ["one"]) as done, progress(2, "title", "unit") as bar:
+            bar.update(2)
+            done("one")
+        say("done")

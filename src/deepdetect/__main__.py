@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 
+from ._shared.progress import STDERR, fails
 from ._shared.signals import noted_interrupts
 
 OPENCV_SETTINGS = {"OPENCV_LOG_LEVEL": "SILENT", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
@@ -19,6 +20,10 @@ STOPPED = 130
 
 def main() -> None:
     """Run the command line; Ctrl-C ends it with exit code 130, while packages are imported, too."""
+    # Numbers of closed streams would go to files, which would get what libraries print.
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(number)
     for name, value in OPENCV_SETTINGS.items():
         os.environ.setdefault(name, value)
     with noted_interrupts() as interrupts:
@@ -33,8 +38,9 @@ def main() -> None:
                 raise
             code = error
     if interrupts and code not in (None, 0, STOPPED):
-        print("deepdetect: stopped; what was written stays", file=sys.stderr)
+        print("deepdetect: stopped; what was written stays", file=STDERR)
         code = STOPPED
+    fails(sys.stderr)  # or Python ends with an exit code of its own
     sys.exit(code)  # type: ignore[arg-type]
 
 

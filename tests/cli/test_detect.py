@@ -15,6 +15,7 @@ from PIL import Image
 
 from deepdetect import DeepDetect, DeepDetectError, Keypoints
 from deepdetect.detector.detector import find_keypoints
+from deepdetect.interchange.sources import read_collection
 from deepdetect.io.tables import load_keypoints
 from deepdetect.viz.draw import CAPTION_HEIGHT
 
@@ -70,12 +71,26 @@ def test_images_without_a_keypoint_have_an_exit_code_of_their_own(
     assert "no keypoint" not in result.stderr
 
 
-def test_two_images_of_one_name_are_refused(run, photos: Path, tmp_path: Path) -> None:
-    other = tmp_path / "cat.png"
-    Image.open(photos / "cat.jpg").save(other)
-    result = run("detect", photos / "cat.jpg", other)
-    assert result.exit_code == 2
-    assert "would both write" in result.stderr
+def test_images_of_one_name_keep_their_folders_or_their_endings(run, photos: Path) -> None:
+    for name in ("set/left/0.jpg", "set/right/0.jpg", "set/right/1.jpg", "set/right/1.png"):
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Image.open(photos / "cat.jpg").save(name)
+    for sources in (["set"], ["set/left", "set/right"]):
+        result = run("detect", *sources, "-o", "out", "--max-keypoints", 9, "--json")
+        assert result.exit_code == 0, result.output
+        files = {image["image"]: image["file"] for image in json.loads(result.stdout)["images"]}
+        assert files == {
+            "set/left/0.jpg": "out/left/0.npz",
+            "set/right/0.jpg": "out/right/0.npz",
+            "set/right/1.jpg": "out/right/1.jpg.npz",
+            "set/right/1.png": "out/right/1.png.npz",
+        }
+        assert len(load_keypoints("out/right/1.png.npz")) == 9
+    # What this has drawn is no photograph to the next command.
+    again = run("detect", ".", "-o", "again", "--max-keypoints", 9, "--json")
+    assert {image["image"] for image in json.loads(again.stdout)["images"]} == {*files}
+    saved = read_collection([*Path("out").rglob("*.npz")], images=Path("set"))
+    assert {*saved.keypoints} == {name.removeprefix("set/") for name in files}
 
 
 @pytest.mark.parametrize("short", [MemoryError, DeepDetectError("there is not enough memory")])

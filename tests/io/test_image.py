@@ -16,18 +16,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from natsort import natsorted, ns
 from PIL import EpsImagePlugin, Image, ImageOps
 from PIL.PngImagePlugin import PngInfo
 
 from deepdetect._shared.errors import ImageError, MissingExtraError, OptionError
-from deepdetect.io.image import (
-    IMAGE_SUFFIXES,
-    find_images,
-    load_image,
-    luma,
-    scale_short_side,
-)
-from deepdetect.io.image_file import limit_megapixels
+from deepdetect.io.image import find_images, load_image, luma, scale_short_side
+from deepdetect.io.image_file import IMAGE_SUFFIXES, limit_megapixels
 
 OneLine = Callable[[BaseException], str]
 
@@ -431,7 +426,8 @@ def test_luma_is_bt601(photo: np.ndarray) -> None:
 
 
 def test_find_images(tmp_path: Path) -> None:
-    wanted = [*(f"a{suffix}" for suffix in IMAGE_SUFFIXES), "b/2.PNG", "b/10.png", "b/c/deep.jpg"]
+    wanted = natsorted((f"a{suffix}" for suffix in IMAGE_SUFFIXES), alg=ns.PATH)
+    wanted += ["b/2.PNG", "b/10.png", "b/c/deep.jpg"]
     others = ["notes.txt", "no_suffix", ".hidden.png", ".cache/thumb.png", "b/.c/thumb.jpg"]
     for name in wanted + others:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -499,3 +495,53 @@ def test_without_pillow_heif_its_name_is_said(
     monkeypatch.delitem(Image.OPEN, "HEIF", raising=False)
     with pytest.raises(MissingExtraError, match="is a HEIF image: run pip install pillow-heif"):
         load_image(content)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"v/1\x01" + bytes(200), "an OpenEXR image"),
+        (b"#?RADIANCE\n" + bytes(200), "a Radiance HDR image"),
+        (b"SIMPLE  =                    T" + bytes(200), "a FITS image"),
+        (bytes(128) + b"DICM" + bytes(200), "a DICOM image"),
+        (b"\x93NUMPY" + bytes(200), "a NumPy array"),
+    ],
+)
+def test_what_is_no_photograph_is_called_what_it_is(
+    content: bytes, words: str, one_line: OneLine
+) -> None:
+    with pytest.raises(ImageError) as caught:
+        load_image(content)
+    assert words in one_line(caught.value)
+
+
+@pytest.fixture
+def raw_photograph(tmp_path: Path) -> Path:
+    """A DNG file of a grey scene, brighter to the right, with a thumbnail before it."""
+    tifffile = pytest.importorskip("tifffile")
+    mosaic = np.tile(np.linspace(0, 4095, 80).astype(np.uint16), (64, 1))
+    tags = [
+        *((50706, 1, 4, (1, 4, 0, 0), True), (50708, 2, 0, "Camera", True)),
+        *((33421, 3, 2, (2, 2), True), (33422, 1, 4, (0, 1, 1, 2), True)),
+        *((50714, 4, 1, 0, True), (50717, 4, 1, 4095, True), (50728, 5, 3, (1,) * 6, True)),
+        (50721, 10, 9, (1, 1, 0, 1, 0, 1, 0, 1, 1, 1, 0, 1, 0, 1, 0, 1, 1, 1), True),
+    ]
+    path = tmp_path / "photo.dng"
+    tifffile.imwrite(path, mosaic, photometric="cfa", extratags=tags)
+    return path
+
+
+def test_raw_photographs_are_developed(raw_photograph: Path) -> None:
+    pytest.importorskip("rawpy")
+    grey = luma(load_image(raw_photograph)).astype(int)
+    assert grey.shape == (64, 80)
+    assert (np.diff(np.median(grey, axis=0)[2:-2]) >= 0).all()
+    assert np.ptp(grey) > 200
+
+
+def test_without_rawpy_its_name_is_said(
+    raw_photograph: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "rawpy", None)
+    with pytest.raises(MissingExtraError, match="is a raw photograph: run pip install rawpy"):
+        load_image(raw_photograph)

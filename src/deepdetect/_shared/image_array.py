@@ -28,6 +28,8 @@ def as_array(image: Any) -> np.ndarray:
     if hasattr(image, "__next__"):
         raise ImageError("an image is an iterator: give one image, or a list to `detect_batch`")
     if hasattr(image, "detach") and hasattr(image, "cpu"):  # a tensor
+        if image.is_meta or str(image.layout) != "torch.strided":
+            raise ImageError("a tensor on the device meta, or a sparse one, is no image: fill it")
         image = image.detach().cpu()
         if image.is_floating_point():
             image = image.float()  # NumPy has no bfloat16

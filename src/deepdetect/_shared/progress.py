@@ -2,11 +2,46 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
+
+
+class _StandardError:
+    """Standard error as it is at the time; where it is None, closed or full, nothing is written."""
+
+    encoding = "utf-8"
+
+    def write(self, text: str) -> None:
+        with suppress(AttributeError, OSError, ValueError):
+            sys.stderr.write(text)
+
+    def flush(self) -> None:
+        with suppress(AttributeError, OSError, ValueError):
+            sys.stderr.flush()
+
+    def isatty(self) -> bool:
+        with suppress(AttributeError, OSError, ValueError):
+            return sys.stderr.isatty()
+        return False
+
+
+STDERR: Any = _StandardError()
+
+
+def fails(stream: Any) -> bool:
+    """Whether a stream is on a full disk or a broken pipe; then nothing more is written to it."""
+    if stream is None:
+        return False
+    try:
+        print(file=stream, end="\n" if stream is sys.stdout else "", flush=True)
+        return False
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        return True
 
 
 def progress(total: int | None, title: str, unit: str, quiet: bool = False, done: int = 0) -> Any:
@@ -19,9 +54,9 @@ def progress(total: int | None, title: str, unit: str, quiet: bool = False, done
         desc=title,
         unit=unit,
         disable=quiet or total == 0,
-        file=sys.stderr,
+        file=STDERR,
         dynamic_ncols=True,
-        mininterval=0.2 if sys.stderr.isatty() else 10,
+        mininterval=0.2 if STDERR.isatty() else 10,
     )
 
 
@@ -32,7 +67,7 @@ def stage_progress(title: str, stages: Sequence[str] = ()) -> Iterator[Callable[
     It shows the stage that is at work, or without a list the last one.
     """
     # On a terminal only: what is logged stays readable.
-    with progress(len(stages) or None, title, "stage", quiet=not sys.stderr.isatty()) as bar:
+    with progress(len(stages) or None, title, "stage", quiet=not STDERR.isatty()) as bar:
         bar.set_postfix_str(stages[0] if stages else "")
 
         def done(stage: str) -> None:
@@ -46,7 +81,7 @@ def say(text: str) -> None:
     """Write a line to standard error, above a bar where there is one."""
     from tqdm import tqdm
 
-    tqdm.write(text, file=sys.stderr)
+    tqdm.write(text, file=STDERR)
 
 
 class StageTimer:

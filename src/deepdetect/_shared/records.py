@@ -10,7 +10,7 @@ import dataclasses
 import hashlib
 import json
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -255,25 +255,9 @@ def _is_unchanged(path: Path, record: Mapping[str, Any]) -> bool:
     return list(file_state(path)) == record["state"] or file_digest(path) == record["digest"]
 
 
-def outputs_in(folder: Path) -> set[str]:
-    """Return the names of what was made in a folder, or was about to be."""
-    return {path.name.removesuffix(".json") for path in (folder / FOLDER).glob("*.json")}
-
-
-def check_not_made(folder: Path, images: Iterable[Path]) -> None:
-    """Refuse images below a folder that earlier runs have made.
-
-    Raises:
-        OptionError: one of them is an output, or lies in a folder that is one.
-    """
-    made = lru_cache(maxsize=None)(outputs_in)
-    for image in images:
-        parts = image.relative_to(folder).parts
-        if any(name in made(folder.joinpath(*parts[:depth])) for depth, name in enumerate(parts)):
-            raise OptionError(
-                f"{image} was made by an earlier run and is no input: move what was made out of "
-                f"{folder}, or list the images"
-            )
+def was_made(path: Path, root: Path) -> bool:
+    """Whether a file below a folder was made by these commands, or lies in a folder that was."""
+    return path != root and (_record(path).is_file() or was_made(path.parent, root))
 
 
 def save_arrays(path: str | Path, arrays: Mapping[str, Any], *, compress: bool = True) -> None:

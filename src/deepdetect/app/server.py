@@ -36,7 +36,7 @@ from .. import __version__
 from .._shared.errors import DeepDetectError, OptionError, unknown_name
 from ..detector.detector import DeepDetect
 from ..detector.points.detection import rank_candidates
-from ..io.image import IMAGE_SUFFIXES
+from ..io.image_file import IMAGE_SUFFIXES
 from .jobs import AppOptions, Jobs
 from .tasks import TASKS, Order, SentImage
 

@@ -14,6 +14,7 @@ from cyclopts.help import DefaultFormatter
 
 from .. import __version__
 from .._shared.errors import BatchError, DeepDetectError, NoDepthError, RegistrationError
+from .._shared.progress import STDERR, fails, say
 
 NOTHING_FOUND = 3
 """Exit code where all went well and nothing was found."""
@@ -126,7 +127,6 @@ def completion(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command, and return the exit code that the README documents."""
     from .._shared.kernels import announce_compilation
-    from .._shared.progress import say
 
     announce_compilation(
         lambda: say("compiling for the first time, about 10 seconds; it is kept for later runs")
@@ -144,9 +144,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _failed(with_flags(str(error), words), NOTHING_FOUND if nothing_found else 2)
     except KeyboardInterrupt:
         return _failed("stopped; what was written stays", 130)
-    except BrokenPipeError:
-        sys.stderr.close()
-        return 1
+    except OSError as error:
+        if not fails(sys.stdout):
+            raise
+        if isinstance(error, BrokenPipeError):
+            return 1
+        text = f"cannot write to standard output ({error.strerror}): what is in files stays"
+        return _failed(text, 2)
 
 
 def _call(words: Sequence[str]) -> int:
@@ -158,11 +162,14 @@ def _call(words: Sequence[str]) -> int:
     words = ["--help" if word == "--help-all" else word for word in words]
     app = make_app(summaries=module is None)
     command, bound, _ = app.parse_args(words, print_error=False, exit_on_error=False)
-    return command(*bound.args, **bound.kwargs) or 0
+    code = command(*bound.args, **bound.kwargs) or 0
+    if sys.stdout is not None:
+        sys.stdout.flush()
+    return code
 
 
 def _failed(text: str, code: int) -> int:
-    print(f"deepdetect: {text}", file=sys.stderr)
+    print(f"deepdetect: {text}", file=STDERR)
     return code
 
 

@@ -9,6 +9,7 @@ import os
 import re
 import sys
 import textwrap
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
@@ -19,7 +20,8 @@ from cyclopts import Parameter
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import BatchError, DeepDetectError, OptionError
-from .._shared.records import Outputs, check_not_made, outputs_in
+from .._shared.progress import STDERR
+from .._shared.records import Outputs
 from .._shared.signals import exit_by_signal, handle_signals
 from ..io.image import find_images, load_image
 from ..io.image_file import MAX_MEGAPIXELS, limit_megapixels
@@ -194,22 +196,27 @@ def output_folder(output: Path) -> Path:
     return output
 
 
-def expand_images(paths: Sequence[Path], output: Path) -> list[Path]:
-    """Replace folders by the images below them.
+def expand_images(paths: Sequence[Path], output: Path) -> dict[Path, Path]:
+    """Replace folders by the images below them, without those in the folder of the results.
 
-    The folder of the results is left out when it lies in one of the folders; where it is one of
-    them, what earlier runs made in it.
+    Returns:
+        By image what its results are called, without a suffix: its path below the folder that was
+        given. Where two have one name, below the folder of all; a suffix stays that tells them
+        apart.
     """
-    images: dict[Path, None] = {}
+    names: dict[Path, Path] = {}
     for path in paths:
         below = find_images(path, [output]) if path.is_dir() else [path]
-        if path.is_dir() and path.resolve() == output.resolve():
-            made = outputs_in(output)
-            below = [each for each in below if not (each.parent == path and each.name in made)]
-            if not below:
-                raise OptionError(f"all images in {path} are results of earlier runs: name others")
-        images |= dict.fromkeys(below)
-    return list(images)
+        names |= {each: each.relative_to(path if path.is_dir() else path.parent) for each in below}
+    if len({name.with_suffix("") for name in names.values()}) < len(names):
+        top = Path(os.path.commonpath([path.parent.absolute() for path in names]))
+        if len({*names.values()}) < len(names):
+            names = {path: path.absolute().relative_to(top) for path in names}
+    count = Counter(name.with_suffix("") for name in names.values())
+    return {
+        path: name if count[name.with_suffix("")] > 1 else name.with_suffix("")
+        for path, name in names.items()
+    }
 
 
 def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
@@ -225,12 +232,6 @@ def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
                 f"two images would both write {output}: rename one, or use two folders"
             )
         seen.add(output)
-
-
-def check_folder_not_made(folder: Path, output: Path) -> None:
-    """Refuse a folder that holds images which earlier runs made, but for those below the output."""
-    if any(folder.glob("**/.deepdetect")):
-        check_not_made(folder, find_images(folder, [output]))
 
 
 @contextmanager
@@ -262,7 +263,7 @@ def writing(
 
 def note(text: str) -> None:
     """Print a line to standard error."""
-    print(text, file=sys.stderr)
+    print(text, file=STDERR)
 
 
 MAX_DEPTH = 2

@@ -42,7 +42,7 @@ def detect(
 
     Writes for each image STEM.npz (or .csv) with the positions and scores, and the pictures
     STEM_keypoints.jpg (the best of all parts of the image, coloured by score), and of the network
-    STEM_dense.jpg (all keypoints) and STEM_heatmap.jpg (logits).
+    STEM_dense.jpg (all keypoints) and STEM_heatmap.jpg (logits). Subfolders stay as they are.
 
     Images that are done are skipped when the same command runs again, and done again with other
     options. What was made from other images of the same name, or by something else, is replaced
@@ -58,12 +58,13 @@ def detect(
     """
     import_opencv()  # what is missing is said before anything is written
     folder = cli.output_folder(output)
-    paths = cli.expand_images(images, folder)
+    names = cli.expand_images(images, folder)
+    paths = [*names]
     drawn = ("keypoints", "dense", "heatmap") if detector == "network" else ("keypoints",)
     outputs = {
-        path: {"file": folder / f"{path.stem}.{file_format}"}
-        | {name: folder / f"{path.stem}_{name}.jpg" for name in drawn if pictures}
-        for path in paths
+        path: {"file": folder / f"{stem}.{file_format}"}
+        | {name: folder / f"{stem}_{name}.jpg" for name in drawn if pictures}
+        for path, stem in names.items()
     }
     cli.check_outputs([file for files in outputs.values() for file in files.values()], paths)
     mask = None if ignore is None else load_mask(ignore)

@@ -18,6 +18,8 @@ PURPOSES = {
     "benchmark": "benchmark, and evaluate with the Oxford scenes",
     "demo": "demo",
     "heif": "images of iPhones (.heic)",
+    "raw": "raw photographs",
+    "tiff": "compressed TIFF of every kind",
     "labels": "label and train, with all nine detectors",
     "onnx": "export onnx",
     "openvino": "--backend openvino and --precision bfloat16",

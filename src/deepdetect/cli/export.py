@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from cyclopts import App, Parameter
 
 from .._shared.errors import MissingFileError, OptionError
-from .._shared.records import Outputs, check_not_made
+from .._shared.records import Outputs
 from ..detector.network.onnx_export import OnnxOptions, write_onnx
 from ..detector.point_detector import PointDetector
 from ..detector.pretrained import resolve_weights
@@ -179,7 +179,6 @@ def _export(
         raise OptionError(f"`{name}` is for {what}: leave it out")
     if of_folder:
         paths = find_images(sources[0])
-        check_not_made(sources[0], paths)
         if marker != output:
             check_names(path.relative_to(sources[0]).as_posix() for path in paths)
     with cli.claimed(Outputs([marker], inputs, {"command": marker.name}, overwrite=overwrite)):

@@ -48,7 +48,6 @@ def extract(
         output: File for the features, or a folder for it.
     """
     file = cli.output_file(output, "features.h5")
-    cli.check_folder_not_made(folder, file)
     how = EXTRACTION.take(values)
     chosen, selection = chosen_detector(detector, values, threads=1)  # one a process
     report = extract_features(folder, file, chosen, selection=selection, quiet=False, **how)

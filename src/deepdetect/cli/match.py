@@ -252,7 +252,7 @@ def stitch(
             [default: the one in the middle]
     """
     file = cli.output_file(output, "panorama.jpg")
-    paths = cli.expand_images(sources, file)
+    paths = [*cli.expand_images(sources, file)]
     picture_suffix(file)  # before the work, which would else be lost
     if reference is not None and reference not in paths:
         raise OptionError(f"--reference {reference} must be one of the images: name it there")

@@ -10,7 +10,7 @@ from typing import Any
 
 from .._shared.errors import OptionError
 from .._shared.progress import stage_progress
-from .._shared.records import Outputs, check_not_made
+from .._shared.records import Outputs
 from ..io.point_cloud import find_writer
 from ..reconstruction.files import ENDINGS, save_reconstruction
 from ..reconstruction.pipeline import reconstruct as reconstruct_pair
@@ -110,9 +110,7 @@ def _reconstruct_many(
     # What is missing or wrong is said before anything is written.
     import_pycolmap()
     check_output_folder(output)
-    found_images = check_images(source)
-    if isinstance(source, Path):
-        check_not_made(source, found_images.values())
+    check_images(source)
     values |= {"selection": selection, "options": MultiViewOptions(**many), "overwrite": overwrite}
     files = output_files(output)
     with Outputs(files, sorted(images), overwrite=overwrite, growing=True).writing():

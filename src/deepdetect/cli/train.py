@@ -138,7 +138,6 @@ def train(
         output: Folder of the run.
         profiling: Time 30 steps of each stage and report what limits the speed; train nothing.
     """
-    cli.check_folder_not_made(images, output)
     run = RUN.take(values)
     if given := run.pop("init_weights", None):
         run["init_weights"] = given[0] if len(given) == 1 else tuple(given)
@@ -175,7 +174,6 @@ def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli
     Args:
         output: Folder of the run.
     """
-    cli.check_folder_not_made(images, output)
     run = {**POINTS_RUN.take(values), "output": output, "log": cli.note}
     result = train_ranker(images, options=PointsTrainingOptions(**values), **run)
     return cli.Result({"weights": result.weights, "best": result.best, "points": result.points})
@@ -196,7 +194,6 @@ def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Resul
         output: Folder for the shards.
     """
     folder = cli.output_folder(output)
-    cli.check_folder_not_made(images, folder)
     how = {**SHARD_SIZE.take(values), **_engine(values)}
     # Shards are for any stages: one that fits every size stands for them.
     recipe = chosen_recipe(**{**values, "stages": ["16x1x1"]})
@@ -237,9 +234,9 @@ def label(
     how = _engine(values)
     options = replace(chosen_label_settings(**LABELS.take(values)), **values)
     tasks = []
-    for image in cli.expand_images(images, folder):
-        figure = folder / f"{image.stem}_labels.png" if visualize else None
-        tasks.append(LabelTask(image, folder / f"{image.stem}.png", options, figure, overwrite))
+    for image, stem in cli.expand_images(images, folder).items():
+        figure = folder / f"{stem}_labels.png" if visualize else None
+        tasks.append(LabelTask(image, folder / f"{stem}.png", options, figure, overwrite))
     cli.check_outputs(
         [path for task in tasks for path in task.outputs.paths], [task.image for task in tasks]
     )

@@ -20,7 +20,8 @@ from .._shared.errors import DeepDetectError, first_line, require_packages
 from .._shared.opencv import cv2
 from .._shared.progress import progress
 from .._shared.records import file_state
-from ..io.image import IMAGE_SUFFIXES, find_images
+from ..io.image import find_images
+from ..io.image_file import IMAGE_SUFFIXES
 
 CHUNK_BYTES = 1 << 16
 """At most this much is lost when a download breaks off."""

@@ -9,7 +9,6 @@ overlap by more than the convolutions see, so the logits are those of the whole 
 from __future__ import annotations
 
 import functools
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
@@ -21,7 +20,7 @@ import numpy as np
 from .._shared.errors import DeepDetectError, first_line
 from .._shared.image_array import fill_planes
 from .._shared.machine import release_freed_memory
-from .._shared.progress import progress
+from .._shared.progress import STDERR, progress
 from ..io.image import luma
 from .backends.onnx_parts import cut_onnx
 from .backends.onnxruntime_backend import start_session
@@ -80,7 +79,7 @@ class TiledNetwork:
         maxima = [np.full((), -np.inf, np.float32)] * len(SCALES)
         logits = np.empty(rgb.shape[:2], np.float32)
         release_freed_memory()
-        with progress(2 * len(tiles), "network", "tile", quiet=not sys.stderr.isatty()) as bar:
+        with progress(2 * len(tiles), "network", "tile", quiet=not STDERR.isatty()) as bar:
             for rows, columns in tiles:
                 features = self.encode(_planes(rgb, rows.seen, columns.seen), *light)
                 for k, (each, scale) in enumerate(zip(features, SCALES, strict=True)):

@@ -141,9 +141,10 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
     matches: dict[Pair, PairMatches] = {}
     for path in sorted(paths, key=lambda path: path.stem.endswith(MATCHES_SUFFIX)):
         if not path.stem.endswith(MATCHES_SUFFIX):
-            if names is not None and path.stem not in names:
-                raise OptionError(f"{path} is of no image in the folder of `images`: give another")
-            keypoints[path.stem if names is None else names[path.stem]] = load_keypoints(path)
+            name = path.stem if names is None else _name_of(path, names)
+            if name in keypoints:
+                raise OptionError(f"two files are of {name}: name the images' folder as `images`")
+            keypoints[name] = load_keypoints(path)
             continue
         loaded = load_matches(path)
         pair = _pair_of_stem(path.stem.removesuffix(MATCHES_SUFFIX), names, path)
@@ -160,19 +161,27 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
 
 
 def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
-    """Return the names of the images below a folder by their stems; None without a folder."""
+    """Return the names of the images below a folder by what npz files of them may be called.
+
+    That is their path without a suffix, or their stem, where it is no other's, or their name.
+    """
     if folder is None:
         return None
-    names: dict[str, str] = {}
+    names: dict[str, set[str]] = {}
     for path in find_images(folder):
-        name = path.relative_to(folder).as_posix()
-        if path.stem in names:
-            raise OptionError(
-                f"{names[path.stem]} and {name} have the same stem, by which npz files are named: "
-                "rename one, or give an HDF5 file of features"
-            )
-        names[path.stem] = name
-    return names
+        own = path.relative_to(folder)
+        for key in (own.as_posix(), own.with_suffix("").as_posix(), path.stem):
+            names.setdefault(key, set()).add(own.as_posix())
+    return {key: name for key, (name, *others) in names.items() if not others}
+
+
+def _name_of(path: Path, names: Mapping[str, str]) -> str:
+    """Return which image an npz file is of: that with the longest common end of their paths."""
+    parts = path.with_suffix("").parts
+    for first in range(len(parts)):
+        if (key := "/".join(parts[first:])) in names:
+            return names[key]
+    raise OptionError(f"{path} is of no image in the folder of `images`, or of several: move it")
 
 
 def _pair_of_stem(stem: str, names: Mapping[str, str] | None, path: Path) -> Pair:

@@ -16,17 +16,14 @@ from .._shared.errors import ImageError, MissingImageError, OptionError
 from .._shared.image_array import Channels, array_to_rgb, check_channels
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
-from .image_file import damaged_image, file_name, is_file, open_image
+from .._shared.records import was_made
+from .image_file import IMAGE_SUFFIXES, damaged_image, file_name, is_file, open_image
 
 Images = list[Any] | tuple[Any, ...] | np.ndarray
 """Several images: a list, a tuple, or a batch in an array of four dimensions."""
 
 MINIMUM_SIDE = 16
 """Smallest width and height of an image, in pixels."""
-
-IMAGE_SUFFIXES = (
-    *(".bmp", ".heic", ".heif", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"),
-)
 
 ORIENTATION_TAG = 0x0112
 SAMPLE_FORMAT, SIGNED = 339, 2  # a tag of TIFF, and its value for signed integers
@@ -147,6 +144,8 @@ def scale_short_side(rgb: np.ndarray, short_side: int) -> np.ndarray:
 def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     """List the image files below a folder in natural order: "2.png" comes before "10.png".
 
+    Pictures that commands of this package have made there are left out.
+
     Raises:
         ImageError: the folder is missing, is a file, or holds no image outside of `exclude`.
     """
@@ -171,9 +170,12 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     )
     if not found:
         raise ImageError(
-            f"there is no image in {root}: put files ending in {', '.join(IMAGE_SUFFIXES)} there"
+            f"there is no image in {root}: put files there that end in .jpg, .png, .tif or alike"
         )
-    return found
+    images = [path for path in found if not was_made(path, root)]
+    if not images:
+        raise ImageError(f"all images in {root} are results of earlier runs: name them, or others")
+    return images
 
 
 def _read_file(source: Any, max_megapixels: float | None) -> np.ndarray:

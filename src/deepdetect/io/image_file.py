@@ -22,19 +22,49 @@ from .._shared.errors import (
     first_line,
 )
 
-FORMATS = (
-    *("JPEG", "PNG", "TIFF", "WEBP", "BMP", "DIB", "GIF", "PPM", "JPEG2000", "AVIF"),
-    *("PSD", "QOI", "SGI", "PCX"),
-    *("HEIF", "JXL"),  # where a plug-in of Pillow registers them
-    "TGA",  # has no signature, so it comes last
-)
+FORMATS = {
+    "JPEG": ".jpg .jpeg .jpe .jfif",
+    "PNG": ".png",
+    "TIFF": ".tif .tiff",
+    "WEBP": ".webp",
+    "BMP": ".bmp",
+    "DIB": ".dib",
+    "GIF": ".gif",
+    "PPM": ".ppm .pgm .pbm .pnm",
+    "JPEG2000": ".jp2 .j2k .jpx .jpf .j2c .jpc",
+    "AVIF": ".avif",
+    "PSD": ".psd",
+    "QOI": ".qoi",
+    "SGI": ".sgi",
+    "PCX": ".pcx",
+    "HEIF": ".heic .heif .hif",  # where a plug-in of Pillow registers it
+    "JXL": ".jxl",  # the same
+    "TGA": ".tga",  # has no signature, so it comes last
+}
 """Formats that are read: all are decoded in this process, unlike EPS, which starts Ghostscript."""
+
+_RAW = ".dng .cr2 .cr3 .crw .nef .nrw .arw .sr2 .srf .raf .orf .rw2 .pef .srw .3fr .iiq .erf"
+RAW_SUFFIXES = tuple(f"{_RAW} .mrw .kdc .dcr .mos .mef .x3f .rwl".split())
+"""Of what sensors have measured, which rawpy develops."""
+
+UNREAD = {
+    b"v/1\x01": ("an OpenEXR image", ".exr"),
+    b"#?R": ("a Radiance HDR image", ".hdr"),
+    b"SIMPLE  =": ("a FITS image", ".fits .fit"),
+    b"\x93NUMPY": ("a NumPy array", ""),
+    b"DICM": ("a DICOM image", ".dcm"),
+}
+"""Formats whose values have no range of their own, by how they begin: they are named."""
+
+_OTHERS = (suffixes for _, suffixes in UNREAD.values())
+IMAGE_SUFFIXES = (*" ".join([*FORMATS.values(), *_OTHERS]).split(), *RAW_SUFFIXES)
+"""What the names of images end in, which are read, or named with the reason why not."""
 
 MAX_MEGAPIXELS = 200.0
 """Largest images that are read unless more is asked for: the largest sensors of phones have 200."""
 
-SIGNATURE_BYTES = 16
-"""Length of the beginning of a file that Pillow tells formats by."""
+SIGNATURE_BYTES = 132
+"""Length of the beginning of a file that formats are told by; DICOM has its own at the end."""
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -79,7 +109,7 @@ def open_image(
     Raises:
         ImageError: the file is missing, truncated, damaged (as far as its format lets one see),
             larger than `max_megapixels` or no image.
-        MissingExtraError: it is a HEIF image, and pillow-heif is not installed.
+        MissingExtraError: it is a HEIF or raw image, and the package for it is not installed.
     """
     limit = megapixel_limit(max_megapixels)
     name = file_name(source, what)
@@ -194,6 +224,14 @@ def _identify(file: BinaryIO, name: str) -> Any:
             from pillow_heif import register_heif_opener
 
             register_heif_opener()
+    for beginning, (what, _) in UNREAD.items():
+        if beginning in (start[: len(beginning)], start[128:]):
+            raise ImageError(
+                f"{name} is {what}, whose values have a range that images have not: load it with "
+                "a program of its own, and give an array or a PNG file"
+            )
+    if name.lower().endswith(RAW_SUFFIXES):
+        return _develop(file, name)
     for key in FORMATS:
         if key not in Image.OPEN:
             continue
@@ -208,6 +246,21 @@ def _identify(file: BinaryIO, name: str) -> Any:
     if heif:
         raise MissingExtraError(f"{name} is a HEIF image: run pip install pillow-heif to read it")
     raise ImageError(f"{name} is not an image that can be read: use PNG or JPEG")
+
+
+def _develop(file: BinaryIO, name: str) -> Any:
+    """Develop a raw photograph to a PIL image, upright, with the camera's white balance."""
+    from PIL import Image
+
+    try:
+        import rawpy
+    except ModuleNotFoundError:
+        raise MissingExtraError(
+            f"{name} is a raw photograph: run pip install rawpy to read it, or develop it to JPEG"
+        ) from None
+    file.seek(0)
+    with rawpy.imread(file) as raw:
+        return Image.fromarray(raw.postprocess(use_camera_wb=True))
 
 
 def _hide_warning_of_large_images() -> None:

@@ -33,7 +33,8 @@ from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
 from ..features.selection import SelectionOptions
-from ..io.image import IMAGE_SUFFIXES, find_images
+from ..io.image import find_images
+from ..io.image_file import IMAGE_SUFFIXES
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
 from .dense import dense_points, find_references, limited_view, merge_dense_points
 from .mapping import RegisteredImage, SparseModel, adjust, map_images, normalise_model, verify_pairs
@@ -99,7 +100,7 @@ def check_images(images: str | Path | Sequence[str | Path]) -> dict[str, Path]:
         if not path.is_file():
             raise MissingImageError(f"there is no file {path}: check the path")
         if path.suffix.lower() not in IMAGE_SUFFIXES:
-            raise OptionError(f"{path} must end in {', '.join(IMAGE_SUFFIXES)}: convert it")
+            raise OptionError(f"{path} must end as images do, in .jpg, .png or alike: rename it")
         if taken.setdefault(path.name, path).resolve() != path.resolve():
             raise OptionError(f"{taken[path.name]} and {path} have one name: rename one of them")
     return taken

@@ -22,7 +22,8 @@ from .._shared.errors import (
 )
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
-from ..io.image import IMAGE_SUFFIXES, find_images, load_image
+from ..io.image import find_images, load_image
+from ..io.image_file import IMAGE_SUFFIXES
 
 FOLDER_FPS = 10.0
 """Of the frames in a folder, which say nothing of it."""
