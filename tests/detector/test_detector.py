@@ -386,9 +386,9 @@ def test_images_are_read_once(
     opened: list[Any] = []
     read_file = io_image._read_file
 
-    def counted(source: Any, max_megapixels: float | None) -> np.ndarray:
+    def counted(source: Any, *options: Any) -> np.ndarray:
         opened.append(source)
-        return read_file(source, max_megapixels)
+        return read_file(source, *options)
 
     monkeypatch.setattr(io_image, "_read_file", counted)
     detector.detect(paths[0])
