@@ -13,13 +13,12 @@ from .errors import ImageError, check_name
 Channels = Literal["rgb", "bgr"]
 CHANNEL_COUNTS = (1, 3, 4)
 
-SENSOR_BITS = (8, 10, 12, 14)
+SENSOR_BITS = (8, 10, 12, 14, 16)
 """Bits of sensors whose numbers are kept in 16: the fewest that hold the largest number count."""
 
-MIN_DEEP = 8192
-"""Largest number from which 16 bits are taken as they are: it is an eighth of their range."""
-
 LITTLE_RANGE = 1 / 8
+"""Share of [0, 1] below which floats are hardly meant to be an image."""
+
 DARK = "uses {:.1%} of its range, and is nearly black: give the range by `value_range`"
 
 
@@ -131,8 +130,6 @@ def _select_bands(array: np.ndarray, bands: Sequence[int], name: str) -> np.ndar
 
 def _white(largest: int) -> int:
     """Return which number is white of 16 bits that say nothing of it, by the largest of them."""
-    if largest >= MIN_DEEP:
-        return 65535
     return next(2**bits - 1 for bits in SENSOR_BITS if largest < 2**bits)
 
 

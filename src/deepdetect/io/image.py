@@ -84,9 +84,9 @@ def load_image(
             One megapixel takes 3 MB, and up to 7 MB while it is read.
             Of WebP, Pillow reads 178 megapixels at most (`PIL.Image.MAX_IMAGE_PIXELS`).
         value_range: the numbers that are black and white, of any type: (0, 4095) of a sensor of 12
-            bits. None: what the file says; else 0 and 1 of floats, 0 and 65535 of uint16. But where
-            all uint16 are below 8192 white is the smallest of 255, 1023, 4095 and 16383 that none
-            exceeds. Of signed and 32-bit integers it must be given.
+            bits. None: what the file says; else 0 and 1 of floats, and of uint16 0 and the smallest
+            of 255, 1023, 4095, 16383 and 65535 that none exceeds. Of signed and 32-bit integers it
+            must be given.
         bands: the three bands that become red, green and blue, numbered from 1, of TIFF files and
             arrays: (4, 3, 2) of Landsat 8. None: the first three, of four bands without alpha and
             more it must be given.

@@ -24,6 +24,7 @@ from .._shared.errors import (
     OptionError,
     first_line,
 )
+from .._shared.options import suggest_keywords
 
 FORMATS = {
     "JPEG": ".jpg .jpeg .jpe .jfif",
@@ -75,6 +76,7 @@ HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
 """In bytes 8 to 12 of HEIF files, which telephones write (ISO/IEC 23008-12)."""
 
 
+@suggest_keywords
 @dataclass(frozen=True)
 class ReadingOptions:
     """How image files are read; the fields are those of `load_image`."""
@@ -288,6 +290,7 @@ def identify(file: BinaryIO, name: str) -> Any:
 
     _hide_warning_of_large_images()
     Image.init()  # registers all formats; that of AVIF is not in every Pillow
+    file.seek(0)
     start = file.read(SIGNATURE_BYTES)
     heif = start[4:8] == b"ftyp" and start[8:12] in HEIF_BRANDS
     if heif:

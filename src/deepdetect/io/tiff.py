@@ -184,7 +184,7 @@ def _read_by_pillow(
 ) -> np.ndarray:
     """Decode what tifffile cannot without imagecodecs, where Pillow is known to be right."""
     bits, photometric = page.bitspersample, int(page.photometric)
-    plain = page.dtype.kind in "bu" and (
+    plain = page.dtype.kind in ("b", "u") and (
         bits in (1, 8) or (bits == 16 and page.samplesperpixel == 1)
     )
     plain &= not (bits == 16 and photometric != MIN_IS_BLACK) and page.samplesperpixel <= 4
