@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import copy
+import multiprocessing
 import os
 import pickle
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -365,6 +368,32 @@ def test_a_detector_goes_to_other_processes(weights: Any, image: np.ndarray) -> 
     np.testing.assert_allclose(
         other.heatmap(image), detector.configured(HeatmapOptions(64, "bgr")).heatmap(image)
     )
+
+
+class OwnDetector(DeepDetect):
+    """A subclass with a signature of its own."""
+
+    def __init__(self) -> None:
+        super().__init__("dense", threads=1)
+        self.note = "kept"
+
+
+@pytest.mark.parametrize("how", [copy.copy, copy.deepcopy, lambda d: pickle.loads(pickle.dumps(d))])
+def test_copies_detect_the_same(how: Any, image: np.ndarray) -> None:
+    for detector in (OwnDetector(), PointDetector(20, spread="grid")):
+        other = how(detector)
+        assert type(other) is type(detector)
+        assert getattr(other, "note", "") == getattr(detector, "note", "")
+        np.testing.assert_array_equal(other.detect(image).xy, detector.detect(image).xy)
+
+
+@pytest.mark.parametrize("method", multiprocessing.get_all_start_methods())
+def test_pools_map_the_methods_of_detectors(method: str, image: np.ndarray) -> None:
+    points = PointDetector(20)
+    context = multiprocessing.get_context(method)
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        found = next(pool.map(points.detect, [image]))
+    np.testing.assert_array_equal(found.xy, points.detect(image).xy)
 
 
 def test_extracted_keypoints_are_the_detected_ones_described(

@@ -15,7 +15,6 @@ Other keys are ignored. The names follow Middlebury 2014, where the offset is `d
 
 from __future__ import annotations
 
-import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import MissingCalibrationError, ReconstructionError, first_line
-from .._shared.options import suggest_keywords
+from .._shared.options import shown, suggest_keywords
 from .camera_files import read_camera_file
 
 Size = tuple[int, int]
@@ -260,7 +259,7 @@ def _numbers(name: str, value: Any, count: int) -> tuple[float, ...]:
         numbers = np.full(count, np.nan)
     if not np.isfinite(numbers).all():
         wanted = "a finite number" if count == 1 else "one or two finite numbers"
-        raise ReconstructionError(f"{name} must be {wanted}, not {reprlib.repr(value)}")
+        raise ReconstructionError(f"{name} must be {wanted}, not {shown(value)}")
     return tuple(numbers.tolist())
 
 

@@ -144,15 +144,21 @@ def _of_size(rgb: np.ndarray, name: str = "the image") -> np.ndarray:
 
 def load_each(images: Images, channels: Channels) -> Iterator[tuple[int, np.ndarray]]:
     """Load images when they are asked for, each with its place in the list, tuple or batch."""
-    if not isinstance(images, (list, tuple)) and getattr(images, "ndim", 0) != 4:
-        raise OptionError(
-            "a batch is a list or a 4-D array: give one image to the method without _batch"
-        )
+    batch_length(images)
     for number, image in enumerate(images):
         with image_named(number):
             rgb = load_image(image, channels=channels)
         yield number, rgb
         del rgb
+
+
+def batch_length(images: Images) -> int:
+    """Return how many images there are; refuse what is no batch."""
+    if not isinstance(images, (list, tuple)) and getattr(images, "ndim", 0) != 4:
+        raise OptionError(
+            "a batch is a list or a 4-D array: give one image to the method without _batch"
+        )
+    return len(images)
 
 
 @contextmanager

@@ -9,12 +9,14 @@ import stat
 import struct
 import warnings
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from numbers import Integral, Real
 from typing import Any, BinaryIO
+
+import numpy as np
 
 from .._shared.errors import (
     DeepDetectError,
@@ -24,7 +26,7 @@ from .._shared.errors import (
     OptionError,
     first_line,
 )
-from .._shared.options import suggest_keywords
+from .._shared.options import shown, suggest_keywords
 
 FORMATS = {
     "JPEG": ".jpg .jpeg .jpe .jfif",
@@ -96,7 +98,7 @@ class ReadingOptions:
             value = getattr(self, name)
             if value is None:
                 continue
-            numbers = tuple(value) if isinstance(value, Iterable) else ()
+            numbers = tuple(value) if np.iterable(value) else ()
             fits = len(numbers) == count and all(isinstance(each, Real) for each in numbers)
             if fits and name == "bands":
                 fits = all(isinstance(each, Integral) and each > 0 for each in numbers)
@@ -104,7 +106,7 @@ class ReadingOptions:
                 fits = bool(0 < numbers[1] - numbers[0] < math.inf)
                 what = "numbers, black and a larger white"
             if not fits:
-                raise OptionError(f"`{name}` must be {count} {what}, not {value!r}")
+                raise OptionError(f"`{name}` must be {count} {what}, not {shown(value)}")
             object.__setattr__(self, name, numbers)
 
     @property
