@@ -36,7 +36,7 @@ STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
     "repeatability_paper": (1, ("keypoints",)),
     "repeatability_mutual_nn": (1, ("keypoints",)),
     "corner_errors": (1, ("matches",)),
-    "pose": (5, ("matches", "guided")),
+    "pose": (7, ("matches", "guided")),
     "sfm": (2, ()),
 }
 """Version of each stage, and the stages it is made from.

@@ -6,6 +6,7 @@ Geometry only proposes. A pair is kept when its patches are the same once the ge
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -29,7 +30,7 @@ from ...geometry.two_view import (
     is_usual_rotation,
 )
 from .evidence import compare_held_out, is_repeated, moving_alike
-from .initial_geometry import MAX_SIDE_PX, InitialGeometry, Pair, guiding_geometry
+from .initial_geometry import InitialGeometry, Pair, guiding_geometry
 from .rectified import match_by_rectification
 from .verification import dissimilarity
 
@@ -56,10 +57,14 @@ MAX_MOVING_PLANES = 3
 
 MIN_ON_LINES = 0.33
 """Of the matches of a plane on the epipolar lines of all else, where both stand still: planes put
-into scenes with depth have up to 0.3, large ones of scenes that stand still from 0.36 on."""
+into scenes with depth have up to 0.3."""
+
+MIN_REST_FRACTION, MIN_REST_RATIO = 0.5, 1.05
+"""Of the matches off a plane that moves on its own, those that agree with their own matrix; and
+how many times those that agree with the matrix of both: else that one will do."""
 
 MAX_REST_LOG10_NFA = -20.0
-"""Of the agreement on an epipole of what such a plane leaves: planes in place of it have -7."""
+"""Of their agreement on an epipole: another plane in place of a scene has -7."""
 
 MAX_PARALLAX_LOG10_NFA = -40.0
 """Or sparse matches off the plane agree this clearly on an epipole: planes of Oxford have at least
@@ -119,8 +124,9 @@ def guided_matches(
     if first.model == "homography":
         geometry, matches = _plane_or_depth(grays, pixels, first, enough, seed)
     else:
-        depth = _apart_from_plane(grays, first, first, seed) or first
-        geometry, matches = _match_depth(grays, pixels[0], depth, enough)
+        apart = _apart_from_plane(grays, first, first, seed)
+        ways = ((way, None) for way in (apart, first) if way is not None)
+        _, geometry, matches = _first_that_matches(grays, pixels[0], ways, enough)
     if matches is None:
         return geometry, None
     geometry, plane = _with_scene(grays, pixels[0], geometry, matches, seed)
@@ -181,15 +187,23 @@ def _plane_or_depth(
     plane = replace(plane[0], verified=verified), plane[1]
     if planar and not off_plane:
         return plane
-    depth = guiding_geometry(grays, "fundamental", seed, first.source)
-    apart = _apart_from_plane(grays, first, depth, seed)
-    depth = apart or depth
-    depth = replace(depth, num_views=depth.num_views + first.num_views)
-    errors = transfer_errors(depth.points0, depth.points1, matrix)
+    joint = guiding_geometry(grays, "fundamental", seed, first.source)
+    joint = replace(joint, num_views=joint.num_views + first.num_views)
+    apart = _apart_from_plane(grays, first, joint, seed)
+    points = (apart or joint).points0, (apart or joint).points1
+    errors = transfer_errors(*points, matrix)
     if planar and np.count_nonzero(errors > OFF_PLANE_PX) < MIN_OFF_PLANE_FRACTION * len(errors):
         return plane
-    known_plane = matrix if planar and apart is None else None
-    geometry, matches = _match_depth(grays, pixels[0], depth, enough, known_plane)
+
+    def ways() -> Iterator[tuple[InitialGeometry, np.ndarray | None]]:
+        if apart is not None:
+            yield apart, None
+        yield joint, matrix if planar else None
+        if not planar and first.others:
+            # What moves otherwise can spoil a matrix that explains a part of it, too.
+            yield guiding_geometry(grays, "fundamental", seed, first.others), None
+
+    depth, geometry, matches = _first_that_matches(grays, pixels[0], ways(), enough)
     if matches is None:
         return plane if planar or plane[1] is not None else (geometry, None)
     errors = transfer_errors(matches.starts(pixels[0]), matches.points1, matrix)
@@ -204,16 +218,11 @@ def _plane_or_depth(
     return (geometry, matches) if shown or plane[1] is None else plane
 
 
-def _threshold_px(model: str, gray1: np.ndarray) -> float:
-    """Return within which sparse matches agree with a model, of smaller copies of large images."""
-    return GUIDING_THRESHOLDS_PX[model] * max(1.0, max(gray1.shape) / MAX_SIDE_PX)
-
-
 def _fit(
     points0: np.ndarray, points1: np.ndarray, model: str, gray1: np.ndarray, seed: int = 0
 ) -> TwoViewModel:
-    """Fit a model that guides to (M, 2) sparse matches, trusted or not."""
-    size1, threshold_px = gray1.shape[::-1], _threshold_px(model, gray1)
+    """Fit a model that guides to (M, 2) matches, trusted or not."""
+    size1, threshold_px = gray1.shape[::-1], GUIDING_THRESHOLDS_PX[model]
     return fit_model(points0, points1, model, size1, threshold_px, seed)
 
 
@@ -227,12 +236,11 @@ def _apart_from_plane(
     if first.others is None or depth.matrix is None:
         return None
     points0, points1 = first.all_points
-    by_depth = epipolar_errors(points0, points1, depth.matrix)
-    near_px, threshold_px = (
-        _threshold_px(model, grays[1]) for model in ("homography", "fundamental")
+    by_depth = (
+        epipolar_errors(points0, points1, depth.matrix) < GUIDING_THRESHOLDS_PX["fundamental"]
     )
-    left, apart = np.ones(len(points0), bool), None
-    most = np.count_nonzero(by_depth < threshold_px)
+    left, apart, spoilt = np.ones(len(points0), bool), None, False
+    most = np.count_nonzero(by_depth)
     for _ in range(MAX_MOVING_PLANES):
         plane = _fit(points0[left], points1[left], "homography", grays[1], seed)
         if plane.matrix is None or not plane.trusted:
@@ -240,11 +248,13 @@ def _apart_from_plane(
         on = transfer_errors(points0, points1, plane.matrix) <= OFF_PLANE_PX
         left &= ~on
         rest = _fit(points0[~on], points1[~on], "fundamental", grays[1], seed)
-        explained = np.count_nonzero(on) + np.count_nonzero(rest.inliers)
-        if rest.matrix is None or explained <= most:
+        own = np.count_nonzero(rest.inliers)
+        explained = np.count_nonzero(on) + own
+        least = MIN_REST_FRACTION * len(rest.inliers)
+        if rest.matrix is None or own < least or explained <= most:
             continue
-        on_lines = epipolar_errors(points0[on], points1[on], rest.matrix) < near_px
-        if np.mean(on_lines) >= MIN_ON_LINES:
+        errors = epipolar_errors(points0[on], points1[on], rest.matrix)
+        if np.mean(errors < GUIDING_THRESHOLDS_PX["homography"]) >= MIN_ON_LINES:
             continue
         # Any matrix of many fits a plane: what tells of depth is off the plane of the rest, too.
         rest0, rest1 = points0[~on][rest.inliers], points1[~on][rest.inliers]
@@ -253,7 +263,8 @@ def _apart_from_plane(
             measure_parallax(rest0, rest1, another.matrix, seed).log10_nfa < MAX_REST_LOG10_NFA
         ):
             apart, most = (points0[~on], points1[~on]), explained
-    return apart and guiding_geometry(grays, "fundamental", seed, apart)
+            spoilt = bool(own > MIN_REST_RATIO * np.count_nonzero(by_depth[~on]))
+    return guiding_geometry(grays, "fundamental", seed, apart) if apart and spoilt else None
 
 
 def _with_further_planes(
@@ -294,6 +305,28 @@ def _with_further_planes(
         if not is_repeated(grays, further.starts(pixels[0])[new], matrix):
             matches = matches.joined(further, new)
     return matches
+
+
+def _first_that_matches(
+    grays: Pair,
+    xy0: np.ndarray,
+    ways: Iterable[tuple[InitialGeometry, np.ndarray | None]],
+    enough: float,
+) -> tuple[InitialGeometry, TwoViewGeometry, GuidedMatches | None]:
+    """Match by geometries, each with a plane where one is known, until one gives enough matches.
+
+    Returns the one that gives most, with its result; of equal ones the first.
+    """
+    best, most = None, -1
+    for first, plane in ways:
+        geometry, matches = _match_depth(grays, xy0, first, enough, plane)
+        count = 0 if matches is None else len(matches)
+        if count > most:
+            best, most = (first, geometry, matches), count
+        if count >= enough:
+            break
+    assert best is not None
+    return best
 
 
 def _match_depth(
