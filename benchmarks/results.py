@@ -32,7 +32,7 @@ BLOCK = re.compile(r"(<!-- results:([\w-]+)(?: ([^\n]*?))? -->\n).*?(<!-- /resul
 
 BENCHMARK = "-m deepdetect benchmark {} --data {{data}} -o {{output}}"
 PEERS = ("xfeat_2048_600x800", "edgepoint2_t32", "edgepoint2_e64")
-XFEAT = f" --method {{published}}/peers/{PEERS[0]}.onnx"
+XFEAT, _, E64 = (f" --method {{published}}/peers/{name}.onnx" for name in PEERS)
 PAGES = [
     page
     for folder in (".", "docs", "src/deepdetect/detector/weights")
@@ -54,6 +54,7 @@ STAGES = {
             "--weights {published}/published_matching.safetensors",
             "middlebury": "middlebury --geometry-weights dense "
             "--geometry-weights {published}/published_reconstruction.safetensors",
+            "pose": "pose --baselines sift,orb --max-pairs 45" + XFEAT + E64,
             "sfm": "sfm",
         }.items()
     },
@@ -219,6 +220,18 @@ RESULTS = {
             "half-occluded: within 1 px": ("of these within 1 px", ".3f"),
             "s": ("seconds", ".2f"),
             "MB": ("all, MB", ".0f"),
+        },
+    ),
+    "poses": Result(
+        "pose",
+        "pose",
+        {
+            "method": ("method", ""),
+            **{f"AUC {limit}°": (f"AUC at {limit}°", ".3f") for limit in (5, 10, 20)},
+            "median error, °": ("median error, °", ".2f"),
+            "matches": ("matches", ".0f"),
+            "worse than SIFT": ("worse than SIFT", ""),
+            "better than SIFT": ("better than SIFT", ""),
         },
     ),
     "cameras": Result(
