@@ -22,7 +22,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from deepdetect._shared.errors import ImageError, MissingExtraError, OptionError
 from deepdetect.io.image import find_images, load_image, luma, scale_short_side
-from deepdetect.io.image_file import IMAGE_SUFFIXES, read_with, reading_options
+from deepdetect.io.image_file import IMAGE_SUFFIXES, limit_megapixels
 
 OneLine = Callable[[BaseException], str]
 
@@ -322,7 +322,7 @@ def test_a_file_of_too_many_pixels_is_not_decoded(size: tuple[int, int], one_lin
 def test_the_limit_of_pixels_is_raised_and_lowered_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)  # Pillow's own, which is for all programs
     np.testing.assert_array_equal(load_image(PNG, max_megapixels=450e-6), RGB)
-    with read_with(reading_options(max_megapixels=449e-6)):
+    with limit_megapixels(449e-6):
         np.testing.assert_array_equal(load_image(PNG, max_megapixels=450e-6), RGB)
         with pytest.raises(ImageError, match=r"over 0\.000449 megapixels"):
             load_image(PNG)

@@ -74,7 +74,7 @@ Sources = Annotated[
 
 
 @export.command
-@cli.command(SAVED, FOLDER, MAX_KEYPOINTS, VERIFY, CAMERAS, SHARED_CAMERA, cli.READING)
+@cli.command(SAVED, FOLDER, MAX_KEYPOINTS, VERIFY, CAMERAS, SHARED_CAMERA, cli.MEGAPIXELS)
 def colmap(
     *sources: Sources,
     output: cli.Output = Path("database.db"),
@@ -125,7 +125,7 @@ def colmap(
 
 
 @export.command
-@cli.command(SAVED, FOLDER, MAX_KEYPOINTS, cli.READING)
+@cli.command(SAVED, FOLDER, MAX_KEYPOINTS, cli.MEGAPIXELS)
 def hloc(
     *sources: Sources,
     output: cli.Output = Path("hloc-files"),

@@ -25,7 +25,7 @@ MATCHING = cli.From(
 )
 
 
-@cli.command(EXTRACTION, SELECTION, POINTS, NETWORK, cli.READING)
+@cli.command(EXTRACTION, SELECTION, POINTS, NETWORK, cli.MEGAPIXELS)
 def extract(
     folder: Annotated[Path, Parameter(help="Folder of the images.")],
     /,
