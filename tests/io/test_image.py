@@ -545,3 +545,16 @@ def test_without_rawpy_its_name_is_said(
     monkeypatch.setitem(sys.modules, "rawpy", None)
     with pytest.raises(MissingExtraError, match="is a raw photograph: run pip install rawpy"):
         load_image(raw_photograph)
+
+
+@pytest.mark.parametrize("words", ["separate planes", "thumbnail"])
+def test_tiff_that_pillow_misreads_is_refused(words: str, one_line: OneLine) -> None:
+    tifffile, file = pytest.importorskip("tifffile"), io.BytesIO()
+    if words == "thumbnail":
+        tifffile.imwrite(file, DEEP, photometric="minisblack", subfiletype=1)
+    else:
+        planes = np.moveaxis(DEEP_RGB, 2, 0).copy()
+        tifffile.imwrite(file, planes, photometric="rgb", planarconfig="separate")
+    with pytest.raises(ImageError, match=words) as caught:
+        load_image(file)
+    one_line(caught.value)

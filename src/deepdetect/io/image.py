@@ -26,7 +26,8 @@ MINIMUM_SIDE = 16
 """Smallest width and height of an image, in pixels."""
 
 ORIENTATION_TAG = 0x0112
-SAMPLE_FORMAT, SIGNED = 339, 2  # a tag of TIFF, and its value for signed integers
+# Tags of TIFF, and their values for signed integers, separate planes and a thumbnail.
+SAMPLE_FORMAT, SIGNED, PLANES, SEPARATE, SUBFILE, REDUCED, BITS = 339, 2, 284, 2, 254, 1, 258
 
 STRIP_PIXELS = 1 << 20
 """PIL images are converted by strips of about this size: whole copies take gigabytes."""
@@ -203,7 +204,12 @@ def _from_pil(image: Any, name: str) -> np.ndarray:
         raise damaged_image(name, error) from None
     # Pillow holds 16-bit PGM, and 10.3 also 16-bit PNG, in 32 bits; all else may have any range.
     wide = image.mode == "I" and image.format not in ("PNG", "PPM")
-    if wide or SIGNED in getattr(image, "tag_v2", {}).get(SAMPLE_FORMAT, ()):
+    tags = getattr(image, "tag_v2", {})
+    if tags.get(PLANES) == SEPARATE and max(tags.get(BITS, (8,))) > 8:  # Pillow makes stripes
+        raise ImageError(f"{name} holds separate planes of 16 bits: save it interleaved")
+    if tags.get(SUBFILE, 0) & REDUCED:
+        raise ImageError(f"{name} begins with a thumbnail: save the full image first")
+    if wide or SIGNED in tags.get(SAMPLE_FORMAT, ()):
         raise ImageError(
             f"{name} holds 32-bit or signed integers, whose range is not known: convert it "
             "to 8 bits (mode L or RGB), 16 bits without sign (mode I;16) or float in [0, 1]"
