@@ -381,7 +381,7 @@ def write_result(name: str, work: Path) -> None:
                 named = (*other[:1], row[first] + "".join(other[1:]))
                 cell = (by_name.get(named, {}) if other else row).get(title)
                 style = style or (".4f" if isinstance(cell, float) else "")
-                lines[-1].append("" if cell is None else format(cell, style))
+                lines[-1].append("" if cell is None else format(TITLES.get(cell, cell), style))
     with (RESULTS_FOLDER / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows(lines)
     index = json.loads((RESULTS_FOLDER / "index.json").read_text())
