@@ -73,7 +73,8 @@ def loaded(generator: np.random.Generator, folder: Path) -> None:
     expect(allowed, f"{array.dtype} of shape {array.shape} was taken")
     expected = array if array.ndim == 3 else array[:, :, None]
     expected = expected[:, :, :3].astype(np.float64)
-    scale = {"u1": 1.0, "u2": 255 / 65535}.get(array.dtype.str[1:], 255.0)
+    white = next(2**bits - 1 for bits in (8, 10, 12, 14, 16) if expected.max() < 2**bits)
+    scale = {"u1": 1.0, "u2": 255 / white}.get(array.dtype.str[1:], 255.0)
     expected = np.broadcast_to(expected * scale, found.shape)
     expect(found.dtype == np.uint8, f"of type {found.dtype}")
     expect(np.abs(found - expected).max() <= 0.51, "pixels are wrong")

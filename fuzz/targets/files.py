@@ -12,7 +12,7 @@ import numpy as np
 from hypothesis import strategies
 
 from deepdetect import Keypoints, load_keypoints, load_matches, save_keypoints
-from deepdetect.geometry.camera import read_calibration
+from deepdetect.geometry.camera import Calibration
 from deepdetect.io.masks import encode_mask, load_mask
 from deepdetect.labels import find_label_settings
 from deepdetect.labels.detectors import DETECTORS
@@ -125,7 +125,7 @@ def calibrations(generator: np.random.Generator, folder: Path) -> None:
         content = b"\xef\xbb\xbf" + content
     path = folder / "calib.json"
     path.write_bytes(content)
-    found = read_calibration(path, (64, 48), (64, 48))
+    found = Calibration.load(path, (64, 48), (64, 48))
     for camera in (found.camera0, found.camera1):
         expect(np.isfinite(camera.matrix).all(), "a camera that is not finite")
         expect(min(camera.matrix[0, 0], camera.matrix[1, 1]) > 0, "no focal length")

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import copy
+import multiprocessing
 import os
 import pickle
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -367,6 +370,32 @@ def test_a_detector_goes_to_other_processes(weights: Any, image: np.ndarray) -> 
     )
 
 
+class OwnDetector(DeepDetect):
+    """A subclass with a signature of its own."""
+
+    def __init__(self) -> None:
+        super().__init__("dense", threads=1)
+        self.note = "kept"
+
+
+@pytest.mark.parametrize("how", [copy.copy, copy.deepcopy, lambda d: pickle.loads(pickle.dumps(d))])
+def test_copies_detect_the_same(how: Any, image: np.ndarray) -> None:
+    for detector in (OwnDetector(), PointDetector(20, spread="grid")):
+        other = how(detector)
+        assert type(other) is type(detector)
+        assert getattr(other, "note", "") == getattr(detector, "note", "")
+        np.testing.assert_array_equal(other.detect(image).xy, detector.detect(image).xy)
+
+
+@pytest.mark.parametrize("method", multiprocessing.get_all_start_methods())
+def test_pools_map_the_methods_of_detectors(method: str, image: np.ndarray) -> None:
+    points = PointDetector(20)
+    context = multiprocessing.get_context(method)
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        found = next(pool.map(points.detect, [image]))
+    np.testing.assert_array_equal(found.xy, points.detect(image).xy)
+
+
 def test_extracted_keypoints_are_the_detected_ones_described(
     detector: DeepDetect, image: np.ndarray
 ) -> None:
@@ -386,9 +415,9 @@ def test_images_are_read_once(
     opened: list[Any] = []
     read_file = io_image._read_file
 
-    def counted(source: Any, max_megapixels: float | None) -> np.ndarray:
+    def counted(source: Any, *options: Any) -> np.ndarray:
         opened.append(source)
-        return read_file(source, max_megapixels)
+        return read_file(source, *options)
 
     monkeypatch.setattr(io_image, "_read_file", counted)
     detector.detect(paths[0])

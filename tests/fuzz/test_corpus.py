@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetectError, load_image, load_keypoints
-from deepdetect.geometry.camera import read_calibration
+from deepdetect.geometry.camera import Calibration
 from deepdetect.io.masks import load_mask
 from deepdetect.labels import find_label_settings
 
 CORPUS = Path(__file__).parents[2] / "fuzz" / "corpus"
 READERS: dict[str, Callable[[Path], Any]] = {
     "array": lambda path: load_image(np.load(path)),
-    "calibration": lambda path: read_calibration(path, (64, 48), (64, 48)),
+    "calibration": lambda path: Calibration.load(path, (64, 48), (64, 48)),
     "image": load_image,
     "keypoints": load_keypoints,
     "label-settings": find_label_settings,

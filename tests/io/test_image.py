@@ -22,7 +22,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from deepdetect._shared.errors import ImageError, MissingExtraError, OptionError
 from deepdetect.io.image import find_images, load_image, luma, scale_short_side
-from deepdetect.io.image_file import IMAGE_SUFFIXES, limit_megapixels
+from deepdetect.io.image_file import IMAGE_SUFFIXES, read_with, reading_options
 
 OneLine = Callable[[BaseException], str]
 
@@ -322,7 +322,7 @@ def test_a_file_of_too_many_pixels_is_not_decoded(size: tuple[int, int], one_lin
 def test_the_limit_of_pixels_is_raised_and_lowered_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)  # Pillow's own, which is for all programs
     np.testing.assert_array_equal(load_image(PNG, max_megapixels=450e-6), RGB)
-    with limit_megapixels(449e-6):
+    with read_with(reading_options(max_megapixels=449e-6)):
         np.testing.assert_array_equal(load_image(PNG, max_megapixels=450e-6), RGB)
         with pytest.raises(ImageError, match=r"over 0\.000449 megapixels"):
             load_image(PNG)
@@ -545,16 +545,3 @@ def test_without_rawpy_its_name_is_said(
     monkeypatch.setitem(sys.modules, "rawpy", None)
     with pytest.raises(MissingExtraError, match="is a raw photograph: run pip install rawpy"):
         load_image(raw_photograph)
-
-
-@pytest.mark.parametrize("words", ["separate planes", "thumbnail"])
-def test_tiff_that_pillow_misreads_is_refused(words: str, one_line: OneLine) -> None:
-    tifffile, file = pytest.importorskip("tifffile"), io.BytesIO()
-    if words == "thumbnail":
-        tifffile.imwrite(file, DEEP, photometric="minisblack", subfiletype=1)
-    else:
-        planes = np.moveaxis(DEEP_RGB, 2, 0).copy()
-        tifffile.imwrite(file, planes, photometric="rgb", planarconfig="separate")
-    with pytest.raises(ImageError, match=words) as caught:
-        load_image(file)
-    one_line(caught.value)

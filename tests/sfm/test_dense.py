@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from deepdetect.geometry.camera import Camera, PosedView
-from deepdetect.io.image_file import limit_megapixels
+from deepdetect.io.image_file import read_with, reading_options
 from deepdetect.sfm import dense
 from deepdetect.sfm.colmap import CameraIntrinsics
 from deepdetect.sfm.dense import (
@@ -166,6 +166,8 @@ def test_a_smaller_view_sees_the_same_directions(monkeypatch: pytest.MonkeyPatch
 def test_what_was_extracted_is_not_too_large(tmp_path: Path, photo: np.ndarray) -> None:
     Image.fromarray(photo).save(tmp_path / "a.png")
     camera = CameraIntrinsics("PINHOLE", photo.shape[1::-1], (1.0, 1.0, 0.0, 0.0))
-    with limit_megapixels(1e-3):  # as in another process than that of the command
+    with read_with(
+        reading_options(max_megapixels=1e-3)
+    ):  # as in another process than that of the command
         rgb = dense._prepared_image(tmp_path / "a.png", (0, 0), camera, camera.size)
     np.testing.assert_array_equal(rgb, photo)

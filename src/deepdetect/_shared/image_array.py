@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -10,6 +12,14 @@ from .errors import ImageError, check_name
 
 Channels = Literal["rgb", "bgr"]
 CHANNEL_COUNTS = (1, 3, 4)
+
+SENSOR_BITS = (8, 10, 12, 14, 16)
+"""Bits of sensors whose numbers are kept in 16: the fewest that hold the largest number count."""
+
+LITTLE_RANGE = 1 / 8
+"""Share of [0, 1] below which floats are hardly meant to be an image."""
+
+DARK = "uses {:.1%} of its range, and is nearly black: give the range by `value_range`"
 
 
 def check_channels(channels: str) -> None:
@@ -39,15 +49,37 @@ def as_array(image: Any) -> np.ndarray:
         raise ImageError("an image array must have rows of equal length") from None
 
 
-def array_to_rgb(image: Any, channels: Channels = "rgb", name: str = "the image") -> np.ndarray:
-    """Convert an image in an array or a PyTorch tensor, as of `load_image`, to (H, W, 3) uint8 RGB.
+def array_to_rgb(
+    image: Any,
+    channels: Channels = "rgb",
+    name: str = "the image",
+    *,
+    value_range: Sequence[float] | None = None,
+    bands: Sequence[int] | None = None,
+    white: int | None = None,
+    deep: bool = False,
+) -> np.ndarray:
+    """Convert an image in an array or a PyTorch tensor, as of `load_image`, to (H, W, 3) RGB.
+
+    It is uint8, or where `deep` uint16 of all but uint8; `white` is the number of 16 bits that is
+    white, where it is known.
 
     Raises:
         ImageError: it has another shape, type or range, or holds NaN; `name` is what it is called.
         OptionError: the order of the channels is unknown.
     """
     check_channels(channels)
-    values = _to_uint8(_channels_last(as_array(image)), name)
+    array = as_array(image)
+    if bands is not None:
+        array = _select_bands(array, bands, name)
+    array = _channels_last(array)
+    if value_range is not None:
+        values = _in_range(array, value_range, name, deep)
+    elif array.dtype.kind == "u" and array.dtype.itemsize == 2:  # of either byte order
+        table = _levels(white or _white(int(array.max(initial=0))), deep)
+        values = table[array]
+    else:
+        values = _to_levels(array, name, deep, white)
     if values.ndim == 2:
         return np.repeat(values[:, :, None], 3, axis=2)
     return np.ascontiguousarray(values[:, :, :3] if channels == "rgb" else values[:, :, 2::-1])
@@ -86,20 +118,62 @@ def _channels_last(array: np.ndarray) -> np.ndarray:
     )
 
 
-def _to_uint8(array: np.ndarray, name: str) -> np.ndarray:
+def _select_bands(array: np.ndarray, bands: Sequence[int], name: str) -> np.ndarray:
+    """Select bands, numbered from 1, along the shorter of the first and the last axis."""
+    if array.ndim == 3 and array.shape[0] < array.shape[2]:
+        array = np.moveaxis(array, 0, 2)
+    if array.ndim != 3 or max(bands) > array.shape[2]:
+        count = array.shape[2] if array.ndim == 3 else 1
+        raise ImageError(f"{name} has {count} bands: leave `bands` out, or choose of these")
+    return array[:, :, np.array(bands) - 1]
+
+
+def _white(largest: int) -> int:
+    """Return which number is white of 16 bits that say nothing of it, by the largest of them."""
+    return next(2**bits - 1 for bits in SENSOR_BITS if largest < 2**bits)
+
+
+def _levels(white: int, deep: bool) -> np.ndarray:
+    """Return the level of each number of 16 bits, from 0 to white."""
+    top = 65535 if deep else 255
+    exact = (np.arange(65536, dtype=np.uint64) * (2 * top) + white) // (2 * white)
+    return np.minimum(exact, top).astype(np.uint16 if deep else np.uint8)
+
+
+def _to_levels(array: np.ndarray, name: str, deep: bool, white: int | None) -> np.ndarray:
     if array.dtype == np.uint8:
-        return array
+        return array if white is None else _levels(white, False)[array]
     if array.dtype == np.bool_:
         return array.astype(np.uint8) * 255
-    if array.dtype.kind == "u" and array.dtype.itemsize == 2:  # of either byte order
-        # Divide by 257 with rounding, so that 65535 becomes 255.
-        return ((array.astype(np.uint32) + 128) // 257).astype(np.uint8)
     if np.issubdtype(array.dtype, np.floating):
-        if not np.isfinite(array).all():
+        low, high = (float(array.min()), float(array.max())) if array.size else (0.0, 1.0)
+        if not np.isfinite([low, high]).all():
             raise ImageError(f"{name} holds NaN or infinite values: replace them first")
-        if array.size and (array.min() < 0 or array.max() > 1):
+        if low < 0 or high > 1:
             raise ImageError(
-                f"{name} spans [{array.min():g}, {array.max():g}]: scale floats to [0, 1] first"
+                f"{name} spans [{low:g}, {high:g}]: scale floats to [0, 1], or give `value_range`"
             )
-        return np.rint(array * np.float32(255)).astype(np.uint8)
-    raise ImageError(f"an image cannot be of type {array.dtype}: use uint8, uint16 or float")
+        if 0 < high < LITTLE_RANGE:
+            warnings.warn(f"{name} {DARK.format(high)}", UserWarning, stacklevel=2)
+        return _in_range(array, (0, 1), name, deep)
+    if array.dtype.kind not in "iu":
+        raise ImageError(f"an image cannot be of type {array.dtype}: use uint8, uint16 or float")
+    raise ImageError(
+        f"{name} holds {array.dtype}, whose range is not known: give `value_range`, or convert it "
+        "to 8 bits, 16 bits without sign, or float in [0, 1]"
+    )
+
+
+def _in_range(array: np.ndarray, value_range: Sequence[float], name: str, deep: bool) -> np.ndarray:
+    """Return the levels of numbers of which the first of a range is black and the second white."""
+    if array.dtype.kind not in "buif":
+        raise ImageError(f"an image cannot be of type {array.dtype}: use uint8, uint16 or float")
+    low, high = value_range
+    top, kind = (65535, np.uint16) if deep and array.dtype != np.uint8 else (255, np.uint8)
+    levels = np.empty(array.shape, kind)
+    for row, values in enumerate(array):  # of whole images the copies are large
+        if not np.isfinite(values).all():
+            raise ImageError(f"{name} holds NaN or infinite values: replace them first")
+        scaled = (values.astype(np.float64) - low) * (top / (high - low))
+        levels[row] = np.rint(scaled.clip(0, top))
+    return levels

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
 import math
 import os
+import reprlib
+import types
+import typing
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Literal, ParamSpec, TypeVar
+
+import numpy as np
 
 from .errors import OptionError, check_name
 
@@ -23,7 +29,8 @@ def suggest_keywords(
 ) -> Callable[Parameters, Result]:
     """Decorate a function so that an unknown keyword is an error with the nearest right one.
 
-    It keeps its signature, and a class, decorated above `dataclass`, stays the same class.
+    So is an argument of a wrong type, where its annotation is of simple types. It keeps its
+    signature, and a class, decorated above `dataclass`, stays the same class.
     `elsewhere` says what to do instead, by keywords that belong to other functions.
     """
     if isinstance(function, type):
@@ -39,9 +46,65 @@ def suggest_keywords(
             if name in elsewhere:
                 raise OptionError(f"unknown option {name!r}: {elsewhere[name]}")
             check_name("option", name, names)
+        kinds = _kinds(function)
+        for name, value in (*zip(parameters, args, strict=False), *kwargs.items()):
+            if name in kinds and not isinstance(value, kinds[name]):
+                wanted = str(parameters[name].annotation)
+                raise OptionError(f"`{name}` must be {wanted}, not {shown(value)}")
         return function(*args, **kwargs)
 
     return call
+
+
+def shown(value: object) -> str:
+    """Return a value for the sentence of an error: short, and of one line."""
+    return " ".join(reprlib.repr(value).split())
+
+
+ACCEPTED: Mapping[Any, tuple[Any, ...]] = {
+    bool: (bool, np.bool_),
+    int: (Real,),  # whole ones, which is checked where they are used
+    float: (Real,),
+    str: (str,),
+    Path: (os.PathLike,),
+    type(None): (type(None),),
+    Callable: (Callable,),
+}
+"""What is taken for a type in a signature, numbers of NumPy as well."""
+MADE_LATER = type(functools.cache(len))
+"""What some keypoints are, which are made when they are asked for."""
+KINDS_OF: Mapping[Any, Any] = {Literal: str, Callable: Callable}
+
+
+@functools.cache
+def _kinds(function: Callable[..., Any]) -> dict[str, tuple[Any, ...]]:
+    """Return what the arguments of a function must be, as far as all of it is of simple types."""
+    try:
+        hints = typing.get_type_hints(function)
+    except NameError:  # a type is imported for checkers alone
+        return {}
+    found = {}
+    for name, hint in hints.items():
+        union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+        members = typing.get_args(hint) if union else (hint,)
+        members = tuple(KINDS_OF.get(typing.get_origin(m), m) for m in members)
+        if all(member in ACCEPTED or dataclasses.is_dataclass(member) for member in members):
+            found[name] = tuple(k for m in members for k in ACCEPTED.get(m, (m, MADE_LATER)))
+    return found
+
+
+def numbers_of(name: str, value: Any, kind: type, columns: int | None = None) -> np.ndarray:
+    """Return numbers as an array of a type, of rows of so many where that is said.
+
+    Raises:
+        OptionError: they are none, or of another shape.
+    """
+    try:
+        found: np.ndarray = np.asarray(value, kind)
+        return found if columns is None else found.reshape(-1, columns)
+    except (TypeError, ValueError, OverflowError):
+        wanted = "numbers" if columns is None else f"rows of {columns} numbers"
+        raise OptionError(f"`{name}` must be {wanted}, not {shown(value)}") from None
 
 
 LARGEST = 1e38

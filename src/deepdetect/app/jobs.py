@@ -20,7 +20,7 @@ from .._shared.errors import DeepDetectError, OptionError
 from .._shared.machine import end_with_parent
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.signals import kill_group, signals_held
-from ..io.image_file import limit_megapixels
+from ..io.image_file import read_with, reading_options
 from .tasks import TASKS, Order
 
 FOLDER_PREFIX = "deepdetect-app-"
@@ -179,7 +179,7 @@ def run_task(sender: Connection, order: Order) -> None:
         sender.send({"state": "running", "stage": stage, "done": done, "total": total})
 
     try:
-        with limit_megapixels(order.max_megapixels):
+        with read_with(reading_options(max_megapixels=order.max_megapixels)):
             result = TASKS[order.kind].run(order.images, order.options, results, report)
         sender.send({"state": "done", **vars(result)})
         return

@@ -25,7 +25,7 @@ from ..features.keypoints import UNSET_ANGLE, Keypoints, unit_length
 from ..features.selection import SelectionOptions
 from ..features.sift import describe_keypoints
 from ..io.image import find_images, load_image, luma
-from ..io.image_file import megapixel_limit
+from ..io.image_file import ReadingOptions, reading_options
 from .hdf5 import BatchReport, Group, Item, State, damaged, fill_file
 
 DESCRIPTOR = "rootsift"
@@ -89,8 +89,10 @@ def extract_features(
     root = Path(folder).absolute()
     names = [image.relative_to(root).as_posix() for image in find_images(root)]
     utf8 = [name for name in names if name == name.encode("utf-8", "ignore").decode()]
+    reading = reading_options(max_megapixels=max_megapixels)
     settings = {
         **detector.settings,
+        **reading.settings,
         **({} if selection is None else vars(selection)),
         "descriptor": DESCRIPTOR,
         "version": __version__,
@@ -104,8 +106,7 @@ def extract_features(
             root=root,
             selection=selection,
             detector=detector,
-            # Other processes do not know that of the command.
-            max_megapixels=megapixel_limit(max_megapixels),
+            reading=reading,  # other processes do not know that of the command
         ),
         of="images",
         others_stay=lambda _: False,
@@ -125,11 +126,11 @@ def _extract(
     root: Path,
     detector: DeepDetect | PointDetector,
     selection: SelectionOptions | None,
-    max_megapixels: float,
+    reading: ReadingOptions,
 ) -> Iterator[Group]:
     for name, state in images:
         with noted_failures(name, failures):
-            rgb = load_image(root / name, max_megapixels=max_megapixels)
+            rgb = load_image(root / name, **vars(reading))
             gray = luma(rgb)
             keypoints = describe_keypoints(gray, find_keypoints(detector, rgb, selection))
             # Of a pixel of the image that they were found on.

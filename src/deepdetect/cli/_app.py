@@ -6,6 +6,7 @@ import functools
 import importlib
 import re
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
@@ -132,8 +133,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         lambda: say("compiling for the first time, about 10 seconds; it is kept for later runs")
     )
     words = list(sys.argv[1:] if arguments is None else arguments)
+    warn = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if category is UserWarning:
+            say(with_flags(str(message), words))
+        else:
+            warn(message, category, *place, **more)
+
     try:
-        return _call(words)
+        with warnings.catch_warnings():
+            warnings.showwarning = show
+            return _call(words)
     except CycloptsError as error:
         return _failed(" ".join(str(error).split()), 2)
     except BatchError as error:

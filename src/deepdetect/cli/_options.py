@@ -11,7 +11,7 @@ import sys
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,7 +24,7 @@ from .._shared.progress import STDERR
 from .._shared.records import Outputs
 from .._shared.signals import exit_by_signal, handle_signals
 from ..io.image import find_images, load_image
-from ..io.image_file import MAX_MEGAPIXELS, limit_megapixels
+from ..io.image_file import MAX_MEGAPIXELS, read_with, reading_options
 from ._app import MORE
 from ._app import NOTHING_FOUND as NOTHING_FOUND
 
@@ -81,8 +81,11 @@ class From:
         return {name: values.pop(name) for name in self.names() if name in values}
 
 
-MEGAPIXELS = From(
-    load_image, more="max_megapixels", defaults={"max_megapixels": f"{MAX_MEGAPIXELS:g}"}
+READING = From(
+    load_image,
+    more="max_megapixels value_range bands page allow_truncated",
+    types={"allow_truncated": bool},
+    defaults={"max_megapixels": f"{MAX_MEGAPIXELS:g}"},
 )
 
 Json = Annotated[bool, Parameter("--json", negative="", help="Print the result as JSON.")]
@@ -135,9 +138,8 @@ def command(
     def decorate(function: Callable[..., Result | None]) -> Callable[..., int]:
         @functools.wraps(function)
         def run(*arguments: Any, as_json: bool = False, **values: Any) -> int:
-            limited = "max_megapixels" in values
-            limit = limit_megapixels(values.pop("max_megapixels")) if limited else nullcontext()
-            with limit:
+            reading = READING.take(values) if READING in sources else {}
+            with read_with(reading_options(**reading)):
                 result = function(*arguments, **values)
             return 0 if result is None else result.show(as_json)
 

@@ -20,6 +20,7 @@ from ..detector.detector import DeepDetect, find_keypoints
 from ..detector.point_detector import PointDetector
 from ..features.selection import SelectionOptions, select_keypoints
 from ..io.image import load_image
+from ..io.image_file import reading_options
 from ..io.masks import load_mask
 from ..io.tables import save_keypoints
 from ..viz.draw import draw_best_keypoints, draw_dense_keypoints, draw_logits, save_picture
@@ -27,7 +28,7 @@ from . import _options as cli
 from ._detection import NETWORK, POINTS, SELECTION, Detector, chosen_detector
 
 
-@cli.command(SELECTION, POINTS, NETWORK, cli.MEGAPIXELS)
+@cli.command(SELECTION, POINTS, NETWORK, cli.READING)
 def detect(
     *images: cli.Images,
     output: cli.Folder = Path("deepdetect-output"),
@@ -111,7 +112,7 @@ class _Work:
     def settings(self) -> dict[str, Any]:
         options = vars(self.selection or SelectionOptions())
         noted = {"ignore": self.mask, "version": __version__}
-        return dict(plain(self.detector.settings | options | noted))
+        return dict(plain(self.detector.settings | options | noted | reading_options().settings))
 
     def say_what_is_replaced(self, outputs: dict[Path, dict[str, Path]]) -> None:
         """Refuse outputs of other images; name the options in which earlier ones differ."""

@@ -19,6 +19,7 @@ PURPOSES = {
     "demo": "demo",
     "heif": "images of iPhones (.heic)",
     "raw": "raw photographs",
+    "tiff": "compressed TIFF of every kind",
     "labels": "label and train, with all nine detectors",
     "onnx": "export onnx",
     "openvino": "--backend openvino and --precision bfloat16",

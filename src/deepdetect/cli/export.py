@@ -74,7 +74,7 @@ Sources = Annotated[
 
 
 @export.command
-@cli.command(SAVED, FOLDER, MAX_KEYPOINTS, VERIFY, CAMERAS, SHARED_CAMERA, cli.MEGAPIXELS)
+@cli.command(SAVED, FOLDER, MAX_KEYPOINTS, VERIFY, CAMERAS, SHARED_CAMERA, cli.READING)
 def colmap(
     *sources: Sources,
     output: cli.Output = Path("database.db"),
@@ -125,7 +125,7 @@ def colmap(
 
 
 @export.command
-@cli.command(SAVED, FOLDER, MAX_KEYPOINTS, cli.MEGAPIXELS)
+@cli.command(SAVED, FOLDER, MAX_KEYPOINTS, cli.READING)
 def hloc(
     *sources: Sources,
     output: cli.Output = Path("hloc-files"),

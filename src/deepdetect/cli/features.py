@@ -25,7 +25,7 @@ MATCHING = cli.From(
 )
 
 
-@cli.command(EXTRACTION, SELECTION, POINTS, NETWORK, cli.MEGAPIXELS)
+@cli.command(EXTRACTION, SELECTION, POINTS, NETWORK, cli.READING)
 def extract(
     folder: Annotated[Path, Parameter(help="Folder of the images.")],
     /,

@@ -64,7 +64,7 @@ OPTIONS = cli.From(StitchingOptions)
 STITCH_KEYPOINTS = cli.From(PointDetector, more="max_keypoints")
 
 
-@cli.command(PAIR, SELECTION, MATCHING, GEOMETRY, POINTS, NETWORK, cli.MEGAPIXELS)
+@cli.command(PAIR, SELECTION, MATCHING, GEOMETRY, POINTS, NETWORK, cli.READING)
 def match(
     image0: cli.Image,
     image1: cli.Image,
@@ -186,7 +186,7 @@ def _draw(rgb0: np.ndarray, rgb1: np.ndarray, matches: Matches, path: Path) -> N
     save_picture(add_caption(picture, caption), path)
 
 
-@cli.command(SELECTION, POINTS, NETWORK, cli.MEGAPIXELS)
+@cli.command(SELECTION, POINTS, NETWORK, cli.READING)
 def register(
     image0: cli.Image,
     image1: cli.Image,
@@ -229,7 +229,7 @@ def register(
     )
 
 
-@cli.command(PANORAMA, OPTIONS, STITCH_KEYPOINTS, POINTS, NETWORK, cli.MEGAPIXELS)
+@cli.command(PANORAMA, OPTIONS, STITCH_KEYPOINTS, POINTS, NETWORK, cli.READING)
 def stitch(
     *sources: cli.Images,
     output: cli.Output = Path("panorama.jpg"),

@@ -39,7 +39,7 @@ MAX_UNREGISTERED = 10
 """Images that are named with a reason on the terminal."""
 
 
-@cli.command(CAMERAS, SELECTION, MANY, WORKERS, POINTS, NETWORK, cli.MEGAPIXELS)
+@cli.command(CAMERAS, SELECTION, MANY, WORKERS, POINTS, NETWORK, cli.READING)
 def reconstruct(
     *images: cli.Images,
     output: cli.Output = Path("deepdetect-output"),

@@ -25,7 +25,7 @@ FRAMES = cli.From(
 )
 
 
-@cli.command(FRAMES, TRACKING, cli.MEGAPIXELS)
+@cli.command(FRAMES, TRACKING, cli.READING)
 def track(
     source: Annotated[str, Parameter(help="A video file, a folder, or the number of a camera.")],
     /,

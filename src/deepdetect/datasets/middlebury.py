@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 
 from .._shared.errors import ImageError, MissingImageError, require_packages
-from ..geometry.camera import Calibration, read_calibration
+from ..geometry.camera import Calibration
 from ..io.image import load_image
 from ..io.image_file import open_image
 
@@ -77,7 +77,7 @@ def load_calibrated_pair(folder: str | Path) -> CalibratedStereoPair:
     """Load a scene with its calib.json, without its ground truth: the disparity is NaN."""
     root, left, right = _load_views(folder)
     size = (left.shape[1], left.shape[0])
-    calibration = read_calibration(root / "calib.json", size, size)
+    calibration = Calibration.load(root / "calib.json", size)
     unknown = np.full(left.shape[:2], np.nan, np.float32)
     return CalibratedStereoPair(root.name, left, right, unknown, calibration)
 

@@ -17,7 +17,7 @@ from .._shared.records import file_digest
 from ..features.keypoints import Keypoints
 from ..features.selection import Maps, SelectionOptions, select_from_maps, select_keypoints
 from ..features.sift import describe_keypoints
-from ..io.image import Images, ignore_masks, image_named, load_each, load_image, luma
+from ..io.image import Images, batch_length, ignore_masks, image_named, load_each, load_image, luma
 from .backends import RuntimeOptions, open_network
 from .heatmap import HeatmapOptions, compute_maps, memory_named, seen_size
 from .pretrained import PRETRAINED, resolve_weights
@@ -113,9 +113,13 @@ class DeepDetect:
         self._runtime = RuntimeOptions(backend, device, threads, precision)
         self._network, self.backend = open_network(self.weights, self._runtime)
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_network"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
         # Another process opens the network itself; names of weights are the same on all machines.
-        return functools.partial(DeepDetect, self._portable, **self._keywords), ()
+        vars(self).update(state, weights=resolve_weights(state["_portable"]))
+        self._network, self.backend = open_network(self.weights, self._runtime)
 
     @property
     def _keywords(self) -> dict[str, Any]:
@@ -281,7 +285,7 @@ class DeepDetect:
             OptionError: an option is out of its range, or a mask has another size.
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
-        masks = ignore_masks(ignore, len(images))
+        masks = ignore_masks(ignore, batch_length(images))
 
         def select(number: int, maps: Maps) -> Keypoints:
             return select_from_maps(maps, options, masks[number])
@@ -344,7 +348,7 @@ class DeepDetect:
 
         made = []
         for _, group in itertools.groupby(load_each(images, channels), size):
-            while batch := list(itertools.islice(group, batch_size)):
+            while batch := list(itertools.islice(group, min(batch_size, len(images)))):
                 places = [(number, rgb.shape) for number, rgb in batch]
                 loaded = [rgb for _, rgb in batch]
                 with image_named(places[0][0]), memory_named(places[0][1], len(batch)):
@@ -376,7 +380,9 @@ def find_keypoints(
     The selection is of pixels of a heat map; None takes those over 0.5.
     """
     check_selection(detector, selection)
-    if not hasattr(detector, "heatmap"):
+    if not (hasattr(detector, "heatmap") or hasattr(detector, "detect")):
+        raise OptionError(f"the detector {detector!r} has no method detect: give a DeepDetect")
+    if hasattr(detector, "detect") and not hasattr(detector, "heatmap"):
         found = detector.detect(rgb, ignore=ignore)
         if not ((found.xy >= -0.5) & (found.xy <= np.array(rgb.shape[1::-1]) - 0.5)).all():
             raise OptionError(

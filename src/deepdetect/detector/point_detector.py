@@ -16,7 +16,7 @@ from .._shared.records import file_digest
 from ..features.keypoints import Keypoints
 from ..features.selection import check_ignore, check_max_keypoints
 from ..features.sift import describe_keypoints
-from ..io.image import Images, ignore_masks, image_named, load_each, load_image, luma
+from ..io.image import Images, batch_length, ignore_masks, image_named, load_each, load_image, luma
 from .heatmap import MAX_AUTO_PIXELS, memory_named
 from .points.detection import SPREADS, Spread, detect_points
 from .points.ranker import load_ranker
@@ -124,7 +124,7 @@ class PointDetector:
             ImageError: an image cannot be read or is not fit.
             OptionError: a mask has another size than its image.
         """
-        masks, found = ignore_masks(ignore, len(images)), []
+        masks, found = ignore_masks(ignore, batch_length(images)), []
         for number, rgb in load_each(images, channels):
             with image_named(number):
                 found.append(self._find(rgb, masks[number]))

@@ -12,7 +12,7 @@ from .._shared.errors import OptionError, check_name, require_packages
 from .._shared.image_array import Channels
 from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
-from .._shared.options import suggest_keywords
+from .._shared.options import numbers_of, shown, suggest_keywords
 
 SIZES_PER_SCALE = {"diameter": 1.0, "sigma": 2.0}
 """Diameters of a keypoint of SIFT per unit of its scale, by the meaning of the scale."""
@@ -73,9 +73,9 @@ class Keypoints:
     descriptor_type: str | None = None
 
     def __post_init__(self) -> None:
-        xy = np.asarray(self.xy, np.float32)
+        xy = numbers_of("xy", self.xy, np.float32)
         xy = xy.reshape(0, 2) if xy.size == 0 else xy
-        scores = np.asarray(self.scores, np.float32)
+        scores = numbers_of("scores", self.scores, np.float32)
         if xy.ndim != 2 or xy.shape[1] != 2 or scores.shape != xy.shape[:1]:
             raise OptionError(
                 f"keypoints need (N, 2) positions and (N,) scores, "
@@ -86,15 +86,15 @@ class Keypoints:
         fields = {"xy": xy, "scores": scores}
         for name, dtype in _OPTIONAL.items():
             if getattr(self, name) is not None:
-                fields[name] = values = np.asarray(getattr(self, name), dtype)
+                fields[name] = values = numbers_of(name, getattr(self, name), dtype)
                 if values.shape != scores.shape:
                     raise OptionError(
                         f"{len(scores)} keypoints need (N,) {name}, not {values.shape}"
                     )
         if self.descriptors is not None:
-            descriptors = np.asarray(self.descriptors)
-            if descriptors.dtype != np.uint8:
-                descriptors = descriptors.astype(np.float32)
+            whole = getattr(self.descriptors, "dtype", None) == np.uint8
+            kind = np.uint8 if whole else np.float32
+            descriptors = numbers_of("descriptors", self.descriptors, kind)
             if descriptors.ndim != 2 or len(descriptors) != len(scores):
                 raise OptionError(
                     f"{len(scores)} keypoints need (N, D) descriptors, not {descriptors.shape}"
@@ -102,7 +102,10 @@ class Keypoints:
             fields["descriptors"] = descriptors
         for name, values in fields.items():
             object.__setattr__(self, name, values)
-        object.__setattr__(self, "image_size", (int(self.image_size[0]), int(self.image_size[1])))
+        size = numbers_of("image_size", self.image_size, np.float64)
+        if size.shape != (2,) or not np.isfinite(size).all():
+            raise OptionError(f"`image_size` must be (width, height), not {shown(self.image_size)}")
+        object.__setattr__(self, "image_size", (int(size[0]), int(size[1])))
 
     @classmethod
     @suggest_keywords

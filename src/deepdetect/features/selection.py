@@ -9,7 +9,7 @@ import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.opencv import cv2
-from .._shared.options import suggest_keywords
+from .._shared.options import numbers_of, suggest_keywords
 from .keypoints import Keypoints, bayer_order
 
 MAX_OFFSET_PX = 0.499
@@ -286,6 +286,7 @@ def _is_highest(
     kind = np.float32 if scores.dtype == np.float32 else np.float64
     image = np.full(shape, -np.inf, kind)
     image.ravel()[pixels] = np.maximum(scores, np.finfo(kind).min)
+    radius = min(radius, max(shape))
     window = np.ones((2 * radius + 1,) * 2, np.uint8)  # a box is dilated in linear time
     highest = cv2.dilate(image, window) == image  # beyond the border is -infinity
     kept = highest.ravel()[pixels]
@@ -330,12 +331,12 @@ def peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis: 
 
 def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Return an ignore mask as (H, W) bool; an OptionError where it differs from the image."""
-    mask = np.asarray(ignore)
+    mask = numbers_of("ignore", ignore, bool)
     if mask.shape != shape:
         raise OptionError(
             f"the ignore mask must have the shape {shape} of the image, not {mask.shape}"
         )
-    return mask.astype(bool)
+    return mask
 
 
 def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:

@@ -15,8 +15,6 @@ Other keys are ignored. The names follow Middlebury 2014, where the offset is `d
 
 from __future__ import annotations
 
-import json
-import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,8 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import MissingCalibrationError, ReconstructionError
-from .._shared.options import suggest_keywords
+from .._shared.errors import MissingCalibrationError, ReconstructionError, first_line
+from .._shared.options import shown, suggest_keywords
+from .camera_files import read_camera_file
 
 Size = tuple[int, int]
 
@@ -162,6 +161,50 @@ class Calibration:
             depth = self.camera0.focal_px[0] * baseline / moved
         return np.where(moved > 0, depth, np.inf)
 
+    @classmethod
+    @suggest_keywords
+    def load(
+        cls,
+        path: str | Path,
+        size0: Size | None = None,
+        size1: Size | None = None,
+        *,
+        views: tuple[int, int] | None = None,
+    ) -> Calibration:
+        """Read a file of cameras: a calib.json, as above, or one of OpenCV, ROS, Kalibr and others.
+
+        Formats are told by their content: https://github.com/deepdetect/deepdetect has a table of
+        them in docs/files.md.
+
+        Args:
+            path: of the file; or of a folder with the files of both cameras.
+            size0, size1: (width, height) of the images. None: as the file says.
+            views: numbers of the left and the right camera in a file of KITTI. None: those of the
+                colour cameras, 2 and 3, else 0 and 1.
+
+        Raises:
+            ReconstructionError: it is missing, damaged, contradictory, of no known format, of
+                cameras that distort, or for images of another size.
+        """
+        place = Path(path)
+        try:
+            values = read_camera_file(place, views)
+            if size0 is None:
+                if not {"width", "height"} <= {*values}:
+                    raise ReconstructionError("it does not name the images' size: give `size0`")
+                size0 = values["width"], values["height"]
+            return _calibration(values, size0, size1 or size0, str(path))
+        except ReconstructionError as error:
+            raise ReconstructionError(f"{path}: {error}") from None
+        except OSError as error:
+            missing = isinstance(error, FileNotFoundError)
+            kind = MissingCalibrationError if missing else ReconstructionError
+            raise kind(f"{path} cannot be read ({error.strerror}): check the path") from None
+        except Exception as error:  # readers of so many formats raise many kinds
+            raise ReconstructionError(
+                f"{path} is damaged ({first_line(error)}): correct it, or give the focal length"
+            ) from None
+
     def check_sizes(self, size0: Size, size1: Size) -> None:
         """Raise `ReconstructionError` unless it is for images of these (width, height)."""
         for name, camera, size in (("left", self.camera0, size0), ("right", self.camera1, size1)):
@@ -173,28 +216,7 @@ class Calibration:
                 )
 
 
-def read_calibration(path: str | Path, size0: Size, size1: Size) -> Calibration:
-    """Read a calib.json, in the format at the top of this module, for images of (width, height).
-
-    A ReconstructionError says that it is missing, damaged, contradictory, or for another size.
-    """
-    try:
-        return _calibration(json.loads(Path(path).read_bytes()), size0, size1, str(path))
-    except ReconstructionError as error:
-        raise ReconstructionError(f"{path}: {error}") from None
-    except OSError as error:
-        missing = isinstance(error, FileNotFoundError)
-        kind = MissingCalibrationError if missing else ReconstructionError
-        raise kind(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except (ValueError, RecursionError) as error:
-        raise ReconstructionError(
-            f"{path} is not valid JSON ({error}): correct it, or give the focal length"
-        ) from None
-
-
-def _calibration(values: Any, size0: Size, size1: Size, source: str) -> Calibration:
-    if not isinstance(values, dict):
-        raise ReconstructionError('it must hold one object, as {"focal_px": 1000}')
+def _calibration(values: dict[str, Any], size0: Size, size1: Size, source: str) -> Calibration:
     views = []
     for name in ("left", "right"):
         of_view = values.get(name, {})
@@ -237,7 +259,7 @@ def _numbers(name: str, value: Any, count: int) -> tuple[float, ...]:
         numbers = np.full(count, np.nan)
     if not np.isfinite(numbers).all():
         wanted = "a finite number" if count == 1 else "one or two finite numbers"
-        raise ReconstructionError(f"{name} must be {wanted}, not {reprlib.repr(value)}")
+        raise ReconstructionError(f"{name} must be {wanted}, not {shown(value)}")
     return tuple(numbers.tolist())
 
 

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import inf, lgamma, log, pi
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 
 from .._shared.errors import OptionError, check_name
 from .._shared.opencv import cv2
-from .._shared.options import check_ranges, suggest_keywords
+from .._shared.options import check_ranges, numbers_of, suggest_keywords
 from .transforms import epipolar_errors, transfer_errors, transform_points
 
 ESTIMATORS = ("magsac", "ransac")
@@ -158,8 +159,8 @@ def estimate_geometry(
         [3.0, 3.0]
     """
     check_model(model, seed, options)
-    points0 = np.asarray(points0, np.float64).reshape(-1, 2)
-    points1 = np.asarray(points1, np.float64).reshape(-1, 2)
+    points0 = numbers_of("points0", points0, np.float64, 2)
+    points1 = numbers_of("points1", points1, np.float64, 2)
     if len(points0) != len(points1):
         counts = f"{len(points0)} and {len(points1)}"
         raise OptionError(f"matches need as many positions in both images, not {counts}")
@@ -201,8 +202,8 @@ def estimate_geometry(
 def check_model(model: str, seed: int, options: GeometryOptions) -> None:
     """Raise an OptionError where `estimate_geometry` would, whatever the matches."""
     check_name("model", model, MODEL_NAMES)
-    if not 0 <= seed < 2**31:
-        raise OptionError(f"the seed must lie in [0, 2147483647], not {seed}")
+    if not (isinstance(seed, Integral) and 0 <= seed < 2**31):
+        raise OptionError(f"the seed must lie in [0, 2147483647] and be whole, not {seed}")
     if model == "essential":
         _cameras(options)
 

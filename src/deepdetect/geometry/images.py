@@ -42,7 +42,8 @@ def warp_to_reference(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Warp the second image by the homography from the first to it, into the frame of the first.
 
-    Returns the (H, W) or (H, W, 3) uint8 image, and the (H, W) bool mask of its valid pixels.
+    Returns the (H, W) or (H, W, 3) image, uint8 or uint16, and the (H, W) bool mask of its valid
+    pixels.
     """
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     warped = cv2.warpPerspective(image1, homography, size, flags=flags)

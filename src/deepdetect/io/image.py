@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -17,7 +17,19 @@ from .._shared.image_array import Channels, array_to_rgb, check_channels
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.records import was_made
-from .image_file import IMAGE_SUFFIXES, damaged_image, file_name, is_file, open_image
+from .image_file import (
+    IMAGE_SUFFIXES,
+    RAW_SUFFIXES,
+    ReadingOptions,
+    damaged_image,
+    file_name,
+    is_file,
+    is_path,
+    open_file,
+    open_image,
+    reading_options,
+)
+from .tiff import read_tiff
 
 Images = list[Any] | tuple[Any, ...] | np.ndarray
 """Several images: a list, a tuple, or a batch in an array of four dimensions."""
@@ -26,8 +38,10 @@ MINIMUM_SIDE = 16
 """Smallest width and height of an image, in pixels."""
 
 ORIENTATION_TAG = 0x0112
-# Tags of TIFF, and their values for signed integers, separate planes and a thumbnail.
-SAMPLE_FORMAT, SIGNED, PLANES, SEPARATE, SUBFILE, REDUCED, BITS = 339, 2, 284, 2, 254, 1, 258
+TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+HEADER_BYTES = 26
+"""Of a PNG file up to its bits and the type of its colours; `GREY_PNG` is one without alpha."""
+GREY_PNG = 0
 
 STRIP_PIXELS = 1 << 20
 """PIL images are converted by strips of about this size: whole copies take gigabytes."""
@@ -46,23 +60,39 @@ UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
 
 @suggest_keywords
 def load_image(
-    image: Any, *, channels: Channels = "rgb", max_megapixels: float | None = None
+    image: Any,
+    *,
+    channels: Channels = "rgb",
+    max_megapixels: float | None = None,
+    value_range: tuple[float, float] | None = None,
+    bands: tuple[int, int, int] | None = None,
+    page: int | None = None,
+    allow_truncated: bool | None = None,
 ) -> np.ndarray:
     """Read an image of any usual kind as 8-bit RGB.
 
     Args:
         image: a path; the content of an image file as bytes, or a file opened in binary mode,
             which is read from its beginning; a PIL image; or an array or a PyTorch tensor
-            (H, W), (H, W, C) or (C, H, W) of 1, 3 or 4 channels: uint8, uint16 (full range
-            0..65535) or float in [0, 1]. The fourth channel, alpha, is dropped. Files, also as
-            bytes, are turned upright by their EXIF tag. Pixels of files and PIL images are
-            of these types too, signed and 32-bit integers are refused.
+            (H, W), (H, W, C) or (C, H, W) of 1, 3 or 4 channels: uint8, uint16 or float in [0, 1].
+            The fourth channel, alpha, is dropped. Files, also as bytes, are turned upright by
+            their EXIF tag. Pixels of files and PIL images are of these types too.
         channels: the order of the colours in an array or a tensor: "bgr" for the images of
             `cv2.imread` and `cv2.VideoCapture`. Files and PIL images say theirs themselves.
         max_megapixels: larger files are refused before they are decoded, as a file of few bytes
             can hold billions of pixels. None: 200, or what `--max-megapixels` says.
             One megapixel takes 3 MB, and up to 7 MB while it is read.
-            Of TIFF and WebP, Pillow reads 178 megapixels at most (`PIL.Image.MAX_IMAGE_PIXELS`).
+            Of WebP, Pillow reads 178 megapixels at most (`PIL.Image.MAX_IMAGE_PIXELS`).
+        value_range: the numbers that are black and white, of any type: (0, 4095) of a sensor of 12
+            bits. None: what the file says; else 0 and 1 of floats, and of uint16 0 and the smallest
+            of 255, 1023, 4095, 16383 and 65535 that none exceeds. Of signed and 32-bit integers it
+            must be given.
+        bands: the three bands that become red, green and blue, numbered from 1, of TIFF files and
+            arrays: (4, 3, 2) of Landsat 8. None: the first three, of four bands without alpha and
+            more it must be given.
+        page: of files with several images, from 0 on, thumbnails not counted. None: the first of
+            the largest of TIFF, else the first.
+        allow_truncated: read files that lack their end; what is missing is black or grey.
 
     Returns:
         (H, W, 3) uint8 RGB.
@@ -71,21 +101,39 @@ def load_image(
         ImageError: the file is missing, truncated, damaged (as far as its format lets one
             see), too large or no image, the array has a wrong shape, type or range or holds
             NaN, or a side is shorter than 16 pixels.
-        MissingExtraError: it is a HEIF image, and pillow-heif is not installed.
-        OptionError: `max_megapixels` is not above 0, or the order of the colours is unknown.
+        MissingExtraError: a package for files of its kind is not installed; it is named.
+        OptionError: an option is out of its range, or the order of the colours is unknown.
 
     Example:
         >>> load_image(np.zeros((20, 30), np.uint16)).shape
         (20, 30, 3)
     """
-    name = "the image"
     check_channels(channels)
+    options = reading_options(
+        max_megapixels=max_megapixels,
+        value_range=value_range,
+        bands=bands,
+        page=page,
+        allow_truncated=allow_truncated,
+    )
+    if is_file(image):
+        return _of_size(_read_file(image, options), file_name(image))
+    # What a command is given is for files.
     if hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
-        rgb = _from_pil(image, name)
-    elif is_file(image):
-        rgb, name = _read_file(image, max_megapixels), file_name(image)
-    else:
-        rgb = array_to_rgb(image, channels, name)
+        return _of_size(_from_pil(image, "the image", value_range))
+    return _of_size(array_to_rgb(image, channels, value_range=value_range, bands=bands))
+
+
+def load_deep(image: Any, channels: Channels) -> np.ndarray:
+    """Read an image as `load_image`, but as uint16 where it has more than 8 bits."""
+    if is_file(image):
+        return _of_size(_read_file(image, reading_options(), deep=True), file_name(image))
+    if hasattr(image, "convert") and hasattr(image, "getbands"):
+        return _of_size(_from_pil(image, "the image", deep=True))
+    return _of_size(array_to_rgb(image, channels, deep=True))
+
+
+def _of_size(rgb: np.ndarray, name: str = "the image") -> np.ndarray:
     if min(rgb.shape[:2]) < MINIMUM_SIDE:
         height, width = rgb.shape[:2]
         raise ImageError(
@@ -96,15 +144,21 @@ def load_image(
 
 def load_each(images: Images, channels: Channels) -> Iterator[tuple[int, np.ndarray]]:
     """Load images when they are asked for, each with its place in the list, tuple or batch."""
-    if not isinstance(images, (list, tuple)) and getattr(images, "ndim", 0) != 4:
-        raise OptionError(
-            "a batch is a list or a 4-D array: give one image to the method without _batch"
-        )
+    batch_length(images)
     for number, image in enumerate(images):
         with image_named(number):
             rgb = load_image(image, channels=channels)
         yield number, rgb
         del rgb
+
+
+def batch_length(images: Images) -> int:
+    """Return how many images there are; refuse what is no batch."""
+    if not isinstance(images, (list, tuple)) and getattr(images, "ndim", 0) != 4:
+        raise OptionError(
+            "a batch is a list or a 4-D array: give one image to the method without _batch"
+        )
+    return len(images)
 
 
 @contextmanager
@@ -179,58 +233,70 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     return images
 
 
-def _read_file(source: Any, max_megapixels: float | None) -> np.ndarray:
-    with open_image(source, max_megapixels=max_megapixels) as image:
-        rgb = _from_pil(image, file_name(source))
-        orientation = _orientation(image)
-    del image  # its pixels, before they are needed once more
+def _read_file(source: Any, options: ReadingOptions, deep: bool = False) -> np.ndarray:
+    with open_file(source) as (file, name):
+        start = file.read(HEADER_BYTES)
+        if start[:4] in TIFF_STARTS and not name.lower().endswith(RAW_SUFFIXES):
+            rgb, orientation = read_tiff(file, name, options, deep)
+        elif options.bands is not None:
+            raise OptionError(f"`bands` are of TIFF files and arrays, and {name} is none")
+        else:
+            given = source if is_path(source) else file
+            with open_image(given, options=options) as image:
+                if image.format == "PNG" and start[24] == 16 and start[25] != GREY_PNG:
+                    rgb = _deep_png(file, name, options, deep)
+                else:
+                    rgb = _from_pil(image, name, value_range=options.value_range, deep=deep)
+                orientation = _orientation(image)
+            del image  # its pixels, before they are needed once more
     return UPRIGHT[orientation](rgb) if orientation in UPRIGHT else rgb
+
+
+def _deep_png(file: BinaryIO, name: str, options: ReadingOptions, deep: bool) -> np.ndarray:
+    """Read a PNG file of 16 bits and several channels, of which Pillow keeps 8."""
+    file.seek(0)
+    values = cv2.imdecode(np.frombuffer(file.read(), np.uint8), cv2.IMREAD_UNCHANGED)
+    if values is None:
+        raise damaged_image(name, "it cannot be decoded")
+    return array_to_rgb(values, "bgr", name, value_range=options.value_range, deep=deep)
 
 
 def _orientation(image: Any) -> Any:
     """Return the EXIF orientation of a loaded image; a broken tag is ignored."""
-    if image.format == "TIFF":  # Pillow has turned it when it loaded it
-        return 1
     try:
         return image.getexif().get(ORIENTATION_TAG, 1)
     except Exception:  # Pillow's readers raise many kinds
         return 1
 
 
-def _from_pil(image: Any, name: str) -> np.ndarray:
+def _from_pil(
+    image: Any,
+    name: str,
+    value_range: tuple[float, float] | None = None,
+    deep: bool = False,
+) -> np.ndarray:
     try:
         image.load()
     except Exception as error:  # Pillow's decoders raise many kinds
         raise damaged_image(name, error) from None
-    # Pillow holds 16-bit PGM, and 10.3 also 16-bit PNG, in 32 bits; all else may have any range.
-    wide = image.mode == "I" and image.format not in ("PNG", "PPM")
-    tags = getattr(image, "tag_v2", {})
-    if tags.get(PLANES) == SEPARATE and max(tags.get(BITS, (8,))) > 8:  # Pillow makes stripes
-        raise ImageError(f"{name} holds separate planes of 16 bits: save it interleaved")
-    if tags.get(SUBFILE, 0) & REDUCED:
-        raise ImageError(f"{name} begins with a thumbnail: save the full image first")
-    if wide or SIGNED in tags.get(SAMPLE_FORMAT, ()):
-        raise ImageError(
-            f"{name} holds 32-bit or signed integers, whose range is not known: convert it "
-            "to 8 bits (mode L or RGB), 16 bits without sign (mode I;16) or float in [0, 1]"
-        )
+    if image.mode.startswith(("I", "F")):
+        values = np.asarray(image)
+        if image.mode == "I" and image.format in ("PNG", "PPM"):  # Pillow's form of their 16 bits
+            values = values.astype(np.uint16)
+        return array_to_rgb(values, name=name, value_range=value_range, deep=deep)
     width, height = image.size
     rgb = np.empty((height, width, 3), np.uint8)
     rows = max(1, STRIP_PIXELS // max(1, width))
     for top in range(0, height, rows):
         bottom = min(top + rows, height)
         strip = image if rows >= height else image.crop((0, top, width, bottom))
-        rgb[top:bottom] = _strip_to_rgb(strip, name)
-    return rgb
+        rgb[top:bottom] = _strip_to_rgb(strip)
+    return rgb if value_range is None else array_to_rgb(rgb, name=name, value_range=value_range)
 
 
-def _strip_to_rgb(image: Any, name: str) -> np.ndarray:
+def _strip_to_rgb(image: Any) -> np.ndarray:
     if image.mode == "P" and isinstance(image.info.get("transparency"), bytes):
         image = image.convert("RGBA")  # Pillow warns when it drops such an alpha at once
     if image.mode == "La":
         image = image.convert("LA")  # the only mode that Pillow converts it to
-    if image.mode == "I":
-        return array_to_rgb(np.asarray(image).astype(np.uint16), name=name)
-    if image.mode.startswith("I;16") or image.mode == "F":
-        return array_to_rgb(np.asarray(image), name=name)
     return np.asarray(image.convert("RGB"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import stat
 import struct
@@ -11,7 +12,11 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from dataclasses import dataclass, replace
+from numbers import Integral, Real
 from typing import Any, BinaryIO
+
+import numpy as np
 
 from .._shared.errors import (
     DeepDetectError,
@@ -21,6 +26,7 @@ from .._shared.errors import (
     OptionError,
     first_line,
 )
+from .._shared.options import shown, suggest_keywords
 
 FORMATS = {
     "JPEG": ".jpg .jpeg .jpe .jfif",
@@ -71,34 +77,79 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
 """In bytes 8 to 12 of HEIF files, which telephones write (ISO/IEC 23008-12)."""
 
-_limit: ContextVar[float] = ContextVar("max_megapixels", default=MAX_MEGAPIXELS)
+
+@suggest_keywords
+@dataclass(frozen=True)
+class ReadingOptions:
+    """How image files are read; the fields are those of `load_image`."""
+
+    max_megapixels: float = MAX_MEGAPIXELS
+    value_range: tuple[float, float] | None = None
+    bands: tuple[int, int, int] | None = None
+    page: int | None = None
+    allow_truncated: bool = False
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.max_megapixels, Real) and self.max_megapixels > 0):
+            raise OptionError(f"`max_megapixels` must be above 0, not {self.max_megapixels}")
+        if self.page is not None and not (isinstance(self.page, Integral) and self.page >= 0):
+            raise OptionError(f"`page` must be a whole number from 0 on, not {self.page!r}")
+        for name, count, what in (("bands", 3, "numbers from 1 on"), ("value_range", 2, "numbers")):
+            value = getattr(self, name)
+            if value is None:
+                continue
+            numbers = tuple(value) if np.iterable(value) else ()
+            fits = len(numbers) == count and all(isinstance(each, Real) for each in numbers)
+            if fits and name == "bands":
+                fits = all(isinstance(each, Integral) and each > 0 for each in numbers)
+            elif fits:
+                fits = bool(0 < numbers[1] - numbers[0] < math.inf)
+                what = "numbers, black and a larger white"
+            if not fits:
+                raise OptionError(f"`{name}` must be {count} {what}, not {shown(value)}")
+            object.__setattr__(self, name, numbers)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the pixels depend on, of what is not as usual."""
+        values = {**vars(self), "max_megapixels": None}
+        return {name: value for name, value in values.items() if value not in (None, False)}
+
+    def check_size(self, name: str, size: tuple[int, int]) -> None:
+        """Raise an ImageError for an image of too many pixels."""
+        width, height = size
+        if width * height > 1e6 * self.max_megapixels:
+            raise ImageError(
+                f"{name} has {width}x{height} pixels, which is over {self.max_megapixels:g} "
+                "megapixels: make it smaller, or allow more by `max_megapixels`"
+            )
+
+
+_USUAL = ReadingOptions()
+_reading: ContextVar[ReadingOptions] = ContextVar("reading", default=_USUAL)
 
 
 @contextmanager
-def limit_megapixels(max_megapixels: float) -> Iterator[None]:
-    """Refuse larger images than these in the block, where a call gives no limit of its own.
+def read_with(options: ReadingOptions) -> Iterator[None]:
+    """Read image files with these options in the block, where a call gives none of its own.
 
     It is for commands, since images are read deep below them. Other processes do not know it.
     """
-    token = _limit.set(megapixel_limit(max_megapixels))
+    token = _reading.set(options)
     try:
         yield
     finally:
-        _limit.reset(token)
+        _reading.reset(token)
 
 
-def megapixel_limit(max_megapixels: float | None) -> float:
-    """Return the limit that is given, or what `--max-megapixels` says, for other processes."""
-    if max_megapixels is None:
-        return _limit.get()
-    if not (isinstance(max_megapixels, (int, float)) and max_megapixels > 0):
-        raise OptionError(f"`max_megapixels` must be above 0, not {max_megapixels}")
-    return max_megapixels
+def reading_options(**given: Any) -> ReadingOptions:
+    """Return the options that are given and not None, and else those of the command."""
+    return replace(_reading.get(), **{n: value for n, value in given.items() if value is not None})
 
 
 @contextmanager
 def open_image(
-    source: Any, *, what: str = "image", max_megapixels: float | None = None
+    source: Any, *, what: str = "image", options: ReadingOptions | None = None
 ) -> Iterator[Any]:
     """Open an image file as a PIL image; its pixels are decoded when it is loaded.
 
@@ -111,19 +162,43 @@ def open_image(
             larger than `max_megapixels` or no image.
         MissingExtraError: it is a HEIF or raw image, and the package for it is not installed.
     """
-    limit = megapixel_limit(max_megapixels)
+    options = options or reading_options()
+    with open_file(source, what) as (file, name):
+        if not options.allow_truncated:
+            _check_png(file, name)
+        with identify(file, name) as image:
+            options.check_size(name, image.size)
+            if options.page:
+                if options.page >= (pages := getattr(image, "n_frames", 1)):
+                    raise ImageError(f"{name} has {pages} pages: give a `page` below that")
+                image.seek(options.page)
+            with _truncated(options.allow_truncated):
+                yield image
+
+
+@contextmanager
+def _truncated(allowed: bool) -> Iterator[None]:
+    """Let Pillow read files that lack their end; meanwhile other threads do so, too."""
+    from PIL import ImageFile
+
+    before = ImageFile.LOAD_TRUNCATED_IMAGES
+    ImageFile.LOAD_TRUNCATED_IMAGES = before or allowed
+    try:
+        yield
+    finally:
+        ImageFile.LOAD_TRUNCATED_IMAGES = before
+
+
+@contextmanager
+def open_file(source: Any, what: str = "image") -> Iterator[tuple[BinaryIO, str]]:
+    """Open a source of `open_image` as a binary file, and say what errors call it.
+
+    Errors of Pillow in the block become `ImageError`.
+    """
     name = file_name(source, what)
     try:
         with _binary_file(source, name) as file:
-            _check_png(file, name)
-            with _identify(file, name) as image:
-                width, height = image.size
-                if width * height > 1e6 * limit:
-                    raise ImageError(
-                        f"{name} has {width}x{height} pixels, which is over {limit:g} megapixels: "
-                        "make it smaller, or allow more by `max_megapixels`"
-                    )
-                yield image
+            yield file, name
     except DeepDetectError:
         raise
     except FileNotFoundError:
@@ -208,7 +283,7 @@ def _check_png(file: BinaryIO, name: str) -> None:
     file.seek(0)
 
 
-def _identify(file: BinaryIO, name: str) -> Any:
+def identify(file: BinaryIO, name: str) -> Any:
     """Open a file with the first of the formats that takes it.
 
     As `PIL.Image.open`, which has a limit of its own that only the whole program can raise.
@@ -217,6 +292,7 @@ def _identify(file: BinaryIO, name: str) -> Any:
 
     _hide_warning_of_large_images()
     Image.init()  # registers all formats; that of AVIF is not in every Pillow
+    file.seek(0)
     start = file.read(SIGNATURE_BYTES)
     heif = start[4:8] == b"ftyp" and start[8:12] in HEIF_BRANDS
     if heif:
@@ -231,7 +307,7 @@ def _identify(file: BinaryIO, name: str) -> Any:
                 "a program of its own, and give an array or a PNG file"
             )
     if name.lower().endswith(RAW_SUFFIXES):
-        return _develop(file, name)
+        return develop(file, name)
     for key in FORMATS:
         if key not in Image.OPEN:
             continue
@@ -248,7 +324,7 @@ def _identify(file: BinaryIO, name: str) -> Any:
     raise ImageError(f"{name} is not an image that can be read: use PNG or JPEG")
 
 
-def _develop(file: BinaryIO, name: str) -> Any:
+def develop(file: BinaryIO, name: str) -> Any:
     """Develop a raw photograph to a PIL image, upright, with the camera's white balance."""
     from PIL import Image
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .image_file import open_image
+from .image_file import open_image, reading_options
 
 
 def save_mask(mask: np.ndarray, path: str | Path) -> None:
@@ -32,7 +32,8 @@ def load_mask(source: Any, *, max_megapixels: float | None = None) -> np.ndarray
 
     In a file of zeros and ones alone, the ones are True. Arguments and errors: see `open_image`.
     """
-    with open_image(source, what="mask", max_megapixels=max_megapixels) as opened:
+    options = reading_options(max_megapixels=max_megapixels)
+    with open_image(source, what="mask", options=options) as opened:
         deep = opened.mode.startswith("I")  # 16 bits per pixel
         values = np.asarray(opened if deep else opened.convert("L"))
     return values > (0 if values.max() <= 1 else 32767 if deep else 127)

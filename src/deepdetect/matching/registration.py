@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import RegistrationError
-from .._shared.image_array import Channels
+from .._shared.image_array import Channels, array_to_rgb
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.detector import AnyDetector
 from ..features.selection import SelectionOptions
 from ..geometry.images import downscale, median_local_zncc, warp_to_reference
 from ..geometry.transforms import scaled_homography
-from ..io.image import Images, load_image, luma
+from ..io.image import Images, load_deep, load_image, luma
 from .pipeline import match_images
 
 SQUARES = 8
@@ -41,7 +41,8 @@ class Registration:
     Attributes:
         homography: (3, 3) from the first image to the second.
         first: (H, W, 3) uint8 RGB, the first image.
-        warped: (H, W, 3) uint8 RGB, the second in its frame, black where it has nothing.
+        warped: (H, W, 3) RGB, the second in its frame, black where it has nothing: uint8, or
+            uint16 where the second has more than 8 bits.
         valid: (H, W) bool, where the second image was warped to.
         matches: number of dense matches that hold.
         zncc: median local ZNCC of the two over what both show, in [-1, 1].
@@ -68,11 +69,11 @@ class Registration:
         side = max(1, min(height, width) // SQUARES)
         row, column = np.indices((height, width)) // side
         second = self.valid & ((row + column) % 2 == 1)
-        return np.where(second[..., None], self.warped, self.first)
+        return np.where(second[..., None], _shallow(self.warped), self.first)
 
     def difference(self) -> np.ndarray:
         """Return how far apart the colours are, 0 where only one has something; (H, W, 3) uint8."""
-        return np.where(self.valid[..., None], cv2.absdiff(self.first, self.warped), 0)
+        return np.where(self.valid[..., None], cv2.absdiff(self.first, _shallow(self.warped)), 0)
 
 
 @suggest_keywords
@@ -111,7 +112,8 @@ def register(
         >>> registration.homography[:2, 2].round(1).tolist()
         [-12.0, 0.0]
     """
-    first, second = (load_image(image, channels=channels) for image in (image0, image1))
+    first, deep = load_image(image0, channels=channels), load_deep(image1, channels)
+    second = _shallow(deep)
     matches = match_images(
         first,
         second,
@@ -134,9 +136,14 @@ def register(
             "the images contradict the homography that their matches agree with: where they would "
             "overlap they are no more alike than images of different things"
         )
-    warped, valid = warp_to_reference(second, homography, (first.shape[1], first.shape[0]))
+    warped, valid = warp_to_reference(deep, homography, (first.shape[1], first.shape[0]))
     zncc = median_local_zncc(*grays, homography)
     return Registration(homography, first, warped, valid, len(matches), zncc)
+
+
+def _shallow(rgb: np.ndarray) -> np.ndarray:
+    """Return an image of 8 or 16 bits as one of 8."""
+    return rgb if rgb.dtype == np.uint8 else array_to_rgb(rgb, white=65535)
 
 
 def agree(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> bool:

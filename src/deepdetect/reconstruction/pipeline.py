@@ -6,6 +6,7 @@ disparity map, from which the keypoints of the left image take their points.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from .._shared.progress import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, find_keypoints
 from ..features.keypoints import Keypoints
 from ..features.selection import SelectionOptions
-from ..geometry.camera import Calibration, Camera, read_calibration
+from ..geometry.camera import Calibration, Camera
 from ..geometry.estimation import GeometryOptions, check_model
 from ..geometry.images import window_sums
 from ..io.exif import calibration_from_exif
@@ -76,8 +77,8 @@ def reconstruct(
             the first one, whose frame the points are in.
         detector: as of `match_images`; default `DeepDetect("dense")`.
         channels: order of the colours in images that are arrays, as of `load_image`.
-        calibration: JSON file of the cameras (docs/reconstruction.md describes its format), or a
-            `Calibration`. Without one the focal length is taken from `focal_px`, or from EXIF.
+        calibration: file of the cameras, as of `Calibration.load`, or a `Calibration`. Without one
+            the focal length is taken from `focal_px`, or from EXIF.
         focal_px: focal length in pixels of both cameras, instead of a calibration.
         rectified: whether matches lie on the same row of both images. None: detected.
         selection: which pixels of a heat map become keypoints; None: those over 0.5. A density of 1
@@ -270,7 +271,10 @@ def _calibration(
         given.check_sizes(*sizes)
         return given
     if given is not None:
-        return read_calibration(given, *sizes)
+        names = [str(image) if isinstance(image, (str, Path)) else "" for image in images]
+        left, right = (re.search(r"image_0?(\d)\b", name) for name in names)  # of KITTI
+        views = (int(left[1]), int(right[1])) if left and right else None
+        return Calibration.load(given, *sizes, views=views)
     if focal_px is not None:
         camera0, camera1 = (Camera(size, focal_px) for size in sizes)
         return Calibration(camera0, camera1, source="focal_px")

@@ -21,7 +21,7 @@ from .._shared.opencv import import_pycolmap as import_pycolmap
 from ..batch.extraction import ROOT_SIFT_NORM
 from ..batch.pair_list import Pair
 from ..features.keypoints import UNSET_ANGLE, Keypoints
-from ..geometry.camera import Calibration, Camera, read_calibration
+from ..geometry.camera import Calibration, Camera
 from ..io.exif import camera_from_exif
 
 PIXEL_CENTRE = 0.5
@@ -145,7 +145,7 @@ def known_cameras(
     for name, size in sizes.items():
         try:
             if isinstance(calibration, (str, Path)):
-                camera = read_calibration(calibration, size, size).camera0
+                camera = Calibration.load(calibration, size).camera0
             else:
                 camera = calibration if isinstance(calibration, Camera) else calibration.camera0
                 Calibration(camera, camera).check_sizes(size, size)

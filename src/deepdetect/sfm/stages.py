@@ -34,7 +34,7 @@ from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
 from ..features.selection import SelectionOptions
 from ..io.image import find_images
-from ..io.image_file import IMAGE_SUFFIXES
+from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, read_with, reading_options
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
 from .dense import dense_points, find_references, limited_view, merge_dense_points
 from .mapping import RegisteredImage, SparseModel, adjust, map_images, normalise_model, verify_pairs
@@ -276,7 +276,9 @@ class Stages:
         # Those of a damaged file are made again.
         made = {path: arrays["dense"] for path in paths if (arrays := load_arrays(path))}
         tasks = [(path, images) for path, images in paths.items() if path not in made]
-        work = partial(_dense_task, folder=folder.absolute(), stride_px=stride)
+        work = partial(
+            _dense_task, folder=folder.absolute(), stride_px=stride, reading=reading_options()
+        )
         with progress(len(paths), "dense points", "image", self.quiet, len(made)) as bar:
             for path, points in map_in_processes(work, tasks, self._dense_workers(sparse)):
                 made[path] = points
@@ -292,9 +294,10 @@ class Stages:
 
 
 def _dense_task(
-    task: tuple[Path, list[RegisteredImage]], folder: Path, stride_px: int
+    task: tuple[Path, list[RegisteredImage]], folder: Path, stride_px: int, reading: ReadingOptions
 ) -> tuple[Path, np.ndarray]:
     path, images = task
-    points = dense_points(folder, images, stride_px)
+    with read_with(reading):
+        points = dense_points(folder, images, stride_px)
     save_arrays(path, {"dense": points}, compress=False)
     return path, points

@@ -45,7 +45,10 @@ WHITE = (255, 255, 255)
 
 
 def save_picture(rgb: np.ndarray, path: str | Path) -> None:
-    """Write a (H, W, 3) uint8 RGB picture as .png, .jpg or .jpeg, whole or not at all."""
+    """Write a (H, W, 3) uint8 RGB picture as .png, .jpg or .jpeg, whole or not at all.
+
+    A PNG file may also be of uint16.
+    """
     suffix = picture_suffix(path)
     # Checked before OpenCV is asked, which would also log it.
     if suffix != ".png" and max(rgb.shape[:2]) > MAX_JPEG_SIDE_PX:

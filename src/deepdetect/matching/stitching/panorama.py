@@ -144,7 +144,7 @@ def stitch(
         (160, 240, 3)
     """
     check_name("projection", projection, PROJECTIONS)
-    if len(images) < 2:
+    if not isinstance(images, Sequence | np.ndarray) or len(images) < 2:
         raise OptionError("a panorama needs two images or more: give more images")
     if reference is not None and not 0 <= reference < len(images):
         raise OptionError(

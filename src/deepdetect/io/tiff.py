@@ -1,0 +1,202 @@
+"""TIFF files: which of their images is read, and what its numbers mean.
+
+Each tag that changes what pixels mean is honoured, or refused by name.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import os
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from .._shared.errors import ImageError, MissingExtraError
+from .._shared.image_array import array_to_rgb
+from .image_file import ReadingOptions, damaged_image, develop, identify
+
+MIN_IS_WHITE, MIN_IS_BLACK, RGB, PALETTE, CMYK, YCBCR = 0, 1, 2, 3, 5, 6
+"""Photometric interpretations that are read."""
+
+MOSAICS = (32803, 34892)
+"""Those of raw photographs: a mosaic of colour filters, and linear raw."""
+
+JPEG = (6, 7)
+"""Compressions that hold YCbCr."""
+
+ALPHA = (1, 2)
+"""Extra samples that are no band."""
+
+ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
+"""Tags; the last is of GDAL."""
+
+MAX_BYTES_PER_PIXEL = 256
+"""Of all bands: a small file can claim any number of them."""
+
+
+def read_tiff(
+    file: BinaryIO, name: str, options: ReadingOptions, deep: bool
+) -> tuple[np.ndarray, int]:
+    """Read an image of a TIFF file.
+
+    Returns:
+        (H, W, 3) RGB as it is stored, uint8, or uint16 of more bits where `deep`; and its EXIF
+        orientation.
+
+    Raises:
+        ImageError: as of `load_image`.
+        MissingExtraError: it is a raw photograph, or compressed in a way that needs imagecodecs.
+    """
+    from tifffile import TiffFile
+
+    logger = logging.getLogger("tifffile")
+    if not logger.handlers:  # or it writes to standard error
+        logger.addHandler(logging.NullHandler())
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    with TiffFile(file, name="image.tif") as tiff:
+        stored = [*tiff.pages]
+        page = _chosen_page(stored, name, options)
+        options.check_size(name, (page.imagewidth, page.imagelength))
+        photometric = _checked_kind(page, name)
+        if photometric in MOSAICS or stored[0].is_dng:
+            return np.asarray(develop(file, name)), 1
+        last = max(map(sum, zip(page.dataoffsets, page.databytecounts, strict=False)), default=0)
+        if last > size:
+            if not options.allow_truncated:
+                raise damaged_image(name, f"{last - size:,} bytes are missing at its end")
+            file.seek(0)
+            filled = io.BytesIO(file.read() + bytes(last - size))
+            return read_tiff(filled, name, options, deep)
+        try:
+            array = page.asarray(squeeze=False)
+        except Exception as error:  # tifffile and its decoders raise many kinds
+            if "imagecodecs" not in str(error):
+                raise damaged_image(name, error) from None
+            return _read_by_pillow(file, stored, page, name, options), 1
+        # (separate bands, depth, height, width, bands) to (height, width, bands).
+        bands = np.moveaxis(array[:, 0], 0, -1).reshape(*array.shape[2:4], -1)
+        tag = page.tags.get(ORIENTATION)
+        return _to_rgb(bands, page, name, options, deep), int(tag.value) if tag else 1
+
+
+def _chosen_page(stored: list[Any], name: str, options: ReadingOptions) -> Any:
+    """Return the page that is asked for, or the largest; thumbnails and masks are none."""
+    pages = [page for page in stored if not (page.is_reduced or page.is_mask)]
+    if not pages:
+        below = [each for page in stored for each in page.pages or ()]
+        pages = [page for page in below if not (page.is_reduced or page.is_mask)] or stored[:1]
+    if options.page is None:
+        return max(pages, key=lambda page: page.imagewidth * page.imagelength)
+    if options.page >= len(pages):
+        raise ImageError(f"{name} has {len(pages)} pages: give a `page` below that")
+    return pages[options.page]
+
+
+def _checked_kind(page: Any, name: str) -> int:
+    """Return the photometric interpretation; refuse what is not read."""
+    photometric, count = int(page.photometric), page.samplesperpixel
+    known = photometric in (MIN_IS_WHITE, MIN_IS_BLACK, RGB, *MOSAICS)
+    known |= photometric == PALETTE and count == 1 and page.colormap is not None
+    known |= photometric == CMYK and page.bitspersample == 8 and count == 4
+    known |= photometric == YCBCR and page.compression in JPEG
+    what = getattr(page.photometric, "name", str(photometric)) + " pixels"
+    if page.imagedepth > 1:
+        known, what = False, "a volume"
+    elif page.dtype is None or page.dtype.kind not in "buif":
+        known, what = False, "complex or mixed numbers"
+    elif page.nbytes > MAX_BYTES_PER_PIXEL * page.imagewidth * page.imagelength:
+        known, what = False, f"{count} bands"
+    if not known:
+        raise ImageError(f"{name} holds {what}, which are not read: convert it to RGB")
+    return photometric
+
+
+def _to_rgb(
+    bands: np.ndarray, page: Any, name: str, options: ReadingOptions, deep: bool
+) -> np.ndarray:
+    """Return the RGB image that (H, W, bands) numbers are by the tags of their page."""
+    photometric = int(page.photometric)
+    chosen = _chosen_bands(bands, page, name, options)
+    absent = _no_data(chosen, page)
+    if absent is not None:
+        chosen = np.where(absent, chosen.dtype.type(0), chosen)
+    if photometric == PALETTE:
+        colours = page.colormap if page.colormap.max() < 256 else page.colormap >> 8
+        rgb = colours.T.astype(np.uint8)[chosen[:, :, 0].astype(np.intp)]
+    elif photometric == CMYK:
+        from PIL import Image
+
+        rgb = np.array(Image.fromarray(np.ascontiguousarray(chosen), "CMYK").convert("RGB"))
+    else:
+        rgb = array_to_rgb(
+            chosen, name=name, value_range=options.value_range, white=_white(page), deep=deep
+        )
+    if photometric == MIN_IS_WHITE:
+        rgb = ~rgb
+    if absent is not None:
+        rgb[absent.any(axis=2)] = 0
+    return rgb
+
+
+def _chosen_bands(bands: np.ndarray, page: Any, name: str, options: ReadingOptions) -> np.ndarray:
+    count, photometric = bands.shape[2], int(page.photometric)
+    whole = photometric in (PALETTE, CMYK)
+    if options.bands is not None:
+        if whole or max(options.bands) > count:
+            raise ImageError(f"{name} has {count} bands: leave `bands` out, or choose of these")
+        return bands[:, :, np.array(options.bands) - 1]
+    grey = photometric in (MIN_IS_WHITE, MIN_IS_BLACK)
+    alpha = bool(page.extrasamples) and page.extrasamples[-1] in ALPHA
+    if not whole and not (count >= 3 if not grey else count - alpha in (1, 3)):
+        raise ImageError(f"{name} has {count} bands: choose three, as `bands=(3, 2, 1)`")
+    return bands if whole else bands[:, :, : count - alpha if grey else 3]
+
+
+def _no_data(chosen: np.ndarray, page: Any) -> np.ndarray | None:
+    tag = page.tags.get(NO_DATA)
+    try:
+        value = float(tag.value) if tag is not None else 0.0
+    except (TypeError, ValueError):
+        return None
+    if value == 0:  # it is black already
+        return None
+    return np.isnan(chosen) if np.isnan(value) else chosen == value
+
+
+def _white(page: Any) -> int | None:
+    """Return the number that is white, where the tags tell it."""
+    bits = page.bitspersample
+    if page.dtype.kind != "u" or bits > 16 or bits == 8:
+        return None
+    if bits < 16:
+        return (1 << bits) - 1
+    tag = page.tags.get(MAX_SAMPLE_VALUE)
+    values = np.atleast_1d(tag.value if tag else 0)
+    largest = int(values.max())
+    # The largest of the pixels, as the standard has it, is hardly one below a power of two.
+    return largest if largest > 255 and not largest & (largest + 1) else None
+
+
+def _read_by_pillow(
+    file: BinaryIO, stored: list[Any], page: Any, name: str, options: ReadingOptions
+) -> np.ndarray:
+    """Decode what tifffile cannot without imagecodecs, where Pillow is known to be right."""
+    bits, photometric = page.bitspersample, int(page.photometric)
+    plain = page.dtype.kind in ("b", "u") and (
+        bits in (1, 8) or (bits == 16 and page.samplesperpixel == 1)
+    )
+    plain &= not (bits == 16 and photometric != MIN_IS_BLACK) and page.samplesperpixel <= 4
+    plain &= options.bands is None and page.tags.get(NO_DATA) is None
+    if not plain or page not in stored:
+        raise MissingExtraError(
+            f"{name} is compressed by {page.compression.name} with {bits} bits a number: run pip "
+            "install imagecodecs to read it"
+        )
+    with identify(file, name) as image:
+        image.seek(stored.index(page))
+        image.load()
+        if bits == 16:
+            return array_to_rgb(np.asarray(image), name=name, value_range=options.value_range)
+        return np.asarray(image.convert("RGB"))
