@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, DeepDetectError, Keypoints
+from deepdetect import DeepDetect, DeepDetectError, Keypoints, load_image
 from deepdetect.detector.detector import find_keypoints
 from deepdetect.interchange.sources import read_collection
 from deepdetect.io.tables import load_keypoints
@@ -255,6 +257,38 @@ def test_pictures_of_an_earlier_run_are_no_inputs(run, photos: Path) -> None:
     result = run("detect", folder, "-o", "link")
     assert result.exit_code == 2
     assert "results of earlier runs" in result.stderr
+
+
+def test_pictures_that_a_pattern_names_beside_their_image_are_left_out(run, photos: Path) -> None:
+    shutil.copy(photos / "cat.jpg", "cat.jpg")
+    assert run("detect", "cat.jpg", "-o", ".").exit_code == 0
+    again = run("detect", *sorted(Path().glob("*.jpg")), "-o", ".", "--json")
+    assert [image["image"] for image in json.loads(again.stdout)["images"]] == ["cat.jpg"]
+    assert "cat_dense.jpg was made of others" in again.stderr
+
+
+@pytest.mark.parametrize("name", ["-", "/dev/stdin"])
+def test_images_come_from_standard_input(name: str, photos: Path, tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "deepdetect", "match", name, str(photos / "cat.jpg"), "--json"]
+    words += ["-o", str(tmp_path)]
+    content = (photos / "cat.jpg").read_bytes()
+    done = subprocess.run(words, input=content, capture_output=True)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    np.testing.assert_allclose(found["matrix"], np.eye(3), atol=1e-6)
+    assert Path(found["file"]).name == "stdin_cat_matches.npz"
+
+
+@pytest.mark.skipif(not os.path.isdir("/dev/fd"), reason="needs /dev/fd")
+def test_images_come_from_pipes_of_a_shell(photos: Path) -> None:
+    content = (photos / "cat.jpg").read_bytes()
+    read, write = os.pipe()
+    with ThreadPoolExecutor(1) as pool, os.fdopen(write, "wb") as file:
+        done = pool.submit(load_image, f"/dev/fd/{read}")
+        file.write(content)
+        file.close()
+        np.testing.assert_array_equal(done.result(60), load_image(content))
+    os.close(read)
 
 
 def test_an_input_is_never_written_over(run, photos: Path) -> None:

@@ -26,7 +26,7 @@ from deepdetect import (
 from deepdetect.datasets.posed_images import load_posed_scenes
 from deepdetect.sfm import MultiViewOptions, MultiViewReconstruction, stages
 from deepdetect.sfm.mapping import read_sparse_model
-from deepdetect.sfm.stages import Stages
+from deepdetect.sfm.stages import Stages, check_images
 
 QUICK = {
     "workers": 1,
@@ -267,16 +267,18 @@ def test_too_few_photographs_are_one_sentence(
     one_line(caught.value)
 
 
-def test_two_files_of_one_name_are_refused(tmp_path: Path, photo_path: Path, pycolmap) -> None:
-    other = tmp_path / "b" / photo_path.name
-    other.parent.mkdir()
-    shutil.copy(photo_path, other)
-    with pytest.raises(OptionError, match="have one name"):
-        reconstruct_many([photo_path, other], tmp_path / "model")
+def test_two_files_of_one_name_keep_their_folders(
+    tmp_path: Path, photo_path: Path, pycolmap
+) -> None:
+    paths = [tmp_path / name / photo_path.name for name in "ab"]
+    for path in paths:
+        path.parent.mkdir()
+        shutil.copy(photo_path, path)
+    assert check_images([*paths, paths[0]]) == {f"{p.parent.name}/{p.name}": p for p in paths}
     with pytest.raises(ImageError, match="there is no file"):
         reconstruct_many([photo_path, tmp_path / "missing.jpg"], tmp_path / "model")
     with pytest.raises(OptionError, match="other must end as images do"):
-        reconstruct_many([photo_path, other.rename(tmp_path / "other")], tmp_path / "model")
+        reconstruct_many([photo_path, paths[1].rename(tmp_path / "other")], tmp_path / "model")
 
 
 def test_without_pycolmap_there_is_one_sentence(tmp_path: Path, monkeypatch, one_line) -> None:

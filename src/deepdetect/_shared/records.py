@@ -255,6 +255,12 @@ def _is_unchanged(path: Path, record: Mapping[str, Any]) -> bool:
     return list(file_state(path)) == record["state"] or file_digest(path) == record["digest"]
 
 
+def inputs_of(path: Path) -> list[str]:
+    """Return what an output was made from, as resolved paths; nothing of what is no output."""
+    record = _read(path)
+    return [] if record is None else list(record["inputs"])
+
+
 def was_made(path: Path, root: Path) -> bool:
     """Whether a file below a folder was made by these commands, or lies in a folder that was."""
     return path != root and (_record(path).is_file() or was_made(path.parent, root))

@@ -170,7 +170,8 @@ def _call(words: Sequence[str]) -> int:
     if module is not None:
         importlib.import_module(f".{module}", __package__)  # with its own errors
     FORMATTER.shows_all = "--help-all" in words
-    words = ["--help" if word == "--help-all" else word for word in words]
+    meant = {"--help-all": "--help", "-": "/dev/stdin"}
+    words = [meant.get(word, word) for word in words]
     app = make_app(summaries=module is None)
     command, bound, _ = app.parse_args(words, print_error=False, exit_on_error=False)
     code = command(*bound.args, **bound.kwargs) or 0

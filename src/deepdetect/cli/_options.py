@@ -21,7 +21,7 @@ from cyclopts import Parameter
 from .._shared.atomic import atomic_path
 from .._shared.errors import BatchError, DeepDetectError, OptionError
 from .._shared.progress import STDERR
-from .._shared.records import Outputs
+from .._shared.records import Outputs, inputs_of
 from .._shared.signals import exit_by_signal, handle_signals
 from ..io.image import find_images, load_image
 from ..io.image_file import MAX_MEGAPIXELS, read_with, reading_options
@@ -201,13 +201,19 @@ def output_folder(output: Path) -> Path:
 def expand_images(paths: Sequence[Path], output: Path) -> dict[Path, Path]:
     """Replace folders by the images below them, without those in the folder of the results.
 
+    Pictures that were made of others of the images are left out.
+
     Returns:
         By image what its results are called, without a suffix: its path below the folder that was
         given. Where two have one name, below the folder of all; a suffix stays that tells them
         apart.
     """
     names: dict[Path, Path] = {}
+    given = {str(path.resolve()) for path in paths}
     for path in paths:
+        if given & {*inputs_of(path)}:  # as where all *.jpg are named
+            note(f"{path} was made of others of the images, and is left out")
+            continue
         below = find_images(path, [output]) if path.is_dir() else [path]
         names |= {each: each.relative_to(path if path.is_dir() else path.parent) for each in below}
     if len({name.with_suffix("") for name in names.values()}) < len(names):

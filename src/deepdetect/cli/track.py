@@ -67,4 +67,5 @@ def track(
     total = report.frames + len(report.failures)
     if report.expected is not None and total < report.expected:
         cli.note(f"the file states {report.expected:,} frames, and may be cut off")
-    return cli.Result(vars(report), None, report.failures, total, "frames")
+    code = 0 if report.tracks or live else cli.NOTHING_FOUND
+    return cli.Result(vars(report), None, report.failures, total, "frames", code)

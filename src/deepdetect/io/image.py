@@ -24,7 +24,6 @@ from .image_file import (
     damaged_image,
     file_name,
     is_file,
-    is_path,
     open_file,
     open_image,
     reading_options,
@@ -241,8 +240,7 @@ def _read_file(source: Any, options: ReadingOptions, deep: bool = False) -> np.n
         elif options.bands is not None:
             raise OptionError(f"`bands` are of TIFF files and arrays, and {name} is none")
         else:
-            given = source if is_path(source) else file
-            with open_image(given, options=options) as image:
+            with open_image(file, options=options) as image:
                 if image.format == "PNG" and start[24] == 16 and start[25] != GREY_PNG:
                     rgb = _deep_png(file, name, options, deep)
                 else:

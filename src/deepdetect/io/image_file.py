@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import math
 import os
 import stat
 import struct
+import sys
 import warnings
 import zlib
 from collections.abc import Iterator
@@ -71,6 +73,9 @@ MAX_MEGAPIXELS = 200.0
 
 SIGNATURE_BYTES = 132
 """Length of the beginning of a file that formats are told by; DICOM has its own at the end."""
+
+STANDARD_INPUT = "/dev/stdin"
+"""Its name on every system; commands take "-" for it."""
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -249,13 +254,16 @@ def _binary_file(source: Any, name: str) -> Iterator[BinaryIO]:
     """Open a path or bytes; rewind an open file, or read it whole where that cannot be done."""
     if isinstance(source, (bytes, bytearray)):
         yield io.BytesIO(source)
+    elif name == STANDARD_INPUT:
+        yield io.BytesIO(_standard_input())
     elif is_path(source):
         mode = os.stat(source).st_mode
-        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        pipe = stat.S_ISFIFO(mode) and name.startswith("/dev/fd/")  # of a shell's <(...)
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or pipe):
             raise ImageError(f"{name} is a pipe or a device: save the image as a file first")
         # Pillow gets no path: it would map uncompressed TIFF into memory, and turn it wrongly.
-        with open(source, "rb") as file:
-            yield file
+        with open(os.fspath(source), "rb") as file:
+            yield io.BytesIO(file.read()) if pipe else file
     else:
         if getattr(source, "closed", False) or isinstance(source, io.TextIOBase):
             raise ImageError(f'{name} is no open binary file: open it with the mode "rb"')
@@ -264,6 +272,14 @@ def _binary_file(source: Any, name: str) -> Iterator[BinaryIO]:
         except (AttributeError, OSError):
             source = io.BytesIO(source.read())
         yield source
+
+
+@functools.cache
+def _standard_input() -> bytes:
+    """Return all of it, which comes once and may be wanted several times."""
+    if sys.stdin is None:
+        raise ImageError("there is no standard input: give the file")
+    return sys.stdin.buffer.read()
 
 
 def _check_png(file: BinaryIO, name: str) -> None:

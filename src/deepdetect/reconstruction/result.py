@@ -23,6 +23,9 @@ SCALE = {
     "calib.json)",
 }
 
+SHAPE = "; where cx of both cameras differ, depth without disparity_offset_px has a wrong shape"
+"""Of a rectified pair whose calibration does not say it."""
+
 
 @suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,6 +128,8 @@ class Reconstruction:
         errors, disparity = self.reprojection_errors, self.disparity
         rows, pose, calibration = self.rectification, self.pose, self.calibration
         cameras = {"left": calibration.camera0, "right": calibration.camera1}
+        unsaid = self.rectified and calibration.camera0 == calibration.camera1
+        unsaid &= calibration.baseline_mm is None
         why = "as asked for"
         if rows is not None:
             on_rows = f"{rows.on_rows:,} of {rows.matches:,} sparse matches are on the same row"
@@ -142,7 +147,7 @@ class Reconstruction:
             "rectified_why": why,
             "rectification": None if rows is None else _finite(dataclasses.asdict(rows)),
             "unit": self.unit,
-            "scale": SCALE[self.unit],
+            "scale": SCALE[self.unit] + (SHAPE if unsaid else ""),
             "depth": _percentiles(self.points[:, 2]),
             "disparity": None if disparity is None else _percentiles(disparity),
             "median_triangulation_angle_degrees": _median(self.triangulation_angles()),

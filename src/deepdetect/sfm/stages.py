@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import json
+import os
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -91,19 +92,20 @@ class MultiViewOptions:
 
 
 def check_images(images: str | Path | Sequence[str | Path]) -> dict[str, Path]:
-    """Return the images below a folder, or of a list without two of one name, by name."""
+    """Return the images below a folder, or of a list, by their name below the folder of all."""
     if isinstance(images, (str, Path)):
         folder = Path(images)
         return {path.relative_to(folder).as_posix(): path for path in find_images(folder)}
-    taken: dict[str, Path] = {}
-    for path in map(Path, images):
+    paths = [*{Path(path).absolute(): Path(path) for path in images}.values()]
+    for path in paths:
         if not path.is_file():
             raise MissingImageError(f"there is no file {path}: check the path")
         if path.suffix.lower() not in IMAGE_SUFFIXES:
             raise OptionError(f"{path} must end as images do, in .jpg, .png or alike: rename it")
-        if taken.setdefault(path.name, path).resolve() != path.resolve():
-            raise OptionError(f"{taken[path.name]} and {path} have one name: rename one of them")
-    return taken
+    if len({path.name for path in paths}) == len(paths):
+        return {path.name: path for path in paths}
+    top = os.path.commonpath([path.parent.absolute() for path in paths])
+    return {path.absolute().relative_to(top).as_posix(): path for path in paths}
 
 
 class Stages:
@@ -133,6 +135,7 @@ class Stages:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         for name, path in taken.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             try:
                 (folder / name).symlink_to(path.resolve())
             except OSError:  # Windows lets only some users do it
