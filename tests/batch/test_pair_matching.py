@@ -238,7 +238,7 @@ def test_lists_of_pairs(tmp_path: Path) -> None:
         ("a.jpg b.jpg c.jpg\n", "in .* is no pair"),
         ("a.jpg a.jpg\n", "in .* is no pair"),
         ("\n", "has no pairs"),
-        (None, "there is no file .*pairs.txt: check the path"),
+        (None, "there is no file .*pairs.txt: give one"),
     ],
 )
 def test_wrong_lists_of_pairs(text: str | None, message: str, tmp_path: Path) -> None:

@@ -79,7 +79,7 @@ def test_one_sentence_and_exit_code_2(run, bad: Path, arguments: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "hint"),
     [
-        ("match x.png", "IMAGE1"),
+        ("register x.png", "IMAGE1"),
         ("detect x.png --threshold high", "high"),
         ("detect x.png --resolution full", "native"),
         ("train x -o out --device tpu", "cuda"),

@@ -80,7 +80,7 @@ def test_straight_from_photographs(run, photos: Path, tmp_path: Path) -> None:
         assert {camera.params[0] for camera in database.read_all_cameras()} == {995}
         assert database.num_verified_image_pairs() == 1
         assert max(len(database.read_keypoints(k)) for k in (1, 2)) <= 300
-    result = run(*words, "e.db", "--no-verify", "--sequential", 1)
+    result = run(*words, "e.db", "--no-verify", "--pairs", "sequential:1")
     assert result.exit_code == 0, result.output
     with import_pycolmap().Database.open(tmp_path / "e.db") as database:
         assert database.num_verified_image_pairs() == 0

@@ -34,7 +34,7 @@ def test_extract_and_match(run, photos: Path) -> None:
     matches = {tuple(m["pair"]): m["matches"] for m in json.loads(result.stdout)["matches"]}
     assert matches["left.png", "right.png"] > 3 * matches["cat.jpg", "left.png"]
     assert len(matches) == 3
-    result = run(*words, "sequential", "--sequential", 1)
+    result = run(*words, "sequential:1")
     assert "0 pairs with 0 matches, 2 already done -> matches.h5" in result.stdout
     Path("pairs.txt").write_text("left.png right.png\n")
     assert "0 pairs with 0 matches, 1 already done" in run(*words, "pairs.txt").stdout

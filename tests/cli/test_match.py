@@ -49,6 +49,45 @@ def test_options_reach_the_matcher(run, photos: Path) -> None:
     assert report["matrix"] is None
 
 
+def test_pairs_of_a_folder_are_those_of_the_images_one_by_one(run, photos: Path) -> None:
+    rgb = np.asarray(Image.open(photos / "cat.jpg").convert("RGB"))
+    for name, x in (("1", 0), ("2", 8), ("10", 16)):
+        (Path("frames") / "a").mkdir(parents=True, exist_ok=True)
+        Image.fromarray(rgb[:, x : x + 150]).save(f"frames/a/{name}.png")
+    how = ("--detector", "points", "--max-keypoints", 300, "--no-pictures", "--json", "-o", "out")
+    found = json.loads(run("match", "frames", *how, "--pairs", "sequential:1").stdout)["pairs"]
+    names = [(Path(each["image0"]).stem, Path(each["image1"]).stem) for each in found]
+    assert names == [("1", "2"), ("2", "10")]
+    one = json.loads(run("match", "frames/a/1.png", "frames/a/2.png", *how).stdout)
+    assert Path(found[0]["file"]).name == "a-1_a-2_matches.npz"
+    assert one["matrix"] == found[0]["matrix"]
+    np.testing.assert_allclose(found[0]["matrix"], [[1, 0, -8], [0, 1, 0], [0, 0, 1]], atol=0.05)
+    Path("pairs.txt").write_text("a/10.png a/1.png\n")
+    listed = json.loads(run("match", "frames", *how, "--pairs", "pairs.txt").stdout)["pairs"]
+    assert [Path(each["image0"]).name for each in listed] == ["10.png"]
+    assert len(json.loads(run("match", "frames", *how).stdout)["pairs"]) == 3
+    Path("frames/a/2.png").write_bytes(b"no image")
+    rest = run("match", "frames", *how)
+    assert rest.exit_code == 1
+    assert "2 of 3 pairs failed" in rest.stderr
+    for words, message in (
+        (("frames", "--pairs", "sequential"), "give one, or exhaustive, or sequential:10"),
+        ((photos / "cat.jpg",), "one image has no pair"),
+    ):
+        refused = run("match", *words, *how)
+        assert refused.exit_code == 2
+        assert message in refused.stderr
+
+
+def test_the_one_file_that_is_written_may_be_named(run, photos: Path) -> None:
+    pair = (photos / "cat.jpg", photos / "cat.jpg", "--detector", "points")
+    assert run("match", *pair, "--no-pictures", "-o", "m.csv").exit_code == 0
+    assert Path("m.csv").read_text().startswith("x0,y0,x1,y1,score,inlier\n")
+    refused = run("match", *pair, "-o", "m.npz")
+    assert refused.exit_code == 2
+    assert "-o names the folder for all results" in refused.stderr
+
+
 @pytest.mark.slow
 def test_the_preset_is_changed_by_given_options_only(run, photos: Path) -> None:
     result = run(

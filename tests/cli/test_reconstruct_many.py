@@ -67,7 +67,7 @@ def test_a_list_of_photographs_and_results_within_the_folder(
     monkeypatch.chdir(fountain)
     images = ("0004.jpg", "0005.jpg", "0006.jpg")
     few = ("--workers", 1, "--max-keypoints", 1000, "--no-dense", "--json")
-    more = (*few, "--sequential", 2, "-o", "model")
+    more = (*few, "--pairs", "sequential:2", "-o", "model")
     result = run("reconstruct", *images, *more)
     assert result.exit_code == 0, result.output
     values = json.loads(result.stdout)
@@ -96,7 +96,7 @@ def test_a_list_of_photographs_and_results_within_the_folder(
         (("a.png",), "give two images"),
         ((".", "a.png"), "one folder, or images"),
         (("a.png", "b.png", "--no-dense"), "--dense is for more than two"),
-        (("a.png", "b.png", "--sequential", "3"), "--sequential is for more than two"),
+        (("a.png", "b.png", "--pairs", "sequential:3"), "--pairs is for more than two"),
         (("a.png", "b.png", "--workers", "2"), "--workers is for more than two"),
         ((".", "--rectified"), "for two images"),
     ],

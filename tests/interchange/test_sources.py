@@ -165,7 +165,7 @@ def test_the_folder_of_other_photographs_is_refused(tmp_path: Path, one_line) ->
 
 def test_a_bad_photograph_does_not_stop_the_others(pair: Path) -> None:
     (pair / "middle.png").write_bytes(b"no image")
-    found = match_folder(pair, PointDetector(300), sequential=1, workers=1)
+    found = match_folder(pair, PointDetector(300), pairs="sequential:1", workers=1)
     assert list(found.keypoints) == ["left_1.png", "right.png"]
     assert list(found.matches) == [("left_1.png", "right.png")]  # the next one that can be read
     (failure,) = found.failures
@@ -181,10 +181,8 @@ def test_a_bad_photograph_does_not_stop_the_others(pair: Path) -> None:
 
 
 def test_pairs_of_a_folder(pair: Path) -> None:
-    one = match_folder(pair, PointDetector(100), sequential=1, workers=1)
+    one = match_folder(pair, PointDetector(100), pairs="sequential:1", workers=1)
     assert list(one.matches) == [("left_1.png", "right.png")]
     assert max(len(points) for points in one.keypoints.values()) == 100
-    with pytest.raises(OptionError, match="not both"):
-        match_folder(pair, sequential=1, pairs=[("left_1.png", "right.png")])
-    with pytest.raises(OptionError, match="sequential"):
-        match_folder(pair, sequential=0)
+    with pytest.raises(DeepDetectError, match="no file sequential: give"):
+        match_folder(pair, pairs="sequential")

@@ -12,11 +12,13 @@ from deepdetect.sfm.stages import MultiViewOptions
 
 def test_small_sets_are_matched_exhaustively_and_large_ones_by_likeness() -> None:
     choices = [MultiViewOptions().pair_choice(count) for count in (3, 50, 51)]
-    assert choices == ["all", "all", "similar"]
-    assert MultiViewOptions(pairs="sequential").pair_choice(3) == "sequential"
+    assert choices == ["exhaustive", "exhaustive", "similar"]
+    assert MultiViewOptions(pairs="sequential:2").pair_choice(3) == "sequential:2"
 
 
-@pytest.mark.parametrize("wrong", [{"pairs": "sequental"}, {"sequential": 0}, {"stride_px": 1.5}])
+@pytest.mark.parametrize(
+    "wrong", [{"pairs": "sequental:3"}, {"pairs": "sequential:0"}, {"stride_px": 1.5}]
+)
 def test_wrong_options_are_refused(wrong: dict) -> None:
     with pytest.raises(OptionError, match=r"sequential|must be"):
         MultiViewOptions(**wrong)

@@ -227,9 +227,9 @@ def test_photographs_of_another_size_do_not_stop_a_calibrated_run(
 def test_pairs_are_chosen(small, monkeypatch: pytest.MonkeyPatch) -> None:
     _, output, found = small
     names = ["0004.jpg", "0005.jpg", "0006.jpg", "other.jpg"]
-    assert (found.pairs, found.pair_choice) == (6, "all")
+    assert (found.pairs, found.pair_choice) == (6, "exhaustive")
     monkeypatch.setattr(stages, "SIMILAR", 1)
-    for options in (MultiViewOptions("similar"), MultiViewOptions("sequential", sequential=1)):
+    for options in (MultiViewOptions("similar"), MultiViewOptions("sequential:1")):
         pairs = Stages(output, options, 1, True).choose_pairs(names)
         assert 2 <= len(pairs) < 6
         assert ("0005.jpg", "0006.jpg") in pairs
@@ -250,7 +250,7 @@ def test_of_two_scenes_the_larger_is_the_model(write_fountain, tmp_path: Path, p
     assert all("with 2 others only" in found.unregistered[name] for name in negatives)
     values = json.loads((tmp_path / "model/model.json").read_text())
     assert values["components"] == [list(negatives)]
-    assert (values["pairs"], values["pair_choice"]) == (21, "all")
+    assert (values["pairs"], values["pair_choice"]) == (21, "exhaustive")
 
 
 def test_too_few_photographs_are_one_sentence(

@@ -61,13 +61,16 @@ def progress(total: int | None, title: str, unit: str, quiet: bool = False, done
 
 
 @contextmanager
-def stage_progress(title: str, stages: Sequence[str] = ()) -> Iterator[Callable[[str], None]]:
+def stage_progress(
+    title: str, stages: Sequence[str] = (), quiet: bool = False
+) -> Iterator[Callable[[str], None]]:
     """Show a bar of stages; yield a function to be called with the name of each when it ends.
 
     It shows the stage that is at work, or without a list the last one.
     """
     # On a terminal only: what is logged stays readable.
-    with progress(len(stages) or None, title, "stage", quiet=not STDERR.isatty()) as bar:
+    quiet = quiet or not STDERR.isatty()
+    with progress(len(stages) or None, title, "stage", quiet) as bar:
         bar.set_postfix_str(stages[0] if stages else "")
 
         def done(stage: str) -> None:

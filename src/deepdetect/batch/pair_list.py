@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -31,7 +33,9 @@ def read_pairs(path: str | Path) -> list[Pair]:
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise MissingFileError(f"there is no file {path}: check the path") from None
+        raise MissingFileError(
+            f"there is no file {path}: give one, or exhaustive, or sequential:10"
+        ) from None
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is no text in UTF-8"
         raise DeepDetectError(f"{path} cannot be read ({reason}): check the file") from None
@@ -41,16 +45,26 @@ def read_pairs(path: str | Path) -> list[Pair]:
     return check_pairs([line.split("\t" if "\t" in line else None) for line in lines], str(path))
 
 
-def sequential_pairs(names: Sequence[str], following: int) -> list[Pair]:
-    """Return each name with so many that follow it.
+def following(pairs: object) -> int | None:
+    """Return with how many that follow each image is matched; None where it is told otherwise."""
+    match = re.fullmatch("sequential:([1-9][0-9]{0,8})", str(pairs))
+    return sys.maxsize if pairs == "exhaustive" else int(match[1]) if match else None
+
+
+def list_pairs(pairs: str | Path | Sequence[Sequence[str]], names: Sequence[str]) -> list[Pair]:
+    """Return the pairs that are asked for, of images of these names.
+
+    "exhaustive": all; "sequential:N": each image with the N that follow it; or a list of pairs of
+    names, or a text file with a pair on each line.
 
     Example:
-        >>> sequential_pairs(["a", "b", "c", "d"], 2)
+        >>> list_pairs("sequential:2", ["a", "b", "c", "d"])
         [('a', 'b'), ('a', 'c'), ('b', 'c'), ('b', 'd'), ('c', 'd')]
     """
-    return [
-        (name, other) for k, name in enumerate(names) for other in names[k + 1 : k + 1 + following]
-    ]
+    count = following(pairs)
+    if count is None:
+        return read_pairs(pairs) if isinstance(pairs, str | Path) else check_pairs(pairs)
+    return [(name, other) for k, name in enumerate(names) for other in names[k + 1 :][:count]]
 
 
 def check_pairs(pairs: Sequence[Sequence[str]], place: str = "`pairs`") -> list[Pair]:

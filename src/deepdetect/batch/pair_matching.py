@@ -32,7 +32,7 @@ from .hdf5 import (
     open_hdf5,
     state_of,
 )
-from .pair_list import Pair, check_pairs, pair_name, read_pairs, sequential_pairs
+from .pair_list import Pair, following, list_pairs, pair_name
 
 MATCHERS_OF_FLOATS = {name: MATCHERS[name] for name in MATCHERS if name != "hamming"}
 """Features in files are no bits."""
@@ -83,7 +83,6 @@ def match_pairs(
     engine: str = "processes",
     workers: int | None = None,
     overwrite: bool = False,
-    sequential: int = 10,
     quiet: bool = True,
 ) -> BatchReport:
     """Match the features of pairs of images, into an HDF5 file of hloc's layout.
@@ -98,15 +97,14 @@ def match_pairs(
 
     Args:
         features: file of `extract_features`, or of hloc.
-        pairs: "exhaustive": all; "sequential": each image with those that follow it by name; or
-            a list of pairs of names, or a text file with a pair on each line. A pair that is listed
-            twice, in either order, is taken once.
+        pairs: "exhaustive": all; "sequential:10": each image with the 10 that follow it by name;
+            or a list of pairs of names, or a text file with a pair on each line. A pair that is
+            listed twice, in either order, is taken once.
         path: the file.
         options: how they are matched.
         engine: "processes" of this machine, or "ray" for a cluster.
         workers: number of processes; default one per processor.
         overwrite: replace the file.
-        sequential: number of following images that each is matched with.
         quiet: show no progress bar.
 
     Returns:
@@ -123,14 +121,11 @@ def match_pairs(
         ...     match_pairs("features.h5", "pairs.txt", "matches.h5").check()
     """
     source = Path(features).absolute()
-    if sequential < 1:
-        raise OptionError(f"`sequential` must be at least 1, not {sequential}")
-    if pairs in ("exhaustive", "sequential"):
+    names: Sequence[str] = ()
+    if following(pairs) is not None:
         with open_hdf5(source) as file:
             names = natsorted(feature_names(file), alg=ns.PATH)
-        listed = sequential_pairs(names, len(names) if pairs == "exhaustive" else sequential)
-    else:
-        listed = read_pairs(pairs) if isinstance(pairs, (str, Path)) else check_pairs(pairs)
+    listed = list_pairs(pairs, names)
     if source == Path(path).absolute():
         raise OptionError(f"{path} holds the features: give the matches another file with -o")
     wanted, failures, gone, made_with = _find_pairs(source, listed)

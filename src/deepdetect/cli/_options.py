@@ -23,7 +23,7 @@ from .._shared.errors import BatchError, DeepDetectError, OptionError
 from .._shared.progress import STDERR
 from .._shared.records import Outputs, inputs_of
 from .._shared.signals import exit_by_signal, handle_signals
-from ..io.image import find_images, load_image
+from ..io.image import load_image, name_images
 from ..io.image_file import MAX_MEGAPIXELS, read_with, reading_options
 from ._app import MORE
 from ._app import NOTHING_FOUND as NOTHING_FOUND
@@ -191,6 +191,13 @@ def output_file(output: Path, name: str) -> Path:
     return output if output.suffix and not output.is_dir() else output / name
 
 
+def output_files(output: Path, stem: str, endings: Mapping[str, str]) -> dict[str, Path]:
+    """Return files by their kind, in the folder that -o names; or itself, where it is the only."""
+    if len(endings) == 1 and output.suffix in (".npz", ".csv"):
+        return dict.fromkeys(endings, output)
+    return {kind: output_folder(output) / f"{stem}{ending}" for kind, ending in endings.items()}
+
+
 def output_folder(output: Path) -> Path:
     """Return the folder that -o names, unless it has the ending of a file."""
     if re.fullmatch(r"\.(npz|csv|json|txt|png|jpe?g|tiff?|webp)", output.suffix.lower()):
@@ -198,33 +205,26 @@ def output_folder(output: Path) -> Path:
     return output
 
 
-def expand_images(paths: Sequence[Path], output: Path) -> dict[Path, Path]:
-    """Replace folders by the images below them, without those in the folder of the results.
+def expand_images(paths: Sequence[Path], output: Path) -> dict[str, Path]:
+    """Return the images that are named, and those below folders, as `name_images`.
 
-    Pictures that were made of others of the images are left out.
-
-    Returns:
-        By image what its results are called, without a suffix: its path below the folder that was
-        given. Where two have one name, below the folder of all; a suffix stays that tells them
-        apart.
+    Those in the folder of the results are none, nor pictures that were made of others of them.
     """
-    names: dict[Path, Path] = {}
     given = {str(path.resolve()) for path in paths}
+    kept = []
     for path in paths:
         if given & {*inputs_of(path)}:  # as where all *.jpg are named
             note(f"{path} was made of others of the images, and is left out")
-            continue
-        below = find_images(path, [output]) if path.is_dir() else [path]
-        names |= {each: each.relative_to(path if path.is_dir() else path.parent) for each in below}
-    if len({name.with_suffix("") for name in names.values()}) < len(names):
-        top = Path(os.path.commonpath([path.parent.absolute() for path in names]))
-        if len({*names.values()}) < len(names):
-            names = {path: path.absolute().relative_to(top) for path in names}
-    count = Counter(name.with_suffix("") for name in names.values())
-    return {
-        path: name if count[name.with_suffix("")] > 1 else name.with_suffix("")
-        for path, name in names.items()
-    }
+        else:
+            kept.append(path)
+    return name_images(kept, [output])
+
+
+def result_stems(images: Mapping[str, Path]) -> dict[Path, str]:
+    """Return what results of images are called: their names, with a suffix that tells two apart."""
+    stems = {name: name.removesuffix(path.suffix) for name, path in images.items()}
+    count = Counter(stems.values())
+    return {path: stems[n] if count[stems[n]] == 1 else n for n, path in images.items()}
 
 
 def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:

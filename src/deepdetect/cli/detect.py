@@ -51,22 +51,18 @@ def detect(
 
         deepdetect detect photo.jpg
         deepdetect detect photos/ -o keypoints --detector points --spread grid
-        deepdetect detect photo.jpg --density 0.1 --format csv
+        deepdetect detect photo.jpg --density 0.1 --no-pictures -o points.csv
 
     Args:
         ignore: Mask image of the same size: no keypoints where it is bright.
         pictures: Write pictures, too.
     """
     import_opencv()  # what is missing is said before anything is written
-    folder = cli.output_folder(output)
-    names = cli.expand_images(images, folder)
-    paths = [*names]
+    stems = cli.result_stems(cli.expand_images(images, output))
+    paths = [*stems]
     drawn = ("keypoints", "dense", "heatmap") if detector == "network" else ("keypoints",)
-    outputs = {
-        path: {"file": folder / f"{stem}.{file_format}"}
-        | {name: folder / f"{stem}_{name}.jpg" for name in drawn if pictures}
-        for path, stem in names.items()
-    }
+    endings = {"file": f".{file_format}"} | {n: f"_{n}.jpg" for n in drawn if pictures}
+    outputs = {path: cli.output_files(output, stem, endings) for path, stem in stems.items()}
     cli.check_outputs([file for files in outputs.values() for file in files.values()], paths)
     mask = None if ignore is None else load_mask(ignore)
     if detector == "network" and "max_keypoints" in values:

@@ -40,7 +40,7 @@ SAVED = cli.From(
     more="",
     types={"matches": Path | None, "images": Path | None},
 )
-FOLDER = cli.From(match_folder, "pairs sequential", more="workers", types={"pairs": Path | None})
+FOLDER = cli.From(match_folder, "pairs", more="workers", types={"pairs": str | None})
 MAX_KEYPOINTS = cli.From(PointDetector, "max_keypoints", more="")
 VERIFY = cli.From(write_colmap, "verify", more="")
 CAMERAS = cli.From(
@@ -170,7 +170,8 @@ def _export(
     The marker is the file whose record says what the output was made of; the values are those of
     `SAVED`, `FOLDER` and `MAX_KEYPOINTS`.
     """
-    inputs = [*sources, *(values[name] for name in ("matches", "pairs") if name in values)]
+    named = [Path(values[name]) for name in ("matches", "pairs") if name in values]
+    inputs = [*sources, *(path for path in named if path.exists())]
     cli.check_outputs([marker], inputs)
     of_folder = len(sources) == 1 and sources[0].is_dir()
     saved, points = SAVED.take(values), MAX_KEYPOINTS.take(values)

@@ -14,7 +14,7 @@ from . import _options as cli
 from ._detection import NETWORK, POINTS, SELECTION, Detector, chosen_detector
 
 EXTRACTION = cli.From(extract_features, "overwrite", more="engine workers")
-PAIRS = cli.From(match_pairs, "sequential overwrite", more="engine workers")
+PAIRS = cli.From(match_pairs, "overwrite", more="engine workers")
 MATCHING = cli.From(
     PairMatchingOptions,
     "ratio mutual verify",
@@ -70,12 +70,12 @@ def match_many(
     interrupted or killed, the same command goes on; new pairs are added later.
 
         deepdetect match-many features.h5 --pairs exhaustive
-        deepdetect match-many features.h5 --pairs sequential --verify fundamental
+        deepdetect match-many features.h5 --pairs sequential:10 --verify fundamental
         deepdetect match-many features.h5 --pairs pairs.txt -o matches.h5
 
     Args:
-        pairs: exhaustive (all), sequential (each image with those that follow it by name), or a
-            text file with the names of two images on each line, as hloc writes it.
+        pairs: exhaustive (all), sequential:10 (each image with the 10 that follow it by name), or
+            a text file with the names of two images on each line, as hloc writes it.
         output: File for the matches, or a folder for it.
     """
     file = cli.output_file(output, "matches.h5")

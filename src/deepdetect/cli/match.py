@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -10,7 +12,8 @@ from typing import Any, Literal
 import numpy as np
 
 from .._shared.errors import ImageError, OptionError, RegistrationError, noted_failures
-from .._shared.progress import stage_progress
+from .._shared.progress import progress, stage_progress
+from ..batch.pair_list import list_pairs
 from ..batch.pair_matching import MATCHERS_OF_FLOATS
 from ..datasets.planar import read_matrix
 from ..detector.detector import DeepDetect
@@ -66,11 +69,9 @@ STITCH_KEYPOINTS = cli.From(PointDetector, more="max_keypoints")
 
 @cli.command(PAIR, SELECTION, MATCHING, GEOMETRY, POINTS, NETWORK, cli.READING)
 def match(
-    image0: cli.Image,
-    image1: cli.Image,
-    /,
-    *,
+    *images: cli.Images,
     output: cli.Folder = Path("deepdetect-output"),
+    pairs: str = "exhaustive",
     detector: Detector = "network",
     preset: Literal["default", "published"] = "default",
     homography: Path | None = None,
@@ -81,7 +82,7 @@ def match(
     overwrite: cli.Overwrite = False,
     **values: Any,
 ) -> cli.Result:
-    """Match the keypoints of two images.
+    """Match the keypoints of two images, or of the pairs of a folder or of more images.
 
     Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their scores, the
     estimated geometry and which matches agree with it, and a picture of them. The options
@@ -92,19 +93,26 @@ def match(
         deepdetect match left.jpg right.jpg
         deepdetect match page1.jpg page2.jpg --model homography --mutual
         deepdetect match left.jpg right.jpg --unguided --ratio 0.9 --mutual
+        deepdetect match frames/ --pairs sequential:1
         deepdetect match a.png b.png --preset published --homography H1to2p
 
     Args:
+        pairs: Of more than two images: exhaustive (all), sequential:1 (each with the next by name),
+            or a text file with the names of two images on each line.
         preset: Options to start from: default, or published (exactly the paper's code).
         homography: Text file of a known 3x3 homography to evaluate matches by.
         camera0: Text file of the 3x3 camera matrix, for the model essential.
         camera1: The same of the second image.  [default: camera0]
         pictures: Write a picture, too.
     """
-    stem = cli.output_folder(output) / f"{image0.stem}_{image1.stem}_matches"
-    files = {"file": stem.with_name(f"{stem.name}.{file_format}")}
-    files |= {"picture": stem.with_name(f"{stem.name}.jpg")} if pictures else {}
-    rgb0, rgb1 = load_image(image0), load_image(image1)
+    many = len(images) != 2 or any(path.is_dir() for path in images)
+    endings = {"file": f".{file_format}"} | ({"picture": ".jpg"} if pictures else {})
+    outputs = {
+        pair: cli.output_files(output, f"{stem}_matches", endings)
+        for pair, stem in _choose_pairs(images, pairs if many else None, output).items()
+    }
+    inputs = [path for pair in outputs for path in pair]
+    cli.check_outputs([path for files in outputs.values() for path in files.values()], inputs)
     start = MatchingOptions()
     if preset == "published":
         start = PUBLISHED_MATCHING
@@ -120,28 +128,82 @@ def match(
     changes = MATCHING.take(values)
     values |= {"selection": selection, "options": replace(start, geometry=geometry, **changes)}
     guided = values.get("guided_matching", True)
-    with cli.writing(files, [image0, image1], overwrite) as made:
-        stages = _guided_stages(detector) if guided else UNGUIDED_STAGES
-        with stage_progress("matching", stages) as done:
-            matches = match_images(rgb0, rgb1, chosen, progress=done, **values)
-        save_matches(matches, made["file"])
-        if pictures:
-            _draw(rgb0, rgb1, matches, made["picture"])
-    if matches.guided and (unused := [name for name in UNGUIDED_ONLY if name in changes]):
+    if guided and (unused := [name for name in UNGUIDED_ONLY if name in changes]):
         flags = " and ".join("--" + name.replace("_", "-") for name in unused)
         cli.note(f"only unguided matching uses {flags}: add --unguided")
+    stages = _guided_stages(detector) if guided else UNGUIDED_STAGES
+    load = functools.lru_cache(2)(load_image)  # pairs that follow each other share one
+    found: list[dict[str, Any]] = []
+    failures: list[str] = []
+    with progress(len(outputs), "matching", "pair", quiet=not many) as bar:
+        for pair, files in outputs.items():
+            name = " ".join(map(str, pair)) if many else ""
+            with noted_failures(name, failures):
+                with cli.writing(files, pair, overwrite) as made:
+                    rgb0, rgb1 = map(load, pair)
+                    with stage_progress("matching", stages, quiet=many) as done:
+                        matches = match_images(rgb0, rgb1, chosen, progress=done, **values)
+                    save_matches(matches, made["file"])
+                    if pictures:
+                        _draw(rgb0, rgb1, matches, made["picture"])
+                if reason := _why_none(matches):
+                    cli.note(f"{name}: {reason}" if many else reason)
+                numbers = _numbers(pair, matches, files)
+                found.append(numbers | {"backend": getattr(chosen, "runtime", None)})
+            bar.update(1)
+    nothing = not (failures or any(each["matches"] and each["success"] for each in found))
+    return cli.Result(
+        {"pairs": found, "failures": failures} if many or failures else found[0],
+        "\n".join(map(_line, found)) if many or failures else None,
+        failures,
+        len(outputs),
+        "pairs",
+        cli.NOTHING_FOUND if nothing else 0,
+    )
+
+
+def _line(found: dict[str, Any]) -> str:
+    count = f"{found['matches']:,} matches, confidence {found['confidence']}"
+    return f"{found['image0']} {found['image1']}: {count} -> {found['file']}"
+
+
+def _choose_pairs(
+    images: Sequence[Path], pairs: str | None, output: Path
+) -> dict[tuple[Path, Path], str]:
+    """Return the pairs that are asked for, each with what its results are called."""
+    if pairs is None:
+        return {(images[0], images[1]): f"{images[0].stem}_{images[1].stem}"}
+    paths = cli.expand_images(images, output)
+    wanted = list_pairs(pairs, [*paths])
+    for name in {name for pair in wanted for name in pair} - paths.keys():
+        raise OptionError(f"{name} of {pairs} is none of the images: name it as below the folder")
+    if not wanted:
+        raise OptionError("one image has no pair: give two images, or more, or a folder of them")
+    stems = {path: stem.replace("/", "-") for path, stem in cli.result_stems(paths).items()}
+    chosen = [(paths[name0], paths[name1]) for name0, name1 in wanted]
+    return {pair: f"{stems[pair[0]]}_{stems[pair[1]]}" for pair in chosen}
+
+
+def _why_none(matches: Matches) -> str | None:
+    """Say why there are no matches, or no matrix."""
     if not matches.success:
-        cli.note(
+        return (
             "no geometry between these images can be trusted, so there are no matches: if they "
             "show the same scene, --unguided matches by descriptors alone"
         )
-    elif not len(matches):
-        cli.note("there are no matches: the images show too little, or the options leave none")
-    elif matches.matrix is None and matches.model != "none":
-        cli.note(f"no {matches.model} could be estimated from these matches")
-    numbers = {
-        "image0": image0,
-        "image1": image1,
+    if not len(matches):
+        return "there are no matches: the images show too little, or the options leave none"
+    if matches.matrix is None and matches.model != "none":
+        return f"no {matches.model} could be estimated from these matches"
+    return None
+
+
+def _numbers(
+    pair: tuple[Path, Path], matches: Matches, files: Mapping[str, Path]
+) -> dict[str, Any]:
+    return {
+        "image0": pair[0],
+        "image1": pair[1],
         "keypoints0": len(matches.keypoints0),
         "keypoints1": len(matches.keypoints1),
         "density0": round(matches.keypoints0.density, 6),
@@ -155,13 +217,10 @@ def match(
         "guided": matches.guided,
         "success": matches.success,
         "two_view_geometry": _two_view_numbers(matches),
-        "backend": getattr(chosen, "runtime", None),
         "seconds": {stage: round(value, 4) for stage, value in matches.seconds.items()},
         "file": files["file"],
         "picture": files.get("picture"),
     }
-    found = len(matches) > 0 and matches.success
-    return cli.Result(numbers, exit_code=0 if found else cli.NOTHING_FOUND)
 
 
 def _guided_stages(detector: Kind) -> tuple[str, ...]:
@@ -252,7 +311,7 @@ def stitch(
             [default: the one in the middle]
     """
     file = cli.output_file(output, "panorama.jpg")
-    paths = [*cli.expand_images(sources, file)]
+    paths = [*cli.expand_images(sources, file).values()]
     picture_suffix(file)  # before the work, which would else be lost
     if reference is not None and reference not in paths:
         raise OptionError(f"--reference {reference} must be one of the images: name it there")

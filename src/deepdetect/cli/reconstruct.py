@@ -64,7 +64,7 @@ def reconstruct(
         deepdetect reconstruct left.jpg right.jpg --focal 1250
         deepdetect reconstruct phone1.jpg phone2.jpg -o phone/
         deepdetect reconstruct photos/ -o model/
-        deepdetect reconstruct frames/ --sequential 8 -o model/
+        deepdetect reconstruct frames/ --pairs sequential:8 -o model/
 
     Args:
         output: Folder for all files; of two images also the model, .ply, .glb or .html: the other
@@ -105,8 +105,6 @@ def _reconstruct_many(
     detector, selection = chosen_detector(kind, values, max_keypoints=MAX_KEYPOINTS, threads=1)
     source: Path | Sequence[Path] = images[0] if len(images) == 1 else images
     many = MANY.take(values)
-    if "sequential" in many:
-        many.setdefault("pairs", "sequential")
     # What is missing or wrong is said before anything is written.
     import_pycolmap()
     check_output_folder(output)

@@ -234,7 +234,7 @@ def label(
     how = _engine(values)
     options = replace(chosen_label_settings(**LABELS.take(values)), **values)
     tasks = []
-    for image, stem in cli.expand_images(images, folder).items():
+    for image, stem in cli.result_stems(cli.expand_images(images, folder)).items():
         figure = folder / f"{stem}_labels.png" if visualize else None
         tasks.append(LabelTask(image, folder / f"{stem}.png", options, figure, overwrite))
     cli.check_outputs(

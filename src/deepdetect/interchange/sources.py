@@ -12,7 +12,7 @@ from .._shared.errors import InvalidFileError, OptionError
 from .._shared.options import suggest_keywords
 from ..batch.extraction import extract_features, read_keypoints
 from ..batch.hdf5 import feature_names, import_h5py, open_hdf5
-from ..batch.pair_list import Pair, read_pairs
+from ..batch.pair_list import Pair, list_pairs
 from ..batch.pair_matching import match_pairs
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
@@ -205,7 +205,6 @@ def match_folder(
     detector: DeepDetect | PointDetector = PointDetector(),
     *,
     pairs: str | Path | Sequence[Pair] | None = None,
-    sequential: int | None = None,
     workers: int | None = None,
     quiet: bool = True,
 ) -> Collection:
@@ -217,8 +216,7 @@ def match_folder(
     Args:
         folder: of the images.
         detector: as of `extract_features`.
-        pairs: of names, or a text file with one on each line; None: all, of up to 50 images.
-        sequential: number of following images that each is matched with, instead of `pairs`.
+        pairs: as of `match_pairs`; None: all, of up to 50 images.
         workers: number of processes; default one per processor.
         quiet: show no progress bars.
 
@@ -233,16 +231,12 @@ def match_folder(
     """
     root = Path(folder)
     names = [path.relative_to(root).as_posix() for path in find_images(root)]
-    if pairs is not None and sequential is not None:
-        raise OptionError("give `pairs` or `sequential`, not both")
-    if sequential is not None and sequential < 1:
-        raise OptionError(f"`sequential` must be at least 1, not {sequential}")
-    if isinstance(pairs, str | Path):
-        pairs = read_pairs(pairs)  # what is wrong with them is said before the work
-    if pairs is None and sequential is None and len(names) > MAX_ALL_PAIRS:
+    if pairs is None and len(names) > MAX_ALL_PAIRS:
         raise OptionError(
-            f"all pairs of {len(names)} images would take long: give `pairs` or `sequential`"
+            f"all pairs of {len(names)} images would take long: give `pairs`, as sequential:10"
         )
+    pairs = "exhaustive" if pairs is None else pairs
+    list_pairs(pairs, ())  # what is wrong with them is said before the work
     with tempfile.TemporaryDirectory(prefix="deepdetect-") as temporary:
         features, found = Path(temporary, "features.h5"), Path(temporary, "matches.h5")
         extracted = extract_features(root, features, detector, workers=workers, quiet=quiet)
@@ -250,11 +244,9 @@ def match_folder(
             extracted.check()
         keypoints = read_features_file(features)
         unread = set(names) - keypoints.keys()
-        wanted: str | list[Pair] = "exhaustive" if sequential is None else "sequential"
-        if pairs is not None:  # an image that cannot be read is one failure, its pairs are none
-            wanted = [pair for pair in pairs if unread.isdisjoint(pair)]
-        matched = match_pairs(
-            features, wanted, found, workers=workers, sequential=sequential or 1, quiet=quiet
-        )
+        # An image that cannot be read is one failure, its pairs are none.
+        wanted = list_pairs(pairs, [name for name in names if name in keypoints])
+        wanted = [pair for pair in wanted if unread.isdisjoint(pair)]
+        matched = match_pairs(features, wanted, found, workers=workers, quiet=quiet)
         matches = read_matches_file(found, keypoints) if matched.counts else {}
         return Collection(keypoints, matches, root, (*extracted.failures, *matched.failures))

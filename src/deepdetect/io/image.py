@@ -5,6 +5,7 @@ Pixel convention everywhere: x right, y down, centre of the first pixel (0, 0).
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -230,6 +231,21 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     if not images:
         raise ImageError(f"all images in {root} are results of earlier runs: name them, or others")
     return images
+
+
+def name_images(paths: Sequence[Path], exclude: Sequence[Path] = ()) -> dict[str, Path]:
+    """Return image files, and those below folders, by their names below these folders.
+
+    Where two would have one name, all are named below the folder that holds them all.
+    """
+    names: dict[Path, Path] = {}
+    for path in paths:
+        below = find_images(path, exclude) if path.is_dir() else [path]
+        names |= {each: each.relative_to(path if path.is_dir() else path.parent) for each in below}
+    if len({*names.values()}) < len(names):
+        top = os.path.commonpath([path.parent.absolute() for path in names])
+        names = {path: path.absolute().relative_to(top) for path in names}
+    return {name.as_posix(): path for path, name in names.items()}
 
 
 def _read_file(source: Any, options: ReadingOptions, deep: bool = False) -> np.ndarray:

@@ -40,7 +40,7 @@ class MultiViewReconstruction:
         keypoints: number of keypoints of each image.
         matched: number of verified matches of each pair that has some.
         pairs: number of pairs that were matched.
-        pair_choice: how they were chosen: "all", "sequential" or "similar".
+        pair_choice: how they were chosen: "exhaustive", "sequential:10" or "similar".
         seconds: time of each stage of this run; what an earlier run had done took none.
         files: what was written.
     """

@@ -7,41 +7,37 @@ that they depend on: a run does not make again what it finds with the right key.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import json
-import os
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 
 from .. import __version__
 from .._shared.atomic import atomic_path
-from .._shared.errors import MissingImageError, OptionError, ReconstructionError, check_name
+from .._shared.errors import MissingImageError, OptionError, ReconstructionError
 from .._shared.machine import available_memory, map_in_processes, needed_memory, processor_count
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.progress import progress
 from .._shared.records import file_state, key, load_arrays, save_arrays
 from ..batch.extraction import extract_features
 from ..batch.hdf5 import open_hdf5
-from ..batch.pair_list import Pair, pair_name, sequential_pairs
+from ..batch.pair_list import Pair, following, list_pairs, pair_name
 from ..batch.pair_matching import PairMatchingOptions, match_pairs
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
 from ..features.selection import SelectionOptions
-from ..io.image import find_images
+from ..io.image import find_images, name_images
 from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, read_with, reading_options
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
 from .dense import dense_points, find_references, limited_view, merge_dense_points
 from .mapping import RegisteredImage, SparseModel, adjust, map_images, normalise_model, verify_pairs
 from .pair_selection import COMPARED_KEYPOINTS, SIMILAR, similar_pairs, vlad_vectors
-
-PairChoice = Literal["auto", "all", "sequential", "similar"]
 
 MAX_EXHAUSTIVE = 50
 """Images of which "auto" matches all pairs."""
@@ -60,9 +56,9 @@ class MultiViewOptions:
     """How many images become cameras and points.
 
     Attributes:
-        pairs: which images are matched: "all", "sequential" (neighbours in the order of their
-            names), "similar" (the most alike), or "auto": all of up to 50, else the most alike.
-        sequential: number of following images that each one is matched with.
+        pairs: which images are matched: "exhaustive": all; "sequential:10": each with the 10 that
+            follow it by name; "similar": the most alike; "auto": all of up to 50, else the most
+            alike.
         ratio: of the ratio test: the best distance must be below this share of the second-best.
         dense: whether dense points are made.
         stride_px: a dense point is sought at every so many pixels of a row and of a column.
@@ -73,39 +69,38 @@ class MultiViewOptions:
         OptionError: a value is unknown or out of its range.
     """
 
-    pairs: PairChoice = "auto"
-    sequential: int = 10
+    pairs: str = "auto"
     ratio: float = 0.85
     dense: bool = True
     stride_px: int = 2
     single_camera: bool | None = None
 
     def __post_init__(self) -> None:
-        check_name("way to choose pairs", self.pairs, get_args(PairChoice))
-        check_ranges(self, counts=("sequential", "stride_px"), fractions=("ratio",))
+        if self.pairs not in ("auto", "similar") and following(self.pairs) is None:
+            raise OptionError(
+                f"`pairs` must be auto, exhaustive, sequential:10 or similar, not {self.pairs}"
+            )
+        check_ranges(self, counts=("stride_px",), fractions=("ratio",))
 
     def pair_choice(self, count: int) -> str:
         """Return how the pairs of so many images are chosen."""
         if self.pairs != "auto":
             return self.pairs
-        return "all" if count <= MAX_EXHAUSTIVE else "similar"
+        return "exhaustive" if count <= MAX_EXHAUSTIVE else "similar"
 
 
 def check_images(images: str | Path | Sequence[str | Path]) -> dict[str, Path]:
-    """Return the images below a folder, or of a list, by their name below the folder of all."""
+    """Return the images below a folder, or of a list, as `name_images`."""
     if isinstance(images, (str, Path)):
         folder = Path(images)
         return {path.relative_to(folder).as_posix(): path for path in find_images(folder)}
-    paths = [*{Path(path).absolute(): Path(path) for path in images}.values()]
+    paths = [*map(Path, images)]
     for path in paths:
         if not path.is_file():
             raise MissingImageError(f"there is no file {path}: check the path")
         if path.suffix.lower() not in IMAGE_SUFFIXES:
             raise OptionError(f"{path} must end as images do, in .jpg, .png or alike: rename it")
-    if len({path.name for path in paths}) == len(paths):
-        return {path.name: path for path in paths}
-    top = os.path.commonpath([path.parent.absolute() for path in paths])
-    return {path.absolute().relative_to(top).as_posix(): path for path in paths}
+    return name_images(paths)
 
 
 class Stages:
@@ -180,10 +175,8 @@ class Stages:
     def choose_pairs(self, names: Sequence[str]) -> list[Pair]:
         """Choose which images are matched with each other."""
         choice = self.options.pair_choice(len(names))
-        if choice == "all":
-            return list(itertools.combinations(names, 2))
-        if choice == "sequential":
-            return sequential_pairs(names, self.options.sequential)
+        if choice != "similar":
+            return list_pairs(choice, names)
         descriptors = []
         with open_hdf5(self.features) as file:
             for name in names:

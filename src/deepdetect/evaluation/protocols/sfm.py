@@ -48,7 +48,7 @@ CURVE_DEG = tuple(0.05 * step for step in range(61))
 
 DATABASE = "sift.db"
 
-OPTIONS = MultiViewOptions(pairs="all")
+OPTIONS = MultiViewOptions(pairs="exhaustive")
 """Of all methods: those of `reconstruct_many`, but every pair is matched."""
 
 KINDS = ("true", "estimated")
