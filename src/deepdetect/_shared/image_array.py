@@ -85,6 +85,11 @@ def array_to_rgb(
     return np.ascontiguousarray(values[:, :, :3] if channels == "rgb" else values[:, :, 2::-1])
 
 
+def to_8_bits(rgb: np.ndarray) -> np.ndarray:
+    """Return an image of uint8 or uint16 as uint8."""
+    return rgb if rgb.dtype == np.uint8 else _levels(65535, False)[rgb]
+
+
 def fill_planes(rgb: np.ndarray, planes: np.ndarray) -> None:
     """Write (H, W, 3) uint8 to larger (3, H, W) float32: the last row and column are repeated."""
     below, right = planes.shape[1] - rgb.shape[0], planes.shape[2] - rgb.shape[1]

@@ -41,8 +41,8 @@ BYTES_PER = {
     # Descriptors, and the search trees of a matcher.
     "matched_keypoint": 1500,
     # Blending a panorama: a pixel of the canvas, and of the box of one image on it.
-    "canvas_pixel": 22,
-    "blended_pixel": 25,
+    "canvas_pixel": 34,
+    "blended_pixel": 30,
     # Two maps of float32, and room for what is made of them.
     "pixel_of_level": 16,
     # Dense matching, at its peak.

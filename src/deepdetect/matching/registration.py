@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import RegistrationError
-from .._shared.image_array import Channels, array_to_rgb
+from .._shared.image_array import Channels, to_8_bits
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.detector import AnyDetector
@@ -69,11 +69,11 @@ class Registration:
         side = max(1, min(height, width) // SQUARES)
         row, column = np.indices((height, width)) // side
         second = self.valid & ((row + column) % 2 == 1)
-        return np.where(second[..., None], _shallow(self.warped), self.first)
+        return np.where(second[..., None], to_8_bits(self.warped), self.first)
 
     def difference(self) -> np.ndarray:
         """Return how far apart the colours are, 0 where only one has something; (H, W, 3) uint8."""
-        return np.where(self.valid[..., None], cv2.absdiff(self.first, _shallow(self.warped)), 0)
+        return np.where(self.valid[..., None], cv2.absdiff(self.first, to_8_bits(self.warped)), 0)
 
 
 @suggest_keywords
@@ -113,7 +113,7 @@ def register(
         [-12.0, 0.0]
     """
     first, deep = load_image(image0, channels=channels), load_deep(image1, channels)
-    second = _shallow(deep)
+    second = to_8_bits(deep)
     matches = match_images(
         first,
         second,
@@ -139,11 +139,6 @@ def register(
     warped, valid = warp_to_reference(deep, homography, (first.shape[1], first.shape[0]))
     zncc = median_local_zncc(*grays, homography)
     return Registration(homography, first, warped, valid, len(matches), zncc)
-
-
-def _shallow(rgb: np.ndarray) -> np.ndarray:
-    """Return an image of 8 or 16 bits as one of 8."""
-    return rgb if rgb.dtype == np.uint8 else array_to_rgb(rgb, white=65535)
 
 
 def agree(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> bool:

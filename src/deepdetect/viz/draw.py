@@ -10,6 +10,7 @@ import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import DeepDetectError, OptionError
+from .._shared.image_array import to_8_bits
 from .._shared.opencv import cv2
 from ..features.display import PICTURE_SIDE_PX, draw_circle, line_scale
 from ..features.keypoints import Keypoints
@@ -45,9 +46,9 @@ WHITE = (255, 255, 255)
 
 
 def save_picture(rgb: np.ndarray, path: str | Path) -> None:
-    """Write a (H, W, 3) uint8 RGB picture as .png, .jpg or .jpeg, whole or not at all.
+    """Write a (H, W, 3) uint8 or uint16 RGB picture as .png, or of 8 bits as .jpg or .jpeg.
 
-    A PNG file may also be of uint16.
+    It is written whole or not at all.
     """
     suffix = picture_suffix(path)
     # Checked before OpenCV is asked, which would also log it.
@@ -56,7 +57,9 @@ def save_picture(rgb: np.ndarray, path: str | Path) -> None:
         raise DeepDetectError(
             f"{path} cannot hold a picture of {size} pixels: give it a name that ends in .png"
         )
-    settings = [] if suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    settings = []
+    if suffix != ".png":
+        rgb, settings = to_8_bits(rgb), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
     _, data = cv2.imencode(suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), settings)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data.tobytes())

@@ -6,6 +6,7 @@ import pytest
 
 from deepdetect import DeepDetectError, OptionError
 from deepdetect._shared import machine
+from deepdetect._shared.image_array import to_8_bits
 from deepdetect.geometry.images import downscale
 from deepdetect.matching.stitching.bundle_adjustment import RotatingCamera
 from deepdetect.matching.stitching.compositing import (
@@ -126,6 +127,21 @@ def test_equal_images_are_kept_to_the_last_bit(scene: np.ndarray) -> None:
     panorama, valid, _ = put_together(images, planned({0: moved(0), 1: moved(0)}))
     np.testing.assert_array_equal(panorama, scene[:300, :400])
     assert valid.all()
+
+
+def test_more_than_8_bits_are_kept(scene: np.ndarray) -> None:
+    noise = np.random.default_rng(0).integers(0, 257, scene.shape)
+    deep = (scene * 256.0 + noise).astype(np.uint16)
+    images = {0: deep[:300, :400], 1: deep[:300, 150:550]}
+    canvas = planned({0: moved(0), 1: moved(150)})
+    small = {number: (to_8_bits(image), 1.0) for number, image in images.items()}
+    panorama, valid, _ = composite(lambda number: images[number], small, canvas)
+    assert panorama.dtype == np.uint16
+    assert valid.all()
+    differences = np.abs(panorama.astype(int) - deep[:300, :550])
+    assert np.median(differences) < 257 / 4
+    mixed, _, _ = composite(lambda n: small[n][0] if n else images[n], small, canvas)
+    assert np.abs(mixed.astype(int) - deep[:300, :550]).mean() < 257
 
 
 def test_brightness_becomes_equal(scene: np.ndarray) -> None:

@@ -2,7 +2,7 @@
 
 Size and memory of a canvas are known before anything is drawn. Exposure and seams are found on
 small copies; the images are warped one after the other and blended in frequency bands (Burt and
-Adelson, "A multiresolution spline with application to image mosaics", 1983; OpenCV's).
+Adelson, "A multiresolution spline with application to image mosaics", 1983).
 """
 
 from __future__ import annotations
@@ -30,9 +30,6 @@ another: near the horizon an image is stretched without bound."""
 MIN_WARP_SCALE = 0.67
 """An image that the canvas shows smaller than this is downscaled first, against aliasing."""
 
-BLEND_FACTOR = 32
-"""Brightness is multiplied by this for blending, whose bands are rounded down to whole numbers."""
-
 NUM_BANDS = 5
 """Frequency bands; the coarsest blends over about 2^5 pixels."""
 
@@ -50,7 +47,7 @@ GAIN_ERROR_STD, GAIN_PRIOR_STD = 0.05, 0.5
 class WarpedImage:
     """An image on the canvas, mirrored beyond its borders, whose left and top are the `corner`.
 
-    The mask is 255 inside. Both are uint8, (h, w, 3) and (h, w).
+    The image is (h, w, 3) uint8 or uint16; the mask, (h, w) uint8, is 255 inside.
     """
 
     image: np.ndarray
@@ -223,27 +220,84 @@ def composite(
 ) -> tuple[np.ndarray, np.ndarray, dict[int, float]]:
     """Put images onto a canvas.
 
-    `load` returns an image, (H, W, 3) uint8 RGB, by its number, and is called once for each;
-    `small` are the same images made smaller, and their scales. Returns the panorama, black where
-    there is nothing; a mask of where there is something; and the gain of each image.
+    `load` returns an image, (H, W, 3) RGB, uint8 or uint16, by its number, and is called once for
+    each; `small` are the same images in uint8, made smaller, and their scales. Returns the
+    panorama, black where there is nothing, uint16 where an image is; a mask of where there is
+    something; and the gain of each image.
     """
     width, height = canvas.size
     scale = min(1.0, float(np.sqrt(SEAM_MEGAPIXELS * 1e6 / (width * height))))
     low = {number: canvas.draw(number, *small[number], scale) for number in canvas.boxes}
     gains = _gains(low)
     seams = _seams(low, gains)
-    blender = cv2.detail_MultiBandBlender(0, NUM_BANDS)
-    blender.prepare((0, 0, width, height))
+    blender = _Blender(width, height)
+    kind: type = np.uint8
     for number, box in canvas.boxes.items():
         drawn = canvas.draw(number, load(number), 1.0, 1.0)
         mask = drawn.mask & _upscale_mask(seams[number], low[number].corner, scale, box)
-        bright = cv2.multiply(drawn.image, (BLEND_FACTOR * gains[number],) * 4, dtype=cv2.CV_16S)
-        blender.feed(bright, mask, box[:2])
-    del drawn, mask, bright
-    blended, valid = blender.blend(None, None)
-    panorama = cv2.convertScaleAbs(np.maximum(blended, 0, out=blended), alpha=1 / BLEND_FACTOR)
-    panorama[valid == 0] = 0
-    return panorama, valid > 0, gains
+        kind = np.uint16 if drawn.image.dtype == np.uint16 else kind
+        top = np.iinfo(drawn.image.dtype).max
+        blender.feed(drawn.image, gains[number] / top, mask, box[:2])
+    del drawn, mask
+    blended, valid = blender.blend()
+    panorama: np.ndarray = np.empty(blended.shape, kind)
+    for row, values in zip(panorama, blended, strict=True):  # of all at once the copies are large
+        row[:] = np.rint(values.clip(0, 1) * np.iinfo(kind).max)
+    panorama[~valid] = 0
+    return panorama, valid, gains
+
+
+class _Blender:
+    """Sums of images in frequency bands, weighted by their masks, and of these weights."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.size = (width, height)
+        step = 1 << NUM_BANDS
+        sides = (-(-height // step) * step, -(-width // step) * step)
+        shapes = [(sides[0] >> k, sides[1] >> k) for k in range(NUM_BANDS + 1)]
+        self.sums = [np.zeros((*shape, 3), np.float32) for shape in shapes]
+        self.weights = [np.zeros(shape, np.float32) for shape in shapes]
+        self.valid = np.zeros((height, width), bool)
+
+    def feed(
+        self, image: np.ndarray, factor: float, mask: np.ndarray, corner: tuple[int, int]
+    ) -> None:
+        """Add an image, times a factor, where its mask is 255."""
+        (height, width), (x, y), step = mask.shape, corner, 1 << NUM_BANDS
+        self.valid[y : y + height, x : x + width] |= mask > 0
+        # To whole pixels of the coarsest band, and as far as the mask is spread there.
+        rows, columns = self.weights[0].shape
+        top, left = (max(0, (start // step - 2) * step) for start in (y, x))
+        bottom = min(rows, (-(-(y + height) // step) + 2) * step)
+        right = min(columns, (-(-(x + width) // step) + 2) * step)
+        margins = (y - top, bottom - y - height, x - left, right - x - width)
+        band = cv2.copyMakeBorder(image, *margins, cv2.BORDER_REFLECT).astype(np.float32)
+        band *= np.float32(factor)
+        weight = cv2.copyMakeBorder(mask, *margins, cv2.BORDER_CONSTANT).astype(np.float32)
+        weight *= np.float32(1 / 255)
+        for k, (sums, weights) in enumerate(zip(self.sums, self.weights, strict=True)):
+            coarse = band
+            if k < NUM_BANDS:
+                coarse = cv2.pyrDown(band)
+                band -= cv2.pyrUp(coarse, dstsize=band.shape[1::-1])
+            part = slice(top >> k, bottom >> k), slice(left >> k, right >> k)
+            band *= weight[..., None]
+            sums[part] += band
+            weights[part] += weight
+            band, weight = coarse, cv2.pyrDown(weight)
+
+    def blend(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the (H, W, 3) float32 image, and where there is one; the sums are used up."""
+        image: np.ndarray | None = None
+        while self.sums:
+            band, weight = self.sums.pop(), self.weights.pop()
+            band /= np.maximum(weight, np.float32(1e-5))[..., None]
+            if image is not None:
+                band += cv2.pyrUp(image, dstsize=band.shape[1::-1])
+            image = band
+        assert image is not None
+        width, height = self.size
+        return image[:height, :width], self.valid
 
 
 def _gains(low: Mapping[int, WarpedImage]) -> dict[int, float]:

@@ -9,13 +9,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ..._shared.errors import OptionError, check_name
-from ..._shared.image_array import Channels
+from ..._shared.image_array import Channels, to_8_bits
 from ..._shared.options import check_ranges, suggest_keywords
 from ..._shared.progress import StageTimer
 from ...detector.detector import AnyDetector, DeepDetect
 from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography, translation_matrix
-from ...io.image import load_image
+from ...io.image import load_deep
 from ..guided.initial_geometry import MAX_SIDE_PX
 from .bundle_adjustment import RotatingCamera, level_cameras
 from .compositing import Canvas, composite, crop_box, least_distorted, plan_curved, plan_plane
@@ -57,7 +57,8 @@ class Panorama:
     """Images put together.
 
     Attributes:
-        image: (H, W, 3) uint8 RGB, black where no image is.
+        image: (H, W, 3) RGB, black where no image is: uint8, or uint16 where one of them has more
+            than 8 bits.
         valid: (H, W) bool, where one is.
         homographies: (3, 3) from each image, by its number: of a flat panorama to `image`, of a
             curved one to the reference; in the order in which they were connected.
@@ -155,7 +156,7 @@ def stitch(
     sizes: dict[int, tuple[int, int]] = {}
     with timer.stage("reading"):
         for number, image in enumerate(images):
-            rgb = load_image(image, channels=channels)
+            rgb = to_8_bits(load_deep(image, channels))
             sizes[number] = (rgb.shape[1], rgb.shape[0])
             small[number] = downscale(rgb, options.registration_side)
         del rgb
@@ -174,7 +175,7 @@ def stitch(
     canvas.check_size(options.max_canvas_megapixels)
     with timer.stage("compositing"):
         panorama, valid, gains = composite(
-            lambda number: load_image(images[number], channels=channels), small, canvas
+            lambda number: load_deep(images[number], channels), small, canvas
         )
         if crop:
             left, top, right, bottom = crop_box(valid)
