@@ -76,7 +76,7 @@ test-opencv4: $(VENV_OPENCV4)/.test
 
 # Collections on a cluster of this machine.
 test-ray: $(VENV_RAY)/.test
-	$(VENV_RAY)/bin/python -m pytest -p no:cacheprovider --runslow tests/batch
+	$(VENV_RAY)/bin/python -m pytest -p no:cacheprovider --runslow tests/batch tests/detector/test_detector.py
 
 # Drop-ins for other programs, with these installed.
 test-integrations: $(VENV_INTEGRATIONS)/.test

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 from collections.abc import Callable
 from pathlib import Path
@@ -20,12 +21,13 @@ from deepdetect import (
     PointDetector,
     SelectionOptions,
 )
+from deepdetect.geometry.point_cloud import PointCloud
 
 from ..case import Target, prepared
 
 ODD: tuple[Any, ...] = (
     *(None, True, -1, 0, 1, 3, 10**30, 0.5, -2.5, float("nan"), float("inf"), 1j, "", "a", "auto"),
-    *(b"a", [], [1], [[1, 2], [3]], (), (1, 2), (1, 2, 3), {}, {"a": 1}, {1}, object(), len, int),
+    *(b"a", [], [1], [[1, 2], [3]], (), (1, 2), (1, 2, 3), {}, {"a": 1}, {1}, object(), repr),
     *(Path("missing.png"), Path("/"), np.zeros(0), np.zeros((3, 2)), np.full((5, 2), np.nan)),
     *(np.zeros((20, 20)), np.zeros((20, 20, 3), "u1"), np.array("a"), np.array([None, 1])),
     *(np.float32(2), np.int64(7), np.bool_(True), slice(3), iter([1, 2]), SelectionOptions()),
@@ -51,6 +53,9 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
     pair = {"image0": scene, "image1": np.roll(scene, 3, axis=1), "detector": points}
     xy = np.random.default_rng(0).uniform(0, 90, (30, 2))
     camera = Camera((112, 96), 100.0)
+    calibration = Calibration(camera, camera)
+    cloud = PointCloud(np.ones((4, 3), np.float32), np.ones((4, 3), np.uint8), "mm", "camera")
+    matches = deepdetect.match_features(found, found)
     return {
         "load_image": (deepdetect.load_image, {"image": scene}),
         "DeepDetect": (DeepDetect, {}),
@@ -72,6 +77,28 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
         "Calibration": (Calibration, {"camera0": camera, "camera1": camera}),
         "Calibration.load": (Calibration.load, {"path": "missing.json"}),
         "load_keypoints": (deepdetect.load_keypoints, {"path": "missing.npz"}),
+        "heatmap_batch": (network.heatmap_batch, {"images": [scene]}),
+        "heatmap_and_logits": (network.heatmap_and_logits, {"image": scene}),
+        "configured": (network.configured, {"heatmap_options": network.heatmap_options}),
+        "with_weights": (network.with_weights, {"weights": "default"}),
+        "save_point_cloud": (deepdetect.save_point_cloud, {"cloud": cloud, "path": "a.ply"}),
+        "reconstruct_many": (deepdetect.reconstruct_many, {"images": "missing", "output": "out"}),
+        "Matches": (Matches, {name: getattr(matches, name) for name in MATCHES}),
+        "best": (found.best, {"count": 5}),
+        "to_lightglue": (found.to_lightglue, {}),
+        "Keypoints.empty": (Keypoints.empty, {"image_size": (112, 96)}),
+        "from_opencv": (
+            Keypoints.from_opencv,
+            {"keypoints": found.to_opencv(), "image_size": (112, 96)},
+        ),
+        "Matches.draw": (matches.draw, {"image0": scene, "image1": scene}),
+        "project": (camera.project, {"points": np.ones((4, 3))}),
+        "rays": (camera.rays, {"points": xy}),
+        "scaled": (camera.scaled, {"size": (56, 48)}),
+        "depth_mm": (calibration.depth_mm, {"disparity_px": np.ones(4)}),
+        "check_sizes": (calibration.check_sizes, {"size0": (112, 96), "size1": (112, 96)}),
+        "save_keypoints": (deepdetect.save_keypoints, {"keypoints": found, "path": "a.npz"}),
+        "save_matches": (deepdetect.save_matches, {"matches": matches, "path": "a.npz"}),
         "load_matches": (deepdetect.load_matches, {"path": "missing.npz"}),
         "match_images": (deepdetect.match_images, pair),
         "register": (deepdetect.register, pair),
@@ -84,6 +111,7 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
     }
 
 
+MATCHES = ("points0", "points1", "scores", "inliers", "model", "matrix", "keypoints0", "keypoints1")
 SLOW = ("match_images", "register", "stitch", "disparity_map", "reconstruct")
 
 
@@ -99,7 +127,8 @@ def called(generator: np.random.Generator, folder: Path) -> None:
         parameters = [name for name in parameters if name not in usual] or parameters
     for name in generator.choice(parameters, min(len(parameters), int(generator.integers(1, 3)))):
         given[str(name)] = ODD[int(generator.integers(len(ODD)))]
-    found = function(**given)
+    with contextlib.chdir(folder):  # some write files
+        found = function(**given)
     assert not isinstance(found, Matches) or len(found) >= 0
 
 

@@ -396,6 +396,21 @@ def test_pools_map_the_methods_of_detectors(method: str, image: np.ndarray) -> N
     np.testing.assert_array_equal(found.xy, points.detect(image).xy)
 
 
+@pytest.mark.parametrize("program", ["joblib", "ray"])
+def test_joblib_and_ray_map_the_methods_of_detectors(program: str, image: np.ndarray) -> None:
+    module = pytest.importorskip(program)
+    for detector in (PointDetector(20), DeepDetect(threads=1)):
+        if program == "joblib":
+            call = module.delayed(detector.detect)
+            found = module.Parallel(n_jobs=2)(call(each) for each in [image, image])
+        else:
+            module.init(num_cpus=1, include_dashboard=False, ignore_reinit_error=True)
+            detect = module.remote(lambda own, rgb: own.detect(rgb))
+            found = module.get([detect.remote(detector, image)])
+        for each in found:
+            np.testing.assert_array_equal(each.xy, detector.detect(image).xy)
+
+
 def test_extracted_keypoints_are_the_detected_ones_described(
     detector: DeepDetect, image: np.ndarray
 ) -> None:

@@ -69,11 +69,12 @@ ACCEPTED: Mapping[Any, tuple[Any, ...]] = {
     Path: (os.PathLike,),
     type(None): (type(None),),
     Callable: (Callable,),
+    Mapping: (Mapping,),
 }
 """What is taken for a type in a signature, numbers of NumPy as well."""
 MADE_LATER = type(functools.cache(len))
 """What some keypoints are, which are made when they are asked for."""
-KINDS_OF: Mapping[Any, Any] = {Literal: str, Callable: Callable}
+KINDS_OF: Mapping[Any, Any] = {Literal: str, Callable: Callable, Mapping: Mapping}
 
 
 @functools.cache
@@ -93,8 +94,8 @@ def _kinds(function: Callable[..., Any]) -> dict[str, tuple[Any, ...]]:
     return found
 
 
-def numbers_of(name: str, value: Any, kind: type, columns: int | None = None) -> np.ndarray:
-    """Return numbers as an array of a type, of rows of so many where that is said.
+def numbers_of(name: str, value: Any, kind: type | None, columns: int | None = None) -> np.ndarray:
+    """Return numbers as an array of a type, or their own, of rows of so many where that is said.
 
     Raises:
         OptionError: they are none, or of another shape.
@@ -105,6 +106,14 @@ def numbers_of(name: str, value: Any, kind: type, columns: int | None = None) ->
     except (TypeError, ValueError, OverflowError):
         wanted = "numbers" if columns is None else f"rows of {columns} numbers"
         raise OptionError(f"`{name}` must be {wanted}, not {shown(value)}") from None
+
+
+def whole(name: str, value: Any) -> int:
+    """Return a whole number from 0 on, or raise an OptionError."""
+    number: Any = value if isinstance(value, Real) else -1
+    if number < 0 or not float(number).is_integer():
+        raise OptionError(f"`{name}` must be a whole number from 0 on, not {shown(value)}")
+    return int(number)
 
 
 LARGEST = 1e38

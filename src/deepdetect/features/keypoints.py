@@ -12,7 +12,7 @@ from .._shared.errors import OptionError, check_name, require_packages
 from .._shared.image_array import Channels
 from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
-from .._shared.options import numbers_of, shown, suggest_keywords
+from .._shared.options import numbers_of, shown, suggest_keywords, whole
 
 SIZES_PER_SCALE = {"diameter": 1.0, "sigma": 2.0}
 """Diameters of a keypoint of SIFT per unit of its scale, by the meaning of the scale."""
@@ -128,6 +128,9 @@ class Keypoints:
             >>> Keypoints.from_opencv([cv2.KeyPoint(3, 4, 7, 90, 0.5)], (8, 8)).sizes.tolist()
             [7.0]
         """
+        points = isinstance(keypoints, Sequence)
+        if not points or not all(isinstance(point, cv2.KeyPoint) for point in keypoints):
+            raise OptionError("`keypoints` must be a sequence of cv2.KeyPoint")
         if not len(keypoints):
             return cls.empty(image_size)
         return cls(
@@ -243,7 +246,7 @@ class Keypoints:
 
         Ties are broken by an order that spreads them evenly over the image.
         """
-        if len(self) <= count:
+        if len(self) <= (count := whole("count", count)):
             return self
         ranks = self.scores if self.logits is None else self.logits
         order = bayer_order(self.xy, self.image_size)

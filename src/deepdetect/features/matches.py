@@ -11,7 +11,7 @@ import numpy as np
 from .._shared.errors import OptionError
 from .._shared.image_array import Channels
 from .._shared.opencv import cv2
-from .._shared.options import suggest_keywords
+from .._shared.options import numbers_of, suggest_keywords, whole
 from .keypoints import Keypoints, nearest_keypoints
 
 MAX_KEYPOINT_DISTANCE_PX = 1.0
@@ -210,13 +210,15 @@ class Matches:
     indices1: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
+        for name, dtype in _COLUMNS.items():
+            columns = 2 if name.startswith("points") else None
+            values = numbers_of(name, getattr(self, name), dtype, columns)
+            object.__setattr__(self, name, values if columns else values.ravel())
         counts = [len(self.points0), len(self.points1), len(self.scores), len(self.inliers)]
         if len(set(counts)) > 1:
             raise OptionError(
                 f"matches need as many points0, points1, scores and inliers, not {counts}"
             )
-        for name, dtype in _COLUMNS.items():
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype))
         if not (np.isfinite(self.points0).all() and np.isfinite(self.points1).all()):
             raise OptionError("matches need finite positions: leave out those that are not")
         for side in (0, 1):
@@ -228,7 +230,7 @@ class Matches:
                     getattr(self, f"points{side}"), keypoints.xy, keypoints.image_size
                 )
                 indices[distances > MAX_KEYPOINT_DISTANCE_PX] = -1
-            indices = np.zeros(0, np.int32) if indices is None else np.asarray(indices)
+            indices = numbers_of(name, () if indices is None else indices, None)
             object.__setattr__(self, name, self._checked_indices(indices, side))
 
     def __getstate__(self) -> dict[str, Any]:
@@ -345,7 +347,7 @@ class Matches:
         rgb0 = checked_image(image0, self.keypoints0.image_size, channels)
         rgb1 = checked_image(image1, self.keypoints1.image_size, channels)
         ends = self.points0, self.points1, self.inliers
-        return draw_matches(rgb0, rgb1, *ends, lines, by_position=by_position)
+        return draw_matches(rgb0, rgb1, *ends, whole("lines", lines), by_position=by_position)
 
     def __len__(self) -> int:
         return len(self.points0)

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import MissingCalibrationError, ReconstructionError, first_line
-from .._shared.options import shown, suggest_keywords
+from .._shared.options import numbers_of, shown, suggest_keywords
 from .camera_files import read_camera_file
 
 Size = tuple[int, int]
@@ -85,19 +85,20 @@ class Camera:
 
     def scaled(self, size: Size) -> Camera:
         """Return the camera of its image at another (width, height)."""
-        ratio = np.divide(size, self.size)
+        ratio = np.divide(_numbers("the image size", size, 2), self.size)
         centre = (np.array(self.centre) + 0.5) * ratio - 0.5
         return Camera(size, (ratio * self.focal_px).tolist(), centre.tolist())
 
     def rays(self, points: np.ndarray) -> np.ndarray:
         """Return (N, 3) float64 viewing directions (x, y, 1) of (N, 2) pixels, in its frame."""
+        points = numbers_of("points", points, np.float64, 2)
         directions = np.ones((len(points), 3))
-        directions[:, :2] = (np.asarray(points, np.float64) - self.centre) / self.focal_px
+        directions[:, :2] = (points - self.centre) / self.focal_px
         return directions
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Project (N, 3) points of its frame (x right, y down, z forward) to (N, 2) pixels."""
-        points = np.asarray(points, np.float64)
+        points = numbers_of("points", points, np.float64, 3)
         with np.errstate(divide="ignore", invalid="ignore"):
             return points[:, :2] / points[:, 2:] * self.focal_px + self.centre
 
@@ -155,7 +156,7 @@ class Calibration:
         Returns:
             float64 of the same shape; infinite where disparity and offset cancel or are negative.
         """
-        moved = np.asarray(disparity_px, np.float64) + self.disparity_offset_px
+        moved = numbers_of("disparity_px", disparity_px, np.float64) + self.disparity_offset_px
         baseline = 1.0 if self.baseline_mm is None else self.baseline_mm
         with np.errstate(divide="ignore"):
             depth = self.camera0.focal_px[0] * baseline / moved
@@ -208,8 +209,8 @@ class Calibration:
     def check_sizes(self, size0: Size, size1: Size) -> None:
         """Raise `ReconstructionError` unless it is for images of these (width, height)."""
         for name, camera, size in (("left", self.camera0, size0), ("right", self.camera1, size1)):
-            if camera.size != tuple(size):
-                wanted, actual = (f"{width}x{height}" for width, height in (camera.size, size))
+            if camera.size != (other := _numbers("the image size", size, 2)):
+                wanted, actual = (f"{side[0]:g}x{side[1]:g}" for side in (camera.size, other))
                 raise ReconstructionError(
                     f"the calibration is for images of {wanted} pixels, the {name} image has "
                     f"{actual}: give the calibration of this size"

@@ -33,7 +33,7 @@ from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
 from ..features.selection import SelectionOptions
 from ..io.image import find_images, name_images
-from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, read_with, reading_options
+from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, is_path, read_with, reading_options
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
 from .dense import dense_points, find_references, limited_view, merge_dense_points
 from .mapping import RegisteredImage, SparseModel, adjust, map_images, normalise_model, verify_pairs
@@ -94,6 +94,8 @@ def check_images(images: str | Path | Sequence[str | Path]) -> dict[str, Path]:
     if isinstance(images, (str, Path)):
         folder = Path(images)
         return {path.relative_to(folder).as_posix(): path for path in find_images(folder)}
+    if not np.iterable(images) or not all(map(is_path, images)):
+        raise OptionError("give a folder, or a list of the paths of images")
     paths = [*map(Path, images)]
     for path in paths:
         if not path.is_file():

@@ -145,7 +145,8 @@ def stitch(
         (160, 240, 3)
     """
     check_name("projection", projection, PROJECTIONS)
-    if not isinstance(images, Sequence | np.ndarray) or len(images) < 2:
+    several = isinstance(images, Sequence) or getattr(images, "ndim", 0) == 4
+    if not several or len(images) < 2:
         raise OptionError("a panorama needs two images or more: give more images")
     if reference is not None and not 0 <= reference < len(images):
         raise OptionError(
