@@ -53,6 +53,19 @@ def test_a_part_that_occurs_once_tells_the_periods_apart() -> None:
     assert is_repeated(grays, POINTS, shift(0))
 
 
+def test_what_stands_before_a_wall_tells_the_periods_apart() -> None:
+    grays, rng = views(unique=False), np.random.default_rng(4)
+    points = rng.uniform(0, SIZE, (40, 2))
+    moved = points + np.column_stack([np.zeros(40), rng.uniform(10, 60, 40)])  # along columns
+    wrong = rng.uniform(0, SIZE, (40, 2)), rng.uniform(0, SIZE, (40, 2))
+    sparse = np.concatenate([points, wrong[0]]), np.concatenate([moved, wrong[1]])
+    assert not is_repeated(grays, POINTS, shift(0), sparse)
+    assert is_repeated(grays, POINTS, shift(-PERIOD_PX), sparse)
+    assert is_repeated(grays, POINTS, shift(0), wrong)
+    along_rows = points + (moved - points)[:, ::-1]  # as the periods do
+    assert is_repeated(grays, POINTS, shift(0), (points, along_rows))
+
+
 def test_where_a_wall_ends_tells_nothing() -> None:
     rng = np.random.default_rng(3)
     wall = np.zeros(SIZE[::-1], bool)

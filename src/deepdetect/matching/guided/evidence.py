@@ -2,7 +2,8 @@
 
 **Repeated patterns** (windows, tiles, fences). Patches cannot tell: they are as much alike one
 period further on. So the aligned images are correlated at all shifts, and where one of these is
-nearly as good, the places that only one of the two homographies explains decide.
+nearly as good, the places that only one of the two homographies explains decide; or sparse matches
+off both planes, which agree on an epipole with the right one.
 
 **Held-out windows.** The matches of the windows around one predict, by an affine map, where it is
 seen in the second image. Right matches predict what looks alike there; what was matched by chance
@@ -16,6 +17,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..._shared.opencv import cv2
+from ...geometry.estimation import MAX_LOG10_NFA, measure_parallax
 from ...geometry.homography_refinement import refine_homography
 from ...geometry.images import (
     BLUR_SIGMA_PX,
@@ -53,6 +55,9 @@ MIN_OWN_FRACTION, MIN_OWN_RATIO = 0.02, 2.0
 """Of the explained places, those that a homography explains alone, and how many times those that
 its shifted copy explains alone."""
 
+OFF_PLANE_PX = 6.0
+"""Matches that end this far from where the homography takes them are off the plane."""
+
 HELD_OUT_SIDE_PX = 640
 """Longer side to which images are reduced for held-out windows."""
 
@@ -77,8 +82,17 @@ MAX_MOVE_DIFFERENCE, MOVE_NOISE_PX = 0.35, 2.0
 tilted or has depth moves so; and by which a step may be wrong."""
 
 
-def is_repeated(grays: Pair, points0: np.ndarray, homography: np.ndarray) -> bool:
-    """Return whether a shifted copy of a homography explains (N, 2) points as well as it does."""
+def is_repeated(
+    grays: Pair,
+    points0: np.ndarray,
+    homography: np.ndarray,
+    sparse: Pair | None = None,
+    seed: int = 0,
+) -> bool:
+    """Return whether a shifted copy of a homography explains (N, 2) points as well as it does.
+
+    And the `sparse` matches, (M, 2) in both images, of all that is seen, many of them wrong.
+    """
     (first, scale0), (second, scale1) = (downscale(gray, COMPARED_SIDE_PX) for gray in grays)
     matrix = scaled_homography(homography, scale0, scale1)
     last = np.array(first.shape[::-1]) - 1
@@ -105,8 +119,22 @@ def is_repeated(grays: Pair, points0: np.ndarray, homography: np.ndarray) -> boo
         alone = np.sum((gain > MIN_ZNCC_GAIN) & ~recurs[known])
         other_alone = np.sum(gain < -MIN_ZNCC_GAIN)
         if alone < max(MIN_OWN_FRACTION * len(gain), MIN_OWN_RATIO * other_alone):
-            return True
+            copy = scaled_homography(other, 1 / scale0, 1 / scale1)
+            if sparse is None or not _parallax_decides(*sparse, homography, copy, seed):
+                return True
     return False
+
+
+def _parallax_decides(
+    points0: np.ndarray, points1: np.ndarray, plane: np.ndarray, copy: np.ndarray, seed: int
+) -> bool:
+    """Whether what lies off a plane, and off its copy, agrees on an epipole with it alone."""
+    errors = [transfer_errors(points0, points1, each) for each in (plane, copy)]
+    off = np.minimum(*errors) > OFF_PLANE_PX
+    own, other = (
+        measure_parallax(points0[off], points1[off], each, seed).log10_nfa for each in (plane, copy)
+    )
+    return own < min(other, 0) + MAX_LOG10_NFA
 
 
 def _correlation(first: np.ndarray, second: np.ndarray, homography: np.ndarray) -> np.ndarray:

@@ -29,7 +29,7 @@ from ...geometry.two_view import (
     fit_model,
     is_usual_rotation,
 )
-from .evidence import compare_held_out, is_repeated, moving_alike
+from .evidence import OFF_PLANE_PX, compare_held_out, is_repeated, moving_alike
 from .initial_geometry import InitialGeometry, Pair, guiding_geometry
 from .rectified import match_by_rectification
 from .verification import dissimilarity
@@ -43,9 +43,6 @@ shifted by a period is matched already."""
 
 MATCHED_PX = 9
 """Side of the window around a match in which the first image counts as matched."""
-
-OFF_PLANE_PX = 6.0
-"""Matches that end this far from where the homography takes them are off the plane."""
 
 MIN_OFF_PLANE_FRACTION = 0.02
 """As many dense matches, of keypoints whose patches the plane does not explain, relative to those
@@ -130,7 +127,8 @@ def guided_matches(
     if matches is None:
         return geometry, None
     geometry, plane = _with_scene(grays, pixels[0], geometry, matches, seed)
-    if plane is not None and is_repeated(grays, *plane):
+    sparse = None if first.others is None else first.all_points
+    if plane is not None and is_repeated(grays, *plane, sparse, seed):
         return replace(geometry, model="none", matrix=None, scene="none"), None
     matches = _with_further_planes(grays, pixels, geometry, matches, first, enough, seed)
     ends = matches.starts(pixels[0]), matches.points1
