@@ -28,7 +28,12 @@ from ...geometry.images import (
     normalise_local_contrast,
     warp_to_reference,
 )
-from ...geometry.transforms import scaled_homography, scaled_points, transfer_errors
+from ...geometry.transforms import (
+    scaled_homography,
+    scaled_points,
+    transfer_errors,
+    transform_points,
+)
 from .initial_geometry import Pair
 
 COMPARED_SIDE_PX = 320
@@ -91,7 +96,8 @@ def is_repeated(
 ) -> bool:
     """Return whether a shifted copy of a homography explains (N, 2) points as well as it does.
 
-    And the `sparse` matches, (M, 2) in both images, of all that is seen, many of them wrong.
+    And the `sparse` matches, (M, 2) in both images, of all that is seen, many of them wrong: what
+    does not recur off a plane moves towards an epipole where its homography is the right one.
     """
     (first, scale0), (second, scale1) = (downscale(gray, COMPARED_SIDE_PX) for gray in grays)
     matrix = scaled_homography(homography, scale0, scale1)
@@ -120,21 +126,40 @@ def is_repeated(
         other_alone = np.sum(gain < -MIN_ZNCC_GAIN)
         if alone < max(MIN_OWN_FRACTION * len(gain), MIN_OWN_RATIO * other_alone):
             copy = scaled_homography(other, 1 / scale0, 1 / scale1)
-            if sparse is None or not _parallax_decides(*sparse, homography, copy, seed):
+            if sparse is None or not _parallax_decides(
+                first, scale0, sparse, homography, copy, seed
+            ):
                 return True
     return False
 
 
 def _parallax_decides(
-    points0: np.ndarray, points1: np.ndarray, plane: np.ndarray, copy: np.ndarray, seed: int
+    first: np.ndarray, scale0: float, sparse: Pair, plane: np.ndarray, copy: np.ndarray, seed: int
 ) -> bool:
     """Whether what lies off a plane, and off its copy, agrees on an epipole with it alone."""
+    points0, points1 = sparse
+    on_plane = transform_points(points1, np.linalg.inv(plane))
+    starts, ends = (scaled_points(points, scale0) for points in (points0, on_plane))
+    shown = ((ends > 0) & (ends < np.array(first.shape[::-1]) - 1)).all(axis=1)
+    ends[~shown] = 0
+    # Where the plane shows the same in the first image, further on, the match is of the pattern.
+    alike = (_patches(first, starts) * _patches(first, ends)).sum(axis=1) > MIN_ZNCC
+    recurs = ~shown | (alike & (np.linalg.norm(ends - starts, axis=1) > MIN_SHIFT_PX))
     errors = [transfer_errors(points0, points1, each) for each in (plane, copy)]
-    off = np.minimum(*errors) > OFF_PLANE_PX
+    off = ~recurs & (np.minimum(*errors) > OFF_PLANE_PX)
     own, other = (
         measure_parallax(points0[off], points1[off], each, seed).log10_nfa for each in (plane, copy)
     )
     return own < min(other, 0) + MAX_LOG10_NFA
+
+
+def _patches(image: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the windows around (M, 2) points with mean 0 and norm 1, (M, `WINDOW_PX`²)."""
+    offsets = np.indices((WINDOW_PX, WINDOW_PX))[::-1].reshape(2, -1) - (WINDOW_PX - 1) / 2
+    x, y = (points.T[:, :, None] + offsets[:, None]).astype(np.float32)
+    values = cv2.remap(gaussian_blur(image, BLUR_SIGMA_PX), x, y, cv2.INTER_LINEAR).astype(float)
+    values -= values.mean(axis=1, keepdims=True)
+    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)
 
 
 def _correlation(first: np.ndarray, second: np.ndarray, homography: np.ndarray) -> np.ndarray:
