@@ -14,10 +14,12 @@ from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.records import file_digest
 from ..features.keypoints import Keypoints
+from ..features.learned import LEARNED
 from ..features.selection import check_ignore, check_max_keypoints
-from ..features.sift import describe_keypoints
+from ..features.sift import ROOT_SIFT, describe_keypoints
 from ..io.image import Images, batch_length, ignore_masks, image_named, load_each, load_image, luma
 from .heatmap import MAX_AUTO_PIXELS, memory_named
+from .points.descriptor import describe_learned
 from .points.detection import SPREADS, Spread, detect_points
 from .points.ranker import load_ranker
 from .pretrained import RANKER
@@ -132,22 +134,33 @@ class PointDetector:
 
     @suggest_keywords
     def extract(
-        self, image: Any, *, ignore: np.ndarray | None = None, channels: Channels = "rgb"
+        self,
+        image: Any,
+        *,
+        descriptor: Literal["rootsift", "learned"] = "rootsift",
+        ignore: np.ndarray | None = None,
+        channels: Channels = "rgb",
     ) -> Keypoints:
-        """Detect the best keypoints of an image, and describe them by RootSIFT.
+        """Detect the best keypoints of an image, and describe them.
 
         Args:
             image, ignore, channels: as of `detect`.
+            descriptor: "rootsift", RootSIFT at the keypoints' own sizes and angles; or "learned",
+                by a small network that sees their surroundings, too.
 
         Returns:
-            As `detect`, with (N, 128) uint8 descriptors at the keypoints' own sizes and angles.
+            As `detect`, with descriptors: (N, 128) uint8 RootSIFT, or (N, 64) float32 learned ones.
 
         Raises:
             ImageError: the image cannot be read or is not fit.
-            OptionError: the mask has another size than the image.
+            OptionError: the descriptor is unknown, or the mask has another size than the image.
         """
+        check_name("descriptor", descriptor, (ROOT_SIFT, LEARNED))
         rgb = load_image(image, channels=channels)
-        return describe_keypoints(luma(rgb), self._find(rgb, ignore))
+        keypoints = self._find(rgb, ignore)
+        if descriptor == ROOT_SIFT:
+            return describe_keypoints(luma(rgb), keypoints)
+        return describe_learned(self._scaled(luma(rgb)), keypoints)
 
     def __repr__(self) -> str:
         return (
@@ -160,12 +173,9 @@ class PointDetector:
         height, width = gray.shape
         if ignore is not None:
             ignore = check_ignore(ignore, gray.shape)
-        scale = (MAX_AUTO_PIXELS / gray.size) ** 0.5
-        scaled = self.resolution == "auto" and scale < 1
-        size = (width, height)
-        if scaled:
-            size = (max(1, round(width * scale)), max(1, round(height * scale)))
-            gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+        gray = self._scaled(gray)
+        size = (gray.shape[1], gray.shape[0])
+        scaled = size != (width, height)
         if scaled and ignore is not None:
             # Wherever a pixel of the small image, or one beside it, holds something to be ignored.
             share = cv2.resize(ignore.astype(np.float32), size, interpolation=cv2.INTER_AREA)
@@ -183,3 +193,12 @@ class PointDetector:
             image_size=(width, height),
             sizes=None if found.sizes is None else found.sizes * factor.mean(),
         )
+
+    def _scaled(self, gray: np.ndarray) -> np.ndarray:
+        """Return the image that keypoints are found in."""
+        height, width = gray.shape
+        scale = (MAX_AUTO_PIXELS / gray.size) ** 0.5
+        if self.resolution == "native" or scale >= 1:
+            return gray
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        return cv2.resize(gray, size, interpolation=cv2.INTER_AREA)

@@ -16,6 +16,7 @@ from .._shared.options import check_ranges, suggest_keywords
 from .._shared.progress import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_keypoints
 from ..features.keypoints import Keypoints, nearest_keypoints
+from ..features.learned import LEARNED, common_turn, turn_descriptors
 from ..features.matchers import get_matcher, match_descriptors
 from ..features.matches import Matches, TwoViewGeometry, lazy
 from ..features.selection import SelectionOptions
@@ -236,15 +237,26 @@ def match_features(
         raise OptionError(f"the ratio must be above 0 and at most 1, not {ratio}")
     check_memory([len(features0), len(features1)])
     alike = features0.sizes is None and features1.sizes is None  # all of one scale and angle
-    matches = match_descriptors(
-        features0.descriptors,
-        features1.descriptors,
-        get_matcher(matcher),
+    match = partial(
+        match_descriptors,
+        matcher=get_matcher(matcher),
         ratio=ratio,
         mutual=mutual,
         seed=seed,
         positions=(features0.xy, features1.xy) if alike else None,
     )
+    descriptors0, descriptors1 = features0.descriptors, features1.descriptors
+    matches = match(descriptors0, descriptors1)
+    angles0, angles1 = features0.angles, features1.angles
+    if features0.descriptor_type == LEARNED and angles0 is not None and angles1 is not None:
+        # Upright descriptors are the best, but where the images are turned. By how much, those at
+        # the keypoints' own angles tell.
+        own = match(
+            turn_descriptors(descriptors0, -angles0), turn_descriptors(descriptors1, -angles1)
+        )
+        turn = common_turn(angles1[own.indices1] - angles0[own.indices0])
+        turned = match(descriptors0, turn_descriptors(descriptors1, -turn))
+        matches = max(matches, turned, key=len)
     return Matches(
         features0.xy[matches.indices0],
         features1.xy[matches.indices1],

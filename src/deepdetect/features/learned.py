@@ -1,0 +1,41 @@
+"""Learned descriptors: upright ones, which are turned without looking at the image again."""
+
+from __future__ import annotations
+
+import numpy as np
+
+LEARNED = "learned"
+"""`Keypoints.descriptor_type` of these."""
+
+CONSTANT = 16
+"""So many numbers, the first, are the same in an image that is turned."""
+
+FREQUENCIES = np.repeat([1, 2, 3], [12, 8, 4])
+"""Of the others, which are the real and then the imaginary parts of complex numbers: an image that
+is turned by an angle turns them by so many times the angle."""
+
+HISTOGRAM_DEGREES = 10
+NEAR_DEGREES = 20
+"""Bins of differences of angles, and how far from the fullest the others are counted with it."""
+
+
+def turn_descriptors(descriptors: np.ndarray, degrees: np.ndarray | float) -> np.ndarray:
+    """Return (N, 64) float32 learned descriptors as in an image that is turned.
+
+    By (N,) or one angle, as `Keypoints.angles`: from the axis of x to that of y.
+    """
+    real = CONSTANT + len(FREQUENCIES)
+    turns = np.exp(1j * np.radians(np.reshape(degrees, (-1, 1))) * FREQUENCIES)
+    numbers = (descriptors[:, CONSTANT:real] + 1j * descriptors[:, real:]) * turns
+    return np.hstack([descriptors[:, :CONSTANT], numbers.real, numbers.imag]).astype(np.float32)
+
+
+def common_turn(degrees: np.ndarray) -> float:
+    """Return the angle that most of (N,) differences of angles are near; 0 without any."""
+    degrees = degrees % 360
+    bins = np.bincount((degrees // HISTOGRAM_DEGREES).astype(int), minlength=36)
+    fullest = int((bins + np.roll(bins, 1) + np.roll(bins, -1)).argmax())
+    centre = (fullest + 0.5) * HISTOGRAM_DEGREES
+    gaps = (degrees - centre + 180) % 360 - 180
+    near = gaps[np.abs(gaps) < NEAR_DEGREES]
+    return centre + float(np.median(near)) if len(near) else 0.0
