@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import torch
 from network import DescriptorNetwork, turn
 from safetensors.torch import load_file, save_file
@@ -182,6 +183,21 @@ def write(network: DescriptorNetwork, output: Path) -> None:
         dynamic_axes={"luma": {2: "height", 3: "width"}}
         | {name: {1: "keypoints"} for name in ("xy", "sizes", "descriptors")},
     )
+    halve(output.with_suffix(".onnx"))
+
+
+def halve(path: Path) -> None:
+    """Store the kernels of an ONNX file as float16; runtimes compute in float32 as before."""
+    model = onnx.load(path)
+    graph = model.graph
+    for kernel in [each for each in graph.initializer if math.prod(each.dims) > 1000]:
+        name = f"{kernel.name}_float16"
+        values = onnx.numpy_helper.to_array(kernel).astype(np.float16)
+        cast = onnx.helper.make_node("Cast", [name], [kernel.name], to=onnx.TensorProto.FLOAT)
+        graph.node.insert(0, cast)
+        graph.initializer.remove(kernel)
+        graph.initializer.append(onnx.numpy_helper.from_array(values, name))
+    onnx.save(model, path)
 
 
 def main() -> None:

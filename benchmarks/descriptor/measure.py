@@ -1,0 +1,160 @@
+"""Right matches by descriptors alone: RootSIFT and the learned descriptor on the same points.
+
+    python benchmarks/descriptor/measure.py DATA [--method edgepoint2_t32.onnx ...]
+
+DATA holds the folders oxford, hpatches, hdr, fountain and entry. 2,048 keypoints of an image,
+mutual nearest neighbours without a ratio test; files of other methods bring their own keypoints.
+Right matches are within 3 px of the truth (hdr: 2 px), means over pairs. Dark copies have 1/8 of
+the light and noise of one grey level, blurred copies a Gaussian of 2 px; both, and turned copies in
+steps of 15 degrees (worst over best, without quarter turns, which no interpolation blurs), are of
+the first image of each Oxford scene. hdr: the exposure of middle grey with each darker one, in all.
+Poses: area under the curve to 5 degrees, with the ratio .85 (a learned one has none), a mean over
+five orders of the matches, by which MAGSAC's result varies.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from deepdetect import Keypoints, PointDetector, match_features
+from deepdetect.datasets.planar import load_hpatches, load_oxford
+from deepdetect.datasets.posed_images import PosedPair, load_posed_scenes
+from deepdetect.evaluation.baselines.external import onnx_feature
+from deepdetect.evaluation.metrics.homography import corner_error
+from deepdetect.evaluation.metrics.pose import pose_auc
+from deepdetect.evaluation.protocols.planar import pairs_of
+from deepdetect.evaluation.protocols.pose import ERROR, estimate_pose, pose_errors
+from deepdetect.evaluation.report import Row, Table
+from deepdetect.geometry import GeometryOptions, estimate_geometry
+from deepdetect.geometry.transforms import transfer_errors
+from deepdetect.io.image import load_image, luma
+
+KEYPOINTS, RIGHT_PX, RIGHT_DARK_PX, RATIO, ORDERS, AUC_DEG = 2048, 3.0, 2.0, 0.85, 5, 5.0
+POINTS = PointDetector(KEYPOINTS)
+MIDDLE_GREY = 118
+
+Extract = Callable[[np.ndarray], Keypoints]
+
+
+def methods(files: list[str]) -> dict[str, Extract]:
+    """Return what extracts keypoints with descriptors, by name; others' files too."""
+    found: dict[str, Extract] = {
+        kind: partial(POINTS.extract, descriptor=kind)  # type: ignore[arg-type]
+        for kind in ("rootsift", "learned")
+    }
+    return found | {Path(file).stem: _extract_other(file) for file in files}
+
+
+def _extract_other(file: str) -> Extract:
+    feature = onnx_feature(file)
+    return lambda rgb: feature.detect(rgb).best(KEYPOINTS)
+
+
+def copies(rgb: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return changed copies of an image by kind, each with the homography to it."""
+    noise = np.random.default_rng(3).normal(0, 1, rgb.shape[:2])
+    dark = np.clip(np.rint(luma(rgb) / 8 + noise), 0, 255).astype(np.uint8)
+    made = {"dark": (dark, np.eye(3)), "blurred": (cv2.GaussianBlur(rgb, (0, 0), 2), np.eye(3))}
+    height, width = rgb.shape[:2]
+    for degrees in range(15, 360, 15):
+        turn = cv2.getRotationMatrix2D(((width - 1) / 2, (height - 1) / 2), degrees, 1)
+        how = {"flags": cv2.INTER_CUBIC, "borderMode": cv2.BORDER_REFLECT_101}
+        turned = cv2.warpAffine(rgb, turn, (width, height), **how)  # type: ignore[call-overload]
+        made[f"turned {degrees}"] = turned, np.vstack([turn, [0, 0, 1]])
+    return made
+
+
+def measure(extract: Extract, data: Path) -> Row:
+    """Return the columns of the table."""
+
+    @cache
+    def features(path: Path) -> Keypoints:
+        return extract(load_image(path))
+
+    def errors(first: Keypoints, second: Keypoints, homography: np.ndarray) -> np.ndarray:
+        found = match_features(first, second, ratio=1)
+        return transfer_errors(found.points0, found.points1, homography)
+
+    counts: dict[str, list[int]] = {}
+
+    def count(kind: str, *pair: Any, px: float = RIGHT_PX) -> int:
+        distances = errors(*pair)
+        counts.setdefault(kind, []).append(int((distances <= px).sum()))
+        return len(distances)
+
+    for pair in pairs_of(load_hpatches(data / "hpatches")):
+        count("HPatches", features(pair.first), features(pair.second), pair.homography)
+    matched, corners = 0, []
+    pairs = pairs_of(load_oxford(data / "oxford", "refined"))
+    for pair in pairs:
+        both = features(pair.first), features(pair.second)
+        matched += count(pair.kind, *both, pair.homography)
+        found = match_features(*both, ratio=1)
+        options = GeometryOptions(inlier_threshold=1.5)
+        fitted = estimate_geometry(found.points0, found.points1, "homography", options=options)
+        corners.append(corner_error(fitted.matrix, pair.homography, both[0].image_size))
+    right = sum(sum(counts[kind]) for kind in {pair.kind for pair in pairs})
+    for path in dict.fromkeys(pair.first for pair in pairs):
+        for kind, (changed, homography) in copies(load_image(path)).items():
+            count(kind, features(path), extract(changed), homography)
+    for scene in sorted((data / "hdr").iterdir()):
+        greys = {path: float(luma(load_image(path)).mean()) for path in scene.glob("*.png")}
+        best = min(greys, key=lambda path: abs(greys[path] - MIDDLE_GREY))
+        for path in sorted(path for path in greys if greys[path] < greys[best]):
+            count("hdr", features(best), features(path), np.eye(3), px=RIGHT_DARK_PX)
+    means = {kind: float(np.mean(values)) for kind, values in counts.items()}
+    turned = [means.pop(f"turned {degrees}") for degrees in range(15, 360, 15)]
+    turned = [value for number, value in enumerate(turned, 1) if number % 6]
+    return {
+        **means,
+        "hdr": float(sum(counts["hdr"])),
+        "precision": right / matched,
+        "worst turn": min(turned) / max(turned),
+        "within 1 px": float((np.array(corners) <= 1).sum()),
+        "within 3 px": float((np.array(corners) <= 3).sum()),
+        **{name: auc(features, data / name) for name in ("fountain", "entry")},
+    }
+
+
+def auc(features: Callable[[Path], Keypoints], folder: Path) -> float:
+    """Return the area under the curve of pose errors, a mean over orders of the matches."""
+    pairs = [pair for scene in load_posed_scenes(folder) for pair in scene.pairs]
+    by_pair = np.array([_pose_errors(features, pair) for pair in pairs])
+    return float(np.mean([pose_auc(errors.tolist(), AUC_DEG) for errors in by_pair.T]))
+
+
+def _pose_errors(features: Callable[[Path], Keypoints], pair: PosedPair) -> list[float]:
+    both = features(pair.first.path), features(pair.second.path)
+    found = match_features(*both, ratio=RATIO if both[0].descriptor_type == "rootsift" else 1)
+    cameras = pair.first.intrinsics, pair.second.intrinsics
+    found_errors = []
+    for order in range(ORDERS):
+        rows = np.random.default_rng(order).permutation(len(found))
+        pose = estimate_pose(found.points0[rows], found.points1[rows], *cameras)
+        found_errors.append(pose_errors(pose, pair)[ERROR])
+    return found_errors
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--method", action="append", default=[], help="an ONNX file")
+    given = parser.parse_args()
+    rows: list[Row] = []
+    for name, extract in methods(given.method).items():
+        rows.append({"descriptors": name, **measure(extract, given.data)})
+    styles = dict.fromkeys(rows[0], ".0f") | {"descriptors": ""}
+    styles |= dict.fromkeys(("precision", "worst turn", "fountain", "entry"), ".3f")
+    print(Table("descriptors", "descriptors", styles, rows).to_markdown())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,48 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import deepdetect
+from deepdetect import Keypoints, OptionError, PointDetector
+from deepdetect.detector.points.descriptor import describe_learned
+
+
+def learned(image: np.ndarray) -> Keypoints:
+    return PointDetector(300).extract(image, descriptor="learned")
+
+
+def test_descriptors_of_length_one_belong_to_the_detected_points(photo: np.ndarray) -> None:
+    found, detected = learned(photo), PointDetector(300).detect(photo)
+    np.testing.assert_array_equal(found.xy, detected.xy)
+    assert found.descriptors is not None
+    assert (found.descriptors.shape, found.descriptor_type) == ((300, 64), "learned")
+    np.testing.assert_allclose(np.linalg.norm(found.descriptors, axis=1), 1, atol=1e-5)
+
+
+def test_rows_do_not_depend_on_each_other(photo: np.ndarray) -> None:
+    gray, found = photo[:, :, 1], learned(photo)
+    alone = describe_learned(gray, found[7:8]).descriptors
+    np.testing.assert_allclose(describe_learned(gray, found).descriptors[7:8], alone, atol=1e-5)
+
+
+@pytest.mark.parametrize("quarter_turns", range(4))
+def test_points_of_a_darkened_turned_image_are_matched(
+    photo: np.ndarray, quarter_turns: int
+) -> None:
+    side = min(photo.shape[:2])
+    square = photo[:side, :side]
+    other = np.ascontiguousarray(np.rot90(square, -quarter_turns)) // 3 + 20  # clockwise
+    matches = deepdetect.match_features(learned(square), learned(other), ratio=1)
+    x, y = matches.points0.T
+    for _ in range(quarter_turns):
+        x, y = side - 1 - y, x
+    right = np.hypot(*(np.stack([x, y], 1) - matches.points1).T) < 3
+    assert right.sum() > 150
+
+
+def test_other_descriptors_cannot_be_compared(photo: np.ndarray) -> None:
+    with pytest.raises(OptionError, match="learned"):
+        deepdetect.match_features(learned(photo), PointDetector(300).extract(photo))
+    with pytest.raises(OptionError, match="rootsift"):
+        PointDetector().extract(photo, descriptor="rootsfit")  # type: ignore[arg-type]
