@@ -34,7 +34,7 @@ def describe_learned(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
     inputs = {
         "luma": padded[None, None].astype(np.float32) / 255,
         "xy": ((keypoints.xy + 0.5) * factor - 0.5)[None],
-        "sizes": (keypoints.sizes * factor.mean())[None],  # type: ignore[index]  # points have sizes
+        "sizes": (keypoints.sizes * factor.mean())[None],
     }
     descriptors = _session().run(["descriptors"], inputs)[0][0]
     return replace(keypoints, descriptors=descriptors, descriptor_type=LEARNED)
