@@ -72,6 +72,8 @@ STAGES = {
     "times": "benchmarks/times.py {data} --cache {output}/cache"
     + "".join(f" --method {{published}}/peers/{name}.onnx" for name in PEERS),
     "published-pipeline": "benchmarks/published_pipeline.py {data}",
+    "descriptors": "benchmarks/descriptor/measure.py {data}"
+    + "".join(f" --method {{published}}/peers/{name}.onnx" for name in PEERS[1:]),
     "fuzz": "-m fuzz",
 }
 """Arguments of Python by the stage's name. What writes no report prints its tables, or JSON."""
@@ -263,6 +265,7 @@ RESULTS = {
     "costs": Result("costs", "0"),
     "times": Result("times", "0"),
     "published-pipeline": Result("published-pipeline", "0"),
+    "descriptors": Result("descriptors", "0"),
     "fuzz": Result("fuzz", "0"),
     "foreground": Result(
         "foreground",

@@ -8,8 +8,8 @@ Right matches are within 3 px of the truth (hdr: 2 px), means over pairs. Dark c
 the light and noise of one grey level, blurred copies a Gaussian of 2 px; both, and turned copies in
 steps of 15 degrees (worst over best, without quarter turns, which no interpolation blurs), are of
 the first image of each Oxford scene. hdr: the exposure of middle grey with each darker one, in all.
-Poses: area under the curve to 5 degrees, with the ratio .85 (a learned one has none), a mean over
-five orders of the matches, by which MAGSAC's result varies.
+Poses: area under the curve to 5 degrees, with the ratio .85, a mean over five orders of the
+matches, by which MAGSAC's result varies.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def auc(features: Callable[[Path], Keypoints], folder: Path) -> float:
 
 def _pose_errors(features: Callable[[Path], Keypoints], pair: PosedPair) -> list[float]:
     both = features(pair.first.path), features(pair.second.path)
-    found = match_features(*both, ratio=RATIO if both[0].descriptor_type == "rootsift" else 1)
+    found = match_features(*both, ratio=RATIO)
     cameras = pair.first.intrinsics, pair.second.intrinsics
     found_errors = []
     for order in range(ORDERS):
