@@ -1,0 +1,1 @@
+"""Training the learned descriptor: photographs -> pairs of views -> network -> ONNX file."""
