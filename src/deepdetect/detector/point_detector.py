@@ -14,7 +14,7 @@ from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.records import file_digest
 from ..features.keypoints import Keypoints
-from ..features.learned import LEARNED
+from ..features.learned import LEARNED, LEARNED_FREE
 from ..features.selection import check_ignore, check_max_keypoints
 from ..features.sift import ROOT_SIFT, describe_keypoints
 from ..io.image import Images, batch_length, ignore_masks, image_named, load_each, load_image, luma
@@ -137,7 +137,7 @@ class PointDetector:
         self,
         image: Any,
         *,
-        descriptor: Literal["rootsift", "learned"] = "rootsift",
+        descriptor: Literal["rootsift", "learned", "learned-free"] = "rootsift",
         ignore: np.ndarray | None = None,
         channels: Channels = "rgb",
     ) -> Keypoints:
@@ -146,7 +146,8 @@ class PointDetector:
         Args:
             image, ignore, channels: as of `detect`.
             descriptor: "rootsift", RootSIFT at the keypoints' own sizes and angles; or "learned",
-                by a small network that sees their surroundings, too.
+                by a small network that sees their surroundings, too; "learned-free", by one that
+                was trained on photographs under free licences alone.
 
         Returns:
             As `detect`, with descriptors: (N, 128) uint8 RootSIFT, or (N, 64) float32 learned ones.
@@ -155,12 +156,12 @@ class PointDetector:
             ImageError: the image cannot be read or is not fit.
             OptionError: the descriptor is unknown, or the mask has another size than the image.
         """
-        check_name("descriptor", descriptor, (ROOT_SIFT, LEARNED))
+        check_name("descriptor", descriptor, (ROOT_SIFT, LEARNED, LEARNED_FREE))
         rgb = load_image(image, channels=channels)
         keypoints = self._find(rgb, ignore)
         if descriptor == ROOT_SIFT:
             return describe_keypoints(luma(rgb), keypoints)
-        return describe_learned(self._scaled(luma(rgb)), keypoints)
+        return describe_learned(self._scaled(luma(rgb)), keypoints, descriptor)
 
     def __repr__(self) -> str:
         return (

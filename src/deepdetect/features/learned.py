@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-LEARNED = "learned"
-"""`Keypoints.descriptor_type` of these."""
+LEARNED, LEARNED_FREE = "learned", "learned-free"
+"""`Keypoints.descriptor_type` of these; the second by weights of photographs under free licences
+alone."""
 
 CONSTANT = 16
 """So many numbers, the first, are the same in an image that is turned."""

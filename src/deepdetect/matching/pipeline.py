@@ -16,7 +16,7 @@ from .._shared.options import check_ranges, suggest_keywords
 from .._shared.progress import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_keypoints
 from ..features.keypoints import Keypoints, nearest_keypoints
-from ..features.learned import LEARNED, common_turn, turn_descriptors
+from ..features.learned import LEARNED, LEARNED_FREE, common_turn, turn_descriptors
 from ..features.matchers import get_matcher, match_descriptors
 from ..features.matches import Matches, TwoViewGeometry, lazy
 from ..features.selection import SelectionOptions
@@ -248,7 +248,8 @@ def match_features(
     descriptors0, descriptors1 = features0.descriptors, features1.descriptors
     matches = match(descriptors0, descriptors1)
     angles0, angles1 = features0.angles, features1.angles
-    if features0.descriptor_type == LEARNED and angles0 is not None and angles1 is not None:
+    learned = features0.descriptor_type in (LEARNED, LEARNED_FREE)
+    if learned and angles0 is not None and angles1 is not None:
         # Upright descriptors are the best, but where the images are turned. By how much, those at
         # the keypoints' own angles tell.
         own = match(

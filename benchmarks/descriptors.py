@@ -1,6 +1,6 @@
 """Right matches by descriptors alone: RootSIFT and the learned descriptor on the same points.
 
-    python benchmarks/descriptor/measure.py DATA [--method edgepoint2_t32.onnx ...]
+    python benchmarks/descriptors.py DATA [--method edgepoint2_t32.onnx ...]
 
 DATA holds the folders oxford, hpatches, hdr, fountain and entry. 2,048 keypoints of an image,
 mutual nearest neighbours without a ratio test; files of other methods bring their own keypoints.
