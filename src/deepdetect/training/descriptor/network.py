@@ -10,6 +10,8 @@ of an upright image: the first 16 do not change where it is turned, the others t
 from __future__ import annotations
 
 import math
+from functools import reduce
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -53,13 +55,17 @@ class Convolution(nn.Module):
         if not self.training:
             return relu(norm(x))
         if octave == 0:
-            self.batch = torch.zeros_like(norm.running_mean), torch.ones_like(norm.running_var)
-            x = batch_norm(x, *self.batch, norm.weight, norm.bias, training=True, momentum=1)
-            with torch.no_grad():
-                norm.running_mean.lerp_(self.batch[0], BATCH_MOMENTUM)
-                norm.running_var.lerp_(self.batch[1], BATCH_MOMENTUM)
-            return relu(x)
-        return relu(batch_norm(x, *self.batch, norm.weight, norm.bias))
+            self.mean, self.variance = (
+                x.new_zeros(x.shape[1]).float(),
+                x.new_ones(x.shape[1]).float(),
+            )
+        batch = self.mean, self.variance
+        first = octave == 0
+        result = relu(batch_norm(x, *batch, norm.weight, norm.bias, training=first, momentum=1))
+        if first:
+            for running, each in zip((norm.running_mean, norm.running_var), batch, strict=True):
+                cast(Tensor, running).lerp_(each, BATCH_MOMENTUM)
+        return result
 
 
 class Halving(nn.Module):
@@ -134,10 +140,9 @@ class DescriptorNetwork(nn.Module):
         ]
         sizes = sizes.clamp(min=SMALLEST_SIZE_PX)
         own = (sizes / FIRST_OCTAVE_PX).log2().clamp(0, OCTAVES - 1)[..., None]
-        own_octave = sum(
-            features * (1 - (own - octave).abs()).clamp(min=0)
-            for octave, features in enumerate(octaves)
-        )
+        shares = (1 - (own - torch.arange(OCTAVES, device=xy.device)).abs()).clamp(min=0)
+        parts = map(torch.mul, octaves, shares.split(1, -1))
+        own_octave = reduce(torch.add, parts)
         features = self.input(torch.cat([octaves[0], own_octave], 2)).flatten(0, 1)
         scale = (sizes / SMALLEST_SIZE_PX).flatten().log()[:, None]
         seen = torch.cat([scale - 0.7, (scale - 0.7) ** 2 - 0.3, (scale * 3).sin()], 1)
@@ -175,16 +180,18 @@ def _read(features: Tensor, xy: Tensor) -> Tensor:
     shape = torch._shape_as_tensor(features)
     last = shape[[3, 2]].to(xy.dtype) - 1
     xy = xy.clamp(min=0).minimum(last)
-    corner = xy.floor().minimum(last - 1)
-    (right, below), width = (xy - corner).unbind(-1), shape[3]
+    origin = xy.floor().minimum(last - 1)
+    (right, below), width = (xy - origin).unbind(-1), shape[3]
     image = torch.arange(len(features), device=xy.device)[:, None] * (shape[2] * width)
-    first = (corner[..., 1] * width + corner[..., 0]).long() + image
+    first = (origin[..., 1] * width + origin[..., 0]).long() + image
     pixels = features.permute(0, 2, 3, 1).flatten(0, 2)
     weights = (1 - right) * (1 - below), right * (1 - below), (1 - right) * below, right * below
-    return sum(
-        pixels[first + offset].float() * weight[..., None]
-        for offset, weight in zip((0, 1, width, width + 1), weights, strict=True)
+    corners = first, first + 1, first + width, first + width + 1
+    values = (
+        pixels[corner].float() * weight[..., None]
+        for corner, weight in zip(corners, weights, strict=True)
     )
+    return reduce(torch.add, values)
 
 
 def turn(descriptors: Tensor, angles: Tensor) -> Tensor:
