@@ -1,6 +1,6 @@
 """How often matches are right, by their confidence: of photographs, and of pairs made of them.
 
-    python benchmarks/made_pairs.py DATA [--only photographs|planes|refusal] [--every N]
+    python benchmarks/made_pairs.py DATA [--only photographs|planes|refusal|hard] [--every N]
 
 DATA holds oxford, middlebury, foreground, and the scenes of `deepdetect benchmark pose`. A line for
 each kind of pair: how many pairs, how many were answered with high and with fair confidence, and
@@ -33,6 +33,9 @@ from deepdetect.io.image import load_image
 
 PAIRS = 60
 """Made pairs of planes, and of facades; the number of a pair is its seed."""
+
+HARD_PAIRS = 200
+"""Made pairs of views that differ much."""
 
 SIZE = (720, 600)
 """Width and height of a made image."""
@@ -221,11 +224,46 @@ def facades(photographs: Photographs) -> Iterator[MadePair]:
         yield MadePair(kind, (views[0], views[1]), homography, np.ones(SIZE[::-1], bool))
 
 
+def hard_views(photographs: Photographs) -> Iterator[MadePair]:
+    """See a photograph from the side, from further away, or in other tones."""
+    for number in range(HARD_PAIRS):
+        rng = np.random.default_rng([2, number])
+        kind = ("seen from the side", "seen from the side", "zoomed", "other tones")[number % 4]
+        image = resized(load_image(photographs.planes[rng.integers(len(photographs.planes))]), SIZE)
+        centre = np.array(SIZE) / 2
+        to_centre, back, change = np.eye(3), np.eye(3), np.eye(3)
+        to_centre[:2, 2], back[:2, 2] = -centre, centre
+        shorter, factor = rng.uniform(2, 6), rng.uniform(2, 6)
+        if kind == "seen from the side":
+            turn = cv2.getRotationMatrix2D((0, 0), rng.uniform(0, 180), 1)[:, :2]
+            change[:2, :2] = turn.T @ np.diag([1 / shorter, 1]) @ turn
+            blur = 0.8 * (shorter**2 - 1) ** 0.5
+            turned = np.vstack([np.c_[turn, centre - turn @ centre], [0, 0, 1]])
+            across = cv2.warpPerspective(image, turned, SIZE, borderMode=cv2.BORDER_REFLECT_101)
+            across = cv2.GaussianBlur(across, (0, 0), sigmaX=blur, sigmaY=0.01)
+            how = {"flags": cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REFLECT_101}
+            image1 = cv2.warpPerspective(across, turned, SIZE, **how)
+        elif kind == "zoomed":
+            change[:2, :2] *= 1 / factor
+            image1 = cv2.GaussianBlur(image, (0, 0), 0.5 * (factor**2 - 1) ** 0.5)
+        else:
+            tones = np.arange(256) / 255
+            curve = 1 - tones if number % 8 == 3 else tones ** (4 ** rng.uniform(-1, 1))
+            image1 = cv2.LUT(image, np.rint(255 * curve).astype(np.uint8))
+        outline = corners(*SIZE)
+        moved = outline + rng.uniform(-0.03, 0.03, (4, 2)) * SIZE[1]
+        homography = cv2.getPerspectiveTransform(outline, moved.astype(np.float32))
+        homography = homography @ back @ change @ to_centre
+        seen = cv2.warpPerspective(image1, homography, SIZE).astype(np.float32)
+        seen = np.clip(seen + rng.normal(0, NOISE, seen.shape), 0, 255).astype(np.uint8)
+        yield MadePair(kind, (image, seen), homography, np.ones(SIZE[::-1], bool))
+
+
 def main() -> None:
     """Match all pairs and print a table of them by their kinds."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("data", type=Path)
-    parser.add_argument("--only", choices=("photographs", "planes", "refusal"))
+    parser.add_argument("--only", choices=("photographs", "planes", "refusal", "hard"))
     parser.add_argument("--every", type=int, default=1, help="only every Nth pair")
     arguments = parser.parse_args()
     photographs, detector = Photographs(arguments.data), DeepDetect()
@@ -233,6 +271,7 @@ def main() -> None:
         "photographs": (photographs_of(arguments.data),),
         "planes": (planes(photographs),),
         "refusal": (unrelated(photographs), facades(photographs)),
+        "hard": (hard_views(photographs),),
     }
     rows: dict[str, list[list[bool]]] = {}
     for name, makers in pairs.items():

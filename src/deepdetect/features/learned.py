@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+
+from .keypoints import Keypoints
+from .matchers import DescriptorMatches
 
 LEARNED, LEARNED_FREE = "learned", "learned-free"
 """`Keypoints.descriptor_type` of these; the second by weights of photographs under free licences
@@ -14,6 +19,12 @@ CONSTANT = 16
 FREQUENCIES = np.repeat([1, 2, 3], [12, 8, 4])
 """Of the others, which are the real and then the imaginary parts of complex numbers: an image that
 is turned by an angle turns them by so many times the angle."""
+
+UPRIGHT_DEGREES = 15.0
+"""Images turned by less are compared as they are, which the network has learned to bear."""
+
+TURNED_KEYPOINTS = 1024
+"""So many, the best of each image, tell by how much one is turned."""
 
 HISTOGRAM_DEGREES = 10
 NEAR_DEGREES = 20
@@ -29,6 +40,34 @@ def turn_descriptors(descriptors: np.ndarray, degrees: np.ndarray | float) -> np
     turns = np.exp(1j * np.radians(np.reshape(degrees, (-1, 1))) * FREQUENCIES)
     numbers = (descriptors[:, CONSTANT:real] + 1j * descriptors[:, real:]) * turns
     return np.hstack([descriptors[:, :CONSTANT], numbers.real, numbers.imag]).astype(np.float32)
+
+
+def match_learned(
+    features0: Keypoints,
+    features1: Keypoints,
+    match: Callable[[np.ndarray, np.ndarray], DescriptorMatches],
+) -> DescriptorMatches:
+    """Match learned descriptors as they are, or turned by the angle that most keypoints show.
+
+    Upright descriptors are the best, but where the images are turned. By how much, those at the
+    keypoints' own angles tell.
+    """
+    descriptors0, descriptors1 = features0.descriptors, features1.descriptors
+    assert descriptors0 is not None
+    assert descriptors1 is not None
+    matches = match(descriptors0, descriptors1)
+    if features0.angles is None or features1.angles is None:
+        return matches
+    best = slice(TURNED_KEYPOINTS)
+    angles0, angles1 = features0.angles[best], features1.angles[best]
+    own = match(
+        turn_descriptors(descriptors0[best], -angles0),
+        turn_descriptors(descriptors1[best], -angles1),
+    )
+    turn = common_turn(angles1[own.indices1] - angles0[own.indices0])
+    if abs((turn + 180) % 360 - 180) < UPRIGHT_DEGREES:
+        return matches
+    return max(matches, match(descriptors0, turn_descriptors(descriptors1, -turn)), key=len)
 
 
 def common_turn(degrees: np.ndarray) -> float:

@@ -16,7 +16,7 @@ from .._shared.options import check_ranges, suggest_keywords
 from .._shared.progress import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_keypoints
 from ..features.keypoints import Keypoints, nearest_keypoints
-from ..features.learned import LEARNED, LEARNED_FREE, common_turn, turn_descriptors
+from ..features.learned import LEARNED, LEARNED_FREE, match_learned
 from ..features.matchers import get_matcher, match_descriptors
 from ..features.matches import Matches, TwoViewGeometry, lazy
 from ..features.selection import SelectionOptions
@@ -245,19 +245,10 @@ def match_features(
         seed=seed,
         positions=(features0.xy, features1.xy) if alike else None,
     )
-    descriptors0, descriptors1 = features0.descriptors, features1.descriptors
-    matches = match(descriptors0, descriptors1)
-    angles0, angles1 = features0.angles, features1.angles
-    learned = features0.descriptor_type in (LEARNED, LEARNED_FREE)
-    if learned and angles0 is not None and angles1 is not None:
-        # Upright descriptors are the best, but where the images are turned. By how much, those at
-        # the keypoints' own angles tell.
-        own = match(
-            turn_descriptors(descriptors0, -angles0), turn_descriptors(descriptors1, -angles1)
-        )
-        turn = common_turn(angles1[own.indices1] - angles0[own.indices0])
-        turned = match(descriptors0, turn_descriptors(descriptors1, -turn))
-        matches = max(matches, turned, key=len)
+    if features0.descriptor_type in (LEARNED, LEARNED_FREE):
+        matches = match_learned(features0, features1, match)
+    else:
+        matches = match(features0.descriptors, features1.descriptors)
     return Matches(
         features0.xy[matches.indices0],
         features1.xy[matches.indices1],
