@@ -74,14 +74,14 @@ def test_photographs_are_not_written_over(files: list[Path]) -> None:
     assert {path: path.read_bytes() for path in files} == before
 
 
-@pytest.mark.parametrize("output", ["panorama.gif", "panorama.tif"])
+@pytest.mark.parametrize("output", ["panorama.gif", "panorama.bmp"])
 def test_an_unknown_ending_ends_before_the_work(
     files: list[Path], output: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
         "deepdetect.cli.match.stitch_images", lambda *_, **__: pytest.fail("it worked")
     )
-    assert "must end in .png, .jpg or .jpeg" in refused(*files, "-o", output)
+    assert "must end in .png, .jpg, .jpeg, .tif or .tiff" in refused(*files, "-o", output)
 
 
 @pytest.mark.slow

@@ -73,13 +73,11 @@ def array_to_rgb(
     if bands is not None:
         array = _select_bands(array, bands, name)
     array = _channels_last(array)
-    if value_range is not None:
-        values = _in_range(array, value_range, name, deep)
-    elif array.dtype.kind == "u" and array.dtype.itemsize == 2:  # of either byte order
-        table = _levels(white or _white(int(array.max(initial=0))), deep)
-        values = table[array]
-    else:
-        values = _to_levels(array, name, deep, white)
+    if array.dtype.kind not in "buif":
+        raise ImageError(f"an image cannot be of type {array.dtype}: use uint8, uint16 or float")
+    if value_range is None:
+        value_range = _range_of(array, name, white)
+    values = _in_range(array, value_range, name, deep)
     if values.ndim == 2:
         return np.repeat(values[:, :, None], 3, axis=2)
     return np.ascontiguousarray(values[:, :, :3] if channels == "rgb" else values[:, :, 2::-1])
@@ -87,7 +85,7 @@ def array_to_rgb(
 
 def to_8_bits(rgb: np.ndarray) -> np.ndarray:
     """Return an image of uint8 or uint16 as uint8."""
-    return rgb if rgb.dtype == np.uint8 else _levels(65535, False)[rgb]
+    return rgb if rgb.dtype == np.uint8 else _in_range(rgb, (0, 65535), "", False)
 
 
 def fill_planes(rgb: np.ndarray, planes: np.ndarray) -> None:
@@ -133,36 +131,23 @@ def _select_bands(array: np.ndarray, bands: Sequence[int], name: str) -> np.ndar
     return array[:, :, np.array(bands) - 1]
 
 
-def _white(largest: int) -> int:
-    """Return which number is white of 16 bits that say nothing of it, by the largest of them."""
-    return next(2**bits - 1 for bits in SENSOR_BITS if largest < 2**bits)
-
-
-def _levels(white: int, deep: bool) -> np.ndarray:
-    """Return the level of each number of 16 bits, from 0 to white."""
-    top = 65535 if deep else 255
-    exact = (np.arange(65536, dtype=np.uint64) * (2 * top) + white) // (2 * white)
-    return np.minimum(exact, top).astype(np.uint16 if deep else np.uint8)
-
-
-def _to_levels(array: np.ndarray, name: str, deep: bool, white: int | None) -> np.ndarray:
-    if array.dtype == np.uint8:
-        return array if white is None else _levels(white, False)[array]
-    if array.dtype == np.bool_:
-        return array.astype(np.uint8) * 255
-    if np.issubdtype(array.dtype, np.floating):
+def _range_of(array: np.ndarray, name: str, white: int | None) -> tuple[float, float]:
+    """Return which numbers are black and white."""
+    kind, size = array.dtype.kind, array.dtype.itemsize
+    if kind == "b":
+        return 0, 1
+    if kind == "u" and size <= 2:
+        bits = (bits for bits in SENSOR_BITS if array.max(initial=0) < 2**bits)
+        return 0, white or 2 ** (8 if size == 1 else next(bits)) - 1
+    if kind == "f":
         low, high = (float(array.min()), float(array.max())) if array.size else (0.0, 1.0)
-        if not np.isfinite([low, high]).all():
-            raise ImageError(f"{name} holds NaN or infinite values: replace them first")
-        if low < 0 or high > 1:
+        if np.isfinite([low, high]).all() and (low < 0 or high > 1):
             raise ImageError(
                 f"{name} spans [{low:g}, {high:g}]: scale floats to [0, 1], or give `value_range`"
             )
         if 0 < high < LITTLE_RANGE:
             warnings.warn(f"{name} {DARK.format(high)}", UserWarning, stacklevel=2)
-        return _in_range(array, (0, 1), name, deep)
-    if array.dtype.kind not in "iu":
-        raise ImageError(f"an image cannot be of type {array.dtype}: use uint8, uint16 or float")
+        return 0, 1
     raise ImageError(
         f"{name} holds {array.dtype}, whose range is not known: give `value_range`, or convert it "
         "to 8 bits, 16 bits without sign, or float in [0, 1]"
@@ -171,14 +156,20 @@ def _to_levels(array: np.ndarray, name: str, deep: bool, white: int | None) -> n
 
 def _in_range(array: np.ndarray, value_range: Sequence[float], name: str, deep: bool) -> np.ndarray:
     """Return the levels of numbers of which the first of a range is black and the second white."""
-    if array.dtype.kind not in "buif":
-        raise ImageError(f"an image cannot be of type {array.dtype}: use uint8, uint16 or float")
-    low, high = value_range
-    top, kind = (65535, np.uint16) if deep and array.dtype != np.uint8 else (255, np.uint8)
-    levels = np.empty(array.shape, kind)
-    for row, values in enumerate(array):  # of whole images the copies are large
+    (low, high), size = value_range, array.dtype.itemsize
+    if array.dtype == np.uint8 and (low, high) == (0, 255):
+        return array
+    top, kind = (65535, np.uint16) if deep and size > 1 else (255, np.uint8)
+
+    def levels(values: np.ndarray) -> np.ndarray:
         if not np.isfinite(values).all():
             raise ImageError(f"{name} holds NaN or infinite values: replace them first")
         scaled = (values.astype(np.float64) - low) * (top / (high - low))
-        levels[row] = np.rint(scaled.clip(0, top))
-    return levels
+        return np.rint(scaled.clip(0, top)).astype(kind)
+
+    if array.dtype.kind == "u" and size <= 2:
+        return levels(np.arange(256**size))[array]
+    found = np.empty(array.shape, kind)
+    for row, values in enumerate(array):  # of whole images the copies are large
+        found[row] = levels(values)
+    return found

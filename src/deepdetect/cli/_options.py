@@ -250,7 +250,7 @@ def claimed(outputs: Outputs) -> Iterator[dict[str, Any]]:
 
 
 @contextmanager
-def whole(files: Mapping[str, Path]) -> Iterator[dict[str, Path]]:
+def whole(files: Mapping[Any, Path]) -> Iterator[dict[Any, Path]]:
     """Give temporary paths for files; all of them appear when the block succeeds, else none."""
     with ExitStack() as stack:
         yield {name: stack.enter_context(atomic_path(path)) for name, path in files.items()}
@@ -258,8 +258,8 @@ def whole(files: Mapping[str, Path]) -> Iterator[dict[str, Path]]:
 
 @contextmanager
 def writing(
-    files: Mapping[str, Path], inputs: Sequence[Path], overwrite: bool
-) -> Iterator[dict[str, Path]]:
+    files: Mapping[Any, Path], inputs: Sequence[Path], overwrite: bool
+) -> Iterator[dict[Any, Path]]:
     """Give temporary paths for files, as `whole`, and record what they are made of.
 
     No input is written over, nor what was made of others.

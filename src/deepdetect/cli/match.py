@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .._shared.errors import ImageError, OptionError, RegistrationError, noted_failures
+from .._shared.image_array import array_to_rgb
 from .._shared.progress import progress, stage_progress
 from ..batch.pair_list import list_pairs
 from ..batch.pair_matching import MATCHERS_OF_FLOATS
@@ -22,7 +23,9 @@ from ..features.matches import Matches
 from ..features.sift import DESCRIPTORS
 from ..geometry import GeometryOptions
 from ..geometry.estimation import ESTIMATORS, MODEL_NAMES
+from ..geometry.transforms import translation_matrix
 from ..io.image import load_image
+from ..io.metadata import read_metadata
 from ..io.tables import save_matches
 from ..matching.pipeline import (
     GUIDED_STAGES,
@@ -62,6 +65,7 @@ GEOMETRY = cli.From(
     more="estimator inlier_threshold confidence iterations",
     types={"estimator": Literal[ESTIMATORS]},
 )
+REGISTRATION = cli.From(register_images, "extent", more="mutual seed")
 PANORAMA = cli.From(stitch_images, "projection crop", more="seed")
 OPTIONS = cli.From(StitchingOptions)
 STITCH_KEYPOINTS = cli.From(PointDetector, more="max_keypoints")
@@ -245,7 +249,7 @@ def _draw(rgb0: np.ndarray, rgb1: np.ndarray, matches: Matches, path: Path) -> N
     save_picture(add_caption(picture, caption), path)
 
 
-@cli.command(SELECTION, POINTS, NETWORK, cli.READING)
+@cli.command(REGISTRATION, SELECTION, POINTS, NETWORK, cli.READING)
 def register(
     image0: cli.Image,
     image1: cli.Image,
@@ -253,6 +257,7 @@ def register(
     *,
     output: cli.Folder = Path("deepdetect-output"),
     detector: Detector = "network",
+    apply_to: tuple[Path, ...] = (),
     overwrite: cli.Overwrite = False,
     **values: Any,
 ) -> cli.Result:
@@ -260,26 +265,49 @@ def register(
 
     Writes STEM1_on_STEM0.png (the second image in the frame of the first), the same as
     _checkerboard.png and _difference.png with the first, and _homography.txt (3x3, from the
-    first image to the second).
+    first image to the second). What the first carries is kept: its place on the Earth, its colour
+    profile, its EXIF. Where it is a GeoTIFF, or the second has other bands than RGB, the second is
+    a GeoTIFF, too, with all its bands as they are.
 
         deepdetect register map.jpg photo-of-the-map.jpg -o registered
+        deepdetect register ortho.tif drone.tif --bands 3 2 1 --extent union --apply-to thermal.tif
+
+    Args:
+        apply_to: More files of the second camera, moved by the same homography.
     """
-    stem = cli.output_folder(output) / f"{image1.stem}_on_{image0.stem}"
-    endings = (".png", "_checkerboard.png", "_difference.png", "_homography.txt")
-    files = {ending: stem.with_name(stem.name + ending) for ending in endings}
+    reference, folder = read_metadata(image0), cli.output_folder(output)
+    own = {path: read_metadata(path) for path in (image1, *apply_to)}
+    files: dict[Any, Path] = {}
+    for path, each in own.items():
+        ending = ".png" if each.plain and not reference.keys else ".tif"
+        files[path] = folder / f"{path.stem}_on_{image0.stem}{ending}"
+        files |= {beside: beside for beside in reference.files_beside(files[path])}
+    for ending in ("_checkerboard.png", "_difference.png", "_homography.txt"):
+        files[ending] = folder / f"{image1.stem}_on_{image0.stem}{ending}"
     chosen, selection = chosen_detector(detector, values)
-    with cli.writing(files, [image0, image1], overwrite) as made:
+    values |= {"selection": selection, "apply_to": [*own]}
+    with cli.writing(files, [image0, *own], overwrite) as made:
         with stage_progress("registering", _guided_stages(detector)) as done:
-            found = register_images(image0, image1, chosen, selection=selection, progress=done)
-        pictures = (found.warped, found.checkerboard(), found.difference())
-        for ending, picture in zip(endings, pictures, strict=False):
-            save_picture(picture, made[ending])
+            found = register_images(image0, image1, chosen, progress=done, **values)
+        moved = reference.moved(translation_matrix(*-np.array(found.origin)))
+        for (path, each), bands in zip(own.items(), found.applied, strict=True):
+            kept = replace(moved, profile=each.profile or moved.profile, no_data=each.no_data)
+            if files[path].suffix == ".tif":
+                kept.write_tiff(bands, made[path])
+            else:
+                rgb = found.warped if path == image1 else array_to_rgb(bands, deep=True)
+                save_picture(rgb, made[path], kept)
+            for beside, content in kept.files_beside(files[path]).items():
+                made[beside].write_bytes(content)
+        save_picture(found.checkerboard(), made["_checkerboard.png"])
+        save_picture(found.difference(), made["_difference.png"])
         np.savetxt(made["_homography.txt"], found.homography, fmt="%.12e")
     return cli.Result(
         {
             "image0": image0,
             "image1": image1,
             "homography": found.homography.tolist(),
+            "origin": found.origin,
             "matches": found.matches,
             "overlap": round(float(found.valid.mean()), 4),
             "correlation": round(found.zncc, 4),
@@ -329,7 +357,14 @@ def stitch(
         what = "too few images, or not the reference, can be read"
         raise ImageError(f"there is no panorama, as {what}: {'; '.join(failures)}")
     cli.check_outputs([file], paths)
-    with cli.writing({"file": file}, images, overwrite) as made:
+    carried = {path: read_metadata(path) for path in images}
+    known = [carried[path] for path in ([reference] if reference is not None else images)]
+    # Where the panorama lies is known if it is known of whichever is its reference.
+    located = values.get("projection", "plane") == "plane"
+    located &= all(each.to_world is not None for each in known)
+    files: dict[Any, Path] = {"file": file}
+    files |= {path: path for path in known[0].files_beside(file) if located}
+    with cli.writing(files, images, overwrite) as made:
         try:
             with stage_progress("stitching", STAGES) as done:
                 panorama = stitch_images(
@@ -345,7 +380,11 @@ def stitch(
             for number, path in enumerate(images):
                 text = text.replace(f"images[{number}]", str(path))
             raise type(error)(text) from error
-        save_picture(panorama.image, made["file"])
+        kept = replace(carried[images[panorama.reference]], no_data=None)
+        kept = kept.moved(panorama.homographies[panorama.reference] if located else None)
+        save_picture(panorama.image, made["file"], kept)
+        for path, content in kept.files_beside(file).items():
+            made[path].write_bytes(content)
     for number, reason in panorama.unregistered.items():
         cli.note(f"not in the panorama: {images[number]}, as {reason}")
     height, width = panorama.valid.shape

@@ -20,6 +20,9 @@ BLUR_SIGMA_PX = 1.25
 NOISE_STD = 2.0
 """Grey levels that are added to a window's standard deviation, so that noise is not amplified."""
 
+MAX_UNKNOWN_WEIGHT = 1e-3
+"""Of pixels without data in what is interpolated."""
+
 MIN_VARIANCE = 1.0
 """Of a window's grey levels: flatter windows are not compared."""
 
@@ -50,6 +53,34 @@ def warp_to_reference(
     whole = np.full(image1.shape[:2], 255, np.uint8)
     nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
     return warped, cv2.warpPerspective(whole, homography, size, flags=nearest) > 0
+
+
+def warp_bands(
+    bands: np.ndarray,
+    homography: np.ndarray,
+    size: tuple[int, int],
+    no_data: float | None = None,
+) -> np.ndarray:
+    """Warp (H, W, C) of any type as `warp_to_reference`; where there is nothing it is `no_data`.
+
+    So is what depends on pixels that are `no_data`; None stands for 0, and for no such pixels.
+    """
+    whole = np.iinfo(bands.dtype) if bands.dtype.kind in "iu" else None
+    if whole and no_data is not None and not whole.min <= no_data <= whole.max:
+        no_data = None
+    known = np.ones(bands.shape[:2], bool)
+    if no_data is not None:
+        known = ~(np.isnan(bands) if np.isnan(no_data) else bands == no_data).any(axis=2)
+    weight, valid = warp_to_reference(known.astype(np.float32), homography, size)
+    if no_data is not None:
+        valid &= np.abs(weight - 1) < MAX_UNKNOWN_WEIGHT
+    planes = []
+    for band in np.moveaxis(bands, 2, 0):
+        warped, _ = warp_to_reference(np.where(known, band, 0).astype(np.float64), homography, size)
+        if whole:
+            warped = np.rint(warped).clip(whole.min, whole.max)
+        planes.append(np.where(valid, warped, no_data or 0).astype(bands.dtype))
+    return np.dstack(planes)
 
 
 def local_zncc(

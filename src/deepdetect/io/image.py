@@ -29,7 +29,7 @@ from .image_file import (
     open_image,
     reading_options,
 )
-from .tiff import read_tiff
+from .tiff import TIFF_STARTS, read_tiff
 
 Images = list[Any] | tuple[Any, ...] | np.ndarray
 """Several images: a list, a tuple, or a batch in an array of four dimensions."""
@@ -38,7 +38,6 @@ MINIMUM_SIDE = 16
 """Smallest width and height of an image, in pixels."""
 
 ORIENTATION_TAG = 0x0112
-TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 HEADER_BYTES = 26
 """Of a PNG file up to its bits and the type of its colours; `GREY_PNG` is one without alpha."""
 GREY_PNG = 0
@@ -116,28 +115,39 @@ def load_image(
         page=page,
         allow_truncated=allow_truncated,
     )
+    return _load(image, channels, options, value_range=value_range, bands=bands)
+
+
+def load_deep(image: Any, channels: Channels, *, raw: bool = False) -> np.ndarray:
+    """Read an image as `load_image`, but as uint16 where it has more than 8 bits.
+
+    Where `raw`, arrays and files of TIFF have all their bands, in their own type; (H, W, C).
+    """
+    return _load(image, channels, reading_options(), deep=True, raw=raw)
+
+
+def _load(
+    image: Any,
+    channels: Channels,
+    options: ReadingOptions,
+    *,
+    deep: bool = False,
+    raw: bool = False,
+    **for_arrays: Any,  # what a command is given is for files
+) -> np.ndarray:
     if is_file(image):
-        return _of_size(_read_file(image, options), file_name(image))
-    # What a command is given is for files.
-    if hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
-        return _of_size(_from_pil(image, "the image", value_range))
-    return _of_size(array_to_rgb(image, channels, value_range=value_range, bands=bands))
-
-
-def load_deep(image: Any, channels: Channels) -> np.ndarray:
-    """Read an image as `load_image`, but as uint16 where it has more than 8 bits."""
-    if is_file(image):
-        return _of_size(_read_file(image, reading_options(), deep=True), file_name(image))
-    if hasattr(image, "convert") and hasattr(image, "getbands"):
-        return _of_size(_from_pil(image, "the image", deep=True))
-    return _of_size(array_to_rgb(image, channels, deep=True))
-
-
-def _of_size(rgb: np.ndarray, name: str = "the image") -> np.ndarray:
-    if min(rgb.shape[:2]) < MINIMUM_SIDE:
-        height, width = rgb.shape[:2]
+        rgb = _read_file(image, options, deep, raw)
+    elif hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
+        rgb = _from_pil(image, "the image", for_arrays.get("value_range"), deep)
+    elif raw and isinstance(image, np.ndarray) and image.ndim in (2, 3):
+        rgb = image.reshape(*image.shape[:2], -1)
+    else:
+        rgb = array_to_rgb(image, channels, deep=deep, **for_arrays)
+    height, width = rgb.shape[:2]
+    if min(height, width) < MINIMUM_SIDE:
         raise ImageError(
-            f"{name} is {width}x{height} pixels: both sides must be at least {MINIMUM_SIDE}"
+            f"{file_name(image)} is {width}x{height} pixels: both sides must be at least "
+            f"{MINIMUM_SIDE}"
         )
     return rgb
 
@@ -248,12 +258,14 @@ def name_images(paths: Sequence[Path], exclude: Sequence[Path] = ()) -> dict[str
     return {name.as_posix(): path for path, name in names.items()}
 
 
-def _read_file(source: Any, options: ReadingOptions, deep: bool = False) -> np.ndarray:
+def _read_file(
+    source: Any, options: ReadingOptions, deep: bool = False, raw: bool = False
+) -> np.ndarray:
     with open_file(source) as (file, name):
         start = file.read(HEADER_BYTES)
         if start[:4] in TIFF_STARTS and not name.lower().endswith(RAW_SUFFIXES):
-            rgb, orientation = read_tiff(file, name, options, deep)
-        elif options.bands is not None:
+            rgb, orientation = read_tiff(file, name, options, deep, raw)
+        elif options.bands is not None and not raw:
             raise OptionError(f"`bands` are of TIFF files and arrays, and {name} is none")
         else:
             with open_image(file, options=options) as image:

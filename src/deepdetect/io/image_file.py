@@ -99,20 +99,20 @@ class ReadingOptions:
             raise OptionError(f"`max_megapixels` must be above 0, not {self.max_megapixels}")
         if self.page is not None and not (isinstance(self.page, Integral) and self.page >= 0):
             raise OptionError(f"`page` must be a whole number from 0 on, not {self.page!r}")
-        for name, count, what in (("bands", 3, "numbers from 1 on"), ("value_range", 2, "numbers")):
+        for name, count in (("bands", 3), ("value_range", 2)):
             value = getattr(self, name)
-            if value is None:
-                continue
-            numbers = tuple(value) if np.iterable(value) else ()
+            numbers: tuple[Any, ...] = tuple(value) if np.iterable(value) else ()
             fits = len(numbers) == count and all(isinstance(each, Real) for each in numbers)
             if fits and name == "bands":
                 fits = all(isinstance(each, Integral) and each > 0 for each in numbers)
             elif fits:
                 fits = bool(0 < numbers[1] - numbers[0] < math.inf)
-                what = "numbers, black and a larger white"
-            if not fits:
-                raise OptionError(f"`{name}` must be {count} {what}, not {shown(value)}")
-            object.__setattr__(self, name, numbers)
+            if not (fits or value is None):
+                what = (
+                    "3 numbers from 1 on" if count == 3 else "2 numbers, black and a larger white"
+                )
+                raise OptionError(f"`{name}` must be {what}, not {shown(value)}")
+            object.__setattr__(self, name, numbers or None)
 
     @property
     def settings(self) -> dict[str, Any]:

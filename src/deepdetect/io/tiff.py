@@ -16,6 +16,8 @@ from .._shared.errors import ImageError, MissingExtraError
 from .._shared.image_array import array_to_rgb
 from .image_file import ReadingOptions, damaged_image, develop, identify
 
+TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
 MIN_IS_WHITE, MIN_IS_BLACK, RGB, PALETTE, CMYK, YCBCR = 0, 1, 2, 3, 5, 6
 """Photometric interpretations that are read."""
 
@@ -36,13 +38,13 @@ MAX_BYTES_PER_PIXEL = 256
 
 
 def read_tiff(
-    file: BinaryIO, name: str, options: ReadingOptions, deep: bool
+    file: BinaryIO, name: str, options: ReadingOptions, deep: bool, raw: bool = False
 ) -> tuple[np.ndarray, int]:
     """Read an image of a TIFF file.
 
     Returns:
-        (H, W, 3) RGB as it is stored, uint8, or uint16 of more bits where `deep`; and its EXIF
-        orientation.
+        (H, W, 3) RGB as it is stored, uint8, or uint16 of more bits where `deep`; where `raw` and
+        its numbers are no code of colours, all bands in their own type; and its EXIF orientation.
 
     Raises:
         ImageError: as of `load_image`.
@@ -68,7 +70,7 @@ def read_tiff(
                 raise damaged_image(name, f"{last - size:,} bytes are missing at its end")
             file.seek(0)
             filled = io.BytesIO(file.read() + bytes(last - size))
-            return read_tiff(filled, name, options, deep)
+            return read_tiff(filled, name, options, deep, raw)
         try:
             array = page.asarray(squeeze=False)
         except Exception as error:  # tifffile and its decoders raise many kinds
@@ -78,7 +80,10 @@ def read_tiff(
         # (separate bands, depth, height, width, bands) to (height, width, bands).
         bands = np.moveaxis(array[:, 0], 0, -1).reshape(*array.shape[2:4], -1)
         tag = page.tags.get(ORIENTATION)
-        return _to_rgb(bands, page, name, options, deep), int(tag.value) if tag else 1
+        orientation = int(tag.value) if tag else 1
+        if raw and photometric in (MIN_IS_BLACK, RGB):
+            return bands, orientation
+        return _to_rgb(bands, page, name, options, deep), orientation
 
 
 def _chosen_page(stored: list[Any], name: str, options: ReadingOptions) -> Any:

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from .._shared.errors import RegistrationError
+from .._shared.errors import OptionError, RegistrationError, check_name
 from .._shared.image_array import Channels, to_8_bits
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.detector import AnyDetector
 from ..features.selection import SelectionOptions
-from ..geometry.images import downscale, median_local_zncc, warp_to_reference
-from ..geometry.transforms import scaled_homography
+from ..geometry.images import downscale, median_local_zncc, warp_bands, warp_to_reference
+from ..geometry.transforms import scaled_homography, transform_points, translation_matrix
 from ..io.image import Images, load_deep, load_image, luma
+from ..io.image_file import file_name, is_file
+from ..io.metadata import read_metadata
 from .pipeline import match_images
+
+Extent = Literal["reference", "union"]
+
+MAX_UNION = 4
+"""Times the pixels of both images that a union of them may have."""
 
 SQUARES = 8
 """Squares of the checkerboard along the shorter side."""
@@ -40,12 +47,15 @@ class Registration:
 
     Attributes:
         homography: (3, 3) from the first image to the second.
-        first: (H, W, 3) uint8 RGB, the first image.
+        first: (H, W, 3) uint8 RGB, the first image; with the extent "union" black around it.
         warped: (H, W, 3) RGB, the second in its frame, black where it has nothing: uint8, or
             uint16 where the second has more than 8 bits.
         valid: (H, W) bool, where the second image was warped to.
         matches: number of dense matches that hold.
         zncc: median local ZNCC of the two over what both show, in [-1, 1].
+        origin: (x, y) of the frame's first pixel in the first image: (0, 0), but for "union".
+        applied: the images of `apply_to` in the same frame, (H, W, C) with all their bands, in
+            their own type, 0 or their value of no data where they have nothing.
     """
 
     homography: np.ndarray
@@ -54,6 +64,8 @@ class Registration:
     valid: np.ndarray
     matches: int
     zncc: float
+    origin: tuple[int, int] = (0, 0)
+    applied: tuple[np.ndarray, ...] = ()
 
     def __repr__(self) -> str:
         height, width = self.valid.shape
@@ -86,6 +98,8 @@ def register(
     selection: SelectionOptions | None = None,
     ignore: np.ndarray | Images | None = None,
     mutual: bool = False,
+    extent: Extent = "reference",
+    apply_to: Sequence[Any] = (),
     seed: int = 0,
     progress: Callable[[str], object] | None = None,
 ) -> Registration:
@@ -97,11 +111,15 @@ def register(
     Args:
         image0, image1: anything `load_image` takes.
         detector, channels, selection, ignore, mutual, seed, progress: as for `match_images`.
+        extent: the frame: "reference", that of the first image, or "union", what both show.
+        apply_to: further images of the second camera, or its own file for all its bands, which are
+            moved by the same homography.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
         OptionError: an option is unknown or out of its range.
-        RegistrationError: no homography can be trusted, or the images contradict it.
+        RegistrationError: no homography can be trusted, or the images contradict it, or the second
+            image reaches the horizon of a union.
 
     Example:
         >>> from deepdetect.evaluation.baselines.random import RandomDetector
@@ -112,6 +130,7 @@ def register(
         >>> registration.homography[:2, 2].round(1).tolist()
         [-12.0, 0.0]
     """
+    check_name("extent", extent, get_args(Extent))
     first, deep = load_image(image0, channels=channels), load_deep(image1, channels)
     second = to_8_bits(deep)
     matches = match_images(
@@ -136,9 +155,52 @@ def register(
             "the images contradict the homography that their matches agree with: where they would "
             "overlap they are no more alike than images of different things"
         )
-    warped, valid = warp_to_reference(deep, homography, (first.shape[1], first.shape[0]))
     zncc = median_local_zncc(*grays, homography)
-    return Registration(homography, first, warped, valid, len(matches), zncc)
+    left, top, right, bottom = 0, 0, first.shape[1], first.shape[0]
+    if extent == "union":
+        left, top, right, bottom = _union(first.shape, deep.shape, homography)
+        margins = (-top, bottom - first.shape[0], -left, right - first.shape[1])
+        first = cv2.copyMakeBorder(first, *margins, cv2.BORDER_CONSTANT)
+    moved, size = homography @ translation_matrix(left, top), (right - left, bottom - top)
+    warped, valid = warp_to_reference(deep, moved, size)
+    applied = tuple(_apply(each, channels, moved, size, deep.shape) for each in apply_to)
+    return Registration(homography, first, warped, valid, len(matches), zncc, (left, top), applied)
+
+
+def _union(
+    shape0: tuple[int, ...], shape1: tuple[int, ...], homography: np.ndarray
+) -> tuple[int, int, int, int]:
+    """Return left, top, right and bottom of what two images show, in pixels of the first."""
+    height, width = shape1[:2]
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+    back = np.linalg.inv(homography)
+    ends, depths = transform_points(corners, back), corners @ back[2, :2] + back[2, 2]
+    # A pixel belongs to an image when its centre does.
+    low = np.minimum(0, np.ceil(ends.min(axis=0)))
+    high = np.maximum([shape0[1], shape0[0]], np.floor(ends.max(axis=0)) + 1)
+    pixels = float(np.prod(high - low))
+    if depths.min() * depths.max() <= 0 or pixels > MAX_UNION * (width * height + np.prod(shape0)):
+        raise RegistrationError(
+            "the second image is seen too much from the side for a union: leave `extent` out"
+        )
+    return (*low.astype(int).tolist(), *high.astype(int).tolist())
+
+
+def _apply(
+    image: Any,
+    channels: Channels,
+    homography: np.ndarray,
+    size: tuple[int, int],
+    shape: tuple[int, ...],
+) -> np.ndarray:
+    """Move all bands of an image of the second camera to the frame."""
+    bands = load_deep(image, channels, raw=True)
+    if bands.shape[:2] != shape[:2]:
+        raise OptionError(
+            f"{file_name(image)} has another size than the second image: leave it out"
+        )
+    no_data = read_metadata(image).no_data if is_file(image) else None
+    return warp_bands(bands, homography, size, no_data)
 
 
 def agree(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> bool:

@@ -16,8 +16,9 @@ from ..features.display import PICTURE_SIDE_PX, draw_circle, line_scale
 from ..features.keypoints import Keypoints
 from ..features.selection import spread_over_grid
 from ..geometry.transforms import scaled_points
+from ..io.metadata import Metadata
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 MAX_JPEG_SIDE_PX = 65_500
 """The largest width and height that libjpeg writes."""
 
@@ -45,12 +46,15 @@ GAP_PX = 6
 WHITE = (255, 255, 255)
 
 
-def save_picture(rgb: np.ndarray, path: str | Path) -> None:
-    """Write a (H, W, 3) uint8 or uint16 RGB picture as .png, or of 8 bits as .jpg or .jpeg.
+def save_picture(rgb: np.ndarray, path: str | Path, metadata: Metadata = Metadata()) -> None:
+    """Write a (H, W, 3) uint8 or uint16 RGB picture as .png or .tif, or of 8 bits as .jpg.
 
     It is written whole or not at all.
     """
     suffix = picture_suffix(path)
+    if suffix.startswith(".tif"):
+        metadata.write_tiff(rgb, Path(path))
+        return
     # Checked before OpenCV is asked, which would also log it.
     if suffix != ".png" and max(rgb.shape[:2]) > MAX_JPEG_SIDE_PX:
         size = f"{rgb.shape[1]}x{rgb.shape[0]}"
@@ -60,9 +64,9 @@ def save_picture(rgb: np.ndarray, path: str | Path) -> None:
     settings = []
     if suffix != ".png":
         rgb, settings = to_8_bits(rgb), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    _, data = cv2.imencode(suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), settings)
+    data = metadata.encode(rgb, suffix, settings)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(data.tobytes())
+        temporary.write_bytes(data)
 
 
 def picture_suffix(path: str | Path) -> str:

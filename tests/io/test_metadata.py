@@ -1,0 +1,194 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+from PIL import Image, ImageCms
+from PIL.ExifTags import IFD, Base
+
+from deepdetect import RegistrationError, load_image, register
+from deepdetect.geometry import transform_points
+from deepdetect.io.exif import camera_from_exif
+from deepdetect.io.metadata import Metadata, read_metadata
+from deepdetect.viz.draw import save_picture
+from tests.command_line import run_command
+
+SPACING_M, EAST, NORTH = 0.5, 500_000.0, 5_400_000.0
+UTM = 32632
+
+
+@pytest.fixture(scope="module")
+def scene() -> np.ndarray:
+    """(400, 500, 5) uint16: an ortho-image of five bands."""
+    rng = np.random.default_rng(4)
+    coarse = rng.integers(0, 4096, (50, 63, 5)).astype(np.float32)
+    fine = cv2.resize(coarse, (500, 400), interpolation=cv2.INTER_CUBIC)
+    return (fine.clip(0, 4095) * 15).astype(np.uint16)
+
+
+def geotiff(
+    path: Path, bands: np.ndarray, transform: np.ndarray, crs: int = UTM, **tags: Any
+) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    height, width, count = bands.shape
+    how = {"driver": "GTiff", "dtype": bands.dtype, "crs": f"EPSG:{crs}"}
+    how["transform"] = rasterio.Affine(*transform[:2].ravel())
+    with rasterio.open(path, "w", width=width, height=height, count=count, **how, **tags) as file:
+        file.write(np.moveaxis(bands, 2, 0))
+
+
+def place(x: float = 0, y: float = 0, degrees: float = 0) -> np.ndarray:
+    """From raster coordinates, of which (x, y) is the first corner, to coordinates."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    north_up = np.array([[SPACING_M, 0, EAST], [0, -SPACING_M, NORTH], [0, 0, 1]])
+    return north_up @ np.array([[c, -s, x], [s, c, y], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("extent", ["reference", "union"])
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_registered_image_opens_in_its_place(
+    extent: str, turned: bool, scene: np.ndarray, tmp_path: Path
+) -> None:
+    rasterio, pyproj = pytest.importorskip("rasterio"), pytest.importorskip("pyproj")
+    matrix = place(degrees=20 if turned else 0)
+    geotiff(tmp_path / "ortho.tif", scene[:300, :350, :3], matrix)
+    drone = scene[60:360, 120:500].astype(np.int32) - 500
+    drone[:8] = -9999
+    tifffile.imwrite(
+        tmp_path / "drone.tif",
+        drone,
+        photometric="minisblack",
+        planarconfig="contig",
+        extratags=[(42113, "s", 0, "-9999", True)],
+    )
+    heat = (scene[60:360, 120:500, 4] / 65535).astype(np.float32)
+    tifffile.imwrite(tmp_path / "heat.tif", heat)
+    words = ["register", "ortho.tif", "drone.tif", "--bands", "3", "2", "1", "--extent", extent]
+    words += ["--value-range", "0", "61440", "--apply-to", "heat.tif", "--detector", "points"]
+    names = [str(tmp_path / word) if word.endswith(".tif") else word for word in words]
+    result = run_command([*names, "-o", str(tmp_path / "out"), "--json"])
+    assert result.exit_code == 0, result.output
+    left, top = json.loads(result.stdout)["origin"]
+    assert (left, top) == (0, 0)
+    size = {"reference": (350, 300), "union": (500, 360)}[extent]
+    east, north, _ = matrix @ [200.5, 150.5, 1]  # the centre of pixel (200, 150) of the ortho-image
+    to_degrees = pyproj.Transformer.from_crs(UTM, 4326, always_xy=True)
+    with rasterio.open(tmp_path / "out" / "drone_on_ortho.tif") as file:
+        assert file.crs.to_epsg() == UTM
+        assert (file.width, file.height) == size
+        assert (file.count, file.dtypes[0], file.nodata) == (5, "int32", -9999)
+        longitude, latitude = to_degrees.transform(east, north)
+        back = pyproj.Transformer.from_crs(4326, file.crs, always_xy=True)
+        row, column = file.index(*back.transform(longitude, latitude))
+        assert (row, column) == (150, 200)
+        found = np.moveaxis(file.read(), 0, 2)
+    np.testing.assert_allclose(found[150, 200], scene[150, 200].astype(int) - 500, atol=600)
+    assert (found[:60] == -9999).all()
+    assert (found[64:67, 130:340] == -9999).all()  # rows that the drone has no data of
+    inside = found[80:290, 130:340] - (scene[80:290, 130:340].astype(int) - 500)
+    assert np.abs(inside).mean() < 400
+    with rasterio.open(tmp_path / "out" / "heat_on_ortho.tif") as file:
+        assert (file.crs.to_epsg(), file.dtypes) == (UTM, ("float32",))
+        assert file.read(1)[150, 200] == pytest.approx(scene[150, 200, 4] / 65535, abs=0.02)
+
+
+def test_a_panorama_lies_where_its_images_do(scene: np.ndarray, tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    rgb = (scene[:, :, :3] >> 8).astype(np.uint8)
+    for name, x in (("a", 0), ("b", 150)):
+        geotiff(tmp_path / f"{name}.tif", rgb[50:350, x : x + 300], place(x, 50))
+    images = [str(tmp_path / f"{name}.tif") for name in "ba"]
+    how = ["--detector", "points", "-o"]
+    result = run_command(["stitch", *images, *how, str(tmp_path / "p.tif")])
+    assert result.exit_code == 0, result.output
+    with rasterio.open(tmp_path / "p.tif") as file:
+        x, y, _ = place() @ [300.5, 200.5, 1]
+        row, column = file.index(x, y)
+        assert file.crs.to_epsg() == UTM
+        found = file.read()[:, row, column].astype(int)
+    np.testing.assert_allclose(found, rgb[200, 300], atol=6)
+    assert run_command(["stitch", *images, *how, str(tmp_path / "p.png")]).exit_code == 0
+    with rasterio.open(tmp_path / "p.png") as file:
+        assert file.index(x, y) == (row, column)
+    curved = ["--projection", "cylindrical", *how, str(tmp_path / "c.png")]
+    if run_command(["stitch", *images, *curved]).exit_code == 0:
+        assert not (tmp_path / "c.pgw").exists()
+
+
+def test_world_files_profiles_and_exif_are_kept(photo: np.ndarray, tmp_path: Path) -> None:
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    exif = Image.Exif()
+    exif[Base.Make] = "maker"
+    exif[Base.Orientation] = 1
+    fine = exif.get_ifd(IFD.Exif)
+    fine |= {Base.FocalLengthIn35mmFilm: 28, Base.ExifImageWidth: 256, Base.ExifImageHeight: 256}
+    exif.get_ifd(IFD.GPSInfo)[1] = "N"
+    Image.fromarray(photo).save(tmp_path / "a.png", exif=exif, icc_profile=profile)
+    warp = np.array([[1, 0, -30], [0, 1, 0], [0, 0, 1.0]])
+    Image.fromarray(cv2.warpPerspective(photo, warp, (256, 256))).save(tmp_path / "b.png")
+    numbers = [0.5, 0.0, 0.0, -0.5, 1000.25, 1999.75]
+    (tmp_path / "a.pgw").write_text("\n".join(map(str, numbers)))
+    (tmp_path / "a.prj").write_text("LOCAL_CS[]")
+    for extent, size in (("reference", 256), ("union", 286)):
+        out = tmp_path / extent
+        words = [str(tmp_path / "a.png"), str(tmp_path / "b.png"), "--extent", extent]
+        result = run_command(["register", *words, "-o", str(out)])
+        assert result.exit_code == 0, result.output
+        with Image.open(out / "b_on_a.png") as written:
+            assert written.size[0] == size
+            kept = written.getexif()
+        assert written.info["icc_profile"] == profile
+        assert (kept[Base.Make], kept.get_ifd(IFD.GPSInfo)[1]) == ("maker", "N")
+        assert kept.get_ifd(IFD.Exif)[Base.ExifImageWidth] == size
+        assert (Base.FocalLengthIn35mmFilm in kept.get_ifd(IFD.Exif)) == (size == 256)
+        moved = np.loadtxt(out / "b_on_a.pgw")
+        np.testing.assert_allclose(moved, [*numbers[:4], 1000.25, 1999.75])
+        assert (out / "b_on_a.prj").read_text() == "LOCAL_CS[]"
+    save_picture(photo, tmp_path / "c.jpg", read_metadata(tmp_path / "a.png"))
+    with Image.open(tmp_path / "c.jpg") as written:
+        assert written.info["icc_profile"] == profile
+    expected, found = (camera_from_exif(tmp_path / n, (256, 256)) for n in ("a.png", "c.jpg"))
+    assert found == expected
+
+
+@pytest.mark.parametrize("point", [False, True])
+def test_pixels_are_corners_or_points(point: bool, tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    bands = np.zeros((20, 30, 1), np.uint8)
+    tags = {"GTIFF_POINT": "YES"} if point else {}
+    geotiff(tmp_path / "a.tif", bands, place(), **tags)
+    if point:
+        with rasterio.open(tmp_path / "a.tif", "r+") as file:
+            file.update_tags(AREA_OR_POINT="Point")
+    found = read_metadata(tmp_path / "a.tif")
+    assert found.to_world is not None
+    with rasterio.open(tmp_path / "a.tif") as file:
+        expected = [file.xy(0, 0), file.xy(7, 11)]
+    np.testing.assert_allclose(
+        transform_points(np.array([[0, 0], [11, 7.0]]), found.to_world), expected
+    )
+    found.write_tiff(bands, tmp_path / "b.tif")
+    with rasterio.open(tmp_path / "b.tif") as file:
+        np.testing.assert_allclose([file.xy(0, 0), file.xy(7, 11)], expected)
+
+
+def test_no_union_reaches_the_horizon(photo: np.ndarray) -> None:
+    steep = np.array([[0.3, 0, 60], [-0.2, 0.5, 60], [-0.0024, 0, 1.0]])
+    second = cv2.warpPerspective(photo, steep, (256, 256), flags=cv2.INTER_AREA)
+    try:
+        found = register(photo, second, extent="union")
+    except RegistrationError:
+        return
+    assert found.valid.size < 9 * photo[:, :, 0].size
+
+
+def test_without_anything_there_is_nothing(photo: np.ndarray, tmp_path: Path) -> None:
+    save_picture(photo, tmp_path / "a.tif")
+    found = read_metadata(tmp_path / "a.tif")
+    assert vars(found) == vars(Metadata())
+    np.testing.assert_array_equal(load_image(tmp_path / "a.tif"), photo)
