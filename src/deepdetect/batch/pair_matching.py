@@ -32,7 +32,7 @@ from .hdf5 import (
     open_hdf5,
     state_of,
 )
-from .pair_list import Pair, following, list_pairs, pair_name
+from .pair_list import Pair, list_pairs, pair_name
 
 MATCHERS_OF_FLOATS = {name: MATCHERS[name] for name in MATCHERS if name != "hamming"}
 """Features in files are no bits."""
@@ -121,11 +121,9 @@ def match_pairs(
         ...     match_pairs("features.h5", "pairs.txt", "matches.h5").check()
     """
     source = Path(features).absolute()
-    names: Sequence[str] = ()
-    if following(pairs) is not None:
-        with open_hdf5(source) as file:
-            names = natsorted(feature_names(file), alg=ns.PATH)
-    listed = list_pairs(pairs, names)
+    list_pairs(pairs, ())  # what is wrong with them is said first
+    with open_hdf5(source) as file:
+        listed = list_pairs(pairs, natsorted(feature_names(file), alg=ns.PATH))
     if source == Path(path).absolute():
         raise OptionError(f"{path} holds the features: give the matches another file with -o")
     wanted, failures, gone, made_with = _find_pairs(source, listed)

@@ -281,7 +281,6 @@ def register(
     for path, each in own.items():
         ending = ".png" if each.plain and not reference.keys else ".tif"
         files[path] = folder / f"{path.stem}_on_{image0.stem}{ending}"
-        files |= {beside: beside for beside in reference.files_beside(files[path])}
     for ending in ("_checkerboard.png", "_difference.png", "_homography.txt"):
         files[ending] = folder / f"{image1.stem}_on_{image0.stem}{ending}"
     chosen, selection = chosen_detector(detector, values)
@@ -297,8 +296,7 @@ def register(
             else:
                 rgb = found.warped if path == image1 else array_to_rgb(bands, deep=True)
                 save_picture(rgb, made[path], kept)
-            for beside, content in kept.files_beside(files[path]).items():
-                made[beside].write_bytes(content)
+            kept.write_beside(files[path])
         save_picture(found.checkerboard(), made["_checkerboard.png"])
         save_picture(found.difference(), made["_difference.png"])
         np.savetxt(made["_homography.txt"], found.homography, fmt="%.12e")
@@ -357,14 +355,7 @@ def stitch(
         what = "too few images, or not the reference, can be read"
         raise ImageError(f"there is no panorama, as {what}: {'; '.join(failures)}")
     cli.check_outputs([file], paths)
-    carried = {path: read_metadata(path) for path in images}
-    known = [carried[path] for path in ([reference] if reference is not None else images)]
-    # Where the panorama lies is known if it is known of whichever is its reference.
-    located = values.get("projection", "plane") == "plane"
-    located &= all(each.to_world is not None for each in known)
-    files: dict[Any, Path] = {"file": file}
-    files |= {path: path for path in known[0].files_beside(file) if located}
-    with cli.writing(files, images, overwrite) as made:
+    with cli.writing({"file": file}, images, overwrite) as made:
         try:
             with stage_progress("stitching", STAGES) as done:
                 panorama = stitch_images(
@@ -380,11 +371,11 @@ def stitch(
             for number, path in enumerate(images):
                 text = text.replace(f"images[{number}]", str(path))
             raise type(error)(text) from error
-        kept = replace(carried[images[panorama.reference]], no_data=None)
-        kept = kept.moved(panorama.homographies[panorama.reference] if located else None)
+        flat = values.get("projection", "plane") == "plane"
+        moved = panorama.homographies[panorama.reference] if flat else None
+        kept = replace(read_metadata(images[panorama.reference]), no_data=None).moved(moved)
         save_picture(panorama.image, made["file"], kept)
-        for path, content in kept.files_beside(file).items():
-            made[path].write_bytes(content)
+        kept.write_beside(file)
     for number, reason in panorama.unregistered.items():
         cli.note(f"not in the panorama: {images[number]}, as {reason}")
     height, width = panorama.valid.shape

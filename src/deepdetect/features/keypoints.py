@@ -128,8 +128,7 @@ class Keypoints:
             >>> Keypoints.from_opencv([cv2.KeyPoint(3, 4, 7, 90, 0.5)], (8, 8)).sizes.tolist()
             [7.0]
         """
-        points = isinstance(keypoints, Sequence)
-        if not points or not all(isinstance(point, cv2.KeyPoint) for point in keypoints):
+        if not isinstance(keypoints, Sequence) or {*map(type, keypoints)} - {cv2.KeyPoint}:
             raise OptionError("`keypoints` must be a sequence of cv2.KeyPoint")
         if not len(keypoints):
             return cls.empty(image_size)

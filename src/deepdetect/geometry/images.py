@@ -70,7 +70,7 @@ def warp_bands(
         no_data = None
     known = np.ones(bands.shape[:2], bool)
     if no_data is not None:
-        known = ~(np.isnan(bands) if np.isnan(no_data) else bands == no_data).any(axis=2)
+        known = ~((bands == no_data) | (np.isnan(no_data) & np.isnan(bands))).any(axis=2)
     weight, valid = warp_to_reference(known.astype(np.float32), homography, size)
     if no_data is not None:
         valid &= np.abs(weight - 1) < MAX_UNKNOWN_WEIGHT

@@ -28,7 +28,7 @@ from .._shared.errors import (
     OptionError,
     first_line,
 )
-from .._shared.options import shown, suggest_keywords
+from .._shared.options import shown, suggest_keywords, whole
 
 FORMATS = {
     "JPEG": ".jpg .jpeg .jpe .jfif",
@@ -97,8 +97,8 @@ class ReadingOptions:
     def __post_init__(self) -> None:
         if not (isinstance(self.max_megapixels, Real) and self.max_megapixels > 0):
             raise OptionError(f"`max_megapixels` must be above 0, not {self.max_megapixels}")
-        if self.page is not None and not (isinstance(self.page, Integral) and self.page >= 0):
-            raise OptionError(f"`page` must be a whole number from 0 on, not {self.page!r}")
+        if self.page is not None:
+            whole("page", self.page)
         for name, count in (("bands", 3), ("value_range", 2)):
             value = getattr(self, name)
             numbers: tuple[Any, ...] = tuple(value) if np.iterable(value) else ()

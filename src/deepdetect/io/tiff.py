@@ -59,7 +59,7 @@ def read_tiff(
     file.seek(0)
     with TiffFile(file, name="image.tif") as tiff:
         stored = [*tiff.pages]
-        page = _chosen_page(stored, name, options)
+        page = chosen_page(stored, name, options)
         options.check_size(name, (page.imagewidth, page.imagelength))
         photometric = _checked_kind(page, name)
         if photometric in MOSAICS or stored[0].is_dng:
@@ -79,14 +79,13 @@ def read_tiff(
             return _read_by_pillow(file, stored, page, name, options), 1
         # (separate bands, depth, height, width, bands) to (height, width, bands).
         bands = np.moveaxis(array[:, 0], 0, -1).reshape(*array.shape[2:4], -1)
-        tag = page.tags.get(ORIENTATION)
-        orientation = int(tag.value) if tag else 1
+        orientation = int(page.tags.valueof(ORIENTATION, 1))
         if raw and photometric in (MIN_IS_BLACK, RGB):
             return bands, orientation
         return _to_rgb(bands, page, name, options, deep), orientation
 
 
-def _chosen_page(stored: list[Any], name: str, options: ReadingOptions) -> Any:
+def chosen_page(stored: list[Any], name: str, options: ReadingOptions) -> Any:
     """Return the page that is asked for, or the largest; thumbnails and masks are none."""
     pages = [page for page in stored if not (page.is_reduced or page.is_mask)]
     if not pages:
@@ -124,8 +123,9 @@ def _to_rgb(
     """Return the RGB image that (H, W, bands) numbers are by the tags of their page."""
     photometric = int(page.photometric)
     chosen = _chosen_bands(bands, page, name, options)
-    absent = _no_data(chosen, page)
-    if absent is not None:
+    value, absent = no_data_of(page), None
+    if value:  # 0 is black already
+        absent = (chosen == value) | (np.isnan(value) & np.isnan(chosen))
         chosen = np.where(absent, chosen.dtype.type(0), chosen)
     if photometric == PALETTE:
         colours = page.colormap if page.colormap.max() < 256 else page.colormap >> 8
@@ -159,15 +159,12 @@ def _chosen_bands(bands: np.ndarray, page: Any, name: str, options: ReadingOptio
     return bands if whole else bands[:, :, : count - alpha if grey else 3]
 
 
-def _no_data(chosen: np.ndarray, page: Any) -> np.ndarray | None:
-    tag = page.tags.get(NO_DATA)
+def no_data_of(page: Any) -> float | None:
+    """Return the number that stands for no data, as GDAL's tag says."""
     try:
-        value = float(tag.value) if tag is not None else 0.0
+        return float(page.tags.valueof(NO_DATA))
     except (TypeError, ValueError):
         return None
-    if value == 0:  # it is black already
-        return None
-    return np.isnan(chosen) if np.isnan(value) else chosen == value
 
 
 def _white(page: Any) -> int | None:
@@ -177,8 +174,7 @@ def _white(page: Any) -> int | None:
         return None
     if bits < 16:
         return (1 << bits) - 1
-    tag = page.tags.get(MAX_SAMPLE_VALUE)
-    values = np.atleast_1d(tag.value if tag else 0)
+    values = np.atleast_1d(page.tags.valueof(MAX_SAMPLE_VALUE, 0))
     largest = int(values.max())
     # The largest of the pixels, as the standard has it, is hardly one below a power of two.
     return largest if largest > 255 and not largest & (largest + 1) else None

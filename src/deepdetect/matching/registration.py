@@ -163,8 +163,17 @@ def register(
         first = cv2.copyMakeBorder(first, *margins, cv2.BORDER_CONSTANT)
     moved, size = homography @ translation_matrix(left, top), (right - left, bottom - top)
     warped, valid = warp_to_reference(deep, moved, size)
-    applied = tuple(_apply(each, channels, moved, size, deep.shape) for each in apply_to)
-    return Registration(homography, first, warped, valid, len(matches), zncc, (left, top), applied)
+    applied = []
+    for each in apply_to:
+        bands = load_deep(each, channels, raw=True)
+        if bands.shape[:2] != deep.shape[:2]:
+            raise OptionError(
+                f"{file_name(each)} has another size than the second image: leave it out"
+            )
+        no_data = read_metadata(each).no_data if is_file(each) else None
+        applied.append(warp_bands(bands, moved, size, no_data))
+    numbers = len(matches), zncc, (left, top), tuple(applied)
+    return Registration(homography, first, warped, valid, *numbers)
 
 
 def _union(
@@ -184,23 +193,6 @@ def _union(
             "the second image is seen too much from the side for a union: leave `extent` out"
         )
     return (*low.astype(int).tolist(), *high.astype(int).tolist())
-
-
-def _apply(
-    image: Any,
-    channels: Channels,
-    homography: np.ndarray,
-    size: tuple[int, int],
-    shape: tuple[int, ...],
-) -> np.ndarray:
-    """Move all bands of an image of the second camera to the frame."""
-    bands = load_deep(image, channels, raw=True)
-    if bands.shape[:2] != shape[:2]:
-        raise OptionError(
-            f"{file_name(image)} has another size than the second image: leave it out"
-        )
-    no_data = read_metadata(image).no_data if is_file(image) else None
-    return warp_bands(bands, homography, size, no_data)
 
 
 def agree(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> bool:

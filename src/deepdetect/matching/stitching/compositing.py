@@ -251,7 +251,6 @@ class _Blender:
     """Sums of images in frequency bands, weighted by their masks, and of these weights."""
 
     def __init__(self, width: int, height: int) -> None:
-        self.size = (width, height)
         step = 1 << NUM_BANDS
         sides = (-(-height // step) * step, -(-width // step) * step)
         shapes = [(sides[0] >> k, sides[1] >> k) for k in range(NUM_BANDS + 1)]
@@ -296,7 +295,7 @@ class _Blender:
                 band += cv2.pyrUp(image, dstsize=band.shape[1::-1])
             image = band
         assert image is not None
-        width, height = self.size
+        height, width = self.valid.shape
         return image[:height, :width], self.valid
 
 
