@@ -7,7 +7,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
 
 from deepdetect.detector.network.espnet import ESPNet  # noqa: E402
-from deepdetect.training.optim import Soap, make_optimizers  # noqa: E402
+from deepdetect.training.optim import Muon, Soap, make_optimizers  # noqa: E402
 
 
 def ill_conditioned(size: int = 6) -> tuple[torch.Tensor, torch.Tensor]:
@@ -80,3 +80,16 @@ def test_every_parameter_of_the_network_is_moved_by_one_optimiser(name: str) -> 
     optimizers = make_optimizers(name, network)
     held = [p for o in optimizers for group in o.param_groups for p in group["params"]]
     assert sorted(map(id, held)) == sorted(map(id, network.parameters()))
+
+
+def test_muon_moves_in_all_directions_alike() -> None:
+    generator = torch.Generator().manual_seed(1)
+    weights = torch.nn.Parameter(torch.randn(6, 4, 3, 3, generator=generator))
+    before, gradient = weights.detach().clone(), torch.randn(6, 36, generator=generator)
+    weights.grad = (gradient * torch.logspace(0, -2, 6)[:, None]).reshape(weights.shape)
+    Muon([weights], lr=0.01).step()
+    change = (weights.detach() - before * (1 - 0.01 * 0.01)).reshape(6, 36)
+    singular = torch.linalg.svdvals(change / (0.01 * 0.2 * 6))
+    assert singular.min() > 0.4  # the polynomial brings them near 1, not to it
+    assert singular.max() < 1.4
+    assert (change * weights.grad.reshape(6, 36)).sum() < 0

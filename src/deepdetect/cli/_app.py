@@ -59,6 +59,7 @@ COMMANDS = {
         "shards": ("train", "pack images for training on large sets"),
         "train": ("train", "train the network on images"),
         "train-points": ("train", "train the ranker of keypoints on images"),
+        "train-descriptor": ("train", "train the learned descriptor of keypoints on images"),
         "average": ("train", "the mean of several weights"),
         "evaluate": ("evaluate", "how good weights are"),
         "evaluate-stereo": ("evaluate", "correct stereo matches of weights and of label settings"),

@@ -1,4 +1,4 @@
-"""`deepdetect train`, `train-points`, `label`, `shards` and `average`."""
+"""`deepdetect train`, `train-points`, `train-descriptor`, `label`, `shards` and `average`."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from ..labels import LabelOptions, find_label_settings
 from ..labels.fusion import LabelTask, label_file
 from ..training import (
     PRESETS,
+    DescriptorTrainingOptions,
     DeviceOptions,
     PointsTrainingOptions,
     Stage,
@@ -27,6 +28,7 @@ from ..training import (
     write_shards,
 )
 from ..training import train as train_network
+from ..training import train_descriptor as train_descriptor_network
 from ..training import train_points as train_ranker
 from . import _options as cli
 from .features import EXTRACTION
@@ -69,6 +71,14 @@ SHARDS = replace(RECIPE, common="max_images augmentations", more="short_sides sq
 SHARD_SIZE = cli.From(write_shards, "shard_size", more="")
 ENGINE = replace(EXTRACTION, common="")
 POINTS_RUN = cli.From(train_ranker, "validation num_workers", more="", types={"validation": Path})
+DESCRIPTOR_RUN = cli.From(
+    train_descriptor_network,
+    "validation init_weights device num_workers",
+    more="",
+    flags={"init_weights": "--init"},
+    types={"validation": Path, "init_weights": Path | None},
+    defaults={"init_weights": "random ones, by the seed", "num_workers": "0 on a CPU"},
+)
 
 
 def chosen_label_settings(
@@ -177,6 +187,26 @@ def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli
     run = {**POINTS_RUN.take(values), "output": output, "log": cli.note}
     result = train_ranker(images, options=PointsTrainingOptions(**values), **run)
     return cli.Result({"weights": result.weights, "best": result.best, "points": result.points})
+
+
+@cli.command(DESCRIPTOR_RUN, cli.From(DescriptorTrainingOptions, "steps pairs seed"))
+def train_descriptor(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
+    """Train the learned descriptor of keypoints on the images in a folder.
+
+    Pairs of views are made of single images, so no labels are needed. The run's folder gets
+    descriptor.onnx and descriptor.safetensors (the weights of the highest validation score),
+    MODEL_CARD.md, curves.csv, curves.png and checkpoint.safetensors. An interrupted run resumes
+    when the same command is given again.
+
+        deepdetect train-descriptor photos/train --validation photos/val -o run
+
+    Args:
+        output: Folder of the run.
+    """
+    run = {**DESCRIPTOR_RUN.take(values), "output": output, "log": cli.note}
+    result = train_descriptor_network(images, options=DescriptorTrainingOptions(**values), **run)
+    files = {"weights": result.weights, "onnx": result.onnx}
+    return cli.Result({**files, "best": result.best, "points": result.points})
 
 
 @cli.command(PRESET, LABELS, SHARDS, SHARD_SIZE, ENGINE)

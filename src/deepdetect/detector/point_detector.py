@@ -11,7 +11,7 @@ import numpy as np
 from .._shared.errors import OptionError, check_name
 from .._shared.image_array import Channels
 from .._shared.opencv import cv2
-from .._shared.options import suggest_keywords
+from .._shared.options import is_path, suggest_keywords
 from .._shared.records import file_digest
 from ..features.keypoints import Keypoints
 from ..features.learned import LEARNED, LEARNED_FREE
@@ -137,7 +137,7 @@ class PointDetector:
         self,
         image: Any,
         *,
-        descriptor: Literal["rootsift", "learned", "learned-free"] = "rootsift",
+        descriptor: str | Path = "rootsift",
         ignore: np.ndarray | None = None,
         channels: Channels = "rgb",
     ) -> Keypoints:
@@ -147,7 +147,8 @@ class PointDetector:
             image, ignore, channels: as of `detect`.
             descriptor: "rootsift", RootSIFT at the keypoints' own sizes and angles; or "learned",
                 by a small network that sees their surroundings, too; "learned-free", by one that
-                was trained on photographs under free licences alone.
+                was trained on photographs under free licences alone; or the ONNX file of
+                `deepdetect train-descriptor`.
 
         Returns:
             As `detect`, with descriptors: (N, 128) uint8 RootSIFT, or (N, 64) float32 learned ones.
@@ -155,8 +156,10 @@ class PointDetector:
         Raises:
             ImageError: the image cannot be read or is not fit.
             OptionError: the descriptor is unknown, or the mask has another size than the image.
+            WeightsError: the descriptor's file is missing or damaged.
         """
-        check_name("descriptor", descriptor, (ROOT_SIFT, LEARNED, LEARNED_FREE))
+        if not is_path(descriptor):
+            check_name("descriptor", str(descriptor), (ROOT_SIFT, LEARNED, LEARNED_FREE))
         rgb = load_image(image, channels=channels)
         keypoints = self._find(rgb, ignore)
         if descriptor == ROOT_SIFT:

@@ -11,7 +11,7 @@ from .matchers import DescriptorMatches
 
 LEARNED, LEARNED_FREE = "learned", "learned-free"
 """`Keypoints.descriptor_type` of these; the second by weights of photographs under free licences
-alone."""
+alone. Of one's own weights it is "learned-" and the beginning of the file's SHA-256."""
 
 CONSTANT = 16
 """So many numbers, the first, are the same in an image that is turned."""
@@ -29,6 +29,11 @@ TURNED_KEYPOINTS = 1024
 HISTOGRAM_DEGREES = 10
 NEAR_DEGREES = 20
 """Bins of differences of angles, and how far from the fullest the others are counted with it."""
+
+
+def is_learned(descriptor_type: str | None) -> bool:
+    """Return whether descriptors are learned ones, by the weights here or by one's own."""
+    return descriptor_type is not None and descriptor_type.startswith(LEARNED)
 
 
 def turn_descriptors(descriptors: np.ndarray, degrees: np.ndarray | float) -> np.ndarray:

@@ -16,7 +16,7 @@ from .._shared.options import check_ranges, suggest_keywords
 from .._shared.progress import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_keypoints
 from ..features.keypoints import Keypoints, nearest_keypoints
-from ..features.learned import LEARNED, LEARNED_FREE, match_learned
+from ..features.learned import is_learned, match_learned
 from ..features.matchers import get_matcher, match_descriptors
 from ..features.matches import Matches, TwoViewGeometry, lazy
 from ..features.selection import SelectionOptions
@@ -245,7 +245,7 @@ def match_features(
         seed=seed,
         positions=(features0.xy, features1.xy) if alike else None,
     )
-    if features0.descriptor_type in (LEARNED, LEARNED_FREE):
+    if is_learned(features0.descriptor_type):
         matches = match_learned(features0, features1, match)
     else:
         matches = match(features0.descriptors, features1.descriptors)

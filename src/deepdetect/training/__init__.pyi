@@ -1,6 +1,7 @@
 from .dataset import CropDataset as CropDataset, ValidationDataset as ValidationDataset
 from .recipe import (
     PRESETS as PRESETS,
+    DescriptorTrainingOptions as DescriptorTrainingOptions,
     DeviceOptions as DeviceOptions,
     PointsTrainingOptions as PointsTrainingOptions,
     Stage as Stage,
@@ -10,6 +11,7 @@ from .run import (
     StageProfile as StageProfile,
     profile as profile,
     train as train,
+    train_descriptor as train_descriptor,
     train_points as train_points,
 )
 from .sampler import CropSampler as CropSampler, Schedule as Schedule

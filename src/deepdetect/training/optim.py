@@ -1,7 +1,8 @@
-"""Optimisers by name: Adam and SOAP."""
+"""Optimisers: Adam and SOAP by name, and Muon."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
 import torch
@@ -15,6 +16,14 @@ EPS = 1e-8
 PRECONDITION_FREQUENCY = 10
 """Steps from one update of the basis to the next."""
 
+NEWTON_SCHULZ = (3.4445, -4.775, 2.0315)
+"""Coefficients of the polynomial that brings singular values near 1 (Keller Jordan, "Muon")."""
+
+NEWTON_SCHULZ_STEPS = 5
+MUON_RMS = 0.2
+"""Root mean square of a step's changes in learning rates, about that of Adam (arXiv:2502.16982)."""
+
+MUON_WEIGHT_DECAY = 0.01
 INITIAL_POWER_ITERATIONS = 3
 """Steps of the power iteration from the axes to the first eigenbasis."""
 
@@ -98,3 +107,39 @@ def _initial_state(gradient: Tensor) -> dict[str, Tensor]:
         # Stored by rows, as a checkpoint restores it: rounding depends on the layout.
         state[f"{side}_basis"] = basis.contiguous()
     return state
+
+
+class Muon(Optimizer):
+    """Muon (Keller Jordan, 2024): momentum whose matrix is made orthogonal before each step.
+
+    For kernels, as `Soap`. A step is as large in all directions of a matrix's space.
+    """
+
+    def __init__(self, parameters: Iterable[nn.Parameter], lr: float = 0.012) -> None:
+        super().__init__(parameters, {"lr": lr})
+
+    @torch.no_grad()
+    def step(self) -> None:  # type: ignore[override]  # takes no closure
+        """Make one step along the gradients of the parameters."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is None:
+                    continue
+                gradient = parameter.grad.reshape(len(parameter), -1)
+                mean = self.state[parameter].setdefault("mean", torch.zeros_like(gradient))
+                mean.lerp_(gradient, 1 - BETA)
+                change = orthogonalized(gradient.lerp(mean, BETA)).reshape(parameter.shape)
+                scale = group["lr"] * MUON_RMS * math.sqrt(max(gradient.shape))
+                parameter.mul_(1 - MUON_WEIGHT_DECAY * group["lr"]).add_(change, alpha=-scale)
+
+
+def orthogonalized(matrix: Tensor) -> Tensor:
+    """Return a matrix with the same singular vectors, and singular values of about 1."""
+    tall = matrix.shape[0] > matrix.shape[1]
+    x = (matrix.T if tall else matrix) / (matrix.norm() + 1e-7)
+    x = x.bfloat16()
+    linear, cubic, quintic = NEWTON_SCHULZ
+    for _ in range(NEWTON_SCHULZ_STEPS):
+        product = x @ x.T
+        x = linear * x + (cubic * product + quintic * product @ product) @ x
+    return (x.T if tall else x).float()

@@ -269,6 +269,40 @@ class PointsTrainingOptions:
             raise OptionError("`min_density` must not be above `max_density`")
 
 
+@suggest_keywords
+@dataclass(frozen=True)
+class DescriptorTrainingOptions:
+    """A training of the learned descriptor.
+
+    Attributes:
+        steps: optimiser steps.
+        pairs: of views in each step.
+        learning_rate: the highest, of Muon, after a warm-up; it falls to 0, linearly.
+        val_count: how many times the weights are measured.
+        val_pairs: of each kind that they are measured on: upright, turned, zoomed.
+        seed: of the weights and the pairs.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    steps: int = 4000
+    pairs: int = 8
+    learning_rate: float = 0.012
+    val_count: int = 12
+    val_pairs: int = 48
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=("learning_rate",),
+            not_negative=("seed",),
+            counts=("steps", "val_count", "val_pairs"),
+            between={"pairs": (1, 400)},
+        )
+
+
 _ESPNET = TrainingOptions(
     network="espnet",
     stages=(Stage(240, 16, 44), Stage(480, 8, 10)),

@@ -1,4 +1,4 @@
-"""`train`, `train_points` and `profile`: training runs, and how fast one would be.
+"""`train`, `train_points`, `train_descriptor`, and `profile`: how fast a run would be.
 
 Their module imports no torch, so that the package can offer them where it is missing.
 """
@@ -10,12 +10,19 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from .._shared.errors import require_packages
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
-from .recipe import DeviceOptions, InitWeights, PointsTrainingOptions, Stage, TrainingOptions
+from .recipe import (
+    DescriptorTrainingOptions,
+    DeviceOptions,
+    InitWeights,
+    PointsTrainingOptions,
+    Stage,
+    TrainingOptions,
+)
 
 if TYPE_CHECKING:
     from .dense import DenseTrainer
@@ -114,6 +121,57 @@ def train_points(
     from .points.task import RankerTrainer
 
     trainer = RankerTrainer(Path(images), Path(validation), options, num_workers)
+    return trainer.fit(Path(output), log)
+
+
+@suggest_keywords
+def train_descriptor(
+    images: str | Path,
+    validation: str | Path,
+    output: str | Path,
+    options: DescriptorTrainingOptions = DescriptorTrainingOptions(),
+    *,
+    init_weights: str | Path | None = None,
+    device: Literal["auto", "cpu", "cuda"] = "auto",
+    num_workers: int | None = None,
+    log: Log | None = None,
+) -> TrainingResult:
+    """Train the learned descriptor on pairs of views that are made of single images.
+
+    An interrupted run resumes as one of `train` does.
+
+    Args:
+        images: folder of images, best of 480 pixels or more.
+        validation: folder of others, by which the best weights are chosen.
+        output: folder for checkpoint.safetensors, descriptor.safetensors, descriptor.onnx,
+            MODEL_CARD.md and the curves.
+        options: the recipe.
+        init_weights: descriptor.safetensors to start from. None: random ones, by the seed.
+        device: "auto" is CUDA if there is a GPU, else the CPU.
+        num_workers: processes that make the pairs, 0 for none but the one that trains. None: 0 on a
+            CPU, one per processor but one beside a GPU.
+        log: takes lines of text for the user; without it there is no progress bar either.
+
+    Returns:
+        The weights' files, of which `PointDetector.extract` takes the ONNX file, and the curves.
+
+    Raises:
+        MissingExtraError: a package of the extra `train` is not installed.
+        ImageError: a folder is missing or empty.
+        OptionError: the folder holds a run with other options or images, or the images show
+            nothing.
+        WeightsError: the initial weights are missing or do not fit.
+
+    Example:
+        >>> result = train_descriptor("photos/train", "photos/val", "run")  # doctest: +SKIP
+        >>> PointDetector().extract("a.png", descriptor=result.onnx)  # doctest: +SKIP
+    """
+    require_packages("training", *TRAINING_PACKAGES)
+    from .descriptor.task import DescriptorTrainer
+
+    where = DeviceOptions(device=device, num_workers=num_workers)
+    initial = None if init_weights is None else Path(init_weights)
+    trainer = DescriptorTrainer(Path(images), Path(validation), options, initial, where)
     return trainer.fit(Path(output), log)
 
 

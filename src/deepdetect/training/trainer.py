@@ -50,7 +50,8 @@ class TrainingResult:
 
     Attributes:
         weights: the weights that the validation found best, safetensors or npz.
-        onnx: the same weights as ONNX, for `DeepDetect(weights=...)`; None for a ranker.
+        onnx: the same weights as ONNX, for `DeepDetect(weights=...)`, or as a descriptor; None for
+            a ranker.
         points: the curves: losses and measures by name, for each validation.
         best: the point of those weights.
         images_per_second: mean rate, in 480x480 images' worth of pixels.
@@ -151,7 +152,7 @@ class Trainer(abc.ABC):
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
             for group in optimizer.param_groups:
-                group["lr"] = self.learning_rate(step)
+                group["lr"] = self.learning_rate(step) * group.get("rate_factor", 1)
         value = self.backward(self.loss(batch))
         norm = clip_grad_norm_(self.network.parameters(), self.max_gradient_norm)
         # A finite loss can have gradients that are not, in bfloat16.

@@ -33,14 +33,14 @@ def save_tensors(tensors: Mapping[str, Tensor], path: str | Path, notes: dict[st
             raise OSError(str(error)) from None
 
 
-def load_network(path: str | Path) -> nn.Module:
+def load_network(path: str | Path, *kinds: type[nn.Module]) -> nn.Module:
     """Make a network from a weights file, in evaluation mode.
 
-    It is the one of `NETWORKS` that has most of the file's tensors.
+    It is the one of those kinds, by default of `NETWORKS`, that has most of the file's tensors.
     """
     if not Path(path).is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")
-    networks = [make() for make in NETWORKS.values()]
+    networks = [make() for make in kinds or NETWORKS.values()]
     try:
         with safe_open(path, framework="pt") as file:
             state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import functools
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..._shared.errors import WeightsError, first_line
 from ..._shared.opencv import cv2
+from ..._shared.records import file_digest
 from ...features.keypoints import Keypoints
 from ...features.learned import LEARNED, LEARNED_FREE
 from ..backends.onnxruntime_backend import start_session
-from ..pretrained import RANKER
+from ..pretrained import RANKER, resolve_weights
 
 DESCRIPTOR_GRAPHS = {
     LEARNED: RANKER.with_name("descriptor.onnx"),
@@ -21,17 +24,25 @@ DESCRIPTOR_GRAPHS = {
 """Map `luma` (1, 1, H, W) in [0, 1], `xy` (1, N, 2) in pixels and `sizes` (1, N), diameters in
 pixels, to `descriptors` (1, N, 64) of length 1, all float32."""
 
+DIGEST_LENGTH = 16
+"""Characters of the SHA-256 of one's own file."""
+
 STRIDE = 128
 """The network halves an image seven times, so its sides must be multiples of 128."""
 
 
 def describe_learned(
-    gray: np.ndarray, keypoints: Keypoints, descriptor: str = LEARNED
+    gray: np.ndarray, keypoints: Keypoints, descriptor: str | Path = LEARNED
 ) -> Keypoints:
     """Return keypoints with learned descriptors, upright ones, of a (H, W) uint8 image.
 
-    The image may be a smaller one than that of the keypoints.
+    The image may be a smaller one than that of the keypoints. The descriptor is a name of
+    `DESCRIPTOR_GRAPHS`, or such a file, whose digest becomes part of the descriptors' type.
     """
+    path, kind = DESCRIPTOR_GRAPHS.get(str(descriptor)), str(descriptor)
+    if path is None:
+        path = resolve_weights(descriptor)
+        kind = f"{LEARNED}-{file_digest(path)[:DIGEST_LENGTH]}"
     height, width = gray.shape
     factor = np.divide((width, height), keypoints.image_size).astype(np.float32)
     below, right = -height % STRIDE, -width % STRIDE
@@ -41,10 +52,21 @@ def describe_learned(
         "xy": ((keypoints.xy + 0.5) * factor - 0.5)[None],
         "sizes": (keypoints.sizes * factor.mean())[None],
     }
-    descriptors = _session(descriptor).run(["descriptors"], inputs)[0][0]
-    return replace(keypoints, descriptors=descriptors, descriptor_type=descriptor)
+    descriptors = _session(path, kind).run(["descriptors"], inputs)[0][0]
+    return replace(keypoints, descriptors=descriptors, descriptor_type=kind)
 
 
 @functools.cache
-def _session(descriptor: str) -> Any:
-    return start_session(str(DESCRIPTOR_GRAPHS[descriptor]), None)
+def _session(path: Path, kind: str) -> Any:
+    """Start a session of a file, once for each content that it has had."""
+    try:
+        session = start_session(str(path), None)
+        names = [each.name for each in (*session.get_inputs(), *session.get_outputs())]
+        if names != ["luma", "xy", "sizes", "descriptors"]:
+            raise ValueError("it is no descriptor")
+    except Exception as error:  # its exceptions share no base class
+        raise WeightsError(
+            f"{path} does not describe keypoints ({first_line(error)}): "
+            "use descriptor.onnx of `deepdetect train-descriptor`"
+        ) from None
+    return session

@@ -1,0 +1,108 @@
+"""The loss of pairs of views, and the measure: how many keypoints find their own in the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import cross_entropy
+
+from .network import DescriptorNetwork, turn
+from .views import SIDE_PX, Pair
+
+NEAR_PX = 3.0
+"""From the right keypoint: in the loss nearer ones are not wrong, in the measure they are right."""
+
+MAX_LOG_TEMPERATURE = 4.3
+UPRIGHT, ANGLE_NOISE = 0.45, 0.15
+"""Radians: pairs turned by less can be matched as they are; the standard deviation of angles."""
+
+KINDS = ("upright", "turned", "zoomed")
+
+
+def kind_of(angle: float, zoom: float) -> str:
+    """Say as which of `KINDS` a pair is measured, by how its views are turned and zoomed."""
+    if zoom > 0.6:  # by 1.8
+        return "zoomed"
+    return "upright" if angle < UPRIGHT else "turned"
+
+
+def describe_views(network: DescriptorNetwork, batch: Pair) -> tuple[Tensor, Tensor]:
+    """Return the upright descriptors of both views, (B, N, 64) each."""
+    images = batch.images.transpose(0, 1).flatten(0, 1)[:, None].float() / 255
+    with torch.autocast(images.device.type, torch.bfloat16):
+        maps = network.maps(images.contiguous(memory_format=torch.channels_last))
+    positions = torch.cat([batch.positions0, batch.positions1])
+    first, second = network.describe(maps, positions, torch.cat(batch[3:5])).chunk(2)
+    return first, second
+
+
+def mirror(batch: Pair, which: Tensor) -> Pair:
+    """Mirror some (B,) of the pairs left to right."""
+
+    def mirrored(xy: Tensor) -> Tensor:
+        x, y = xy.unbind(-1)
+        return torch.stack([torch.where(which[:, None], SIDE_PX - 1 - x, x), y], -1)
+
+    return batch._replace(
+        images=torch.where(which[:, None, None, None], batch.images.flip(-1), batch.images),
+        positions0=mirrored(batch.positions0),
+        positions1=mirrored(batch.positions1),
+        turns=torch.where(which[:, None], -batch.turns, batch.turns),
+    )
+
+
+def contrastive_loss(
+    network: DescriptorNetwork, batch: Pair, generator: np.random.Generator
+) -> Tensor:
+    """Return the cross-entropy of the right keypoint among all of the other view (InfoNCE).
+
+    In both directions. Half of the pairs are mirrored. Turned pairs are turned back by angles as
+    detectors measure them; of those that hardly are, half stay as upright images will be.
+    """
+    device, count = batch.turns.device, len(batch.turn)
+    mirrored, kept = torch.from_numpy(generator.random((2, count)) < 0.5).to(device)
+    noise = torch.from_numpy(generator.normal(0, ANGLE_NOISE, batch.turns.shape)).to(device)
+    batch = mirror(batch, mirrored)
+    first, second = describe_views(network, batch)
+    as_is = kept & (batch.turn < UPRIGHT)
+    second = turn(second, torch.where(as_is[:, None], 0, -(batch.turns + noise.float())))
+    similar = (
+        first @ second.transpose(1, 2) * network.temperature.clamp(max=MAX_LOG_TEMPERATURE).exp()
+    )
+    valid, size = batch.valid, batch.valid.shape[1]
+    near = _near(batch.positions0) | _near(batch.positions1)
+    wrong = near & ~torch.eye(size, dtype=torch.bool, device=device) | ~valid[:, None]
+    own = torch.arange(size, device=device).expand(valid.shape)[valid]
+    both = (each.masked_fill(wrong, -1e4)[valid] for each in (similar, similar.transpose(1, 2)))
+    forth, back = (cross_entropy(each, own) for each in both)
+    return (forth + back) / 2
+
+
+def _near(xy: Tensor) -> Tensor:
+    return (xy[:, :, None] - xy[:, None]).square().sum(-1) < NEAR_PX**2
+
+
+@torch.no_grad()
+def shares_right(network: DescriptorNetwork, batches: Iterable[Pair]) -> dict[str, float]:
+    """Return which share of keypoints are mutual nearest neighbours and right, by kind of pair.
+
+    The network is in evaluation mode; there are pairs of all of `KINDS`.
+    """
+    shares: dict[str, list[float]] = {kind: [] for kind in KINDS}
+    generator = np.random.default_rng(1)
+    for batch in batches:
+        first, second = describe_views(network, batch)
+        noise = generator.normal(0, ANGLE_NOISE, batch.turns.shape).astype(np.float32)
+        turned = turn(second, -(batch.turns + torch.from_numpy(noise).to(second.device)))
+        for row, valid in enumerate(batch.valid):
+            angle, zoom = batch.turn[row].item(), batch.zoom[row].item()
+            other = (second if angle < UPRIGHT else turned)[row][valid]
+            similar, places = first[row][valid] @ other.T, batch.positions1[row][valid]
+            nearest = similar.argmax(1)
+            mutual = similar.argmax(0)[nearest] == torch.arange(len(nearest), device=other.device)
+            right = mutual & ((places[nearest] - places).norm(dim=1) < NEAR_PX)
+            shares[kind_of(angle, zoom)].append(right.float().mean().item())
+    return {f"{kind} correct": float(np.mean(values)) for kind, values in shares.items()}
