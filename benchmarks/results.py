@@ -72,7 +72,8 @@ STAGES = {
     "times": "benchmarks/times.py {data} --cache {output}/cache"
     + "".join(f" --method {{published}}/peers/{name}.onnx" for name in PEERS),
     "published-pipeline": "benchmarks/published_pipeline.py {data}",
-    "descriptors": "benchmarks/descriptors.py {data}",
+    "descriptors": "benchmarks/descriptors.py {data}"
+    + "".join(f" --method {{published}}/peers/{name}.onnx" for name in PEERS[1:]),
     "fuzz": "-m fuzz",
 }
 """Arguments of Python by the stage's name. What writes no report prints its tables, or JSON."""
