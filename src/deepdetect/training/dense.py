@@ -12,7 +12,6 @@ import logging
 import math
 import os
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +33,6 @@ from ..detector.network.weights import (
     NETWORKS,
     average_weights,
     load_network,
-    read_notes,
-    save_tensors,
     weights_digest,
 )
 from ..detector.pretrained import resolve_weights
@@ -285,12 +282,6 @@ class DenseTrainer(Trainer):
         batch = batch.contiguous(memory_format=torch.channels_last)
         logits = self.average(batch)[0, 0, :height, :width]
         return torch.sigmoid(logits.float()).cpu().numpy()
-
-    def save(self, path: Path, notes: Mapping[str, Any]) -> None:
-        save_tensors(self.average.state_dict(), path, dict(notes))
-
-    def read_notes(self, path: Path) -> Mapping[str, Any]:
-        return read_notes(path)
 
     def export(self, folder: Path) -> Path:
         best = load_network(folder / self.weights_file)

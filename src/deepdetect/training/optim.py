@@ -40,13 +40,11 @@ def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:
     return [Soap(kernels), torch.optim.Adam(vectors, fused=True)]
 
 
-class Soap(Optimizer):
-    """SOAP (arXiv:2409.11321): Adam in the eigenbasis of Shampoo's preconditioner.
+class KernelOptimizer(Optimizer):
+    """An optimiser of matrices and convolution kernels: matrices with one row per output channel.
 
-    For matrices and convolution kernels: a kernel is a matrix with one row per output channel.
     All of the state are tensors, per parameter, so that safetensors can store them and a run
-    resumes bit by bit. (pytorch-optimizer's keeps one basis for each axis of a kernel, in lists,
-    beside numbers.) The first step only computes the first basis.
+    resumes bit by bit.
     """
 
     def __init__(self, parameters: Iterable[nn.Parameter], lr: float = 1e-3) -> None:
@@ -58,10 +56,21 @@ class Soap(Optimizer):
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is not None:
-                    self._step(parameter, parameter.grad, group["lr"])
+                    gradient = parameter.grad.reshape(len(parameter), -1).float().contiguous()
+                    self._step(parameter, gradient, group["lr"])
 
     def _step(self, parameter: nn.Parameter, gradient: Tensor, learning_rate: float) -> None:
-        gradient = gradient.reshape(len(parameter), -1).float().contiguous()
+        raise NotImplementedError
+
+
+class Soap(KernelOptimizer):
+    """SOAP (arXiv:2409.11321): Adam in the eigenbasis of Shampoo's preconditioner.
+
+    pytorch-optimizer's keeps one basis for each axis of a kernel, in lists, beside numbers. The
+    first step only computes the first basis.
+    """
+
+    def _step(self, parameter: nn.Parameter, gradient: Tensor, learning_rate: float) -> None:
         state = self.state[parameter]
         if not state:
             state.update(_initial_state(gradient))
@@ -109,31 +118,18 @@ def _initial_state(gradient: Tensor) -> dict[str, Tensor]:
     return state
 
 
-class Muon(Optimizer):
-    """Muon (Keller Jordan, 2024): momentum whose matrix is made orthogonal before each step.
+class Muon(KernelOptimizer):
+    """Muon (Keller Jordan, 2024): momentum whose matrix is made orthogonal before each step."""
 
-    For kernels, as `Soap`. A step is as large in all directions of a matrix's space.
-    """
-
-    def __init__(self, parameters: Iterable[nn.Parameter], lr: float = 0.012) -> None:
-        super().__init__(parameters, {"lr": lr})
-
-    @torch.no_grad()
-    def step(self) -> None:  # type: ignore[override]  # takes no closure
-        """Make one step along the gradients of the parameters."""
-        for group in self.param_groups:
-            for parameter in group["params"]:
-                if parameter.grad is None:
-                    continue
-                gradient = parameter.grad.reshape(len(parameter), -1)
-                mean = self.state[parameter].setdefault("mean", torch.zeros_like(gradient))
-                mean.lerp_(gradient, 1 - BETA)
-                change = orthogonalized(gradient.lerp(mean, BETA)).reshape(parameter.shape)
-                scale = group["lr"] * MUON_RMS * math.sqrt(max(gradient.shape))
-                parameter.mul_(1 - MUON_WEIGHT_DECAY * group["lr"]).add_(change, alpha=-scale)
+    def _step(self, parameter: nn.Parameter, gradient: Tensor, learning_rate: float) -> None:
+        mean = self.state[parameter].setdefault("mean", torch.zeros_like(gradient))
+        mean.lerp_(gradient, 1 - BETA)
+        change = _orthogonalized(gradient.lerp(mean, BETA)).reshape(parameter.shape)
+        scale = learning_rate * MUON_RMS * math.sqrt(max(gradient.shape))
+        parameter.mul_(1 - MUON_WEIGHT_DECAY * learning_rate).add_(change, alpha=-scale)
 
 
-def orthogonalized(matrix: Tensor) -> Tensor:
+def _orthogonalized(matrix: Tensor) -> Tensor:
     """Return a matrix with the same singular vectors, and singular values of about 1."""
     tall = matrix.shape[0] > matrix.shape[1]
     x = (matrix.T if tall else matrix) / (matrix.norm() + 1e-7)

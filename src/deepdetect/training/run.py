@@ -141,25 +141,19 @@ def train_descriptor(
     An interrupted run resumes as one of `train` does.
 
     Args:
-        images: folder of images, best of 480 pixels or more.
-        validation: folder of others, by which the best weights are chosen.
+        images, validation, options, log: as of `train_points`; images best of 480 pixels a side.
         output: folder for checkpoint.safetensors, descriptor.safetensors, descriptor.onnx,
             MODEL_CARD.md and the curves.
-        options: the recipe.
         init_weights: descriptor.safetensors to start from. None: random ones, by the seed.
         device: "auto" is CUDA if there is a GPU, else the CPU.
         num_workers: processes that make the pairs, 0 for none but the one that trains. None: 0 on a
             CPU, one per processor but one beside a GPU.
-        log: takes lines of text for the user; without it there is no progress bar either.
 
     Returns:
         The weights' files, of which `PointDetector.extract` takes the ONNX file, and the curves.
 
     Raises:
-        MissingExtraError: a package of the extra `train` is not installed.
-        ImageError: a folder is missing or empty.
-        OptionError: the folder holds a run with other options or images, or the images show
-            nothing.
+        The errors of `train_points`; an OptionError, too, where the images show nothing.
         WeightsError: the initial weights are missing or do not fit.
 
     Example:

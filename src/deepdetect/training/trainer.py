@@ -22,6 +22,7 @@ from .._shared.errors import OptionError
 from .._shared.progress import progress
 from .._shared.provenance import provenance
 from .._shared.records import check_same, file_digest, plain
+from ..detector.network.weights import read_notes, save_tensors
 from ..evaluation.report import Table, line_chart
 from .checkpoint import Point, read_checkpoint, restore, save_checkpoint
 from .dataset import loading
@@ -122,13 +123,13 @@ class Trainer(abc.ABC):
     def validate(self, step: int) -> dict[str, float]:
         """Measure the weights after a number of steps."""
 
-    @abc.abstractmethod
     def save(self, path: Path, notes: Mapping[str, Any]) -> None:
         """Write the weights that are measured."""
+        save_tensors(self.average.state_dict(), path, dict(notes))
 
-    @abc.abstractmethod
     def read_notes(self, path: Path) -> Mapping[str, Any]:
         """Read the notes of a file of weights; a WeightsError where it is missing."""
+        return read_notes(path)
 
     @abc.abstractmethod
     def card(self, best: Point) -> tuple[str, list[str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from ..._shared.errors import OptionError
 from ..._shared.records import key
-from ...detector.network.weights import load_network, read_notes, save_tensors, weights_digest
+from ...detector.network.weights import load_network, weights_digest
 from ...evaluation.report import Table
 from ...io.image import find_images
 from ..checkpoint import Point
@@ -196,12 +196,6 @@ class DescriptorTrainer(Trainer):
         """Measure the average of the weights so far."""
         shares = shares_right(self.average, self.batches)
         return {"score": sum(shares.values()) / len(shares), **shares}
-
-    def save(self, path: Path, notes: Mapping[str, Any]) -> None:
-        save_tensors(self.average.state_dict(), path, dict(notes))
-
-    def read_notes(self, path: Path) -> Mapping[str, Any]:
-        return read_notes(path)
 
     def export(self, folder: Path) -> Path:
         best: Any = load_network(folder / self.weights_file, DescriptorNetwork)
