@@ -31,12 +31,12 @@ Result = TypeVar("Result")
 STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
     "keypoints": (1, ()),
     "matches": (1, ("keypoints",)),
-    "guided": (7, ("keypoints",)),
-    "stereo": (3, ()),
+    "guided": (8, ("keypoints",)),
+    "stereo": (4, ()),
     "repeatability_paper": (1, ("keypoints",)),
     "repeatability_mutual_nn": (1, ("keypoints",)),
     "corner_errors": (1, ("matches",)),
-    "pose": (7, ("matches", "guided")),
+    "pose": (8, ("matches", "guided")),
     "sfm": (2, ()),
 }
 """Version of each stage, and the stages it is made from.

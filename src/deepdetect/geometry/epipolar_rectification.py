@@ -110,24 +110,28 @@ class PolarFrame:
 
     def from_frame(self, points: np.ndarray, view: int) -> np.ndarray:
         """Take positions of the frame into a view."""
-        points = np.asarray(points, np.float64).reshape(-1, 2)
-        directions = self._directions(
-            self.middle + self.first_angle + points[:, 1] * self.step, view
-        )
-        radius = self.min_radius_px * np.exp(points[:, :1] * self.step)
-        positions = self.epipoles[view] + directions * radius
-        if view and self.plane is not None:
-            return transform_points(positions, self.plane)
-        return positions
+        column, row = np.asarray(points, np.float64).reshape(-1, 2).T
+        return self._positions(column, row, view)
 
     def warp(self, image: np.ndarray, view: int) -> tuple[np.ndarray, np.ndarray]:
         """Show a view in the frame."""
         width, height = self.size
-        grid = np.mgrid[:height, :width][::-1].reshape(2, -1).T
-        x, y = self.from_frame(grid, view).T.reshape(2, height, width).astype(np.float32)
-        rows, columns = image.shape[:2]
-        shown = (x >= -0.5) & (x <= columns - 0.5) & (y >= -0.5) & (y <= rows - 0.5)
-        return cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), shown
+        places = self._positions(np.arange(width)[None], np.arange(height)[:, None], view)
+        places = places.astype(np.float32)
+        last = np.array(image.shape[1::-1], np.float32) - 0.5
+        shown = np.all((places >= -0.5) & (places <= last), axis=2)
+        border = cv2.BORDER_REPLICATE
+        return cv2.remap(image, places, None, cv2.INTER_CUBIC, borderMode=border), shown
+
+    def _positions(self, column: np.ndarray, row: np.ndarray, view: int) -> np.ndarray:
+        """Return where columns and rows, arrays that fit each other, lie in a view, (..., 2)."""
+        angles = self.middle + self.first_angle + row * self.step
+        directions = self._directions(angles.ravel(), view).reshape(*row.shape, 2)
+        radius = self.min_radius_px * np.exp(column * self.step)
+        positions = self.epipoles[view] + directions * radius[..., None]
+        if view and self.plane is not None:
+            return transform_points(positions, self.plane).reshape(positions.shape)
+        return positions
 
     def _directions(self, angles: np.ndarray, view: int) -> np.ndarray:
         first = np.column_stack([np.cos(angles), np.sin(angles)])

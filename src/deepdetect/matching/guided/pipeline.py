@@ -183,7 +183,9 @@ def _plane_or_depth(
     off_plane = first.parallax is not None and first.parallax.significant
     plane = _trusted(first, matrix, on_plane, enough)
     plane = replace(plane[0], verified=verified), plane[1]
-    if planar and not off_plane:
+    clear = first.parallax is not None and first.parallax.log10_nfa < MAX_PARALLAX_LOG10_NFA
+    unexplained = 1 - verified >= MIN_OFF_PLANE_FRACTION * verified
+    if planar and not (clear or (off_plane and unexplained)):
         return plane
     joint = guiding_geometry(grays, "fundamental", seed, first.source)
     joint = replace(joint, num_views=joint.num_views + first.num_views)
@@ -208,7 +210,6 @@ def _plane_or_depth(
     new = ~np.isin(matches.indices0, on_plane.indices0)
     off = int(np.count_nonzero(new & (errors > OFF_PLANE_PX)))
     if planar:
-        clear = first.parallax is not None and first.parallax.log10_nfa < MAX_PARALLAX_LOG10_NFA
         shown = clear or off >= MIN_OFF_PLANE_FRACTION * len(on_plane)
     else:
         fractions = [len(each.points0) / max(len(each.inliers), 1) for each in (first, depth)]

@@ -38,7 +38,7 @@ from .initial_geometry import Pair
 DISPARITY = DisparityOptions(discontinuity_margin_px=1)
 """How rows are matched; the range is found."""
 
-MAX_VOLUME = 1e8
+MAX_VOLUME = 5e7
 """Pixels of the frame times disparities; with more, the images are scaled down."""
 
 MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25
@@ -161,19 +161,19 @@ def match_by_rectification(
         return None
     tracked, on_rows = tracks
     fundamental = _refine(fundamental, sparse, tracked, sizes)
-    errors = epipolar_errors(tracked[0], on_rows, fundamental)
-    near = float(np.quantile(errors, ROW_QUANTILE)) < MAX_ROW_ERROR_PX
-    if not exact and (not near or _is_range_too_wide(view)):
+    row_error = np.quantile(epipolar_errors(tracked[0], on_rows, fundamental), ROW_QUANTILE)
+    if not exact and (row_error > MAX_ROW_ERROR_PX or _is_range_too_wide(view)):
         again = rectified_view(grays, tracked, fundamental, plane)
         tracks = None if again is None else _track(again)
         if again is not None and tracks is not None:
             counts = [np.count_nonzero(each.relied) for each in (view, again)]
             if counts[1] >= counts[0]:
-                view, near = again, True
+                view, row_error = again, 0.0
                 fundamental = _refine(fundamental, sparse, tracks[0], sizes)
     if not exact and _agreement(view, sparse) < MIN_AGREEMENT:
         return None
     # Rows that are off, and could not be corrected, are a reason to doubt low correlation.
+    near = row_error * view.scale < MAX_ROW_ERROR_PX
     disparity = view.disparity if near else np.where(view.relied, view.disparity, np.nan)
     rows, ends, scores = _sample(view, disparity, xy0)
     ends = _moved_to_lines(xy0[rows], ends, fundamental)
