@@ -26,9 +26,9 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import numpy as np
@@ -42,6 +42,7 @@ from deepdetect.evaluation.metrics.pose import pose_auc
 from deepdetect.evaluation.protocols.planar import pairs_of
 from deepdetect.evaluation.protocols.pose import ERROR, estimate_pose, pose_errors
 from deepdetect.evaluation.report import Row, Table
+from deepdetect.features.learned import Descriptor
 from deepdetect.features.sift import to_root_sift
 from deepdetect.geometry import GeometryOptions, estimate_geometry
 from deepdetect.geometry.transforms import transfer_errors
@@ -49,7 +50,6 @@ from deepdetect.io.image import load_image, luma
 
 KEYPOINTS, FEW, RIGHT_PX, RIGHT_DARK_PX, RATIO, ORDERS, AUC_DEG = 2048, 512, 3.0, 2.0, 0.85, 5, 5.0
 FOUND_DEG, CLIPS, CLIP_PAIRS, ROUNDS = 10.0, ("kitti-clip", "kitti-clip2"), 30, 15
-POINTS = PointDetector(KEYPOINTS)
 MIDDLE_GREY, TURNED = 118, ("boat", "graf", "wall")
 
 Extract = Callable[[np.ndarray], Keypoints]
@@ -58,8 +58,7 @@ Extract = Callable[[np.ndarray], Keypoints]
 def methods(files: list[str]) -> dict[str, Extract]:
     """Return what extracts keypoints with descriptors, by name; others' files too."""
     found: dict[str, Extract] = {
-        kind: partial(POINTS.extract, descriptor=kind)  # type: ignore[arg-type]
-        for kind in ("rootsift", "learned", "learned-free")
+        kind: PointDetector(KEYPOINTS, descriptor=kind).extract for kind in get_args(Descriptor)
     }
     others = {Path(file).stem: _extract_other(file) for file in files}
     return found | {"SIFT": extract_sift} | others

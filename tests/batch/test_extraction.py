@@ -16,7 +16,7 @@ from PIL import Image
 from deepdetect import DeepDetect, OptionError, PointDetector, SelectionOptions, load_image
 from deepdetect.batch import extract_features
 from deepdetect.detector.pretrained import pretrained_weights
-from deepdetect.features.sift import describe_keypoints, root_sift_descriptors
+from deepdetect.features.sift import root_sift_descriptors
 from deepdetect.io.image import luma
 
 FEW, PIXELS = PointDetector(50), SelectionOptions(max_keypoints=50)
@@ -48,10 +48,10 @@ def test_the_layout_is_that_of_hloc(collection: Callable[..., Path], tmp_path: P
         found = {name: value[()] for name, value in stored.items()}
         assert stored["keypoints"].attrs["uncertainty"] == 1
     expected = FEW.detect(folder / "b/01.png")
-    described = describe_keypoints(luma(load_image(folder / "b/01.png")), expected)
+    described = FEW.extract(folder / "b/01.png")
     assert {name: (value.shape, value.dtype.name) for name, value in found.items()} == {
         "keypoints": ((50, 2), "float32"),
-        "descriptors": ((128, 50), "float32"),
+        "descriptors": ((64, 50), "float32"),
         "scores": ((50,), "float32"),
         "scales": ((50,), "float32"),
         "oris": ((50,), "float32"),
@@ -96,7 +96,7 @@ def test_an_image_without_keypoints(tmp_path: Path) -> None:
     report = extract_features(tmp_path / "photos", tmp_path / "f.h5", workers=1)
     assert (tuple(report.counts), sum(report.counts.values())) == (("black.png",), 0)
     with h5py.File(tmp_path / "f.h5") as file:
-        assert file["black.png/descriptors"].shape == (128, 0)
+        assert file["black.png/descriptors"].shape == (64, 0)
         assert file["black.png/keypoints"].shape == (0, 2)
 
 

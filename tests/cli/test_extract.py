@@ -23,7 +23,7 @@ def test_extract_and_match(run, photos: Path) -> None:
     result = run("extract", photos, "-o", "f.h5", "--max-keypoints", 200, "--workers", 1)
     assert result.exit_code == 0, result.output
     assert "3 images with 600 keypoints, 0 already done -> f.h5" in result.stdout
-    assert shapes("f.h5") == dict.fromkeys(("cat.jpg", "left.png", "right.png"), (128, 200))
+    assert shapes("f.h5") == dict.fromkeys(("cat.jpg", "left.png", "right.png"), (64, 200))
     again = json.loads(
         run("extract", photos, "-o", "f.h5", "--max-keypoints", 200, "--json").stdout
     )

@@ -33,7 +33,8 @@ def test_it_finds_the_best_points(image: np.ndarray, gray: np.ndarray) -> None:
 def test_extracted_points_are_the_detected_ones_described(
     image: np.ndarray, gray: np.ndarray
 ) -> None:
-    found, expected = PointDetector(50).extract(image), PointDetector(50).detect(image)
+    points = PointDetector(50, descriptor="rootsift")
+    found, expected = points.extract(image), points.detect(image)
     np.testing.assert_array_equal(found.xy, expected.xy)
     sift = scaled_sift_descriptors(gray, expected.xy, expected.sizes, expected.angles)
     np.testing.assert_array_equal(found.descriptors, to_root_sift(sift))

@@ -74,7 +74,7 @@ def test_the_extractor_gives_described_points(views: Views, load: Callable[..., 
     assert {name: tuple(value.shape) for name, value in found.items()} == {
         "keypoints": (1, 100, 2),
         "scores": (1, 100),
-        "descriptors": (1, 128, 100),
+        "descriptors": (1, 64, 100),
         "scales": (1, 100),
         "oris": (1, 100),
     }

@@ -70,7 +70,7 @@ def test_a_batch_is_filled_as_kornia_does(views: Views) -> None:
     lafs, scores, descriptors = kornia.DeepDetectFeature(PointDetector(50))(
         tensor(views.first, flat)
     )
-    assert (lafs.shape[:2], scores.shape, descriptors.shape) == ((2, 50), (2, 50), (2, 50, 128))
+    assert (lafs.shape[:2], scores.shape, descriptors.shape) == ((2, 50), (2, 50), (2, 50, 64))
     assert kornia_feature.laf_is_filled(lafs).sum(dim=1).tolist() == [50, 0]
     assert torch.allclose(descriptors[0].norm(dim=1), torch.ones(50))
     alone = kornia.DeepDetectFeature(PointDetector(50))(tensor(flat))

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import Keypoints, PointDetector
+from deepdetect import Keypoints, OptionError, PointDetector
 from deepdetect.features.sift import describe_keypoints
 from deepdetect.io.image import luma
 
@@ -12,6 +12,8 @@ from .conftest import Views
 
 torch = pytest.importorskip("torch", reason="needs torch")
 lightglue = pytest.importorskip("deepdetect.integrations.lightglue")
+
+POINTS = PointDetector(100, descriptor="rootsift")
 
 
 def tensor(image: np.ndarray) -> torch.Tensor:
@@ -39,7 +41,7 @@ def test_sift_keypoints_become_what_lightglues_extractor_makes_of_them(views: Vi
 
 def test_the_extractor_gives_points(views: Views) -> None:
     expected = PointDetector(100).detect(views.first)
-    features = lightglue.DeepDetectExtractor(PointDetector(100)).extract(tensor(views.first))
+    features = lightglue.DeepDetectExtractor(POINTS).extract(tensor(views.first))
     assert {name: tuple(value.shape) for name, value in features.items()} == {
         "keypoints": (1, 100, 2),
         "keypoint_scores": (1, 100),
@@ -51,8 +53,13 @@ def test_the_extractor_gives_points(views: Views) -> None:
     assert {value.dtype for value in features.values()} == {torch.float32}
     assert np.array_equal(features["keypoints"][0], expected.xy)
     for image in (views.first, tensor(views.first)[None]):
-        again = lightglue.DeepDetectExtractor(PointDetector(100)).extract(image)
+        again = lightglue.DeepDetectExtractor(POINTS).extract(image)
         assert all(torch.equal(again[name], features[name]) for name in features)
+
+
+def test_descriptors_without_weights_are_refused() -> None:
+    with pytest.raises(OptionError, match="rootsift"):
+        lightglue.DeepDetectExtractor(PointDetector(100))
 
 
 def test_scales_and_angles_are_as_kornia_makes_them_of_frames(views: Views) -> None:
@@ -61,9 +68,7 @@ def test_scales_and_angles_are_as_kornia_makes_them_of_frames(views: Views) -> N
     from deepdetect.integrations.kornia import DeepDetectDetector
 
     lafs, _ = DeepDetectDetector(PointDetector(100))(tensor(views.first)[None])
-    features = lightglue.DeepDetectExtractor(PointDetector(100), scale="sigma").extract(
-        tensor(views.first)
-    )
+    features = lightglue.DeepDetectExtractor(POINTS, scale="sigma").extract(tensor(views.first))
     assert torch.allclose(features["scales"], feature.get_laf_scale(lafs)[..., 0, 0] / 6)
     turned = torch.deg2rad(feature.get_laf_orientation(lafs)[..., 0]) + features["oris"]
     assert torch.allclose(torch.cos(turned), torch.ones(1), atol=1e-5)
@@ -76,7 +81,7 @@ def test_lightglue_runs_on_our_points(views: Views) -> None:
     matcher = feature.LightGlue(
         None, input_dim=128, add_scale_ori=True, n_layers=2, filter_threshold=0.0
     ).eval()
-    extractor = lightglue.DeepDetectExtractor(PointDetector(60))
+    extractor = lightglue.DeepDetectExtractor(PointDetector(60, descriptor="rootsift"))
     features = [extractor.extract(tensor(image)) for image in (views.first, views.second)]
     with torch.inference_mode():
         found = matcher({"image0": features[0], "image1": features[1]})

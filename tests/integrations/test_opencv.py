@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -26,12 +28,13 @@ def test_keypoints_are_those_of_the_detector(views: Views, bgr: np.ndarray) -> N
         assert np.array_equal([k.response for k in keypoints], expected.scores)
 
 
-def test_both_steps_in_one_are_the_two_steps(bgr: np.ndarray) -> None:
-    feature = DeepDetectFeature2D(PointDetector(200))
+@pytest.mark.parametrize("descriptor", ["learned", "rootsift"])
+def test_both_steps_in_one_are_the_two_steps(bgr: np.ndarray, descriptor: Any) -> None:
+    feature = DeepDetectFeature2D(PointDetector(200, descriptor=descriptor))
     both, descriptors = feature.detectAndCompute(bgr, None)
     keypoints, again = feature.compute(bgr, feature.detect(bgr))
     assert [k.pt for k in keypoints] == [k.pt for k in both]
-    assert np.array_equal(descriptors, again)
+    assert np.allclose(descriptors, again, atol=1e-5)
     assert descriptors.dtype == np.float32
     assert descriptors.shape == (len(both), feature.descriptorSize())
     assert feature.descriptorType() == cv2.SIFT_create().descriptorType()
@@ -41,7 +44,8 @@ def test_both_steps_in_one_are_the_two_steps(bgr: np.ndarray) -> None:
 
 
 def test_sift_describes_our_keypoints_as_we_do(bgr: np.ndarray) -> None:
-    keypoints, ours = DeepDetectFeature2D(PointDetector(200)).detectAndCompute(bgr, None)
+    detector = PointDetector(200, descriptor="rootsift")
+    keypoints, ours = DeepDetectFeature2D(detector).detectAndCompute(bgr, None)
     gray = cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY)
     _, theirs = cv2.SIFT_create(enable_precise_upscale=True).compute(gray, keypoints)
     assert np.array_equal(to_root_sift(theirs.astype(np.uint8)), ours)
@@ -52,7 +56,7 @@ def test_we_describe_sifts_keypoints_as_it_does(bgr: np.ndarray) -> None:
     keypoints, theirs = cv2.SIFT_create(100, enable_precise_upscale=True).detectAndCompute(
         gray, None
     )
-    kept, ours = DeepDetectFeature2D().compute(gray, keypoints)
+    kept, ours = DeepDetectFeature2D(PointDetector(descriptor="rootsift")).compute(gray, keypoints)
     assert kept == tuple(keypoints)
     expected = to_root_sift(theirs.astype(np.uint8)).astype(np.float32)
     near = np.linalg.norm(ours - expected, axis=1)

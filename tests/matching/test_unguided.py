@@ -35,7 +35,7 @@ def test_features_match_as_images_do(pair, features: list[Keypoints]) -> None:
         guided_matching=False,
         model="none",
         mutual=True,
-        options=MatchingOptions(descriptor="rootsift", matcher="auto", ratio=0.8),
+        options=MatchingOptions(matcher="auto", ratio=0.93),
     )
     assert len(found) > 100
     for name in ("points0", "points1", "scores", "inliers", "indices0", "indices1"):
@@ -53,8 +53,8 @@ def test_dense_features_match(pair) -> None:
 
 
 def test_descriptors_that_cannot_be_compared_are_refused(features: list[Keypoints]) -> None:
-    for changes in ({"descriptor_type": "sift"}, {"descriptors": features[1].descriptors[:, 64:]}):
-        with pytest.raises(OptionError, match=r"types rootsift \(128 numbers\) and .* be compared"):
+    for changes in ({"descriptor_type": "sift"}, {"descriptors": features[1].descriptors[:, 32:]}):
+        with pytest.raises(OptionError, match=r"types learned \(64 numbers\) and .* be compared"):
             match_features(features[0], dataclasses.replace(features[1], **changes))
     bare = dataclasses.replace(features[1], descriptors=None, descriptor_type=None)
     with pytest.raises(OptionError, match="no descriptors"):

@@ -176,6 +176,11 @@ def use_one_thread() -> None:
     _max_threads = 1
 
 
+def thread_limit() -> int | None:
+    """Return how many threads this process may use; None: one per processor."""
+    return _max_threads
+
+
 def end_with_parent(end: Callable[[], object] = lambda: None) -> None:
     """End this process when the one that started it has ended, after a last call."""
     import multiprocessing

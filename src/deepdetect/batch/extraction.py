@@ -5,6 +5,7 @@ https://github.com/cvg/Hierarchical-Localization stores them so; its pixels are 
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -23,12 +24,10 @@ from ..detector.heatmap import MAX_AUTO_PIXELS
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import UNSET_ANGLE, Keypoints, unit_length
 from ..features.selection import SelectionOptions
-from ..features.sift import describe_keypoints
+from ..features.sift import ROOT_SIFT, describe_keypoints
 from ..io.image import find_images, load_image, luma
 from ..io.image_file import ReadingOptions, reading_options
-from .hdf5 import BatchReport, Group, Item, State, damaged, fill_file
-
-DESCRIPTOR = "rootsift"
+from .hdf5 import SETTINGS, BatchReport, Group, Item, State, damaged, fill_file
 
 ROOT_SIFT_NORM = 512
 """Length of these as bytes."""
@@ -51,7 +50,8 @@ def extract_features(
 
     Each image has a group with its path below the folder as name, as "db/1.jpg". In it are
     `keypoints` (N, 2) float32, x right and y down in pixels, centre of the first pixel (0, 0), with
-    the attribute `uncertainty` in pixels; `descriptors` (128, N) float32, RootSIFT of length 1;
+    the attribute `uncertainty` in pixels; `descriptors` (D, N) float32 of length 1, 64 learned
+    numbers, or 128 of RootSIFT, which `DeepDetect` has;
     `scores` (N,) float32, the higher the better; `colors` (N, 3) uint8 sRGB; `image_size` (width,
     height) int32; and of keypoints with sizes and angles `scales` (N,) float32, sigma in pixels
     (half the size), and `oris` (N,) float32 in degrees.
@@ -94,7 +94,7 @@ def extract_features(
         **detector.settings,
         **reading.settings,
         **({} if selection is None else vars(selection)),
-        "descriptor": DESCRIPTOR,
+        "descriptor": detector.descriptor if isinstance(detector, PointDetector) else ROOT_SIFT,
         "version": __version__,
     }
     report = fill_file(
@@ -132,7 +132,11 @@ def _extract(
         with noted_failures(name, failures):
             rgb = load_image(root / name, **vars(reading))
             gray = luma(rgb)
-            keypoints = describe_keypoints(gray, find_keypoints(detector, rgb, selection))
+            keypoints = find_keypoints(detector, rgb, selection)
+            if isinstance(detector, PointDetector):
+                keypoints = detector.describe(rgb, keypoints)
+            else:
+                keypoints = describe_keypoints(gray, keypoints)
             # Of a pixel of the image that they were found on.
             scaled = detector.settings["resolution"] != "native" and gray.size > MAX_AUTO_PIXELS
             uncertainty = math.sqrt(gray.size / MAX_AUTO_PIXELS) if scaled else 1.0
@@ -165,15 +169,25 @@ def feature_group(
     return Group(name, arrays, state, {"keypoints": {"uncertainty": np.float32(uncertainty)}})
 
 
-def read_keypoints(file: Any, name: str, descriptor_type: str | None = None) -> Keypoints:
-    """Return the keypoints of an image in a file; "rootsift" descriptors become bytes again.
+def read_keypoints(file: Any, name: str) -> Keypoints:
+    """Return the keypoints of an image in a file; RootSIFT descriptors become bytes again.
 
-    An InvalidFileError says that they are damaged.
+    Of what type they are, files of other programs do not say. An InvalidFileError says that they
+    are damaged.
     """
     try:
-        return _keypoints_of(file[name], descriptor_type)
+        settings = json.loads(file.attrs.get(SETTINGS, "{}"))
+        return _keypoints_of(file[name], settings.get("descriptor"))
     # h5py raises any of these, by what is damaged; a wrong shape asks for too much memory.
-    except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError) as error:
+    except (
+        OSError,
+        RuntimeError,
+        LookupError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        MemoryError,
+    ) as error:
         raise damaged(Path(f"{file.filename}, {name}"), error) from error
 
 
@@ -192,7 +206,7 @@ def _keypoints_of(group: Any, descriptor_type: str | None) -> Keypoints:
         descriptors = np.ascontiguousarray(descriptors.T, np.float32)
         if not np.isfinite(descriptors).all():
             raise ValueError("its descriptors are not all finite numbers")
-        if descriptor_type == DESCRIPTOR:
+        if descriptor_type == ROOT_SIFT:
             descriptors = np.rint(descriptors * ROOT_SIFT_NORM).clip(0, 255).astype(np.uint8)
     return Keypoints(
         xy,

@@ -20,7 +20,7 @@ from ..features.matchers import MATCHERS
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
 from ..matching.pipeline import match_features
-from .extraction import DESCRIPTOR, read_keypoints
+from .extraction import read_keypoints
 from .hdf5 import (
     SETTINGS,
     BatchReport,
@@ -45,6 +45,7 @@ class PairMatchingOptions:
 
     Attributes:
         ratio: of the ratio test: the best distance must be below this share of the second-best.
+            None: as of `match_features`.
         mutual: keep only mutual nearest neighbours.
         matcher: name of the matcher: "auto", "exact", "patchmatch", "flann" or "faiss".
         verify: keep only the matches that agree with a geometry that is estimated from them:
@@ -56,7 +57,7 @@ class PairMatchingOptions:
         OptionError: a value is unknown or out of its range.
     """
 
-    ratio: float = 0.85
+    ratio: float | None = None
     mutual: bool = True
     matcher: str = "auto"
     verify: str = "none"
@@ -194,13 +195,12 @@ def _match_pairs(
     options: PairMatchingOptions,
 ) -> Iterator[Group]:
     with open_hdf5(features) as file:
-        kind = DESCRIPTOR if DESCRIPTOR in str(file.attrs.get(SETTINGS)) else None
         first: tuple[str, Keypoints] | None = None  # pairs are sorted by their first image
         for (name0, name1), state in pairs:
             with noted_failures(f"{name0} {name1}", failures):
                 if first is None or first[0] != name0:
-                    first = name0, read_keypoints(file, name0, kind)
-                features0, features1 = first[1], read_keypoints(file, name1, kind)
+                    first = name0, read_keypoints(file, name0)
+                features0, features1 = first[1], read_keypoints(file, name1)
                 both = features0.descriptors, features1.descriptors
                 if len({np.asarray(each).shape[-1:] for each in both}) > 1:
                     raise InvalidFileError("their descriptors differ: extract both alike")

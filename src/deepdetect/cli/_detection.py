@@ -26,6 +26,7 @@ NETWORK = From(
     defaults={"threads": "the backend's choice"},
 )
 POINTS = From(PointDetector, more="spread ranker")
+DESCRIBED_POINTS = From(PointDetector, more="spread ranker descriptor")
 SELECTION = From(
     SelectionOptions,
     "max_keypoints threshold density",
@@ -34,13 +35,19 @@ SELECTION = From(
 
 
 def chosen_detector(
-    kind: Kind, values: dict[str, Any], *, max_keypoints: int = 2048, **defaults: Any
+    kind: Kind,
+    values: dict[str, Any],
+    *,
+    max_keypoints: int = 2048,
+    options: From = POINTS,
+    **defaults: Any,
 ) -> tuple[DeepDetect | PointDetector, SelectionOptions | None]:
     """Make the detector that is chosen, and its selection, taking their options out of the values.
 
-    The number of points and the defaults of the network are used where nothing else is given.
+    The number of points and the defaults of the network are used where nothing else is given;
+    `options` are those of points.
     """
-    network, points, selection = (source.take(values) for source in (NETWORK, POINTS, SELECTION))
+    network, points, selection = (source.take(values) for source in (NETWORK, options, SELECTION))
     if kind == "points":
         points["max_keypoints"] = selection.pop("max_keypoints", max_keypoints)
         points["resolution"] = network.pop("resolution", "auto")

@@ -11,7 +11,7 @@ from ..batch.extraction import extract_features
 from ..batch.hdf5 import BatchReport
 from ..batch.pair_matching import MATCHERS_OF_FLOATS, PairMatchingOptions, match_pairs
 from . import _options as cli
-from ._detection import NETWORK, POINTS, SELECTION, Detector, chosen_detector
+from ._detection import DESCRIBED_POINTS, NETWORK, SELECTION, Detector, chosen_detector
 
 EXTRACTION = cli.From(extract_features, "overwrite", more="engine workers")
 PAIRS = cli.From(match_pairs, "overwrite", more="engine workers")
@@ -25,7 +25,7 @@ MATCHING = cli.From(
 )
 
 
-@cli.command(EXTRACTION, SELECTION, POINTS, NETWORK, cli.READING)
+@cli.command(EXTRACTION, SELECTION, DESCRIBED_POINTS, NETWORK, cli.READING)
 def extract(
     folder: Annotated[Path, Parameter(help="Folder of the images.")],
     /,
@@ -34,7 +34,7 @@ def extract(
     detector: Detector = "points",
     **values: Any,
 ) -> cli.Result:
-    """Extract the keypoints and RootSIFT descriptors of all images below a folder.
+    """Extract the keypoints and descriptors of all images below a folder.
 
     Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. When it is
     interrupted or killed, the same command goes on; new and changed images are added later, and
@@ -49,7 +49,9 @@ def extract(
     """
     file = cli.output_file(output, "features.h5")
     how = EXTRACTION.take(values)
-    chosen, selection = chosen_detector(detector, values, threads=1)  # one a process
+    chosen, selection = chosen_detector(  # one a process
+        detector, values, options=DESCRIBED_POINTS, threads=1
+    )
     report = extract_features(folder, file, chosen, selection=selection, quiet=False, **how)
     keypoints = sum(report.counts.values())
     return _result(report, "keypoints", images=[*report.counts], keypoints=keypoints)

@@ -18,7 +18,7 @@ from ..sfm.colmap import import_pycolmap
 from ..sfm.pipeline import MAX_KEYPOINTS, check_output_folder, output_files, reconstruct_many
 from ..sfm.stages import MultiViewOptions, check_images
 from . import _options as cli
-from ._detection import NETWORK, POINTS, SELECTION, Detector, Kind, chosen_detector
+from ._detection import DESCRIBED_POINTS, NETWORK, SELECTION, Detector, Kind, chosen_detector
 
 CAMERAS = cli.From(
     reconstruct_pair,
@@ -39,7 +39,7 @@ MAX_UNREGISTERED = 10
 """Images that are named with a reason on the terminal."""
 
 
-@cli.command(CAMERAS, SELECTION, MANY, WORKERS, POINTS, NETWORK, cli.READING)
+@cli.command(CAMERAS, SELECTION, MANY, WORKERS, DESCRIBED_POINTS, NETWORK, cli.READING)
 def reconstruct(
     *images: cli.Images,
     output: cli.Output = Path("deepdetect-output"),
@@ -88,7 +88,9 @@ def reconstruct(
     files[model.suffix.lower()] = model
     if "calibration" in values:
         cli.check_outputs(files.values(), [values["calibration"]])
-    chosen, selection = chosen_detector(detector or "network", values, weights="dense")
+    chosen, selection = chosen_detector(
+        detector or "network", values, options=DESCRIBED_POINTS, weights="dense"
+    )
     with cli.writing(files, images, overwrite) as made, stage_progress("reconstructing") as done:
         left, right = images
         found = reconstruct_pair(left, right, chosen, selection=selection, progress=done, **values)
@@ -102,7 +104,9 @@ def _reconstruct_many(
 ) -> cli.Result:
     if "rectified" in values:
         raise OptionError("--rectified and --not-rectified are for two images")
-    detector, selection = chosen_detector(kind, values, max_keypoints=MAX_KEYPOINTS, threads=1)
+    detector, selection = chosen_detector(
+        kind, values, max_keypoints=MAX_KEYPOINTS, options=DESCRIBED_POINTS, threads=1
+    )
     source: Path | Sequence[Path] = images[0] if len(images) == 1 else images
     many = MANY.take(values)
     # What is missing or wrong is said before anything is written.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from .._shared.opencv import cv2
 from .._shared.options import is_path, suggest_keywords
 from .._shared.records import file_digest
 from ..features.keypoints import Keypoints
-from ..features.learned import LEARNED, LEARNED_FREE
+from ..features.learned import Descriptor
 from ..features.selection import check_ignore, check_max_keypoints
 from ..features.sift import ROOT_SIFT, describe_keypoints
 from ..io.image import Images, batch_length, ignore_masks, image_named, load_each, load_image, luma
@@ -40,6 +40,10 @@ class PointDetector:
             that) or "native" (always as it is).
         ranker: npz file of `deepdetect train-points` that ranks the points. None: the one inside
             the package.
+        descriptor: of `extract`: "learned", by a small network that sees the surroundings of a
+            keypoint, too; "learned-free", by one that was trained on photographs under free
+            licences alone; the ONNX file of `deepdetect train-descriptor`; or "rootsift", for
+            programs that expect SIFT's.
 
     Raises:
         WeightsError: the ranker is missing, damaged or does not fit.
@@ -50,7 +54,7 @@ class PointDetector:
         >>> image[20:40, 24:44] = 255
         >>> points = PointDetector(max_keypoints=4)
         >>> len(points.detect(image)), points.extract(image).descriptors.shape
-        (4, (4, 128))
+        (4, (4, 64))
     """
 
     @suggest_keywords
@@ -61,6 +65,7 @@ class PointDetector:
         spread: Spread = "none",
         resolution: Literal["auto", "native"] = "auto",
         ranker: str | Path | None = None,
+        descriptor: Descriptor | str | Path = "learned",
     ) -> None:
         check_max_keypoints(max_keypoints)
         check_name("spread", spread, SPREADS)
@@ -68,7 +73,9 @@ class PointDetector:
             raise OptionError(f"`spread={spread!r}` needs `max_keypoints`: how many to spread")
         check_name("resolution of points", resolution, ("auto", "native"))
         self.max_keypoints = None if max_keypoints is None else int(max_keypoints)
-        self.spread, self.resolution = spread, resolution
+        if not is_path(descriptor):
+            check_name("descriptor", str(descriptor), get_args(Descriptor))
+        self.spread, self.resolution, self.descriptor = spread, resolution, descriptor
         self.ranker = RANKER if ranker is None else Path(ranker).absolute()
         self._ranker = load_ranker(self.ranker)
 
@@ -137,7 +144,6 @@ class PointDetector:
         self,
         image: Any,
         *,
-        descriptor: str | Path = "rootsift",
         ignore: np.ndarray | None = None,
         channels: Channels = "rgb",
     ) -> Keypoints:
@@ -145,31 +151,44 @@ class PointDetector:
 
         Args:
             image, ignore, channels: as of `detect`.
-            descriptor: "rootsift", RootSIFT at the keypoints' own sizes and angles; or "learned",
-                by a small network that sees their surroundings, too; "learned-free", by one that
-                was trained on photographs under free licences alone; or the ONNX file of
-                `deepdetect train-descriptor`.
 
         Returns:
-            As `detect`, with descriptors: (N, 128) uint8 RootSIFT, or (N, 64) float32 learned ones.
+            As `detect`, with descriptors at the keypoints' own sizes and angles: (N, 64) float32
+            learned ones of length 1, or (N, 128) uint8 RootSIFT.
 
         Raises:
             ImageError: the image cannot be read or is not fit.
-            OptionError: the descriptor is unknown, or the mask has another size than the image.
+            OptionError: the mask has another size than the image.
             WeightsError: the descriptor's file is missing or damaged.
         """
-        if not is_path(descriptor):
-            check_name("descriptor", str(descriptor), (ROOT_SIFT, LEARNED, LEARNED_FREE))
         rgb = load_image(image, channels=channels)
-        keypoints = self._find(rgb, ignore)
-        if descriptor == ROOT_SIFT:
-            return describe_keypoints(luma(rgb), keypoints)
-        return describe_learned(self._scaled(luma(rgb)), keypoints, descriptor)
+        return self.describe(rgb, self._find(rgb, ignore))
+
+    @suggest_keywords
+    def describe(
+        self, image: Any, keypoints: Keypoints, *, channels: Channels = "rgb"
+    ) -> Keypoints:
+        """Describe keypoints, also of other detectors, as `extract` does.
+
+        Args:
+            image, channels: as of `detect`.
+            keypoints: with sizes; angles of -1, or none, become the dominant ones.
+
+        Raises:
+            ImageError: the image cannot be read or is not fit.
+            OptionError: keypoints have no sizes above 0.
+            WeightsError: the descriptor's file is missing or damaged.
+        """
+        gray = luma(load_image(image, channels=channels))
+        if self.descriptor == ROOT_SIFT:
+            return describe_keypoints(gray, keypoints)
+        return describe_learned(self._scaled(gray), keypoints, self.descriptor)
 
     def __repr__(self) -> str:
         return (
             f"PointDetector(max_keypoints={self.max_keypoints}, spread={self.spread!r}, "
-            f"resolution={self.resolution!r}, ranker={self.ranker.name})"
+            f"resolution={self.resolution!r}, ranker={self.ranker.name}, "
+            f"descriptor={self.descriptor!r})"
         )
 
     def _find(self, rgb: np.ndarray, ignore: np.ndarray | None) -> Keypoints:

@@ -174,8 +174,9 @@ class Keypoints:
     ) -> dict[str, Any]:
         """Convert to the features of one image that LightGlue takes, as PyTorch tensors.
 
-        `LightGlue(features="sift")` takes RootSIFT descriptors, sizes and angles; up to 4,096
-        keypoints are usual. Its pixels are as ours: the centre of the first is (0, 0).
+        `LightGlue(features="sift")` takes RootSIFT, as of `PointDetector(descriptor="rootsift")`,
+        sizes and angles; up to 4,096 keypoints are usual. Its pixels are as ours: the centre of the
+        first is (0, 0).
 
         Args:
             scale: what its scales are: "diameter", as its own extractor has them from OpenCV, or

@@ -182,13 +182,13 @@ def patchmatch_neighbours(
     correct matches; it does not suit few or scattered ones. A `Matcher` of bytes on whole pixels;
     the result is the same for any number of threads.
     """
-    if queries.dtype != np.uint8 or base.dtype != np.uint8:
-        raise OptionError(
-            "the matcher patchmatch needs descriptors of bytes: use flann, faiss or exact"
-        )
     if positions is None or not all(on_pixels(xy) for xy in positions):
         raise OptionError(
             "patchmatch needs dense keypoints of one scale and angle, on whole pixels: use auto"
+        )
+    if queries.dtype != np.uint8 or base.dtype != np.uint8:
+        raise OptionError(
+            "the matcher patchmatch needs descriptors of bytes: use flann, faiss or exact"
         )
     from . import kernels
 

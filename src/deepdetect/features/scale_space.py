@@ -99,3 +99,13 @@ def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.n
         windows = WINDOW_PER_SIGMA * sizes[rows] / SIZE_PER_SIGMA / 2.0**octave
         angles[rows] = strongest_directions(image, pixels, windows)
     return angles
+
+
+def set_angles(
+    gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray, angles: np.ndarray | None
+) -> np.ndarray:
+    """Return (N,) float32 angles, the dominant ones where they are below 0, or None."""
+    angles = np.full(len(xy), -1, np.float32) if angles is None else angles.copy()
+    unset = np.flatnonzero(angles < 0)
+    angles[unset] = dominant_angles(gray, xy[unset], sizes[unset])
+    return angles

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 
@@ -14,11 +15,11 @@ from .._shared.errors import OptionError
 from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
 from .._shared.options import look_up
-from .keypoints import UNSET_ANGLE, Keypoints, on_pixels
-from .scale_space import BASE_SIGMA_PX, CAMERA_SIGMA_PX, LAYERS, dominant_angles, packed_octaves
+from .keypoints import Keypoints, on_pixels
+from .scale_space import BASE_SIGMA_PX, CAMERA_SIGMA_PX, LAYERS, packed_octaves, set_angles
 from .selection import spread_over_grid
 
-ROOT_SIFT = "rootsift"
+ROOT_SIFT: Final = "rootsift"
 """`Keypoints.descriptor_type` of RootSIFT."""
 
 DENSE_SIZES_PX = (2.0, 8.0)
@@ -191,9 +192,7 @@ def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
     else:
         if not (sizes > 0).all():
             raise OptionError("keypoints need sizes above 0 to be described: give them some")
-        angles = np.full(len(xy), UNSET_ANGLE, np.float32) if angles is None else angles.copy()
-        unset = np.flatnonzero(angles < 0)
-        angles[unset] = dominant_angles(gray, xy[unset], sizes[unset])
+        angles = set_angles(gray, xy, sizes, angles)
         descriptors = scaled_sift_descriptors(gray, xy, sizes, angles)
     root = to_root_sift(descriptors, overwrite=True)
     return replace(keypoints, angles=angles, descriptors=root, descriptor_type=ROOT_SIFT)

@@ -16,6 +16,7 @@ from .._shared.errors import OptionError, check_name, require_packages
 from ..detector.detector import AnyDetector, DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import unit_length
+from ..features.learned import LEARNED
 from ..features.matchers import get_matcher, match_descriptors
 from ..matching.pipeline import match_images
 from .tensors import load_tensor
@@ -57,16 +58,18 @@ DENSE_MATCHER_CONF: dict[str, Any] = {
 
 
 class DeepDetectExtractor(BaseModel):
-    """The best keypoints of all scales with RootSIFT descriptors, for `hloc.extract_features`.
+    """The best keypoints of all scales with descriptors, for `hloc.extract_features`.
 
-    Its options in hloc's configuration: `max_keypoints` and `spread` as of `PointDetector`; and
-    `angle_unit` of `oris`, "degrees" as of hloc's own SIFT, or "radians" as LightGlue wants them.
-    Positions are float64, which hloc does not round to half precision.
+    Its options in hloc's configuration: `max_keypoints`, `spread` and `descriptor` as of
+    `PointDetector`, of which hloc's LightGlue needs "rootsift"; and `angle_unit` of `oris`,
+    "degrees" as of hloc's own SIFT, or "radians" as LightGlue wants them. Positions are float64,
+    which hloc does not round to half precision.
     """
 
     default_conf: dict[str, Any] = {  # noqa: RUF012  # hloc's way to declare it
         "max_keypoints": 4096,
         "spread": "none",
+        "descriptor": LEARNED,
         "angle_unit": "degrees",
     }
     required_inputs = ["image"]  # noqa: RUF012
@@ -79,7 +82,9 @@ class DeepDetectExtractor(BaseModel):
             raise OptionError(
                 f"hloc takes `max_keypoints` up to {MAX_KEYPOINTS}, not {conf['max_keypoints']}"
             )
-        self._detector = PointDetector(conf["max_keypoints"], spread=conf["spread"])
+        self._detector = PointDetector(
+            conf["max_keypoints"], spread=conf["spread"], descriptor=conf["descriptor"]
+        )
         self._radians = conf["angle_unit"] == "radians"
 
     def _forward(self, data: dict[str, Tensor]) -> dict[str, Tensor]:

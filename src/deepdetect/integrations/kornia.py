@@ -73,8 +73,8 @@ class DeepDetectDetector(Module):
 class DeepDetectFeature(DeepDetectDetector):
     """Finds and describes the best keypoints, for `kornia.feature.LocalFeatureMatcher`.
 
-    It takes the place of `kornia.feature.LocalFeature`, and describes keypoints by RootSIFT.
-    Arguments and errors as of `DeepDetectDetector`.
+    It takes the place of `kornia.feature.LocalFeature`, and describes keypoints as the detector
+    does. Arguments and errors as of `DeepDetectDetector`.
     """
 
     def forward(  # type: ignore[override]  # as kornia's features differ from its detectors
@@ -86,8 +86,8 @@ class DeepDetectFeature(DeepDetectDetector):
             img, mask: as of `DeepDetectDetector`.
 
         Returns:
-            (B, N, 2, 3) LAFs and (B, N) scores as of `DeepDetectDetector`, and (B, N, 128)
-            descriptors of length 1.
+            (B, N, 2, 3) LAFs and (B, N) scores as of `DeepDetectDetector`, and (B, N, D)
+            descriptors of length 1, 64 learned numbers or 128 of RootSIFT.
         """
         found = _found(self._detector.extract, img, mask)
         descriptors = [

@@ -12,6 +12,7 @@ from .._shared.errors import OptionError, check_name, require_packages
 from .._shared.options import suggest_keywords
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import SIZES_PER_SCALE
+from ..features.sift import ROOT_SIFT
 from .tensors import load_tensor
 
 require_packages("the drop-in for LightGlue", "torch")
@@ -29,7 +30,7 @@ class DeepDetectExtractor(Module):
     """Takes the place of an extractor of LightGlue, as `lightglue.SIFT`.
 
     Args:
-        detector: of the points; LightGlue takes up to 4,096.
+        detector: of the points, up to 4,096, with RootSIFT, which its weights are for.
         scale: as of `Keypoints.to_lightglue`.
 
     Raises:
@@ -38,9 +39,17 @@ class DeepDetectExtractor(Module):
 
     @suggest_keywords
     def __init__(
-        self, detector: PointDetector = PointDetector(), *, scale: Scale = "diameter"
+        self,
+        detector: PointDetector = PointDetector(descriptor=ROOT_SIFT),
+        *,
+        scale: Scale = "diameter",
     ) -> None:
         super().__init__()
+        if detector.descriptor != ROOT_SIFT:
+            raise OptionError(
+                f"LightGlue has no weights for {detector.descriptor} descriptors: give the "
+                f"detector `descriptor={ROOT_SIFT!r}`"
+            )
         if detector.max_keypoints is None or detector.max_keypoints > MAX_KEYPOINTS:
             raise OptionError(
                 f"LightGlue takes up to {MAX_KEYPOINTS} keypoints, not "

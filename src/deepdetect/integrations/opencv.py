@@ -14,19 +14,20 @@ from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
+from ..features.learned import LENGTH
 from ..features.scale_space import packed_octaves
-from ..features.sift import describe_keypoints
-from ..io.image import load_image, luma
+from ..features.sift import ROOT_SIFT
+from ..io.image import load_image
 
 
 class DeepDetectFeature2D:
-    """The best keypoints of all scales, with RootSIFT descriptors, as `cv2.SIFT` gives them.
+    """The best keypoints of all scales, with descriptors, as `cv2.SIFT` gives them.
 
     It has the methods of `cv2.Feature2D`, but does not derive from it: a Python class that does
     crashes the interpreter. So functions of OpenCV that ask for a `cv2.Feature2D` refuse it.
 
     Args:
-        detector: of the points.
+        detector: of the points and their descriptors.
         channels: order of the colours in images: "bgr" as of `cv2.imread`, or "rgb".
 
     Raises:
@@ -38,7 +39,7 @@ class DeepDetectFeature2D:
         >>> detector = DeepDetectFeature2D(PointDetector(4))
         >>> keypoints, descriptors = detector.detectAndCompute(image, None)
         >>> len(keypoints), descriptors.shape
-        (4, (4, 128))
+        (4, (4, 64))
     """
 
     @suggest_keywords
@@ -77,14 +78,14 @@ class DeepDetectFeature2D:
             descriptors: not used; OpenCV has this argument.
 
         Returns:
-            The same keypoints, and (N, 128) float32 RootSIFT descriptors, whole numbers from 0 to
-            255 (None without keypoints, as OpenCV does).
+            The same keypoints, and (N, D) float32 descriptors: 64 learned numbers, or 128 of
+            RootSIFT, whole ones from 0 to 255 (None without keypoints, as OpenCV does).
         """
         rgb = self._load(image)
         points = Keypoints.from_opencv(keypoints, (rgb.shape[1], rgb.shape[0]))
         if not len(points):
             return (), None
-        return tuple(keypoints), _as_float(describe_keypoints(luma(rgb), points))
+        return tuple(keypoints), _as_float(self._detector.describe(rgb, points))
 
     def detectAndCompute(
         self,
@@ -105,7 +106,7 @@ class DeepDetectFeature2D:
 
     def descriptorSize(self) -> int:
         """Return the length of a descriptor."""
-        return 128
+        return 128 if self._detector.descriptor == ROOT_SIFT else LENGTH
 
     def descriptorType(self) -> int:
         """Return the type of descriptors, float32 as of `cv2.SIFT`."""

@@ -14,15 +14,14 @@ from .._shared.errors import OptionError
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
 from ..features.scale_space import SIZE_PER_SIGMA
-from ..features.sift import describe_keypoints
-from ..io.image import load_image, luma
+from ..io.image import load_image
 
 
 class DeepDetectFeatures:
-    """The best keypoints of all scales, with RootSIFT descriptors.
+    """The best keypoints of all scales, with descriptors.
 
     Args:
-        detector: of the points.
+        detector: of the points and their descriptors.
 
     Attributes:
         keypoints: (N, 2) float32 positions as (row, column), best first.
@@ -30,7 +29,7 @@ class DeepDetectFeatures:
         orientations: (N,) float32 in radians from columns towards rows, as of
             `skimage.feature.corner_orientations`.
         responses: (N,) float32 scores, the higher the better.
-        descriptors: (N, 128) uint8.
+        descriptors: (N, 64) float32 learned ones, or (N, 128) uint8 RootSIFT.
 
     All are None before the first image.
 
@@ -43,7 +42,7 @@ class DeepDetectFeatures:
         >>> features = DeepDetectFeatures(PointDetector(4))
         >>> features.detect_and_extract(image)
         >>> features.keypoints.shape, features.descriptors.shape
-        ((4, 2), (4, 128))
+        ((4, 2), (4, 64))
     """
 
     keypoints: np.ndarray | None = None
@@ -103,7 +102,7 @@ class DeepDetectFeatures:
             sizes=np.full(len(xy), sizes) if sizes.ndim == 0 else sizes,
             angles=None if orientations is None else np.rad2deg(np.asarray(orientations)) % 360,
         )
-        self.descriptors = describe_keypoints(luma(rgb), given).descriptors
+        self.descriptors = self._detector.describe(rgb, given).descriptors
 
     def detect_and_extract(self, image: Any) -> None:
         """Detect and describe keypoints, and set all attributes; argument as of `detect`."""

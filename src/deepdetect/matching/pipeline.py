@@ -15,12 +15,20 @@ from .._shared.machine import require_memory
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.progress import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_keypoints
+from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints, nearest_keypoints
-from ..features.learned import is_learned, match_learned
+from ..features.learned import (
+    LEARNED,
+    LEARNED_FREE,
+    LEARNED_RATIO,
+    RATIO,
+    is_learned,
+    match_learned,
+)
 from ..features.matchers import get_matcher, match_descriptors
 from ..features.matches import Matches, TwoViewGeometry, lazy
 from ..features.selection import SelectionOptions
-from ..features.sift import get_descriptor, scaled_sift_descriptors, to_root_sift
+from ..features.sift import DESCRIPTORS, get_descriptor, scaled_sift_descriptors, to_root_sift
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
 from ..geometry.transforms import epipolar_errors, transfer_errors
@@ -54,7 +62,8 @@ class MatchingOptions:
     Attributes:
         two_view_model: the geometry that guides where `model` leaves it open: "homography",
             "fundamental", or "auto": the one that fits the images.
-        descriptor: "sift", "rootsift", or "sift-opencv" for OpenCV's own in any case.
+        descriptor: "sift", "rootsift", or "sift-opencv" for OpenCV's own in any case; of points
+            also "learned" or "learned-free". None: learned of points, and SIFT of dense keypoints.
         keypoint_size: diameter of a keypoint for its descriptor, in pixels (paper: 3). Keypoints
             with sizes and angles of their own are described at these.
         angle: direction of all keypoints in degrees; -1 is OpenCV's "unset".
@@ -69,7 +78,7 @@ class MatchingOptions:
     """
 
     two_view_model: str = "auto"
-    descriptor: str = "sift"
+    descriptor: str | None = None
     keypoint_size: float = 3.0
     angle: float = 0.0
     matcher: str = "flann"
@@ -77,7 +86,7 @@ class MatchingOptions:
     geometry: GeometryOptions = field(default_factory=GeometryOptions)
 
     def __post_init__(self) -> None:
-        get_descriptor(self.descriptor)
+        check_name("descriptor", self.descriptor, (None, *DESCRIPTORS, LEARNED, LEARNED_FREE))
         get_matcher(self.matcher)
         if self.matcher == "hamming":
             raise OptionError(
@@ -90,7 +99,7 @@ class MatchingOptions:
         check_ranges(self, positive=tuple(limits), between=limits)
 
 
-PUBLISHED_MATCHING = MatchingOptions(angle=-1.0, ratio=0.99, matcher="flann")
+PUBLISHED_MATCHING = MatchingOptions(descriptor="sift", angle=-1.0, ratio=0.99, matcher="flann")
 """What the authors' published code runs, with `DeepDetect(resolution=480, network_channels="bgr")`
 (BGR although the weights were trained on RGB), `guided_matching=False` and `model="none"`: every
 match is evaluated by the true homography."""
@@ -195,7 +204,7 @@ def match_features(
     features1: Keypoints,
     *,
     matcher: str = "auto",
-    ratio: float = 0.8,
+    ratio: float | None = None,
     mutual: bool = True,
     seed: int = 0,
 ) -> Matches:
@@ -205,7 +214,8 @@ def match_features(
         features0, features1: keypoints with descriptors of one type.
         matcher: "auto" ("exact" for few keypoints, else "patchmatch" for dense ones and "flann" for
             others), "flann", "exact", "faiss", "patchmatch", or "hamming" for binary descriptors.
-        ratio: the distance of the best over that of the second-best must be below this.
+        ratio: the distance of the best over that of the second-best must be below this. None: 0.85,
+            of learned descriptors 0.93, which is as strict.
         mutual: keep only mutual nearest neighbours.
         seed: of a matcher that is random.
 
@@ -233,6 +243,9 @@ def match_features(
             f"descriptors of the types {features0.descriptor_type} ({length0} numbers) and "
             f"{features1.descriptor_type} ({length1}) cannot be compared: extract both alike"
         )
+    learned = is_learned(features0.descriptor_type)
+    if ratio is None:
+        ratio = LEARNED_RATIO if learned else RATIO
     if not 0 < ratio <= 1:
         raise OptionError(f"the ratio must be above 0 and at most 1, not {ratio}")
     check_memory([len(features0), len(features1)])
@@ -245,7 +258,7 @@ def match_features(
         seed=seed,
         positions=(features0.xy, features1.xy) if alike else None,
     )
-    if is_learned(features0.descriptor_type):
+    if learned:
         matches = match_learned(features0, features1, match)
     else:
         matches = match(features0.descriptors, features1.descriptors)
@@ -371,15 +384,19 @@ def _match_unguided(
 
 def _describe(gray: np.ndarray, keypoints: Keypoints, options: MatchingOptions) -> Keypoints:
     """Add descriptors at the keypoints' own sizes and angles, or at those of the options."""
+    points = keypoints.sizes is not None and keypoints.angles is not None
+    kind = options.descriptor or (LEARNED if points else "sift")
+    if is_learned(kind):
+        return PointDetector(descriptor=kind).describe(gray, keypoints)
     if keypoints.sizes is None or keypoints.angles is None:
-        of_pixels = get_descriptor(options.descriptor)
+        of_pixels = get_descriptor(kind)
         descriptors = of_pixels(gray, keypoints.xy, options.keypoint_size, options.angle)
     else:
         scaled = keypoints.xy, keypoints.sizes, keypoints.angles
         descriptors = scaled_sift_descriptors(gray, *scaled)
-        if options.descriptor == "rootsift":
+        if kind == "rootsift":
             descriptors = to_root_sift(descriptors, True)
-    return replace(keypoints, descriptors=descriptors, descriptor_type=options.descriptor)
+    return replace(keypoints, descriptors=descriptors, descriptor_type=kind)
 
 
 def check_memory(keypoints: Sequence[int]) -> None:

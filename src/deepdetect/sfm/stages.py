@@ -60,6 +60,7 @@ class MultiViewOptions:
             follow it by name; "similar": the most alike; "auto": all of up to 50, else the most
             alike.
         ratio: of the ratio test: the best distance must be below this share of the second-best.
+            None: as of `match_features`.
         dense: whether dense points are made.
         stride_px: a dense point is sought at every so many pixels of a row and of a column.
         single_camera: whether images of one size were taken by one camera; None: where their EXIF
@@ -70,7 +71,7 @@ class MultiViewOptions:
     """
 
     pairs: str = "auto"
-    ratio: float = 0.85
+    ratio: float | None = None
     dense: bool = True
     stride_px: int = 2
     single_camera: bool | None = None

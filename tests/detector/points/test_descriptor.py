@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from deepdetect.detector.points.descriptor import describe_learned
 
 
 def learned(image: np.ndarray) -> Keypoints:
-    return PointDetector(300).extract(image, descriptor="learned")
+    return PointDetector(300).extract(image)
 
 
 def test_descriptors_of_length_one_belong_to_the_detected_points(photo: np.ndarray) -> None:
@@ -42,7 +44,31 @@ def test_points_of_a_darkened_turned_image_are_matched(
 
 
 def test_other_descriptors_cannot_be_compared(photo: np.ndarray) -> None:
+    other = PointDetector(300, descriptor="rootsift").extract(photo)
     with pytest.raises(OptionError, match="learned"):
-        deepdetect.match_features(learned(photo), PointDetector(300).extract(photo))
+        deepdetect.match_features(learned(photo), other)
     with pytest.raises(OptionError, match="rootsift"):
-        PointDetector().extract(photo, descriptor="rootsfit")  # type: ignore[arg-type]
+        PointDetector(descriptor="rootsfit")  # type: ignore[arg-type]
+
+
+def test_descriptors_of_a_turned_image_are_alike_in_any_program(photo: np.ndarray) -> None:
+    side = min(photo.shape[:2])
+    square = photo[:side, :side]
+    first, second = learned(square), learned(np.ascontiguousarray(np.rot90(square)))
+    alike = first.descriptors @ second.descriptors.T
+    x, y = first.xy.T
+    there = np.stack([y, side - 1 - x], 1)  # against the clock
+    right = np.hypot(*(there - second.xy[alike.argmax(1)]).T) < 3
+    assert right.mean() > 0.6
+
+
+def test_unset_angles_become_dominant_ones(photo: np.ndarray) -> None:
+    points, found = PointDetector(300), learned(photo)
+    bare = dataclasses.replace(found, angles=None, descriptors=None)
+    again = points.describe(photo, bare)
+    turns = (again.angles - found.angles + 180) % 360 - 180
+    assert np.median(np.abs(turns)) < 1
+    near = np.sum(again.descriptors * found.descriptors, 1)
+    assert np.median(near) > 0.99
+    with pytest.raises(OptionError, match="sizes"):
+        points.describe(photo, dataclasses.replace(bare, sizes=None))

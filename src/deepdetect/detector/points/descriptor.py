@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from ..._shared.errors import WeightsError, first_line
+from ..._shared.errors import OptionError, WeightsError, first_line
+from ..._shared.machine import thread_limit
 from ..._shared.opencv import cv2
 from ..._shared.records import file_digest
 from ...features.keypoints import Keypoints
-from ...features.learned import LEARNED, LEARNED_FREE
+from ...features.learned import LEARNED, LEARNED_FREE, LENGTH, turn_descriptors
+from ...features.scale_space import set_angles
 from ..backends.onnxruntime_backend import start_session
 from ..pretrained import RANKER, resolve_weights
 
@@ -34,33 +36,45 @@ STRIDE = 128
 def describe_learned(
     gray: np.ndarray, keypoints: Keypoints, descriptor: str | Path = LEARNED
 ) -> Keypoints:
-    """Return keypoints with learned descriptors, upright ones, of a (H, W) uint8 image.
+    """Return keypoints with learned descriptors at their own sizes and angles.
 
-    The image may be a smaller one than that of the keypoints. The descriptor is a name of
-    `DESCRIPTOR_GRAPHS`, or such a file, whose digest becomes part of the descriptors' type.
+    The image, (H, W) uint8 luma, may be a smaller one than that of the keypoints. Angles of -1, or
+    none, become the dominant ones. The descriptor is a name of `DESCRIPTOR_GRAPHS`, or such a file,
+    whose digest becomes part of the descriptors' type. An OptionError says that the keypoints have
+    no sizes.
     """
     path, kind = DESCRIPTOR_GRAPHS.get(str(descriptor)), str(descriptor)
     if path is None:
         path = resolve_weights(descriptor)
         kind = f"{LEARNED}-{file_digest(path)[:DIGEST_LENGTH]}"
+    if not len(keypoints):
+        none = np.empty((0, LENGTH), np.float32)
+        return replace(keypoints, descriptors=none, descriptor_type=kind)
+    if keypoints.sizes is None or not (keypoints.sizes > 0).all():
+        raise OptionError(
+            "learned descriptors need keypoints with sizes above 0: take points, or RootSIFT"
+        )
     height, width = gray.shape
     factor = np.divide((width, height), keypoints.image_size).astype(np.float32)
+    xy, sizes = (keypoints.xy + 0.5) * factor - 0.5, keypoints.sizes * factor.mean()
+    angles = set_angles(gray, xy, sizes, keypoints.angles)
     below, right = -height % STRIDE, -width % STRIDE
     padded = cv2.copyMakeBorder(gray, 0, below, 0, right, cv2.BORDER_REPLICATE)
     inputs = {
         "luma": padded[None, None].astype(np.float32) / 255,
-        "xy": ((keypoints.xy + 0.5) * factor - 0.5)[None],
-        "sizes": (keypoints.sizes * factor.mean())[None],
+        "xy": xy[None],
+        "sizes": sizes[None],
     }
-    descriptors = _session(path, kind).run(["descriptors"], inputs)[0][0]
-    return replace(keypoints, descriptors=descriptors, descriptor_type=kind)
+    upright = _session(path, kind).run(["descriptors"], inputs)[0][0]
+    descriptors = turn_descriptors(upright, -angles)
+    return replace(keypoints, angles=angles, descriptors=descriptors, descriptor_type=kind)
 
 
 @functools.cache
 def _session(path: Path, kind: str) -> Any:
     """Start a session of a file, once for each content that it has had."""
     try:
-        session = start_session(str(path), None)
+        session = start_session(str(path), thread_limit())
         names = [each.name for each in (*session.get_inputs(), *session.get_outputs())]
         if names != ["luma", "xy", "sizes", "descriptors"]:
             raise ValueError("it is no descriptor")

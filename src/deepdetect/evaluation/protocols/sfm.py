@@ -24,7 +24,6 @@ from ...datasets.posed_images import PosedScene, load_posed_scenes
 from ...detector.point_detector import PointDetector
 from ...features.keypoints import Keypoints
 from ...features.scale_space import dominant_angles
-from ...features.sift import describe_keypoints
 from ...geometry.camera import Camera, PosedView
 from ...io.image import load_image, luma
 from ...sfm.colmap import PIXEL_CENTRE, import_pycolmap, initial_intrinsics, quiet_pycolmap
@@ -185,7 +184,7 @@ def choose_images(scene: PosedScene, most: int) -> PosedScene:
 def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
     """Return the ranked points, SIFT where it is among the baselines, and random points."""
     points = PointDetector(MAX_KEYPOINTS, ranker=options.ranker)
-    version, random = str(points.settings), "baseline: as many random points"
+    version, random = f"{points.settings} {points.descriptor}", "baseline: as many random points"
     ours = SfmMethod("DeepDetect, points", partial(find_points, points), version=version)
     sift = SfmMethod("SIFT, pycolmap", find_sift, match_sift)
     chance = SfmMethod(random, partial(find_random_points, points), version=version, chance=True)
@@ -299,7 +298,7 @@ def find_random_points(detector: PointDetector, stages: Stages, folder: Path) ->
             sizes = rng.permutation(2 * group["scales"][()])
             scores, angles = rng.random(count, np.float32), dominant_angles(gray, xy, sizes)
             points = Keypoints(xy, scores, (width, height), sizes=sizes, angles=angles)
-            made = feature_group(name, describe_keypoints(gray, points)).arrays
+            made = feature_group(name, detector.describe(gray, points)).arrays
             for kind in ("keypoints", "descriptors", "scores", "scales", "oris"):
                 group[kind][...] = made[kind]
 
