@@ -44,14 +44,14 @@ def test_points_match_at_their_own_sizes_and_angles(pair, points) -> None:
 
 def test_of_a_large_image_they_are_scaled(pair, points, monkeypatch) -> None:
     grays = luma(pair[0]), luma(pair[1])
-    whole = matches_of_points(grays, points)
     monkeypatch.setattr(module, "MAX_SIDE_PX", 128)
     found = matches_of_points(grays, points)
     assert found.scales == (0.5, 0.5)
     assert found.features[0].xy.max() < 128
     assert found.features[0].image_size == found.views[0].shape == (128, 128)
-    kept = {tuple(row) for row in np.round(whole.points0, 2).tolist()}
-    assert {tuple(row) for row in np.round(found.points0, 2).tolist()} <= kept
+    assert len(found.points0) > 50
+    offsets = np.linalg.norm(found.points0[:, None] - points[0].xy, axis=2)
+    assert offsets.min(axis=1).max() < 0.01
 
 
 def test_too_few_or_plain_keypoints_are_not_taken(pair, points, monkeypatch) -> None:

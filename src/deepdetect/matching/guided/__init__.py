@@ -1,6 +1,17 @@
 """Guided matching: a geometry from a few matches proposes dense ones, which are verified."""
 
-from .initial_geometry import TentativeMatches, find_tentative_matches, guiding_geometry
+from .initial_geometry import (
+    TentativeMatches,
+    find_tentative_matches,
+    guiding_geometry,
+    learned_geometry,
+)
 from .pipeline import guided_matches
 
-__all__ = ["TentativeMatches", "find_tentative_matches", "guided_matches", "guiding_geometry"]
+__all__ = [
+    "TentativeMatches",
+    "find_tentative_matches",
+    "guided_matches",
+    "guiding_geometry",
+    "learned_geometry",
+]
