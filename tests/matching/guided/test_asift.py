@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.matching.guided.asift import TILTS, simulate_view, simulated_views
+from deepdetect.matching.guided.asift import simulate_view, simulated_views
 
 
 def blob(x: float, y: float, across: float, down: float) -> np.ndarray:
@@ -14,7 +14,7 @@ def blob(x: float, y: float, across: float, down: float) -> np.ndarray:
     return np.rint(40 + 180 * np.exp(-away / 2)).astype(np.uint8)
 
 
-@pytest.mark.parametrize("tilt", TILTS)
+@pytest.mark.parametrize("tilt", [2.0, 4.0])
 @pytest.mark.parametrize("turn", [0.0, 25.0, 144.0])
 def test_a_spot_lies_where_the_map_says(tilt: float, turn: float) -> None:
     view, affine = simulate_view(blob(130, 60, 6, 6), tilt, turn)
@@ -24,7 +24,7 @@ def test_a_spot_lies_where_the_map_says(tilt: float, turn: float) -> None:
     np.testing.assert_allclose(centre, affine @ [130, 60, 1], atol=0.1)
 
 
-@pytest.mark.parametrize("tilt", TILTS)
+@pytest.mark.parametrize("tilt", [2.0, 4.0])
 @pytest.mark.parametrize("turn", [0.0, 40.0, 110.0])
 def test_the_whole_image_is_within_the_view_and_grey_outside(tilt: float, turn: float) -> None:
     view, affine = simulate_view(np.full((90, 140), 250, np.uint8), tilt, turn)
@@ -43,7 +43,7 @@ def test_the_whole_image_is_within_the_view_and_grey_outside(tilt: float, turn: 
     assert inside.any()
 
 
-@pytest.mark.parametrize("tilt", TILTS)
+@pytest.mark.parametrize("tilt", [2.0, 4.0])
 def test_fine_stripes_are_blurred_before_they_are_shortened(tilt: float) -> None:
     """Else they would come back as coarse ones."""
     stripes = np.zeros((80, 160), np.uint8)
@@ -54,12 +54,10 @@ def test_fine_stripes_are_blurred_before_they_are_shortened(tilt: float) -> None
     assert np.ptp(upright[10:-10, 5:-5].astype(int)) == 255  # the height is not touched
 
 
-@pytest.mark.parametrize("tilt", TILTS)
-def test_keypoints_lie_at_their_positions_in_the_image_itself(tilt: float) -> None:
-    """A spot as many times wider than high is round in the view without a turn."""
-    gray = blob(110, 70, 3 * tilt, 3)
-    found = next(simulated_views(gray, tilt, 100))
+def test_keypoints_lie_at_their_positions_in_the_image_itself() -> None:
+    """A spot four times wider than high is round in the view without a turn."""
+    found = next(simulated_views(blob(110, 70, 12, 3), 100))
     gaps = found.xy - [110, 70]
     near = gaps[np.argmin(np.linalg.norm(gaps, axis=1))]
-    assert abs(near[0]) < 0.15 * tilt
+    assert abs(near[0]) < 0.6
     assert abs(near[1]) < 0.15

@@ -35,7 +35,7 @@ from ...geometry.transforms import (
     scaled_points,
 )
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, choose_model
-from .asift import TILTS, simulated_views
+from .asift import simulated_views
 from .epipolar_search import epipolar_search, log10_p_value
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -81,8 +81,7 @@ MAX_MATCHES_TO_SEARCH = 200
 
 MAX_HINT_LOG10_NFA = 0.0
 """Where the logarithm of the number of false alarms of the best geometry so far is below this, it
-may be more than chance: views of a larger tilt are simulated, and further matches along epipolar
-lines are counted."""
+may be more than chance: further matches along epipolar lines are counted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +208,7 @@ class InitialGeometry(TwoViewModel):
 
     `points0` and `points1` are the matches that agree with it, `others` those that do not, None
     where the model was asked for; `num_views` were simulated for them. Another model would be found
-    from the `source`.
+    from the `source`. A `negative` is the second image of the first.
     """
 
     points0: np.ndarray
@@ -217,6 +216,7 @@ class InitialGeometry(TwoViewModel):
     others: Pair | None
     num_views: int = 0
     source: Source = None
+    negative: bool = False
 
     @classmethod
     def of(
@@ -304,30 +304,38 @@ def guiding_geometry(
         geometry = learned_geometry(grays, model, seed)
         if geometry.matrix is not None:
             return geometry
-    small, keypoints = longest <= SIMULATED_SIDE_PX, MAX_KEYPOINTS
-    if not small:
-        keypoints = SIMULATED_KEYPOINTS
-        tentative = find_tentative_matches(
-            *grays, max_side_px=SIMULATED_SIDE_PX, max_keypoints=keypoints
-        )
+    tentative = _learned_matches(grays, SIMULATED_SIDE_PX, SIMULATED_KEYPOINTS)
     geometry = estimate_initial_geometry(
-        tentative, model, seed, semi_calibrated=small, view_keypoints=keypoints // 2
+        tentative, model, seed, semi_calibrated=False, view_keypoints=SIMULATED_KEYPOINTS // 2
     )
     return replace(geometry, source=source)
 
 
 def learned_geometry(grays: Pair, model: str = "auto", seed: int = 0) -> InitialGeometry:
-    """Find the geometry that points with learned descriptors show.
+    """Find the geometry that points with learned descriptors show, where one is a negative, too.
 
     In unlike light, the dark, blur, or from another side two to fifteen times as many of them agree
     as of SIFT's keypoints; where one image is four times as large, SIFT's are more. SIFT's lie more
     exactly where they belong, which tells depth from a plane.
     """
-    points = PointDetector(LEARNED_KEYPOINTS)
-    views = downscale(grays[0], MAX_SIDE_PX)[0], downscale(grays[1], MAX_SIDE_PX)[0]
+    as_it_is = _learned_matches(grays, MAX_SIDE_PX, LEARNED_KEYPOINTS)
+    first, second = as_it_is.features
+    assert second.angles is not None
+    # Points and sizes are those of the image, gradients point the other way.
+    second = replace(second, angles=(second.angles + 180) % 360)
+    second = describe_learned(255 - as_it_is.views[1], second)
+    inverted = find_tentative_matches(*grays, (first, second))
+    negative = len(inverted.ratios) > len(as_it_is.ratios)
+    tentative = inverted if negative else as_it_is
+    geometry = estimate_initial_geometry(tentative, model, seed)
+    return replace(geometry, source=tentative, negative=negative)
+
+
+def _learned_matches(grays: Pair, side_px: int, keypoints: int) -> TentativeMatches:
+    points = PointDetector(keypoints)
+    views = downscale(grays[0], side_px)[0], downscale(grays[1], side_px)[0]
     first, second = (points.extract(view, descriptor=LEARNED) for view in views)
-    tentative = find_tentative_matches(*grays, (first, second))
-    return replace(estimate_initial_geometry(tentative, model, seed), source=tentative)
+    return find_tentative_matches(*grays, (first, second), max_side_px=side_px)
 
 
 def _is_clear(geometry: InitialGeometry) -> bool:
@@ -397,29 +405,28 @@ def estimate_initial_geometry(
             if best.trusted:
                 best = _with_further_matches(best, tentative)
                 return best.rescaled(*tentative.scales)
-        if num_views and best.log10_nfa > MAX_HINT_LOG10_NFA:
-            break
     return replace(best, num_views=num_views).untrusted()
 
 
 def _more_and_more_matches(
     tentative: TentativeMatches, view_keypoints: int
 ) -> Iterator[tuple[Pair, np.ndarray, int]]:
-    """Yield matched positions, ratios and the number of simulated views, up to strong tilts."""
+    """Yield matched positions, ratios and the number of simulated views."""
     (points0, points1), ratios = tentative.matched, tentative.ratios
     yield (points0, points1), ratios, 0
-    for tilt in TILTS if view_keypoints else ():
-        views = 0
-        for side in (0, 1):
-            other = tentative.features[1 - side]
-            for seen in simulated_views(tentative.views[side], tilt, view_keypoints):
-                further = _match_sparse(seen, other)
-                points0 = np.concatenate([points0, further[side]])
-                points1 = np.concatenate([points1, further[1 - side]])
-                ratios = np.concatenate([ratios, further[2]])
-                views += 1
-        points0, points1, ratios = _separate(points0, points1, ratios)
-        yield (points0, points1), ratios, views
+    if not view_keypoints:
+        return
+    views = 0
+    for side in (0, 1):
+        other = tentative.features[1 - side]
+        for seen in simulated_views(tentative.views[side], view_keypoints):
+            further = _match_sparse(seen, other)
+            points0 = np.concatenate([points0, further[side]])
+            points1 = np.concatenate([points1, further[1 - side]])
+            ratios = np.concatenate([ratios, further[2]])
+            views += 1
+    points0, points1, ratios = _separate(points0, points1, ratios)
+    yield (points0, points1), ratios, views
 
 
 def _with_further_evidence(

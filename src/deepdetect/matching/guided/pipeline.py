@@ -118,6 +118,8 @@ def guided_matches(
     Returns the geometry that guided, and the matches; None when no geometry could be trusted.
     """
     enough = MIN_MATCHED_FRACTION * min(len(xy) for xy in pixels)
+    if first.negative:
+        grays = grays[0], 255 - grays[1]
     if first.model == "homography":
         geometry, matches = _plane_or_depth(grays, pixels, first, enough, seed)
     else:
