@@ -31,6 +31,9 @@ FREQUENCIES = np.repeat([1, 2, 3], [12, 8, 4])
 """Of the others, which are the real and then the imaginary parts of complex numbers: an image that
 is turned by an angle turns them by so many times the angle."""
 
+UPRIGHT_DEGREES = 15.0
+"""Images turned by less are compared as they are, which the network has learned to bear."""
+
 TURNED_KEYPOINTS = 512
 """So many, the best of each image, tell by how much one is turned."""
 
@@ -73,9 +76,12 @@ def match_learned(
         return match(descriptors0, descriptors1)
     own = match(descriptors0[:TURNED_KEYPOINTS], descriptors1[:TURNED_KEYPOINTS])
     turn = common_turn(angles1[own.indices1] - angles0[own.indices0])
-    return match(
-        turn_descriptors(descriptors0, angles0), turn_descriptors(descriptors1, angles1 - turn)
-    )
+    first = turn_descriptors(descriptors0, angles0)
+    upright = match(first, turn_descriptors(descriptors1, angles1))
+    if abs((turn + 180) % 360 - 180) < UPRIGHT_DEGREES:
+        return upright
+    # Where few match, it is chance which turn most of them show.
+    return max(upright, match(first, turn_descriptors(descriptors1, angles1 - turn)), key=len)
 
 
 def common_turn(degrees: np.ndarray) -> float:

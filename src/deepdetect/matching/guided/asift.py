@@ -17,8 +17,10 @@ import numpy as np
 from ..._shared.machine import processor_count
 from ..._shared.opencv import cv2
 from ...detector.point_detector import PointDetector
+from ...detector.points.descriptor import describe_learned
 from ...features.keypoints import Keypoints
 from ...features.learned import LEARNED
+from ...io.image import MINIMUM_SIDE
 
 BLUR = 0.8
 """Sigma of the blur before an image is shortened, in units of sqrt(tilt^2 - 1)."""
@@ -32,14 +34,21 @@ Learned descriptors bear tilts up to two or three alone; of 60 pairs seen from t
 55, with SIFT and tilts of 2 and 4 in 30 views 33."""
 
 
+def learned_points(gray: np.ndarray, max_keypoints: int) -> Keypoints:
+    """Return points with learned descriptors; of a view that is too small for them, none."""
+    height, width = gray.shape
+    if min(height, width) < MINIMUM_SIDE:
+        return describe_learned(gray, Keypoints.empty((width, height)))
+    return PointDetector(max_keypoints, descriptor=LEARNED).extract(gray)
+
+
 def simulated_views(gray: np.ndarray, max_keypoints: int) -> Iterator[Keypoints]:
     """Yield the described points of views from the side, at their positions in the image."""
-    points = PointDetector(max_keypoints)
     size = gray.shape[1], gray.shape[0]
 
     def see(rotation_deg: float) -> Keypoints:
         view, to_view = simulate_view(gray, TILT, rotation_deg)
-        keypoints = points.extract(view, descriptor=LEARNED)
+        keypoints = learned_points(view, max_keypoints)
         back = cv2.invertAffineTransform(to_view)
         xy = keypoints.xy @ back[:, :2].T.astype(np.float32) + back[:, 2].astype(np.float32)
         moved = replace(keypoints, xy=xy, image_size=size)

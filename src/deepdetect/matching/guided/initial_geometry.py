@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import OptionError
-from ...detector.point_detector import PointDetector
 from ...detector.points.descriptor import describe_learned
 from ...features.keypoints import Keypoints
 from ...features.learned import LEARNED, match_learned
@@ -35,7 +34,7 @@ from ...geometry.transforms import (
     scaled_points,
 )
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, choose_model
-from .asift import simulated_views
+from .asift import learned_points, simulated_views
 from .epipolar_search import epipolar_search, log10_p_value
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -332,9 +331,8 @@ def learned_geometry(grays: Pair, model: str = "auto", seed: int = 0) -> Initial
 
 
 def _learned_matches(grays: Pair, side_px: int, keypoints: int) -> TentativeMatches:
-    points = PointDetector(keypoints)
     views = downscale(grays[0], side_px)[0], downscale(grays[1], side_px)[0]
-    first, second = (points.extract(view, descriptor=LEARNED) for view in views)
+    first, second = (learned_points(view, keypoints) for view in views)
     return find_tentative_matches(*grays, (first, second), max_side_px=side_px)
 
 
