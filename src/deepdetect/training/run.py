@@ -158,7 +158,7 @@ def train_descriptor(
 
     Example:
         >>> result = train_descriptor("photos/train", "photos/val", "run")  # doctest: +SKIP
-        >>> PointDetector().extract("a.png", descriptor=result.onnx)  # doctest: +SKIP
+        >>> PointDetector(descriptor=result.onnx).extract("a.png")  # doctest: +SKIP
     """
     require_packages("training", *TRAINING_PACKAGES)
     from .descriptor.task import DescriptorTrainer

@@ -13,7 +13,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from deepdetect import OptionError, PointDetector, match_features
+from deepdetect import Keypoints, OptionError, PointDetector, match_features
 from deepdetect._shared.errors import WeightsError
 from deepdetect._shared.records import file_digest
 from deepdetect.detector.network.weights import load_network, read_notes
@@ -118,19 +118,23 @@ def test_the_onnx_file_describes_as_the_network(whole: TrainingResult) -> None:
 def test_own_weights_describe_points_and_are_of_their_own_type(
     whole: TrainingResult, textures: Path, tmp_path: Path
 ) -> None:
-    image, points = textures / "0.png", PointDetector(200)
+    image = textures / "0.png"
     assert whole.onnx is not None
-    found = points.extract(image, descriptor=whole.onnx)
+
+    def extract(descriptor: str | Path) -> Keypoints:
+        return PointDetector(200, descriptor=descriptor).extract(image)
+
+    found = extract(whole.onnx)
     assert found.descriptor_type == f"learned-{file_digest(whole.onnx)[:16]}"
-    matches = match_features(found, points.extract(image, descriptor=str(whole.onnx)), ratio=1)
+    matches = match_features(found, extract(str(whole.onnx)), ratio=1)
     np.testing.assert_array_equal(matches.points0, matches.points1)
     with pytest.raises(OptionError, match="learned"):
-        match_features(found, points.extract(image, descriptor="learned"))
+        match_features(found, extract("learned"))
     with pytest.raises(WeightsError, match="nowhere"):
-        points.extract(image, descriptor="nowhere/descriptor.onnx")
+        extract("nowhere/descriptor.onnx")
     (tmp_path / "broken.onnx").write_bytes(b"nothing")
     with pytest.raises(WeightsError, match="broken"):
-        points.extract(image, descriptor=tmp_path / "broken.onnx")
+        extract(tmp_path / "broken.onnx")
 
 
 def test_a_run_starts_from_weights(whole: TrainingResult, textures: Path, tmp_path: Path) -> None:
