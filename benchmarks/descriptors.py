@@ -28,7 +28,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import cv2
 import numpy as np
@@ -42,7 +42,6 @@ from deepdetect.evaluation.metrics.pose import pose_auc
 from deepdetect.evaluation.protocols.planar import pairs_of
 from deepdetect.evaluation.protocols.pose import ERROR, estimate_pose, pose_errors
 from deepdetect.evaluation.report import Row, Table
-from deepdetect.features.learned import Descriptor
 from deepdetect.features.sift import to_root_sift
 from deepdetect.geometry import GeometryOptions, estimate_geometry
 from deepdetect.geometry.transforms import transfer_errors
@@ -58,7 +57,8 @@ Extract = Callable[[np.ndarray], Keypoints]
 def methods(files: list[str]) -> dict[str, Extract]:
     """Return what extracts keypoints with descriptors, by name; others' files too."""
     found: dict[str, Extract] = {
-        kind: PointDetector(KEYPOINTS, descriptor=kind).extract for kind in get_args(Descriptor)
+        kind: PointDetector(KEYPOINTS, descriptor=kind).extract
+        for kind in ("rootsift", "learned", "learned-free")
     }
     others = {Path(file).stem: _extract_other(file) for file in files}
     return found | {"SIFT": extract_sift} | others

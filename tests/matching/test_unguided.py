@@ -35,7 +35,7 @@ def test_features_match_as_images_do(pair, features: list[Keypoints]) -> None:
         guided_matching=False,
         model="none",
         mutual=True,
-        options=MatchingOptions(matcher="auto", ratio=0.93),
+        options=MatchingOptions(matcher="auto", ratio=0.88),
     )
     assert len(found) > 100
     for name in ("points0", "points1", "scores", "inliers", "indices0", "indices1"):

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import Calibration, Camera, Keypoints, ReconstructionError
+from deepdetect import Calibration, Camera, Keypoints, PointDetector, ReconstructionError
 from deepdetect.sfm.colmap import (
     CameraIntrinsics,
     initial_intrinsics,
     known_cameras,
     quiet_pycolmap,
+    sift_bytes,
     write_database,
 )
 
@@ -163,3 +164,16 @@ def test_colmap_reads_what_is_written(pycolmap, tmp_path: Path) -> None:
         np.testing.assert_allclose(keypoints[:, :2], images["a b.jpg"][0].xy + 0.5, atol=1e-5)
         matches = database.read_matches(found["c.jpg"].image_id, found["a b.jpg"].image_id)
         np.testing.assert_array_equal(matches, rows)
+
+
+def test_learned_descriptors_keep_their_neighbours_as_bytes(photo: np.ndarray) -> None:
+    first, second = (PointDetector(300).extract(image) for image in (photo, photo[5:, 9:] // 2))
+    expected = first.descriptors @ second.descriptors.T
+    described = [sift_bytes(each) for each in (first, second)]
+    assert {(each.shape, each.dtype.name) for each in described} == {((300, 128), "uint8")}
+    lengths = [np.linalg.norm(each.astype(float), axis=1) for each in described]
+    np.testing.assert_allclose(lengths, 512, rtol=0.02)
+    products = described[0].astype(int) @ described[1].astype(int).T
+    near = expected.max(1) > 0.8  # others have no partner
+    assert near.sum() > 100
+    assert np.mean((products.argmax(1) == expected.argmax(1))[near]) > 0.98

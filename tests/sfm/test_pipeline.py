@@ -119,8 +119,8 @@ def test_good_photographs_are_registered_and_bad_ones_named(small, shared: Path)
 
 def test_points_agree_with_the_photographs(small) -> None:
     folder, _, found = small
-    assert len(found.sparse) > 100
-    assert len(found.dense) > 5 * len(found.sparse)
+    assert len(found.sparse) > 300
+    assert len(found.dense) > 4 * len(found.sparse)
     assert np.median(found.sparse_errors) < 0.5
     assert np.median(found.dense_errors) < 0.3
     assert found.dense_views.min() >= 3

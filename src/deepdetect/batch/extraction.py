@@ -94,7 +94,9 @@ def extract_features(
         **detector.settings,
         **reading.settings,
         **({} if selection is None else vars(selection)),
-        "descriptor": detector.descriptor if isinstance(detector, PointDetector) else ROOT_SIFT,
+        "descriptor": detector.descriptor_type
+        if isinstance(detector, PointDetector)
+        else ROOT_SIFT,
         "version": __version__,
     }
     report = fill_file(

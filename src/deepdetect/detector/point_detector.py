@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,12 +14,12 @@ from .._shared.opencv import cv2
 from .._shared.options import is_path, suggest_keywords
 from .._shared.records import file_digest
 from ..features.keypoints import Keypoints
-from ..features.learned import Descriptor
+from ..features.learned import LEARNED, LEARNED_FREE
 from ..features.selection import check_ignore, check_max_keypoints
 from ..features.sift import ROOT_SIFT, describe_keypoints
 from ..io.image import Images, batch_length, ignore_masks, image_named, load_each, load_image, luma
 from .heatmap import MAX_AUTO_PIXELS, memory_named
-from .points.descriptor import describe_learned
+from .points.descriptor import describe_learned, descriptor_type
 from .points.detection import SPREADS, Spread, detect_points
 from .points.ranker import load_ranker
 from .pretrained import RANKER
@@ -46,7 +46,7 @@ class PointDetector:
             programs that expect SIFT's.
 
     Raises:
-        WeightsError: the ranker is missing, damaged or does not fit.
+        WeightsError: the ranker or the descriptor is missing, damaged or does not fit.
         OptionError: an option is unknown or out of its range.
 
     Example:
@@ -65,7 +65,7 @@ class PointDetector:
         spread: Spread = "none",
         resolution: Literal["auto", "native"] = "auto",
         ranker: str | Path | None = None,
-        descriptor: Descriptor | str | Path = "learned",
+        descriptor: str | Path = LEARNED,
     ) -> None:
         check_max_keypoints(max_keypoints)
         check_name("spread", spread, SPREADS)
@@ -73,11 +73,14 @@ class PointDetector:
             raise OptionError(f"`spread={spread!r}` needs `max_keypoints`: how many to spread")
         check_name("resolution of points", resolution, ("auto", "native"))
         self.max_keypoints = None if max_keypoints is None else int(max_keypoints)
-        if not is_path(descriptor):
-            check_name("descriptor", str(descriptor), get_args(Descriptor))
-        self.spread, self.resolution, self.descriptor = spread, resolution, descriptor
+        self.spread, self.resolution = spread, resolution
         self.ranker = RANKER if ranker is None else Path(ranker).absolute()
         self._ranker = load_ranker(self.ranker)
+        if is_path(descriptor):
+            descriptor = Path(descriptor).absolute()
+        else:
+            check_name("descriptor", descriptor, (LEARNED, LEARNED_FREE, ROOT_SIFT))
+        self.descriptor, self.descriptor_type = descriptor, descriptor_type(descriptor)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -159,7 +162,7 @@ class PointDetector:
         Raises:
             ImageError: the image cannot be read or is not fit.
             OptionError: the mask has another size than the image.
-            WeightsError: the descriptor's file is missing or damaged.
+            WeightsError: the descriptor's file is damaged.
         """
         rgb = load_image(image, channels=channels)
         return self.describe(rgb, self._find(rgb, ignore))
@@ -177,10 +180,10 @@ class PointDetector:
         Raises:
             ImageError: the image cannot be read or is not fit.
             OptionError: keypoints have no sizes above 0.
-            WeightsError: the descriptor's file is missing or damaged.
+            WeightsError: the descriptor's file is damaged.
         """
         gray = luma(load_image(image, channels=channels))
-        if self.descriptor == ROOT_SIFT:
+        if self.descriptor_type == ROOT_SIFT:
             return describe_keypoints(gray, keypoints)
         return describe_learned(self._scaled(gray), keypoints, self.descriptor)
 
@@ -188,7 +191,7 @@ class PointDetector:
         return (
             f"PointDetector(max_keypoints={self.max_keypoints}, spread={self.spread!r}, "
             f"resolution={self.resolution!r}, ranker={self.ranker.name}, "
-            f"descriptor={self.descriptor!r})"
+            f"descriptor={str(self.descriptor)!r})"
         )
 
     def _find(self, rgb: np.ndarray, ignore: np.ndarray | None) -> Keypoints:

@@ -45,9 +45,9 @@ class DeepDetectExtractor(Module):
         scale: Scale = "diameter",
     ) -> None:
         super().__init__()
-        if detector.descriptor != ROOT_SIFT:
+        if detector.descriptor_type != ROOT_SIFT:
             raise OptionError(
-                f"LightGlue has no weights for {detector.descriptor} descriptors: give the "
+                f"LightGlue has no weights for {detector.descriptor_type} descriptors: give the "
                 f"detector `descriptor={ROOT_SIFT!r}`"
             )
         if detector.max_keypoints is None or detector.max_keypoints > MAX_KEYPOINTS:

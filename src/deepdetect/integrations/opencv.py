@@ -106,7 +106,7 @@ class DeepDetectFeature2D:
 
     def descriptorSize(self) -> int:
         """Return the length of a descriptor."""
-        return 128 if self._detector.descriptor == ROOT_SIFT else LENGTH
+        return 128 if self._detector.descriptor_type == ROOT_SIFT else LENGTH
 
     def descriptorType(self) -> int:
         """Return the type of descriptors, float32 as of `cv2.SIFT`."""

@@ -17,14 +17,7 @@ from .._shared.progress import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_keypoints
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints, nearest_keypoints
-from ..features.learned import (
-    LEARNED,
-    LEARNED_FREE,
-    LEARNED_RATIO,
-    RATIO,
-    is_learned,
-    match_learned,
-)
+from ..features.learned import LEARNED_RATIO, RATIO, is_learned, match_learned
 from ..features.matchers import get_matcher, match_descriptors
 from ..features.matches import Matches, TwoViewGeometry, lazy
 from ..features.selection import SelectionOptions
@@ -62,8 +55,8 @@ class MatchingOptions:
     Attributes:
         two_view_model: the geometry that guides where `model` leaves it open: "homography",
             "fundamental", or "auto": the one that fits the images.
-        descriptor: "sift", "rootsift", or "sift-opencv" for OpenCV's own in any case; of points
-            also "learned" or "learned-free". None: learned of points, and SIFT of dense keypoints.
+        descriptor: "sift", "rootsift", or "sift-opencv" for OpenCV's own in any case. None: what a
+            `PointDetector` extracts; of others "sift".
         keypoint_size: diameter of a keypoint for its descriptor, in pixels (paper: 3). Keypoints
             with sizes and angles of their own are described at these.
         angle: direction of all keypoints in degrees; -1 is OpenCV's "unset".
@@ -86,7 +79,7 @@ class MatchingOptions:
     geometry: GeometryOptions = field(default_factory=GeometryOptions)
 
     def __post_init__(self) -> None:
-        check_name("descriptor", self.descriptor, (None, *DESCRIPTORS, LEARNED, LEARNED_FREE))
+        check_name("descriptor", self.descriptor, (None, *DESCRIPTORS))
         get_matcher(self.matcher)
         if self.matcher == "hamming":
             raise OptionError(
@@ -184,7 +177,7 @@ def match_images(
     if not guided_matching:
         with timer.stage("keypoints"):
             keypoints = find[0](), find[1]()
-        return _match_unguided(grays, keypoints, model, mutual, seed, options, timer)
+        return _match_unguided(grays, keypoints, detector, model, mutual, seed, options, timer)
     # Keypoints of the network take no part in the first geometry, and finding them cannot fail:
     # where no geometry can be trusted nobody may ever ask for them.
     keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
@@ -215,7 +208,7 @@ def match_features(
         matcher: "auto" ("exact" for few keypoints, else "patchmatch" for dense ones and "flann" for
             others), "flann", "exact", "faiss", "patchmatch", or "hamming" for binary descriptors.
         ratio: the distance of the best over that of the second-best must be below this. None: 0.85,
-            of learned descriptors 0.93, which is as strict.
+            of learned descriptors 0.88, which is as strict.
         mutual: keep only mutual nearest neighbours.
         seed: of a matcher that is random.
 
@@ -353,6 +346,7 @@ def _found_both_ways(matches: Matches, back: Matches) -> Matches:
 def _match_unguided(
     grays: tuple[np.ndarray, np.ndarray],
     keypoints: tuple[Keypoints, Keypoints],
+    detector: AnyDetector,
     model: str,
     mutual: bool,
     seed: int,
@@ -362,7 +356,8 @@ def _match_unguided(
     check_memory([len(each) for each in keypoints])
     with timer.stage("descriptors"):
         features0, features1 = (
-            _describe(gray, each, options) for gray, each in zip(grays, keypoints, strict=True)
+            _describe(gray, each, detector, options)
+            for gray, each in zip(grays, keypoints, strict=True)
         )
     with timer.stage("matching"):
         matches = match_features(
@@ -387,12 +382,13 @@ def _match_unguided(
     )
 
 
-def _describe(gray: np.ndarray, keypoints: Keypoints, options: MatchingOptions) -> Keypoints:
+def _describe(
+    gray: np.ndarray, keypoints: Keypoints, detector: AnyDetector, options: MatchingOptions
+) -> Keypoints:
     """Add descriptors at the keypoints' own sizes and angles, or at those of the options."""
-    points = keypoints.sizes is not None and keypoints.angles is not None
-    kind = options.descriptor or (LEARNED if points else "sift")
-    if is_learned(kind):
-        return PointDetector(descriptor=kind).describe(gray, keypoints)
+    kind = options.descriptor or "sift"
+    if options.descriptor is None and isinstance(detector, PointDetector):
+        return detector.describe(gray, keypoints)
     if keypoints.sizes is None or keypoints.angles is None:
         of_pixels = get_descriptor(kind)
         descriptors = of_pixels(gray, keypoints.xy, options.keypoint_size, options.angle)

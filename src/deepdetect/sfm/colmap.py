@@ -21,6 +21,7 @@ from .._shared.opencv import import_pycolmap as import_pycolmap
 from ..batch.extraction import ROOT_SIFT_NORM
 from ..batch.pair_list import Pair
 from ..features.keypoints import UNSET_ANGLE, Keypoints
+from ..features.learned import is_learned
 from ..geometry.camera import Calibration, Camera
 from ..io.exif import camera_from_exif
 
@@ -196,8 +197,8 @@ def write_database(
     """Write a new database of COLMAP to a file that does not exist, or is empty.
 
     Images with the same object of intrinsics share a camera. Keypoints with sizes have four columns
-    (x, y, scale, orientation), others two; only SIFT's descriptors are written. Matches are (K, 2)
-    rows of keypoints.
+    (x, y, scale, orientation), others two; descriptors are written as `sift_bytes`. Matches are
+    (K, 2) rows of keypoints.
     """
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(path) as database:
         cameras: dict[int, tuple[int, int]] = {}  # camera and rig by the object
@@ -242,9 +243,13 @@ def orientations_of(points: Keypoints) -> np.ndarray:
 def sift_bytes(keypoints: Keypoints) -> np.ndarray | None:
     """Return descriptors as SIFT's (N, 128) uint8, or None where they are of another kind.
 
-    Those of length 1 are multiplied by 512, as SIFT does it.
+    Those of length 1 are multiplied by 512, as SIFT does it. Of learned ones the positive and the
+    negative numbers become 64 each, which COLMAP compares as it does SIFT's: one or two of 100
+    right matches are lost. Its vocabulary trees are of SIFT's words, and do not know them.
     """
     found = keypoints.descriptors
+    if found is not None and is_learned(keypoints.descriptor_type):
+        found = np.hstack([np.maximum(found, 0), np.maximum(-found, 0)])
     if found is None or found.shape[1] != SIFT_NUMBERS:
         return None
     if found.dtype == np.uint8:

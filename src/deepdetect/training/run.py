@@ -150,7 +150,7 @@ def train_descriptor(
             CPU, one per processor but one beside a GPU.
 
     Returns:
-        The weights' files, of which `PointDetector.extract` takes the ONNX file, and the curves.
+        The weights' files, of which `PointDetector` takes the ONNX file, and the curves.
 
     Raises:
         The errors of `train_points`; an OptionError, too, where the images show nothing.

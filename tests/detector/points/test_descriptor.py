@@ -48,7 +48,7 @@ def test_other_descriptors_cannot_be_compared(photo: np.ndarray) -> None:
     with pytest.raises(OptionError, match="learned"):
         deepdetect.match_features(learned(photo), other)
     with pytest.raises(OptionError, match="rootsift"):
-        PointDetector(descriptor="rootsfit")  # type: ignore[arg-type]
+        PointDetector(descriptor="rootsfit")
 
 
 def test_descriptors_of_a_turned_image_are_alike_in_any_program(photo: np.ndarray) -> None:

@@ -13,7 +13,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from deepdetect import Keypoints, OptionError, PointDetector, match_features
+from deepdetect import OptionError, PointDetector, match_features
 from deepdetect._shared.errors import WeightsError
 from deepdetect._shared.records import file_digest
 from deepdetect.detector.network.weights import load_network, read_notes
@@ -120,21 +120,20 @@ def test_own_weights_describe_points_and_are_of_their_own_type(
 ) -> None:
     image = textures / "0.png"
     assert whole.onnx is not None
-
-    def extract(descriptor: str | Path) -> Keypoints:
-        return PointDetector(200, descriptor=descriptor).extract(image)
-
-    found = extract(whole.onnx)
+    found = PointDetector(200, descriptor=whole.onnx).extract(image)
     assert found.descriptor_type == f"learned-{file_digest(whole.onnx)[:16]}"
-    matches = match_features(found, extract(str(whole.onnx)), ratio=1)
+    again = PointDetector(200, descriptor=str(whole.onnx)).extract(image)
+    matches = match_features(found, again, ratio=1)
     np.testing.assert_array_equal(matches.points0, matches.points1)
+    other = PointDetector(200).extract(image)
     with pytest.raises(OptionError, match="learned"):
-        match_features(found, extract("learned"))
+        match_features(found, other)
     with pytest.raises(WeightsError, match="nowhere"):
-        extract("nowhere/descriptor.onnx")
+        PointDetector(descriptor="nowhere/descriptor.onnx")
     (tmp_path / "broken.onnx").write_bytes(b"nothing")
+    broken = PointDetector(200, descriptor=tmp_path / "broken.onnx")
     with pytest.raises(WeightsError, match="broken"):
-        extract(tmp_path / "broken.onnx")
+        broken.extract(image)
 
 
 def test_a_run_starts_from_weights(whole: TrainingResult, textures: Path, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from ..._shared.records import file_digest
 from ...features.keypoints import Keypoints
 from ...features.learned import LEARNED, LEARNED_FREE, LENGTH, turn_descriptors
 from ...features.scale_space import set_angles
+from ...features.sift import ROOT_SIFT
 from ..backends.onnxruntime_backend import start_session
 from ..pretrained import RANKER, resolve_weights
 
@@ -39,14 +40,10 @@ def describe_learned(
     """Return keypoints with learned descriptors at their own sizes and angles.
 
     The image, (H, W) uint8 luma, may be a smaller one than that of the keypoints. Angles of -1, or
-    none, become the dominant ones. The descriptor is a name of `DESCRIPTOR_GRAPHS`, or such a file,
-    whose digest becomes part of the descriptors' type. An OptionError says that the keypoints have
-    no sizes.
+    none, become the dominant ones. The descriptor is a name of `DESCRIPTOR_GRAPHS`, or such a file.
+    An OptionError says that the keypoints have no sizes.
     """
-    path, kind = DESCRIPTOR_GRAPHS.get(str(descriptor)), str(descriptor)
-    if path is None:
-        path = resolve_weights(descriptor)
-        kind = f"{LEARNED}-{file_digest(path)[:DIGEST_LENGTH]}"
+    kind = descriptor_type(descriptor)
     if not len(keypoints):
         none = np.empty((0, LENGTH), np.float32)
         return replace(keypoints, descriptors=none, descriptor_type=kind)
@@ -65,9 +62,17 @@ def describe_learned(
         "xy": xy[None],
         "sizes": sizes[None],
     }
+    path = DESCRIPTOR_GRAPHS.get(str(descriptor), Path(descriptor))
     upright = _session(path, kind).run(["descriptors"], inputs)[0][0]
     descriptors = turn_descriptors(upright, -angles)
     return replace(keypoints, angles=angles, descriptors=descriptors, descriptor_type=kind)
+
+
+def descriptor_type(descriptor: str | Path) -> str:
+    """Return the `Keypoints.descriptor_type` of a name, or of a file, which has its digest."""
+    if str(descriptor) in (*DESCRIPTOR_GRAPHS, ROOT_SIFT):
+        return str(descriptor)
+    return f"{LEARNED}-{file_digest(resolve_weights(descriptor))[:DIGEST_LENGTH]}"
 
 
 @functools.cache

@@ -184,7 +184,10 @@ def choose_images(scene: PosedScene, most: int) -> PosedScene:
 def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
     """Return the ranked points, SIFT where it is among the baselines, and random points."""
     points = PointDetector(MAX_KEYPOINTS, ranker=options.ranker)
-    version, random = f"{points.settings} {points.descriptor}", "baseline: as many random points"
+    version, random = (
+        f"{points.settings} {points.descriptor_type}",
+        "baseline: as many random points",
+    )
     ours = SfmMethod("DeepDetect, points", partial(find_points, points), version=version)
     sift = SfmMethod("SIFT, pycolmap", find_sift, match_sift)
     chance = SfmMethod(random, partial(find_random_points, points), version=version, chance=True)
