@@ -141,10 +141,13 @@ def train_descriptor(
     An interrupted run resumes as one of `train` does.
 
     Args:
-        images, validation, options, log: as of `train_points`; images best of 480 pixels a side.
+        images: folder of images, best of some 480 pixels a side.
+        validation: folder of others, by which the best weights are chosen.
         output: folder for checkpoint.safetensors, descriptor.safetensors, descriptor.onnx,
             MODEL_CARD.md and the curves.
-        init_weights: descriptor.safetensors to start from. None: random ones, by the seed.
+        options, log: as of `train_points`.
+        init_weights: weights (descriptor.safetensors) to start from. None: random ones, by the
+            seed.
         device: "auto" is CUDA if there is a GPU, else the CPU.
         num_workers: processes that make the pairs, 0 for none but the one that trains. None: 0 on a
             CPU, one per processor but one beside a GPU.
