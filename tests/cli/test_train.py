@@ -96,3 +96,23 @@ def test_a_preset_is_changed_by_options(
     assert options.frozen_batch_norm is False
     assert options.max_images == PRESETS["paper"].max_images
     assert init_weights == ("default", "dense")
+
+
+def test_train_descriptor_writes_what_extract_takes(run, tmp_path: Path) -> None:
+    from PIL import Image
+    from skimage import data
+
+    from deepdetect import PointDetector
+
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    Image.fromarray(data.astronaut()).save(photos / "astronaut.png")
+    tiny = ["--steps", "1", "--pairs", "2", "--val-count", "1", "--val-pairs", "1"]
+    where = ["--validation", photos, "--device", "cpu", "-o", tmp_path / "run"]
+    made = run("train-descriptor", photos, *where, *tiny, "--json")
+    assert made.exit_code == 0, made.output
+    values = json.loads(made.stdout)
+    assert values["best"]["step"] == 1
+    found = PointDetector(50).extract(data.astronaut(), descriptor=values["onnx"])
+    assert found.descriptors is not None
+    assert found.descriptors.shape == (50, 64)
