@@ -113,6 +113,6 @@ def test_train_descriptor_writes_what_extract_takes(run, tmp_path: Path) -> None
     assert made.exit_code == 0, made.output
     values = json.loads(made.stdout)
     assert values["best"]["step"] == 1
-    found = PointDetector(50).extract(data.astronaut(), descriptor=values["onnx"])
+    found = PointDetector(50, descriptor=values["onnx"]).extract(data.astronaut())
     assert found.descriptors is not None
     assert found.descriptors.shape == (50, 64)
