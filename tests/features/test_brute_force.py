@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.distance import cdist
 
+from deepdetect._shared.runtimes import start_session
 from deepdetect.features import matchers
-from deepdetect.features.matchers import exact_neighbours, hamming_neighbours
+from deepdetect.features.matchers import exact_neighbours, hamming_neighbours, match_descriptors
 
 
 def naive_neighbours(
@@ -54,6 +55,44 @@ def test_blocks_do_not_change_the_result(block: int, monkeypatch: pytest.MonkeyP
     rows, distances = exact_neighbours(queries, base, 2, 0)
     np.testing.assert_array_equal(rows, expected[0])
     np.testing.assert_array_equal(distances, expected[1])
+
+
+@pytest.mark.parametrize("signed", [True, False])
+def test_bytes_equal_a_naive_search_both_ways(
+    signed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where sums are as large as they can be, and where many distances are equal."""
+    if not signed:
+        unsigned = matchers.BYTE_PRODUCT.replace(b"\x08\x03\x12", b"\x08\x02\x12")
+        product = start_session(unsigned, 1), 0
+        monkeypatch.setattr(matchers, "_byte_product", lambda: product)
+    rng = np.random.default_rng(0)
+    queries = rng.choice(np.array([0, 255, 3], np.uint8), (170, 128), p=[0.1, 0.8, 0.1])
+    base = np.concatenate([queries[:70:2], rng.integers(0, 256, (130, 128), np.uint8)])
+    base = np.concatenate([base, base[:40]])
+    rows, expected = naive_neighbours(queries, base, 2)
+    found, distances = exact_neighbours(queries, base, 2, 0)
+    np.testing.assert_array_equal(found, rows)
+    np.testing.assert_allclose(distances, expected, rtol=1e-6)
+    nearest = naive_neighbours(base, queries, 1)[0][:, 0]
+    matches = match_descriptors(queries, base, exact_neighbours, ratio=1, mutual=True)
+    kept = (nearest[rows[:, 0]] == np.arange(170)) & (expected[:, 0] < expected[:, 1])
+    np.testing.assert_array_equal(matches.indices0, np.flatnonzero(kept))
+    np.testing.assert_array_equal(matches.indices1, rows[kept, 0])
+
+
+@pytest.mark.parametrize("noise", [0.3, 1e-4, 0])
+def test_mutual_neighbours_are_those_of_a_naive_search(noise: float) -> None:
+    rng = np.random.default_rng(1)
+    queries = on_sphere(rng, 90)
+    base = queries[rng.permutation(90)] + noise * on_sphere(rng, 90)
+    base = np.concatenate([base, base[:30] + np.float32(noise / 9)]).astype(np.float32)
+    rows, expected = naive_neighbours(queries, base, 2)
+    nearest = naive_neighbours(base, queries, 1)[0][:, 0]
+    kept = (nearest[rows[:, 0]] == np.arange(90)) & (expected[:, 0] < expected[:, 1])
+    matches = match_descriptors(queries, base, exact_neighbours, ratio=1, mutual=True)
+    np.testing.assert_array_equal(matches.indices0, np.flatnonzero(kept))
+    np.testing.assert_array_equal(matches.indices1, rows[kept, 0])
 
 
 def small_integers(rows: st.SearchStrategy[int]) -> st.SearchStrategy[np.ndarray]:

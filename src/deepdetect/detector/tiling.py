@@ -21,9 +21,9 @@ from .._shared.errors import DeepDetectError, first_line
 from .._shared.image_array import fill_planes
 from .._shared.machine import release_freed_memory
 from .._shared.progress import STDERR, progress
+from .._shared.runtimes import start_session
 from ..io.image import luma
 from .backends.onnx_parts import cut_onnx
-from .backends.onnxruntime_backend import start_session
 from .pretrained import LOGITS, STRIDE
 
 COUNTED = "/network/exposure/Slice_1_output_0"

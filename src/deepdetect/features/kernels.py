@@ -29,6 +29,9 @@ BINS = 36
 RADIUS_PER_WINDOW = 3.0
 """Of the pixels that vote, over the sigma of their Gaussian window."""
 
+CHUNK = 64
+"""Distances of which the least is noted, so that the nearest are found without a second look."""
+
 MIN_SQUARED_NORMS = 1e-3
 """Of the product of the squared norms: below it a descriptor is the mean."""
 
@@ -213,6 +216,50 @@ def _insert(row, distance, best, second, nearer, farther):  # type: ignore[no-un
     if distance < farther:
         return best, row, nearer, distance
     return best, second, nearer, farther
+
+
+# Without NaN, so that least numbers are found many at a time.
+@compiled(nogil=True, fastmath={"nnan", "nsz"})
+def scan_products(products, terms0, terms1, start, rows, values, nearest, best, second):  # type: ignore[no-untyped-def]
+    """Find the nearest of the base to queries, and of the queries to the base, by their products.
+
+    The squared distances of a block of queries, which begins with number `start`, are
+    `terms0[i] + terms1[j] - 2 * products[i, j]`. Writes the (Q, K) nearest rows of the base, of
+    equals the lower ones, with their squared distances; and keeps for each of (M,) rows of the base
+    the nearest query so far, its squared distance and that of the second.
+    """
+    count = products.shape[1]
+    chunks = (count + CHUNK - 1) // CHUNK
+    line = np.full(chunks * CHUNK, np.inf, np.float32)
+    least = np.empty(chunks, np.float32)
+    for query in range(len(products)):
+        term, number = terms0[query], np.int32(start + query)
+        for row in range(count):
+            value = term + terms1[row] - np.float32(2) * np.float32(products[query, row])
+            line[row] = value
+            second[row] = min(second[row], max(best[row], value))
+            nearest[row] = number if value < best[row] else nearest[row]
+            best[row] = min(best[row], value)
+        for chunk in range(chunks):
+            least[chunk] = _least(line, chunk)
+        for rank in range(rows.shape[1]):
+            chunk = 0
+            for other in range(1, chunks):
+                chunk = other if least[other] < least[chunk] else chunk
+            row = chunk * CHUNK
+            while row < min((chunk + 1) * CHUNK, count) - 1 and line[row] != least[chunk]:
+                row += 1
+            rows[query, rank], values[query, rank] = row, line[row]
+            line[row] = np.inf
+            least[chunk] = _least(line, chunk)
+
+
+@compiled(nogil=True, fastmath={"nnan", "nsz"}, inline="always")
+def _least(line, chunk):  # type: ignore[no-untyped-def]
+    value = line[chunk * CHUNK]
+    for row in range(chunk * CHUNK, (chunk + 1) * CHUNK):
+        value = min(value, line[row])
+    return value
 
 
 @compiled(nogil=True, inline="always")

@@ -5,6 +5,7 @@ To add a matcher, write a function of the signature of `Matcher` and add it to `
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -13,16 +14,24 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import OptionError, require_packages
-from .._shared.machine import parallel_for
+from .._shared.machine import parallel_for, thread_limit
 from .._shared.opencv import cv2
 from .._shared.options import look_up
+from .._shared.runtimes import start_session
 from .keypoints import on_pixels
 
-BLOCK_SIZE = 4_000_000
-"""Numbers of four bytes that exact search holds at a time: 16 MB, most of which caches hold."""
+BLOCK_SIZE = 2_000_000
+"""Numbers of four bytes that exact search holds at a time: 8 MB, most of which caches hold."""
 
 MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
 """Length of descriptors of bytes up to which single precision computes distances exactly."""
+
+BYTE_PRODUCT = (
+    b'\x08\x08:b\n\x18\n\x01a\n\x01b\x12\x01y"\rMatMulInteger\x12\x01gZ\x15\n\x01a\x12\x10\n\x0e\x08\x02\x12'
+    b"\n\n\x03\x12\x01n\n\x03\x12\x01dZ\x15\n\x01b\x12\x10\n\x0e\x08\x03\x12\n\n\x03\x12\x01d\n\x03"
+    b"\x12\x01mb\x15\n\x01y\x12\x10\n\x0e\x08\x06\x12\n\n\x03\x12\x01n\n\x03\x12\x01mB\x04\n\x00\x10\r"
+)
+"""An ONNX file of one node, MatMulInteger: y (n, m) int32 of a (n, d) uint8 and b (d, m) int8."""
 
 MAX_EXACT_PRODUCT = 4e8
 """Keypoints of both images, multiplied, up to which all distances are computed in a moment."""
@@ -69,35 +78,94 @@ def exact_neighbours(
 
     The time grows with the product of the numbers: meant for tens of thousands.
     """
-    rows = np.empty((len(queries), count), np.int32)
+    return _search_both_ways(queries, base, count)[:2]
+
+
+def _search_both_ways(
+    queries: np.ndarray, base: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return `exact_neighbours`, and (M,) int32 the nearest query of each row of the base."""
+    from .kernels import scan_products
+
+    width = base.shape[1]
+    whole = queries.dtype == base.dtype == np.uint8 and width <= MAX_EXACT_BYTES
+    terms0, terms1 = (np.einsum("ij,ij->i", a, a, dtype=np.float64) for a in (queries, base))
+    multiply: Callable[[np.ndarray], np.ndarray]
+    if whole:
+        session, offset = _byte_product()
+        factor = np.ascontiguousarray(base.T) - np.uint8(offset)
+        factor = factor.view(np.int8) if offset else factor
+        terms0 -= 2 * offset * queries.sum(1, dtype=np.float64)
+
+        def multiply(block: np.ndarray) -> np.ndarray:
+            return session.run(None, {"a": block, "b": factor})[0]
+    else:
+        queries, base = (np.asarray(part, np.float32) for part in (queries, base))
+        transposed = np.ascontiguousarray(base.T)
+
+        def multiply(block: np.ndarray) -> np.ndarray:
+            return block @ transposed
+
+    found = min(count + 1, len(base))  # one more tells whether rounding could change the others
+    rows = np.empty((len(queries), found), np.int32)
+    squared = np.empty((len(queries), found), np.float32)
+    nearest = np.zeros(len(base), np.int32)
+    best, second = np.full((2, len(base)), np.inf, np.float32)
+    step = max(1, BLOCK_SIZE // max(len(base), 2 * count * width))
+    parts = [slice(start, start + step) for start in range(0, len(queries), step)]
+    terms = terms0.astype(np.float32), terms1.astype(np.float32)
+    for part in parts:
+        block = multiply(queries[part]), terms[0][part], terms[1], part.start
+        scan_products(*block, rows[part], squared[part], nearest, best, second)
+    if whole:
+        return rows[:, :count], np.sqrt(squared[:, :count]), nearest
+    # Bounds of all rounding: of the sum of the product, and of the terms.
+    lengths = np.sqrt(terms0), np.sqrt(terms1)
+    bound = (width / 2 + 8) * float(np.finfo(np.float32).eps)
+    doubt = bound * (lengths[0] + lengths[1].max()) ** 2
+    unsure = np.flatnonzero(squared[:, -1] - squared[:, count - 1] <= doubt)
+    rows = rows[:, :count]
+    if found > count:
+        rows[unsure] = _nearest_in_double(queries[unsure], base, count)
+    unsure = np.flatnonzero(second - best <= bound * (lengths[1] + lengths[0].max()) ** 2)
+    nearest[unsure] = _nearest_in_double(base[unsure], queries, 1)[:, 0]
+    rows.sort(axis=1)
     distances = np.empty((len(queries), count), np.float32)
-    # The expansion below loses digits where distances are small: double precision, but for bytes,
-    # whose sums are whole numbers that single precision holds.
-    whole = queries.dtype == base.dtype == np.uint8 and queries.shape[1] <= MAX_EXACT_BYTES
-    precision: type[np.floating[Any]] = np.float32 if whole else np.float64
-    queries, base = (np.asarray(part, np.float32) for part in (queries, base))
-    # |q - b|^2 without the constant |q|^2, as one product: (-2 q, 1) (b, |b|^2).
-    length = base.shape[1]
-    wide = np.empty((length + 1, len(base)), precision)
-    wide[:length] = base.T
-    np.einsum("ij,ij->j", wide[:length], wide[:length], out=wide[length])
-    step = max(1, BLOCK_SIZE // max(len(base) * wide.itemsize // 4, 2 * count * length))
-    for start in range(0, len(queries), step):
-        block = queries[start : start + step]
-        factors = np.ones((len(block), length + 1), precision)
-        np.multiply(block, -2, out=factors[:, :length])
-        partial = factors @ wide
-        nearest = np.empty((len(block), count), np.intp)
-        for rank in range(count):  # argmin takes the lower row of equals
-            nearest[:, rank] = partial.argmin(1)
-            partial[np.arange(len(block)), nearest[:, rank]] = np.inf
-        nearest.sort(axis=1)
+    for part in parts:
         # From the differences themselves, so that distances are exact near 0.
-        gaps = np.linalg.norm(block[:, None] - base[nearest], axis=2)
+        gaps = np.linalg.norm(queries[part, None] - base[rows[part]], axis=2)
         order = np.argsort(gaps, axis=1, kind="stable")
-        rows[start : start + step] = np.take_along_axis(nearest, order, 1)
-        distances[start : start + step] = np.take_along_axis(gaps, order, 1)
-    return rows, distances
+        rows[part] = np.take_along_axis(rows[part], order, 1)
+        distances[part] = np.take_along_axis(gaps, order, 1)
+    return rows, distances, nearest
+
+
+def _nearest_in_double(queries: np.ndarray, base: np.ndarray, count: int) -> np.ndarray:
+    """Return the rows of the nearest by products in double precision, for few queries."""
+    rows = np.empty((len(queries), count), np.int32)
+    squares = np.einsum("ij,ij->i", base, base, dtype=np.float64)
+    step = max(1, BLOCK_SIZE // (2 * len(base)))
+    for start in range(0, len(queries), step):
+        block = squares - 2 * (queries[start : start + step].astype(np.float64) @ base.T)
+        for rank in range(count):  # argmin takes the lower row of equals
+            rows[start : start + step, rank] = nearest = block.argmin(1)
+            block[np.arange(len(block)), nearest] = np.inf
+    return rows
+
+
+@functools.cache
+def _byte_product() -> tuple[Any, int]:
+    """Return a session that multiplies bytes, and what is to be subtracted from those of the base.
+
+    The fastest instructions take signed bytes on one side. Processors without VNNI have others of
+    the kind, whose sums saturate: they are given bytes without a sign.
+    """
+    session = start_session(BYTE_PRODUCT, thread_limit(), spin=False)
+    most = np.full((8, 64), 255, np.uint8), np.full((64, 64), 127, np.int8)
+    if (session.run(None, dict(zip("ab", most, strict=True)))[0] == 64 * 255 * 127).all():
+        return session, 128
+    unsigned = BYTE_PRODUCT.replace(b"\x08\x03\x12", b"\x08\x02\x12")
+    return start_session(unsigned, thread_limit(), spin=False), 0
 
 
 def hamming_neighbours(
@@ -287,22 +355,19 @@ def match_descriptors(
     if len(descriptors0) == 0 or len(descriptors1) < 2:  # there is no second-best neighbour
         none = np.empty(0, np.int32)
         return DescriptorMatches(none, none, np.empty(0, np.float32))
-    rows, distances = matcher(descriptors0, descriptors1, 2, seed, positions)
+    few = len(descriptors0) * len(descriptors1) <= MAX_EXACT_PRODUCT
+    if matcher is exact_neighbours or (few and matcher is automatic_neighbours):
+        rows, distances, nearest = _search_both_ways(descriptors0, descriptors1, 2)
+    else:
+        rows, distances = matcher(descriptors0, descriptors1, 2, seed, positions)
+        back = None if positions is None else positions[::-1]
+        nearest = matcher(descriptors1, descriptors0, 1, seed, back)[0][:, 0] if mutual else rows
     best, second = distances[:, 0], distances[:, 1]
     # Two neighbours at distance 0 are equally good: their ratio is 1.
     ratios = np.divide(best, second, out=np.ones_like(best), where=second > 0)
     ratios[~np.isfinite(second)] = 1  # no second-best was found
     kept = ratios < ratio
     if mutual:
-        few = len(descriptors0) * len(descriptors1) <= MAX_EXACT_PRODUCT
-        exact = exact_neighbours, hamming_neighbours, *([automatic_neighbours] if few else [])
-        if matcher in exact:  # it finds for a query what it finds for many
-            asked = np.unique(rows[kept, 0])  # the way back of the others changes nothing
-            nearest = np.full(len(descriptors1), -1)
-            nearest[asked] = matcher(descriptors1[asked], descriptors0, 1, seed, None)[0][:, 0]
-        else:
-            back = None if positions is None else positions[::-1]
-            nearest = matcher(descriptors1, descriptors0, 1, seed, back)[0][:, 0]
         kept &= nearest[rows[:, 0]] == np.arange(len(rows))
     rows0 = np.flatnonzero(kept).astype(np.int32)
     return DescriptorMatches(rows0, rows[rows0, 0].astype(np.int32), ratios[rows0])

@@ -1,16 +1,11 @@
-"""What the backends share: how a runtime is imported, and what a network must answer."""
+"""What the backends share: options, and what a network must answer."""
 
 from __future__ import annotations
 
-import importlib
-import os
-import sys
-import threading
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -20,8 +15,6 @@ from ..pretrained import LOGITS
 
 PROBE_SHAPE = (24, 32)
 """Height and width of the image that a network is tried on."""
-
-_import_lock = threading.Lock()
 
 
 class Network(Protocol):
@@ -43,41 +36,6 @@ class RuntimeOptions:
     device: str = "cpu"
     threads: int | None = None
     precision: str = "float32"
-
-
-def import_onnxruntime() -> ModuleType:
-    """Import ONNX Runtime with ORT_DISABLE_TELEMETRY=1, unless the user has set it."""
-    # It is read during the import: disable_telemetry_events() would come too late.
-    variable = "ORT_DISABLE_TELEMETRY"
-    return _import_with("onnxruntime", os.environ, variable, os.environ.get(variable, "1"))
-
-
-def import_openvino() -> ModuleType:
-    """Import OpenVINO as if openvino_telemetry were not installed, which it is prepared for."""
-    # Only the variable CI would switch it off, which other packages read too.
-    return _import_with("openvino", sys.modules, "openvino_telemetry", None)
-
-
-def _import_with(
-    package: str, entries: MutableMapping[str, Any], key: str, value: object
-) -> ModuleType:
-    """Import a package while an entry has a value; then put back what was there.
-
-    Both packages start telemetry when they are imported: they write an identifier into the home
-    folder, and OpenVINO sends an event. One that was imported before is left as it is.
-    """
-    with _import_lock:
-        if package in sys.modules:
-            return importlib.import_module(package)
-        before = dict(entries)
-        entries[key] = value
-        try:
-            return importlib.import_module(package)
-        finally:
-            if key in before:
-                entries[key] = before[key]
-            else:
-                entries.pop(key, None)
 
 
 def output_to_read(names: Sequence[str]) -> str:

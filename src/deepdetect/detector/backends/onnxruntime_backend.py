@@ -9,19 +9,18 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import OptionError, first_line, unknown_name
+from ..._shared.runtimes import CPU, import_onnxruntime, start_session
 from ..pretrained import POINTS
 from .interface import (
     PROBE_SHAPE,
     RuntimeOptions,
     as_logits,
     failed_run,
-    import_onnxruntime,
     output_to_read,
     unreadable,
 )
 from .onnx_parts import leave_out_outputs
 
-CPU = "CPUExecutionProvider"
 PROVIDERS = {"cpu": CPU, "cuda": "CUDAExecutionProvider"}
 
 
@@ -74,23 +73,6 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
     if provider not in session.get_providers():
         raise _not_started(device, "no reason given")
     return OnnxRuntimeNetwork(session, path, options.threads)
-
-
-def start_session(
-    model: str | bytes, threads: int | None, provider: str = CPU, keep_memory: bool = True
-) -> Any:
-    """Start a session that prints nothing, for a file or its content."""
-    onnxruntime = import_onnxruntime()
-    settings = onnxruntime.SessionOptions()
-    settings.log_severity_level = 4  # what fails is said by the exception, and by us
-    settings.enable_cpu_mem_arena = settings.enable_mem_pattern = keep_memory
-    if threads is not None:
-        settings.intra_op_num_threads = int(threads)
-    # Falling back to the CPU after a failure, it would print blocks of text.
-    session = onnxruntime.InferenceSession(model, settings, providers=[provider], enable_fallback=0)
-    session.disable_fallback()
-    session._model_bytes = None  # the content of the file, which it keeps for falling back
-    return session
 
 
 def _not_started(device: str, reason: object) -> OptionError:

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import OptionError
+from ..._shared.runtimes import import_openvino
 from ..pretrained import LOGITS, PADDED_IMAGE, POINTS
 from .interface import (
     RuntimeOptions,
     as_logits,
     failed_run,
-    import_openvino,
     output_to_read,
     unreadable,
 )

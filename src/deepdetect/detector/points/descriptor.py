@@ -13,11 +13,11 @@ from ..._shared.errors import OptionError, WeightsError, first_line
 from ..._shared.machine import thread_limit
 from ..._shared.opencv import cv2
 from ..._shared.records import file_digest
+from ..._shared.runtimes import start_session
 from ...features.keypoints import Keypoints
 from ...features.learned import LEARNED, LEARNED_FREE, LENGTH, turn_descriptors
 from ...features.scale_space import set_angles
 from ...features.sift import ROOT_SIFT
-from ..backends.onnxruntime_backend import start_session
 from ..pretrained import RANKER, resolve_weights
 
 DESCRIPTOR_GRAPHS = {

@@ -28,8 +28,7 @@ from ..._shared.errors import OptionError, WeightsError, first_line
 from ..._shared.opencv import cv2
 from ..._shared.options import look_up
 from ..._shared.records import file_digest
-from ...detector.backends.interface import import_openvino
-from ...detector.backends.onnxruntime_backend import start_session
+from ..._shared.runtimes import import_openvino, start_session
 from ...features.keypoints import Keypoints
 from .hessian import HESSIAN
 from .method import COMMON_DESCRIPTOR, BaselineError, LocalFeature
