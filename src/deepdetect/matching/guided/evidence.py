@@ -72,8 +72,8 @@ WINDOW_PX = 16
 MIN_AROUND = 5
 """Of the eight windows around one, those with matches, for them to predict where it is seen."""
 
-MIN_WINDOWS = 20
-"""With fewer that can be compared nothing is known."""
+MIN_COMPARED = 20
+"""With fewer places, or windows, that can be compared nothing is known."""
 
 FALSE_POSITIVE_RATE = 0.05
 """Fraction of the unrelated windows that are as much alike, with those around them, as those of
@@ -124,7 +124,8 @@ def is_repeated(
         gain = (own - others)[known]
         alone = np.sum((gain > MIN_ZNCC_GAIN) & ~recurs[known])
         other_alone = np.sum(gain < -MIN_ZNCC_GAIN)
-        if alone < max(MIN_OWN_FRACTION * len(gain), MIN_OWN_RATIO * other_alone):
+        least = max(MIN_OWN_FRACTION * len(gain), MIN_OWN_RATIO * other_alone)
+        if len(gain) < MIN_COMPARED or alone < least:
             copy = scaled_homography(other, 1 / scale0, 1 / scale1)
             if sparse is None or not _parallax_decides(
                 first, scale0, sparse, homography, copy, seed
@@ -218,7 +219,7 @@ def compare_held_out(
     shift = rows // 2 * WINDOW_PX, columns // 2 * WINDOW_PX
     others, shown = (np.roll(values, shift, (0, 1)) for values in (seen, inside))
     unrelated = local_zncc(first, others, shown, WINDOW_PX, WINDOW_PX)
-    if min(np.isfinite(own).sum(), np.isfinite(unrelated).sum()) < MIN_WINDOWS:
+    if min(np.isfinite(own).sum(), np.isfinite(unrelated).sum()) < MIN_COMPARED:
         return 0.0, everything
     bound = np.nanquantile(_mean_around(unrelated), 1 - FALSE_POSITIVE_RATE)
     alike = ~(_mean_around(own) <= bound)  # or not known
