@@ -97,7 +97,9 @@ def test_matches_of_two_views(views: Views, load: Callable[..., Any]) -> None:
         for row, found in enumerate(features)
         for name, value in found.items()
     }
-    found = load("matchers", {"name": "deepdetect"})(data)
+    any_program = load("matchers", {"name": "deepdetect"})(data)["matches0"]
+    found = load("matchers", {"name": "deepdetect", "descriptor": "learned"})(data)
+    assert (found["matches0"] >= 0).sum() > (any_program >= 0).sum() > 150
     matches, scores = found["matches0"], found["matching_scores0"]
     assert matches.shape == scores.shape == (1, 500)
     rows0 = np.flatnonzero(matches[0] >= 0)

@@ -15,10 +15,9 @@ import numpy as np
 from .._shared.errors import OptionError, check_name, require_packages
 from ..detector.detector import AnyDetector, DeepDetect
 from ..detector.point_detector import PointDetector
-from ..features.keypoints import unit_length
+from ..features.keypoints import Keypoints, unit_length
 from ..features.learned import LEARNED
-from ..features.matchers import get_matcher, match_descriptors
-from ..matching.pipeline import match_images
+from ..matching.pipeline import match_features, match_images
 from .tensors import load_tensor
 
 require_packages("the drop-in for hloc", "hloc", "torch")
@@ -43,7 +42,7 @@ EXTRACTOR_CONF: dict[str, Any] = {
 
 MATCHER_CONF: dict[str, Any] = {
     "output": "matches-deepdetect",
-    "model": {"name": NAME},
+    "model": {"name": NAME, "descriptor": LEARNED},
 }
 """For `hloc.match_features.main`."""
 
@@ -106,17 +105,24 @@ class DeepDetectMatcher(BaseModel):
     """Nearest neighbours of descriptors with the ratio test, for `hloc.match_features`.
 
     Its options in hloc's configuration: `ratio` and `mutual`, as of `match_features`. It matches
-    the features of any extractor whose descriptors are compared by their Euclidean distance.
+    the features of any extractor whose descriptors are compared by their Euclidean distance. With
+    `descriptor` "learned" these are of `DeepDetectExtractor`, with `oris` in degrees, and matched
+    turned as the images are, which finds more.
     """
 
-    default_conf: dict[str, Any] = {"ratio": 0.85, "mutual": True}  # noqa: RUF012
+    default_conf: dict[str, Any] = {  # noqa: RUF012
+        "ratio": None,
+        "mutual": True,
+        "descriptor": None,
+    }
     required_inputs = ["descriptors0", "descriptors1"]  # noqa: RUF012
 
     def _init(self, conf: dict[str, Any]) -> None:
         _check_names(conf, self.default_conf)
-        if not 0 < conf["ratio"] <= 1:
-            raise OptionError(f"`ratio` must lie in (0, 1], not {conf['ratio']}")
-        self._ratio, self._mutual = float(conf["ratio"]), bool(conf["mutual"])
+        ratio, self._descriptor = conf["ratio"], conf["descriptor"]
+        if not (ratio is None or 0 < ratio <= 1):
+            raise OptionError(f"`ratio` must lie in (0, 1], not {ratio}")
+        self._how = {"matcher": "exact", "ratio": ratio, "mutual": bool(conf["mutual"])}
 
     def _forward(self, data: dict[str, Tensor]) -> dict[str, Tensor]:
         described = [data[name][0].T.cpu().float().numpy() for name in self.required_inputs]
@@ -124,13 +130,23 @@ class DeepDetectMatcher(BaseModel):
             raise OptionError(
                 f"hloc takes {MAX_KEYPOINTS} keypoints at most, not {len(described[1])}: use fewer"
             )
-        first, second = (np.ascontiguousarray(descriptors) for descriptors in described)
-        found = match_descriptors(
-            first, second, get_matcher("exact"), ratio=self._ratio, mutual=self._mutual
-        )
+        features = []
+        for side, descriptors in enumerate(described):
+            count, oris = len(descriptors), data.get(f"oris{side}")
+            features.append(
+                Keypoints(
+                    np.zeros((count, 2)),  # where they are does not matter
+                    np.ones(count),
+                    (1, 1),
+                    angles=None if oris is None else oris[0, :count].cpu().float().numpy() % 360,
+                    descriptors=np.ascontiguousarray(descriptors),
+                    descriptor_type=self._descriptor,
+                )
+            )
+        found = match_features(*features, **self._how)
         matches = np.full(len(described[0]), -1, np.int64)
         scores = np.zeros(len(described[0]), np.float32)
-        matches[found.indices0], scores[found.indices0] = found.indices1, 1 - found.ratios
+        matches[found.indices0], scores[found.indices0] = found.indices1, found.scores
         return {
             "matches0": torch.from_numpy(matches)[None],
             "matching_scores0": torch.from_numpy(scores)[None],

@@ -20,7 +20,7 @@ import numpy as np
 from ..._shared.errors import OptionError
 from ...detector.points.descriptor import describe_learned
 from ...features.keypoints import Keypoints
-from ...features.learned import LEARNED, match_learned
+from ...features.learned import LEARNED, is_learned, match_learned
 from ...features.matchers import exact_neighbours, match_descriptors
 from ...features.matches import TwoViewGeometry
 from ...features.sift import detect_sift
@@ -181,7 +181,7 @@ def _match_sparse(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, ...]
     assert first.descriptors is not None
     assert second.descriptors is not None
     match = partial(match_descriptors, matcher=exact_neighbours, ratio=max(MAX_RATIOS), mutual=True)
-    if first.descriptor_type == LEARNED:
+    if is_learned(first.descriptor_type):
         matches = match_learned(first, second, match)
     else:
         matches = match(first.descriptors, second.descriptors)

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..._shared.errors import RegistrationError
 from ...detector.detector import AnyDetector, find_keypoints
+from ...detector.point_detector import PointDetector
 from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
 from ...features.sift import describe_keypoints, detect_sift
@@ -119,7 +120,10 @@ def register_images(
 def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
     gray = luma(image)
     if not hasattr(detector, "heatmap"):
-        points = describe_keypoints(gray, find_keypoints(detector, image))
+        if isinstance(detector, PointDetector):
+            points = detector.extract(image)
+        else:
+            points = describe_keypoints(gray, find_keypoints(detector, image))
         return _Image(gray, points, np.rint(points.xy))
     # Without suppression: neighbouring pixels are what the verification compares.
     keypoints = find_keypoints(detector, image, SelectionOptions(max_keypoints=MAX_KEYPOINTS))
