@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import Keypoints, PointDetector, load_image
+from deepdetect import Keypoints, PointDetector
 from deepdetect.datasets.posed_images import PosedPair, load_posed_scenes
 from deepdetect.evaluation.metrics.pose import epipolar_inlier_ratio
 from deepdetect.evaluation.protocols.sfm import (
@@ -17,8 +17,6 @@ from deepdetect.evaluation.protocols.sfm import (
     find_sift,
     match_sift,
 )
-from deepdetect.features.sift import describe_keypoints
-from deepdetect.io.image import luma
 from deepdetect.sfm.stages import MultiViewOptions, Stages
 
 NAMES = ("0004", "0005", "0006")
@@ -77,9 +75,9 @@ def test_random_points_differ_from_ours_in_nothing_but_their_places(scene, tmp_p
         np.testing.assert_allclose(counts, len(own["keypoints"]) / 4, rtol=0.25)
         values = {"sizes": 2 * its["scales"], "angles": its["oris"]}
         points = Keypoints(its["keypoints"], its["scores"], tuple(map(int, size)), **values)
-        expected = describe_keypoints(luma(load_image(folder / name)), points).descriptors
+        expected = PointDetector(8192).describe(folder / name, points).descriptors
         expected = expected / np.linalg.norm(expected.astype(np.float32), axis=1, keepdims=True)
-        np.testing.assert_allclose(its["descriptors"].T, expected, atol=1e-6)
+        np.testing.assert_allclose(its["descriptors"].T, expected, atol=1e-5)
     first, second = (both[1][name]["keypoints"] for name in pair)
     assert np.abs(first[:100] - second[:100]).max() > 10  # other places in each photograph
     true, chance = (agreement(scene, stages, stages.match([pair]))[0] for stages in (ours, random))
