@@ -81,6 +81,12 @@ def test_bytes_equal_a_naive_search_both_ways(
     np.testing.assert_array_equal(matches.indices1, rows[kept, 0])
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+def test_nothing_has_no_neighbours(kind: type) -> None:
+    rows, distances = exact_neighbours(np.empty((0, 64), kind), np.ones((5, 64), kind), 2, 0)
+    assert rows.shape == distances.shape == (0, 2)
+
+
 @pytest.mark.parametrize("noise", [0.3, 1e-4, 0])
 def test_mutual_neighbours_are_those_of_a_naive_search(noise: float) -> None:
     rng = np.random.default_rng(1)
