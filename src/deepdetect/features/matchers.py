@@ -117,17 +117,17 @@ def _search_both_ways(
     for part in parts:
         block = multiply(queries[part]), terms[0][part], terms[1], part.start
         scan_products(*block, rows[part], squared[part], nearest, best, second)
-    if whole:
+    if whole or not len(queries):
         return rows[:, :count], np.sqrt(squared[:, :count]), nearest
     # Bounds of all rounding: of the sum of the product, and of the terms.
     lengths = np.sqrt(terms0), np.sqrt(terms1)
     bound = (width / 2 + 8) * float(np.finfo(np.float32).eps)
-    doubt = bound * (lengths[0] + lengths[1].max(initial=0)) ** 2
+    doubt = bound * (lengths[0] + lengths[1].max()) ** 2
     unsure = np.flatnonzero(squared[:, -1] - squared[:, count - 1] <= doubt)
     rows = rows[:, :count]
     if found > count:
         rows[unsure] = _nearest_in_double(queries[unsure], base, count)
-    unsure = np.flatnonzero(second - best <= bound * (lengths[1] + lengths[0].max(initial=0)) ** 2)
+    unsure = np.flatnonzero(second - best <= bound * (lengths[1] + lengths[0].max()) ** 2)
     nearest[unsure] = _nearest_in_double(base[unsure], queries, 1)[:, 0]
     rows.sort(axis=1)
     distances = np.empty((len(queries), count), np.float32)
