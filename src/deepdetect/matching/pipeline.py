@@ -26,7 +26,7 @@ from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
 from ..geometry.transforms import epipolar_errors, transfer_errors
 from ..io.image import Images, ignore_masks, load_image, luma
-from .guided import TentativeMatches, guided_matches, guiding_geometry, learned_geometry
+from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .guided.initial_geometry import checked_positions
 
 GUIDED_STAGES = ("initial geometry", "keypoints", "guided matching", "geometry")
@@ -295,11 +295,6 @@ def _match_guided(
             first = guiding_geometry(grays, guiding, seed, keypoints if source is None else source)
         pixels = np.rint(keypoints[0].xy), np.rint(keypoints[1].xy)
         guide, matched = guided_matches(grays, pixels, first, seed)
-        if matched is None and source is None and not first.learned:
-            # SIFT's keypoints agree with a geometry, but nothing else does.
-            again = learned_geometry(grays, guiding, seed)
-            if again.matrix is not None:
-                guide, matched = guided_matches(grays, pixels, again, seed)
     if matched is None:
         return _no_matches(*keypoints, guide, timer)
     # Where a keypoint of the second image is none of a match, its end is where the pixel of the

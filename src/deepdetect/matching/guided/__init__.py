@@ -4,7 +4,6 @@ from .initial_geometry import (
     TentativeMatches,
     find_tentative_matches,
     guiding_geometry,
-    learned_geometry,
 )
 from .pipeline import guided_matches
 
@@ -13,5 +12,4 @@ __all__ = [
     "find_tentative_matches",
     "guided_matches",
     "guiding_geometry",
-    "learned_geometry",
 ]

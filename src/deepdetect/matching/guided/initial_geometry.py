@@ -20,7 +20,7 @@ import numpy as np
 from ..._shared.errors import OptionError
 from ...detector.points.descriptor import describe_learned
 from ...features.keypoints import Keypoints
-from ...features.learned import LEARNED, is_learned, match_learned
+from ...features.learned import is_learned, match_learned
 from ...features.matchers import exact_neighbours, match_descriptors
 from ...features.matches import TwoViewGeometry
 from ...features.sift import detect_sift
@@ -229,14 +229,6 @@ class InitialGeometry(TwoViewModel):
         )
 
     @property
-    def learned(self) -> bool:
-        """Whether it comes from learned descriptors."""
-        source = self.source
-        return isinstance(source, TentativeMatches) and (
-            source.features[0].descriptor_type == LEARNED
-        )
-
-    @property
     def all_points(self) -> Pair:
         """Positions of all matches, those that agree with the model first."""
         assert self.others is not None
@@ -300,7 +292,7 @@ def guiding_geometry(
     if geometry.matrix is not None:
         return replace(geometry, source=tentative)
     if not given:
-        geometry = learned_geometry(grays, model, seed)
+        geometry = _learned_geometry(grays, model, seed)
         if geometry.matrix is not None:
             return geometry
     tentative = _learned_matches(grays, SIMULATED_SIDE_PX, SIMULATED_KEYPOINTS)
@@ -310,7 +302,7 @@ def guiding_geometry(
     return replace(geometry, source=source)
 
 
-def learned_geometry(grays: Pair, model: str = "auto", seed: int = 0) -> InitialGeometry:
+def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
     """Find the geometry that points with learned descriptors show, where one is a negative, too.
 
     In unlike light, the dark, blur, or from another side two to fifteen times as many of them agree
