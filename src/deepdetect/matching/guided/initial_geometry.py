@@ -207,7 +207,7 @@ class InitialGeometry(TwoViewModel):
 
     `points0` and `points1` are the matches that agree with it, `others` those that do not, None
     where the model was asked for; `num_views` were simulated for them. Another model would be found
-    from the `source`. A `negative` is the second image of the first.
+    from the `source`. A `learned` one is of points; a `negative` is the second image of the first.
     """
 
     points0: np.ndarray
@@ -215,6 +215,7 @@ class InitialGeometry(TwoViewModel):
     others: Pair | None
     num_views: int = 0
     source: Source = None
+    learned: bool = False
     negative: bool = False
 
     @classmethod
@@ -309,17 +310,17 @@ def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
     as of SIFT's keypoints; where one image is four times as large, SIFT's are more. SIFT's lie more
     exactly where they belong, which tells depth from a plane.
     """
-    as_it_is = _learned_matches(grays, MAX_SIDE_PX, LEARNED_KEYPOINTS)
+    as_it_is = _learned_matches(grays, COARSE_SIDE_PX, LEARNED_KEYPOINTS)
     first, second = as_it_is.features
     assert second.angles is not None
     # Points and sizes are those of the image, gradients point the other way.
     second = replace(second, angles=(second.angles + 180) % 360)
     second = describe_learned(255 - as_it_is.views[1], second)
-    inverted = find_tentative_matches(*grays, (first, second))
+    inverted = find_tentative_matches(*grays, (first, second), max_side_px=COARSE_SIDE_PX)
     negative = len(inverted.ratios) > len(as_it_is.ratios)
     tentative = inverted if negative else as_it_is
     geometry = estimate_initial_geometry(tentative, model, seed)
-    return replace(geometry, source=tentative, negative=negative)
+    return replace(geometry, source=tentative, learned=True, negative=negative)
 
 
 def _learned_matches(grays: Pair, side_px: int, keypoints: int) -> TentativeMatches:

@@ -182,7 +182,8 @@ def _plane_or_depth(
     matrix = most_alike(*grays, known)
     on_plane, verified = match_by_homography(grays, pixels, matrix, seed)
     planar = first.parallax is None or verified >= MIN_VERIFIED_FRACTION
-    off_plane = first.parallax is not None and first.parallax.significant
+    # Points with learned descriptors lie where they belong less exactly, which looks like parallax.
+    off_plane = first.parallax is not None and first.parallax.significant and not first.learned
     plane = _trusted(first, matrix, on_plane, enough)
     plane = replace(plane[0], verified=verified), plane[1]
     clear = first.parallax is not None and first.parallax.log10_nfa < MAX_PARALLAX_LOG10_NFA
