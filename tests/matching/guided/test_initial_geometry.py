@@ -148,16 +148,29 @@ def test_the_centre_of_the_first_pixel_is_the_origin(
     assert np.abs(gaps.mean(0)).max() < 0.08
 
 
-def test_a_strong_tilt_needs_simulated_views(picture: Callable[..., np.ndarray]) -> None:
+NINE_POINTS = pytest.mark.xfail(
+    strict=True, reason="nine points with learned descriptors decide first, 2.3 px off"
+)
+
+
+@pytest.mark.parametrize(
+    ("turn", "swapped"),
+    [pytest.param(0.0, False, marks=[pytest.mark.slow, NINE_POINTS]), (35.0, True)],
+)
+def test_a_strong_tilt_needs_simulated_views(
+    picture: Callable[..., np.ndarray], turn: float, swapped: bool
+) -> None:
     gray = picture("astronaut", (360, 360))
-    side, true = from_the_side(gray, 4, 35.0)
+    side, true = from_the_side(gray, 4, turn)
     # The initial geometry counts in pixels of the second image, so the truth is asked for there.
-    found, true = geometry_of_views(side, gray), np.linalg.inv(true)
+    pair = (side, gray) if swapped else (gray, side)
+    true = np.linalg.inv(true) if swapped else true
+    found = geometry_of_views(*pair)
     assert found.model == "homography"
     assert found.num_views > 0
     assert len(found.points0) >= 20
     check_agreeing(found)
-    tilt = 4  # pixels of the long side for one of the short
+    tilt = 4 if swapped else 1  # pixels of the long side for one of the short
     errors = transfer_errors(found.points0, found.points1, true)
     assert np.median(errors) < 2 * tilt
     assert np.quantile(errors, 0.9) < 4 * tilt
