@@ -111,15 +111,17 @@ def test_a_plane_that_moves_otherwise_keeps_its_matches_and_spoils_no_others(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [1, 8])  # of the ninth all disparities are too many
-def test_a_dominant_plane_does_not_hide_the_depth_beside_it(shared: Path, number: int) -> None:
+@pytest.mark.parametrize(("number", "times"), [(1, 5), (8, 4)])
+def test_a_dominant_plane_does_not_hide_the_depth_beside_it(
+    shared: Path, number: int, times: int
+) -> None:
     (scene,) = load_posed_scenes(shared / "data" / "entry")
     first, second = scene.images[0 if number == 1 else 2], scene.images[number]
     matches = match(first.path, second.path)
     guide = matches.two_view_geometry
     assert guide.model == "fundamental"
     assert guide.scene == "depth with a dominant plane"
-    assert guide.on_plane > 2 * guide.off_plane > 10_000
+    assert guide.on_plane > times * guide.off_plane > 10_000
     pair = PosedPair("entry", first, second)
     errors = epipolar_errors(matches.points0, matches.points1, pair.fundamental)
     assert (errors < 3).mean() > 0.99
