@@ -151,7 +151,7 @@ def test_all_files_are_there_and_readable(small, pycolmap) -> None:
     }
     values = json.loads((output / "model.json").read_text())
     assert (values["images"], values["registered"]) == (7, 3)
-    model = pycolmap.Reconstruction(output / "sparse")
+    model = pycolmap.Reconstruction(output / "sparse" / "0")
     assert model.num_reg_images() == 3
     assert model.num_points3D() == values["sparse_points"]
     for image in model.images.values():
@@ -175,7 +175,9 @@ def test_a_run_goes_on_where_it_was_killed(small, tmp_path: Path, monkeypatch) -
     lost, damaged, *kept = sorted((output / "work" / "dense").iterdir())
     lost.unlink()
     damaged.write_bytes(damaged.read_bytes()[:1000])
-    times = {path: path.stat().st_mtime_ns for path in [*kept, output / "sparse" / "images.bin"]}
+    times = {
+        path: path.stat().st_mtime_ns for path in [*kept, output / "work" / "sparse" / "images.bin"]
+    }
     monkeypatch.setattr(stages, "map_images", None)  # it would fail
     found = reconstruct_many(folder, output, **QUICK)
     assert times == {path: path.stat().st_mtime_ns for path in times}

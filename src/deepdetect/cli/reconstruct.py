@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from .._shared.errors import OptionError
 from .._shared.progress import stage_progress
@@ -15,6 +15,7 @@ from ..io.point_cloud import find_writer
 from ..reconstruction.files import ENDINGS, save_reconstruction
 from ..reconstruction.pipeline import reconstruct as reconstruct_pair
 from ..sfm.colmap import import_pycolmap
+from ..sfm.formats import FORMATS, check_formats
 from ..sfm.pipeline import MAX_KEYPOINTS, check_output_folder, output_files, reconstruct_many
 from ..sfm.stages import MultiViewOptions, check_images
 from . import _options as cli
@@ -30,7 +31,13 @@ CAMERAS = cli.From(
 )
 MANY = cli.From(
     MultiViewOptions,
-    flags={"stride_px": "--stride", "single_camera": "--single-camera/--camera-each"},
+    flags={
+        "stride_px": "--stride",
+        "single_camera": "--single-camera/--camera-each",
+        "control_points": "--gcp",
+        "formats": "--format",
+    },
+    types={"control_points": Path | None, "formats": tuple[Literal["laz", "map"], ...]},
 )
 WORKERS = cli.From(reconstruct_many, more="workers")
 """Options that two images do not have."""
@@ -56,8 +63,9 @@ def reconstruct(
     disparity map become points; --density 1 takes all of them.
 
     A folder, or three and more images: their cameras are estimated, too. Writes model.ply,
-    model.glb, model.html (with the cameras), model.json, and COLMAP's sparse/ and database.db. When
-    it is interrupted or killed, the same command goes on. Images that cannot be read, or show
+    model.glb, model.html (with the cameras), model.json, and COLMAP's sparse/0 and database.db.
+    Where the images carry GPS, the model goes east, north and up in metres. When it is interrupted
+    or killed, the same command goes on. Images that cannot be read, or show
     something else, are left out, and listed.
 
         deepdetect reconstruct left.png right.png --calibration calib.json -o model.ply
@@ -65,6 +73,8 @@ def reconstruct(
         deepdetect reconstruct phone1.jpg phone2.jpg -o phone/
         deepdetect reconstruct photos/ -o model/
         deepdetect reconstruct frames/ --pairs sequential:8 -o model/
+        deepdetect reconstruct drone/ --gcp gcp_list.txt --format laz map -o model/
+        deepdetect reconstruct photos/ --scale-by 0.25 a.jpg:812,640 a.jpg:1290,655 -o model/
 
     Args:
         output: Folder for all files; of two images also the model, .ply, .glb or .html: the other
@@ -111,13 +121,16 @@ def _reconstruct_many(
     many = MANY.take(values)
     # What is missing or wrong is said before anything is written.
     import_pycolmap()
+    check_formats(many.get("formats", ()))
     check_output_folder(output)
     check_images(source)
     values |= {"selection": selection, "options": MultiViewOptions(**many), "overwrite": overwrite}
-    files = output_files(output)
+    files = output_files(output, many.get("formats", ()))
     with Outputs(files, sorted(images), overwrite=overwrite, growing=True).writing():
         reconstruct_many(source, output, detector, quiet=False, **values)
     numbers = json.loads((output / "model.json").read_text(encoding="utf-8"))
     # model.json names all, and where each camera is.
     few = dict(islice(numbers["unregistered"].items(), MAX_UNREGISTERED))
-    return cli.Result(numbers, cli.table({**numbers, "cameras": None, "unregistered": few}))
+    place = {**numbers.get("georeference", {}), "residuals_m": None}
+    shown = {**numbers, "cameras": None, "unregistered": few, "georeference": place}
+    return cli.Result(numbers, cli.table(shown))

@@ -10,11 +10,15 @@ from .._shared.errors import OptionError, check_name
 from .._shared.options import suggest_keywords
 
 UNITS = {
+    "m": "metres",
     "mm": "millimetres",
     "baseline": "baselines (1 = the distance of the two cameras)",
     "spacing": "spacings (1 = the median distance from a camera to the nearest other one)",
 }
 """Of lengths, as files explain them; with the last two the scale is not known."""
+
+EAST_NORTH_UP = "x east, y north, z up"
+"""Frame of a cloud whose place on the Earth is known; others are frames of cameras."""
 
 BOX_PERCENTILE = 1.0
 """Percent of the points that lie beyond each side of the robust box."""
@@ -26,14 +30,15 @@ MAX_ANGULAR_SPACING = 0.02
 @suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class PointCloud:
-    """Coloured points in the frame of a camera: x right, y down, z forward.
+    """Coloured points in the frame of a camera: x right, y down, z forward; or `EAST_NORTH_UP`.
 
     Attributes:
         points: (N, 3) float32 or float64 positions, the camera's centre at (0, 0, 0).
         colors: (N, 3) uint8 sRGB.
-        unit: "mm"; or lengths are multiples of the distance of the two cameras ("baseline"), or of
-            the median distance from one of many cameras to the nearest other one ("spacing").
-        frame: which camera that is.
+        unit: "mm" or "m"; or lengths are multiples of the distance of the two cameras ("baseline"),
+            or of the median distance from one of many cameras to the nearest other ("spacing").
+        frame: which camera that is, or `EAST_NORTH_UP`.
+        normals: (N, 3) float32 of length 1, towards the cameras, or None.
 
     `len` and indexing by slices, masks and index arrays work.
 
@@ -51,6 +56,7 @@ class PointCloud:
     colors: np.ndarray
     unit: str
     frame: str = "left camera"
+    normals: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         check_name("unit", self.unit, UNITS)
@@ -82,7 +88,15 @@ class PointCloud:
     def __getitem__(self, index: slice | np.ndarray | list[int]) -> PointCloud:
         if isinstance(index, (int, np.integer)):
             index = [int(index)]
-        return PointCloud(self.points[index], self.colors[index], self.unit, self.frame)
+        normals = None if self.normals is None else self.normals[index]
+        return PointCloud(self.points[index], self.colors[index], self.unit, self.frame, normals)
+
+    @property
+    def axes(self) -> str:
+        """The frame, as files explain it."""
+        if self.frame == EAST_NORTH_UP:
+            return self.frame
+        return f"{self.frame}, x right, y down, z forward, origin at its centre"
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.image_array import srgb_to_linear
-from ..geometry.point_cloud import UNITS, PointCloud
+from ..geometry.point_cloud import EAST_NORTH_UP, UNITS, PointCloud
 
 FLOAT, UNSIGNED_SHORT, ARRAY_BUFFER, POINTS = 5126, 5123, 34962, 0
 
@@ -27,10 +27,12 @@ def write_glb(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> Non
     Colours become linear as glTF requires, with 16 bits, which keep each of the 256 sRGB levels
     apart. The metadata are in the asset's extras, with unit and frame.
     """
-    # A half turn about the x axis makes y point up and z backward. Units of unknown length become
-    # metres, and the file says so.
-    half_turn = np.array([1, -1, -1]) * (1e-3 if cloud.unit == "mm" else 1.0)
-    positions = (cloud.points * half_turn).astype("<f4")
+    # A half turn about the x axis makes y point up and z backward, of what goes up already a
+    # quarter. Units of unknown length become metres, and the file says so.
+    turned = cloud.points[:, [0, 2, 1]] if cloud.frame == EAST_NORTH_UP else cloud.points
+    signs = [1, 1, -1] if cloud.frame == EAST_NORTH_UP else [1, -1, -1]
+    unit = 1e-3 if cloud.unit == "mm" else 1.0
+    positions = (turned * (np.array(signs) * unit)).astype("<f4")
     colors = np.full((len(cloud), 4), 65535, "<u2")
     colors[:, :3] = np.rint(65535 * srgb_to_linear()).astype("<u2")[cloud.colors]
     text = json.dumps(_tree(cloud, positions, metadata), separators=(",", ":")).encode("ascii")
@@ -49,7 +51,7 @@ def _tree(cloud: PointCloud, positions: np.ndarray, metadata: Mapping[str, str])
     count = len(cloud)
     box = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
     primitive = {"attributes": {"POSITION": 0, "COLOR_0": 1}, "mode": POINTS, "material": 0}
-    unit = "metres" if cloud.unit == "mm" else f"{UNITS[cloud.unit]}, of unknown length"
+    unit = "metres" if cloud.unit in ("mm", "m") else f"{UNITS[cloud.unit]}, of unknown length"
     rough = {"metallicFactor": 0, "roughnessFactor": 1}
     return {
         "asset": {
@@ -57,7 +59,9 @@ def _tree(cloud: PointCloud, positions: np.ndarray, metadata: Mapping[str, str])
             "generator": "deepdetect",
             "extras": {
                 "unit": unit,
-                "frame": f"origin at the {cloud.frame}, x right, y up, z backward",
+                "frame": "x east, y up, z south"
+                if cloud.frame == EAST_NORTH_UP
+                else f"origin at the {cloud.frame}, x right, y up, z backward",
                 "notes": dict(metadata),
             },
         },

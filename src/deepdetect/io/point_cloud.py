@@ -18,14 +18,19 @@ Metadata = Mapping[str, str | int | float]
 PointCloudWriter = Callable[[PointCloud, Path, Mapping[str, str]], None]
 
 VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
+VERTEX_WITH_NORMAL = np.dtype([("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
 
 
 def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> None:
     """Write binary PLY (Turk, 1994): float x y z, uchar red green blue; 15 bytes per point.
 
+    With normals, nx ny nz come between, and it is 27.
     Frame, unit and metadata are comments, which libraries do not write; non-ASCII becomes "?".
     """
-    vertices = np.empty(len(cloud), VERTEX)
+    vertices = np.empty(len(cloud), VERTEX if cloud.normals is None else VERTEX_WITH_NORMAL)
+    names = "x y z" if cloud.normals is None else "x y z nx ny nz"
+    if cloud.normals is not None:
+        vertices["normal"] = cloud.normals
     vertices["xyz"] = cloud.points
     vertices["rgb"] = cloud.colors
     header = [
@@ -33,10 +38,10 @@ def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> Non
         "format binary_little_endian 1.0",
         "comment written by deepdetect",
         f"comment unit: {UNITS[cloud.unit]}",
-        f"comment frame: {cloud.frame}, x right, y down, z forward, origin at its centre",
+        f"comment frame: {cloud.axes}",
         *(f"comment {name}: {text}" for name, text in metadata.items()),
         f"element vertex {len(cloud)}",
-        *(f"property float {axis}" for axis in "xyz"),
+        *(f"property float {axis}" for axis in names.split()),
         *(f"property uchar {colour}" for colour in ("red", "green", "blue")),
         "end_header\n",
     ]

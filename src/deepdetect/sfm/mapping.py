@@ -17,6 +17,7 @@ import numpy as np
 from .._shared.errors import NoDepthError
 from ..batch.pair_list import Pair
 from ..geometry.camera import PosedView, camera_spacing
+from ..geometry.similarity import Similarity
 from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
 from .pair_selection import largest_component
 
@@ -223,9 +224,12 @@ def normalise_model(model: Any) -> None:
     view = max(sparse.images.values(), key=lambda image: len(image.points)).view
     centres = np.array([each.centre for each in sparse.views.values()])
     scale = 1 / (camera_spacing(centres) or 1.0)
+    own = Similarity(scale, view.rotation, scale * np.asarray(view.translation))
+    transform_model(model, own)
+
+
+def transform_model(model: Any, similarity: Similarity) -> None:
+    """Move, turn and scale a `pycolmap.Reconstruction`."""
     with quiet_pycolmap() as pycolmap:
-        model.transform(
-            pycolmap.Sim3d(
-                scale, pycolmap.Rotation3d(view.rotation), scale * np.asarray(view.translation)
-            )
-        )
+        rotation = pycolmap.Rotation3d(similarity.rotation)
+        model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,13 +23,15 @@ from ..batch.pair_list import Pair
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.selection import SelectionOptions
-from ..geometry.camera import Calibration, Camera
-from ..geometry.point_cloud import PointCloud
+from ..geometry.camera import Calibration, Camera, PosedView
+from ..geometry.point_cloud import EAST_NORTH_UP, PointCloud
 from ..io.html_viewer import write_html_page
 from ..io.point_cloud import save_point_cloud
-from .colmap import import_pycolmap, initial_intrinsics, known_cameras
+from .colmap import import_pycolmap, initial_intrinsics, known_cameras, write_colmap_model
 from .dense import DENSE_POINT
-from .mapping import MIN_VIEWS, SparseModel, read_sparse_model
+from .formats import FORMATS, check_formats
+from .georeference import Georeference, georeference, read_control_points
+from .mapping import MIN_VIEWS, SparseModel, read_sparse_model, transform_model
 from .result import MultiViewReconstruction
 from .stages import WORK, MultiViewOptions, Stages
 
@@ -57,8 +60,9 @@ def reconstruct_many(
     """Reconstruct the cameras and a dense model from three or more images of a scene.
 
     Writes into the folder `output`: model.ply, model.glb, model.html (a viewer, with the cameras),
-    model.json, sparse/ and database.db (COLMAP's), and work/ with what each stage made. A call that
-    was interrupted or killed goes on when it is made again. A script must call this under
+    model.json, sparse/0 and database.db (COLMAP's), and work/ with what each stage made. Where the
+    images carry GPS, all of it is in metres east, north and up. A call that was interrupted or
+    killed goes on when it is made again. A script must call this under
     `if __name__ == "__main__":`, since processes are started.
 
     Args:
@@ -90,6 +94,8 @@ def reconstruct_many(
         ...     found.centres, found.dense.points, found.unregistered
     """
     import_pycolmap()  # what is missing is said before hours of work
+    check_formats(options.formats)
+    control = read_control_points(options.control_points) if options.control_points else None
     target = Path(output)
     check_output_folder(target)
     if calibration is not None and focal_px is not None:
@@ -127,17 +133,25 @@ def reconstruct_many(
     intrinsics = initial_intrinsics(folder, sizes, known, focal_px, options.single_camera)
     with timer.stage("mapping"):
         model, verified, components = stages.map(folder, intrinsics, matches, bool(known))
-    sparse = read_sparse_model(model, {name: own.source for name, own in intrinsics.items()})
+    sources = {name: own.source for name, own in intrinsics.items()}
+    sparse = read_sparse_model(model, sources)
     for name in sizes:
         if name not in sparse.images:
             unregistered[name] = _why_unregistered(name, verified, components)
     with timer.stage("dense points"):
         dense = stages.dense(folder, sparse) if options.dense else np.empty(0, DENSE_POINT)
     with timer.stage("files"):
-        views = dict(sorted(sparse.views.items()))
-        reference = min(views, key=lambda name: float(np.linalg.norm(views[name].centre)))
+        reference = min(sparse.views.values(), key=lambda v: float(np.linalg.norm(v.centre))).name
         unit = "spacing", f"camera of {reference}"
+        place = georeference(sparse, dense["points"], folder, control, options.scale_by)
+        if isinstance(place, Georeference):
+            unit = "m", unit[1] if place.origin is None else EAST_NORTH_UP
+            transform_model(model, place.similarity)
+            sparse = read_sparse_model(model, sources)
+            dense["points"] = place.similarity.apply(dense["points"])
+        views = dict(sorted(sparse.views.items()))
         found = MultiViewReconstruction(
+            georeference=place,
             views=views,
             intrinsics={name: sparse.images[name].intrinsics for name in views},
             unregistered=dict(sorted(unregistered.items())),
@@ -154,9 +168,10 @@ def reconstruct_many(
             pairs=len(pairs),
             pair_choice=options.pair_choice(len(sizes)),
             seconds=timer.seconds,
-            files=output_files(target)[:-1],
+            files=output_files(target, options.formats)[:-1],
         )
-        _write(found, target)
+        write_colmap_model(model, found.sparse.colors, target / "sparse" / "0")
+        _write(found, target, options.formats)
     return found
 
 
@@ -166,14 +181,15 @@ def check_output_folder(output: Path) -> None:
         raise OptionError(f"{output} is the name of a file: give the name of a folder with -o")
 
 
-def output_files(output: Path) -> tuple[Path, ...]:
+def output_files(output: Path, formats: Sequence[str] = ()) -> tuple[Path, ...]:
     """Name all that is written into the folder of the results; the last is what stages made."""
-    names = ("model.ply", "model.glb", "model.html", "model.json", "sparse", "database.db", WORK)
-    return tuple(output / name for name in names)
+    names = ("model.ply", "model.glb", "model.html", "model.json", "sparse", "database.db")
+    more = [file for name in formats for file in FORMATS[name].files]
+    return tuple(output / name for name in (*names, *more, WORK))
 
 
-def _write(found: MultiViewReconstruction, output: Path) -> None:
-    """Write the files of the model, the JSON last."""
+def _write(found: MultiViewReconstruction, output: Path, formats: Sequence[str]) -> None:
+    """Write the files of the model, and further formats, which may lack a place."""
     notes = {
         "title": f"{len(found.views)} images",
         "images": f"{len(found.views)} of {len(found.views) + len(found.unregistered)}",
@@ -182,10 +198,27 @@ def _write(found: MultiViewReconstruction, output: Path) -> None:
     save_point_cloud(found.cloud, output / "model.ply", notes)
     save_point_cloud(found.cloud, output / "model.glb", notes)
     with atomic_path(output / "model.html") as path:
-        write_html_page(found.cloud, path, notes, list(found.views.values()))
+        page, cameras = _seen_from(found.views[found.reference], found)
+        write_html_page(page, path, notes, cameras)
     values = {**found.summary(), "files": [str(path) for path in found.files]}
     with atomic_path(output / "model.json") as path:
         path.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+    for name in formats:
+        FORMATS[name].write(found, output)
+
+
+def _seen_from(
+    view: PosedView, found: MultiViewReconstruction
+) -> tuple[PointCloud, list[PosedView]]:
+    """Return the points and cameras in the frame of one of these, as the page shows them."""
+    frame = f"camera of {view.name}"
+    points = found.cloud.points @ view.rotation.T + view.translation
+    cameras = []
+    for each in found.views.values():
+        rotation = each.rotation @ view.rotation.T
+        moved = each.translation - rotation @ view.translation
+        cameras.append(replace(each, rotation=rotation, translation=moved))
+    return PointCloud(points, found.cloud.colors, found.cloud.unit, frame), cameras
 
 
 def _why_unregistered(

@@ -12,9 +12,10 @@ import numpy as np
 from ..geometry.camera import PosedView
 from ..geometry.point_cloud import PointCloud
 from .colmap import CameraIntrinsics
+from .georeference import Georeference
 
 SCALE = "lengths are in spacings, the median distance from a camera to the nearest other one: the \
-true scale is not known"
+true scale is not known, since"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -22,7 +23,8 @@ class MultiViewReconstruction:
     """Cameras and points of many images.
 
     The world is the frame of the camera of `reference`: x right, y down, z forward. 1 is the median
-    distance from a camera to the nearest other one; the true scale is not known.
+    distance from a camera to the nearest other one; the true scale is not known. Where satellite
+    fixes or ground control points place the model, the world goes east, north and up in metres.
 
     Attributes:
         views: of the images that are part of it, by name; their cameras are pinhole cameras.
@@ -30,7 +32,8 @@ class MultiViewReconstruction:
         unregistered: why each of the others is not, by name.
         components: names of unregistered images that hang together among themselves, the largest
             component first: each can be reconstructed alone.
-        reference: name of the image whose camera's frame is the world.
+        reference: name of the image whose camera's frame is the world, or that sees most points.
+        georeference: how the model got its scale and place, or why it has none.
         sparse: the points by which the poses were estimated.
         sparse_errors: (N,) float32 their mean reprojection errors in pixels.
         sparse_views: (N,) int32 number of images that each of them is seen in.
@@ -50,6 +53,7 @@ class MultiViewReconstruction:
     unregistered: Mapping[str, str]
     components: tuple[tuple[str, ...], ...]
     reference: str
+    georeference: Georeference | str
     sparse: PointCloud
     sparse_errors: np.ndarray
     sparse_views: np.ndarray
@@ -88,7 +92,7 @@ class MultiViewReconstruction:
             "unregistered": dict(self.unregistered),
             "components": [list(names) for names in self.components],
             "reference": self.reference,
-            "scale": SCALE,
+            **_place(self.georeference),
             "keypoints": sum(self.keypoints.values()),
             "pairs": self.pairs,
             "pair_choice": self.pair_choice,
@@ -119,6 +123,12 @@ class MultiViewReconstruction:
             "translation": np.asarray(view.translation).tolist(),
             "centre": view.centre.tolist(),
         }
+
+
+def _place(georeference: Georeference | str) -> dict[str, Any]:
+    if isinstance(georeference, str):
+        return {"scale": f"{SCALE} {georeference}"}
+    return {"scale": "lengths are in metres", "georeference": georeference.summary()}
 
 
 def _rounded(values: np.ndarray, function: Any) -> float | None:

@@ -65,6 +65,11 @@ class MultiViewOptions:
         stride_px: a dense point is sought at every so many pixels of a row and of a column.
         single_camera: whether images of one size were taken by one camera; None: where their EXIF
             gives one focal length, or none.
+        control_points: file of ground control points as OpenDroneMap's gcp_list.txt, by which the
+            model gets its scale and place in place of the GPS of the images.
+        scale_by: a distance in metres, and its two ends: two images, for their cameras, or what is
+            at two pixels, as IMG_1.jpg:120,340.
+        formats: further formats that the model is written in, of `FORMATS`.
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -75,8 +80,13 @@ class MultiViewOptions:
     dense: bool = True
     stride_px: int = 2
     single_camera: bool | None = None
+    control_points: str | Path | None = None
+    scale_by: tuple[float, str, str] | None = None
+    formats: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.scale_by is not None and not 0 < self.scale_by[0] < np.inf:
+            raise OptionError(f"`scale_by` must be a distance in metres, not {self.scale_by[0]}")
         if self.pairs not in ("auto", "similar") and following(self.pairs) is None:
             raise OptionError(
                 f"`pairs` must be auto, exhaustive, sequential:10 or similar, not {self.pairs}"
@@ -228,7 +238,7 @@ class Stages:
             (known, self.seed, pycolmap.__version__, __version__),
         )
         record = self.work / f"mapping-{made_of}.json"
-        database, sparse = self.output / "database.db", self.output / "sparse"
+        database, sparse = self.output / "database.db", self.work / "sparse"
         with contextlib.suppress(OSError, ValueError):  # there is none, or a damaged one
             noted = json.loads(record.read_text(encoding="utf-8"))
             verified = {(a, b): count for a, b, count in noted["verified"]}

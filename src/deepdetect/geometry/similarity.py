@@ -1,0 +1,255 @@
+"""Similarities between points in two frames, robust to wrong ones: a model's place and scale.
+
+Least median of squares finds where most points agree; Gauss-Newton with Huber's weights fits all of
+them, and what is known to be level.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from .._shared.errors import ReconstructionError
+from .._shared.opencv import cv2
+from .camera import cross_matrix
+
+MIN_POINTS = 3
+"""That agree."""
+
+MAX_SAMPLES = 500
+"""Pairs and triples of points that the search for most agreement tries, each."""
+
+MAX_START_TILT_DEG = 60.0
+"""Between what a triple says and what is known of up: a triple on a line may turn all over."""
+
+MIN_AREA_POINTS, MIN_AREA = 8, 0.2
+"""From so many points on, spread across by so much of their spread along, they need no up."""
+
+MUCH_BETTER = 0.5
+"""Share of the median distance with what is known of up, below which that was wrong."""
+
+HUBER_STDS = 2.0
+"""Standard deviations from which on a residual has less weight."""
+
+WRONG_STDS = 5.0
+"""A point beyond it is wrong, and has no weight."""
+
+PRIOR_COUNT = 6.0
+"""Coordinates that the stated accuracy counts for: few residuals say little of their spread."""
+
+MAD_STD = 1.4826
+"""Standard deviation over the median of absolute values."""
+
+MAX_ITERATIONS, MIN_STEP = 50, 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """y = scale * rotation @ x + translation."""
+
+    scale: float
+    rotation: np.ndarray
+    translation: np.ndarray
+
+    def apply(self, points: np.ndarray) -> np.ndarray:
+        """Transform (N, 3) points."""
+        return np.asarray(self.scale * (points @ self.rotation.T) + self.translation)
+
+
+@dataclass(frozen=True, eq=False)
+class SimilarityFit:
+    """A similarity, and how far it can be trusted.
+
+    Attributes:
+        similarity: from the points to the targets.
+        residuals: (N, 3) target minus transformed point.
+        wrong: (N,) bool, points that do not agree with the others.
+        stds: horizontal and vertical standard deviation of the targets.
+        scale_std: relative standard deviation of the scale; 0 where it was given.
+        axes_std_deg: (3,) standard deviations of the rotation about the x, y and z axis.
+        axis_std_deg_of_targets: that about the least certain axis by the targets alone; 180 where
+            they leave it open.
+    """
+
+    similarity: Similarity
+    residuals: np.ndarray
+    wrong: np.ndarray
+    stds: tuple[float, float]
+    scale_std: float
+    axes_std_deg: np.ndarray
+    axis_std_deg_of_targets: float
+
+
+def fit_similarity(
+    points: np.ndarray,
+    targets: np.ndarray,
+    accuracy: float,
+    *,
+    up: np.ndarray | None = None,
+    level: np.ndarray | None = None,
+    level_stds: np.ndarray | None = None,
+    scale: float | None = None,
+    seed: int = 0,
+) -> SimilarityFit:
+    """Fit the similarity that most of the points agree on.
+
+    Args:
+        points: (N, 3), three or more.
+        targets: (N, 3) where they are, z up; z may be NaN where it is unknown.
+        accuracy: of the targets, as far as it is known beforehand: a standard deviation.
+        up: (3,) upward direction in the frame of the points, roughly.
+        level, level_stds: (L, 3) directions in this frame that are horizontal, and (L,) their
+            standard deviations in radians.
+        scale: what the scale is, where it is known.
+        seed: of the random choices.
+
+    Raises:
+        ReconstructionError: the points are in one place, or too few of them agree.
+    """
+    points, targets = (np.asarray(values, np.float64) for values in (points, targets))
+    targets = targets.copy()
+    known = np.isfinite(targets)
+    targets[~known] = 0.0
+    level = np.empty((0, 3)) if level is None else level
+    level_stds = np.ones(len(level)) if level_stds is None else level_stds
+    found, median = _search(points, targets, known, up, scale, seed)
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    if up is not None and len(points) >= MIN_AREA_POINTS and spread[1] > MIN_AREA * spread[0]:
+        # Where all cameras look straight down, what is taken for up may be far off.
+        free_of_it, less = _search(points, targets, known, None, scale, seed)
+        found = free_of_it if less < MUCH_BETTER * median else found
+    if found is None:
+        raise ReconstructionError("the points are in one place")
+    middle = points.mean(axis=0)  # turning and scaling about it leaves the translation alone
+    own, free = points - middle, 7 if scale is None else 6
+    current = Similarity(found.scale, found.rotation, found.apply(middle[None])[0])
+    distances = np.linalg.norm((targets - current.apply(own)) * known, axis=1)
+    stds = np.full(3, max(MAD_STD * float(np.median(distances)), accuracy))
+    for _ in range(MAX_ITERATIONS):
+        residuals = (targets - current.apply(own)) * known
+        away = np.linalg.norm(residuals / stds, axis=1)
+        wrong = away > WRONG_STDS
+        if (~wrong).sum() < MIN_POINTS:
+            raise ReconstructionError("too few of the points agree")
+        stds = _spread(residuals[~wrong], known[~wrong], accuracy)
+        weights = np.where(wrong, 0, np.minimum(1, HUBER_STDS / np.maximum(away, 1e-12)))
+        turned = current.scale * (own @ current.rotation.T)
+        jacobian = np.zeros((len(points), 3, 7))
+        jacobian[:, :, :3] = np.eye(3)
+        jacobian[:, :, 3:6] = [-cross_matrix(row) for row in turned]
+        jacobian[:, :, 6] = turned
+        jacobian *= (known / stds)[:, :, None]
+        weighted = jacobian * weights[:, None, None]
+        of_targets = np.einsum("nai,naj->ij", weighted, jacobian)
+        right = np.einsum("nai,na->i", weighted, residuals / stds)
+        # e_z . exp(w) R v = 0, robust as the points are: some photographs are held askew.
+        seen = level @ current.rotation.T
+        errors = seen[:, 2] / level_stds
+        rows = np.zeros((len(level), 7))
+        rows[:, 3], rows[:, 4] = seen[:, 1] / level_stds, -seen[:, 0] / level_stds
+        trust = 1 / (1 + (errors / HUBER_STDS) ** 2)
+        normal = of_targets + (rows * trust[:, None]).T @ rows
+        right -= (rows * trust[:, None]).T @ errors
+        step = np.zeros(7)
+        step[:free] = np.linalg.lstsq(normal[:free, :free], right[:free], rcond=1e-12)[0]
+        current = Similarity(
+            current.scale * float(np.exp(np.clip(step[6], -1, 1))),
+            cv2.Rodrigues(step[3:6])[0] @ current.rotation,
+            current.translation + step[:3],
+        )
+        if np.abs(step / np.array([*stds, 1, 1, 1, 1])).max() < MIN_STEP:
+            break
+    covariance, alone = (_covariance(matrix[:free, :free]) for matrix in (normal, of_targets))
+    deviations = np.sqrt(np.diag(covariance))
+    widest = float(np.sqrt(np.linalg.eigvalsh(alone[3:6, 3:6])[-1]))
+    shift = current.translation - current.scale * (current.rotation @ middle)
+    return SimilarityFit(
+        Similarity(current.scale, current.rotation, shift),
+        np.where(known, targets - current.apply(own), np.nan),
+        wrong,
+        (float(stds[0]), float(stds[2])),
+        0.0 if scale is not None else float(deviations[6]),
+        np.degrees(deviations[3:6]).clip(max=180),
+        min(float(np.degrees(widest)), 180.0),
+    )
+
+
+def _search(
+    points: np.ndarray,
+    targets: np.ndarray,
+    known: np.ndarray,
+    up: np.ndarray | None,
+    scale: float | None,
+    seed: int,
+) -> tuple[Similarity | None, float]:
+    """Find the similarity with the least median of the distances, and this.
+
+    It is that of three points, or of two and the upward direction.
+    """
+    random = np.random.default_rng(seed)
+    best, least = None, np.inf
+    for size in (2, 3) if up is not None else (3,):
+        samples = [*combinations(range(len(points)), size)] if len(points) < 16 else []
+        if not samples or len(samples) > MAX_SAMPLES:
+            draws = range(MAX_SAMPLES)
+            samples = [tuple(random.choice(len(points), size, replace=False)) for _ in draws]
+        for sample in samples:
+            rows = [*sample]
+            found = _of_sample(points[rows], targets[rows], up if size == 2 else None, scale)
+            if found is None:
+                continue
+            if up is not None and (found.rotation @ up)[2] < np.cos(np.radians(MAX_START_TILT_DEG)):
+                continue
+            median = np.median(np.linalg.norm((targets - found.apply(points)) * known, axis=1))
+            if median < least:
+                best, least = found, float(median)
+    return best, least
+
+
+def _of_sample(
+    points: np.ndarray, targets: np.ndarray, up: np.ndarray | None, scale: float | None
+) -> Similarity | None:
+    """Return the similarity of a few points (Umeyama, 1991), about the vertical alone with `up`."""
+    middle, middle_of_targets = points.mean(axis=0), targets.mean(axis=0)
+    own, other = points - middle, targets - middle_of_targets
+    if up is not None:
+        axis = np.cross(up, [0, 0, 1.0])
+        length = float(np.linalg.norm(axis))
+        angle = float(np.arctan2(length, up[2]))
+        axis = axis / length if length > 1e-12 else np.array([1.0, 0, 0])
+        upright = cv2.Rodrigues(angle * axis)[0]
+        own = own @ upright.T
+        own[:, 2] = other[:, 2] = 0
+        cosine, sine = float((own * other).sum()), float(np.cross(own, other)[:, 2].sum())
+        strength = float(np.hypot(sine, cosine))
+        rotation = cv2.Rodrigues(np.array([0, 0, np.arctan2(sine, cosine)]))[0] @ upright
+    else:
+        left, values, right = np.linalg.svd(other.T @ own)
+        signs = np.array([1, 1, np.sign(np.linalg.det(left @ right)) or 1])
+        rotation = left @ np.diag(signs) @ right
+        strength = float(values @ signs)
+    factor = scale if scale is not None else strength / float((own**2).sum() or np.inf)
+    if not factor > 0:
+        return None
+    return Similarity(factor, rotation, middle_of_targets - factor * (rotation @ middle))
+
+
+def _spread(residuals: np.ndarray, known: np.ndarray, accuracy: float) -> np.ndarray:
+    """Return the (3,) standard deviations of targets: across, twice, and of heights."""
+    stds = []
+    for part, lost in ((slice(0, 2), 5), (slice(2, 3), 2)):  # parameters that fit these
+        values = np.abs(residuals[:, part][known[:, part]])
+        squares = len(values) * (MAD_STD * float(np.median(values))) ** 2 if len(values) else 0.0
+        variance = (PRIOR_COUNT * accuracy**2 + squares) / (
+            PRIOR_COUNT + max(len(values) - lost, 0)
+        )
+        stds.append(np.sqrt(variance))
+    return np.array([stds[0], stds[0], stds[1]])
+
+
+def _covariance(normal: np.ndarray) -> np.ndarray:
+    """Return the inverse, with large values where the parameters are open."""
+    values, vectors = np.linalg.eigh(normal)
+    return np.asarray(vectors / np.maximum(values, 1e-12 * values[-1]) @ vectors.T)

@@ -1,0 +1,106 @@
+"""Where photographs were taken, and how they were held: EXIF, and the XMP of DJI's drones."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL.ExifTags import GPS, IFD, Base
+
+from .image_file import open_image
+
+XMP_OF_DRONES = re.compile(rb"(?<!/)drone-dji:(\w+)\s*(?:=\s*[\"']([^\"']*)|>([^<]*))")
+"""As attributes or as elements: DJI writes both."""
+
+MAX_GRAVITY_TILT_DEG = 120.0
+"""A gimbal's angles beyond it are no angles."""
+
+
+@dataclass(frozen=True, eq=False)
+class GpsFix:
+    """The place of a photograph by satellite, in WGS 84, and its gravity.
+
+    Attributes:
+        latitude, longitude: in degrees, north and east positive.
+        altitude: in metres as the camera gives it, mostly above the sea; NaN where it does not.
+        accuracy_m: standard deviation in metres, horizontally, as the camera says; None: unknown.
+        gravity: (3,) unit vector to the ground in the frame of the camera, x right, y down, z
+            forward, of a gimbal; None: unknown.
+    """
+
+    latitude: float
+    longitude: float
+    altitude: float
+    accuracy_m: float | None = None
+    gravity: np.ndarray | None = None
+
+
+def read_gps(path: Path) -> GpsFix | None:
+    """Read the fix of a photograph; None where it carries none that can be.
+
+    What a drone writes to XMP has more digits than its EXIF, and is preferred.
+    """
+    try:
+        with open_image(path) as image:
+            exif, xmp = image.getexif(), image.info.get("xmp") or b""
+        tags = dict(exif.get_ifd(IFD.GPSInfo))
+        orientation = exif.get(Base.Orientation, 1)
+    except Exception:  # Pillow's readers raise many kinds; broken tags are ignored
+        return None
+    found = XMP_OF_DRONES.findall(xmp if isinstance(xmp, bytes) else xmp.encode())
+    drone = {name.decode(): _number(one or other) for name, one, other in found}
+    latitude, longitude = (
+        _degrees(tags.get(tag), tags.get(sign), below)
+        for tag, sign, below in (
+            (GPS.GPSLatitude, GPS.GPSLatitudeRef, "S"),
+            (GPS.GPSLongitude, GPS.GPSLongitudeRef, "W"),
+        )
+    )
+    below_sea = tags.get(GPS.GPSAltitudeRef) in (1, b"\x01")
+    altitude = _number(tags.get(GPS.GPSAltitude)) * (-1 if below_sea else 1)
+    # Older drones spell it Longtitude.
+    east = drone.get("GpsLongitude", drone.get("GpsLongtitude", np.nan))
+    if np.isfinite(east) and np.isfinite(north := drone.get("GpsLatitude", np.nan)):
+        latitude, longitude = (north, east) if north or east else (latitude, longitude)
+    for name in ("RelativeAltitude", "AbsoluteAltitude"):
+        altitude = drone[name] if np.isfinite(drone.get(name, np.nan)) else altitude
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180) or latitude == longitude == 0:
+        return None
+    spread = np.hypot(drone.get("RtkStdLat", np.nan), drone.get("RtkStdLon", np.nan))
+    accuracy = float(spread) if spread > 0 else _number(tags.get(GPS.GPSHPositioningError))
+    return GpsFix(
+        latitude,
+        longitude,
+        altitude,
+        accuracy if accuracy > 0 else None,
+        _gravity(drone) if orientation == 1 else None,
+    )
+
+
+def _gravity(drone: dict[str, float]) -> np.ndarray | None:
+    """Return the direction to the ground by a gimbal's pitch, 0 is level, -90 down, and roll."""
+    angles = drone.get("GimbalPitchDegree", np.nan), drone.get("GimbalRollDegree", np.nan)
+    if not max(map(abs, angles)) <= MAX_GRAVITY_TILT_DEG:
+        return None
+    pitch, roll = np.radians(angles)
+    return np.array([np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch), -np.sin(pitch)])
+
+
+def _degrees(value: Any, sign: Any, below: str) -> float:
+    """Return degrees, minutes and seconds as degrees; NaN where they are none."""
+    try:
+        degrees, minutes, seconds = (_number(part) for part in value)
+    except (TypeError, ValueError):
+        return np.nan
+    sum_ = degrees + minutes / 60 + (seconds if np.isfinite(seconds) else 0) / 3600
+    return -sum_ if str(sign).strip().upper() == below else sum_
+
+
+def _number(value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return np.nan

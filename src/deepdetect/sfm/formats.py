@@ -1,0 +1,108 @@
+"""Further formats of a model, for programs of surveyors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from .._shared.atomic import atomic_path
+from .._shared.errors import ReconstructionError, check_name, require_packages
+from ..geometry.point_cloud import BOX_PERCENTILE
+from ..io.metadata import KEY_DIRECTORY, Metadata
+from .georeference import Georeference
+from .result import MultiViewReconstruction
+
+LAZ_STEP_M = 0.001
+"""Precision of coordinates in LAZ files."""
+
+POINTS_PER_CELL = 4.0
+"""Of a map: so few cells stay empty."""
+
+MAX_MAP_SIDE = 10_000
+"""Cells of a map, across and down."""
+
+
+def write_laz(found: MultiViewReconstruction, output: Path) -> None:
+    """Write model.laz: the points in UTM, with their colours in 16 bits (LAS 1.4, format 7)."""
+    import laspy
+    from pyproj import CRS
+
+    xyz, epsg = _in_utm(found, "a LAZ file")
+    header = laspy.LasHeader(version="1.4", point_format=7)
+    header.offsets, header.scales = np.floor(xyz.min(axis=0)), np.full(3, LAZ_STEP_M)
+    header.add_crs(CRS.from_epsg(epsg))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = xyz.T
+    # 8 bits in 16: 255 becomes 65535
+    las.red, las.green, las.blue = found.cloud.colors.astype(np.uint16).T * 257
+    with atomic_path(output / "model.laz") as path, path.open("wb") as file:
+        las.write(file, do_compress=True)
+
+
+def write_map(found: MultiViewReconstruction, output: Path) -> None:
+    """Write height.tif, metres, NaN where unknown, and orthophoto.tif: GeoTIFF in UTM, north up.
+
+    A cell has the median height and colour of the points in it.
+    """
+    xyz, epsg = _in_utm(found, "a map")
+    low, high = np.percentile(xyz, (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0)
+    margin = BOX_PERCENTILE / 50 * (high - low)
+    inside = ((xyz >= low - margin) & (xyz <= high + margin)).all(axis=1)
+    xyz, colors = xyz[inside], found.cloud.colors[inside]
+    size = xyz[:, :2].max(axis=0) - xyz[:, :2].min(axis=0)
+    cell = max(float(np.sqrt(size.prod() * POINTS_PER_CELL / len(xyz))), size.max() / MAX_MAP_SIDE)
+    cell = float(f"{cell:.1g}") or 1.0
+    west, north = np.floor(xyz[:, 0].min() / cell), np.ceil(xyz[:, 1].max() / cell)
+    column = np.floor(xyz[:, 0] / cell - west).astype(np.int64)
+    row = np.floor(north - xyz[:, 1] / cell).astype(np.int64)
+    width, height = int(column.max()) + 1, int(row.max()) + 1
+    cells = row * width + column
+    order = np.lexsort((xyz[:, 2], cells))
+    filled, start, count = np.unique(cells[order], return_index=True, return_counts=True)
+    middle = order[start + count // 2]
+    heights = np.full((height, width), np.nan, np.float32)
+    heights.flat[filled] = xyz[middle, 2]
+    photo = np.zeros((height * width, 3), np.uint8)
+    photo[filled] = colors[middle]
+    corner = cell * np.array([west + 0.5, north - 0.5])
+    to_world = np.array([[cell, 0, corner[0]], [0, -cell, corner[1]], [0, 0, 1.0]])
+    # GeoTIFF 1.1: a projected system, pixels are areas, of this number.
+    directory = (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, epsg)
+    keys = ((KEY_DIRECTORY, 3, len(directory), directory, True),)
+    Metadata(to_world, keys, no_data=np.nan).write_tiff(heights, output / "height.tif")
+    bands = photo.reshape(height, width, 3)
+    Metadata(to_world, keys, no_data=0).write_tiff(bands, output / "orthophoto.tif")
+
+
+def _in_utm(found: MultiViewReconstruction, what: str) -> tuple[np.ndarray, int]:
+    place = found.georeference
+    if not isinstance(place, Georeference) or place.origin is None:
+        raise ReconstructionError(
+            f"{what} needs a place on the Earth, the other files are written: take photographs "
+            "with GPS, or give ground control points"
+        )
+    return place.origin.to_utm(found.cloud.points)
+
+
+class Format(NamedTuple):
+    """How a format is written into the folder of the results, as which files, by which packages."""
+
+    write: Callable[[MultiViewReconstruction, Path], None]
+    files: tuple[str, ...]
+    packages: tuple[str, ...] = ()
+
+
+FORMATS = {
+    "laz": Format(write_laz, ("model.laz",), ("laspy", "lazrs", "pyproj")),
+    "map": Format(write_map, ("height.tif", "orthophoto.tif")),
+}
+
+
+def check_formats(names: Sequence[str]) -> None:
+    """Raise what is wrong with the names of formats, or missing for them, before hours of work."""
+    for name in names:
+        check_name("format", name, FORMATS)
+        require_packages(f"the format {name}", *FORMATS[name].packages)

@@ -1,0 +1,369 @@
+"""Scale and place of a model: by satellite fixes, ground control points, or a known distance."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .._shared.errors import OptionError, ReconstructionError, first_line, require_packages
+from ..geometry.camera import PosedView
+from ..geometry.similarity import Similarity, SimilarityFit, fit_similarity
+from ..io.gps import read_gps
+from .colmap import import_pycolmap
+from .mapping import SparseModel
+
+GPS_ACCURACY_M = 3.0
+"""Of a fix that does not say it: that of ordinary receivers under the open sky."""
+
+CONTROL_ACCURACY_M = 0.1
+"""Of ground control points: surveyed to centimetres, clicked to a few pixels."""
+
+MIN_FIXES = 3
+"""That agree, for a model to get a place."""
+
+MAX_SCALE_STD = 0.25
+"""Relative: fixes that are too close to each other for their accuracy say nothing of the scale."""
+
+MAX_HEADING_STD_DEG = 20.0
+"""The same of where north is."""
+
+MAX_OPEN_AXIS_DEG = 10.0
+"""Standard deviation of an axis by the fixes alone, from which on the cameras' up decides on it."""
+
+GRAVITY_STD_DEG = 2.0
+"""Of a gimbal's angles."""
+
+UPRIGHT_STD_DEG, AHEAD_STD_DEG = 5.0, 25.0
+"""How level the rows of a photograph are, and the lines of sight on the whole."""
+
+DOWNWARD_SHARE = 0.1
+"""What the lines of sight, which go down rather than up, count for where up is, beside columns."""
+
+MAX_DISTANCE_PX = 15.0
+"""From a pixel that is named to the nearest point of the model."""
+
+
+NEARLY_A_LINE = "they lie nearly on a line: how the model is turned about it follows from the \
+cameras' being upright"
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The point of the Earth, in WGS 84, from which a model goes east, north and up in metres."""
+
+    latitude: float
+    longitude: float
+    height: float
+
+    def to_enu(self, places: np.ndarray) -> np.ndarray:
+        """Return (N, 3) metres east, north and up of latitudes, longitudes and heights (N, 3)."""
+        where = self.latitude, self.longitude, self.height
+        return np.asarray(_ellipsoid().ellipsoid_to_enu(places, *where))
+
+    def to_utm(self, enu: np.ndarray) -> tuple[np.ndarray, int]:
+        """Return (N, 3) eastings, northings and heights in its zone of UTM, and the EPSG number."""
+        where = self.latitude, self.longitude, self.height
+        # The zone is that of the first.
+        all_ = np.vstack([np.zeros((1, 3)), np.asarray(enu, np.float64)])
+        found, zone = _ellipsoid().ellipsoid_to_utm(_ellipsoid().enu_to_ellipsoid(all_, *where))
+        return np.asarray(found)[1:], (32600 if self.latitude >= 0 else 32700) + int(zone)
+
+
+def _ellipsoid() -> Any:
+    pycolmap = import_pycolmap()
+    return pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+
+
+@dataclass(frozen=True, eq=False)
+class Georeference:
+    """How a model got its scale, and its place.
+
+    Attributes:
+        similarity: from the frame of the mapping to the world.
+        source: "GPS", "ground control points" or "known distance", which gives no place.
+        origin: of the world, whose axes go east, north and up; None without a place.
+        epsg: number of its UTM zone.
+        residuals: (3,) metres east, north and up from the model to each fix, by image, or to each
+            control point.
+        wrong: names of those that do not agree with the others, which were left out of account.
+        fit: how far all that can be trusted.
+    """
+
+    similarity: Similarity
+    source: str
+    origin: Origin | None = None
+    epsg: int | None = None
+    residuals: Mapping[str, np.ndarray] | None = None
+    wrong: tuple[str, ...] = ()
+    fit: SimilarityFit | None = None
+
+    def summary(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        values: dict[str, Any] = {"source": self.source}
+        if self.origin is None or self.fit is None or self.residuals is None:
+            return values
+        good = np.array([r for name, r in self.residuals.items() if name not in self.wrong])
+        across = np.linalg.norm(good[:, :2], axis=1)
+        alone = round(self.fit.axis_std_deg_of_targets, 2)
+        return values | {
+            "axes": "metres east, north and up of the origin",
+            "origin": vars(self.origin) | {"crs": "EPSG:4979"},
+            "utm_crs": f"EPSG:{self.epsg}",
+            "used": len(good),
+            "wrong": list(self.wrong),
+            "median_residual_across_m": round(float(np.median(across)), 3),
+            "median_residual_up_m": round(float(np.nanmedian(np.abs(good[:, 2]))), 3)
+            if np.isfinite(good[:, 2]).any()
+            else None,
+            "scale_std_percent": round(100 * self.fit.scale_std, 2),
+            "axes_std_deg": self.fit.axes_std_deg.round(2).tolist(),
+            "least_certain_axis_std_deg_by_these_alone": alone,
+            "note": NEARLY_A_LINE if alone > MAX_OPEN_AXIS_DEG else None,
+            "residuals_m": {
+                name: [None if np.isnan(each) else round(float(each), 3) for each in residual]
+                for name, residual in self.residuals.items()
+            },
+        }
+
+
+def georeference(
+    sparse: SparseModel,
+    points: np.ndarray,
+    folder: Path,
+    control: Sequence[ControlRow] | None = None,
+    scale_by: tuple[float, str, str] | None = None,
+) -> Georeference | str:
+    """Find scale and place of a model, by what there is; or say why there are none.
+
+    Args:
+        sparse: the model.
+        points: (N, 3) its dense points, among which ends of a distance are sought, too.
+        folder: of the images.
+        control: ground control points, before the fixes of the images.
+        scale_by: as of `MultiViewOptions`, before both.
+
+    Raises:
+        OptionError: control points or ends of the distance are not found.
+        ReconstructionError: the control points contradict the model.
+    """
+    scale = None
+    if scale_by is not None:
+        scale = scale_by_distance(*scale_by, sparse, np.vstack([sparse.points, points]))
+    if control is not None:
+        return georeference_by_control_points(sparse, control, scale)
+    try:
+        return georeference_by_gps(sparse.views, folder, scale)
+    except ReconstructionError as error:
+        if scale is None:
+            return str(error)
+    return Georeference(Similarity(scale, np.eye(3), np.zeros(3)), "known distance")
+
+
+def georeference_by_gps(
+    views: Mapping[str, PosedView], folder: Path, scale: float | None = None
+) -> Georeference:
+    """Find the place of a model by the fixes of its images below a folder.
+
+    A ReconstructionError says why there is none. `scale` is in metres, where it is known.
+    """
+    fixes = {name: fix for name in views if (fix := read_gps(folder / name)) is not None}
+    if len(fixes) < MIN_FIXES:
+        raise ReconstructionError(
+            f"{len(fixes)} of its images carry a satellite fix, {MIN_FIXES} are needed"
+        )
+    places = np.array([(fix.latitude, fix.longitude, fix.altitude) for fix in fixes.values()])
+    stated = [fix.accuracy_m for fix in fixes.values() if fix.accuracy_m is not None]
+    accuracy = float(np.median(stated)) if stated else GPS_ACCURACY_M
+    up, level, stds = upright(views, {name: fix.gravity for name, fix in fixes.items()})
+    centres = {name: views[name].centre for name in fixes}
+    return _place("GPS", centres, places, accuracy, scale, up=up, level=level, level_stds=stds)
+
+
+def _place(
+    source: str,
+    points: Mapping[str, np.ndarray],
+    places: np.ndarray,
+    accuracy: float,
+    scale: float | None,
+    **upright: Any,
+) -> Georeference:
+    heights = places[np.isfinite(places[:, 2]), 2]
+    height = float(np.median(heights)) if len(heights) else 0.0
+    latitude, longitude = np.median(places[:, :2], axis=0).tolist()
+    origin = Origin(round(latitude, 6), round(longitude, 6), round(height, 1))
+    known = np.column_stack([places[:, :2], np.nan_to_num(places[:, 2], nan=height)])
+    targets = origin.to_enu(known)
+    targets[~np.isfinite(places[:, 2]), 2] = np.nan
+    own = np.array([*points.values()])
+    problem = ReconstructionError(
+        "its satellite fixes do not agree with each other, or lie too close together for their "
+        "accuracy"
+        if source == "GPS"
+        else "the ground control points do not agree with the model: check their coordinates, "
+        "pixels and names of images"
+    )
+    try:
+        fit = fit_similarity(own, targets, accuracy, scale=scale, **upright)
+    except ReconstructionError:
+        raise problem from None
+    if not (fit.scale_std < MAX_SCALE_STD and fit.axes_std_deg[2] < MAX_HEADING_STD_DEG):
+        raise problem
+    residuals = dict(zip(points, fit.residuals, strict=True))
+    wrong = tuple(name for name, is_wrong in zip(points, fit.wrong, strict=True) if is_wrong)
+    _, epsg = origin.to_utm(np.zeros((1, 3)))
+    return Georeference(fit.similarity, source, origin, epsg, residuals, wrong, fit)
+
+
+def upright(
+    views: Mapping[str, PosedView], gravities: Mapping[str, np.ndarray | None] = {}
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return what cameras know of up: the direction, and as `fit_similarity` what is level.
+
+    That is what is across the gravity of gimbals. Where there is none, the rows of photographs, and
+    less surely the lines of sight, are taken to be level.
+    """
+    level, stds, down = [], [], []
+    for name, view in views.items():
+        gravity = gravities.get(name)
+        if gravity is not None:
+            down.append(view.rotation.T @ gravity)
+            level += [*np.linalg.svd(down[-1][None])[2][1:]]
+            stds += 2 * [GRAVITY_STD_DEG]
+        else:
+            # That all look up somewhat does not become surer by their number.
+            level += [view.rotation[0], view.rotation[2]]
+            stds += [UPRIGHT_STD_DEG, AHEAD_STD_DEG * np.sqrt(len(views))]
+    rows = np.array([view.rotation for view in views.values()])
+    if down:
+        up = -np.mean(down, axis=0)
+    else:  # as Brown and Lowe's horizon of panoramas
+        across, above = rows[:, 0], -(rows[:, 1] + DOWNWARD_SHARE * rows[:, 2]).mean(axis=0)
+        up = np.linalg.solve(across.T @ across / len(across) + 1e-3 * np.eye(3), above)
+    return up / np.linalg.norm(up), np.array(level), np.radians(stds)
+
+
+class ControlRow(NamedTuple):
+    """A ground control point in an image: its name, latitude, longitude, height, and pixel."""
+
+    name: str
+    place: tuple[float, float, float]
+    image: str
+    xy: np.ndarray
+
+
+def read_control_points(path: str | Path) -> list[ControlRow]:
+    """Read ground control points as OpenDroneMap has them.
+
+    The first line is the coordinate system, as "EPSG:32633" or "WGS84 UTM 33N", the others are
+    `x y z column row image [name]`.
+    """
+    require_packages("a file of ground control points", "pyproj")
+    from pyproj import CRS, Transformer
+
+    try:
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+        first, *lines = [line.strip() for line in lines if line.strip() and line[0] != "#"]
+        zone = re.fullmatch(r"WGS84 UTM (\d+)([NS])", first)
+        system = first
+        if zone:
+            system = f"EPSG:{(32600 if zone[2] == 'N' else 32700) + int(zone[1])}"
+        to_degrees = Transformer.from_crs(CRS.from_user_input(system), 4326, always_xy=True)
+        rows = []
+        for line in lines:
+            x, y, z, column, row, image, *name = line.split()
+            longitude, latitude = to_degrees.transform(float(x), float(y))
+            xy = np.array([float(column), float(row)])
+            place = latitude, longitude, float(z)
+            rows.append(ControlRow((name or [f"{x} {y} {z}"])[0], place, image, xy))
+    except OSError as error:
+        raise OptionError(f"{path} cannot be read ({error.strerror}): check the path") from None
+    except Exception as error:  # of pyproj, and of numbers that are none
+        raise OptionError(
+            f"{path} is no file of ground control points ({first_line(error)}): write the "
+            "coordinate system, as EPSG:32633, then lines of x y z column row image"
+        ) from None
+    return rows
+
+
+def georeference_by_control_points(
+    sparse: SparseModel, control: Sequence[ControlRow], scale: float | None = None
+) -> Georeference:
+    """Find the place of a model by points that two or more of its images show."""
+    names = _by_file_name(sparse)
+    seen: dict[str, dict[str, ControlRow]] = {}
+    for row in control:
+        if row.image in names:
+            seen.setdefault(row.name, {})[names[row.image]] = row
+    seen = {name: rows for name, rows in seen.items() if len(rows) > 1}
+    if len(seen) < MIN_FIXES:
+        raise OptionError(
+            f"{len(seen)} ground control points are in two or more images of the model, "
+            f"{MIN_FIXES} are needed: name more, and the images as their files are called"
+        )
+    points = {name: _triangulated(sparse, rows) for name, rows in seen.items()}
+    places = np.array([next(iter(rows.values())).place for rows in seen.values()])
+    return _place("ground control points", points, places, CONTROL_ACCURACY_M, scale)
+
+
+def _by_file_name(sparse: SparseModel) -> dict[str, str]:
+    """Return the names of images by these, and by the names of their files alone."""
+    return {Path(name).name: name for name in sparse.images} | {
+        name: name for name in sparse.images
+    }
+
+
+def _triangulated(sparse: SparseModel, rows: Mapping[str, ControlRow]) -> np.ndarray:
+    """Return the point nearest to the lines of sight."""
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    for name, row in rows.items():
+        view = sparse.images[name].view
+        xy = sparse.images[name].intrinsics.to_pinhole(row.xy[None])
+        ray = view.rotation.T @ view.camera.rays(xy)[0]
+        across = np.eye(3) - np.outer(ray, ray) / (ray @ ray)
+        normal += across
+        right += across @ view.centre
+    return np.linalg.solve(normal, right)
+
+
+def scale_by_distance(
+    distance_m: float, end0: str, end1: str, sparse: SparseModel, points: np.ndarray
+) -> float:
+    """Return the metres per unit of a model, by the distance of two cameras or of two points.
+
+    An end is the name of an image, for its camera, or NAME:X,Y for what is at a pixel of it, where
+    `points` (N, 3) say.
+    """
+    one, other = (_end(end, sparse, points) for end in (end0, end1))
+    length = float(np.linalg.norm(one - other))
+    if not length > 0:
+        raise OptionError(f"{end0} and {end1} are in one place: name two places")
+    return distance_m / length
+
+
+def _end(end: str, sparse: SparseModel, points: np.ndarray) -> np.ndarray:
+    pixel = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", end)
+    name = pixel[1] if pixel else end
+    names = _by_file_name(sparse)
+    if name not in names:
+        raise OptionError(
+            f"{name} is no image of the model: name two of its images, or pixels as NAME:X,Y"
+        )
+    image = sparse.images[names[name]]
+    if not pixel:
+        return image.view.centre
+    xy = image.intrinsics.to_pinhole(np.array([[float(pixel[2]), float(pixel[3])]]))
+    projected, depth = image.view.project(points)
+    distances = np.where(depth > 0, np.linalg.norm(projected - xy, axis=1), np.inf)
+    if not (len(points) and distances.min() < MAX_DISTANCE_PX):
+        raise OptionError(
+            f"the model has no point within {MAX_DISTANCE_PX:g} pixels of {end}: name a pixel with "
+            "more texture around it"
+        )
+    # Of several as near, the nearest to the camera hides the others.
+    near = np.flatnonzero(distances < distances.min() + 2)
+    return np.asarray(points[near[depth[near].argmin()]], np.float64)

@@ -1,0 +1,246 @@
+"""Made cameras on a known path: photographs with fixes, control points, distances."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect import Camera, OptionError, ReconstructionError
+from deepdetect.geometry.camera import PosedView
+from deepdetect.geometry.similarity import Similarity
+from deepdetect.sfm.colmap import CameraIntrinsics
+from deepdetect.sfm.georeference import (
+    Georeference,
+    Origin,
+    georeference,
+    read_control_points,
+    upright,
+)
+from deepdetect.sfm.mapping import RegisteredImage, SparseModel
+
+from ..io.test_gps import place_tags, write_photograph
+
+ORIGIN = Origin(47.5, 8.25, 430.0)
+CAMERA = Camera((640, 480), 600.0)
+NORTH_LEVEL = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+"""From east, north, up to the camera of a photograph that looks north, held level."""
+
+
+def turn(axis: str, degrees: float) -> np.ndarray:
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return {
+        "z": np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]),
+        "x": np.array([[1, 0, 0], [0, c, -s], [0, s, c]]),
+    }[axis]
+
+
+def made_model(
+    centres: np.ndarray, rotations: list[np.ndarray], points: np.ndarray, model: Similarity
+) -> SparseModel:
+    """Put cameras and points in metres east, north, up into the frame of a mapping.
+
+    `model` goes from that frame to metres.
+    """
+
+    def inside(xyz: np.ndarray) -> np.ndarray:
+        return (xyz - model.translation) @ model.rotation / model.scale
+
+    images = {}
+    for k, (centre, rotation) in enumerate(zip(inside(centres), rotations, strict=True)):
+        own = rotation @ model.rotation
+        view = PosedView(f"{k:02}.jpg", CAMERA, own, -own @ centre)
+        xy, _ = view.project(inside(points))
+        rows = np.arange(len(points))
+        intrinsics = CameraIntrinsics.of_camera(CAMERA)
+        images[view.name] = RegisteredImage(view, intrinsics, rows, xy, rows)
+    zeros = np.zeros(len(points))
+    return SparseModel(images, inside(points), zeros, zeros.astype(int))
+
+
+@pytest.fixture
+def hidden() -> Similarity:
+    rotation = turn("z", 110) @ turn("x", 70) @ turn("z", 20)
+    return Similarity(6.5, rotation, np.array([30.0, -12.0, 4.0]))
+
+
+def write_fixes(folder: Path, enu: np.ndarray, xmp: list[str] | None = None) -> None:
+    pyproj = pytest.importorskip("pyproj", reason="needs pyproj")
+    system = f"+proj=topocentric +ellps=WGS84 +lat_0={ORIGIN.latitude} +lon_0={ORIGIN.longitude}"
+    pipeline = f"+proj=pipeline +step +inv {system} +h_0={ORIGIN.height} +step +inv +proj=cart"
+    longitude, latitude, height = pyproj.Transformer.from_pipeline(pipeline).transform(*enu.T)
+    for k, place in enumerate(zip(latitude, longitude, height, strict=True)):
+        write_photograph(folder / f"{k:02}.jpg", place_tags(*place), xmp[k] if xmp else "")
+
+
+def heading_error_deg(found: Similarity, true: Similarity) -> float:
+    """Return the angle about the vertical between two results."""
+    between = found.rotation @ true.rotation.T
+    return float(abs(np.degrees(np.arctan2(between[1, 0], between[0, 0]))))
+
+
+def tilt_error_deg(found: Similarity, true: Similarity) -> float:
+    between = found.rotation @ true.rotation.T
+    return float(np.degrees(np.arccos(np.clip(between[2, 2], -1, 1))))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noisy_fixes_two_of_them_wrong(
+    pycolmap, tmp_path: Path, hidden: Similarity, seed: int
+) -> None:
+    """Photographs of a walk of some 300 m: 3 m of noise, two fixes 200 m off."""
+    random = np.random.default_rng(seed)
+    at = np.linspace(0, 5, 40)
+    centres = np.column_stack([45 * at, 60 * np.sin(at), 0.5 * np.cos(2 * at)])
+    rotations = [
+        turn("z", random.normal(0, 2)) @ NORTH_LEVEL @ turn("z", -heading)
+        for heading in np.degrees(at)
+    ]
+    fixes = centres + random.normal(0, 3, (40, 3))
+    fixes[[7, 25]] += [[200.0, 0, 0], [-140.0, 143.0, 0]]
+    write_fixes(tmp_path, fixes)
+    sparse = made_model(centres, rotations, np.zeros((1, 3)), hidden)
+    found = georeference(sparse, sparse.points, tmp_path)
+    assert isinstance(found, Georeference)
+    assert found.similarity.scale == pytest.approx(hidden.scale, rel=0.02)
+    assert heading_error_deg(found.similarity, hidden) < 2
+    assert tilt_error_deg(found.similarity, hidden) < 2
+    assert found.wrong == ("07.jpg", "25.jpg")
+    assert found.epsg == 32632
+    values = json.loads(json.dumps(found.summary()))
+    assert values["used"] == 38
+    assert 2 < values["median_residual_across_m"] < 5
+    assert np.linalg.norm(values["residuals_m"]["07.jpg"]) == pytest.approx(200, abs=12)
+
+
+@pytest.mark.parametrize("kind", ["level", "gimbal"])
+def test_along_a_line_the_cameras_know_up(
+    pycolmap, tmp_path: Path, hidden: Similarity, kind: str
+) -> None:
+    """Photographs along a street, or of a drone above it that looks down at 60 degrees."""
+    random = np.random.default_rng(1)
+    centres = np.column_stack([np.linspace(0, 120, 20), np.zeros(20), np.full(20, 2.0)])
+    down = 60 if kind == "gimbal" else 0
+    rotations = [turn("z", random.normal(0, 2)) @ turn("x", down) @ NORTH_LEVEL for _ in centres]
+    gimbal = 'drone-dji:GimbalPitchDegree="-60.0" drone-dji:GimbalRollDegree="0.0"'
+    xmp = [f"<a {gimbal}/>"] * 20 if kind == "gimbal" else None
+    write_fixes(tmp_path, centres + random.normal(0, 1.5, centres.shape), xmp)
+    sparse = made_model(centres, rotations, np.zeros((1, 3)), hidden)
+    found = georeference(sparse, sparse.points, tmp_path)
+    assert isinstance(found, Georeference)
+    assert found.similarity.scale == pytest.approx(hidden.scale, rel=0.02)
+    assert heading_error_deg(found.similarity, hidden) < 2
+    assert tilt_error_deg(found.similarity, hidden) < 3
+    assert "line" in found.summary()["note"]
+
+
+def test_a_drone_that_looks_straight_down_needs_no_gimbal(
+    pycolmap, tmp_path: Path, hidden: Similarity
+) -> None:
+    """A grid of photographs, all with the same heading: their columns are no up."""
+    random = np.random.default_rng(2)
+    x, y = np.meshgrid(np.arange(6) * 20.0, np.arange(5) * 25.0)
+    centres = np.column_stack([x.ravel(), y.ravel(), np.full(30, 80.0)])
+    rotations = [turn("x", 90) @ NORTH_LEVEL for _ in centres]
+    write_fixes(tmp_path, centres + random.normal(0, 1.5, centres.shape))
+    sparse = made_model(centres, rotations, np.zeros((1, 3)), hidden)
+    found = georeference(sparse, sparse.points, tmp_path)
+    assert isinstance(found, Georeference)
+    assert found.similarity.scale == pytest.approx(hidden.scale, rel=0.02)
+    assert heading_error_deg(found.similarity, hidden) < 2
+    assert tilt_error_deg(found.similarity, hidden) < 2
+
+
+def test_fixes_that_say_nothing_give_no_place(pycolmap, tmp_path: Path, hidden: Similarity) -> None:
+    random = np.random.default_rng(0)
+    centres = random.normal(0, 0.5, (10, 3))  # a statue: a metre across, fixes of 3 m
+    sparse = made_model(centres, [NORTH_LEVEL] * 10, np.zeros((1, 3)), hidden)
+    assert "0 of its images" in str(georeference(sparse, sparse.points, tmp_path))
+    write_fixes(tmp_path, random.normal(0, 3, (10, 3)))
+    assert "too close together" in str(georeference(sparse, sparse.points, tmp_path))
+    write_fixes(tmp_path, np.zeros((10, 3)))
+    assert isinstance(georeference(sparse, sparse.points, tmp_path), str)
+
+
+def test_ground_control_points(pycolmap, tmp_path: Path, hidden: Similarity) -> None:
+    """As OpenDroneMap has them, in UTM; one was written down wrong."""
+    pyproj = pytest.importorskip("pyproj", reason="needs pyproj")
+    random = np.random.default_rng(0)
+    centres = np.column_stack([np.arange(6) * 12.0, random.normal(0, 3, 6), np.full(6, 3.0)])
+    marks = np.column_stack(
+        [random.uniform(0, 60, 6), random.uniform(25, 45, 6), random.uniform(0, 8, 6)]
+    )
+    sparse = made_model(centres, [NORTH_LEVEL] * 6, marks, hidden)
+    utm, epsg = ORIGIN.to_utm(marks)
+    # The zone, and what pyproj makes of it, are right.
+    longitude, latitude = pyproj.Transformer.from_crs(epsg, 4326, always_xy=True).transform(
+        *utm.T[:2]
+    )
+    np.testing.assert_allclose(
+        ORIGIN.to_enu(np.column_stack([latitude, longitude, utm[:, 2]])), marks, atol=1e-3
+    )
+    utm[5] += [30, 0, 0]
+    lines = [
+        f"{x:.3f} {y:.3f} {z:.3f} {xy[k, 0]:.2f} {xy[k, 1]:.2f} {name} mark{k}"
+        for name, xy in ((name, image.xy) for name, image in sparse.images.items())
+        for k, (x, y, z) in enumerate(utm)
+    ]
+    path = tmp_path / "gcp_list.txt"
+    for system in ("WGS84 UTM 32N", "EPSG:32632"):
+        path.write_text("\n".join([system, *lines]))
+        found = georeference(sparse, sparse.points, tmp_path, read_control_points(path))
+        assert isinstance(found, Georeference)
+        assert found.wrong == ("mark5",)
+        assert found.similarity.scale == pytest.approx(hidden.scale, rel=1e-3)
+        assert found.origin is not None
+        placed = found.similarity.apply(sparse.points)
+        again, _ = found.origin.to_utm(placed)
+        np.testing.assert_allclose(again[:5], utm[:5], atol=0.02)
+    path.write_text("\n".join(["EPSG:32632", *lines[:3]]))
+    with pytest.raises(OptionError, match="0 ground control points"):
+        georeference(sparse, sparse.points, tmp_path, read_control_points(path))
+    path.write_text("nowhere\n1 2 3")
+    with pytest.raises(OptionError, match="no file of ground control points"):
+        read_control_points(path)
+    path.write_text(
+        "\n".join(
+            ["EPSG:32632", *(f"{random.uniform(0, 500)} {line.split(' ', 1)[1]}" for line in lines)]
+        )
+    )
+    with pytest.raises(ReconstructionError, match="do not agree"):
+        georeference(sparse, sparse.points, tmp_path, read_control_points(path))
+
+
+def test_a_known_distance_gives_the_scale(pycolmap, tmp_path: Path, hidden: Similarity) -> None:
+    centres = np.column_stack([np.arange(4) * 2.0, np.zeros((4, 2))])
+    points = np.array([[0.0, 10, 0], [3, 10, 1], [3.1, 30, 1]])
+    sparse = made_model(centres, [NORTH_LEVEL] * 4, points, hidden)
+    xy = sparse.images["01.jpg"].xy.round(1)
+    pixels = [f"01.jpg:{x},{y}" for x, y in xy.tolist()]
+    for distance, *ends in ((4.0, "00.jpg", "02.jpg"), (np.sqrt(10), pixels[0], pixels[1])):
+        found = georeference(sparse, sparse.points, tmp_path, scale_by=(distance, *ends))
+        assert isinstance(found, Georeference)
+        assert found.similarity.scale == pytest.approx(hidden.scale, rel=1e-6)
+        assert found.origin is None
+        np.testing.assert_array_equal(found.similarity.rotation, np.eye(3))
+    for ends in (("00.jpg", "00.jpg"), ("00.jpg", "no.jpg"), ("00.jpg:0,0", "00.jpg")):
+        with pytest.raises(OptionError):
+            georeference(sparse, sparse.points, tmp_path, scale_by=(1.0, *ends))
+    # With fixes, too, it is this distance that holds.
+    write_fixes(tmp_path, 1.3 * centres * 20)
+    placed = georeference(sparse, sparse.points, tmp_path, scale_by=(80.0, "00.jpg", "02.jpg"))
+    assert isinstance(placed, Georeference)
+    assert placed.similarity.scale == pytest.approx(20 * hidden.scale, rel=1e-6)
+
+
+def test_what_is_upright() -> None:
+    views = {
+        str(k): PosedView(str(k), CAMERA, NORTH_LEVEL @ turn("z", 50 * k), np.zeros(3))
+        for k in range(5)
+    }
+    up, level, stds = upright(views)
+    np.testing.assert_allclose(up, [0, 0, 1], atol=1e-3)
+    np.testing.assert_allclose(level @ [0, 0, 1], 0, atol=1e-9)
+    assert len(stds) == len(level) == 10
