@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from .._shared.errors import OptionError
 from .._shared.progress import stage_progress
@@ -15,7 +15,7 @@ from ..io.point_cloud import find_writer
 from ..reconstruction.files import ENDINGS, save_reconstruction
 from ..reconstruction.pipeline import reconstruct as reconstruct_pair
 from ..sfm.colmap import import_pycolmap
-from ..sfm.formats import FORMATS, check_formats
+from ..sfm.formats import check_formats
 from ..sfm.pipeline import MAX_KEYPOINTS, check_output_folder, output_files, reconstruct_many
 from ..sfm.stages import MultiViewOptions, check_images
 from . import _options as cli
@@ -37,7 +37,7 @@ MANY = cli.From(
         "control_points": "--gcp",
         "formats": "--format",
     },
-    types={"control_points": Path | None, "formats": tuple[Literal["laz", "map"], ...]},
+    types={"control_points": Path | None},
 )
 WORKERS = cli.From(reconstruct_many, more="workers")
 """Options that two images do not have."""

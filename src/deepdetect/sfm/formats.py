@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from ..geometry.point_cloud import BOX_PERCENTILE
 from ..io.metadata import KEY_DIRECTORY, Metadata
 from .georeference import Georeference
 from .result import MultiViewReconstruction
+
+FormatName = Literal["laz", "map"]
 
 LAZ_STEP_M = 0.001
 """Precision of coordinates in LAZ files."""
@@ -95,13 +97,13 @@ class Format(NamedTuple):
     packages: tuple[str, ...] = ()
 
 
-FORMATS = {
+FORMATS: dict[FormatName, Format] = {
     "laz": Format(write_laz, ("model.laz",), ("laspy", "lazrs", "pyproj")),
     "map": Format(write_map, ("height.tif", "orthophoto.tif")),
 }
 
 
-def check_formats(names: Sequence[str]) -> None:
+def check_formats(names: Sequence[FormatName]) -> None:
     """Raise what is wrong with the names of formats, or missing for them, before hours of work."""
     for name in names:
         check_name("format", name, FORMATS)

@@ -29,7 +29,7 @@ from ..io.html_viewer import write_html_page
 from ..io.point_cloud import save_point_cloud
 from .colmap import import_pycolmap, initial_intrinsics, known_cameras, write_colmap_model
 from .dense import DENSE_POINT
-from .formats import FORMATS, check_formats
+from .formats import FORMATS, FormatName, check_formats
 from .georeference import Georeference, georeference, read_control_points
 from .mapping import MIN_VIEWS, SparseModel, read_sparse_model, transform_model
 from .result import MultiViewReconstruction
@@ -181,14 +181,14 @@ def check_output_folder(output: Path) -> None:
         raise OptionError(f"{output} is the name of a file: give the name of a folder with -o")
 
 
-def output_files(output: Path, formats: Sequence[str] = ()) -> tuple[Path, ...]:
+def output_files(output: Path, formats: Sequence[FormatName] = ()) -> tuple[Path, ...]:
     """Name all that is written into the folder of the results; the last is what stages made."""
     names = ("model.ply", "model.glb", "model.html", "model.json", "sparse", "database.db")
     more = [file for name in formats for file in FORMATS[name].files]
     return tuple(output / name for name in (*names, *more, WORK))
 
 
-def _write(found: MultiViewReconstruction, output: Path, formats: Sequence[str]) -> None:
+def _write(found: MultiViewReconstruction, output: Path, formats: Sequence[FormatName]) -> None:
     """Write the files of the model, and further formats, which may lack a place."""
     notes = {
         "title": f"{len(found.views)} images",

@@ -36,6 +36,7 @@ from ..io.image import find_images, name_images
 from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, is_path, read_with, reading_options
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
 from .dense import dense_points, find_references, limited_view, merge_dense_points
+from .formats import FormatName
 from .mapping import RegisteredImage, SparseModel, adjust, map_images, normalise_model, verify_pairs
 from .pair_selection import COMPARED_KEYPOINTS, SIMILAR, similar_pairs, vlad_vectors
 
@@ -69,7 +70,7 @@ class MultiViewOptions:
             model gets its scale and place in place of the GPS of the images.
         scale_by: a distance in metres, and its two ends: two images, for their cameras, or what is
             at two pixels, as IMG_1.jpg:120,340.
-        formats: further formats that the model is written in, of `FORMATS`.
+        formats: further formats that the model is written in.
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -82,7 +83,7 @@ class MultiViewOptions:
     single_camera: bool | None = None
     control_points: str | Path | None = None
     scale_by: tuple[float, str, str] | None = None
-    formats: tuple[str, ...] = ()
+    formats: tuple[FormatName, ...] = ()
 
     def __post_init__(self) -> None:
         if self.scale_by is not None and not 0 < self.scale_by[0] < np.inf:
