@@ -10,10 +10,8 @@ import math
 
 import numpy as np
 
+from ..._shared.kernels import compiled
 from ...features.keypoints import Keypoints
-
-BLOCK = 500
-"""Keypoints of the first image that are compared at once."""
 
 MAX_DISTANCE_PX = 3.0
 """Of each keypoint from the other's line."""
@@ -40,45 +38,81 @@ def epipolar_search(
 
     Returns (M, 2) float64 positions in both images.
     """
-    points0, points1 = first.xy.astype(np.float64), second.xy.astype(np.float64)
-    if not len(points0) or not len(points1):
-        return np.empty((0, 2)), np.empty((0, 2))
+    return _search(first, second, _squared_distances(first, second), fundamental)
+
+
+def _squared_distances(first: Keypoints, second: Keypoints) -> np.ndarray:
+    """Return (N, M) float32 squared distances of descriptors."""
     assert first.descriptors is not None
     assert second.descriptors is not None
     described0 = first.descriptors.astype(np.float32)
     described1 = second.descriptors.astype(np.float32)
-    squares1 = (described1**2).sum(axis=1)
+    squares0, squares1 = ((each**2).sum(axis=1) for each in (described0, described1))
+    distances = described0 @ described1.T
+    distances *= -2
+    distances += squares0[:, None]
+    distances += squares1
+    return np.maximum(distances, 0, out=distances)
+
+
+def _search(
+    first: Keypoints, second: Keypoints, distances: np.ndarray, fundamental: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    points0, points1 = first.xy.astype(np.float64), second.xy.astype(np.float64)
+    if not len(points0) or not len(points1):
+        return np.empty((0, 2)), np.empty((0, 2))
     ones0, lines1 = _points_and_lines(points0, fundamental)
     ones1, lines0 = _points_and_lines(points1, fundamental.T)
-    count = len(points0)
-    best = np.full(count, np.inf, np.float32)
-    partner = np.zeros(count, np.int64)
-    second_best, elsewhere0 = best.copy(), best.copy()
-    elsewhere1 = np.full(len(points1), np.inf, np.float32)
-    best1, partner1 = elsewhere1.copy(), np.zeros(len(points1), np.int64)
-    for start in range(0, count, BLOCK):
-        rows = slice(start, min(start + BLOCK, count))
-        products = described0[rows] @ described1.T
-        squares0 = (described0[rows] ** 2).sum(axis=1)[:, None]
-        distance = np.sqrt(np.maximum(squares0 + squares1 - 2 * products, 0))
-        near = np.abs(lines1[rows] @ ones1.T) < MAX_DISTANCE_PX
-        near &= np.abs(ones0[rows] @ lines0.T) < MAX_DISTANCE_PX
-        inside, outside = np.where(near, distance, np.inf), np.where(near, np.inf, distance)
-        elsewhere0[rows] = outside.min(axis=1)
-        elsewhere1 = np.minimum(elsewhere1, outside.min(axis=0))
-        nearest = inside.argmin(axis=0)
-        value = inside[nearest, np.arange(len(points1))]
-        better = value < best1
-        best1[better], partner1[better] = value[better], nearest[better] + start
-        nearest = inside.argmin(axis=1)
-        best[rows], partner[rows] = inside[np.arange(len(nearest)), nearest], nearest
-        offsets = points1 - points1[nearest][:, None]
-        apart = np.hypot(offsets[..., 0], offsets[..., 1]) >= MIN_SEPARATION_PX
-        second_best[rows] = np.where(apart, inside, np.inf).min(axis=1)
-    kept = np.isfinite(best) & (partner1[partner] == np.arange(count))
-    kept &= best < MAX_RATIO_ELSEWHERE * np.minimum(elsewhere0, elsewhere1[partner])
-    kept &= best < MAX_RATIO_NEAR * second_best
-    return points0[kept], points1[partner[kept]]
+    geometry = ones0, lines1, ones1, lines0
+    separation = MIN_SEPARATION_PX**2
+    partner0, least, rival, elsewhere0, partner1, elsewhere1 = _nearest_on_lines(
+        distances, *geometry, MAX_DISTANCE_PX, separation
+    )
+    kept = np.isfinite(least) & (partner1[partner0] == np.arange(len(points0)))
+    kept &= least < MAX_RATIO_ELSEWHERE**2 * np.minimum(elsewhere0, elsewhere1[partner0])
+    kept &= least < MAX_RATIO_NEAR**2 * rival
+    return points0[kept], points1[partner0[kept]]
+
+
+@compiled(nogil=True)
+def _nearest_on_lines(distances, ones0, lines1, ones1, lines0, max_distance, separation):  # type: ignore[no-untyped-def]
+    """Find the most similar keypoint near the line of each, and what is to be compared with it.
+
+    Returns, of the first image's keypoints, the partner's index, its squared distance, that of the
+    most similar one near the line but apart from it, and far from the line; of the second image's
+    keypoints the partner's index, and the squared distance of the most similar far from the line.
+    """
+    count0, count1 = distances.shape
+    partner0, partner1 = np.zeros(count0, np.int64), np.zeros(count1, np.int64)
+    least0 = np.full(count0, np.inf, np.float32)
+    rival, elsewhere0 = least0.copy(), least0.copy()
+    least1 = np.full(count1, np.inf, np.float32)
+    elsewhere1 = least1.copy()
+    near = np.empty(count1, np.int64)
+    for i in range(count0):
+        u0, v0, a1, b1, c1 = ones0[i, 0], ones0[i, 1], lines1[i, 0], lines1[i, 1], lines1[i, 2]
+        found = 0
+        for j in range(count1):
+            value = distances[i, j]
+            off1 = abs(a1 * ones1[j, 0] + b1 * ones1[j, 1] + c1)
+            if off1 < max_distance:
+                off0 = abs(lines0[j, 0] * u0 + lines0[j, 1] * v0 + lines0[j, 2])
+                if off0 < max_distance:
+                    near[found] = j
+                    found += 1
+                    if value < least0[i]:
+                        least0[i], partner0[i] = value, j
+                    if value < least1[j]:
+                        least1[j], partner1[j] = value, i
+                    continue
+            elsewhere0[i] = min(elsewhere0[i], value)
+            elsewhere1[j] = min(elsewhere1[j], value)
+        x, y = ones1[partner0[i], 0], ones1[partner0[i], 1]
+        for j in near[:found]:
+            apart = (ones1[j, 0] - x) ** 2 + (ones1[j, 1] - y) ** 2 >= separation
+            if apart and distances[i, j] < rival[i]:
+                rival[i] = distances[i, j]
+    return partner0, least0, rival, elsewhere0, partner1, elsewhere1
 
 
 def _points_and_lines(points: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -98,10 +132,11 @@ def log10_p_value(
     or wrong: they are no evidence. Lines at wrong places, the same but moved, find matches by
     chance alone; as many as the right lines find are unlikely among them (a Poisson distribution).
     """
+    distances = _squared_distances(first, second)
     known = {(float(x), float(y)) for x, y in np.asarray(used, np.float32)}
 
     def further(matrix: np.ndarray) -> int:
-        points0 = epipolar_search(first, second, matrix)[0].astype(np.float32)
+        points0 = _search(first, second, distances, matrix)[0].astype(np.float32)
         return sum((float(x), float(y)) not in known for x, y in points0)
 
     side = max(second.image_size)
