@@ -14,12 +14,12 @@ from .._shared.opencv import cv2
 from .._shared.options import is_path, suggest_keywords
 from .._shared.records import file_digest
 from ..features.keypoints import Keypoints
-from ..features.learned import LEARNED, LEARNED_FREE
+from ..features.learned import LEARNED
 from ..features.selection import check_ignore, check_max_keypoints
 from ..features.sift import ROOT_SIFT, describe_keypoints
 from ..io.image import Images, batch_length, ignore_masks, image_named, load_each, load_image, luma
 from .heatmap import MAX_AUTO_PIXELS, memory_named
-from .points.descriptor import describe_learned, descriptor_type
+from .points.descriptor import DESCRIPTOR_GRAPHS, describe_learned, descriptor_type
 from .points.detection import SPREADS, Spread, detect_points
 from .points.ranker import load_ranker
 from .pretrained import RANKER
@@ -42,8 +42,9 @@ class PointDetector:
             the package.
         descriptor: of `extract`: "learned", by a small network that sees the surroundings of a
             keypoint, too; "learned-free", by one that was trained on photographs under free
-            licences alone; the ONNX file of `deepdetect train-descriptor`; or "rootsift", for
-            programs that expect SIFT's.
+            licences alone; "cross-modal", for images of different sensors, such as infrared and
+            visible light, or a map; the ONNX file of `deepdetect train-descriptor`; or
+            "rootsift", for programs that expect SIFT's.
 
     Raises:
         WeightsError: the ranker or the descriptor is missing, damaged or does not fit.
@@ -79,7 +80,7 @@ class PointDetector:
         if is_path(descriptor):
             descriptor = Path(descriptor).absolute()
         else:
-            check_name("descriptor", descriptor, (LEARNED, LEARNED_FREE, ROOT_SIFT))
+            check_name("descriptor", descriptor, (*DESCRIPTOR_GRAPHS, ROOT_SIFT))
         self.descriptor, self.descriptor_type = descriptor, descriptor_type(descriptor)
 
     @property

@@ -12,8 +12,11 @@ from .matchers import DescriptorMatches
 
 LEARNED: Final = "learned"
 LEARNED_FREE: Final = "learned-free"
+CROSS_MODAL: Final = "cross-modal"
 """`Keypoints.descriptor_type` of these; the second by weights of photographs under free licences
-alone. Of one's own weights it is "learned-" and the beginning of the file's SHA-256."""
+alone, the third for images of different sensors, where what is dark in one may be bright in the
+other. Of one's own weights it is "learned-" or "cross-modal-" and the beginning of the file's
+SHA-256."""
 
 RATIO, LEARNED_RATIO = 0.85, 0.88
 """Of the ratio test, of all others and of learned descriptors. On photos/val, with the second these
@@ -42,7 +45,15 @@ NEAR_DEGREES = 20
 
 def is_learned(descriptor_type: str | None) -> bool:
     """Return whether descriptors are learned ones, by the weights here or by one's own."""
-    return descriptor_type is not None and descriptor_type.startswith(LEARNED)
+    return descriptor_type is not None and descriptor_type.startswith((LEARNED, CROSS_MODAL))
+
+
+def angles_counted(descriptor_type: str) -> int:
+    """Return how many times a keypoint's angle its descriptor is turned by.
+
+    Twice those of images of different sensors: a gradient may point the other way.
+    """
+    return 2 if descriptor_type.startswith(CROSS_MODAL) else 1
 
 
 def turn_descriptors(descriptors: np.ndarray, degrees: np.ndarray | float) -> np.ndarray:
@@ -67,11 +78,13 @@ def match_learned(
     how keypoints are turned to each other, find about a sixth more.
     """
     descriptors0, descriptors1 = features0.descriptors, features1.descriptors
-    angles0, angles1 = features0.angles, features1.angles
     assert descriptors0 is not None
     assert descriptors1 is not None
-    if angles0 is None or angles1 is None:
+    assert features0.descriptor_type is not None
+    if features0.angles is None or features1.angles is None:
         return match(descriptors0, descriptors1)
+    counted = angles_counted(features0.descriptor_type)
+    angles0, angles1 = counted * features0.angles, counted * features1.angles
     own = match(descriptors0[:TURNED_KEYPOINTS], descriptors1[:TURNED_KEYPOINTS])
     turn = common_turn(angles1[own.indices1] - angles0[own.indices0])
     first = turn_descriptors(descriptors0, angles0)

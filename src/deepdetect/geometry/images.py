@@ -251,3 +251,18 @@ def track_round_trip(
 def equalise(gray: np.ndarray) -> np.ndarray:
     """Equalise an image locally, so that changes of light are not taken for motion."""
     return cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply(gray)
+
+
+EDGE_SIGMA_PX, EDGE_QUANTILE = 1.0, 0.99
+"""Of the blur before the gradient, and of its length at white."""
+
+
+def edge_strength(gray: np.ndarray) -> np.ndarray:
+    """Return the length of the gradient of (H, W) uint8 luma, (H, W) uint8.
+
+    It does not tell which side of an edge is bright: so images of different sensors are alike.
+    """
+    smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), EDGE_SIGMA_PX)
+    length = np.hypot(cv2.Scharr(smooth, -1, 1, 0), cv2.Scharr(smooth, -1, 0, 1))
+    white = max(float(np.quantile(length, EDGE_QUANTILE)), 1.0)
+    return np.asarray(cv2.convertScaleAbs(length, alpha=255 / white))

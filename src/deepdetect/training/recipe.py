@@ -280,6 +280,8 @@ class DescriptorTrainingOptions:
         learning_rate: the highest, of Muon, after a warm-up; it falls to 0, linearly.
         val_count: how many times the weights are measured.
         val_pairs: of each kind that they are measured on: upright, turned, zoomed.
+        cross_modal: whether the views of a pair are as of different sensors: with other mixtures of
+            colours, inverted or any other tones, or edges.
         seed: of the weights and the pairs.
 
     Raises:
@@ -291,6 +293,7 @@ class DescriptorTrainingOptions:
     learning_rate: float = 0.012
     val_count: int = 12
     val_pairs: int = 48
+    cross_modal: bool = False
     seed: int = 0
 
     def __post_init__(self) -> None:

@@ -131,9 +131,8 @@ def test_own_weights_describe_points_and_are_of_their_own_type(
     with pytest.raises(WeightsError, match="nowhere"):
         PointDetector(descriptor="nowhere/descriptor.onnx")
     (tmp_path / "broken.onnx").write_bytes(b"nothing")
-    broken = PointDetector(200, descriptor=tmp_path / "broken.onnx")
     with pytest.raises(WeightsError, match="broken"):
-        broken.extract(image)
+        PointDetector(200, descriptor=tmp_path / "broken.onnx")
 
 
 def test_a_run_starts_from_weights(whole: TrainingResult, textures: Path, tmp_path: Path) -> None:
@@ -165,4 +164,4 @@ def test_images_without_detail_are_refused(tmp_path: Path, monkeypatch: pytest.M
     cv2.imwrite(str(tmp_path / "grey.png"), np.full((480, 480), 90, np.uint8))
     monkeypatch.setattr("deepdetect.training.descriptor.task.ATTEMPTS", 2)
     with pytest.raises(OptionError, match="detail"):
-        draw_numbered([tmp_path / "grey.png"], 0)
+        draw_numbered([tmp_path / "grey.png"], False, 0)

@@ -15,7 +15,14 @@ from ..._shared.opencv import cv2
 from ..._shared.records import file_digest
 from ..._shared.runtimes import start_session
 from ...features.keypoints import Keypoints
-from ...features.learned import LEARNED, LEARNED_FREE, LENGTH, turn_descriptors
+from ...features.learned import (
+    CROSS_MODAL,
+    LEARNED,
+    LEARNED_FREE,
+    LENGTH,
+    angles_counted,
+    turn_descriptors,
+)
 from ...features.scale_space import set_angles
 from ...features.sift import ROOT_SIFT
 from ..pretrained import RANKER, resolve_weights
@@ -23,6 +30,7 @@ from ..pretrained import RANKER, resolve_weights
 DESCRIPTOR_GRAPHS = {
     LEARNED: RANKER.with_name("descriptor.onnx"),
     LEARNED_FREE: RANKER.with_name("descriptor_free.onnx"),
+    CROSS_MODAL: RANKER.with_name("descriptor_cross_modal.onnx"),
 }
 """Map `luma` (1, 1, H, W) in [0, 1], `xy` (1, N, 2) in pixels and `sizes` (1, N), diameters in
 pixels, to `descriptors` (1, N, 64) of length 1, all float32."""
@@ -63,8 +71,8 @@ def describe_learned(
         "sizes": sizes[None],
     }
     path = DESCRIPTOR_GRAPHS.get(str(descriptor), Path(descriptor))
-    upright = _session(path, kind).run(["descriptors"], inputs)[0][0]
-    descriptors = turn_descriptors(upright, -angles)
+    upright = _session(path, kind[-DIGEST_LENGTH:]).run(["descriptors"], inputs)[0][0]
+    descriptors = turn_descriptors(upright, -angles_counted(kind) * angles)
     return replace(keypoints, angles=angles, descriptors=descriptors, descriptor_type=kind)
 
 
@@ -72,11 +80,14 @@ def descriptor_type(descriptor: str | Path) -> str:
     """Return the `Keypoints.descriptor_type` of a name, or of a file, which has its digest."""
     if str(descriptor) in (*DESCRIPTOR_GRAPHS, ROOT_SIFT):
         return str(descriptor)
-    return f"{LEARNED}-{file_digest(resolve_weights(descriptor))[:DIGEST_LENGTH]}"
+    path = resolve_weights(descriptor)
+    digest = file_digest(path)[:DIGEST_LENGTH]
+    cross_modal = _session(path, digest).get_modelmeta().description == CROSS_MODAL
+    return f"{CROSS_MODAL if cross_modal else LEARNED}-{digest}"
 
 
 @functools.cache
-def _session(path: Path, kind: str) -> Any:
+def _session(path: Path, content: str) -> Any:
     """Start a session of a file, once for each content that it has had."""
     try:
         session = start_session(str(path), thread_limit())

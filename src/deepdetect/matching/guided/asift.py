@@ -7,6 +7,7 @@ way round. The views stay upright, as learned descriptors are, which bear what l
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -39,7 +40,12 @@ def learned_points(gray: np.ndarray, max_keypoints: int) -> Keypoints:
     height, width = gray.shape
     if min(height, width) < MINIMUM_SIDE:
         return describe_learned(gray, Keypoints.empty((width, height)))
-    return PointDetector(max_keypoints, descriptor=LEARNED).extract(gray)
+    return _detector(max_keypoints).extract(gray)
+
+
+@functools.cache
+def _detector(max_keypoints: int) -> PointDetector:
+    return PointDetector(max_keypoints, descriptor=LEARNED)
 
 
 def simulated_views(gray: np.ndarray, max_keypoints: int) -> Iterator[Keypoints]:

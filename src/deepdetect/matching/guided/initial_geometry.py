@@ -2,7 +2,7 @@
 
 A coarse pass on small copies first, which is enough where the pair is clearly a plane or clearly
 has depth; then plain SIFT on larger ones; learned descriptors, and simulated views (`asift`), only
-when that gives nothing.
+when that gives nothing, or little of images of different sensors.
 Which model it is decides `geometry.two_view`; its thresholds and those here were chosen on all of
 Oxford and Middlebury, Strecha's fountain and a KITTI clip.
 """
@@ -20,7 +20,7 @@ import numpy as np
 from ..._shared.errors import OptionError
 from ...detector.points.descriptor import describe_learned
 from ...features.keypoints import Keypoints
-from ...features.learned import is_learned, match_learned
+from ...features.learned import CROSS_MODAL, is_learned, match_learned
 from ...features.matchers import exact_neighbours, match_descriptors
 from ...features.matches import TwoViewGeometry
 from ...features.sift import detect_sift
@@ -207,7 +207,8 @@ class InitialGeometry(TwoViewModel):
 
     `points0` and `points1` are the matches that agree with it, `others` those that do not, None
     where the model was asked for; `num_views` were simulated for them. Another model would be found
-    from the `source`. A `learned` one is of points; a `negative` is the second image of the first.
+    from the `source`. A `learned` one is of points; a `cross_modal` one of images in which the same
+    thing is dark and bright.
     """
 
     points0: np.ndarray
@@ -216,7 +217,7 @@ class InitialGeometry(TwoViewModel):
     num_views: int = 0
     source: Source = None
     learned: bool = False
-    negative: bool = False
+    cross_modal: bool = False
 
     @classmethod
     def of(
@@ -269,33 +270,19 @@ def guiding_geometry(
     grays: Pair, model: str = "auto", seed: int = 0, source: Source = None
 ) -> InitialGeometry:
     """Find the geometry to begin with, by the least effort that it takes."""
-    tentative = source if isinstance(source, TentativeMatches) else None
-    if isinstance(source, tuple) and isinstance(source[0], Keypoints):
-        matches = matches_of_points(grays, source)
+    if isinstance(source, TentativeMatches):
+        geometry = replace(estimate_initial_geometry(source, model, seed), source=source)
+    elif isinstance(source, tuple) and not isinstance(source[0], Keypoints):
+        return replace(_geometry_of_positions(grays, source, model, seed), source=source)
+    else:
+        matches = None if source is None else matches_of_points(grays, source)
         if matches is not None:
             geometry = estimate_initial_geometry(matches, model, seed)
             if len(geometry.points0) >= MIN_COARSE_INLIERS:
                 return replace(geometry, source=source)
-    elif isinstance(source, tuple):
-        return replace(_geometry_of_positions(grays, source, model, seed), source=source)
-    longest = max(max(gray.shape) for gray in grays)
-    if tentative is None and longest > COARSE_SIDE_PX and model != "fundamental":
-        coarse = find_tentative_matches(
-            *grays, max_side_px=COARSE_SIDE_PX, max_keypoints=COARSE_KEYPOINTS
-        )
-        geometry = estimate_initial_geometry(coarse, model, seed, semi_calibrated=False)
-        if _is_clear(geometry):
-            return replace(geometry, source=source)
-    given = tentative is not None
-    if tentative is None:
-        tentative = find_tentative_matches(*grays)
-    geometry = estimate_initial_geometry(tentative, model, seed)
+        geometry = _geometry_of_keypoints(grays, model, seed, source)
     if geometry.matrix is not None:
-        return replace(geometry, source=tentative)
-    if not given:
-        geometry = _learned_geometry(grays, model, seed)
-        if geometry.matrix is not None:
-            return geometry
+        return geometry
     tentative = _learned_matches(grays, SIMULATED_SIDE_PX, SIMULATED_KEYPOINTS)
     geometry = estimate_initial_geometry(
         tentative, model, seed, semi_calibrated=False, view_keypoints=SIMULATED_KEYPOINTS // 2
@@ -303,24 +290,48 @@ def guiding_geometry(
     return replace(geometry, source=source)
 
 
+def _geometry_of_keypoints(
+    grays: Pair, model: str, seed: int, source: tuple[Keypoints, Keypoints] | None
+) -> InitialGeometry:
+    """Find the geometry that SIFT's keypoints show, or else points with learned descriptors."""
+    longest, learned = max(max(gray.shape) for gray in grays), None
+    if longest > COARSE_SIDE_PX and model != "fundamental":
+        coarse = find_tentative_matches(
+            *grays, max_side_px=COARSE_SIDE_PX, max_keypoints=COARSE_KEYPOINTS
+        )
+        geometry = estimate_initial_geometry(coarse, model, seed, semi_calibrated=False)
+        if _is_clear(geometry):
+            return replace(geometry, source=source)
+        if geometry.log10_nfa >= MAX_HINT_LOG10_NFA:
+            learned = _learned_geometry(grays, model, seed)
+            if learned.log10_nfa >= MAX_HINT_LOG10_NFA:
+                # Nor do larger copies show anything where small ones do not even hint at it.
+                return learned
+    tentative = find_tentative_matches(*grays)
+    geometry = estimate_initial_geometry(tentative, model, seed)
+    if len(geometry.points0) < MIN_COARSE_INLIERS:
+        learned = learned or _learned_geometry(grays, model, seed)
+        more = len(learned.points0) > len(geometry.points0)
+        if geometry.matrix is None or (learned.cross_modal and more):
+            return learned
+    return replace(geometry, source=tentative)
+
+
 def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
-    """Find the geometry that points with learned descriptors show, where one is a negative, too.
+    """Find the geometry that points with learned descriptors show, of other sensors, too.
 
     In unlike light, the dark, blur, or from another side two to fifteen times as many of them agree
     as of SIFT's keypoints; where one image is four times as large, SIFT's are more. SIFT's lie more
     exactly where they belong, which tells depth from a plane.
     """
     as_it_is = _learned_matches(grays, COARSE_SIDE_PX, LEARNED_KEYPOINTS)
-    first, second = as_it_is.features
-    assert second.angles is not None
-    # Points and sizes are those of the image, gradients point the other way.
-    second = replace(second, angles=(second.angles + 180) % 360)
-    second = describe_learned(255 - as_it_is.views[1], second)
-    inverted = find_tentative_matches(*grays, (first, second), max_side_px=COARSE_SIDE_PX)
-    negative = len(inverted.ratios) > len(as_it_is.ratios)
-    tentative = inverted if negative else as_it_is
+    views = zip(as_it_is.views, as_it_is.features, strict=True)
+    first, second = (describe_learned(*each, CROSS_MODAL) for each in views)
+    across = find_tentative_matches(*grays, (first, second), max_side_px=COARSE_SIDE_PX)
+    cross_modal = len(across.ratios) > len(as_it_is.ratios)
+    tentative = across if cross_modal else as_it_is
     geometry = estimate_initial_geometry(tentative, model, seed)
-    return replace(geometry, source=tentative, learned=True, negative=negative)
+    return replace(geometry, source=tentative, learned=True, cross_modal=cross_modal)
 
 
 def _learned_matches(grays: Pair, side_px: int, keypoints: int) -> TentativeMatches:

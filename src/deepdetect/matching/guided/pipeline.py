@@ -16,7 +16,7 @@ from ...features.keypoints import nearest_keypoints
 from ...features.matches import GuidedMatches, TwoViewGeometry
 from ...geometry.estimation import TwoViewModel, estimate_geometry, measure_parallax
 from ...geometry.homography_refinement import most_alike, refine_homography
-from ...geometry.images import downscale, warp_to_reference
+from ...geometry.images import downscale, edge_strength, warp_to_reference
 from ...geometry.transforms import (
     epipolar_errors,
     scaled_homography,
@@ -118,8 +118,8 @@ def guided_matches(
     Returns the geometry that guided, and the matches; None when no geometry could be trusted.
     """
     enough = MIN_MATCHED_FRACTION * min(len(xy) for xy in pixels)
-    if first.negative:
-        grays = grays[0], 255 - grays[1]
+    if first.cross_modal:
+        grays = edge_strength(grays[0]), edge_strength(grays[1])
     if first.model == "homography":
         geometry, matches = _plane_or_depth(grays, pixels, first, enough, seed)
     else:
@@ -186,6 +186,12 @@ def _plane_or_depth(
     off_plane = first.parallax is not None and first.parallax.significant and not first.learned
     plane = _trusted(first, matrix, on_plane, enough)
     plane = replace(plane[0], verified=verified), plane[1]
+    if first.cross_modal:
+        # What patches of different sensors do not show is no evidence of depth.
+        if plane[1] is None:
+            plane = _sparsely(grays[0], pixels[0], first)
+        if plane[1] is not None:
+            return plane
     clear = first.parallax is not None and first.parallax.log10_nfa < MAX_PARALLAX_LOG10_NFA
     unexplained = 1 - verified >= MIN_OFF_PLANE_FRACTION * verified
     if planar and not (clear or (off_plane and unexplained)):
@@ -351,8 +357,7 @@ def _match_depth(
             dense = match_by_rectification(grays, xy0, sparse, first.matrix, plane=plane)
     if dense is None or len(dense[1]) < enough:
         # Too little around the sparse matches is alike, but they are distinct, and agree.
-        alike = _sparse_matches(grays[0], xy0, first)
-        return _trusted(first, first.matrix, alike, MIN_ALIKE_FRACTION * len(first.points0))
+        return _sparsely(grays[0], xy0, first)
     return _trusted(first, *dense, enough)
 
 
@@ -365,15 +370,19 @@ def _trusted(
     return replace(first, matrix=matrix).as_two_view_geometry(), matches
 
 
-def _sparse_matches(gray0: np.ndarray, xy0: np.ndarray, first: InitialGeometry) -> GuidedMatches:
-    """Return the sparse matches that move as those around them do, where they are."""
+def _sparsely(
+    gray0: np.ndarray, xy0: np.ndarray, first: InitialGeometry
+) -> tuple[TwoViewGeometry, GuidedMatches | None]:
+    """Return the sparse matches that move as those around them do, where they are, if enough do."""
+    assert first.matrix is not None
     scores = moving_alike(first.points0, first.points1)
     kept = scores >= MIN_MOVING_ALIKE
     points0 = first.points0[kept]
     rows, distances = nearest_keypoints(points0, xy0, gray0.shape[::-1])
     rows = np.where(np.isfinite(distances), rows, -1).astype(np.int64)
     ends = first.points1[kept], scores[kept].astype(np.float32)
-    return GuidedMatches(rows, *ends, subpixel=True, points0=points0)
+    matches = GuidedMatches(rows, *ends, subpixel=True, points0=points0)
+    return _trusted(first, first.matrix, matches, MIN_ALIKE_FRACTION * len(first.points0))
 
 
 def match_by_homography(

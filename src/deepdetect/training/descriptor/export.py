@@ -15,13 +15,14 @@ import torch
 from ..._shared.atomic import atomic_path
 from ...detector.network.onnx_export import OPSET
 from ...detector.points.descriptor import STRIDE
+from ...features.learned import LEARNED
 from .network import DescriptorNetwork
 
 MIN_HALVED = 1000
 """Numbers of a kernel from which on it is stored as float16; runtimes compute in float32."""
 
 
-def export_descriptor(network: DescriptorNetwork, path: Path) -> None:
+def export_descriptor(network: DescriptorNetwork, path: Path, kind: str = LEARNED) -> None:
     """Write a network as `PointDetector.extract` reads it (see `DESCRIPTOR_GRAPHS`)."""
     inputs = torch.zeros(1, 1, STRIDE, 2 * STRIDE), torch.ones(1, 50, 2), torch.ones(1, 50)
     names, written = ["luma", "xy", "sizes"], io.BytesIO()
@@ -32,7 +33,7 @@ def export_descriptor(network: DescriptorNetwork, path: Path) -> None:
         warnings.simplefilter("ignore")  # of what it traces
         torch.onnx.export(network.cpu().eval(), inputs, written, **how)  # type: ignore[arg-type]
     model = onnx.load_model_from_string(written.getvalue())
-    graph = model.graph
+    model.doc_string, graph = kind, model.graph
     for kernel in [each for each in graph.initializer if math.prod(each.dims) > MIN_HALVED]:
         values = onnx.numpy_helper.to_array(kernel).astype(np.float16)
         halved = onnx.numpy_helper.from_array(values, f"{kernel.name}_float16")

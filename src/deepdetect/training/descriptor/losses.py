@@ -55,12 +55,13 @@ def mirror(batch: Pair, which: Tensor) -> Pair:
 
 
 def contrastive_loss(
-    network: DescriptorNetwork, batch: Pair, generator: np.random.Generator
+    network: DescriptorNetwork, batch: Pair, generator: np.random.Generator, counted: int = 1
 ) -> Tensor:
     """Return the cross-entropy of the right keypoint among all of the other view (InfoNCE).
 
     In both directions. Half of the pairs are mirrored. Turned pairs are turned back by angles as
-    detectors measure them; of those that hardly are, half stay as upright images will be.
+    detectors measure them, each `counted` so many times; of those that hardly are, half stay as
+    upright images will be.
     """
     device, count = batch.turns.device, len(batch.turn)
     mirrored, kept = torch.from_numpy(generator.random((2, count)) < 0.5).to(device)
@@ -68,7 +69,7 @@ def contrastive_loss(
     batch = mirror(batch, mirrored)
     first, second = describe_views(network, batch)
     as_is = kept & (batch.turn < UPRIGHT)
-    second = turn(second, torch.where(as_is[:, None], 0, -(batch.turns + noise.float())))
+    second = turn(second, torch.where(as_is[:, None], 0, -counted * (batch.turns + noise.float())))
     similar = (
         first @ second.transpose(1, 2) * network.temperature.clamp(max=MAX_LOG_TEMPERATURE).exp()
     )
@@ -86,7 +87,9 @@ def _near(xy: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def shares_right(network: DescriptorNetwork, batches: Iterable[Pair]) -> dict[str, float]:
+def shares_right(
+    network: DescriptorNetwork, batches: Iterable[Pair], counted: int = 1
+) -> dict[str, float]:
     """Return which share of keypoints are mutual nearest neighbours and right, by kind of pair.
 
     The network is in evaluation mode; there are pairs of all of `KINDS`.
@@ -96,7 +99,8 @@ def shares_right(network: DescriptorNetwork, batches: Iterable[Pair]) -> dict[st
     for batch in batches:
         first, second = describe_views(network, batch)
         noise = generator.normal(0, ANGLE_NOISE, batch.turns.shape).astype(np.float32)
-        turned = turn(second, -(batch.turns + torch.from_numpy(noise).to(second.device)))
+        angles = counted * (batch.turns + torch.from_numpy(noise).to(second.device))
+        turned = turn(second, -angles)
         for row, valid in enumerate(batch.valid):
             angle, zoom = batch.turn[row].item(), batch.zoom[row].item()
             other = (second if angle < UPRIGHT else turned)[row][valid]

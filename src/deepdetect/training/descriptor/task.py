@@ -16,6 +16,7 @@ from ..._shared.errors import OptionError
 from ..._shared.records import key
 from ...detector.network.weights import load_network, weights_digest
 from ...evaluation.report import Table
+from ...features.learned import CROSS_MODAL, LEARNED, angles_counted
 from ...io.image import find_images
 from ..checkpoint import Point
 from ..optim import Muon
@@ -64,11 +65,11 @@ def pairs_to_draw(
         drawn |= wanted
 
 
-def draw_numbered(files: Sequence[Path], *seed: int) -> Pair:
+def draw_numbered(files: Sequence[Path], cross_modal: bool, *seed: int) -> Pair:
     """Draw a pair by a seed; an OptionError where the images show too little."""
     generator = np.random.default_rng(seed)
     for _ in range(ATTEMPTS):
-        if (pair := draw_pair(generator, files)) is not None:
+        if (pair := draw_pair(generator, files, cross_modal)) is not None:
             return pair
     raise OptionError("the images show too little for pairs of views: use photographs with detail")
 
@@ -81,12 +82,13 @@ def stack(pairs: Sequence[Pair]) -> Pair:
 class PairDataset(Dataset[tuple[int, list[int], Pair | None]]):
     """Pairs by step; each is a pure function of the seed and its number."""
 
-    def __init__(self, files: Sequence[Path], seed: int) -> None:
-        self.files, self.seed = files, seed
+    def __init__(self, files: Sequence[Path], options: DescriptorTrainingOptions) -> None:
+        self.files, self.options = files, options
 
     def __getitem__(self, index: tuple[int, list[int]]) -> tuple[int, list[int], Pair | None]:
         step, numbers = index
-        pairs = [draw_numbered(self.files, self.seed, 3, number) for number in numbers]
+        fixed = self.files, self.options.cross_modal, self.options.seed, 3
+        pairs = [draw_numbered(*fixed, number) for number in numbers]
         return step, numbers, stack(pairs) if pairs else None
 
 
@@ -95,7 +97,7 @@ def validation_batches(files: Sequence[Path], options: DescriptorTrainingOptions
     pairs: dict[str, list[Pair]] = {kind: [] for kind in KINDS}
     number = 0
     while min(map(len, pairs.values())) < options.val_pairs:
-        pair = draw_numbered(files, 0, 2, number)
+        pair = draw_numbered(files, options.cross_modal, 0, 2, number)
         number += 1
         if len(of_kind := pairs[kind_of(pair.turn, pair.zoom)]) < options.val_pairs:
             of_kind.append(pair)
@@ -123,6 +125,7 @@ class DescriptorTrainer(Trainer):
         device: DeviceOptions,
     ) -> None:
         self.options, self.num_workers = options, device.worker_count
+        self.kind = CROSS_MODAL if options.cross_modal else LEARNED
         self.device = torch.device(device.accelerator)
         self.files, of_validation = find_images(images), find_images(validation)
         if init_weights is None:
@@ -158,7 +161,7 @@ class DescriptorTrainer(Trainer):
         """Return the loader of some steps: the step, numbers of pairs, and these pairs."""
         to_draw = pairs_to_draw(self.options, first, self.steps if last is None else last)
         return DataLoader(
-            PairDataset(self.files, self.options.seed),
+            PairDataset(self.files, self.options),
             batch_size=None,
             sampler=list(to_draw),
             num_workers=self.num_workers,
@@ -184,7 +187,7 @@ class DescriptorTrainer(Trainer):
         rows = torch.from_numpy(pairs_of_step(self.options, step) % WINDOW).to(self.device)
         chosen = Pair(*(kept[rows] for kept in self.window or ()))
         generator = np.random.default_rng([self.options.seed, 5, step])
-        return contrastive_loss(self.network, chosen, generator)
+        return contrastive_loss(self.network, chosen, generator, angles_counted(self.kind))
 
     def learning_rate(self, step: int) -> float:
         """Return the rate of Muon in a step: a warm-up, a plateau, a linear decay to 0."""
@@ -194,12 +197,12 @@ class DescriptorTrainer(Trainer):
 
     def validate(self, step: int) -> dict[str, float]:
         """Measure the average of the weights so far."""
-        shares = shares_right(self.average, self.batches)
+        shares = shares_right(self.average, self.batches, angles_counted(self.kind))
         return {"score": sum(shares.values()) / len(shares), **shares}
 
     def export(self, folder: Path) -> Path:
         best: Any = load_network(folder / self.weights_file, DescriptorNetwork)
-        export_descriptor(best, folder / ONNX)
+        export_descriptor(best, folder / ONNX, self.kind)
         return folder / ONNX
 
     def card(self, best: Point) -> tuple[str, list[str]]:

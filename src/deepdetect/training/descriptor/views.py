@@ -102,7 +102,7 @@ class View:
 
 
 class Layer(NamedTuple):
-    """A photograph in both views; (H, W) float32 in [0, 1] where it covers what is behind it."""
+    """A photograph, RGB, in both views; (H, W) float32 in [0, 1] where it covers what is behind."""
 
     photograph: np.ndarray
     views: tuple[View, View]
@@ -128,6 +128,11 @@ def _rotation(angle: float) -> np.ndarray:
     return np.array([[c, -s], [s, c]])
 
 
+CROSS_MODAL_SHARE, MIXED_SHARE = 0.6, 0.45
+"""Of pairs for images of different sensors, those of which one view has other tones, and those of
+which one is of another mixture of colours."""
+
+
 def _smooth_noise(
     rng: np.random.Generator, cells: tuple[int, int] = (3, 8), side: int = SIDE_PX
 ) -> np.ndarray:
@@ -142,10 +147,10 @@ def draw_layers(
     normal, uniform, chance = rng.normal, rng.uniform, rng.random
 
     def draw_photograph() -> np.ndarray:
-        return luma(load_image(files[int(rng.integers(len(files)))]))
+        return load_image(files[int(rng.integers(len(files)))])
 
     photograph = draw_photograph()
-    middle = np.array(photograph.shape[::-1]) / 2 + uniform(-90, 90, 2)
+    middle = np.array(photograph.shape[1::-1]) / 2 + uniform(-90, 90, 2)
     scale = math.exp(uniform(math.log(0.6), math.log(1.5)))
     zoom = math.exp(uniform(-0.2, 0.2))
     if chance() < 0.5:
@@ -181,18 +186,23 @@ def draw_layers(
     return layers, scales, abs(turn)
 
 
-def render_layers(layers: Sequence[Layer], side: int, scale: float) -> tuple[np.ndarray, ...]:
-    """Return one of the views, (S, S) float32, and the number of the layer in each pixel."""
+def render_layers(
+    layers: Sequence[Layer], side: int, scale: float, mixture: np.ndarray | None = None
+) -> tuple[np.ndarray, ...]:
+    """Return one of the views, (S, S) float32, and the number of the layer in each pixel.
+
+    In luma, or in a (1, 3) mixture of colours.
+    """
     view, top = np.zeros((SIDE_PX, SIDE_PX), np.float32), np.zeros((SIDE_PX, SIDE_PX), np.uint8)
     for number, (photograph, views, shape) in enumerate(layers):
-        smooth = photograph
+        smooth = luma(photograph) if mixture is None else mix_colours(photograph, mixture)
         if scale > 1.15:  # so that it is not aliased
-            smooth = cv2.GaussianBlur(photograph, (0, 0), 0.5 * math.sqrt(scale * scale - 1))
+            smooth = cv2.GaussianBlur(smooth, (0, 0), 0.5 * math.sqrt(scale * scale - 1))
         shown = views[side].render(smooth)
         if shape is None:
             view = shown
             continue
-        shape = cv2.resize(shape, photograph.shape[::-1])
+        shape = cv2.resize(shape, smooth.shape[::-1])
         cover = views[side].render(shape, cv2.BORDER_CONSTANT)
         view = view * (1 - cover) + shown * cover
         top[cover > 0.5] = number
@@ -213,7 +223,7 @@ def correspond(
         rows = np.flatnonzero(layer_of == number)
         places = first.to_photograph(xy[rows])
         there[rows] = second.from_photograph(places)
-        last = np.array(photograph.shape[::-1]) - 1
+        last = np.array(photograph.shape[1::-1]) - 1
         visible[rows] = ((places >= 0) & (places < last)).all(1)
         for axis, step in enumerate(2 * np.eye(2, dtype=np.float32)):
             ends = (first.to_photograph(xy[rows] + sign * step) for sign in (1, -1))
@@ -228,11 +238,21 @@ def _at(numbers: np.ndarray, xy: np.ndarray) -> np.ndarray:
     return numbers[row, column]
 
 
-def draw_pair(rng: np.random.Generator, files: Sequence[Path]) -> Pair | None:
-    """Draw a pair of views of photographs; None where they share too little."""
+def draw_pair(
+    rng: np.random.Generator, files: Sequence[Path], cross_modal: bool = False
+) -> Pair | None:
+    """Draw a pair of views, as of one or of different sensors; None where they share too little."""
     layers, scales, turn = draw_layers(rng, files)
-    views, tops = zip(*(render_layers(layers, k, scales[k]) for k in range(2)), strict=True)
-    images = [relight(rng, view / 255) for view in views]
+    mixtures: list[np.ndarray | None] = [None, None]
+    if cross_modal and rng.random() < MIXED_SHARE:
+        mixtures[int(rng.integers(2))] = draw_mixture(rng)
+    rendered = (render_layers(layers, k, scales[k], mixtures[k]) for k in range(2))
+    views, tops = zip(*rendered, strict=True)
+    seen = [view / 255 for view in views]
+    if cross_modal and rng.random() < CROSS_MODAL_SHARE:
+        other = int(rng.integers(2))
+        seen[other] = change_tones(rng, seen[other])
+    images = [relight(rng, view) for view in seen]
     clean = rng.random() < 0.6
     xy0, sigmas0 = find_keypoints(views[0].astype(np.uint8) if clean else images[0])
     xy0 = (xy0 + rng.uniform(-0.5, 0.5, xy0.shape)).astype(np.float32)
@@ -266,6 +286,47 @@ def find_keypoints(view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rows = np.flatnonzero(inside.all(1) & (found.sigma_px < MAX_FIRST_SIGMA_PX))
     rows = rows[np.argsort(found.rank[rows])][:STRONGEST]
     return found.xy[rows], found.sigma_px[rows]
+
+
+def draw_mixture(rng: np.random.Generator) -> np.ndarray:
+    """Draw what a sensor sees of the colours, (1, 3) float32: a channel, or any mixture."""
+    if rng.random() < 0.4:
+        return np.eye(3, dtype=np.float32)[[int(rng.integers(3))]]
+    weights = rng.normal(1 / 3, 0.6, (1, 3)).astype(np.float32)
+    return weights / max(0.5, np.abs(weights).sum())
+
+
+def mix_colours(photograph: np.ndarray, mixture: np.ndarray) -> np.ndarray:
+    """Return (H, W) uint8 of (H, W, 3), lifted as far as colours that count less than 0 need."""
+    mixed = cv2.transform(photograph.astype(np.float32), mixture)
+    lifted: np.ndarray = np.clip(mixed - 255 * np.minimum(mixture, 0).sum(), 0, 255)
+    return lifted.astype(np.uint8)
+
+
+def change_tones(rng: np.random.Generator, view: np.ndarray) -> np.ndarray:
+    """Return a (S, S) float32 view in [0, 1] as another sensor may see it.
+
+    Inverted, by any curve of tones, by two that take turns over the view, or as its edges.
+    """
+
+    def curve() -> np.ndarray:
+        tones = rng.random(int(rng.integers(3, 8)))
+        tones = (tones - tones.min()) / (np.ptp(tones) + 1e-6)
+        return np.interp(view, np.linspace(0, 1, len(tones)), tones).astype(np.float32)
+
+    kind = rng.random()
+    if kind < 0.35:
+        return 1 - view
+    if kind < 0.7:
+        return curve()
+    if kind < 0.88:
+        field = _smooth_noise(rng, (2, 5))
+        share = np.clip(0.5 + field / (2 * np.abs(field).max()), 0, 1)
+        return curve() * share + curve() * (1 - share)
+    smooth = cv2.GaussianBlur(view, (0, 0), rng.uniform(0.7, 1.5))
+    edges = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0), cv2.Sobel(smooth, cv2.CV_32F, 0, 1))
+    edges = np.clip(edges / (np.quantile(edges, 0.98) + 1e-3), 0, 1)
+    return 1 - edges if rng.random() < 0.5 else edges
 
 
 def relight(rng: np.random.Generator, view: np.ndarray) -> np.ndarray:
