@@ -148,14 +148,8 @@ def test_the_centre_of_the_first_pixel_is_the_origin(
     assert np.abs(gaps.mean(0)).max() < 0.08
 
 
-NINE_POINTS = pytest.mark.xfail(
-    strict=True, reason="nine points with learned descriptors decide first, 2.3 px off"
-)
-
-
 @pytest.mark.parametrize(
-    ("turn", "swapped"),
-    [pytest.param(0.0, False, marks=[pytest.mark.slow, NINE_POINTS]), (35.0, True)],
+    ("turn", "swapped"), [pytest.param(0.0, False, marks=pytest.mark.slow), (35.0, True)]
 )
 def test_a_strong_tilt_needs_simulated_views(
     picture: Callable[..., np.ndarray], turn: float, swapped: bool

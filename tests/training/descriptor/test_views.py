@@ -74,7 +74,7 @@ def test_layers_in_front_hide_what_is_behind(textures: Path) -> None:
     drawn = (draw_layers(np.random.default_rng(k), files(textures)) for k in range(40))
     layers, scales, _ = next(each for each in drawn if len(each[0]) > 2)
     plain = [
-        Layer(np.full((480, 480), 10.0 * (k + 1), np.float32), *layer[1:])
+        Layer(np.full((480, 480, 3), 10 * (k + 1), np.uint8), *layer[1:])
         for k, layer in enumerate(layers)
     ]
     image, top = render_layers(plain, 0, scales[0])

@@ -75,6 +75,9 @@ MIN_COARSE_FRACTION = 0.5
 SIMULATED_SIDE_PX, SIMULATED_KEYPOINTS = 320, 1000
 """Longer side and keypoints of images of which views are simulated; each view gets half as many."""
 
+MIN_WITHOUT_VIEWS = 20
+"""Matches that agree with a geometry, for it to be taken without those of simulated views."""
+
 MAX_MATCHES_TO_SEARCH = 200
 """With fewer that agree with a fundamental matrix, more are searched for along its lines."""
 
@@ -394,20 +397,21 @@ def estimate_initial_geometry(
     nowhere = np.empty((0, 2))
     nothing = TwoViewModel("none", None, np.zeros(0, bool), float("inf"))
     best = InitialGeometry.of(nothing, nowhere, nowhere, model)
-    num_views = 0
-    for points, ratios, views in _more_and_more_matches(tentative, view_keypoints):
-        num_views += views
-        for ratio in MAX_RATIOS:
-            chosen = points[0][ratios < ratio], points[1][ratios < ratio]
-            two_view = choose_model(*chosen, sizes, model, seed, semi_calibrated)
-            geometry = InitialGeometry.of(two_view, *chosen, model)
-            geometry = _with_further_evidence(geometry, chosen[0], tentative)
-            if geometry.log10_nfa < best.log10_nfa:
-                best = replace(geometry, num_views=num_views)
-            if best.trusted:
-                best = _with_further_matches(best, tentative)
-                return best.rescaled(*tentative.scales)
-    return replace(best, num_views=num_views).untrusted()
+    views = 0
+    more = _more_and_more_matches(tentative, view_keypoints)
+    for points, ratios, views, ratio in ((*each, ratio) for each in more for ratio in MAX_RATIOS):
+        chosen = points[0][ratios < ratio], points[1][ratios < ratio]
+        two_view = choose_model(*chosen, sizes, model, seed, semi_calibrated)
+        geometry = InitialGeometry.of(two_view, *chosen, model)
+        geometry = _with_further_evidence(geometry, chosen[0], tentative)
+        if geometry.log10_nfa < best.log10_nfa:
+            best = replace(geometry, num_views=views)
+        enough = views or not view_keypoints or len(best.points0) >= MIN_WITHOUT_VIEWS
+        if best.trusted and enough:
+            break
+    if not best.trusted:
+        return replace(best, num_views=views).untrusted()
+    return _with_further_matches(best, tentative).rescaled(*tentative.scales)
 
 
 def _more_and_more_matches(
