@@ -2,10 +2,12 @@
 
     python benchmarks/descriptors.py DATA [--method edgepoint2_t32.onnx ...]
 
-DATA holds the folders oxford, hpatches, hdr, fountain, entry and the clips of KITTI. 2,048
+DATA holds the folders oxford, hpatches, hdr, fountain, entry and the clips of KITTI, and, if you
+like, roadscene: crop_LR_visible and cropinfrared of the public photographs of that name. 2,048
 keypoints of an image, mutual nearest neighbours without a ratio test; SIFT (with RootSIFT, and
 weaker keypoints where there are few) and files of other methods bring their own keypoints.
-Right matches are within 3 px of the truth (hdr: 2 px), means over pairs. Dark copies have 1/8 of
+Right matches are within 3 px of the truth (hdr: 2 px, roadscene, whose photographs in visible and
+infrared light lie upon each other less exactly: 5 px), means over pairs. Dark copies have 1/8 of
 the light and noise of one grey level, blurred copies a Gaussian of 2 px, both of the first image of
 each Oxford scene; turned ones, of three of them, are in steps of 15 degrees (worst over best,
 without quarter turns, which nothing blurs). hdr: the exposure of middle grey with each darker one,
@@ -47,6 +49,7 @@ from deepdetect.geometry.transforms import transfer_errors
 from deepdetect.io.image import load_image, luma
 
 KEYPOINTS, FEW, RIGHT_PX, RIGHT_DARK_PX, ORDERS, AUC_DEG = 2048, 512, 3.0, 2.0, 5, 5.0
+RIGHT_INFRARED_PX = 5.0
 FOUND_DEG, CLIPS, CLIP_PAIRS, ROUNDS = 10.0, ("kitti-clip", "kitti-clip2"), 30, 15
 MIDDLE_GREY, TURNED = 118, ("boat", "graf", "wall")
 
@@ -57,7 +60,7 @@ def methods(files: list[str]) -> dict[str, Extract]:
     """Return what extracts keypoints with descriptors, by name; others' files too."""
     found: dict[str, Extract] = {
         kind: PointDetector(KEYPOINTS, descriptor=kind).extract
-        for kind in ("rootsift", "learned", "learned-free")
+        for kind in ("rootsift", "learned", "learned-free", "cross-modal")
     }
     others = {Path(file).stem: _extract_other(file) for file in files}
     return found | {"SIFT": lambda rgb: detect_sift(luma(rgb), KEYPOINTS)} | others
@@ -122,6 +125,9 @@ def measure(extract: Extract, data: Path) -> tuple[Row, set[str]]:
         best = min(greys, key=lambda path: abs(greys[path] - MIDDLE_GREY))
         for path in sorted(path for path in greys if greys[path] < greys[best]):
             count("hdr", features(best), features(path), np.eye(3), px=RIGHT_DARK_PX)
+    for path in sorted((data / "roadscene/crop_LR_visible").glob("*.jpg")):
+        other = features(data / "roadscene/cropinfrared" / path.name)
+        count("infrared", features(path), other, np.eye(3), px=RIGHT_INFRARED_PX)
     means = {kind: float(np.mean(values)) for kind, values in counts.items()}
     turned = [means.pop(f"turned {degrees}") for degrees in range(15, 360, 15)]
     turned = [value for number, value in enumerate(turned, 1) if number % 6]

@@ -73,7 +73,7 @@ STAGES = {
     + "".join(f" --method {{published}}/peers/{name}.onnx" for name in PEERS),
     "published-pipeline": "benchmarks/published_pipeline.py {data}",
     "descriptors": "benchmarks/descriptors.py {data}"
-    + "".join(f" --method {{published}}/peers/{name}.onnx" for name in PEERS[1:]),
+    + "".join(f" --method {{published}}/peers/{name}.onnx" for name in PEERS),
     "fuzz": "-m fuzz",
 }
 """Arguments of Python by the stage's name. What writes no report prints its tables, or JSON."""

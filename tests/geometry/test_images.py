@@ -5,6 +5,7 @@ import pytest
 from scipy.ndimage import shift as shifted
 
 from deepdetect.geometry.images import (
+    edge_strength,
     erode_mask,
     gaussian_blur,
     gaussian_means,
@@ -109,3 +110,13 @@ def test_means_are_weighted_by_a_gaussian(some: tuple[np.ndarray, np.ndarray]) -
     np.testing.assert_allclose(found, expected, atol=2e-3)
     same = gaussian_means(pixels, np.full(150, 7.0), (20, 30), 1.5, pixels)
     np.testing.assert_allclose(same, 7, rtol=1e-5)
+
+
+def test_edges_do_not_tell_which_side_is_bright() -> None:
+    gray = noise()
+    edges = edge_strength(gray)
+    np.testing.assert_array_equal(edge_strength(255 - gray), edges)
+    step = np.zeros((40, 40), np.uint8)
+    step[:, 20:] = 90
+    assert (edge_strength(step).argmax(1) // 2 == 19 // 2).all()
+    assert not edge_strength(np.full((40, 40), 7, np.uint8)).any()

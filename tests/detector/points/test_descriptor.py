@@ -72,3 +72,21 @@ def test_unset_angles_become_dominant_ones(photo: np.ndarray) -> None:
     assert np.median(near) > 0.99
     with pytest.raises(OptionError, match="sizes"):
         points.describe(photo, dataclasses.replace(bare, sizes=None))
+
+
+@pytest.mark.parametrize("quarter_turns", range(4))
+def test_cross_modal_descriptors_match_a_turned_negative(
+    photo: np.ndarray, quarter_turns: int
+) -> None:
+    points = PointDetector(300, descriptor="cross-modal")
+    side = min(photo.shape[:2])
+    square = photo[:side, :side]
+    first = points.extract(square)
+    assert first.descriptor_type == "cross-modal"
+    negative = np.ascontiguousarray(np.rot90(255 - square, -quarter_turns))
+    matches = deepdetect.match_features(first, points.extract(negative), ratio=1)
+    x, y = matches.points0.T
+    for _ in range(quarter_turns):
+        x, y = side - 1 - y, x
+    right = np.hypot(*(np.stack([x, y], 1) - matches.points1).T) < 3
+    assert right.sum() > 150

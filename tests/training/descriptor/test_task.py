@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -165,3 +166,17 @@ def test_images_without_detail_are_refused(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr("deepdetect.training.descriptor.task.ATTEMPTS", 2)
     with pytest.raises(OptionError, match="detail"):
         draw_numbered([tmp_path / "grey.png"], False, 0)
+
+
+def test_cross_modal_weights_are_told_from_others(textures: Path, tmp_path: Path) -> None:
+    options = replace(OPTIONS, steps=1, cross_modal=True)
+    found = train_descriptor(textures, textures, tmp_path, options, device="cpu")
+    assert found.onnx is not None
+    points = PointDetector(200, descriptor=found.onnx)
+    assert points.descriptor_type == f"cross-modal-{file_digest(found.onnx)[:16]}"
+    first = points.extract(textures / "0.png")
+    assert first.descriptors is not None
+    assert first.angles is not None
+    # Half a turn of a keypoint is none.
+    again = points.describe(textures / "0.png", replace(first, angles=(first.angles + 180) % 360))
+    np.testing.assert_allclose(again.descriptors, first.descriptors, atol=1e-5)

@@ -9,9 +9,11 @@ from deepdetect.training.descriptor.views import (
     SIDE_PX,
     Layer,
     View,
+    change_tones,
     correspond,
     draw_layers,
     draw_pair,
+    mix_colours,
     relight,
     render_layers,
 )
@@ -106,3 +108,31 @@ def test_light_changes_values_but_not_places() -> None:
     for seed in range(30):
         changed = relight(np.random.default_rng(seed), image).astype(float)
         assert changed[110:146, 78:114].mean() > changed[110:146, 160:196].mean()
+
+
+def test_a_mixture_of_colours_is_lifted_above_zero() -> None:
+    colours = np.array([[[255, 0, 0], [0, 255, 0], [10, 20, 30]]], np.uint8)
+    red = np.array([[1, 0, 0]], np.float32)
+    np.testing.assert_array_equal(mix_colours(colours, red), [[255, 0, 10]])
+    np.testing.assert_array_equal(mix_colours(colours, -red), [[0, 255, 245]])
+
+
+def test_other_tones_stay_at_their_places() -> None:
+    image = np.zeros((SIDE_PX, SIDE_PX), np.float32)
+    image[96:160, 64:128] = 0.8
+    darker = 0
+    for seed in range(30):
+        changed = change_tones(np.random.default_rng(seed), image)
+        assert 0 <= changed.min() < changed.max() <= 1
+        inside, beside = changed[110:146, 78:114].mean(), changed[110:146, 160:196].mean()
+        darker += inside < beside
+        at_edge = np.abs(np.diff(changed[128])).argmax()
+        assert min(abs(at_edge - 63), abs(at_edge - 127)) < 5
+    assert 8 < darker < 22
+
+
+def test_views_as_of_different_sensors_show_the_same_keypoints(textures: Path) -> None:
+    drawn = [draw_pair(np.random.default_rng(k), files(textures), True) for k in range(12)]
+    pairs = [pair for pair in drawn if pair is not None]
+    assert len(pairs) > 6
+    assert all(pair.valid.sum() >= 40 for pair in pairs)
