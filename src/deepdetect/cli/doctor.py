@@ -17,6 +17,7 @@ PURPOSES = {
     "app": "app",
     "benchmark": "benchmark, and evaluate with the Oxford scenes",
     "demo": "demo",
+    "geo": "LAZ files, and ground control points",
     "heif": "images of iPhones (.heic)",
     "raw": "raw photographs",
     "tiff": "compressed TIFF of every kind",
