@@ -5,20 +5,25 @@ from __future__ import annotations
 import importlib.util
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 from PIL.ExifTags import GPS, IFD
 
-from deepdetect import MissingExtraError, OptionError, PointDetector, reconstruct_many
+from deepdetect import Camera, MissingExtraError, OptionError, PointDetector, reconstruct_many
 from deepdetect.datasets.posed_images import load_posed_scenes
+from deepdetect.geometry.point_cloud import EAST_NORTH_UP, PointCloud
 from deepdetect.sfm import MultiViewOptions, MultiViewReconstruction
-from deepdetect.sfm.formats import FORMATS
+from deepdetect.sfm.dense import DENSE_POINT
+from deepdetect.sfm.formats import FORMATS, write_mesh
 from deepdetect.sfm.georeference import Georeference
+from deepdetect.sfm.splat import seen_depths, thinned
 
 from ..io.test_gps import place_tags
 
+FORMATS_OF_ALL = tuple(n for n in FORMATS if n != "mesh" or "normals" in DENSE_POINT.names)
 NAMES = ("0003", "0004", "0005", "0006")
 METRES_PER_DEGREE = np.array([111_132.95, 78_846.8])
 """Of latitude and longitude, at 45 degrees north, by WGS 84."""
@@ -49,7 +54,7 @@ def placed(
             exif.get_ifd(IFD.GPSInfo).update(place_tags(latitude, longitude, up + 100))
             exif.get_ifd(IFD.GPSInfo)[GPS.GPSHPositioningError] = 0.02
             image.save(path, quality=95, exif=exif)
-    options = MultiViewOptions(stride_px=4, formats=tuple(FORMATS))
+    options = MultiViewOptions(stride_px=4, formats=FORMATS_OF_ALL)
     detector = PointDetector(1000)
     return root / "model", reconstruct_many(
         folder, root / "model", detector, options=options, workers=1
@@ -117,6 +122,135 @@ def test_maps_are_read_by_rasterio(placed) -> None:
     assert known.mean() > 0.9
     assert np.median(np.abs(sampled - utm[:, 2])[known]) < np.ptp(utm[known, 2]) / 4
     assert (colors[known].sum(axis=1) > 0).mean() > 0.99
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "splat/transforms.json"])
+def test_transforms_are_as_nerfstudio_reads_them(placed, name: str) -> None:
+    """Its own parser needs gigabytes; this is what it does: OpenGL's cameras, COLMAP's pixels."""
+    output, found = placed
+    path = output / name
+    values = json.loads(path.read_text())
+    assert values["camera_model"] == "OPENCV"
+    with (path.parent / values["ply_file_path"]).open("rb") as file:
+        assert file.read(3) == b"ply"
+    assert len(values["frames"]) == len(found.views)
+    for frame in values["frames"]:
+        with Image.open(path.parent / frame["file_path"]) as image:
+            assert image.size == (frame["w"], frame["h"])
+            rgb = np.asarray(image).astype(int)
+        camera = np.linalg.inv(frame["transform_matrix"])
+        x, y, z = camera[:3, :3] @ found.dense.points.T + camera[:3, 3:]
+        across, down = x / -z, -y / -z
+        bent = 1 + frame["k1"] * (across**2 + down**2)
+        column = frame["fl_x"] * across * bent + frame["cx"]
+        row = frame["fl_y"] * down * bent + frame["cy"]
+        inside = (z < 0) & (column > 1) & (row > 1)
+        inside &= (column < frame["w"] - 1) & (row < frame["h"] - 1)
+        assert inside.mean() > 0.5
+        shown = rgb[row[inside].astype(int), column[inside].astype(int)]
+        differences = np.abs(shown - found.dense.colors[inside]).mean(axis=1)
+        shifted = rgb[row[inside].astype(int) - 1, column[inside].astype(int) - 1]
+        assert np.median(differences) < 15
+        assert differences.mean() < np.abs(shifted - found.dense.colors[inside]).mean()
+
+
+def test_the_splats_model_is_read_by_pycolmap(placed, pycolmap) -> None:
+    output, found = placed
+    model = pycolmap.Reconstruction(output / "splat" / "sparse" / "0")
+    assert {camera.model_name for camera in model.cameras.values()} == {"PINHOLE"}
+    assert model.num_points3D() == len(found.sparse) + len(found.dense)
+    before = pycolmap.Reconstruction(output / "sparse" / "0")
+    assert len(before.points3D) == len(found.sparse)
+    errors = []
+    for each in (model, before):
+        distances = []
+        for point in each.points3D.values():
+            for element in point.track.elements:
+                image = each.images[element.image_id]
+                seen = image.points2D[element.point2D_idx].xy
+                distances.append(np.linalg.norm(image.project_point(point.xyz) - seen))
+        errors.append(np.mean(distances))
+    assert errors[0] == pytest.approx(errors[1], rel=0.02)
+    for image in model.images.values():
+        with Image.open(output / "splat" / "images" / image.name) as picture:
+            assert picture.size == (image.camera.width, image.camera.height)
+            assert np.asarray(picture)[[0, -1]].max() > 0
+    dense = [point for point in model.points3D.values() if not point.track.elements]
+    colors = {tuple(point.color) for point in dense}
+    assert colors == set(map(tuple, found.dense.colors.tolist()))
+    assert {round(float(p.error), 5) for p in dense} == {
+        round(float(error), 5) for error in found.dense_errors
+    }
+
+
+def test_text_is_the_same_model(placed, pycolmap) -> None:
+    output, _ = placed
+    text, binary = (pycolmap.Reconstruction(output / n) for n in ("sparse_text", "sparse/0"))
+    assert text.num_points3D() == binary.num_points3D()
+    point = next(iter(binary.points3D))
+    np.testing.assert_allclose(text.points3D[point].xyz, binary.points3D[point].xyz)
+    np.testing.assert_array_equal(text.points3D[point].color, binary.points3D[point].color)
+    assert binary.points3D[point].color.max() > 0
+
+
+def test_depth_maps_are_depths(placed) -> None:
+    output, found = placed
+    values = json.loads((output / "splat" / "transforms.json").read_text())
+    for frame, view in zip(values["frames"], found.views.values(), strict=True):
+        with Image.open(output / "splat" / frame["depth_file_path"]) as image:
+            assert image.size == (frame["w"], frame["h"])
+            depths = np.asarray(image) * values["depth_unit_scale_factor"]
+        assert image.mode == "I;16"
+        _, depth = view.project(found.dense.points)
+        assert np.median(depths[depths > 0]) == pytest.approx(np.median(depth[depth > 0]), rel=0.2)
+        assert (depths > 0).mean() > 0.1
+
+
+def test_what_is_seen_through_gaps_is_left_out() -> None:
+    """A near plane with a point at every second pixel hides a far one."""
+    camera = Camera((40, 40), 40.0)
+    y, x = np.mgrid[0:40:2, 0:40:2].reshape(2, -1)
+    near = camera.rays(np.column_stack([x, y]).astype(float)) * 2.0
+    y, x = np.mgrid[0:40, 0:40].reshape(2, -1)
+    far = camera.rays(np.column_stack([x, y]).astype(float)) * 8.0
+    view = SimpleNamespace(
+        camera=camera, project=lambda points: (camera.project(points), points[:, 2])
+    )
+    seen = seen_depths(view, np.concatenate([near, far]))
+    assert set(np.unique(seen[np.isfinite(seen)])) == {2.0}
+
+
+def test_thinned_points_are_even_in_space() -> None:
+    """Of a line whose one half has a hundred times as many points."""
+    random = np.random.default_rng(0)
+    places = np.concatenate([random.uniform(0, 1, 10_000), random.uniform(1, 2, 100)])
+    points = np.column_stack([places, np.zeros((len(places), 2))])
+    errors = random.uniform(0, 1, len(places))
+    rows = thinned(points, errors, 100)
+    assert 90 <= len(rows) <= 100
+    assert (points[rows, 0] < 1).mean() == pytest.approx(0.5, abs=0.15)
+    assert errors[rows][points[rows, 0] < 1].max() < 0.1  # the best of each cell
+    assert len(thinned(points, errors, 20_000)) == len(points)
+
+
+def test_a_mesh_is_read_by_trimesh(tmp_path: Path, pycolmap) -> None:
+    """The surface of a ball, coloured by place."""
+    trimesh = pytest.importorskip("trimesh", reason="needs trimesh")
+    normals = np.random.default_rng(0).normal(size=(8000, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    colors = np.rint((normals + 1) * 127).astype(np.uint8)
+    ball = PointCloud(2 * normals + [10, 20, 30], colors, "m", EAST_NORTH_UP, normals)
+    write_mesh(SimpleNamespace(dense=ball), tmp_path, tmp_path)
+    plain = trimesh.load(tmp_path / "mesh.ply", process=False)
+    glb = trimesh.load(tmp_path / "mesh.glb", process=False, force="mesh")
+    np.testing.assert_allclose(np.linalg.norm(plain.vertices - [10, 20, 30], axis=1), 2, atol=0.05)
+    np.testing.assert_array_equal(plain.faces, glb.faces)
+    np.testing.assert_allclose(  # east, up, south
+        glb.vertices, plain.vertices[:, [0, 2, 1]] * [1, 1, -1], atol=1e-5
+    )
+    assert plain.volume == pytest.approx(4 / 3 * np.pi * 8, rel=0.01)
+    expected = (plain.vertices - [10, 20, 30] + 2) / 2 * 127
+    assert np.abs(plain.visual.vertex_colors[:, :3] - expected).mean() < 4
 
 
 def test_formats_are_checked_before_the_work(

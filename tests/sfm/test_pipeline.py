@@ -146,7 +146,7 @@ def test_points_agree_with_the_photographs(small) -> None:
 def test_all_files_are_there_and_readable(small, pycolmap) -> None:
     _, output, _ = small
     assert {path.name for path in output.iterdir()} == {
-        *("model.ply", "model.glb", "model.html", "model.json"),
+        *("model.ply", "model.glb", "model.html", "model.json", "transforms.json"),
         *("sparse", "database.db", "work"),
     }
     values = json.loads((output / "model.json").read_text())

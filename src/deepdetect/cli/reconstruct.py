@@ -73,7 +73,7 @@ def reconstruct(
         deepdetect reconstruct phone1.jpg phone2.jpg -o phone/
         deepdetect reconstruct photos/ -o model/
         deepdetect reconstruct frames/ --pairs sequential:8 -o model/
-        deepdetect reconstruct drone/ --gcp gcp_list.txt --format laz map -o model/
+        deepdetect reconstruct drone/ --gcp gcp_list.txt --format laz --format map -o model/
         deepdetect reconstruct photos/ --scale-by 0.25 a.jpg:812,640 a.jpg:1290,655 -o model/
 
     Args:

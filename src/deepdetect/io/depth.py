@@ -16,16 +16,18 @@ HEADROOM = 4.0
 """The scale holds all depths up to this many times their 99th percentile."""
 
 
-def save_depth_png(depth: np.ndarray, path: Path, unit: str) -> dict[str, str | float]:
+def save_depth_png(
+    depth: np.ndarray, path: Path, unit: str, scale: float | None = None
+) -> dict[str, str | float]:
     """Write a depth map as a grey PNG of 16 bits, whole or not at all; return what is in it.
 
     value = round(depth * value_per_unit), and 0 where the depth is unknown: not finite, 0 or less.
-    `value_per_unit` is the finest of 1, 2 or 5 times a power of ten that holds all depths up to 4
-    times the 99th percentile; those that do not fit, `out_of_range`, are written as unknown. Unit
-    and scale are also in the PNG, as text chunks `unit` and `value_per_unit`.
+    `value_per_unit` is `scale`, or the finest of 1, 2 or 5 times a power of ten that holds all
+    depths up to 4 times the 99th percentile; those that do not fit, `out_of_range`, are written as
+    unknown. Unit and scale are also in the PNG, as text chunks `unit` and `value_per_unit`.
     """
     known = np.isfinite(depth) & (depth > 0)
-    scale = _scale(depth[known])
+    scale = scale or _scale(depth[known])
     values = np.rint(np.where(known, depth, 0).astype(np.float64) * scale)
     fits = known & (values >= 1) & (values <= MAX_UINT16)
     stored = np.where(fits, values, 0).astype(np.uint16)
@@ -51,10 +53,14 @@ def save_depth_npz(depth: np.ndarray, path: Path, unit: str, **arrays: np.ndarra
 
 
 def _scale(depths: np.ndarray) -> float:
-    """Choose the finest round scale that holds all depths but outliers."""
+    """Choose the scale that holds all depths but outliers."""
     if not len(depths):
         return 1.0
-    furthest = min(float(depths.max()), HEADROOM * float(np.percentile(depths, 99)))
+    return depth_scale(min(float(depths.max()), HEADROOM * float(np.percentile(depths, 99))))
+
+
+def depth_scale(furthest: float) -> float:
+    """Choose the finest scale of 1, 2 or 5 times a power of ten that holds a depth."""
     finest = MAX_UINT16 / furthest
     power = 10.0 ** np.floor(np.log10(finest))
     return float(max(step * power for step in (1, 2, 5) if step * power <= finest * (1 + 1e-12)))

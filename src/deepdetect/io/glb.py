@@ -18,11 +18,16 @@ import numpy as np
 from .._shared.image_array import srgb_to_linear
 from ..geometry.point_cloud import EAST_NORTH_UP, UNITS, PointCloud
 
-FLOAT, UNSIGNED_SHORT, ARRAY_BUFFER, POINTS = 5126, 5123, 34962, 0
+FLOAT, UNSIGNED_SHORT, UNSIGNED_INT, POINTS, TRIANGLES = 5126, 5123, 5125, 0, 4
+ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 
 
-def write_glb(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> None:
+def write_glb(
+    cloud: PointCloud, path: Path, metadata: Mapping[str, str], faces: np.ndarray | None = None
+) -> None:
     """Write the points in glTF's frame with their colours, 20 bytes per point.
+
+    With (M, 3) `faces`, rows of points, it is a mesh of triangles.
 
     Colours become linear as glTF requires, with 16 bits, which keep each of the 256 sRGB levels
     apart. The metadata are in the asset's extras, with unit and frame.
@@ -35,9 +40,12 @@ def write_glb(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> Non
     positions = (turned * (np.array(signs) * unit)).astype("<f4")
     colors = np.full((len(cloud), 4), 65535, "<u2")
     colors[:, :3] = np.rint(65535 * srgb_to_linear()).astype("<u2")[cloud.colors]
-    text = json.dumps(_tree(cloud, positions, metadata), separators=(",", ":")).encode("ascii")
+    corners = np.ascontiguousarray(np.empty(0) if faces is None else faces, "<u4")
+    text = json.dumps(
+        _tree(cloud, positions, metadata, corners.size), separators=(",", ":")
+    ).encode("ascii")
     text += b" " * (-len(text) % 4)
-    size = positions.nbytes + colors.nbytes  # a multiple of 4
+    size = positions.nbytes + colors.nbytes + corners.nbytes  # a multiple of 4
     with path.open("wb") as file:
         file.write(struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + size))
         file.write(struct.pack("<I4s", len(text), b"JSON"))
@@ -45,12 +53,16 @@ def write_glb(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> Non
         file.write(struct.pack("<I4s", size, b"BIN\0"))
         positions.tofile(file)
         colors.tofile(file)
+        corners.tofile(file)
 
 
-def _tree(cloud: PointCloud, positions: np.ndarray, metadata: Mapping[str, str]) -> dict[str, Any]:
+def _tree(
+    cloud: PointCloud, positions: np.ndarray, metadata: Mapping[str, str], corners: int
+) -> dict[str, Any]:
     count = len(cloud)
     box = {"min": positions.min(0).tolist(), "max": positions.max(0).tolist()}
     primitive = {"attributes": {"POSITION": 0, "COLOR_0": 1}, "mode": POINTS, "material": 0}
+    primitive |= {"mode": TRIANGLES, "indices": 2} if corners else {}
     unit = "metres" if cloud.unit in ("mm", "m") else f"{UNITS[cloud.unit]}, of unknown length"
     rough = {"metallicFactor": 0, "roughnessFactor": 1}
     return {
@@ -71,15 +83,23 @@ def _tree(cloud: PointCloud, positions: np.ndarray, metadata: Mapping[str, str])
         "meshes": [{"primitives": [primitive]}],
         # Points without normals are not lit; the extension says so to all viewers.
         "extensionsUsed": ["KHR_materials_unlit"],
-        "materials": [{"pbrMetallicRoughness": rough, "extensions": {"KHR_materials_unlit": {}}}],
+        "materials": [
+            {"pbrMetallicRoughness": rough, "extensions": {"KHR_materials_unlit": {}}}
+            | {"doubleSided": True}
+        ],
         "accessors": [
             {"bufferView": 0, "componentType": FLOAT, "type": "VEC3", "count": count, **box},
             {"bufferView": 1, "componentType": UNSIGNED_SHORT, "type": "VEC4", "count": count}
             | {"normalized": True},
-        ],
+            {"bufferView": 2, "componentType": UNSIGNED_INT, "type": "SCALAR", "count": corners},
+        ][: 3 if corners else 2],
         "bufferViews": [
-            {"buffer": 0, "byteOffset": offset, "byteLength": length, "target": ARRAY_BUFFER}
-            for offset, length in ((0, 12 * count), (12 * count, 8 * count))
+            {"buffer": 0, "byteOffset": offset, "byteLength": length, "target": target}
+            for offset, length, target in (
+                (0, 12 * count, ARRAY_BUFFER),
+                (12 * count, 8 * count, ARRAY_BUFFER),
+                (20 * count, 4 * corners, ELEMENT_ARRAY_BUFFER),
+            )[: 3 if corners else 2]
         ],
-        "buffers": [{"byteLength": 20 * count}],
+        "buffers": [{"byteLength": 20 * count + 4 * corners}],
     }

@@ -30,6 +30,9 @@ PIXEL_CENTRE = 0.5
 
 SIFT_NUMBERS = 128
 
+ROWS = 256
+"""Of an image that are undistorted at once, which bounds the memory."""
+
 ESTIMATED_FOCAL_FACTOR = 1.2
 """Focal length over the longer side, where nothing is known: where its estimation begins."""
 
@@ -123,15 +126,28 @@ class CameraIntrinsics:
         found = self.colmap_camera().img_from_cam(self.pinhole.rays(xy))
         return np.asarray(found - PIXEL_CENTRE)
 
-    def undistort(self, image: np.ndarray) -> np.ndarray:
-        """Return an image (H, W) or (H, W, 3) as the pinhole camera would have taken it."""
+    @property
+    def without_border(self) -> CameraIntrinsics:
+        """A pinhole camera that sees no more than what this one does: as COLMAP undistorts."""
+        pycolmap = import_pycolmap()
+        cropped = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), self.colmap_camera())
+        return CameraIntrinsics.of_colmap(cropped, self.source) if self.distorts else self
+
+    def undistort(self, image: np.ndarray, pinhole: Camera | None = None) -> np.ndarray:
+        """Return an image (H, W) or (H, W, 3) as a pinhole camera would have taken it."""
         if not self.distorts:
             return image
-        width, height = self.size
-        y, x = np.indices((height, width))
-        places = self.from_pinhole(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
-        column, row = places.T.astype(np.float32).reshape(2, height, width)
-        return cv2.remap(image, column, row, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
+        pinhole, camera = pinhole or self.pinhole, self.colmap_camera()
+        width, height = pinhole.size
+        made = np.empty((height, width, *image.shape[2:]), image.dtype)
+        for top in range(0, height, ROWS):
+            part = made[top : top + ROWS]
+            y, x = np.indices(part.shape[:2], np.float64)
+            rays = pinhole.rays(np.column_stack([x.ravel(), y.ravel() + top]))
+            places = camera.img_from_cam(rays) - PIXEL_CENTRE
+            column, row = places.T.astype(np.float32).reshape(2, *part.shape[:2])
+            part[:] = cv2.remap(image, column, row, cv2.INTER_CUBIC, borderValue=0)
+        return made
 
 
 def known_cameras(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import shutil
+import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -10,15 +13,27 @@ import numpy as np
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import ReconstructionError, check_name, require_packages
-from ..geometry.point_cloud import BOX_PERCENTILE
+from ..geometry.point_cloud import BOX_PERCENTILE, PointCloud, robust_box
+from ..io.glb import write_glb
 from ..io.metadata import KEY_DIRECTORY, Metadata
+from ..io.point_cloud import save_point_cloud
+from .colmap import quiet_pycolmap
 from .georeference import Georeference
 from .result import MultiViewReconstruction
+from .splat import write_splat
 
-FormatName = Literal["laz", "map"]
+FormatName = Literal["laz", "map", "mesh", "splat", "text"]
 
 LAZ_STEP_M = 0.001
 """Precision of coordinates in LAZ files."""
+
+MESH_MARGIN = 0.5
+"""Points farther from the robust box, by its size, are no part of a mesh."""
+
+MESH_DEPTHS, MESH_TRIM = (6, 12), 3
+"""Levels of the octree, and how many coarser the surface may be than the finest one."""
+
+COLORS = ("red", "green", "blue")
 
 POINTS_PER_CELL = 4.0
 """Of a map: so few cells stay empty."""
@@ -27,7 +42,7 @@ MAX_MAP_SIDE = 10_000
 """Cells of a map, across and down."""
 
 
-def write_laz(found: MultiViewReconstruction, output: Path) -> None:
+def write_laz(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
     """Write model.laz: the points in UTM, with their colours in 16 bits (LAS 1.4, format 7)."""
     import laspy
     from pyproj import CRS
@@ -44,7 +59,7 @@ def write_laz(found: MultiViewReconstruction, output: Path) -> None:
         las.write(file, do_compress=True)
 
 
-def write_map(found: MultiViewReconstruction, output: Path) -> None:
+def write_map(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
     """Write height.tif, metres, NaN where unknown, and orthophoto.tif: GeoTIFF in UTM, north up.
 
     A cell has the median height and colour of the points in it.
@@ -89,10 +104,59 @@ def _in_utm(found: MultiViewReconstruction, what: str) -> tuple[np.ndarray, int]
     return place.origin.to_utm(found.cloud.points)
 
 
-class Format(NamedTuple):
-    """How a format is written into the folder of the results, as which files, by which packages."""
+def write_text(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
+    """Write sparse_text/: COLMAP's model as text files."""
+    (output / "sparse_text").mkdir(exist_ok=True)
+    with quiet_pycolmap() as pycolmap:
+        pycolmap.Reconstruction(output / "sparse" / "0").write_text(output / "sparse_text")
 
-    write: Callable[[MultiViewReconstruction, Path], None]
+
+def write_mesh(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
+    """Write mesh.ply and mesh.glb: the surface of the dense points, coloured.
+
+    By screened Poisson reconstruction (Kazhdan and Hoppe, 2013), which COLMAP brings.
+    """
+    cloud = found.dense
+    if cloud.normals is None or not len(cloud):
+        raise ReconstructionError("a mesh needs dense points, the other files are written")
+    box = robust_box(cloud)
+    margin = MESH_MARGIN * (box.high - box.low)
+    inside = (cloud.points >= box.low - margin) & (cloud.points <= box.high + margin)
+    cloud = cloud[inside.all(axis=1)]
+    # Points lie on surfaces, so that their number grows with the square of cells across.
+    depth = round(float(np.clip(np.log2(np.sqrt(len(cloud))), *MESH_DEPTHS)))
+    with tempfile.TemporaryDirectory(prefix="deepdetect-") as space:
+        points, surface = Path(space) / "points.ply", Path(space) / "mesh.ply"
+        save_point_cloud(cloud, points)
+        with quiet_pycolmap() as pycolmap:
+            how = pycolmap.PoissonMeshingOptions(depth=depth, trim=depth - MESH_TRIM)
+            pycolmap.poisson_meshing(points, surface, how)
+        vertices, faces = _read_mesh(surface)
+        with atomic_path(output / "mesh.ply") as path:
+            shutil.copyfile(surface, path)
+    xyz, rgb = (np.column_stack([vertices[n] for n in k]) for k in ("xyz", COLORS))
+    mesh = PointCloud(xyz, rgb, cloud.unit, cloud.frame)
+    with atomic_path(output / "mesh.glb") as path:
+        write_glb(mesh, path, {"title": "mesh"}, faces)
+
+
+def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read what COLMAP has written: (N,) vertices with fields, and (M, 3) corners of triangles."""
+    header, _, data = path.read_bytes().partition(b"end_header\n")
+    counts = [int(number) for number in re.findall(rb"element \w+ (\d+)", header)]
+    fields = re.findall(r"property (float|uchar) (\w+)", header.decode("ascii"))
+    kinds = {"float": "<f4", "uchar": "u1"}
+    vertices = np.frombuffer(data, [(name, kinds[kind]) for kind, name in fields], counts[0])
+    of_count = "u1" if b"property list uchar" in header else "<i4"
+    triangle = np.dtype([("count", of_count), ("corners", "<i4", 3)])
+    triangles = np.frombuffer(data, triangle, counts[1], vertices.nbytes)
+    return vertices, triangles["corners"]
+
+
+class Format(NamedTuple):
+    """How a format is written, of the images below a folder, as which files, by which packages."""
+
+    write: Callable[[MultiViewReconstruction, Path, Path], None]
     files: tuple[str, ...]
     packages: tuple[str, ...] = ()
 
@@ -100,6 +164,9 @@ class Format(NamedTuple):
 FORMATS: dict[FormatName, Format] = {
     "laz": Format(write_laz, ("model.laz",), ("laspy", "lazrs", "pyproj")),
     "map": Format(write_map, ("height.tif", "orthophoto.tif")),
+    "mesh": Format(write_mesh, ("mesh.ply", "mesh.glb")),
+    "splat": Format(write_splat, ("splat",)),
+    "text": Format(write_text, ("sparse_text",)),
 }
 
 

@@ -33,6 +33,7 @@ from .formats import FORMATS, FormatName, check_formats
 from .georeference import Georeference, georeference, read_control_points
 from .mapping import MIN_VIEWS, SparseModel, read_sparse_model, transform_model
 from .result import MultiViewReconstruction
+from .splat import write_transforms
 from .stages import WORK, MultiViewOptions, Stages
 
 MAX_KEYPOINTS = 8192
@@ -141,6 +142,7 @@ def reconstruct_many(
     with timer.stage("dense points"):
         dense = stages.dense(folder, sparse) if options.dense else np.empty(0, DENSE_POINT)
     with timer.stage("files"):
+        normals = dense["normals"].copy() if "normals" in (DENSE_POINT.names or ()) else None
         reference = min(sparse.views.values(), key=lambda v: float(np.linalg.norm(v.centre))).name
         unit = "spacing", f"camera of {reference}"
         place = georeference(sparse, dense["points"], folder, control, options.scale_by)
@@ -149,6 +151,8 @@ def reconstruct_many(
             transform_model(model, place.similarity)
             sparse = read_sparse_model(model, sources)
             dense["points"] = place.similarity.apply(dense["points"])
+            if normals is not None:
+                normals = normals @ place.similarity.rotation.T.astype(np.float32)
         views = dict(sorted(sparse.views.items()))
         found = MultiViewReconstruction(
             georeference=place,
@@ -160,7 +164,7 @@ def reconstruct_many(
             sparse=PointCloud(sparse.points, _sparse_colors(stages.features, sparse), *unit),
             sparse_errors=sparse.errors.astype(np.float32),
             sparse_views=sparse.tracks.astype(np.int32),
-            dense=PointCloud(dense["points"].copy(), dense["colors"].copy(), *unit),
+            dense=PointCloud(dense["points"].copy(), dense["colors"].copy(), *unit, normals),
             dense_errors=dense["errors"].copy(),
             dense_views=dense["views"].copy(),
             keypoints=keypoints,
@@ -171,7 +175,7 @@ def reconstruct_many(
             files=output_files(target, options.formats)[:-1],
         )
         write_colmap_model(model, found.sparse.colors, target / "sparse" / "0")
-        _write(found, target, options.formats)
+        _write(found, folder, target, options.formats)
     return found
 
 
@@ -183,13 +187,18 @@ def check_output_folder(output: Path) -> None:
 
 def output_files(output: Path, formats: Sequence[FormatName] = ()) -> tuple[Path, ...]:
     """Name all that is written into the folder of the results; the last is what stages made."""
-    names = ("model.ply", "model.glb", "model.html", "model.json", "sparse", "database.db")
+    names = (
+        *("model.ply", "model.glb", "model.html", "model.json", "transforms.json"),
+        *("sparse", "database.db"),
+    )
     more = [file for name in formats for file in FORMATS[name].files]
     return tuple(output / name for name in (*names, *more, WORK))
 
 
-def _write(found: MultiViewReconstruction, output: Path, formats: Sequence[FormatName]) -> None:
-    """Write the files of the model, and further formats, which may lack a place."""
+def _write(
+    found: MultiViewReconstruction, folder: Path, output: Path, formats: Sequence[FormatName]
+) -> None:
+    """Write the files of the model, and then further formats, which may lack what they need."""
     notes = {
         "title": f"{len(found.views)} images",
         "images": f"{len(found.views)} of {len(found.views) + len(found.unregistered)}",
@@ -200,11 +209,19 @@ def _write(found: MultiViewReconstruction, output: Path, formats: Sequence[Forma
     with atomic_path(output / "model.html") as path:
         page, cameras = _seen_from(found.views[found.reference], found)
         write_html_page(page, path, notes, cameras)
+    images = {name: (folder / name).resolve() for name in found.views}
+    write_transforms(
+        output / "transforms.json",
+        found.views,
+        found.intrinsics,
+        {"file_path": images},
+        output / "model.ply",
+    )
     values = {**found.summary(), "files": [str(path) for path in found.files]}
     with atomic_path(output / "model.json") as path:
         path.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
     for name in formats:
-        FORMATS[name].write(found, output)
+        FORMATS[name].write(found, folder, output)
 
 
 def _seen_from(

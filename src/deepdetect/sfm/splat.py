@@ -1,0 +1,164 @@
+"""What trainers of radiance fields and Gaussian splats begin with: images, cameras, points."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._shared.atomic import atomic_path
+from .._shared.opencv import cv2
+from ..geometry.camera import PosedView
+from ..io.depth import depth_scale, save_depth_png
+from ..io.image import load_image
+from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
+from .result import MultiViewReconstruction
+
+SPLAT_POINTS = 200_000
+"""Of the initial cloud, about: trainers add their own where these are too few."""
+
+JPEG_QUALITY = 95
+
+MAX_CELL_PX = 4
+"""Side, at the most, of what a point covers in a depth map, where points are sparse."""
+
+MAX_DEPTH_STEP = 0.1
+"""A point so much, relatively, behind one beside it in a depth map is seen through a gap."""
+
+DEPTH_PERCENT = 95.0
+"""Of the sparse points of each view, whose depths fit into its map at least."""
+
+MAX_VALUE_PER_UNIT = 1000.0
+"""Millimetres, which nearly all readers of depth maps expect, where they reach far enough."""
+
+OPENGL = np.diag([1.0, -1, -1, 1])
+"""From nerfstudio's cameras, y up and z backward, to ours."""
+
+
+def write_transforms(
+    path: Path,
+    views: Mapping[str, PosedView],
+    intrinsics: Mapping[str, CameraIntrinsics],
+    files: Mapping[str, Mapping[str, Path]],
+    points: Path,
+    **more: Any,
+) -> None:
+    """Write nerfstudio's transforms.json: cameras, points, and `files` by their key and image."""
+
+    def relative(file: Path) -> str:
+        return Path(os.path.relpath(file, path.parent)).as_posix()
+
+    frames = []
+    for name, view in views.items():
+        own, pinhole, world = intrinsics[name], intrinsics[name].pinhole, np.eye(4)
+        world[:3] = np.column_stack([view.rotation.T, view.centre])
+        numbers = [*own.size, *pinhole.focal_px, *np.add(pinhole.centre, PIXEL_CENTRE).tolist()]
+        frames.append(
+            {key: relative(paths[name]) for key, paths in files.items()}
+            | dict(zip(("w", "h", "fl_x", "fl_y", "cx", "cy"), numbers, strict=True))
+            | {"k1": own.params[3] if own.distorts else 0.0}
+            | {"transform_matrix": (world @ OPENGL).tolist()}
+        )
+    values = {"camera_model": "OPENCV", "ply_file_path": relative(points), **more}
+    with atomic_path(path) as temporary:
+        text = json.dumps({**values, "frames": frames}, indent=1)
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def write_splat(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
+    """Write splat/: images/ without distortion, sparse/0, depths/ (16 bits), transforms.json.
+
+    Sparse points keep their tracks; dense ones are thinned to `SPLAT_POINTS`, evenly in space.
+    """
+    target = output / "splat"
+    cropped = {own: own.without_border for own in {*found.intrinsics.values()}}
+    intrinsics = {name: cropped[own] for name, own in found.intrinsics.items()}
+    views = {
+        name: replace(view, camera=intrinsics[name].pinhole) for name, view in found.views.items()
+    }
+    names = {
+        name: name if Path(name).suffix.lower() in (".jpg", ".jpeg", ".png") else f"{name}.jpg"
+        for name in views
+    }
+    images = {name: target / "images" / names[name] for name in views}
+    depths = {name: target / "depths" / f"{names[name]}.png" for name in views}
+    reach = max(
+        float(np.percentile(view.project(found.sparse.points)[1], DEPTH_PERCENT))
+        for view in views.values()
+    )
+    scale = min(MAX_VALUE_PER_UNIT, depth_scale(reach))
+    for name, view in views.items():
+        rgb = load_image(folder / name, max_megapixels=np.inf)
+        rgb = found.intrinsics[name].undistort(rgb, view.camera)
+        quality = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+        _, data = cv2.imencode(images[name].suffix, cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), quality)
+        with atomic_path(images[name]) as path:
+            path.write_bytes(data.tobytes())
+        seen = seen_depths(view, found.cloud.points)
+        save_depth_png(seen, depths[name], found.cloud.unit, scale)
+    chosen = thinned(found.dense.points, found.dense_errors, SPLAT_POINTS)
+    with quiet_pycolmap() as pycolmap:
+        model = pycolmap.Reconstruction(output / "sparse" / "0")
+        for image in model.images.values():
+            old, new = found.intrinsics[image.name], intrinsics[image.name]
+            xy = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+            moved = new.pinhole.project(old.pinhole.rays(old.to_pinhole(xy - PIXEL_CENTRE)))
+            for point, place in zip(image.points2D, moved, strict=True):
+                point.xy = place + PIXEL_CENTRE
+        for image in model.images.values():  # which share cameras
+            camera, pinhole = image.camera, intrinsics[image.name].colmap_camera()
+            camera.model, camera.params = pinhole.model, pinhole.params
+            camera.width, camera.height = pinhole.width, pinhole.height
+            image.name = names[image.name]
+        for row in chosen:
+            number = model.add_point3D(
+                found.dense.points[row], pycolmap.Track(), found.dense.colors[row]
+            )
+            model.points3D[number].error = found.dense_errors[row]
+        (target / "sparse" / "0").mkdir(parents=True, exist_ok=True)
+        model.write(target / "sparse" / "0")
+        model.export_PLY(target / "points.ply")
+    files = {"file_path": images, "depth_file_path": depths}
+    unit = {"depth_unit_scale_factor": 1 / scale}
+    path = target / "transforms.json"
+    write_transforms(path, views, intrinsics, files, target / "points.ply", **unit)
+
+
+def thinned(points: np.ndarray, errors: np.ndarray, count: int) -> np.ndarray:
+    """Return rows of at most `count` of (N, 3) points: in each cell of a grid the best one."""
+    order = np.argsort(errors, kind="stable")
+    if len(points) <= count:
+        return order
+    low, high = 0.0, float(np.ptp(points, axis=0).max())
+    best = order[:1]
+    for _ in range(20):  # halvings: to a millionth of the extent
+        cell = (low + high) / 2
+        cells = np.floor((points[order] - points.min(axis=0)) / cell).astype(np.int64)
+        keys = cells @ np.array([1, 2_097_152, 2_097_152**2])  # 21 bits for each axis
+        rows = np.unique(keys, return_index=True)[1]
+        if len(rows) > count:
+            low = cell
+        else:
+            high, best = cell, order[rows]
+    return np.sort(best)
+
+
+def seen_depths(view: PosedView, points: np.ndarray) -> np.ndarray:
+    """Return the depth map (H, W) that points (N, 3) make, NaN where none is seen."""
+    width, height = view.camera.size
+    xy, depth = view.project(points)
+    inside = (depth > 0) & ((xy > -0.5) & (xy < (width - 0.5, height - 0.5))).all(axis=1)
+    xy, depth = xy[inside], depth[inside]
+    side = int(np.clip(np.sqrt(width * height / max(len(xy), 1)), 1, MAX_CELL_PX))
+    nearest = np.full((-(-height // side), -(-width // side)), np.inf)
+    column, row = ((xy + 0.5) // side).astype(np.int64).T
+    np.minimum.at(nearest, (row, column), depth)
+    beside = cv2.erode(nearest, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    nearest[nearest > (1 + MAX_DEPTH_STEP) * beside] = np.inf
+    nearest[np.isinf(nearest)] = np.nan
+    return np.repeat(np.repeat(nearest, side, 0), side, 1)[:height, :width]
