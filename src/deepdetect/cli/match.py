@@ -379,6 +379,12 @@ def stitch(
         kept.write_beside(file)
     for number, reason in panorama.unregistered.items():
         cli.note(f"not in the panorama: {images[number]}, as {reason}")
+    if panorama.parallax:
+        (first, second), distance = max(panorama.parallax.items(), key=lambda item: item[1])
+        cli.note(
+            f"{images[first]} and {images[second]} differ by {distance:.0f} pixels along their "
+            "seam, since the camera moved: turn it about its lens, or keep away from near things"
+        )
     height, width = panorama.valid.shape
     used = sorted(panorama.homographies)
     numbers = {
@@ -397,6 +403,11 @@ def stitch(
             for (first, second), count in panorama.matches.items()
         ],
         "residual_px": round(panorama.residual_px, 4),
+        "closed": panorama.closed,
+        "parallax": [
+            {"images": [images[first], images[second]], "pixels": round(distance, 1)}
+            for (first, second), distance in panorama.parallax.items()
+        ],
         "seconds": {stage: round(value, 4) for stage, value in panorama.seconds.items()},
         "file": file,
         "failures": failures,

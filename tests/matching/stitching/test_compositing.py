@@ -109,7 +109,7 @@ def test_parts_become_the_whole(scene: np.ndarray) -> None:
     images = {0: scene[:300, :400], 1: scene[:300, 150:550], 2: scene[90:390, 60:460]}
     canvas = planned({0: moved(0), 1: moved(150), 2: moved(60, 90)})
     assert canvas.size == (550, 390)
-    panorama, valid, gains = put_together(images, canvas)
+    panorama, valid, gains, _ = put_together(images, canvas)
     assert max(abs(gain - 1) for gain in gains.values()) < 1e-3
     expected = np.zeros((390, 550), bool)
     expected[:300] = True
@@ -124,7 +124,7 @@ def test_parts_become_the_whole(scene: np.ndarray) -> None:
 
 def test_equal_images_are_kept_to_the_last_bit(scene: np.ndarray) -> None:
     images = {0: scene[:300, :400], 1: scene[:300, :400]}
-    panorama, valid, _ = put_together(images, planned({0: moved(0), 1: moved(0)}))
+    panorama, valid, *_ = put_together(images, planned({0: moved(0), 1: moved(0)}))
     np.testing.assert_array_equal(panorama, scene[:300, :400])
     assert valid.all()
 
@@ -135,12 +135,12 @@ def test_more_than_8_bits_are_kept(scene: np.ndarray) -> None:
     images = {0: deep[:300, :400], 1: deep[:300, 150:550]}
     canvas = planned({0: moved(0), 1: moved(150)})
     small = {number: (to_8_bits(image), 1.0) for number, image in images.items()}
-    panorama, valid, _ = composite(lambda number: images[number], small, canvas)
+    panorama, valid, *_ = composite(lambda number: images[number], small, canvas)
     assert panorama.dtype == np.uint16
     assert valid.all()
     differences = np.abs(panorama.astype(int) - deep[:300, :550])
     assert np.median(differences) < 257 / 4
-    mixed, _, _ = composite(lambda n: small[n][0] if n else images[n], small, canvas)
+    mixed, *_ = composite(lambda n: small[n][0] if n else images[n], small, canvas)
     assert np.abs(mixed.astype(int) - deep[:300, :550]).mean() < 257
 
 
@@ -148,7 +148,7 @@ def test_brightness_becomes_equal(scene: np.ndarray) -> None:
     scene = scene // 2
     dark = (scene[:300, 150:550] * 0.7).astype(np.uint8)
     canvas = planned({0: moved(0), 1: moved(150)})
-    panorama, _, gains = put_together({0: scene[:300, :400], 1: dark}, canvas)
+    panorama, _, gains, _ = put_together({0: scene[:300, :400], 1: dark}, canvas)
     assert gains[1] / gains[0] == pytest.approx(1 / 0.7, rel=0.03)
     factor = panorama.astype(float).mean((0, 2)) / scene[:300, :550].mean((0, 2))
     assert factor[:150].mean() / factor[-150:].mean() == pytest.approx(1, abs=0.03)
@@ -193,7 +193,7 @@ def test_all_around_is_one_strip() -> None:
     canvas = plan_curved("cylindrical", dict.fromkeys(cameras, SIZE), cameras, 5, 0.5)
     assert canvas.size[0] == pytest.approx(2 * np.pi * 240, abs=3)
     plain = {k: np.full((300, 400, 3), 100, np.uint8) for k in cameras}
-    panorama, valid, _ = put_together(plain, canvas)
+    panorama, valid, *_ = put_together(plain, canvas)
     assert (np.abs(panorama[valid].astype(int) - 100) < 3).all()
     assert valid[60:-60].all()
 

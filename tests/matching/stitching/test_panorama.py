@@ -211,3 +211,105 @@ def test_cameras_that_moved_make_no_curved_panorama(shared: Path) -> None:
     assert len(stitch(paths).homographies) == 2
     with pytest.raises(DeepDetectError, match="did more than turn"):
         stitch(paths, projection="spherical")
+
+
+TURN, RADIUS = 1800, 1800 / (2 * np.pi)
+
+
+@pytest.fixture(scope="module")
+def surroundings() -> np.ndarray:
+    """A picture on a cylinder, (360, 1800, 3), whose ends meet: photographs with soft borders."""
+    data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
+    photographs = [data.astronaut(), data.coffee(), data.chelsea(), data.rocket()]
+    step, soft = TURN // len(photographs), 40
+    ramp = np.minimum(np.arange(1, step + soft + 1), np.arange(step + soft, 0, -1)).clip(max=soft)
+    sums, weights = np.zeros((360, TURN, 3)), np.zeros((TURN, 1))
+    for k, photograph in enumerate(photographs):
+        columns = (k * step + np.arange(step + soft)) % TURN
+        sums[:, columns] += cv2.resize(photograph, (step + soft, 360)) * ramp[:, None]
+        weights[columns] += ramp[:, None]
+    return np.rint(sums / weights).astype(np.uint8)
+
+
+def taken(picture: np.ndarray, rotation: np.ndarray, focal_px: float = 300.0) -> np.ndarray:
+    """Photograph a picture on a cylinder, (240, 320, 3)."""
+    y, x = np.mgrid[0:240, 0:320]
+    rays = np.dstack([(x - 159.5) / focal_px, (y - 119.5) / focal_px, np.ones((240, 320))])
+    rays = rays @ rotation.T
+    column = np.arctan2(rays[..., 0], rays[..., 2]) * RADIUS % TURN
+    row = rays[..., 1] / np.hypot(rays[..., 0], rays[..., 2]) * RADIUS + picture.shape[0] / 2
+    picture = np.concatenate([picture, picture[:, :2]], axis=1)
+    maps = column.astype(np.float32), row.astype(np.float32)
+    return cv2.remap(picture, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+
+
+def rotations_all_around(count: int) -> list[np.ndarray]:
+    random = np.random.default_rng(0)
+    yaws = 2 * np.pi * np.arange(count) / count + random.normal(0, 0.02, count)
+    tilts = [cv2.Rodrigues(np.array([*random.normal(0, 0.03, 2), 0])[[0, 2, 1]])[0] for _ in yaws]
+    return [
+        cv2.Rodrigues(np.array([0, yaw, 0]))[0] @ tilt
+        for yaw, tilt in zip(yaws, tilts, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("projection", ["cylindrical", "spherical"])
+def test_a_full_turn_is_closed(projection, surroundings: np.ndarray) -> None:
+    """Ten photographs: what is right of the right end is at the left one."""
+    images = [taken(surroundings, rotation) for rotation in rotations_all_around(10)]
+    order = [4, 9, 0, 2, 7, 5, 1, 8, 3, 6]
+    found = stitch(
+        [images[k] for k in order], PointDetector(1000), projection=projection, crop=True
+    )
+    assert len(found.homographies) == 10
+    assert found.closed
+    assert found.valid.all()
+    height, width = found.valid.shape
+    assert width == pytest.approx(2 * np.pi * 300, abs=3)
+    # Beside the join, and elsewhere, neighbouring parts are neighbours in the true picture.
+    scale = width / TURN
+    true = cv2.resize(np.tile(surroundings, (1, 2, 1)), None, fx=scale, fy=scale)
+    for join in (width, width // 3):
+        places = []
+        for start in (join - 50, join):
+            part = np.take(found.image, np.arange(start, start + 50) % width, axis=1)
+            part = part[height // 2 - 25 : height // 2 + 25]
+            scores = cv2.matchTemplate(true[:, : width + 100], part, cv2.TM_CCOEFF_NORMED)
+            assert scores.max() > 0.9
+            places.append(np.unravel_index(scores.argmax(), scores.shape))
+        rows, columns = np.diff(places, axis=0)[0]
+        assert abs((columns - 50 + 100) % width - 100) <= 1
+        assert abs(rows) <= 1
+    # All rotations are right, with the pair that closes the turn.
+    matrix = np.array([[300, 0, 159.5], [0, 300, 119.5], [0, 0, 1.0]])
+    rotations = [rotations_all_around(10)[k] for k in order]
+    for number, homography in found.homographies.items():
+        between = rotations[found.reference].T @ rotations[number]
+        expected = matrix @ between @ np.linalg.inv(matrix)
+        if between[2, 2] > 0.5:  # the others are behind the reference
+            assert corner_error(homography, expected, (320, 240)) < 1
+    assert not found.parallax
+
+
+def test_less_than_a_turn_is_not_cut(surroundings: np.ndarray) -> None:
+    """The widest gap is behind, wherever the reference looks."""
+    images = [taken(surroundings, rotation) for rotation in rotations_all_around(10)[:7]]
+    found = stitch(images, PointDetector(1000), projection="cylindrical", reference=0)
+    assert not found.closed
+    columns = found.valid.any(axis=0)
+    assert columns.all()
+    assert len(columns) == pytest.approx(2 * np.pi * 300 * 6 / 10 + 300, abs=60)
+
+
+def test_parallax_along_a_seam_is_told(surroundings: np.ndarray) -> None:
+    """What is near moves by 6 pixels more than what is far from view to view."""
+    images = []
+    for k in range(3):
+        rotation = cv2.Rodrigues(np.array([0, 0.5 * k, 0]))[0]
+        nearer = cv2.Rodrigues(np.array([0, 0.52 * k, 0]))[0]
+        image = taken(surroundings, rotation)
+        image[160:] = taken(surroundings[:, ::-1], nearer)[160:]
+        images.append(image)
+    found = stitch(images, PointDetector(1000), projection="cylindrical")
+    assert set(found.parallax) == {(0, 1), (1, 2)}
+    assert all(distance == pytest.approx(6, abs=1.5) for distance in found.parallax.values())

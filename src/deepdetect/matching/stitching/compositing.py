@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -39,6 +40,12 @@ SEAM_MEGAPIXELS = 0.5
 MIN_OVERLAP_PX = 100
 """Pixels there by which two images must overlap for their brightness to be compared."""
 
+SEAM_TOLERANCE_PX, SEAM_PERCENT = 1.0, 90.0
+"""Pixels there that images may differ along nearly all of a seam: on a screen it is not seen."""
+
+MIN_FLOW_PX = 32
+"""Side of an overlap in which displacements can be found."""
+
 GAIN_ERROR_STD, GAIN_PRIOR_STD = 0.05, 0.5
 """Standard deviations of log brightness: of what an overlap says of two, and of images."""
 
@@ -57,13 +64,15 @@ class WarpedImage:
 
 @dataclass(frozen=True, eq=False)
 class Canvas:
-    """Where images lie on a canvas: a box for each, by its number.
+    """Where images lie on a canvas: boxes by the number of the image, or ~number of its rest.
 
-    `draw(number, rgb, scale_of_image, scale_of_canvas)` draws one, both made smaller.
+    `draw(place, rgb, scale_of_image, scale_of_canvas)` draws one, both made smaller. A `closed`
+    canvas shows all around: its right end goes on at its left one.
     """
 
     boxes: dict[int, Box]
     draw: Callable[[int, np.ndarray, float, float], WarpedImage]
+    closed: bool = False
 
     @property
     def size(self) -> tuple[int, int]:
@@ -156,26 +165,67 @@ def plan_curved(
 ) -> Canvas:
     """Find the smallest canvas of all images on a cylinder or a sphere.
 
-    It has `scale` pixels per pixel in the middle of the reference.
+    It has `scale` pixels per pixel in the middle of the reference, but for a turn of whole pixels.
+    Where images show all around, it is cut through the middle of the one that is most behind.
     """
-    radius_px = cameras[reference].focal_px * scale
-    matrices = {
-        number: (one.intrinsics(sizes[number]).astype(np.float32), one.rotation.astype(np.float32))
-        for number, one in cameras.items()
-    }
-    warper = cv2.PyRotationWarper(projection, radius_px)
-    boxes = {}
-    for number in cameras:
-        left, top, width, height = warper.warpRoi(sizes[number], *matrices[number])
-        boxes[number] = (left, top, left + width, top + height)
-    x, y = (min(box[side] for box in boxes.values()) for side in (0, 1))
-    boxes = {n: (box[0] - x, box[1] - y, box[2] - x, box[3] - y) for n, box in boxes.items()}
+    turn = round(2 * np.pi * cameras[reference].focal_px * scale)
+    angles = {n: float(np.arctan2(*one.rotation[[0, 2], 2])) for n, one in cameras.items()}
 
-    def draw(number: int, rgb: np.ndarray, image_scale: float, canvas_scale: float) -> WarpedImage:
-        size, radius = sizes[number], radius_px * canvas_scale
-        warper = cv2.PyRotationWarper(projection, radius)
-        (left, top, _, _), *maps = warper.buildMaps(size, *matrices[number])
+    def warp(number: int, start: float, canvas_scale: float) -> tuple[Any, Any, int]:
+        """Return a warper, its arguments, and the column that is 0 for it.
+
+        It draws each image ahead, where it is in one piece.
+        """
+        radius = turn * canvas_scale / (2 * np.pi)
+        middle = round((angles[number] - start) % (2 * np.pi) * radius)
+        ahead = cv2.Rodrigues(np.array([0, -middle / radius - start, 0]))[0]
+        matrices = cameras[number].intrinsics(sizes[number]), ahead @ cameras[number].rotation
+        arguments = sizes[number], *(matrix.astype(np.float32) for matrix in matrices)
+        return cv2.PyRotationWarper(projection, radius), arguments, middle
+
+    def find_boxes(start: float) -> dict[int, Box]:
+        boxes = {}
+        for number in cameras:
+            warper, arguments, middle = warp(number, start, 1)
+            left, top, width, height = warper.warpRoi(*arguments)
+            boxes[number] = (left + middle, top, left + middle + width, top + height)
+        return boxes
+
+    columns = [np.arange(left, right) % turn for left, _, right, _ in find_boxes(0.0).values()]
+    closed = len(np.unique(np.concatenate(columns))) == turn
+    if closed:
+        start = min(angles.values(), key=lambda angle: np.cos(angle - angles[reference]))
+    else:  # in the widest gap
+        order = np.sort([*angles.values()])
+        gaps = np.diff(np.append(order, order[0] + 2 * np.pi))
+        start = float((order + gaps / 2)[gaps.argmax()])
+    boxes = find_boxes(start)
+    top = min(box[1] for box in boxes.values())
+    origin = 0 if closed else min(box[0] for box in boxes.values())
+    if closed:  # what reaches over an end goes on at the other
+        wrapped = {}
+        for number, (left, up, right, down) in boxes.items():
+            wrapped[number] = (max(left, 0), up, min(right, turn), down)
+            if left < 0 or right > turn:
+                left, right = (side + (turn if left < 0 else -turn) for side in (left, right))
+                wrapped[~number] = (max(left, 0), up, min(right, turn), down)
+        boxes = wrapped
+    boxes = {n: (b[0] - origin, b[1] - top, b[2] - origin, b[3] - top) for n, b in boxes.items()}
+
+    def draw(place: int, rgb: np.ndarray, image_scale: float, canvas_scale: float) -> WarpedImage:
+        number = image_of(place)
+        warper, arguments, middle = warp(number, start, canvas_scale)
+        (left, up, _, _), *maps = warper.buildMaps(*arguments)
+        left += middle
+        if closed:
+            around = round(turn * canvas_scale)
+            left += 0 if place == number else around if left < 0 else -around
+            first, last = max(-left, 0), min(around - left, maps[0].shape[1])
+            maps = [np.ascontiguousarray(one[:, first:last]) for one in maps]
+            left += first
+        size = sizes[number]
         inside = [(one > -0.5) & (one < side - 0.5) for one, side in zip(maps, size, strict=True)]
+        radius = turn * canvas_scale / (2 * np.pi)
         rgb, smaller = _downscaled(rgb, radius / (cameras[number].focal_px * image_scale))
         for one in maps:  # to pixels of the image that is drawn
             one += np.float32(0.5)
@@ -183,10 +233,15 @@ def plan_curved(
             one -= np.float32(0.5)
         drawn = cv2.remap(rgb, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
         mask = np.logical_and(*inside).astype(np.uint8) * np.uint8(255)
-        corner = left - round(x * canvas_scale), top - round(y * canvas_scale)
+        corner = left - round(origin * canvas_scale), up - round(top * canvas_scale)
         return WarpedImage(drawn, mask, corner)
 
-    return Canvas(boxes, draw)
+    return Canvas(boxes, draw, closed)
+
+
+def image_of(place: int) -> int:
+    """Return the number of the image in a place: ~number is where its rest goes on."""
+    return max(place, ~place)
 
 
 def _downscaled(rgb: np.ndarray, shown: float) -> tuple[np.ndarray, float]:
@@ -217,24 +272,27 @@ def composite(
     load: Callable[[int], np.ndarray],
     small: Mapping[int, tuple[np.ndarray, float]],
     canvas: Canvas,
-) -> tuple[np.ndarray, np.ndarray, dict[int, float]]:
+) -> tuple[np.ndarray, np.ndarray, dict[int, float], dict[tuple[int, int], float]]:
     """Put images onto a canvas.
 
     `load` returns an image, (H, W, 3) RGB, uint8 or uint16, by its number, and is called once for
-    each; `small` are the same images in uint8, made smaller, and their scales. Returns the
+    each place; `small` are the same images in uint8, made smaller, and their scales. Returns the
     panorama, black where there is nothing, uint16 where an image is; a mask of where there is
-    something; and the gain of each image.
+    something; the gain of each image; and by how many pixels of the panorama
+    two images differ along their seam, of those that differ too much.
     """
     width, height = canvas.size
     scale = min(1.0, float(np.sqrt(SEAM_MEGAPIXELS * 1e6 / (width * height))))
-    low = {number: canvas.draw(number, *small[number], scale) for number in canvas.boxes}
+    low = {place: canvas.draw(place, *small[image_of(place)], scale) for place in canvas.boxes}
     gains = _gains(low)
     seams = _seams(low, gains)
+    parallax = {pair: px / scale for pair, px in _parallax(low, gains, seams).items()}
     blender = _Blender(width, height)
     kind: type = np.uint8
-    for number, box in canvas.boxes.items():
-        drawn = canvas.draw(number, load(number), 1.0, 1.0)
-        mask = drawn.mask & _upscale_mask(seams[number], low[number].corner, scale, box)
+    for place, box in canvas.boxes.items():
+        number = image_of(place)
+        drawn = canvas.draw(place, load(number), 1.0, 1.0)
+        mask = drawn.mask & _upscale_mask(seams[place], low[place].corner, scale, box)
         kind = np.uint16 if drawn.image.dtype == np.uint16 else kind
         top = np.iinfo(drawn.image.dtype).max
         blender.feed(drawn.image, gains[number] / top, mask, box[:2])
@@ -244,7 +302,7 @@ def composite(
     for row, values in zip(panorama, blended, strict=True):  # of all at once the copies are large
         row[:] = np.rint(values.clip(0, 1) * np.iinfo(kind).max)
     panorama[~valid] = 0
-    return panorama, valid, gains
+    return panorama, valid, gains, parallax
 
 
 class _Blender:
@@ -305,42 +363,81 @@ def _gains(low: Mapping[int, WarpedImage]) -> dict[int, float]:
     Least squares of logarithms, else as Brown and Lowe, "Automatic panoramic image stitching using
     invariant features", 2007.
     """
-    rows, right = [*np.eye(len(low)) / GAIN_PRIOR_STD], [0.0] * len(low)
-    for (i, first), (j, second) in combinations(enumerate(low.values()), 2):
-        means = _overlap_means(first, second)
+    numbers = [*dict.fromkeys(map(image_of, low))]
+    rows, right = [*np.eye(len(numbers)) / GAIN_PRIOR_STD], [0.0] * len(numbers)
+    for (place, first), (other, second) in combinations(low.items(), 2):
+        i, j = (numbers.index(image_of(each)) for each in (place, other))
+        means = None if i == j else _overlap_means(first, second)
         if means is not None:
-            row = np.zeros(len(low))
+            row = np.zeros(len(numbers))
             row[i], row[j] = 1 / GAIN_ERROR_STD, -1 / GAIN_ERROR_STD
             rows.append(row)
             right.append(np.log(means[1] / means[0]) / GAIN_ERROR_STD)
     gains = np.exp(np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0])
-    return dict(zip(low, gains.tolist(), strict=True))
+    return dict(zip(numbers, gains.tolist(), strict=True))
 
 
 def _overlap_means(first: WarpedImage, second: WarpedImage) -> tuple[float, float] | None:
     """Return the mean brightness of both images where they overlap; None for too small a part."""
-    both = first, second
-    left, top = np.max([one.corner for one in both], axis=0)
-    right, bottom = np.min([np.add(one.corner, one.mask.shape[::-1]) for one in both], axis=0)
-    if left >= right or top >= bottom:
-        return None
-    parts = [
-        (slice(top - y, bottom - y), slice(left - x, right - x))
-        for x, y in (first.corner, second.corner)
-    ]
+    parts = _overlap(first, second)
     shared = (first.mask[parts[0]] > 0) & (second.mask[parts[1]] > 0)
     if np.count_nonzero(shared) < MIN_OVERLAP_PX:
         return None
     # Black is not 0 times white.
     means = [
-        float(one.image[part][shared].mean()) + 1 for one, part in zip(both, parts, strict=True)
+        float(one.image[part][shared].mean()) + 1
+        for one, part in zip((first, second), parts, strict=True)
     ]
     return means[0], means[1]
 
 
+def _overlap(first: WarpedImage, second: WarpedImage) -> list[tuple[slice, slice]]:
+    """Return the rows and columns of both that are the same box of the canvas; it may be empty."""
+    both = first, second
+    left, top = np.max([one.corner for one in both], axis=0)
+    right, bottom = np.min([np.add(one.corner, one.mask.shape[::-1]) for one in both], axis=0)
+    return [
+        (slice(top - y, max(top, bottom) - y), slice(left - x, max(left, right) - x))
+        for x, y in (first.corner, second.corner)
+    ]
+
+
+def _parallax(
+    low: Mapping[int, WarpedImage], gains: Mapping[int, float], seams: Mapping[int, np.ndarray]
+) -> dict[tuple[int, int], float]:
+    """Find by how many pixels images differ along their seams, of those that differ too much."""
+    flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    found: dict[tuple[int, int], float] = {}
+    for places in combinations(low, 2):
+        parts = _overlap(*(low[place] for place in places))
+        seam = np.uint8(255)
+        grays = []
+        for place, part in zip(places, parts, strict=True):
+            if not low[place].mask[part].size:
+                break
+            seam = seam & cv2.dilate(seams[place][part], np.ones((5, 5), np.uint8))
+            seam = seam & cv2.erode(low[place].mask[part], np.ones((9, 9), np.uint8))
+            gray = cv2.cvtColor(low[place].image[part], cv2.COLOR_RGB2GRAY)
+            grays.append(cv2.convertScaleAbs(gray, alpha=gains[image_of(place)]))
+        if len(grays) < 2 or min(grays[0].shape) < MIN_FLOW_PX:
+            continue
+        forward, backward = flow.calc(*grays, None), flow.calc(*grays[::-1], None)
+        y, x = np.indices(grays[0].shape, np.float32)
+        ends = forward + np.dstack([x, y])
+        back = cv2.remap(backward, ends, None, cv2.INTER_LINEAR)
+        known = (seam > 0) & (np.linalg.norm(forward + back, axis=2) < SEAM_TOLERANCE_PX)
+        if np.count_nonzero(known) < MIN_OVERLAP_PX:
+            continue
+        distance = float(np.percentile(np.linalg.norm(forward[known], axis=1), SEAM_PERCENT))
+        if distance > SEAM_TOLERANCE_PX:
+            first, second = sorted(map(image_of, places))
+            found[first, second] = max(distance, found.get((first, second), 0.0))
+    return found
+
+
 def _seams(low: Mapping[int, WarpedImage], gains: Mapping[int, float]) -> dict[int, np.ndarray]:
     """Divide the overlaps where the images differ least; (h, w) uint8 masks on the small canvas."""
-    images = [one.image.astype(np.float32) * gains[number] for number, one in low.items()]
+    images = [one.image.astype(np.float32) * gains[image_of(n)] for n, one in low.items()]
     corners, masks = [one.corner for one in low.values()], [one.mask for one in low.values()]
     # Graph cuts take minutes where large overlaps are equal.
     masks = cv2.detail_DpSeamFinder("COLOR").find(images, corners, masks)
@@ -366,11 +463,14 @@ def _upscale_mask(seam: np.ndarray, corner: tuple[int, int], scale: float, box: 
     return np.where(large > 127, np.uint8(255), np.uint8(0))
 
 
-def crop_box(valid: np.ndarray) -> Box:
+def crop_box(valid: np.ndarray, whole_rows: bool = False) -> Box:
     """Return the largest rectangle of a mask, (H, W) bool, that is true everywhere.
 
+    With `whole_rows` it has the full width, if a row has.
     Row by row, for each column: the run that ends there, and how far its height reaches sideways.
     """
+    if whole_rows and valid.all(axis=1).any():
+        valid = np.repeat(valid.all(axis=1, keepdims=True), valid.shape[1], axis=1)
     width = valid.shape[1]
     column = np.arange(width)
     runs, left, right = np.zeros(width, int), np.zeros(width, int), np.full(width, width)

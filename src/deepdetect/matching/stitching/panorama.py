@@ -69,6 +69,9 @@ class Panorama:
             from the panorama's, in pixels of the registration; flat: 0 without closed loops.
         gains: factor that the brightness of each image was multiplied by.
         seconds: time of each stage.
+        parallax: pixels of the panorama by which two images differ along their seam, of the pairs
+            where it is seen: the camera moved between them.
+        closed: whether it shows all around: its right end goes on at its left one.
     """
 
     image: np.ndarray
@@ -80,6 +83,8 @@ class Panorama:
     residual_px: float
     gains: dict[int, float]
     seconds: dict[str, float]
+    parallax: dict[tuple[int, int], float]
+    closed: bool
 
     def __repr__(self) -> str:
         height, width = self.valid.shape
@@ -175,11 +180,11 @@ def stitch(
     )
     canvas.check_size(options.max_canvas_megapixels)
     with timer.stage("compositing"):
-        panorama, valid, gains = composite(
+        panorama, valid, gains, parallax = composite(
             lambda number: load_deep(images[number], channels), small, canvas
         )
         if crop:
-            left, top, right, bottom = crop_box(valid)
+            left, top, right, bottom = crop_box(valid, canvas.closed)
             part = (slice(top, bottom), slice(left, right))
             panorama, valid = panorama[part].copy(), valid[part].copy()
             if projection == "plane":
@@ -195,6 +200,8 @@ def stitch(
         registration.residual_px,
         gains,
         timer.seconds,
+        parallax,
+        canvas.closed,
     )
 
 
