@@ -104,9 +104,14 @@ def test_ranges_are_given_for_signed_and_large_numbers(one_line: OneLine) -> Non
         np.testing.assert_array_equal(load_image(values, value_range=(low, high)), triple(GREY))
 
 
-def test_floats_that_use_little_of_their_range_are_told() -> None:
+@pytest.mark.parametrize(
+    "values",
+    [(GREY / 2550).astype(np.float32), (GREY // 10).astype(np.uint16)],
+    ids=["floats", "16 bits"],
+)
+def test_numbers_that_use_little_of_their_range_are_told(values: np.ndarray) -> None:
     with pytest.warns(UserWarning, match="nearly black: give the range by `value_range`"):
-        load_image(written((GREY / 2550).astype(np.float32)))
+        load_image(written(values))
 
 
 @pytest.mark.parametrize("planes", ["contig", "separate"])

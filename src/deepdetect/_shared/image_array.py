@@ -17,7 +17,7 @@ SENSOR_BITS = (8, 10, 12, 14, 16)
 """Bits of sensors whose numbers are kept in 16: the fewest that hold the largest number count."""
 
 LITTLE_RANGE = 1 / 8
-"""Share of [0, 1] below which floats are hardly meant to be an image."""
+"""Share of the range below which floats, or numbers of 16 bits, are hardly meant to be an image."""
 
 DARK = "uses {:.1%} of its range, and is nearly black: give the range by `value_range`"
 
@@ -136,22 +136,30 @@ def _range_of(array: np.ndarray, name: str, white: int | None) -> tuple[float, f
     kind, size = array.dtype.kind, array.dtype.itemsize
     if kind == "b":
         return 0, 1
-    if kind == "u" and size <= 2:
-        bits = (bits for bits in SENSOR_BITS if array.max(initial=0) < 2**bits)
-        return 0, white or 2 ** (8 if size == 1 else next(bits)) - 1
+    if kind == "u" and size == 1:
+        return 0, white or 255
+    if kind == "u" and size == 2:
+        largest = int(array.max(initial=0))
+        white = white or 2 ** next(bits for bits in SENSOR_BITS if largest < 2**bits) - 1
+        _tell_if_dark(largest / white, name)
+        return 0, white
     if kind == "f":
         low, high = (float(array.min()), float(array.max())) if array.size else (0.0, 1.0)
         if np.isfinite([low, high]).all() and (low < 0 or high > 1):
             raise ImageError(
                 f"{name} spans [{low:g}, {high:g}]: scale floats to [0, 1], or give `value_range`"
             )
-        if 0 < high < LITTLE_RANGE:
-            warnings.warn(f"{name} {DARK.format(high)}", UserWarning, stacklevel=2)
+        _tell_if_dark(high, name)
         return 0, 1
     raise ImageError(
         f"{name} holds {array.dtype}, whose range is not known: give `value_range`, or convert it "
         "to 8 bits, 16 bits without sign, or float in [0, 1]"
     )
+
+
+def _tell_if_dark(used: float, name: str) -> None:
+    if 0 < used < LITTLE_RANGE:
+        warnings.warn(f"{name} {DARK.format(used)}", UserWarning, stacklevel=2)
 
 
 def _in_range(array: np.ndarray, value_range: Sequence[float], name: str, deep: bool) -> np.ndarray:
