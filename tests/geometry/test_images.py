@@ -14,6 +14,7 @@ from deepdetect.geometry.images import (
     normalise_local_contrast,
     warp_to_reference,
     window_sums,
+    zncc_at_points,
 )
 
 
@@ -120,3 +121,16 @@ def test_edges_do_not_tell_which_side_is_bright() -> None:
     step[:, 20:] = 90
     assert (edge_strength(step).argmax(1) // 2 == 19 // 2).all()
     assert not edge_strength(np.full((40, 40), 7, np.uint8)).any()
+
+
+def test_windows_around_points_are_correlated() -> None:
+    image = gaussian_blur(noise(1, (80, 80)), 1)
+    points = np.array([[20.0, 30.0], [41.5, 40.0], [60.0, 12.5]])
+    moved = np.float32(shifted(image.astype(float), (3, 2), order=1))
+    same, inverted, chance = (
+        zncc_at_points((image, other), (points, to), 16)
+        for other, to in ((moved, points + (2, 3)), (255 - image, points), (image, points[::-1]))
+    )
+    np.testing.assert_allclose(same, 1, atol=1e-3)
+    np.testing.assert_allclose(inverted, -1, atol=1e-3)
+    assert np.abs(chance[[0, 2]]).max() < 0.5

@@ -253,6 +253,21 @@ def equalise(gray: np.ndarray) -> np.ndarray:
     return cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply(gray)
 
 
+def zncc_at_points(
+    images: tuple[np.ndarray, np.ndarray], points: tuple[np.ndarray, np.ndarray], side: int
+) -> np.ndarray:
+    """Return the ZNCC of the windows around (M, 2) points in both images, (M,) float64."""
+    patches = []
+    for image, at in zip(images, points, strict=True):
+        offsets = np.indices((side, side))[::-1].reshape(2, -1) - (side - 1) / 2
+        x, y = (at.T[:, :, None] + offsets[:, None]).astype(np.float32)
+        values = cv2.remap(gaussian_blur(image, BLUR_SIGMA_PX), x, y, cv2.INTER_LINEAR)
+        values = values - values.mean(axis=1, keepdims=True, dtype=np.float64)
+        norms = np.linalg.norm(values, axis=1, keepdims=True)
+        patches.append(values / np.maximum(norms, 1e-9))
+    return np.asarray((patches[0] * patches[1]).sum(axis=1))
+
+
 EDGE_SIGMA_PX, EDGE_QUANTILE = 1.0, 0.99
 """Of the blur before the gradient, and of its length at white."""
 

@@ -27,6 +27,7 @@ from ...geometry.images import (
     local_zncc,
     normalise_local_contrast,
     warp_to_reference,
+    zncc_at_points,
 )
 from ...geometry.transforms import (
     scaled_homography,
@@ -144,7 +145,7 @@ def _parallax_decides(
     shown = ((ends > 0) & (ends < np.array(first.shape[::-1]) - 1)).all(axis=1)
     ends[~shown] = 0
     # Where the plane shows the same in the first image, further on, the match is of the pattern.
-    alike = (_patches(first, starts) * _patches(first, ends)).sum(axis=1) > MIN_ZNCC
+    alike = zncc_at_points((first, first), (starts, ends), WINDOW_PX) > MIN_ZNCC
     recurs = ~shown | (alike & (np.linalg.norm(ends - starts, axis=1) > MIN_SHIFT_PX))
     errors = [transfer_errors(points0, points1, each) for each in (plane, copy)]
     off = ~recurs & (np.minimum(*errors) > OFF_PLANE_PX)
@@ -152,15 +153,6 @@ def _parallax_decides(
         measure_parallax(points0[off], points1[off], each, seed).log10_nfa for each in (plane, copy)
     )
     return own < min(other, 0) + MAX_LOG10_NFA
-
-
-def _patches(image: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the windows around (M, 2) points with mean 0 and norm 1, (M, `WINDOW_PX`²)."""
-    offsets = np.indices((WINDOW_PX, WINDOW_PX))[::-1].reshape(2, -1) - (WINDOW_PX - 1) / 2
-    x, y = (points.T[:, :, None] + offsets[:, None]).astype(np.float32)
-    values = cv2.remap(gaussian_blur(image, BLUR_SIGMA_PX), x, y, cv2.INTER_LINEAR).astype(float)
-    values -= values.mean(axis=1, keepdims=True)
-    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)
 
 
 def _correlation(first: np.ndarray, second: np.ndarray, homography: np.ndarray) -> np.ndarray:

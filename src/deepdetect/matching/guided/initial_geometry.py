@@ -25,7 +25,7 @@ from ...features.matchers import exact_neighbours, match_descriptors
 from ...features.matches import TwoViewGeometry
 from ...features.sift import detect_sift
 from ...geometry.estimation import TwoViewModel
-from ...geometry.images import downscale
+from ...geometry.images import downscale, zncc_at_points
 from ...geometry.semi_calibrated import MATCH_SIGMA_PX, refine_fundamental
 from ...geometry.transforms import (
     epipolar_errors,
@@ -74,6 +74,13 @@ MIN_COARSE_FRACTION = 0.5
 
 SIMULATED_SIDE_PX, SIMULATED_KEYPOINTS = 320, 1000
 """Longer side and keypoints of images of which views are simulated; each view gets half as many."""
+
+WINDOW_PX = 16
+"""Side of the windows around matches that are correlated."""
+
+MIN_INVERTED = 0.1
+"""Share of the matches with a negative correlation: of visible and infrared light one to nine of
+ten have one, of facades and photographs in other light none of a hundred."""
 
 MIN_WITHOUT_VIEWS = 20
 """Matches that agree with a geometry, for it to be taken without those of simulated views."""
@@ -331,10 +338,16 @@ def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
     views = zip(as_it_is.views, as_it_is.features, strict=True)
     first, second = (describe_learned(*each, CROSS_MODAL) for each in views)
     across = find_tentative_matches(*grays, (first, second), max_side_px=COARSE_SIDE_PX)
-    cross_modal = len(across.ratios) > len(as_it_is.ratios)
+    cross_modal = len(across.ratios) > len(as_it_is.ratios) and _is_inverted(across)
     tentative = across if cross_modal else as_it_is
     geometry = estimate_initial_geometry(tentative, model, seed)
     return replace(geometry, source=tentative, learned=True, cross_modal=cross_modal)
+
+
+def _is_inverted(tentative: TentativeMatches) -> bool:
+    """Whether some of what is bright in one image is dark in the other."""
+    correlations = zncc_at_points(tentative.views, tentative.matched, WINDOW_PX)
+    return bool(np.mean(correlations < 0) > MIN_INVERTED)
 
 
 def _learned_matches(grays: Pair, side_px: int, keypoints: int) -> TentativeMatches:
