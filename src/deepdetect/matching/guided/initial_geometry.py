@@ -82,6 +82,10 @@ MIN_INVERTED = 0.1
 """Share of the matches with a negative correlation: of visible and infrared light one to nine of
 ten have one, of facades and photographs in other light none of a hundred."""
 
+MAX_CROSS_MODAL_LOG10_NFA = -20.0
+"""Of what cross-modal descriptors show: they see the edges of small images, too, which lie in the
+same places, so that noise of 160x120 has -7; visible and infrared light have -33 and less."""
+
 MIN_WITHOUT_VIEWS = 20
 """Matches that agree with a geometry, for it to be taken without those of simulated views."""
 
@@ -341,6 +345,8 @@ def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
     cross_modal = len(across.ratios) > len(as_it_is.ratios) and _is_inverted(across)
     tentative = across if cross_modal else as_it_is
     geometry = estimate_initial_geometry(tentative, model, seed)
+    if cross_modal and geometry.log10_nfa > MAX_CROSS_MODAL_LOG10_NFA:
+        geometry = geometry.untrusted()
     return replace(geometry, source=tentative, learned=True, cross_modal=cross_modal)
 
 
