@@ -108,9 +108,9 @@ def test_noisy_fixes_two_of_them_wrong(
     assert heading_error_deg(found.similarity, hidden) < 2
     assert tilt_error_deg(found.similarity, hidden) < 2
     assert found.wrong == ("07.jpg", "25.jpg")
-    assert found.epsg == 32632
     values = json.loads(json.dumps(found.summary()))
     assert values["used"] == 38
+    assert values["utm_crs"] == "EPSG:32632"
     assert 2 < values["median_residual_across_m"] < 5
     assert np.linalg.norm(values["residuals_m"]["07.jpg"]) == pytest.approx(200, abs=12)
 

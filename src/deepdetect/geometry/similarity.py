@@ -7,7 +7,6 @@ them, and what is known to be level.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
@@ -19,7 +18,7 @@ MIN_POINTS = 3
 """That agree."""
 
 MAX_SAMPLES = 500
-"""Pairs and triples of points that the search for most agreement tries, each."""
+"""Pairs and triples of points, each, that the search for most agreement tries."""
 
 MAX_START_TILT_DEG = 60.0
 """Between what a triple says and what is known of up: a triple on a line may turn all over."""
@@ -66,7 +65,6 @@ class SimilarityFit:
         similarity: from the points to the targets.
         residuals: (N, 3) target minus transformed point.
         wrong: (N,) bool, points that do not agree with the others.
-        stds: horizontal and vertical standard deviation of the targets.
         scale_std: relative standard deviation of the scale; 0 where it was given.
         axes_std_deg: (3,) standard deviations of the rotation about the x, y and z axis.
         axis_std_deg_of_targets: that about the least certain axis by the targets alone; 180 where
@@ -76,7 +74,6 @@ class SimilarityFit:
     similarity: Similarity
     residuals: np.ndarray
     wrong: np.ndarray
-    stds: tuple[float, float]
     scale_std: float
     axes_std_deg: np.ndarray
     axis_std_deg_of_targets: float
@@ -88,8 +85,8 @@ def fit_similarity(
     accuracy: float,
     *,
     up: np.ndarray | None = None,
-    level: np.ndarray | None = None,
-    level_stds: np.ndarray | None = None,
+    level: np.ndarray = np.empty((0, 3)),
+    level_stds: np.ndarray = np.empty(0),
     scale: float | None = None,
     seed: int = 0,
 ) -> SimilarityFit:
@@ -112,14 +109,7 @@ def fit_similarity(
     targets = targets.copy()
     known = np.isfinite(targets)
     targets[~known] = 0.0
-    level = np.empty((0, 3)) if level is None else level
-    level_stds = np.ones(len(level)) if level_stds is None else level_stds
-    found, median = _search(points, targets, known, up, scale, seed)
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    if up is not None and len(points) >= MIN_AREA_POINTS and spread[1] > MIN_AREA * spread[0]:
-        # Where all cameras look straight down, what is taken for up may be far off.
-        free_of_it, less = _search(points, targets, known, None, scale, seed)
-        found = free_of_it if less < MUCH_BETTER * median else found
+    found = _search(points, targets, known, up, scale, seed)
     if found is None:
         raise ReconstructionError("the points are in one place")
     middle = points.mean(axis=0)  # turning and scaling about it leaves the translation alone
@@ -169,7 +159,6 @@ def fit_similarity(
         Similarity(current.scale, current.rotation, shift),
         np.where(known, targets - current.apply(own), np.nan),
         wrong,
-        (float(stds[0]), float(stds[2])),
         0.0 if scale is not None else float(deviations[6]),
         np.degrees(deviations[3:6]).clip(max=180),
         min(float(np.degrees(widest)), 180.0),
@@ -183,29 +172,23 @@ def _search(
     up: np.ndarray | None,
     scale: float | None,
     seed: int,
-) -> tuple[Similarity | None, float]:
-    """Find the similarity with the least median of the distances, and this.
-
-    It is that of three points, or of two and the upward direction.
-    """
+) -> Similarity | None:
+    """Find the similarity of three points, or of two and up, with the least median of distances."""
     random = np.random.default_rng(seed)
-    best, least = None, np.inf
-    for size in (2, 3) if up is not None else (3,):
-        samples = [*combinations(range(len(points)), size)] if len(points) < 16 else []
-        if not samples or len(samples) > MAX_SAMPLES:
-            draws = range(MAX_SAMPLES)
-            samples = [tuple(random.choice(len(points), size, replace=False)) for _ in draws]
-        for sample in samples:
-            rows = [*sample]
-            found = _of_sample(points[rows], targets[rows], up if size == 2 else None, scale)
-            if found is None:
-                continue
-            if up is not None and (found.rotation @ up)[2] < np.cos(np.radians(MAX_START_TILT_DEG)):
-                continue
-            median = np.median(np.linalg.norm((targets - found.apply(points)) * known, axis=1))
-            if median < least:
-                best, least = found, float(median)
-    return best, least
+    best: dict[bool, tuple[float, Similarity | None]] = dict.fromkeys((True, False), (np.inf, None))
+    for size in [3] * MAX_SAMPLES + [2] * (0 if up is None else MAX_SAMPLES):
+        rows = random.choice(len(points), size, replace=False)
+        found = _of_sample(points[rows], targets[rows], up if size == 2 else None, scale)
+        if found is None:
+            continue
+        median = float(np.median(np.linalg.norm((targets - found.apply(points)) * known, axis=1)))
+        upright = up is None or (found.rotation @ up)[2] > np.cos(np.radians(MAX_START_TILT_DEG))
+        if median < best[bool(upright)][0]:
+            best[bool(upright)] = median, found
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    sure = len(points) >= MIN_AREA_POINTS and spread[1] > MIN_AREA * spread[0]
+    # Where all cameras look straight down, what is taken for up may be far off.
+    return best[not (sure and best[False][0] < MUCH_BETTER * best[True][0])][1]
 
 
 def _of_sample(
@@ -215,11 +198,8 @@ def _of_sample(
     middle, middle_of_targets = points.mean(axis=0), targets.mean(axis=0)
     own, other = points - middle, targets - middle_of_targets
     if up is not None:
-        axis = np.cross(up, [0, 0, 1.0])
-        length = float(np.linalg.norm(axis))
-        angle = float(np.arctan2(length, up[2]))
-        axis = axis / length if length > 1e-12 else np.array([1.0, 0, 0])
-        upright = cv2.Rodrigues(angle * axis)[0]
+        across = np.linalg.svd(np.asarray(up)[None])[2][1:]  # any two axes
+        upright = np.array([across[0], np.cross(up, across[0]), up])
         own = own @ upright.T
         own[:, 2] = other[:, 2] = 0
         cosine, sine = float((own * other).sum()), float(np.cross(own, other)[:, 2].sum())
@@ -239,14 +219,12 @@ def _of_sample(
 def _spread(residuals: np.ndarray, known: np.ndarray, accuracy: float) -> np.ndarray:
     """Return the (3,) standard deviations of targets: across, twice, and of heights."""
     stds = []
-    for part, lost in ((slice(0, 2), 5), (slice(2, 3), 2)):  # parameters that fit these
-        values = np.abs(residuals[:, part][known[:, part]])
-        squares = len(values) * (MAD_STD * float(np.median(values))) ** 2 if len(values) else 0.0
-        variance = (PRIOR_COUNT * accuracy**2 + squares) / (
-            PRIOR_COUNT + max(len(values) - lost, 0)
-        )
-        stds.append(np.sqrt(variance))
-    return np.array([stds[0], stds[0], stds[1]])
+    for axes, lost in (([0, 1], 5), ([2], 2)):  # parameters that fit these
+        values = np.abs(residuals[:, axes][known[:, axes]])
+        squares = len(values) * (MAD_STD * np.median(values)) ** 2 if len(values) else 0.0
+        free = PRIOR_COUNT + max(len(values) - lost, 0)
+        stds += len(axes) * [np.sqrt((PRIOR_COUNT * accuracy**2 + squares) / free)]
+    return np.array(stds)
 
 
 def _covariance(normal: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -87,7 +87,6 @@ class Georeference:
         similarity: from the frame of the mapping to the world.
         source: "GPS", "ground control points" or "known distance", which gives no place.
         origin: of the world, whose axes go east, north and up; None without a place.
-        epsg: number of its UTM zone.
         residuals: (3,) metres east, north and up from the model to each fix, by image, or to each
             control point.
         wrong: names of those that do not agree with the others, which were left out of account.
@@ -97,38 +96,35 @@ class Georeference:
     similarity: Similarity
     source: str
     origin: Origin | None = None
-    epsg: int | None = None
-    residuals: Mapping[str, np.ndarray] | None = None
+    residuals: Mapping[str, np.ndarray] = field(default_factory=dict)
     wrong: tuple[str, ...] = ()
     fit: SimilarityFit | None = None
 
     def summary(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        values: dict[str, Any] = {"source": self.source}
-        if self.origin is None or self.fit is None or self.residuals is None:
-            return values
+        if self.origin is None or self.fit is None:
+            return {"source": self.source}
         good = np.array([r for name, r in self.residuals.items() if name not in self.wrong])
-        across = np.linalg.norm(good[:, :2], axis=1)
         alone = round(self.fit.axis_std_deg_of_targets, 2)
-        return values | {
+        return {
+            "source": self.source,
             "axes": "metres east, north and up of the origin",
             "origin": vars(self.origin) | {"crs": "EPSG:4979"},
-            "utm_crs": f"EPSG:{self.epsg}",
+            "utm_crs": f"EPSG:{self.origin.to_utm(np.zeros((1, 3)))[1]}",
             "used": len(good),
             "wrong": list(self.wrong),
-            "median_residual_across_m": round(float(np.median(across)), 3),
-            "median_residual_up_m": round(float(np.nanmedian(np.abs(good[:, 2]))), 3)
-            if np.isfinite(good[:, 2]).any()
-            else None,
+            "median_residual_across_m": _rounded(np.median(np.linalg.norm(good[:, :2], axis=1))),
+            "median_residual_up_m": _rounded(np.median(np.abs(good[:, 2]))),
             "scale_std_percent": round(100 * self.fit.scale_std, 2),
             "axes_std_deg": self.fit.axes_std_deg.round(2).tolist(),
             "least_certain_axis_std_deg_by_these_alone": alone,
             "note": NEARLY_A_LINE if alone > MAX_OPEN_AXIS_DEG else None,
-            "residuals_m": {
-                name: [None if np.isnan(each) else round(float(each), 3) for each in residual]
-                for name, residual in self.residuals.items()
-            },
+            "residuals_m": {name: [*map(_rounded, r)] for name, r in self.residuals.items()},
         }
+
+
+def _rounded(value: float) -> float | None:
+    return None if np.isnan(value) else round(float(value), 3)
 
 
 def georeference(
@@ -192,14 +188,12 @@ def _place(
     scale: float | None,
     **upright: Any,
 ) -> Georeference:
-    heights = places[np.isfinite(places[:, 2]), 2]
-    height = float(np.median(heights)) if len(heights) else 0.0
-    latitude, longitude = np.median(places[:, :2], axis=0).tolist()
+    unknown = np.isnan(places[:, 2])
+    places = np.where(np.isnan(places), 0 if unknown.all() else np.nanmedian(places[:, 2]), places)
+    latitude, longitude, height = np.median(places, axis=0).tolist()
     origin = Origin(round(latitude, 6), round(longitude, 6), round(height, 1))
-    known = np.column_stack([places[:, :2], np.nan_to_num(places[:, 2], nan=height)])
-    targets = origin.to_enu(known)
-    targets[~np.isfinite(places[:, 2]), 2] = np.nan
-    own = np.array([*points.values()])
+    targets = origin.to_enu(places)
+    targets[unknown, 2] = np.nan
     problem = ReconstructionError(
         "its satellite fixes do not agree with each other, or lie too close together for their "
         "accuracy"
@@ -208,15 +202,16 @@ def _place(
         "pixels and names of images"
     )
     try:
-        fit = fit_similarity(own, targets, accuracy, scale=scale, **upright)
+        fit = fit_similarity(
+            np.array([*points.values()]), targets, accuracy, scale=scale, **upright
+        )
     except ReconstructionError:
         raise problem from None
     if not (fit.scale_std < MAX_SCALE_STD and fit.axes_std_deg[2] < MAX_HEADING_STD_DEG):
         raise problem
     residuals = dict(zip(points, fit.residuals, strict=True))
     wrong = tuple(name for name, is_wrong in zip(points, fit.wrong, strict=True) if is_wrong)
-    _, epsg = origin.to_utm(np.zeros((1, 3)))
-    return Georeference(fit.similarity, source, origin, epsg, residuals, wrong, fit)
+    return Georeference(fit.similarity, source, origin, residuals, wrong, fit)
 
 
 def upright(
@@ -238,11 +233,10 @@ def upright(
             # That all look up somewhat does not become surer by their number.
             level += [view.rotation[0], view.rotation[2]]
             stds += [UPRIGHT_STD_DEG, AHEAD_STD_DEG * np.sqrt(len(views))]
-    rows = np.array([view.rotation for view in views.values()])
-    if down:
-        up = -np.mean(down, axis=0)
-    else:  # as Brown and Lowe's horizon of panoramas
-        across, above = rows[:, 0], -(rows[:, 1] + DOWNWARD_SHARE * rows[:, 2]).mean(axis=0)
+    up = -np.mean(down, axis=0) if down else np.zeros(3)
+    if not down:  # as Brown and Lowe's horizon of panoramas
+        across, *others = np.array([view.rotation for view in views.values()]).swapaxes(0, 1)
+        above = -(others[0] + DOWNWARD_SHARE * others[1]).mean(axis=0)
         up = np.linalg.solve(across.T @ across / len(across) + 1e-3 * np.eye(3), above)
     return up / np.linalg.norm(up), np.array(level), np.radians(stds)
 
@@ -267,10 +261,8 @@ def read_control_points(path: str | Path) -> list[ControlRow]:
 
     try:
         lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
-        first, *lines = [line.strip() for line in lines if line.strip() and line[0] != "#"]
-        zone = re.fullmatch(r"WGS84 UTM (\d+)([NS])", first)
-        system = first
-        if zone:
+        system, *lines = [line.strip() for line in lines if line.strip() and line[0] != "#"]
+        if zone := re.fullmatch(r"WGS84 UTM (\d+)([NS])", system):
             system = f"EPSG:{(32600 if zone[2] == 'N' else 32700) + int(zone[1])}"
         to_degrees = Transformer.from_crs(CRS.from_user_input(system), 4326, always_xy=True)
         rows = []
@@ -312,9 +304,7 @@ def georeference_by_control_points(
 
 def _by_file_name(sparse: SparseModel) -> dict[str, str]:
     """Return the names of images by these, and by the names of their files alone."""
-    return {Path(name).name: name for name in sparse.images} | {
-        name: name for name in sparse.images
-    }
+    return {each: name for name in sparse.images for each in (Path(name).name, name)}
 
 
 def _triangulated(sparse: SparseModel, rows: Mapping[str, ControlRow]) -> np.ndarray:
