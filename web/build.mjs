@@ -1,7 +1,7 @@
-// Makes web/dist: the page with ONNX Runtime, the network and the graph of the points, for any web server.
+// Makes web/dist: the page with ONNX Runtime, the networks and the graph of the points, for any web server.
 import { createHash } from "node:crypto";
 import { cpSync, mkdirSync, readFileSync, readdirSync, rmSync, writeFileSync } from "node:fs";
-import { dirname, join, relative } from "node:path";
+import { basename, dirname, join, relative } from "node:path";
 import { fileURLToPath } from "node:url";
 import { gzipSync } from "node:zlib";
 
@@ -18,8 +18,8 @@ const WEBGPU_FILES = ["ort.webgpu.min.mjs", "ort-wasm-simd-threaded.asyncify.mjs
 rmSync(dist, { recursive: true, force: true });
 cpSync(join(packaged, "app/static"), dist, { recursive: true });
 mkdirSync(join(dist, "ort"));
-// Not every web server compresses WebAssembly, so the page unpacks it. Servers know no files of this
-// ending: they leave them as they are.
+// Not every web server compresses WebAssembly and models, so the page unpacks them. Servers know no
+// files of these endings: they leave them as they are.
 const packedName = (name) => name.replace(/\.wasm$/, ".wasm.packed");
 for (const name of [...RUNTIME_FILES, ...WEBGPU_FILES]) {
   const content = readFileSync(join(runtime, name));
@@ -27,8 +27,10 @@ for (const name of [...RUNTIME_FILES, ...WEBGPU_FILES]) {
                 name.endsWith(".wasm") ? gzipSync(content, { level: 9 }) : content);
 }
 mkdirSync(join(dist, "model"));
-cpSync(join(packaged, "detector/weights/default.onnx"), join(dist, "model/default.onnx"));
-cpSync(join(here, "points.onnx"), join(dist, "model/points.onnx"));
+for (const path of [join(packaged, "detector/weights/default.onnx"), join(here, "points.onnx"),
+                    join(packaged, "detector/points/descriptor.onnx")]) {
+  writeFileSync(join(dist, "model", basename(path)), gzipSync(readFileSync(path), { level: 9 }));
+}
 writeFileSync(join(dist, "config.json"),
               JSON.stringify({ engine: "browser", offline: true, webgpu: true }) + "\n");
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import product
 from typing import Any
 
@@ -12,8 +13,10 @@ from scipy.spatial import cKDTree
 import deepdetect
 from deepdetect import Keypoints, load_image
 from deepdetect.app.server import STATIC
+from deepdetect.detector.points.descriptor import describe_learned
 from deepdetect.detector.points.detection import detect_points, rank_candidates
-from deepdetect.features.sift import scaled_sift_descriptors, to_root_sift
+from deepdetect.features.learned import LEARNED_RATIO, match_learned, turn_descriptors
+from deepdetect.features.matchers import exact_neighbours, match_descriptors
 from deepdetect.io.image import luma
 
 PHOTOS = ("coffee-turned.jpg", "motorcycle-left.jpg")
@@ -130,41 +133,61 @@ write(values.sigmas.flatMap((sigma) => Array.from(blur(gray, width, height, sigm
     np.testing.assert_allclose(found, np.ravel(expected), rtol=1e-6, atol=1e-5)
 
 
-def test_angles_and_descriptors_at_their_own_size(run_node: Any) -> None:
+def test_angles(run_node: Any) -> None:
     gray = np.ascontiguousarray(gray_of("motorcycle-left.jpg")[:240, :320])
     points = detect_points(gray, 500)
     assert points.sizes is not None
-    assert points.angles is not None
-    imports = """
-import { dominantAngles } from "@/orientation.js";
-import { describeAtOwnSize } from "@/descriptors.js";
-"""
     script = """
 const [xy, sizes] = [Float32Array.from(values.xy), Float32Array.from(values.sizes)];
-const gray = new Uint8Array(bytes);
-const angles = dominantAngles(gray, width, height, { xy, sizes });
-const assigned = Float32Array.from(values.angles);
-write([...angles, ...describeAtOwnSize(gray, width, height, { xy, sizes, angles: assigned })]);
+write(dominantAngles(new Uint8Array(bytes), width, height, { xy, sizes }));
 """
     found = run_node(
-        imports,
+        'import { dominantAngles } from "@/orientation.js";\n',
         WRITE + script,
         gray,
         width=gray.shape[1],
         height=gray.shape[0],
         xy=points.xy.reshape(-1).tolist(),
         sizes=points.sizes.tolist(),
-        angles=points.angles.tolist(),
     )
-    turned = np.abs((found[: len(points)] - points.angles + 180) % 360 - 180)
+    turned = np.abs((found - points.angles + 180) % 360 - 180)
     assert np.quantile(turned, 0.99) < 1e-3
-    descriptors = found[len(points) :].reshape(-1, 16, 8)
-    expected = scaled_sift_descriptors(gray, points.xy, points.sizes, points.angles)
-    expected = to_root_sift(expected).reshape(-1, 16, 8)
-    # OpenCV counts directions the other way round, and rounds positions to pixels.
-    expected = expected[:, :, [0, 7, 6, 5, 4, 3, 2, 1]]
-    expected = expected / np.linalg.norm(expected, axis=(1, 2), keepdims=True)
-    assert (descriptors * expected).sum((1, 2)).min() > 0.98
+
+
+@pytest.mark.parametrize("quarters", [0, 1])
+def test_learned_descriptors_are_turned_and_matched_as_in_the_package(
+    quarters: int, run_node: Any
+) -> None:
+    first, second = (gray_of(f"motorcycle-{side}.jpg") for side in ("left", "right"))
+    features = [
+        describe_learned(gray, detect_points(gray, 800))
+        for gray in (first, np.ascontiguousarray(np.rot90(second, -quarters)))
+    ]
+    upright = [turn_descriptors(each.descriptors, each.angles) for each in features]
+    script = """
+const numbers = new Float32Array(bytes);
+const middle = numbers.length / 2;
+const [first, second] = [numbers.slice(0, middle), numbers.slice(middle)].map((half) => {
+  const end = half.length / (LENGTH + 1) * LENGTH;
+  return { upright: half.slice(0, end), angles: half.slice(end) };
+});
+const { rows0, rows1, ratios } = matchLearned(first, second);
+write([...rows0].flatMap((row0, k) => ratios[k] < RATIO ? [row0, rows1[k]] : []));
+"""
+    found = run_node(
+        'import { LENGTH, RATIO, matchLearned } from "@/learned.js";\n',
+        WRITE + script,
+        np.concatenate(
+            [np.append(rows, each.angles) for rows, each in zip(upright, features, strict=True)]
+        ).astype(np.float32),
+        width=0,
+        height=0,
+    )
+    match = partial(match_descriptors, matcher=exact_neighbours, ratio=LEARNED_RATIO, mutual=True)
+    expected = match_learned(*features, match)
+    pairs = set(zip(expected.indices0.tolist(), expected.indices1.tolist(), strict=True))
+    common = pairs & {tuple(pair) for pair in found.reshape(-1, 2).astype(int).tolist()}
+    assert len(common) >= SHARED * max(len(pairs), len(found) / 2) > 200
 
 
 @pytest.mark.parametrize("size", [(1601, 1250), (1416, 1416), (1000, 2000), (9000, 300)], ids=str)

@@ -21,7 +21,9 @@ from deepdetect._shared.errors import OptionError
 from deepdetect.app import jobs
 from deepdetect.app.jobs import AppOptions, Job
 from deepdetect.app.server import AppServer
-from deepdetect.detector.points.detection import rank_candidates
+from deepdetect.detector.points.descriptor import describe_learned
+from deepdetect.detector.points.detection import detect_points, rank_candidates
+from deepdetect.features.learned import turn_descriptors
 from deepdetect.io.image import luma
 
 from .conftest import Client, packed
@@ -129,6 +131,24 @@ def test_the_candidates_are_those_of_the_package(serve: Any, photo: np.ndarray) 
     np.testing.assert_array_equal(found[2], candidates.sigma_px[order].astype(np.float32))
     np.testing.assert_array_equal(found[3], logits[order])
     assert (np.diff(candidates.strength[order]) <= 0).all()
+
+
+def test_the_descriptors_are_those_of_the_package(serve: Any, photo: np.ndarray) -> None:
+    client, _ = serve()
+    gray = luma(np.ascontiguousarray(photo[:100, :91]))
+    points = describe_learned(gray, detect_points(gray, 20))
+    assert points.sizes is not None
+    body = gray.tobytes() + points.xy.tobytes() + points.sizes.tobytes()
+    answer = client.ask("POST", "/api/descriptors?width=91&height=100", body)
+    found = np.frombuffer(answer.content, "<f4").reshape(20, 64)
+    assert points.descriptors is not None
+    assert points.angles is not None
+    expected = turn_descriptors(points.descriptors, points.angles)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    wrong = gray.tobytes() + np.full(3, np.nan, "f4").tobytes()
+    for refused in (body[:-4], wrong):
+        answer = client.ask("POST", "/api/descriptors?width=91&height=100", refused)
+        assert answer.status == 400
 
 
 @pytest.mark.parametrize(

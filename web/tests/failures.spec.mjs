@@ -22,7 +22,7 @@ for (const { name, answer, said } of [
     await page.route(MODEL, (route) => route.fulfill(answer));
     await openExample(page, "Coffee");
     await choose(page, "kind", "points");
-    await expect(page.getByRole("alert")).toContainText(`What finds points could not be loaded ${said}`);
+    await expect(page.getByRole("alert")).toContainText(`What finds and describes points could not be loaded ${said}`);
     await expect(page.locator("#busy")).toBeHidden();
     await choose(page, "kind", "dense");
     await expect(page.locator("#count")).toContainText("keypoint");

@@ -164,6 +164,31 @@ test("circles have the sizes of the points", async ({ page }) => {
   expect(Math.min(...marked)).toBeGreaterThanOrEqual(3); // of four places on each circle
 });
 
+test("descriptors of the page's own network are those of Python", async ({ page }) => {
+  const expected = askPython(`
+import json, sys, numpy as np
+from deepdetect import PointDetector, load_image
+from deepdetect.detector.points.descriptor import describe_learned
+from deepdetect.features.learned import turn_descriptors
+from deepdetect.io.image import luma
+gray = luma(load_image(sys.argv[1]))
+found = describe_learned(gray, PointDetector(500).detect(gray))
+upright = turn_descriptors(found.descriptors, found.angles)
+print(json.dumps({"gray": gray.ravel().tolist(), "xy": found.xy.ravel().tolist(),
+                  "sizes": found.sizes.tolist(), "upright": upright.ravel().tolist()}))
+`, join(examples, "coffee.jpg"));
+  await page.goto("./");
+  const upright = await page.evaluate(async ({ gray, xy, sizes }) => {
+    const { Background } = await import("/js/background.js");
+    const worker = new Background("/js/points_worker.js");
+    const points = { xy: Float32Array.from(xy), sizes: Float32Array.from(sizes) };
+    const values = { gray: Uint8Array.from(gray), width: 600, height: 400, points, token: null };
+    return [...(await worker.call("describe", values)).upright];
+  }, expected);
+  expect(upright.length).toBe(500 * 64);
+  expect(Math.max(...upright.map((value, k) => Math.abs(value - expected.upright[k])))).toBeLessThan(1e-3);
+});
+
 test("a turned picture is matched by points", async ({ page }, info) => {
   const path = info.outputPath("turned.png");
   askPython("import sys, cv2; cv2.imwrite(sys.argv[2], cv2.rotate(cv2.imread(sys.argv[1]), cv2.ROTATE_90_CLOCKWISE)); print(0)",

@@ -35,7 +35,9 @@ from starlette.staticfiles import StaticFiles
 from .. import __version__
 from .._shared.errors import DeepDetectError, OptionError, unknown_name
 from ..detector.detector import DeepDetect
+from ..detector.points.descriptor import describe_learned
 from ..detector.points.detection import rank_candidates
+from ..features.keypoints import Keypoints
 from ..io.image_file import IMAGE_SUFFIXES
 from .jobs import AppOptions, Jobs
 from .tasks import TASKS, Order, SentImage
@@ -54,6 +56,10 @@ CHECK_EVERY_S = 1.0
 
 MAX_IMAGE_PIXELS = 2_100_000
 """The page reduces images to two megapixels, with sides that are multiples of 8."""
+
+POINT_BYTES = 12
+MAX_POINTS = 4000
+"""Of an image, as many as the page's slider allows; each is x, y and a size in float32."""
 
 MIN_SIDE = 16
 MAX_DESCRIPTION_BYTES = 1 << 18
@@ -155,6 +161,7 @@ class AppServer:
                 Route("/config.json", lambda _: JSONResponse(self._description())),
                 Route("/api/heatmap", self._heatmap, methods=["POST"]),
                 Route("/api/candidates", self._candidates, methods=["POST"]),
+                Route("/api/descriptors", self._descriptors, methods=["POST"]),
                 Route("/api/jobs", self._new_job, methods=["POST"]),
                 Route("/api/jobs/{name}", self._job_state, methods=["GET"]),
                 Route("/api/jobs/{name}", self._remove_job, methods=["DELETE"]),
@@ -231,7 +238,7 @@ class AppServer:
     async def _heatmap(self, request: Request) -> Response:
         """Answer the pixels of an image, (H, W, 3) uint8, with its logits, (H, W) float32."""
 
-        def logits(rgb: np.ndarray) -> np.ndarray:
+        def logits(rgb: np.ndarray, _: bytes) -> np.ndarray:
             return self._detector.heatmap_and_logits(rgb)[1]
 
         return await self._answer(request, 3, logits)
@@ -242,17 +249,37 @@ class AppServer:
         They are (4, N) float32: x, y, sigmas and logits, the strongest first.
         """
 
-        def ranked(gray: np.ndarray) -> np.ndarray:
+        def ranked(gray: np.ndarray, _: bytes) -> np.ndarray:
             candidates, logits = rank_candidates(gray[..., 0])
             columns = np.column_stack([candidates.xy, candidates.sigma_px, logits])
             return columns[np.argsort(candidates.rank)].T
 
         return await self._answer(request, 1, ranked)
 
+    async def _descriptors(self, request: Request) -> Response:
+        """Answer grey levels, (H, W) uint8, and points of them with upright learned descriptors.
+
+        The points are (N, 2) float32 positions and (N,) sizes, the descriptors (N, 64).
+        """
+
+        def described(gray: np.ndarray, numbers: bytes) -> np.ndarray:
+            xy, sizes = np.split(np.frombuffer(numbers, "<f4"), [len(numbers) // POINT_BYTES * 2])
+            size, upright = (gray.shape[1], gray.shape[0]), np.zeros(len(sizes))
+            points = Keypoints(xy.reshape(-1, 2), upright, size, sizes=sizes, angles=upright)
+            descriptors = describe_learned(gray[..., 0], points).descriptors
+            assert descriptors is not None
+            return descriptors
+
+        return await self._answer(request, 1, described, MAX_POINTS)
+
     async def _answer(
-        self, request: Request, channels: int, compute: Callable[[np.ndarray], np.ndarray]
+        self,
+        request: Request,
+        channels: int,
+        compute: Callable[[np.ndarray, bytes], np.ndarray],
+        max_points: int = 0,
     ) -> Response:
-        """Answer the pixels of an image, (H, W, C) uint8, with float32 computed of them."""
+        """Answer the pixels of an image, (H, W, C) uint8, and points, with float32 of them."""
         self._check_key(request)
         try:
             width, height = (int(request.query_params[name]) for name in ("width", "height"))
@@ -261,14 +288,16 @@ class AppServer:
         if min(width, height) < MIN_SIDE or width * height > MAX_IMAGE_PIXELS:
             raise HTTPException(400, f"an image cannot be {width}x{height} here")
         length = channels * width * height
-        if _body_length(request, length) != length:
+        points = _body_length(request, length + POINT_BYTES * max_points) - length
+        if points < 0 or points % POINT_BYTES:
             raise HTTPException(400, "these are not the pixels of such an image")
         async with asyncio.timeout(self.options.max_request_s):
-            body = np.frombuffer(await request.body(), np.uint8)
+            body = await request.body()
+        pixels = np.frombuffer(body, np.uint8, length).reshape(height, width, channels)
 
         def answer() -> bytes:
             with self._processors:
-                return compute(body.reshape(height, width, channels)).astype("<f4").tobytes()
+                return compute(pixels, body[length:]).astype("<f4").tobytes()
 
         return Response(await run_in_threadpool(answer), media_type="application/octet-stream")
 

@@ -50,18 +50,25 @@ export async function findHeatMap(picture) {
   });
 }
 
+const token = () => (page.server ? page.token : null);
+
 /** Ranks the points of a picture, where that has not been done; it fails where the picture is removed. */
 export async function findPoints(picture) {
   if (picture.ranking) return;
   await once(picture, "ranking", async () => {
     const { file, name, rgba, width, height, original } = picture;
-    const token = page.server ? page.token : null;
-    const values = { file, name, rgba, width, height, original, token };
+    const values = { file, name, rgba, width, height, original, token: token() };
     const found = pointsWorker.call("rank", values, picture.removal.signal);
     const ranking = await during("Finding points…", found);
     counted("points");
     return ranking;
   });
+}
+
+/** Describes points of a picture. @returns {Promise<import("./learned.js").Described>} */
+export function describe({ ranking, removal }, points) {
+  const { gray, width, height } = ranking;
+  return pointsWorker.call("describe", { gray, width, height, points, token: token() }, removal.signal);
 }
 
 /** The angles of points of a picture. @returns {Promise<Float32Array>} degrees */

@@ -1,5 +1,4 @@
 // Mutual nearest neighbours of descriptors, with the ratio of the best to the second best distance.
-import { LENGTH } from "./descriptors.js";
 
 /**
  * @typedef {object} Pairs
@@ -7,9 +6,9 @@ import { LENGTH } from "./descriptors.js";
  * @property {Float32Array} ratios in [0, 1]: the lower, the more the match stands out
  */
 
-/** @param {Float32Array} first @param {Float32Array} second @returns {Pairs} */
-export function mutualMatches(first, second) {
-  const [count0, count1] = [first.length / LENGTH, second.length / LENGTH];
+/** @param {Float32Array} first @param {Float32Array} second rows of a length @returns {Pairs} */
+export function mutualMatches(first, second, length) {
+  const [count0, count1] = [first.length / length, second.length / length];
   const best0 = new Int32Array(count0).fill(-1);
   const best1 = new Int32Array(count1).fill(-1);
   const top1 = new Float32Array(count1).fill(-Infinity);
@@ -17,7 +16,7 @@ export function mutualMatches(first, second) {
   for (let i = 0; i < count0; i++) {
     let [top, next] = [-Infinity, -Infinity];
     for (let j = 0; j < count1; j++) {
-      const likeness = product(first, i * LENGTH, second, j * LENGTH);
+      const likeness = product(first, i * length, second, j * length, length);
       if (likeness > top) {
         next = top;
         top = likeness;
@@ -41,9 +40,9 @@ export function mutualMatches(first, second) {
   };
 }
 
-function product(first, i, second, j) {
+function product(first, i, second, j, length) {
   let [a, b, c, d] = [0, 0, 0, 0]; // four sums at once: they do not wait for each other
-  for (let k = 0; k < LENGTH; k += 4) {
+  for (let k = 0; k < length; k += 4) {
     a += first[i + k] * second[j + k];
     b += first[i + k + 1] * second[j + k + 1];
     c += first[i + k + 2] * second[j + k + 2];

@@ -1,21 +1,12 @@
-// Describes and matches keypoints of two pictures beside the page.
+// Matches described keypoints of two pictures beside the page.
 import { answer } from "./background.js";
-import { describeAtOwnSize } from "./descriptors.js";
-import { mutualMatches } from "./matching.js";
 import { estimateGeometry, project } from "./geometry.js";
-import { dominantAngles } from "./orientation.js";
-
-/** Descriptors of keypoints, at their own sizes and angles. */
-function described({ gray, width, height, xy, sizes }) {
-  const angles = dominantAngles(gray, width, height, { xy, sizes });
-  return describeAtOwnSize(gray, width, height, { xy, sizes, angles });
-}
+import { matchLearned } from "./learned.js";
 
 answer({
   /** @returns mutual nearest neighbours with their ratios, as positions */
   match({ pictures }) {
-    const [first, second] = pictures.map(described);
-    const { rows0, rows1, ratios } = mutualMatches(first, second);
+    const { rows0, rows1, ratios } = matchLearned(...pictures);
     const take = (xy, rows) => Float32Array.from({ length: 2 * rows.length },
                                                  (_, k) => xy[2 * rows[k >> 1] + (k & 1)]);
     return { points0: take(pictures[0].xy, rows0), points1: take(pictures[1].xy, rows1), ratios };

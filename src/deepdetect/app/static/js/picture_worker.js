@@ -48,7 +48,7 @@ async function browserNetwork(processor) {
   const model = await openModel("default.onnx", graphics);
   const run = async (rgba, width, height) => {
     const planes = toPlanes(rgba, width * height);
-    const { logits } = await model("image", "float32", planes, [1, 3, height, width], ["logits"]);
+    const { logits } = await model({ image: ["float32", planes, [1, 3, height, width]] }, ["logits"]);
     return Float32Array.from(logits);
   };
   const words = graphics ? "on the graphics card (WebGPU)" : "on the processor (WebAssembly)";

@@ -1,5 +1,4 @@
-// Ranks the points of pictures, by ONNX Runtime here or by Python, and finds their angles, beside the
-// page. The network is not needed.
+// Ranks and describes the points of pictures, by ONNX Runtime here or by Python, beside the page.
 import { UserError, answer } from "./background.js";
 import { decode } from "./decoding.js";
 import { dominantAngles } from "./orientation.js";
@@ -7,14 +6,15 @@ import { GRAY, luma, pointsSize, reduceByArea } from "./pixels.js";
 import { rankingOf } from "./points/ranking.js";
 import { askPython, openModel } from "./runtime.js";
 
-let model = null;
+const STRIDE = 128; // the network of the descriptors halves a picture seven times
+const models = {};
 
-async function openedModel() {
+async function opened(name) {
   try {
-    return await openModel("points.onnx");
+    return models[name] ??= await openModel(name);
   } catch (error) {
     if (error instanceof UserError) throw error;
-    throw new UserError(`What finds points could not be loaded (${error.message}): load the page again.`);
+    throw new UserError(`What finds and describes points could not be loaded (${error.message}): load the page again.`);
   }
 }
 
@@ -26,8 +26,28 @@ async function candidatesOf({ gray, width, height }, token) {
     const [x, y, sigmas, logits] = [0, 1, 2, 3].map((k) => rows.subarray(k * count, (k + 1) * count));
     return { x, y, sigmas, logits };
   }
-  model ??= await openedModel();
-  return model("gray", "uint8", gray, [1, 1, height, width]);
+  const model = await opened("points.onnx");
+  return model({ gray: ["uint8", gray, [1, 1, height, width]] });
+}
+
+/** Descriptors of points as in a picture that is not turned, rows of 64. */
+async function uprightDescriptors({ gray, width, height, points: { xy, sizes } }, token) {
+  const count = sizes.length;
+  if (!count) return new Float32Array(0);
+  if (token !== null) return askPython("descriptors", width, height, new Blob([gray, xy, sizes]), token);
+  const model = await opened("descriptor.onnx");
+  const [across, down] = [width, height].map((side) => STRIDE * Math.ceil(side / STRIDE));
+  const luma = new Float32Array(across * down);
+  for (let y = 0, at = 0; y < down; y++) {
+    const start = Math.min(y, height - 1) * width;
+    for (let x = 0; x < across; x++) luma[at++] = gray[start + Math.min(x, width - 1)] / 255;
+  }
+  const { descriptors } = await model({
+    luma: ["float32", luma, [1, 1, down, across]],
+    xy: ["float32", xy, [1, count, 2]],
+    sizes: ["float32", sizes, [1, count]],
+  });
+  return descriptors;
 }
 
 /** The luma of a file at the size at which points are looked for. */
@@ -53,4 +73,11 @@ answer({
 
   /** @returns {Float32Array} angles of points in degrees */
   angles: ({ gray, width, height, points }) => dominantAngles(gray, width, height, points),
+
+  /** Describes points. @returns {Promise<import("./learned.js").Described>} */
+  async describe({ token, ...picture }) {
+    const { gray, width, height, points } = picture;
+    return { upright: await uprightDescriptors(picture, token),
+             angles: dominantAngles(gray, width, height, points) };
+  },
 }, (reason) => `The points could not be found (${reason}): try a smaller picture.`);

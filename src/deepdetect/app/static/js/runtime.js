@@ -5,9 +5,7 @@ const MAX_THREADS = 4;
 const GZIP = [0x1f, 0x8b]; // the first bytes of such a file
 
 /** The content of a file that the build has compressed, and that some web servers unpack themselves. */
-async function unpacked(address) {
-  const response = await fetch(address);
-  if (!response.ok) throw new Error("a file of ONNX Runtime is missing");
+async function unpacked(response) {
   const content = await response.arrayBuffer();
   const [first, second] = new Uint8Array(content);
   if (first !== GZIP[0] || second !== GZIP[1]) return content;
@@ -22,37 +20,42 @@ async function unpacked(address) {
  *
  * @param {string} name of its file
  * @param {boolean} graphics
- * @returns {Promise<(name: string, type: string, data: ArrayLike<number>, sides: number[],
- *           outputs?: string[]) => Promise<Object<string, Float32Array>>>} runs it with an input
+ * @returns {Promise<(inputs: Object<string, [string, ArrayLike<number>, number[]]>,
+ *           outputs?: string[]) => Promise<Object<string, Float32Array>>>} runs it with the types,
+ *           values and sides of its inputs
  */
 export async function openModel(name, graphics = false) {
   const response = await fetch(new URL(`../model/${name}`, import.meta.url)).catch(() => {
     throw new UserError(`model/${name} could not be loaded: check the connection, and try again.`);
   });
   if (!response.ok) throw new Error(`model/${name} is missing`);
-  const content = new Uint8Array(await response.arrayBuffer());
+  const content = await unpacked(response);
   const folder = new URL("../ort/", import.meta.url).href;
   const ort = await import(`${folder}ort.${graphics ? "webgpu" : "wasm"}.min.mjs`);
   ort.env.logLevel = "error";
   ort.env.wasm.wasmPaths = folder;
-  ort.env.wasm.wasmBinary = await unpacked(
-    `${folder}ort-wasm-simd-threaded.${graphics ? "asyncify." : ""}wasm.packed`);
+  if (!ort.env.wasm.wasmBinary) { // one for all models
+    const binary = await fetch(`${folder}ort-wasm-simd-threaded.${graphics ? "asyncify." : ""}wasm.packed`);
+    if (!binary.ok) throw new Error("a file of ONNX Runtime is missing");
+    ort.env.wasm.wasmBinary = await unpacked(binary);
+  }
   ort.env.wasm.numThreads = self.crossOriginIsolated
     ? Math.min(MAX_THREADS, navigator.hardwareConcurrency || 1) : 1;
   const session = await ort.InferenceSession.create(
     content, { executionProviders: [graphics ? "webgpu" : "wasm"] });
-  return async (input, type, data, sides, outputs) => {
-    const found = await session.run({ [input]: new ort.Tensor(type, data, sides) }, outputs);
+  return async (inputs, outputs) => {
+    const feeds = Object.entries(inputs).map(([key, values]) => [key, new ort.Tensor(...values)]);
+    const found = await session.run(Object.fromEntries(feeds), outputs);
     return Object.fromEntries(Object.entries(found).map(([key, { data: values }]) => [key, values]));
   };
 }
 
 /** Asks Python on this computer. @returns {Promise<Float32Array>} */
-export async function askPython(task, width, height, pixels, token) {
+export async function askPython(task, width, height, body, token) {
   let response;
   try {
     response = await fetch(`/api/${task}?width=${width}&height=${height}`, {
-      method: "POST", body: pixels,
+      method: "POST", body,
       headers: { "Authorization": `Bearer ${token}`, "Content-Type": "application/octet-stream" },
     });
   } catch {

@@ -1,6 +1,6 @@
 // Matches of two pictures by descriptors, their lines, and the geometry that they agree with.
 import { Background } from "../background.js";
-import { findPoints } from "../detection.js";
+import { describe, findPoints } from "../detection.js";
 import { drawMatches, newCanvas } from "../draw.js";
 import { save, savePng, stem, toCsv, toJson } from "../downloads.js";
 import { announce, counted, during, element, onceAFrame, page, rescaled, showError, toOriginal } from "../page.js";
@@ -31,12 +31,12 @@ function showControls() {
   form.querySelector('output[for="ratio"]').textContent = ratio().toFixed(2);
 }
 
-/** The points of a picture, with the pixels that they were found in. */
+/** The described points of a picture, and the size that they were found in. */
 async function pointsOf(picture, number) {
   await findPoints(picture);
-  const { gray, width, height } = picture.ranking;
+  const { width, height } = picture.ranking;
   const { xy, sizes } = choosePoints(picture.ranking, number);
-  return { gray, width, height, xy, sizes };
+  return { width, height, xy, ...await during("Describing points…", describe(picture, { xy, sizes })) };
 }
 
 /** Matches the pictures where that has not been done, and finds their geometry. */
