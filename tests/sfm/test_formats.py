@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from PIL import Image
-from PIL.ExifTags import GPS, IFD
+from PIL.ExifTags import GPS, IFD, Base
 
 from deepdetect import Camera, MissingExtraError, OptionError, PointDetector, reconstruct_many
 from deepdetect.datasets.posed_images import load_posed_scenes
@@ -24,7 +24,7 @@ from deepdetect.sfm.splat import seen_depths, thinned
 from ..io.test_gps import place_tags
 
 FORMATS_OF_ALL = tuple(n for n in FORMATS if n != "mesh" or "normals" in DENSE_POINT.names)
-NAMES = ("0003", "0004", "0005", "0006")
+NAMES, TURNED = ("0003", "0004", "0005", "0006"), "0006"
 METRES_PER_DEGREE = np.array([111_132.95, 78_846.8])
 """Of latitude and longitude, at 45 degrees north, by WGS 84."""
 
@@ -53,6 +53,9 @@ def placed(
             latitude, longitude = [45, 9] + np.array([north, east]) / METRES_PER_DEGREE
             exif.get_ifd(IFD.GPSInfo).update(place_tags(latitude, longitude, up + 100))
             exif.get_ifd(IFD.GPSInfo)[GPS.GPSHPositioningError] = 0.02
+            if name == TURNED:
+                exif[Base.Orientation] = 3  # it is stored upside down
+                image = image.transpose(Image.Transpose.ROTATE_180)
             image.save(path, quality=95, exif=exif)
     options = MultiViewOptions(stride_px=4, formats=FORMATS_OF_ALL)
     detector = PointDetector(1000)
@@ -138,6 +141,8 @@ def test_transforms_are_as_nerfstudio_reads_them(placed, name: str) -> None:
         with Image.open(path.parent / frame["file_path"]) as image:
             assert image.size == (frame["w"], frame["h"])
             rgb = np.asarray(image).astype(int)
+            if image.getexif().get(Base.Orientation) == 3:  # nerfstudio does not turn it: docs
+                rgb = rgb[::-1, ::-1]
         camera = np.linalg.inv(frame["transform_matrix"])
         x, y, z = camera[:3, :3] @ found.dense.points.T + camera[:3, 3:]
         across, down = x / -z, -y / -z

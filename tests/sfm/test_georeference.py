@@ -8,9 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import Camera, OptionError, ReconstructionError
+from deepdetect import (
+    Camera,
+    OptionError,
+    PointDetector,
+    ReconstructionError,
+    reconstruct_many,
+)
 from deepdetect.geometry.camera import PosedView
 from deepdetect.geometry.similarity import Similarity
+from deepdetect.sfm import MultiViewOptions
 from deepdetect.sfm.colmap import CameraIntrinsics
 from deepdetect.sfm.georeference import (
     Georeference,
@@ -233,6 +240,34 @@ def test_a_known_distance_gives_the_scale(pycolmap, tmp_path: Path, hidden: Simi
     placed = georeference(sparse, sparse.points, tmp_path, scale_by=(80.0, "00.jpg", "02.jpg"))
     assert isinstance(placed, Georeference)
     assert placed.similarity.scale == pytest.approx(20 * hidden.scale, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_photographs_of_a_street_with_a_phones_fixes(
+    shared: Path, tmp_path: Path, pycolmap
+) -> None:
+    """Fifteen, taken upright along a street; their fixes are some metres off, and on a line."""
+    folder = shared / "data" / "lund"
+    if not folder.is_dir():
+        pytest.skip("needs the photographs of Lund in ../shared")
+    options = MultiViewOptions(dense=False)
+    found = reconstruct_many(folder, tmp_path / "m", PointDetector(3000), options=options)
+    place = found.georeference
+    assert isinstance(place, Georeference)
+    assert len(place.residuals) == len(found.views) >= 14
+    values = place.summary()
+    assert values["median_residual_across_m"] < 6
+    assert values["scale_std_percent"] < 10
+    assert values["least_certain_axis_std_deg_by_these_alone"] > 45
+    fixes = found.centres + [place.residuals[name] for name in found.views]
+    headings = []
+    for path in (found.centres, fixes):
+        east, north, _ = np.polyfit(np.arange(len(path)), path, 1)[0]
+        headings.append(np.degrees(np.arctan2(east, north)))
+    assert abs(headings[0] - headings[1]) < 5
+    downs = np.array([view.rotation[1] for view in found.views.values()])
+    tilts = np.degrees(np.arccos(np.clip(-downs[:, 2], -1, 1)))
+    assert np.median(tilts) < 5
 
 
 def test_what_is_upright() -> None:
