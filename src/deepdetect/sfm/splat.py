@@ -24,8 +24,8 @@ SPLAT_POINTS = 200_000
 
 JPEG_QUALITY = 95
 
-MAX_CELL_PX = 4
-"""Side, at the most, of what a point covers in a depth map, where points are sparse."""
+CELLS_PX, CLOSED_GAIN = (1, 2, 3, 4, 6, 8), 1.3
+"""Sides of what a point covers in a depth map: the first whose successor covers little more."""
 
 MAX_DEPTH_STEP = 0.1
 """A point so much, relatively, behind one beside it in a depth map is seen through a gap."""
@@ -154,10 +154,16 @@ def seen_depths(view: PosedView, points: np.ndarray) -> np.ndarray:
     xy, depth = view.project(points)
     inside = (depth > 0) & ((xy > -0.5) & (xy < (width - 0.5, height - 0.5))).all(axis=1)
     xy, depth = xy[inside], depth[inside]
-    side = int(np.clip(np.sqrt(width * height / max(len(xy), 1)), 1, MAX_CELL_PX))
-    nearest = np.full((-(-height // side), -(-width // side)), np.inf)
-    column, row = ((xy + 0.5) // side).astype(np.int64).T
-    np.minimum.at(nearest, (row, column), depth)
+    chosen, covered = (1, np.full((height, width), np.inf)), 0.0
+    for side in CELLS_PX:
+        nearest = np.full((-(-height // side), -(-width // side)), np.inf)
+        column, row = ((xy + 0.5) // side).astype(np.int64).T
+        np.minimum.at(nearest, (row, column), depth)
+        area = np.isfinite(nearest).sum() * side**2
+        if area < CLOSED_GAIN * covered:
+            break
+        chosen, covered = (side, nearest), area
+    side, nearest = chosen
     beside = cv2.erode(nearest, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
     nearest[nearest > (1 + MAX_DEPTH_STEP) * beside] = np.inf
     nearest[np.isinf(nearest)] = np.nan
