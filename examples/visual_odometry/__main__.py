@@ -3,7 +3,8 @@
     python examples/visual_odometry ../shared/data/kitti-clip -o odometry/
 
 The folder holds frames, calib.txt or K.txt, and poses.txt as KITTI's odometry benchmark has them.
-All keypoints go the same roads: followed by Lucas-Kanade, or matched by RootSIFT, then `odometry`.
+All keypoints go the same roads: followed by Lucas-Kanade, or matched by descriptors (learned ones of
+DeepDetect, RootSIFT of SIFT), then `odometry`.
 The truth is used for one number, the scale of each path, and to measure the errors.
 """
 
@@ -22,7 +23,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from odometry import VisualOdometry
 
-from deepdetect import Camera, DeepDetectError, Keypoints, load_image, match_features
+from deepdetect import (
+    Camera,
+    DeepDetectError,
+    Keypoints,
+    PointDetector,
+    load_image,
+    match_features,
+)
 from deepdetect.datasets.posed_images import load_posed_scenes
 from deepdetect.features.sift import describe_keypoints
 from deepdetect.geometry.relative_pose import rotation_angle
@@ -50,21 +58,29 @@ def trackers(count: int) -> dict[str, Tracker | Matcher]:
         "ORB": partial(opencv, orb),
     }
     followed = {name: Tracker(detect, options) for name, detect in detectors.items()}
-    matched = {f"{name}, matched": Matcher(detectors[name]) for name in ("DeepDetect", "SIFT")}
+    describe = {
+        "DeepDetect": PointDetector().describe,
+        "SIFT": lambda rgb, points: describe_keypoints(luma(rgb), points),
+    }
+    matched = {f"{name}, matched": Matcher(detectors[name], describe[name]) for name in describe}
     return followed | matched
 
 
 class Matcher:
-    """Makes tracks of the keypoints that frames have in common by their RootSIFT descriptors."""
+    """Makes tracks of the keypoints that frames have in common by their descriptors."""
 
-    def __init__(self, detect: Callable[[np.ndarray], Keypoints]) -> None:
-        self.detect = detect
+    def __init__(
+        self,
+        detect: Callable[[np.ndarray], Keypoints],
+        describe: Callable[[np.ndarray, Keypoints], Keypoints],
+    ) -> None:
+        self.detect, self.describe = detect, describe
         self.before: Keypoints | None = None
         self.tracks, self.next_track, self.number = np.empty(0, np.int64), 0, 0
 
     def update(self, rgb: np.ndarray) -> TrackedFrame:
         """Match the keypoints of the next frame with those of the frame before."""
-        found = describe_keypoints(luma(rgb), self.detect(rgb))
+        found = self.describe(rgb, self.detect(rgb))
         tracks = np.arange(len(found)) + self.next_track
         self.next_track += len(found)
         if self.before is not None:
