@@ -3,9 +3,9 @@
     python examples/visual_odometry ../shared/data/kitti-clip -o odometry/
 
 The folder holds frames, calib.txt or K.txt, and poses.txt as KITTI's odometry benchmark has them.
-All keypoints go the same roads: followed by Lucas-Kanade, or matched by descriptors (learned ones of
-DeepDetect, RootSIFT of SIFT), then `odometry`.
-The truth is used for one number, the scale of each path, and to measure the errors.
+All keypoints go the same roads: followed by Lucas-Kanade, or matched by descriptors (learned ones
+of DeepDetect, RootSIFT of SIFT), then `odometry`. The truth is used for one
+number, the scale of each path, and to measure the errors.
 """
 
 from __future__ import annotations
