@@ -87,6 +87,22 @@ def made(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
     return output, json.loads(result.stdout)
 
 
+def test_pose_prints_rotation_and_translation(folder: Path) -> None:
+    words = ["pose", str(folder / "left.png"), str(folder / "turned1.png"), "--focal", str(FOCAL)]
+    result = run_command([*words, "--json"])
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    turned = cv2.Rodrigues(np.radians([2, -3, 4.0]))[0]
+    np.testing.assert_allclose(found["R"], turned, atol=0.02)
+    # The right camera's centre lies in the direction of x of the left one.
+    np.testing.assert_allclose(np.array(found["R"]).T @ found["t"], [-1, 0, 0], atol=0.1)
+    assert found["inliers"] > 0.9 * found["matches"] > 500
+    table = run_command(words).stdout
+    assert all(f"R, row {k}" in table for k in (1, 2, 3))
+    plane = run_command(["pose", str(folder / "left.png"), str(folder / "left.png"), *words[3:]])
+    assert plane.exit_code == 3
+
+
 def test_a_rectified_pair_becomes_metric_files(made, folder: Path) -> None:
     output, values = made
     assert sorted(path.name for path in output.iterdir()) == FILES

@@ -27,6 +27,7 @@ from deepdetect.evaluation.baselines.random import AllPixels
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.geometry.point_cloud import PointCloud
 from deepdetect.matching.stereo import DisparityOptions, disparity_map
+from deepdetect.reconstruction import estimate_pose
 from deepdetect.reconstruction.outliers import PointFilterOptions
 from deepdetect.reconstruction.result import Reconstruction
 
@@ -205,6 +206,12 @@ def test_the_right_camera_is_where_it_is_seen_from(posed: Any, turned: Any) -> N
 
 
 @pytest.mark.slow
+def test_the_pose_alone_is_true(turned: Any) -> None:
+    pose = estimate_pose(turned.left, turned.right, calibration=turned.calibration)
+    assert turned.rotation_error(pose.rotation) < 0.3
+    assert turned.direction_error(pose.translation) < 2
+
+
 def test_both_pipelines_agree_on_a_rectified_pair(level: Any, detector: DeepDetect) -> None:
     """Forced each way the depths are the same; found out it is the rectified one."""
     ways = [

@@ -39,6 +39,7 @@ COMMANDS = {
         "match": ("match", "matches between two images"),
         "register": ("match", "one image registered to another"),
         "stitch": ("match", "a panorama of overlapping images"),
+        "pose": ("reconstruct", "the pose of one camera relative to another"),
         "reconstruct": ("reconstruct", "a 3D reconstruction of two images, or of many"),
     },
     "Many images": {

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from cyclopts import Parameter
 
@@ -87,6 +87,9 @@ READING = From(
     types={"allow_truncated": bool},
     defaults={"max_megapixels": f"{MAX_MEGAPIXELS:g}"},
 )
+
+T = TypeVar("T")
+More = Annotated[T, Parameter(group=MORE)]
 
 Json = Annotated[bool, Parameter("--json", negative="", help="Print the result as JSON.")]
 JSON = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Json)

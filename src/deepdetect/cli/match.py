@@ -53,8 +53,7 @@ PAIR = cli.From(
 )
 MATCHING = cli.From(
     MatchingOptions,
-    "ratio",
-    more="two_view_model descriptor keypoint_size angle matcher",
+    more="ratio two_view_model descriptor keypoint_size angle matcher",
     types={
         "two_view_model": Literal[TWO_VIEW_MODELS],
         "descriptor": Literal[(*DESCRIPTORS, LEARNED, LEARNED_FREE, CROSS_MODAL)],
@@ -78,10 +77,10 @@ def match(
     output: cli.Folder = Path("deepdetect-output"),
     pairs: str = "exhaustive",
     detector: Detector = "network",
-    preset: Literal["default", "published"] = "default",
-    homography: Path | None = None,
-    camera0: Path | None = None,
-    camera1: Path | None = None,
+    preset: cli.More[Literal["default", "published"]] = "default",
+    homography: cli.More[Path | None] = None,
+    camera0: cli.More[Path | None] = None,
+    camera1: cli.More[Path | None] = None,
     file_format: cli.Format = "npz",
     pictures: bool = True,
     overwrite: cli.Overwrite = False,

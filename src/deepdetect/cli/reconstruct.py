@@ -13,6 +13,7 @@ from .._shared.progress import stage_progress
 from .._shared.records import Outputs
 from ..io.point_cloud import find_writer
 from ..reconstruction.files import ENDINGS, save_reconstruction
+from ..reconstruction.pipeline import estimate_pose
 from ..reconstruction.pipeline import reconstruct as reconstruct_pair
 from ..sfm.colmap import import_pycolmap
 from ..sfm.formats import check_formats
@@ -28,6 +29,14 @@ CAMERAS = cli.From(
     flags={"focal_px": "--focal", "rectified": "--rectified/--not-rectified"},
     types={"calibration": Path | None},
     defaults={"focal_px": "from EXIF", "rectified": "detected"},
+)
+POSE = cli.From(
+    estimate_pose,
+    "calibration focal_px",
+    more="seed",
+    flags={"focal_px": "--focal"},
+    types={"calibration": Path | None},
+    defaults={"focal_px": "from EXIF"},
 )
 MANY = cli.From(
     MultiViewOptions,
@@ -107,6 +116,35 @@ def reconstruct(
         title = f"{left.name} and {right.name}"
         named = {"left": left, "right": right, "files": [*files.values()]}
         return cli.Result(save_reconstruction(found, made, title, **named))
+
+
+@cli.command(POSE, NETWORK, cli.READING)
+def pose(first: Path, second: Path, /, **values: Any) -> cli.Result:
+    """Estimate how the second camera stands to the first, from one image of each.
+
+    A point X of the first camera's frame (x right, y down, z forward) is R X + t in that of the
+    second; the length of t cannot be known. Ends with exit code 3 where the images cannot tell it:
+    they show one plane, or the camera only turned.
+
+        deepdetect pose left.jpg right.jpg --focal 1250
+        deepdetect pose left.jpg right.jpg --calibration calib.json --json
+
+    Args:
+        first: Image of the first camera.
+        second: Image of the second camera.
+    """
+    chosen, _ = chosen_detector("network", values)
+    with stage_progress("pose") as done:
+        found = estimate_pose(first, second, chosen, progress=done, **values)
+    numbers = {
+        "R": found.rotation.tolist(),
+        "t": found.translation.tolist(),
+        "angle_deg": found.angle,
+        "matches": len(found.inliers),
+        "inliers": int(found.inliers.sum()),
+    }
+    rows = {f"R, row {k}": row for k, row in enumerate(numbers["R"], 1)}
+    return cli.Result(numbers, cli.table({**rows, **numbers}))
 
 
 def _reconstruct_many(

@@ -1,3 +1,3 @@
 from .outliers import PointFilterOptions as PointFilterOptions
-from .pipeline import reconstruct as reconstruct
+from .pipeline import estimate_pose as estimate_pose, reconstruct as reconstruct
 from .result import Reconstruction as Reconstruction

@@ -24,6 +24,7 @@ from ..features.selection import SelectionOptions
 from ..geometry.camera import Calibration, Camera
 from ..geometry.estimation import GeometryOptions, check_model
 from ..geometry.images import window_sums
+from ..geometry.relative_pose import RelativePose
 from ..io.exif import calibration_from_exif
 from ..io.image import Images, ignore_masks, load_image, luma
 from ..matching.pipeline import MatchingOptions, match_images
@@ -37,7 +38,8 @@ from .rectification import (
     find_rectification,
 )
 from .result import Reconstruction
-from .two_view import reconstruct_two_view
+from .subpixel import refine_matches, spread_corners
+from .two_view import POSE_CELLS, checked_pose, reconstruct_two_view
 
 SOR_WINDOW_PX = 9
 """Side of the window of pixels that SOR compares with in rectified pairs."""
@@ -163,6 +165,70 @@ def reconstruct(
         calibration=known,
         seconds=timer.seconds,
     )
+
+
+@suggest_keywords
+def estimate_pose(
+    first: Any,
+    second: Any,
+    detector: AnyDetector | None = None,
+    *,
+    channels: Channels = "rgb",
+    calibration: Calibration | str | Path | None = None,
+    focal_px: float | None = None,
+    seed: int = 0,
+    progress: Callable[[str], object] | None = None,
+) -> RelativePose:
+    """Estimate the pose of the second camera in the frame of the first, from their images.
+
+    Args:
+        first, second: anything `load_image` takes.
+        detector: as of `match_images`; default `DeepDetect()`.
+        channels: order of the colours in images that are arrays, as of `load_image`.
+        calibration: file of the cameras, as of `Calibration.load`, or a `Calibration`. Without one
+            the focal length is taken from `focal_px`, or from EXIF.
+        focal_px: focal length in pixels of both cameras, instead of a calibration.
+        seed: of all random choices.
+        progress: called with the name of each stage when it ends.
+
+    Returns:
+        Rotation and translation, X1 = rotation @ X0 + translation, whose length cannot be known.
+
+    Raises:
+        ImageError: an image cannot be read or is not fit.
+        ReconstructionError: there is no calibration, or it is wrong; a NoDepthError says that the
+            images show one plane, or the camera only turned, so that the pose cannot be told.
+
+    Example:
+        >>> import cv2
+        >>> rng = np.random.default_rng(0)
+        >>> scene = cv2.GaussianBlur(rng.integers(0, 256, (96, 200)).astype(np.uint8), (0, 0), 1)
+        >>> x, y = np.meshgrid(np.arange(160, dtype=np.float32), np.arange(96, dtype=np.float32))
+        >>> first = cv2.remap(scene, x + 10 + y / 16, y, cv2.INTER_CUBIC)
+        >>> second = cv2.remap(scene, x + 20 + y * y / 600, y, cv2.INTER_CUBIC)
+        >>> pose = estimate_pose(first, second, focal_px=300)
+        >>> bool(pose.angle < 1), bool(pose.translation[0] < -0.99)
+        (True, True)
+    """
+    check_model("fundamental", seed, GeometryOptions())
+    rgb = load_image(first, channels=channels), load_image(second, channels=channels)
+    grays = luma(rgb[0]), luma(rgb[1])
+    sizes = grays[0].shape[::-1], grays[1].shape[::-1]
+    known = _calibration(calibration, focal_px, (first, second), sizes)
+    timer = StageTimer(progress)
+    with timer.stage("keypoints and matching"):
+        matches = match_images(
+            *rgb,
+            detector,
+            model="none",
+            options=MatchingOptions(two_view_model="fundamental"),
+            seed=seed,
+        )
+    with timer.stage("sub-pixel"):
+        points0 = matches.points0.astype(np.float64)
+        rows = spread_corners(grays[0], points0, POSE_CELLS)
+        refined, converged = refine_matches(*grays, points0[rows], matches.points1[rows])
+    return checked_pose(points0[rows][converged], refined[converged], known, seed, timer)
 
 
 def _from_disparities(

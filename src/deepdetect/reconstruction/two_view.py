@@ -84,19 +84,10 @@ def reconstruct_two_view(
             pose_indices = spread_corners(images[0], points0, POSE_CELLS)
         aligned, converged = refine_matches(*images, points0[pose_indices], points1[pose_indices])
     pose_indices = pose_indices[converged]
-    evident = points0[pose_indices], aligned[converged]
     if not matches.subpixel:
         indices, points1 = pose_indices, aligned
         dropped["not refined"] = len(points0) - len(indices)
-    with timer.stage("checks"):
-        cells, epipolar = check_matches(*evident, calibration.camera1.size, calibration, seed)
-    with timer.stage("pose"):
-        found = estimate_relative_pose(*evident, calibration, MAX_EPIPOLAR_DISTANCE_PX, seed)
-        pose = check_pose(found, cells, epipolar, calibration)
-    with timer.stage("focal length"):
-        explained = cells[epipolar.inliers]
-        on_lines = evident[0][explained], evident[1][explained]
-        check_focal(*on_lines, pose.errors[explained], calibration, seed)
+    pose = checked_pose(points0[pose_indices], aligned[converged], calibration, seed, timer)
     baseline = 1.0 if calibration.baseline_mm is None else calibration.baseline_mm
     used = points0[indices], points1[indices]
     with timer.stage("triangulation"):
@@ -136,6 +127,30 @@ def reconstruct_two_view(
         "matches": len(matches),
         "dropped": dropped,
     }
+
+
+def checked_pose(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    calibration: Calibration,
+    seed: int,
+    timer: StageTimer,
+) -> RelativePose:
+    """Estimate the pose from refined matches, (M, 2); an error says why it cannot be told."""
+    with timer.stage("checks"):
+        cells, epipolar = check_matches(
+            points0, points1, calibration.camera1.size, calibration, seed
+        )
+    with timer.stage("pose"):
+        found = estimate_relative_pose(
+            points0, points1, calibration, MAX_EPIPOLAR_DISTANCE_PX, seed
+        )
+        pose = check_pose(found, cells, epipolar, calibration)
+    with timer.stage("focal length"):
+        explained = cells[epipolar.inliers]
+        on_lines = points0[explained], points1[explained]
+        check_focal(*on_lines, pose.errors[explained], calibration, seed)
+    return pose
 
 
 def check_matches(
