@@ -86,8 +86,20 @@ def test_a_list_of_photographs_and_results_within_the_folder(
     assert (values["images"], values["registered"]) == (4, 3)
     drawn = run("detect", "black.png", "-o", "drawn")
     assert drawn.exit_code == 3, drawn.output
+    for _ in range(2):  # nor are those of a format
+        again = run("reconstruct", ".", *few, "--format", "splat", "--format", "text")
+        assert again.exit_code == 0, again.output
+        assert json.loads(again.stdout)["images"] == 4
     again = run("reconstruct", ".", *few)
     assert json.loads(again.stdout)["images"] == 4
+    # A known distance, and what lacks a place, which is said when all else is written.
+    scaled = run("reconstruct", ".", *few, "--scale-by", 2.5, "0004.jpg", "0006.jpg")
+    values = json.loads(scaled.stdout)
+    centres = [np.array(values["cameras"][name]["centre"]) for name in ("0004.jpg", "0006.jpg")]
+    assert np.linalg.norm(centres[1] - centres[0]) == pytest.approx(2.5)
+    refused = run("reconstruct", ".", *few, "--format", "map")
+    assert refused.exit_code == 2
+    assert "needs a place" in refused.stderr
 
 
 @pytest.mark.parametrize(
