@@ -1,4 +1,4 @@
-"""Further formats of a model, for programs of surveyors."""
+"""Further formats of a model: for surveyors, viewers of meshes, trainers of splats."""
 
 from __future__ import annotations
 
