@@ -1,8 +1,8 @@
 // The page alone, in a browser: what `npm run build` makes.
-import { readFileSync, writeFileSync } from "node:fs";
+import { existsSync, readFileSync, writeFileSync } from "node:fs";
 import { join } from "node:path";
 import { NO_BROWSER, askPython, choose, chromium, downloaded, example, examples, expect, expectAccessible,
-         openExample, slide, table, test } from "./page.mjs";
+         openExample, slide, table, test, web } from "./page.mjs";
 
 test.skip(!chromium, NO_BROWSER);
 
@@ -158,6 +158,23 @@ test("matches of two views agree with the true disparity", async ({ page }) => {
   await expect.poll(fewer).toBeLessThan(rows.length);
   const json = await downloaded(page, page.locator("#view-matches [data-download=json]"));
   expect(JSON.parse(json.content)).toMatchObject({ model: "fundamental", options: { ratio: 0.6 } });
+});
+
+test("a plane seen aslant is one, as in Python", async ({ page }) => {
+  const graf = join(web, "../../shared/data/oxford/graf");
+  test.skip(!existsSync(graf), "needs Oxford's pictures in ../shared");
+  await page.goto("./");
+  await page.locator("#file").setInputFiles([1, 3].map((k) => join(graf, `img${k}.png`)));
+  await expect(page.locator("#match-hint")).toContainText("agree with one homography");
+  const { content } = await downloaded(page, page.locator("#view-matches [data-download=json]"));
+  const { model, matches } = JSON.parse(content);
+  expect(model).toBe("homography");
+  const rows = readFileSync(join(graf, "H1to3p"), "utf-8").trim().split(/\s+/).map(Number);
+  const right = matches.filter(([x, y, u, v]) => {
+    const [a, b, c] = [0, 3, 6].map((k) => rows[k] * x + rows[k + 1] * y + rows[k + 2]);
+    return Math.hypot(a / c - u, b / c - v) < 5;
+  });
+  expect(right.length / matches.length).toBeGreaterThan(0.85);
 });
 
 test("pictures that show different things have no geometry", async ({ page }) => {

@@ -1,13 +1,18 @@
-// The geometry that most matches agree with: a homography or a fundamental matrix, by RANSAC, and
-// how surely it is not chance (a contrario: Moisan and Stival, 2004).
+// The geometry that matches agree with: a homography, or a fundamental matrix where they show depth,
+// by RANSAC, and how surely it is not chance (a contrario: Moisan and Stival, 2004). Which of both is
+// decided as in `deepdetect.geometry.two_view`.
 
 const MAX_ERROR_PX = 3;
 const ROUNDS = 3000;
-const MAX_LOG10_NFA = -3; // one such geometry among a thousand pairs that have none
+const LOCAL_REACHES = [3, 3, 3, 2, 2, 2, 1]; // in units of the largest error (LO-RANSAC: Chum et al., 2003)
+const MAX_LOG10_NFA = -6;
 // Several matches along one edge are no independent evidence: it is counted by places that lie apart.
 const MIN_PLACES = 9; // Brown and Lowe, 2007: over 8
 const PLACE_WIDTH = 0.02; // of the diagonal: by it, 7 to 9 wrong matches along edges were 4 or 5 places
-const PREFER_HOMOGRAPHY = 0.8; // of a fundamental matrix's inliers: it says less about each
+const EPIPOLES = 1000; // tried, each of two matches off the plane
+const MAX_EPIPOLE_DISTANCE_PX = 1.5; // by which a match may miss the line through the epipole
+const MIN_FRACTION_OF_PLANE = 0.2; // that agree with an epipole, relative to the matches on the plane
+const MIN_FRACTION_OF_REST = 0.5; // the same, of the matches off the plane
 
 const MODELS = {
   homography: { sample: 4, fit: fitHomography, error: transferError },
@@ -28,16 +33,57 @@ const MODELS = {
  * @returns {Geometry}
  */
 export function estimateGeometry(points0, points1, sizes) {
-  const found = Object.keys(MODELS).map((name) => ransac(name, points0, points1));
-  const likely = found.filter(({ model, inliers }) =>
-    log10Nfa(model, inliers, ...sizes[1]) < MAX_LOG10_NFA
-    && countPlaces(points0, points1, inliers, sizes) >= MIN_PLACES);
-  const none = { model: "none", matrix: null, inliers: new Uint8Array(points0.length / 2) };
-  if (!likely.length) return none;
-  const [first, second] = likely;
-  if (!second) return first;
-  return sum(first.inliers) >= PREFER_HOMOGRAPHY * sum(second.inliers) ? first : second;
+  const isTrusted = ({ model, inliers }) => log10NfaOf(model, inliers, sizes[1]) < MAX_LOG10_NFA
+    && countPlaces(points0, points1, inliers, sizes) >= MIN_PLACES;
+  const plane = ransac("homography", points0, points1);
+  const isPlanar = isTrusted(plane);
+  if (isPlanar && !showsDepth(points0, points1, plane.matrix)) return plane;
+  const epipolar = ransac("fundamental", points0, points1);
+  if (isTrusted(epipolar)) return epipolar;
+  return isPlanar ? plane : { model: "none", matrix: null, inliers: new Uint8Array(points0.length / 2) };
 }
+
+/**
+ * Whether most matches off a plane move along lines through one epipole, and there are many (Chum,
+ * Werner and Matas, 2005).
+ */
+function showsDepth(points0, points1, homography) {
+  const count = points0.length / 2;
+  const [across, down] = [0, 1].map((axis) => points1.filter((_, k) => k % 2 === axis));
+  const [left, top] = [across, down].map((values) => values.reduce((a, b) => Math.min(a, b)));
+  const [width, height] = [[across, left], [down, top]].map(
+    ([values, least]) => values.reduce((a, b) => Math.max(a, b)) - least);
+  const scale = Math.max(width, height);
+  const off = []; // where the plane would be seen, the line to where it is, and the place itself
+  for (let k = 0; k < count; k++) {
+    if (transferError(homography, points0, points1, k) < MAX_ERROR_PX) continue;
+    const [first, second] = [project(homography, points0[2 * k], points0[2 * k + 1]), [across[k], down[k]]]
+      .map(([x, y]) => [(x - left) / scale - 0.5, (y - top) / scale - 0.5, 1]);
+    if (Number.isFinite(first[0] + first[1])) off.push({ first, line: cross(first, second) });
+  }
+  if (off.length < 3 || !width || !height) return false;
+  const random = generator(1);
+  const draw = () => off[Math.floor(random() * off.length)].line;
+  let agreeing = 0;
+  for (let round = 0; round < EPIPOLES; round++) {
+    const epipole = cross(draw(), draw());
+    const length = Math.hypot(...epipole);
+    if (length <= 1e-12) continue;
+    const [x, y, z] = epipole.map((value) => value / length);
+    let near = 0;
+    for (const { first: [u, v], line } of off) {
+      const miss = Math.abs(x * line[0] + y * line[1] + z * line[2]);
+      if (miss < MAX_EPIPOLE_DISTANCE_PX / scale * Math.max(1e-12, Math.hypot(y - z * v, z * u - x))) near++;
+    }
+    agreeing = Math.max(agreeing, near);
+  }
+  const chance = 2 * MAX_EPIPOLE_DISTANCE_PX * Math.hypot(width, height) / Math.max(width * height, 1);
+  return agreeing >= MIN_FRACTION_OF_REST * off.length
+    && agreeing >= MIN_FRACTION_OF_PLANE * (count - off.length)
+    && log10Nfa(off.length, agreeing, 2, chance) < MAX_LOG10_NFA;
+}
+
+const cross = ([a, b, c], [x, y, z]) => [b * z - c * y, c * x - a * z, a * y - b * x];
 
 const sum = (values) => values.reduce((total, value) => total + value, 0);
 
@@ -53,13 +99,16 @@ function countPlaces(points0, points1, inliers, sizes) {
   return places.length;
 }
 
-/** The expected number of geometries that so many of wrong matches would agree with, log10. */
-export function log10Nfa(model, inliers, width, height) {
-  const [total, agreeing, sample] = [inliers.length, sum(inliers), MODELS[model].sample];
-  if (agreeing <= sample) return Infinity;
+/** The expected number of geometries that as many of wrong matches would agree with, log10. */
+function log10NfaOf(model, inliers, [width, height]) {
   const chance = model === "homography" ? Math.PI * MAX_ERROR_PX ** 2 / (width * height)
                                         : 2 * MAX_ERROR_PX * Math.hypot(width, height) / (width * height);
-  return Math.log10(2 * (total - sample)) + log10Choose(total, agreeing)
+  return log10Nfa(inliers.length, sum(inliers), MODELS[model].sample, chance);
+}
+
+function log10Nfa(total, agreeing, sample, chance) {
+  if (agreeing <= sample) return Infinity;
+  return Math.log10(total - sample) + log10Choose(total, agreeing)
     + log10Choose(agreeing, sample) + (agreeing - sample) * Math.log10(Math.min(1, chance));
 }
 
@@ -85,13 +134,18 @@ function ransac(model, points0, points1) {
     [most, best] = [agreeing, { model, matrix, inliers }];
     return true;
   };
+  const places = [...best.inliers.keys()];
   let needed = ROUNDS;
   for (let round = 0; count > sample && round < needed; round++) {
     const rows = new Set();
     while (rows.size < sample) rows.add(Math.floor(random() * count));
     if (!judge(fit(points0, points1, [...rows]))) continue;
-    for (let k = 0; k < 3; k++) { // all that agree fit better than a sample does
-      if (!judge(fit(points0, points1, rowsOf(best.inliers)))) break;
+    let local = best.matrix; // all that are near fit better than a sample does
+    for (const reach of LOCAL_REACHES) {
+      const near = places.filter((k) => error(local, points0, points1, k) <= reach * MAX_ERROR_PX);
+      local = fit(points0, points1, near);
+      if (!local) break;
+      judge(local);
     }
     const miss = Math.log(1 - Math.min(0.999999, (most / count) ** sample));
     needed = Math.min(ROUNDS, Math.ceil(Math.log(1e-4) / miss));
