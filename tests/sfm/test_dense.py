@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from deepdetect._shared.opencv import cv2
 from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.io.image_file import read_with, reading_options
 from deepdetect.sfm import dense
 from deepdetect.sfm.colmap import CameraIntrinsics
 from deepdetect.sfm.dense import (
     DENSE_POINT,
+    DEPTH_PIXEL,
     find_references,
-    fuse_matches,
+    fuse_depth_maps,
     limited_view,
     merge_dense_points,
 )
@@ -33,74 +35,119 @@ def view(x: float, name: str = "") -> PosedView:
     return PosedView(name, Camera(SIZE, 300.0), rotation, -rotation @ [x, 0, 0])
 
 
-@pytest.fixture
-def scene() -> tuple[PosedView, list[PosedView], np.ndarray, np.ndarray]:
-    """A reference, four neighbours, pixels of the reference and the points that they show."""
-    rng = np.random.default_rng(0)
-    xy = rng.uniform((20, 20), (300, 220), (500, 2))
-    reference = view(0)
-    points = reference.camera.rays(xy) * rng.uniform(5, 7, (500, 1))
-    return reference, [view(x) for x in (-1.0, -0.5, 0.5, 1.0)], xy, points
+def tilted(own: PosedView, stride: int = 2) -> np.ndarray:
+    """Return the exact depth map of the plane z = 6 + x / 2."""
+    y, x = np.mgrid[0 : SIZE[1] : stride, 0 : SIZE[0] : stride]
+    rays = own.camera.rays(np.column_stack([x.ravel(), y.ravel()]))
+    # Of a point X = centre + t ray: its z - x / 2 - 6 is 0, and t is its depth.
+    plane = np.array([-0.5, 0, 1])
+    inverse = (rays @ own.rotation @ plane) / (6 - own.centre @ plane)
+    made = np.zeros(x.shape, DEPTH_PIXEL)
+    made["plane"][..., 0] = inverse.reshape(x.shape)
+    # Linear in the position: the slopes are those of neighbouring pixels.
+    made["plane"][..., 2], made["plane"][..., 1] = (
+        each / stride for each in np.gradient(made["plane"][..., 0].astype(np.float64))
+    )
+    made["error"], made["color"] = 0.25, (10, 20, 30)
+    return made
 
 
-def test_exact_matches_give_the_points(scene) -> None:
-    reference, others, xy, points = scene
-    matches = [other.project(points)[0] for other in others]
-    found, errors, counts = fuse_matches([reference, *others], np.stack([xy, *matches]))
-    np.testing.assert_allclose(found, points, atol=1e-6)
-    assert errors.max() < 1e-6
-    assert (counts == 5).all()
+REFERENCE, OTHERS = view(0), [view(x) for x in (-1.0, -0.5, 0.5, 1.0)]
 
 
-def test_noise_is_averaged_over_the_views(scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    reference, others, xy, points = scene
+def test_exact_depth_maps_give_points_and_normals() -> None:
+    views = [REFERENCE, *OTHERS]
+    found = fuse_depth_maps(views, [tilted(each) for each in views], 2)
+    points = found["points"]
+    assert len(found) > 0.9 * SIZE[0] * SIZE[1] / 4
+    np.testing.assert_allclose(points[:, 2], 6 + points[:, 0] / 2, atol=1e-4)
+    np.testing.assert_allclose(
+        found["normals"], [np.array([0.5, 0, -1]) / 1.25**0.5] * len(found), atol=1e-3
+    )
+    assert found["views"].max() == 5
+    assert (found["errors"] == 0.25).all()
+    assert (found["colors"] == (10, 20, 30)).all()
+
+
+def test_noise_is_averaged_over_the_depth_maps() -> None:
+    views = [REFERENCE, *OTHERS]
     rng = np.random.default_rng(1)
-    matches = [other.project(points)[0] + rng.normal(0, 0.1, xy.shape) for other in others]
-    several, errors, counts = fuse_matches([reference, *others], np.stack([xy, *matches]))
-    monkeypatch.setattr(dense, "MIN_VIEWS", 2)
-    single, _, _ = fuse_matches([reference, *others[2:3]], np.stack([xy, *matches[2:3]]))
-    good = counts > 0
-    assert good.mean() > 0.95
-    assert 0.05 < np.median(errors[good]) < 0.15
-    depth_errors = [
-        np.median(np.abs(each[good, 2] - points[good, 2])) for each in (several, single)
-    ]
-    assert depth_errors[0] < 0.6 * depth_errors[1]
+    maps = [tilted(each) for each in views]
+    for each in maps:
+        each["plane"][..., 0] *= 1 + rng.normal(0, 0.001, each.shape)
+    found = fuse_depth_maps(views, maps, 2)
+    found = found[found["views"] == 5]
+    inverse = 1 / found["points"][:, 2]
+    noise = inverse * (6 + found["points"][:, 0] / 2) - 1
+    assert len(found) > 1000
+    assert np.std(noise) < 0.6 * 0.001
 
 
-def test_a_wrong_match_is_outvoted(scene) -> None:
-    reference, others, xy, points = scene
-    matches = [other.project(points)[0] for other in others]
-    matches[1] = matches[1] + (40, 0)
-    matches[3] = matches[3] - (25, 0)
-    found, errors, counts = fuse_matches([reference, *others], np.stack([xy, *matches]))
-    np.testing.assert_allclose(found, points, atol=1e-6)
-    assert (counts == 3).all()
-    assert errors.max() < 1e-6
+def test_a_wrong_depth_map_is_outvoted() -> None:
+    views = [REFERENCE, *OTHERS]
+    maps = [tilted(each) for each in views]
+    maps[1]["plane"][..., 0] *= 1.1
+    maps[3]["plane"] = np.nan
+    found = fuse_depth_maps(views, maps, 2)
+    points = found["points"]
+    np.testing.assert_allclose(points[:, 2], 6 + points[:, 0] / 2, atol=1e-4)
+    assert (found["views"] == 3).all()
+    assert len(found) > 5000
 
 
-def test_two_views_are_not_enough(scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    reference, others, xy, points = scene
-    matches = [other.project(points)[0] for other in others[:2]]
-    matches[1][:250] = np.nan  # there is no match
-    matches[1][250:] += (30, 0)  # a match that contradicts
-    _, _, counts = fuse_matches([reference, *others[:2]], np.stack([xy, *matches]))
-    assert not counts.any()
-    monkeypatch.setattr(dense, "MIN_VIEWS", 2)
-    _, _, counts = fuse_matches([reference, *others[:2]], np.stack([xy, *matches]))
-    assert (counts >= 2).all()
+def test_two_depth_maps_are_not_enough() -> None:
+    views = [REFERENCE, *OTHERS[:2]]
+    maps = [tilted(each) for each in views]
+    maps[1]["plane"][:, :80, 0] *= 1.1
+    maps[2]["plane"][...] = np.nan
+    assert not len(fuse_depth_maps(views, maps, 2))
 
 
-def test_points_without_parallax_or_behind_the_cameras_are_left_out(scene) -> None:
-    reference, _, xy, _ = scene
-    near = [view(x) for x in (0.01, 0.02, 0.03)]
-    far = reference.camera.rays(xy) * 6
-    matches = [other.project(far)[0] for other in near]
-    assert not fuse_matches([reference, *near], np.stack([xy, *matches]))[2].any()
-    wide = [view(x) for x in (-1.0, 1.0, 0.5)]
-    behind = [other.project(-far)[0] for other in wide]
-    assert np.isfinite(behind[0]).all()
-    assert not fuse_matches([reference, *wide], np.stack([xy, *behind]))[2].any()
+def test_points_without_parallax_or_behind_the_cameras_are_left_out() -> None:
+    near = [REFERENCE, *(view(x) for x in (0.01, 0.02, 0.03))]
+    assert not len(fuse_depth_maps(near, [tilted(each) for each in near], 2))
+    views = [REFERENCE, *OTHERS]
+    maps = [tilted(each) for each in views]
+    for each in maps:
+        each["plane"] *= -1
+    assert not len(fuse_depth_maps(views, maps, 2))
+
+
+def test_the_depth_of_a_steep_ground_is_found(tmp_path: Path) -> None:
+    """Four cameras 1.5 above a textured plane: matches move by up to a pixel per row."""
+    rng = np.random.default_rng(0)
+    texture = cv2.GaussianBlur(rng.uniform(0, 255, (1200, 1200)).astype(np.float32), (0, 0), 1.2)
+    texture = (texture - texture.mean()) * 3 + 128
+    camera = Camera(SIZE, 300.0)
+    tilt = np.deg2rad(25)
+    rotation = np.array(
+        [[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]]
+    )
+    y, x = np.mgrid[0 : SIZE[1], 0 : SIZE[0]]
+    xy = np.column_stack([x.ravel(), y.ravel()])
+    points = np.column_stack([rng.uniform(-2, 2, 200), np.full(200, 1.5), rng.uniform(2, 8, 200)])
+    images = []
+    for number, place in enumerate((0.0, -0.4, 0.4, 0.8)):
+        own = PosedView(f"{number}.png", camera, rotation, -rotation @ [place, 0, 0])
+        rays = camera.rays(xy) @ rotation
+        ground = own.centre + rays * (1.5 / rays[:, 1:2])
+        u, v = (150 * (ground[:, 0] + 4)), 150 * ground[:, 2] - 200
+        seen = cv2.remap(
+            texture, *(each.reshape(y.shape).astype(np.float32) for each in (u, v)), cv2.INTER_CUBIC
+        )
+        Image.fromarray(seen.clip(0, 255).astype(np.uint8)).save(tmp_path / own.name)
+        rows = np.flatnonzero(own.project(points)[1] > 0)
+        xys = own.project(points[rows])[0]
+        images.append(RegisteredImage(own, CameraIntrinsics.of_camera(camera), rows, xys, rows))
+    made = dense.depth_map(tmp_path, images, points, 2)
+    rays = camera.rays(np.column_stack([x[::2, ::2].ravel(), y[::2, ::2].ravel()]))
+    inverse = ((rays @ rotation)[:, 1] / 1.5).reshape(made.shape)
+    moved = 300 * 0.8 * (made["plane"][..., 0] - inverse)  # pixels in the farthest image
+    inside = np.s_[30:-10, 20:-60]
+    assert np.mean(np.abs(moved[inside]) < 1) > 0.9  # not where it is NaN
+    assert np.nanmedian(np.abs(moved[inside])) < 0.2
+    slope = np.nanmedian(made["plane"][inside][..., 2])
+    np.testing.assert_allclose(slope, np.diff(inverse[:, 0]).mean() / 2, rtol=0.05)
 
 
 def surface(reference: PosedView, depth: float = 6.0, stride: int = 2) -> np.ndarray:
@@ -169,5 +216,5 @@ def test_what_was_extracted_is_not_too_large(tmp_path: Path, photo: np.ndarray) 
     with read_with(
         reading_options(max_megapixels=1e-3)
     ):  # as in another process than that of the command
-        rgb = dense._prepared_image(tmp_path / "a.png", (0, 0), camera, camera.size)
+        rgb = dense._prepared_image(tmp_path / "a.png", (0, 0), camera, camera.pinhole)
     np.testing.assert_array_equal(rgb, photo)

@@ -134,17 +134,18 @@ class CameraIntrinsics:
         return CameraIntrinsics.of_colmap(cropped, self.source) if self.distorts else self
 
     def undistort(self, image: np.ndarray, pinhole: Camera | None = None) -> np.ndarray:
-        """Return an image (H, W) or (H, W, 3) as a pinhole camera would have taken it."""
+        """Return an image (H, W) or (H, W, 3), of any size, as a pinhole camera would take it."""
         if not self.distorts:
             return image
         pinhole, camera = pinhole or self.pinhole, self.colmap_camera()
+        ratio = np.divide(image.shape[1::-1], self.size)
         width, height = pinhole.size
         made = np.empty((height, width, *image.shape[2:]), image.dtype)
         for top in range(0, height, ROWS):
             part = made[top : top + ROWS]
             y, x = np.indices(part.shape[:2], np.float64)
             rays = pinhole.rays(np.column_stack([x.ravel(), y.ravel() + top]))
-            places = camera.img_from_cam(rays) - PIXEL_CENTRE
+            places = camera.img_from_cam(rays) * ratio - PIXEL_CENTRE
             column, row = places.T.astype(np.float32).reshape(2, *part.shape[:2])
             part[:] = cv2.remap(image, column, row, cv2.INTER_CUBIC, borderValue=0)
         return made

@@ -1,11 +1,15 @@
 """Dense points from images with known cameras.
 
-Each image in turn is the reference. It is rectified with its best neighbours, and matched with
-them row by row. A pixel becomes a point where enough views agree with one position in space.
+Each image in turn gets a depth map. A small copy is matched with its best neighbours together, by
+semi-global matching; pixels that correlate badly take planes of others; and inverse depths are
+fitted to the grey values at full size. A surface near a pixel is a plane throughout, so that
+slanted ones are matched as well as others. A pixel becomes a point where the depth maps of enough
+neighbours agree.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -13,17 +17,20 @@ from pathlib import Path
 
 import numpy as np
 
+from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
 from .._shared.records import file_state
-from ..geometry.camera import PosedView, angles_between, relative_fundamental
-from ..geometry.transforms import scaled_points
+from ..geometry.camera import Camera, PosedView, angles_between
 from ..io.image import load_image, luma
-from ..matching.guided.rectified import match_by_rectification
+from ..matching.stereo.sgm import LANES, OUTSIDE_COST, WRONG_PLACE_BITS, aggregate, census
 from .colmap import CameraIntrinsics
 from .mapping import RegisteredImage, SparseModel
 
-NEIGHBOURS = 4
+MATCHED_NEIGHBOURS = 4
 """Images that each one is matched with."""
+
+NEIGHBOURS = 8
+"""Images whose depth maps it is compared with, the matched ones among them."""
 
 MIN_COMMON_POINTS = 30
 """Sparse points that both see."""
@@ -40,17 +47,72 @@ MAX_SIDE_PX = 2000
 CACHED_IMAGES = 16
 """Prepared images that a process keeps: following references share neighbours."""
 
-BLOCK = 50_000
-"""Pixels that are triangulated at once, which bounds the memory."""
+SMALL_SCALE = 0.5
+"""Of the copies that are searched, at most."""
 
-REWEIGHTINGS = 2
-"""Of the linear triangulation, after which it minimises distances in pixels."""
+MAX_VOLUME = 3e7
+"""Pixels of such a copy times inverse depths; with more, it is smaller."""
+
+TAIL_FRACTION, DEPTH_MARGIN = 0.002, 0.2
+"""Of the inverse depths of the sparse points in an image, at each end, which may be wrong; and of
+their range, added at both ends: what is searched."""
+
+MIN_FAR = 0.1
+"""Least inverse depth that is searched, relative to the least of the sparse points."""
+
+MAX_APPROACH = 0.5
+"""Of the way to the middle of the searched depths, that a neighbour is ahead; it is moved away."""
+
+PARALLAX_QUANTILE = 0.5
+"""Of how far matches move with the inverse depth, over the image; steps are so fine."""
+
+SAME_SURFACE_PX = 1.0
+"""An inverse depth that moves the match in a small copy by more belongs to another surface."""
+
+FIT_RADIUS_PX = 3
+"""Of the windows in which planes are fitted to the inverse depths of a small copy."""
+
+FIT_TOLERANCES_PX = (4, 2, 1)
+"""Of these fits, one after the other: the first follows steep surfaces, such as the ground."""
+
+MIN_FITTED = 12
+"""Pixels that a plane is fitted to, at least: smaller patches apart from all around are wrong."""
+
+WINDOW_RADIUS_PX, WINDOW_SPACING_PX = 4, 2
+"""Of the windows that are compared at full size, and of their pixels that are."""
+
+BLUR_SIGMA_PX = 1.0
+"""Of both images before, so that these pixels stand for all."""
+
+NOISE_LEVELS = 1.0
+"""Grey levels; where the images have no stronger gradients, the depth stays."""
+
+JUMPS = (16, 8, 4, 2, 1)
+"""Distances over which planes spread, in pixels of the depth map."""
+
+SURE_CORRELATION = 0.9
+"""With which a pixel keeps its own plane."""
+
+MIN_CORRELATION = 0.5
+"""Of the window of a pixel with that of a neighbour which takes part in its refinement."""
+
+SMOOTHING_RADII = (4, 3)
+"""Of the fits after each refinement, in pixels of the depth map."""
+
+MIN_WEIGHT = 0.02
+"""Of a pixel without texture in these fits; half of the others have more than 0.5."""
 
 MIN_VIEWS = 3
 """Images that must agree on a point, the reference among them."""
 
 MAX_ERROR_PX = 1.0
-"""Between a match and the projection of the point that it agrees with."""
+"""Between a pixel and where the surface of another depth map is seen."""
+
+MAX_DEPTH_DIFFERENCE = 0.01
+"""Of two depth maps that agree, relative."""
+
+EDGE_RADIUS, MIN_VIEWS_AT_EDGES = 4, 5
+"""Pixels of a depth map from a farther surface within which so many images must agree."""
 
 MIN_TRIANGULATION_DEG = 1.0
 """Smallest angle between two of the lines of sight."""
@@ -58,17 +120,25 @@ MIN_TRIANGULATION_DEG = 1.0
 DUPLICATE_DEPTH = 0.01
 """Of a point that another reference has given already, the relative difference of the depths."""
 
+DEPTH_PIXEL = np.dtype(
+    [("plane", np.float32, 3), ("error", np.float32), ("color", np.uint8, 3)], align=True
+)
+"""Of a depth map: the inverse depth, NaN where there is none, and its changes per pixel of the
+image to the right and down; the distance in pixels from the matches of each neighbour alone (root
+mean square); and the sRGB colour."""
 
 DENSE_POINT = np.dtype(
     [
         ("points", np.float32, 3),
+        ("normals", np.float32, 3),
         ("errors", np.float32),
         ("colors", np.uint8, 3),
         ("views", np.uint8),
     ]
 )
-"""A point that several images agree on, its distance in pixels from their matches (root mean square
-of all of them), its sRGB colour, and how many these are."""
+"""A point that several images agree on, the normal of its surface, towards the reference, its
+distance in pixels from the matches of the reference (root mean square), its sRGB colour, and how
+many images these are."""
 
 
 def find_references(sparse: SparseModel) -> list[list[RegisteredImage]]:
@@ -95,156 +165,260 @@ def find_references(sparse: SparseModel) -> list[list[RegisteredImage]]:
     return found
 
 
-def dense_points(folder: Path, images: Sequence[RegisteredImage], stride_px: int) -> np.ndarray:
-    """Match the first image with the others, and return what enough of them agree on (DENSE_POINT).
+def depth_map(
+    folder: Path, images: Sequence[RegisteredImage], points: np.ndarray, stride_px: int
+) -> np.ndarray:
+    """Match the first image with the others; (H, W) `DEPTH_PIXEL`.
 
-    A point is sought at every `stride_px` pixels of a row and of a column.
+    It has every `stride_px` pixels of a row and of a column. `points` are those of the sparse
+    model, among whose depths it searches.
     """
-    reference, *neighbours = images
-    rgb, view, scale = _prepared(folder, reference)
-    gray = luma(rgb)
-    height, width = gray.shape
-    y, x = np.mgrid[0:height:stride_px, 0:width:stride_px]
-    xy = np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
-    views, positions = [view], [xy]
-    for neighbour in neighbours:
-        other, its_view, its_scale = _prepared(folder, neighbour)
-        _, own, its = np.intersect1d(reference.points, neighbour.points, return_indices=True)
-        found = match_by_rectification(
-            (gray, luma(other)),
-            xy,
-            (
-                scaled_points(reference.xy[own], scale),
-                scaled_points(neighbour.xy[its], its_scale),
-            ),
-            relative_fundamental(view, its_view),
-            exact=True,
-        )
-        if found is None:
-            continue
-        matched = np.full((len(xy), 2), np.nan)
-        matched[found[1].indices0] = found[1].points1
-        views.append(its_view)
-        positions.append(matched)
-    stacked = np.stack(positions)
-    blocks = [fuse_matches(views, stacked[:, k : k + BLOCK]) for k in range(0, len(xy), BLOCK)]
-    points, errors, counts = (np.concatenate(values) for values in zip(*blocks, strict=True))
-    kept = np.flatnonzero(counts)
-    made = np.empty(len(kept), DENSE_POINT)
-    made["points"], made["errors"], made["views"] = points[kept], errors[kept], counts[kept]
-    made["colors"] = rgb[y.ravel()[kept], x.ravel()[kept]]
+    rgbs, views = zip(*(_prepared(folder, image) for image in images), strict=True)
+    grays = [luma(rgb) for rgb in rgbs]
+    size = np.array(views[0].camera.size)
+    xy, depth = views[0].project(points)
+    seen = ((xy >= 0) & (xy < size)).all(axis=1) & (depth > 0)
+    low, high = np.quantile(1 / depth[seen], [TAIL_FRACTION, 1 - TAIL_FRACTION])
+    margin = DEPTH_MARGIN * (high - low)
+    small, step = _search(grays, views, (max(low - margin, MIN_FAR * low), high + margin))
+    # From the pixels of the small copy to those of the depth map.
+    ratio = np.divide(small.shape[1::-1], size)
+    whole = [np.arange(0, side, stride_px) for side in size]
+    places = [(at + 0.5) * each - 0.5 for at, each in zip(whole, ratio, strict=True)]
+    column, row = (
+        np.rint(at).astype(np.int64).clip(0, side - 1)
+        for at, side in zip(places, small.shape[1::-1], strict=True)
+    )
+    planes = small[row[:, None], column]
+    planes[..., 0] += planes[..., 1] * (places[0] - column)
+    planes[..., 0] += planes[..., 2] * (places[1] - row)[:, None]
+    planes[..., 1:] *= ratio
+    made = np.empty(planes.shape[:2], DEPTH_PIXEL)
+    made["plane"], made["error"] = _refine(grays, views, planes, stride_px, step)
+    made["color"] = rgbs[0][::stride_px, ::stride_px]
     return made
 
 
-def _prepared(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, PosedView, float]:
-    """Return an image without its distortion at most `MAX_SIDE_PX` long, its view, its scale."""
+def _search(
+    grays: Sequence[np.ndarray], views: Sequence[PosedView], searched: tuple[float, float]
+) -> tuple[np.ndarray, float]:
+    """Search inverse depths by semi-global matching of small copies of the images.
+
+    Returns (h, w, 3) planes in pixels of the small copy of the first, and the change of the inverse
+    depth that moves a match there by a pixel.
+    """
+    from .dense_kernels import choose_rows, cost_rows
+
+    # Not where a camera that moves forward has passed.
+    passed = max(-relative_projection(views[0], view)[1][2] for view in views[1:])
+    middle = min(float(np.mean(searched)), MAX_APPROACH / max(passed, 1e-9))
+    parallax = max(_parallax(views[0], view, middle) for view in views[1:])
+    count = parallax * (searched[1] - searched[0]) * SMALL_SCALE + 1
+    volume = count * grays[0].size * SMALL_SCALE**2
+    scale = SMALL_SCALE * min(1.0, (MAX_VOLUME / volume) ** (1 / 3))
+    small = [_scaled(view, scale) for view in views]
+    copies = [
+        cv2.resize(gray, view.camera.size, interpolation=cv2.INTER_AREA)
+        for gray, view in zip(grays, small, strict=True)
+    ]
+    count = -(-math.ceil(count * scale / SMALL_SCALE) // LANES) * LANES
+    inverse = np.linspace(*searched, count)
+    own = copies[0]
+    size = np.array(own.shape[::-1])
+    # Neighbours are warped by the plane of the middle depth: what is left of another depth is a
+    # shift and a growth of the whole image.
+    warps, corners = [], np.empty((len(copies) - 1, 2, 2, count))  # first and last, x and y
+    for view, places in zip(small[1:], corners, strict=True):
+        matrix, vector = relative_projection(small[0], view)
+        warp = matrix + middle * np.outer(vector, [0, 0, 1])
+        shift = np.linalg.solve(warp, vector)[:, None] * (inverse - middle)
+        growth = np.where(1 + shift[2] > 0, 1 + shift[2], np.inf)
+        places[:] = (np.stack([[0, 0], size - 1])[..., None] + shift[:2]) / growth
+        warps.append(warp)
+    first = np.floor(corners.min(axis=(0, 1, 3))).clip(-size, 0).astype(np.int64) - 1
+    last = np.ceil(corners.max(axis=(0, 1, 3))).clip(size, 2 * size).astype(np.int64) + 1
+    words = np.stack(
+        [
+            _warped_census(copy, warp, first, last)
+            for copy, warp in zip(copies[1:], warps, strict=True)
+        ]
+    )
+    tables = []
+    for axis in (0, 1):
+        along = np.linspace(corners[:, 0, axis], corners[:, 1, axis], size[axis], axis=-1)
+        at = np.rint(along).clip(first[axis], last[axis]) - first[axis]
+        tables.append(at.astype(np.int32))
+    cost = np.empty((*own.shape, count), np.uint8)
+    hidden_cost = np.uint8(OUTSIDE_COST * WRONG_PLACE_BITS)
+    parallel_for(len(own), cost_rows, census(own), words, *tables, hidden_cost, cost)
+    chosen = np.empty(own.shape, np.float32)
+    parallel_for(len(own), choose_rows, aggregate(own, cost), chosen)
+    step = inverse[1] - inverse[0]
+    planes = np.zeros((*own.shape, 3), np.float32)
+    planes[..., 0] = searched[0] + step * chosen
+    weights = np.ones(own.shape, np.float32)
+    for tolerance in FIT_TOLERANCES_PX:
+        planes = _fit(planes, weights, FIT_RADIUS_PX, tolerance * step)
+    return planes, step
+
+
+def _warped_census(
+    gray: np.ndarray, warp: np.ndarray, first: np.ndarray, last: np.ndarray
+) -> np.ndarray:
+    """Return the census of an image at the pixels `first` to `last` of another, by a homography."""
+    from .dense_kernels import HIDDEN
+
+    across, down = last - first + 1
+    warp = warp @ [[1, 0, first[0]], [0, 1, first[1]], [0, 0, 1]]
+    how = cv2.WARP_INVERSE_MAP
+    whole = np.ones_like(gray)
+    shown = cv2.warpPerspective(whole, warp, (across, down), flags=how | cv2.INTER_NEAREST) > 0
+    shown &= warp[2, 0] * np.arange(across) + warp[2, 1] * np.arange(down)[:, None] + warp[2, 2] > 0
+    shown[[0, -1]] = shown[:, [0, -1]] = False
+    words = census(cv2.warpPerspective(gray, warp, (across, down), flags=how | cv2.INTER_LINEAR))
+    return np.where(shown, words, HIDDEN)
+
+
+def _fit(planes: np.ndarray, weights: np.ndarray, radius: int, tolerance: float) -> np.ndarray:
+    """Fit a plane to the inverse depths around each pixel that are about on its own plane."""
+    from .dense_kernels import fit_rows
+
+    fitted = np.empty_like(planes)
+    parallel_for(len(planes), fit_rows, planes, weights, radius, tolerance, MIN_FITTED, fitted)
+    return fitted
+
+
+def _refine(
+    grays: Sequence[np.ndarray],
+    views: Sequence[PosedView],
+    planes: np.ndarray,
+    stride_px: int,
+    step: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Refine (H, W, 3) planes by the grey values at full size; also return errors in pixels."""
+    from .dense_kernels import propagate_rows, refine_rows
+
+    blurred = [cv2.GaussianBlur(gray.astype(np.float32), (0, 0), BLUR_SIGMA_PX) for gray in grays]
+    sizes = np.array([view.camera.size for view in views[1:]])
+    others = np.zeros((len(sizes), *sizes.max(axis=0)[::-1]), np.float32)
+    for page, image in zip(others, blurred[1:], strict=True):
+        page[: image.shape[0], : image.shape[1]] = image
+    maps = _projections(views[0], views[1:])
+    window = WINDOW_RADIUS_PX, WINDOW_SPACING_PX, np.float32(NOISE_LEVELS)
+    compared = stride_px, blurred[0], others, sizes, maps, *window
+    shape = planes.shape[:2]
+    scores = np.full(shape, -1, np.float32)
+    for jump in (0, *JUMPS):
+        better, found = np.empty_like(planes), np.empty_like(scores)
+        before = planes, scores, jump, SURE_CORRELATION
+        parallel_for(len(planes), propagate_rows, *before, *compared, better, found)
+        planes, scores = better, found
+    tolerance = SAME_SURFACE_PX * step
+    for radius in SMOOTHING_RADII:
+        refined, errors, certainty = np.empty((3, *shape), np.float32)
+        made = refined, errors, certainty
+        limits = tolerance, MIN_CORRELATION, MIN_VIEWS - 1
+        parallel_for(len(planes), refine_rows, planes, *compared, *limits, *made)
+        weights = certainty / (certainty + max(np.median(certainty), 1e-9)) + np.float32(MIN_WEIGHT)
+        # Slopes are per pixel of the depth map while it is fitted.
+        planes = _fit(np.dstack([refined, planes[..., 1:] * stride_px]), weights, radius, tolerance)
+        planes[..., 1:] /= stride_px
+    return planes, errors
+
+
+def relative_projection(first: PosedView, second: PosedView) -> tuple[np.ndarray, np.ndarray]:
+    """Return A (3, 3) and b (3,): the pixel q of inverse depth w is seen at A (q, 1) + w b."""
+    rotation = second.rotation @ first.rotation.T
+    translation = second.translation - rotation @ first.translation
+    matrix = second.camera.matrix
+    return matrix @ rotation @ np.linalg.inv(first.camera.matrix), matrix @ translation
+
+
+def _projections(first: PosedView, others: Sequence[PosedView], back: bool = False) -> np.ndarray:
+    """Return (K, 3, 4) `relative_projection` to others, or `back` from them."""
+    pairs = [(other, first) if back else (first, other) for other in others]
+    return np.array([np.column_stack(relative_projection(*pair)) for pair in pairs])
+
+
+def _parallax(first: PosedView, second: PosedView, inverse_depth: float) -> float:
+    """Return by how many pixels matches move with the inverse depth, a quantile of the image.
+
+    Near the epipole, which lies ahead of a camera that moves forward, they do not move.
+    """
+    matrix, vector = relative_projection(first, second)
+    x, y = (np.linspace(0, side - 1, 7)[1:-1] for side in first.camera.size)
+    pixels = np.array([[across, down, 1] for across in x for down in y])
+    seen = pixels @ matrix.T + inverse_depth * vector
+    moved = (vector[:2] - seen[:, :2] / seen[:, 2:] * vector[2]) / seen[:, 2:]
+    lengths = np.linalg.norm(moved[seen[:, 2] > 0], axis=1)
+    return float(np.quantile(lengths, PARALLAX_QUANTILE)) if len(lengths) else 0.0
+
+
+def _prepared(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, PosedView]:
+    """Return an image without its distortion at most `MAX_SIDE_PX` long, and its view."""
     path, view = folder / image.view.name, limited_view(image.view)
-    rgb = _prepared_image(path, file_state(path), image.intrinsics, view.camera.size)
-    return rgb, view, view.camera.size[0] / image.view.camera.size[0]
+    return _prepared_image(path, file_state(path), image.intrinsics, view.camera), view
 
 
 @lru_cache(maxsize=CACHED_IMAGES)
 def _prepared_image(
-    path: Path, state: tuple[int, int], intrinsics: CameraIntrinsics, size: tuple[int, int]
+    path: Path, state: tuple[int, int], intrinsics: CameraIntrinsics, camera: Camera
 ) -> np.ndarray:
     """Read an image of this `file_state`, which extraction has let pass, without its distortion."""
-    rgb = intrinsics.undistort(load_image(path, max_megapixels=np.inf))
-    if size != intrinsics.size:
-        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-    return rgb
+    rgb = load_image(path, max_megapixels=np.inf)
+    if camera.size != intrinsics.size:
+        rgb = cv2.resize(rgb, camera.size, interpolation=cv2.INTER_AREA)
+    return intrinsics.undistort(rgb, camera)
 
 
 def limited_view(view: PosedView) -> PosedView:
     """Return a view of at most `MAX_SIDE_PX`."""
-    width, height = view.camera.size
-    scale = MAX_SIDE_PX / max(width, height)
-    if scale >= 1:
+    return _scaled(view, min(1.0, MAX_SIDE_PX / max(view.camera.size)))
+
+
+def _scaled(view: PosedView, scale: float) -> PosedView:
+    if scale == 1:
         return view
-    camera = view.camera.scaled((round(width * scale), round(height * scale)))
-    return replace(view, camera=camera)
+    width, height = view.camera.size
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return replace(view, camera=view.camera.scaled(size))
 
 
-def fuse_matches(
-    views: Sequence[PosedView], places: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the points (N, 3) that positions (V, N, 2) in views, NaN where unknown, agree on.
+def fuse_depth_maps(
+    views: Sequence[PosedView], maps: Sequence[np.ndarray], stride_px: int
+) -> np.ndarray:
+    """Return what enough depth maps (`DEPTH_PIXEL`) agree on with the first one (`DENSE_POINT`)."""
+    from .dense_kernels import fuse_rows
 
-    The match of each view in turn gives a point with the position in the first one, with which
-    those of other views agree or not. The point with most agreement is triangulated again from all
-    that agree. Returns points, errors as of `DENSE_POINT`, and the number of views that agree, 0
-    where there is no point.
-    """
-    known = np.isfinite(places).all(axis=2)
-    agreeing = np.zeros(known.shape, bool)
-    most = np.zeros(places.shape[1], np.int64)
-    for k in range(1, len(views)):
-        if not known[k].any():
-            continue
-        alone = np.zeros(known.shape, bool)
-        alone[0] = alone[k] = known[k]
-        points = _triangulate(views, places, alone)
-        distance, _ = _distances(views, places, points)
-        agree = known & known[k] & (distance < MAX_ERROR_PX)
-        number = agree.sum(axis=0)
-        better = agree[0] & agree[k] & (number > most)
-        agreeing[:, better], most[better] = agree[:, better], number[better]
-    points = _triangulate(views, places, agreeing)
-    distance, depth = _distances(views, places, points)
-    number = agreeing.sum(axis=0)
-    squares = np.where(agreeing, distance**2, 0).sum(axis=0)
-    errors = np.sqrt(squares / np.maximum(number, 1))
-    ahead = np.where(agreeing, depth > 0, True).all(axis=0)
-    rays = [points - view.centre for view in views]
-    angles = [np.degrees(angles_between(rays[0], other)) for other in rays]
-    angle = np.where(agreeing, angles, 0).max(axis=0)
-    good = (
-        (number >= MIN_VIEWS)
-        & np.isfinite(points).all(axis=1)
-        & ahead
-        & (errors < MAX_ERROR_PX)
-        & (angle >= MIN_TRIANGULATION_DEG)
-    )
-    return points, errors, np.where(good, number, 0)
-
-
-def _triangulate(views: Sequence[PosedView], places: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Triangulate (N, 3) points from positions (V, N, 2) in the views that are used (V, N).
-
-    Linear, weighted by depths: after some rounds the least squares of distances in pixels.
-    """
-    count = places.shape[1]
-    points = np.full((count, 3), np.nan)
-    depth = np.ones(places.shape[:2])
-    for _ in range(1 + REWEIGHTINGS):
-        normal = np.zeros((count, 3, 3))
-        right = np.zeros((count, 3))
-        for k, view in enumerate(views):
-            weight = np.where(used[k], 1 / depth[k], 0)
-            projection = view.projection
-            for axis in (0, 1):
-                where = np.where(used[k], places[k, :, axis], 0)
-                row = (where[:, None] * projection[2] - projection[axis]) * weight[:, None]
-                normal += row[:, :3, None] * row[:, None, :3]
-                right -= row[:, :3] * row[:, 3:]
-        solvable = (used.sum(axis=0) >= 2) & (np.linalg.det(normal) > 0)
-        points[solvable] = np.linalg.solve(normal[solvable], right[solvable, :, None])[:, :, 0]
-        for k, view in enumerate(views):
-            seen = np.abs(points @ view.rotation[2] + view.translation[2])
-            depth[k] = np.where(np.isfinite(seen) & (seen > 1e-9), seen, 1)
-    return points
-
-
-def _distances(
-    views: Sequence[PosedView], places: np.ndarray, points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return (V, N) distances of projections from positions, infinite behind a view; depths."""
-    distances, depths = np.full(places.shape[:2], np.inf), np.full(places.shape[:2], -1.0)
-    for k, view in enumerate(views):
-        projected, depth = view.project(points)
-        distance = np.linalg.norm(projected - places[k], axis=1)
-        fine = np.isfinite(distance) & (depth > 0)
-        distances[k, fine], depths[k, fine] = distance[fine], depth[fine]
-    return distances, depths
+    planes = np.ascontiguousarray(maps[0]["plane"])
+    shape = np.max([each.shape for each in maps], axis=0)
+    others = np.full((len(maps) - 1, *shape, 3), np.nan, np.float32)
+    for page, each in zip(others, maps[1:], strict=True):
+        page[: each.shape[0], : each.shape[1]] = each["plane"]
+    there, back = (_projections(views[0], views[1:], back) for back in (False, True))
+    camera = views[0].camera
+    centres = [views[0].rotation @ view.centre + views[0].translation for view in views[1:]]
+    inverse, count = np.empty(planes.shape[:2], np.float32), np.empty(planes.shape[:2], np.uint8)
+    geometry = stride_px, there, back, np.linalg.inv(camera.matrix), np.array(centres)
+    limits = MAX_ERROR_PX, MAX_DEPTH_DIFFERENCE, math.radians(MIN_TRIANGULATION_DEG)
+    parallel_for(len(planes), fuse_rows, planes, others, *geometry, *limits, inverse, count)
+    # Windows there give pixels beside a nearer surface its depth, in all views alike.
+    known = np.nan_to_num(planes[..., 0], nan=np.inf)
+    farthest = cv2.erode(known, np.ones((2 * EDGE_RADIUS + 1,) * 2, np.uint8))
+    slanted = EDGE_RADIUS * stride_px * np.abs(planes[..., 1:]).sum(axis=2)
+    edge = planes[..., 0] - farthest > MAX_DEPTH_DIFFERENCE * planes[..., 0] + slanted
+    row, column = np.nonzero(count >= np.where(edge, MIN_VIEWS_AT_EDGES, MIN_VIEWS))
+    found, plane = maps[0][row, column], planes[row, column].astype(np.float64)
+    xy, near = np.column_stack([column, row]) * float(stride_px), inverse[row, column]
+    made = np.empty(len(row), DENSE_POINT)
+    made["points"] = (camera.rays(xy) / near[:, None] - views[0].translation) @ views[0].rotation
+    # The inverse depth of a plane is its normal times the line of sight, over its distance.
+    ahead = near - (plane[:, 1:] * (xy - camera.centre)).sum(axis=1)
+    away = np.column_stack([plane[:, 1:] * camera.focal_px, ahead]) @ views[0].rotation
+    made["normals"] = -away / np.linalg.norm(away, axis=1, keepdims=True)
+    made["errors"], made["colors"] = found["error"], found["color"]
+    made["views"] = count[row, column]
+    return made
 
 
 def merge_dense_points(parts: Sequence[tuple[PosedView, np.ndarray]], stride_px: int) -> np.ndarray:

@@ -35,7 +35,14 @@ from ..features.selection import SelectionOptions
 from ..io.image import find_images, name_images
 from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, is_path, read_with, reading_options
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
-from .dense import dense_points, find_references, limited_view, merge_dense_points
+from .dense import (
+    MATCHED_NEIGHBOURS,
+    depth_map,
+    find_references,
+    fuse_depth_maps,
+    limited_view,
+    merge_dense_points,
+)
 from .formats import FormatName
 from .mapping import RegisteredImage, SparseModel, adjust, map_images, normalise_model, verify_pairs
 from .pair_selection import COMPARED_KEYPOINTS, SIMILAR, similar_pairs, vlad_vectors
@@ -274,27 +281,36 @@ class Stages:
         return model, verified, components
 
     def dense(self, folder: Path, sparse: SparseModel) -> np.ndarray:
-        """Make the dense points that earlier runs have not made, and join all (`DENSE_POINT`)."""
+        """Make the depth maps that earlier runs have not made, and fuse all (`DENSE_POINT`)."""
         store, stride = self.work / "dense", self.options.stride_px
-        paths: dict[Path, list[RegisteredImage]] = {}
-        for images in find_references(sparse):
-            states = [file_state(folder / image.view.name) for image in images]
-            paths[store / f"{key(images, states, stride, __version__)}.npz"] = images
+        references = find_references(sparse)
+        paths: dict[str, Path] = {}
+        tasks = []
+        for images in references:
+            matched = images[: 1 + MATCHED_NEIGHBOURS]
+            states = [file_state(folder / image.view.name) for image in matched]
+            path = store / f"{key(matched, states, stride, __version__)}.npz"
+            paths[images[0].view.name] = path
+            if load_arrays(path) is None:  # those of a damaged file are made again
+                tasks.append((path, matched))
         for old in store.glob("*.npz"):
-            if old not in paths:
+            if old not in paths.values():
                 old.unlink()
-        # Those of a damaged file are made again.
-        made = {path: arrays["dense"] for path in paths if (arrays := load_arrays(path))}
-        tasks = [(path, images) for path, images in paths.items() if path not in made]
         work = partial(
-            _dense_task, folder=folder.absolute(), stride_px=stride, reading=reading_options()
+            _depth_task,
+            folder=folder.absolute(),
+            points=sparse.points,
+            stride_px=stride,
+            reading=reading_options(),
         )
-        with progress(len(paths), "dense points", "image", self.quiet, len(made)) as bar:
-            for path, points in map_in_processes(work, tasks, self._dense_workers(sparse)):
-                made[path] = points
+        workers, done = self._dense_workers(sparse), len(paths) - len(tasks)
+        with progress(len(paths), "dense points", "image", self.quiet, done) as bar:
+            for _ in map_in_processes(work, tasks, workers):
                 bar.update()
-        parts = [(limited_view(images[0].view), made[path]) for path, images in paths.items()]
-        return merge_dense_points(parts, stride)
+        fuse = partial(_fuse_task, paths=paths, stride_px=stride)
+        views = (limited_view(images[0].view) for images in references)
+        fused = map_in_processes(fuse, references, workers)
+        return merge_dense_points([*zip(views, fused, strict=True)], stride)
 
     def _dense_workers(self, sparse: SparseModel) -> int:
         sizes = [limited_view(image.view).camera.size for image in sparse.images.values()]
@@ -303,11 +319,22 @@ class Stages:
         return min(self.workers or processor_count(), fitting)
 
 
-def _dense_task(
-    task: tuple[Path, list[RegisteredImage]], folder: Path, stride_px: int, reading: ReadingOptions
-) -> tuple[Path, np.ndarray]:
+def _depth_task(
+    task: tuple[Path, list[RegisteredImage]],
+    folder: Path,
+    points: np.ndarray,
+    stride_px: int,
+    reading: ReadingOptions,
+) -> None:
     path, images = task
     with read_with(reading):
-        points = dense_points(folder, images, stride_px)
-    save_arrays(path, {"dense": points}, compress=False)
-    return path, points
+        made = depth_map(folder, images, points, stride_px)
+    save_arrays(path, {"depth": made}, compress=False)
+
+
+def _fuse_task(
+    images: list[RegisteredImage], paths: Mapping[str, Path], stride_px: int
+) -> np.ndarray:
+    images = [image for image in images if image.view.name in paths]  # others have no map
+    maps = [(load_arrays(paths[image.view.name]) or {})["depth"] for image in images]
+    return fuse_depth_maps([limited_view(image.view) for image in images], maps, stride_px)

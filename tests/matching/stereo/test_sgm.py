@@ -72,9 +72,10 @@ def test_the_paths_are_those_of_the_definition() -> None:
     generator = np.random.default_rng(0)
     gray = generator.integers(0, 256, (9, 14), np.uint8)
     left, right = (generator.integers(0, 2**62, gray.shape, np.uint64) for _ in range(2))
-    total = module.aggregate(gray, (left, right), -3, 16, module.WRONG_PLACE_BITS)
+    volume = matching_cost((left, right), -3, 16)
+    total = module.aggregate(gray, volume)
     height, width = gray.shape
-    cost = matching_cost((left, right), -3, 16).astype(int)
+    cost = volume.astype(int)
     expected = np.zeros_like(cost)
     for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
         path = np.zeros_like(cost)

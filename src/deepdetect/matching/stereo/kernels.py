@@ -38,7 +38,7 @@ def census_rows(first, last, padded, out):  # type: ignore[no-untyped-def]
 
 
 @compiled(nogil=True, inline="always")
-def _count_bits(word):  # type: ignore[no-untyped-def]
+def count_bits(word):  # type: ignore[no-untyped-def]
     """Count the bits of a 64-bit word; the compiler knows this form as one instruction."""
     word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
     word = (word & np.uint64(0x3333333333333333)) + (
@@ -61,7 +61,7 @@ def _distances(left, right_mirrored, min_disparity, outside, out):  # type: igno
         out[x, high:] = outside
         word = left[x]
         for d in range(low, high):
-            out[x, d] = np.uint8(_count_bits(word ^ right_mirrored[start + d]))
+            out[x, d] = np.uint8(count_bits(word ^ right_mirrored[start + d]))
 
 
 @compiled(nogil=True)

@@ -122,7 +122,7 @@ def semi_global_matching(
         first = max(top - BAND_OVERLAP_PX, 0)
         band = slice(first, min(bottom + BAND_OVERLAP_PX, height))
         in_band = censuses[0][band], censuses[1][band]
-        total = aggregate(left[band], in_band, disparities[0], count, outside)
+        total = aggregate(left[band], matching_cost(in_band, disparities[0], count, outside))
         parts.append(_least_costs(total[top - first : bottom - first], disparities))
     return SGMResult(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
@@ -194,14 +194,11 @@ def match_distance(censuses: Pair, disparities: DisparityRange) -> float:
     return min(typical, WRONG_PLACE_BITS)
 
 
-def aggregate(
-    gray: np.ndarray, censuses: Pair, min_disparity: int, count: int, outside: int
-) -> np.ndarray:
-    """Return the (H, W, D) uint16 costs of a pair's censuses, summed over the eight paths."""
+def aggregate(gray: np.ndarray, cost: np.ndarray) -> np.ndarray:
+    """Return (H, W, D) uint8 costs summed over the eight paths, uint16."""
     from .kernels import sum_along_paths
 
     height, width = gray.shape
-    cost = matching_cost(censuses, min_disparity, count, outside)
     total = np.zeros(cost.shape, np.uint16)
     p2 = np.maximum(P2_BITS / (1 + np.arange(256) / P2_HALF_GRADIENT_LEVELS), MIN_P2_BITS)
     penalties = np.uint16(P1_BITS * COST_PER_BIT), (p2 * COST_PER_BIT).astype(np.uint16)

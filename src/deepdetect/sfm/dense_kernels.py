@@ -1,0 +1,367 @@
+"""The compiled parts of dense points. Importing them takes numba; the first call compiles.
+
+Kernels work on the rows `first` to `last - 1`. A surface near a pixel is a plane: its inverse depth
+is linear in the pixel's position, whatever its slant. A match in a neighbour is the projection of
+(A, b), (3, 3) and (3,): pixel q of inverse depth w is seen at A (q, 1) + w b.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from .._shared.kernels import compiled
+from ..matching.stereo.kernels import count_bits
+
+HIDDEN = np.uint64(1) << np.uint64(63)
+"""Bit of a census of 62 bits: the neighbour does not show this place."""
+
+
+@compiled(nogil=True)
+def _two_best(y, census, neighbours, columns, rows, hidden_cost, line):  # type: ignore[no-untyped-def]
+    """Write the sum of the two least distances to the neighbours, (D, W) uint8, of a row."""
+    count, width = line.shape
+    least, second = np.empty((2, width), np.uint8)
+    for d in range(count):
+        least[:] = 255
+        second[:] = 255
+        for k in range(len(neighbours)):
+            words, at = neighbours[k, rows[k, d, y]], columns[k, d]
+            for x in range(width):
+                word = words[at[x]]
+                bits = np.uint8(count_bits(word ^ census[y, x]))
+                cost = hidden_cost if word >> np.uint64(63) else bits
+                second[x] = min(second[x], max(least[x], cost))
+                least[x] = min(least[x], cost)
+        for x in range(width):
+            line[d, x] = least[x] + second[x]
+
+
+@compiled(nogil=True)
+def cost_rows(first, last, census, neighbours, columns, rows, hidden_cost, cost):  # type: ignore[no-untyped-def]
+    """Write the costs of inverse depths, (H, W, D) uint8: of the two neighbours that agree best.
+
+    `neighbours` (K, H', W') are censuses in the frame of the reference: the pixel (x, y) at the
+    inverse depth d is at `columns` (K, D, W) and `rows` (K, D, H) of theirs. An eighth of the sum
+    over 3 x 3 pixels.
+    """
+    height, width, count = cost.shape
+    line = np.empty((count, width), np.uint8)
+    sums = np.empty((3, count, width), np.uint16)
+    done = first - 2
+    for y in range(first, last):
+        for row in range(max(y - 1, done + 1), y + 2):
+            at = min(max(row, 0), height - 1)
+            _two_best(at, census, neighbours, columns, rows, hidden_cost, line)
+            for d in range(count):
+                here, out = line[d], sums[row % 3, d]
+                out[0] = np.uint16(2 * here[0]) + np.uint16(here[1])
+                out[width - 1] = np.uint16(2 * here[width - 1]) + np.uint16(here[width - 2])
+                for x in range(1, width - 1):
+                    out[x] = np.uint16(here[x - 1]) + np.uint16(here[x]) + np.uint16(here[x + 1])
+            done = row
+        for d in range(count):
+            above, here, below = sums[(y + 2) % 3, d], sums[y % 3, d], sums[(y + 1) % 3, d]
+            for x in range(width):
+                cost[y, x, d] = np.uint8((above[x] + here[x] + below[x]) >> np.uint16(3))
+
+
+@compiled(nogil=True)
+def choose_rows(first, last, total, out):  # type: ignore[no-untyped-def]
+    """Write the number of the least of D sums of costs, (H, W) float32, with a parabola's rest."""
+    count = total.shape[2]
+    for y in range(first, last):
+        for x in range(total.shape[1]):
+            sums = total[y, x]
+            at, least = 0, sums[0]
+            for d in range(1, count):
+                if sums[d] < least:
+                    at, least = d, sums[d]
+            rest = 0.0
+            if 0 < at < count - 1:
+                before, after = float(sums[at - 1]), float(sums[at + 1])
+                bend = before + after - 2 * float(least)
+                rest = 0.5 * (before - after) / bend if bend > 0 else 0.0
+            out[y, x] = at + rest
+
+
+@compiled(nogil=True)
+def fit_rows(first, last, planes, weights, radius, tolerance, min_pixels, out):  # type: ignore[no-untyped-def]
+    """Fit a plane to the inverse depths around each pixel that lie near its own plane.
+
+    `planes` (H, W, 3) float32 are inverse depths, NaN where unknown, and their changes per pixel
+    to the right and down. Of fewer pixels than `min_pixels` NaN.
+    """
+    height, width = planes.shape[:2]
+    for y in range(first, last):
+        for x in range(width):
+            w, right, down = planes[y, x]
+            n = si = sj = sii = sij = sjj = sv = siv = sjv = 0.0
+            pixels = 0
+            for j in range(max(-radius, -y), min(radius, height - 1 - y) + 1):
+                for i in range(max(-radius, -x), min(radius, width - 1 - x) + 1):
+                    rest = planes[y + j, x + i, 0] - w - i * right - j * down
+                    if abs(rest) <= tolerance:
+                        weight = float(weights[y + j, x + i])
+                        pixels += 1
+                        n += weight
+                        si += weight * i
+                        sj += weight * j
+                        sii += weight * i * i
+                        sij += weight * i * j
+                        sjj += weight * j * j
+                        rest *= weight
+                        sv += rest
+                        siv += i * rest
+                        sjv += j * rest
+            if pixels < min_pixels:
+                out[y, x] = np.nan
+                continue
+            a, b, c = sii - si * si / n, sij - si * sj / n, sjj - sj * sj / n
+            e, f = siv - si * sv / n, sjv - sj * sv / n
+            area = a * c - b * b
+            more_right = more_down = 0.0
+            if area > n:  # not on a line
+                more_right, more_down = (e * c - f * b) / area, (f * a - e * b) / area
+            out[y, x, 0] = w + (sv - more_right * si - more_down * sj) / n
+            out[y, x, 1] = right + more_right
+            out[y, x, 2] = down + more_down
+
+
+@compiled(nogil=True, inline="always")
+def _project(m, x, y, w):  # type: ignore[no-untyped-def]
+    """Return where a neighbour sees the pixel (x, y) of inverse depth w, and a depth."""
+    z = m[2, 0] * x + m[2, 1] * y + m[2, 2] + w * m[2, 3]
+    across = m[0, 0] * x + m[0, 1] * y + m[0, 2] + w * m[0, 3]
+    down = m[1, 0] * x + m[1, 1] * y + m[1, 2] + w * m[1, 3]
+    return across / z, down / z, z
+
+
+@compiled(nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
+def _compare(gray, y, x, plane, same, m, other, size, radius, spacing, noise):  # type: ignore[no-untyped-def]
+    """Compare the window around a pixel with that of a neighbour, warped by its plane.
+
+    Returns their correlation, by how many pixels the match should move along its line (one step of
+    Lucas-Kanade; contrast and brightness may differ), how far it moves for a change of the inverse
+    depth, and the weight of that: the correlation is -1 where the neighbour does not show it.
+    """
+    nothing = np.float32(-1), np.float32(0), 0.0, np.float32(0)
+    w, right, down = plane
+    px, py, pz = _project(m, x, y, w)
+    if not pz > 0:
+        return nothing
+    ax = (m[0, 0] + right * m[0, 3] - px * (m[2, 0] + right * m[2, 3])) / pz
+    ay = (m[1, 0] + right * m[1, 3] - py * (m[2, 0] + right * m[2, 3])) / pz
+    bx = (m[0, 1] + down * m[0, 3] - px * (m[2, 1] + down * m[2, 3])) / pz
+    by = (m[1, 1] + down * m[1, 3] - py * (m[2, 1] + down * m[2, 3])) / pz
+    reach_x, reach_y = radius * (abs(ax) + abs(bx)), radius * (abs(ay) + abs(by))
+    if not (reach_x <= px < size[0] - 2 - reach_x and reach_y <= py < size[1] - 2 - reach_y):
+        return nothing
+    gx, gy = (m[0, 3] - px * m[2, 3]) / pz, (m[1, 3] - py * m[2, 3]) / pz
+    parallax = math.sqrt(gx * gx + gy * gy)
+    if parallax < 1e-9:
+        return nothing
+    gx, gy = np.float32(gx / parallax), np.float32(gy / parallax)
+    ax, ay, bx, by = np.float32(ax), np.float32(ay), np.float32(bx), np.float32(by)
+    fx, fy = np.float32(px), np.float32(py)
+    here, middle = gray[y, x], other[int(py), int(px)]
+    n = sp = sv = ss = pp = vv = sss = vs = pv = ps = np.float32(0)
+    for j in range(-radius, radius + 1, spacing):
+        for i in range(-radius, radius + 1, spacing):
+            if not same[j + radius, i + radius]:
+                continue
+            qx, qy = fx + ax * i + bx * j, fy + ay * i + by * j
+            left, top = int(qx), int(qy)
+            tx, ty = qx - np.float32(left), qy - np.float32(top)
+            v00, v01 = other[top, left], other[top, left + 1]
+            v10, v11 = other[top + 1, left], other[top + 1, left + 1]
+            above, below = v00 + tx * (v01 - v00), v10 + tx * (v11 - v10)
+            v = above + ty * (below - above) - middle
+            across = v01 - v00 + ty * (v11 - v10 - v01 + v00)
+            s = gx * across + gy * (below - above)
+            p = gray[y + j, x + i] - here
+            n += np.float32(1)
+            sp += p
+            sv += v
+            ss += s
+            pp += p * p
+            vv += v * v
+            sss += s * s
+            vs += v * s
+            pv += p * v
+            ps += p * s
+    floor = n * noise * noise
+    own = pp - sp * sp / n + floor
+    spread = vv - sv * sv / n + floor
+    steep = sss - ss * ss / n + floor
+    mixed = vs - sv * ss / n
+    covariance = pv - sp * sv / n + floor
+    moved = ps - sp * ss / n
+    area = spread * steep - mixed * mixed
+    gain = (covariance * steep - moved * mixed) / area
+    shift = (moved * spread - covariance * mixed) / (area * max(gain, np.float32(0.2)))
+    shift = min(max(shift, np.float32(-1)), np.float32(1))
+    weight = (steep - mixed * mixed / spread) / own
+    return covariance / np.float32(math.sqrt(own * spread)), shift, parallax, weight
+
+
+@compiled(nogil=True)
+def _score(gray, y, x, plane, same, neighbours, sizes, maps, radius, spacing, noise):  # type: ignore[no-untyped-def]
+    """Return the mean correlation with the two neighbours that correlate best."""
+    best = second = np.float32(-1)
+    for k in range(len(neighbours)):
+        found = _compare(
+            gray, y, x, plane, same, maps[k], neighbours[k], sizes[k], radius, spacing, noise
+        )[0]
+        second = max(second, min(best, found))
+        best = max(best, found)
+    return np.float32(0.5) * (best + second)
+
+
+@compiled(nogil=True)
+def propagate_rows(  # type: ignore[no-untyped-def]
+    first, last, planes, scores, jump, sure, stride, gray, neighbours, sizes, maps, radius, spacing,
+    noise, out, found,
+):  # fmt: skip
+    """Give pixels that correlate less than `sure` the plane of one of four others, if it is better.
+
+    `planes` and what follows as of `refine_rows`. The others are `jump` pixels of `planes` away.
+    `scores` (H, W) are those of the planes, `found` those of the new ones.
+    """
+    height, width = gray.shape
+    rows, columns = planes.shape[:2]
+    same = np.ones((2 * radius + 1, 2 * radius + 1), np.bool_)
+    plane = np.empty(3, np.float32)
+    for row in range(first, last):
+        for column in range(columns):
+            out[row, column] = planes[row, column]
+            best = scores[row, column]
+            y, x = row * stride, column * stride
+            inside = radius <= y < height - radius and radius <= x < width - radius
+            if best < sure and inside:
+                for turn in range(4 if jump else 1):
+                    across = (jump, -jump, 0, 0)[turn]
+                    down = (0, 0, jump, -jump)[turn]
+                    r, c = row + down, column + across
+                    if not (0 <= r < rows and 0 <= c < columns) or scores[r, c] < best:
+                        continue
+                    plane[:] = planes[r, c]
+                    plane[0] -= stride * (across * plane[1] + down * plane[2])
+                    if not plane[0] > 0:
+                        continue
+                    score = _score(
+                        gray, y, x, plane, same, neighbours, sizes, maps, radius, spacing, noise
+                    )
+                    if score > best:
+                        best = score
+                        out[row, column] = plane
+            found[row, column] = best
+
+
+@compiled(nogil=True)
+def refine_rows(  # type: ignore[no-untyped-def]
+    first, last, planes, stride, gray, neighbours, sizes, maps, radius, spacing, noise, tolerance,
+    min_correlation, min_number, out, errors, certainty,
+):  # fmt: skip
+    """Write the inverse depths after one step of Lucas-Kanade in all neighbours together.
+
+    `planes` (H, W, 3), as of `fit_rows`, are at every `stride` pixels of `gray`, slopes per pixel
+    of `gray`. `neighbours` (K, H', W') float32 have (width, height) `sizes`, `maps` (K, 3, 4) are A
+    and b. Every `spacing`-th pixel of the window counts that is on the same surface. `errors` are
+    the distances in pixels to the matches of each neighbour alone, as root mean squares.
+    """
+    height, width = gray.shape
+    side = 2 * radius + 1
+    same = np.empty((side, side), np.bool_)
+    shifts, parallaxes = np.empty((2, len(neighbours)))
+    for row in range(first, last):
+        for column in range(planes.shape[1]):
+            w, right, down = planes[row, column]
+            out[row, column] = w
+            errors[row, column] = certainty[row, column] = 0
+            if not w > 0:
+                continue
+            y, x = row * stride, column * stride
+            for j in range(-radius, radius + 1, spacing):
+                for i in range(-radius, radius + 1, spacing):
+                    r = min((y + j + stride // 2) // stride, planes.shape[0] - 1)
+                    c = min((x + i + stride // 2) // stride, planes.shape[1] - 1)
+                    near = 0 <= y + j < height and 0 <= x + i < width
+                    if near:
+                        expected = w + right * (c * stride - x) + down * (r * stride - y)
+                        near = abs(planes[r, c, 0] - expected) <= tolerance
+                    same[j + radius, i + radius] = near
+            same[radius, radius] = True
+            step = information = 0.0
+            number = 0
+            for k in range(len(neighbours)):
+                correlation, shift, parallax, weight = _compare(
+                    gray, y, x, planes[row, column], same, maps[k], neighbours[k], sizes[k], radius,
+                    spacing, noise,
+                )  # fmt: skip
+                if correlation >= min_correlation:
+                    step += parallax * weight * shift
+                    information += parallax * parallax * weight
+                    shifts[number], parallaxes[number] = shift, parallax
+                    number += 1
+            out[row, column] = np.nan
+            if number >= min_number and information > 0:
+                certainty[row, column] = information
+                step /= information
+                out[row, column] = w + step
+                squares = ((shifts[:number] - parallaxes[:number] * step) ** 2).sum()
+                errors[row, column] = math.sqrt(squares / number)
+
+
+@compiled(nogil=True)
+def fuse_rows(  # type: ignore[no-untyped-def]
+    first, last, planes, neighbours, stride, there, back, rays, centres, max_error, max_difference,
+    min_angle, fused, views,
+):  # fmt: skip
+    """Write the mean inverse depth of the depth maps that agree on each pixel of the first.
+
+    `planes` (H, W, 3) and `neighbours` (K, H', W', 3), NaN where unknown, are at every `stride`
+    pixels. `there` and `back` (K, 3, 4) are A and b to the neighbours and from them. `rays` (3, 3)
+    makes lines of sight of pixels, `centres` (K, 3) are those of the neighbours in the same frame.
+    A neighbour agrees where its own surface is seen within `max_error` pixels. `views` (H, W) is
+    how many do, with the first one, or 0.
+    """
+    across, down = neighbours.shape[2], neighbours.shape[1]
+    for row in range(first, last):
+        for column in range(planes.shape[1]):
+            w, right, below = planes[row, column]
+            views[row, column] = 0
+            if not w > 0:
+                continue
+            x, y = float(column * stride), float(row * stride)
+            line = rays @ np.array([x, y, 1.0])
+            total, count, widest = float(w), 1, 0.0
+            for k in range(len(neighbours)):
+                m, n = there[k], back[k]
+                px, py, pz = _project(m, x, y, w)
+                if not pz > 0:
+                    continue
+                c, r = math.floor(px / stride + 0.5), math.floor(py / stride + 0.5)
+                if not (0 <= c < across and 0 <= r < down):
+                    continue
+                its, its_right, its_down = neighbours[k, r, c]
+                its += its_right * (px - c * stride) + its_down * (py - r * stride)
+                if not its > 0:
+                    continue
+                qx, qy, qz = _project(n, px, py, its)
+                if not qz > 0:
+                    continue
+                dx, dy = qx - x, qy - y
+                seen = its / qz
+                if dx * dx + dy * dy > max_error * max_error or abs(seen - w) > max_difference * w:
+                    continue
+                total += seen - right * dx - below * dy
+                count += 1
+                other = line / w - centres[k]
+                product = (line * other).sum()
+                product /= math.sqrt((line * line).sum() * (other * other).sum())
+                widest = max(widest, math.acos(min(max(product, -1.0), 1.0)))
+            if widest >= min_angle:
+                fused[row, column] = total / count
+                views[row, column] = count
