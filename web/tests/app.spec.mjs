@@ -66,13 +66,20 @@ test("a 3D model is shown, and can be turned", async ({ page, app }) => {
   await expect(viewer.locator("#message")).toBeHidden({ timeout: 120_000 });
   await expect(viewer.locator("dl")).toContainText("Points");
   const frame = page.locator("#job-result iframe");
-  const before = await frame.screenshot();
+  const opened = await frame.screenshot();
+  await expect.poll(async () => (await frame.screenshot()).equals(opened)).toBe(false); // it sways
   const box = await frame.boundingBox();
   await page.mouse.move(box.x + 500, box.y + 100);
   await page.mouse.down();
+  let touched = null;
+  await expect.poll(async () => {
+    touched = await frame.screenshot();
+    await page.waitForTimeout(500);
+    return (await frame.screenshot()).equals(touched);
+  }).toBe(true);
   await page.mouse.move(box.x + 300, box.y + 100);
   await page.mouse.up();
-  expect((await frame.screenshot()).equals(before)).toBe(false);
+  await expect.poll(async () => (await frame.screenshot()).equals(touched)).toBe(false);
   await expect.poll(() => tasksOf(app)).toEqual([]);
   const { content } = await downloaded(page, page.getByRole("button", { name: "model.ply" }));
   expect(String(content.subarray(0, 3))).toBe("ply");
