@@ -12,7 +12,7 @@ const tasksOf = ({ folder }) => readdirSync(folder).filter((name) => name.starts
 
 const openTasks = async (page, title, app) => {
   await openExample(page, title, app.address);
-  await page.getByRole("tab", { name: "3D and more" }).click();
+  await page.getByRole("tab", { name: "3D, panorama, folder" }).click();
 };
 
 const startTask = (page, kind) => page.locator(`[data-kind="${kind}"]`).click();
@@ -89,7 +89,7 @@ test("a 3D model is shown, and can be turned", async ({ page, app }) => {
 test("registration is compared in the wipe", async ({ page, app }) => {
   await openTasks(page, "Coffee, turned", app);
   await startTask(page, "register");
-  await page.getByRole("button", { name: "Compare in Wipe" }).click({ timeout: 120_000 });
+  await page.getByRole("button", { name: "Compare with the first" }).click({ timeout: 120_000 });
   await expect(page.locator("#wipe-hint")).toContainText("guided matching");
 });
 
@@ -196,7 +196,7 @@ test("a folder", async ({ page, app }, info) => {
 test("what has no geometry is said in one sentence", async ({ page, app }) => {
   await page.goto(app.address);
   await page.locator("#file").setInputFiles([join(examples, "coffee.jpg"), join(examples, "motorcycle-left.jpg")]);
-  await page.getByRole("tab", { name: "3D and more" }).click();
+  await page.getByRole("tab", { name: "3D, panorama, folder" }).click();
   await startTask(page, "register");
   await expect(page.getByRole("alert")).toContainText("No homography can be trusted", { timeout: 120_000 });
 });

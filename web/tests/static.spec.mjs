@@ -160,6 +160,34 @@ test("matches of two views agree with the true disparity", async ({ page }) => {
   expect(JSON.parse(json.content)).toMatchObject({ model: "fundamental", options: { ratio: 0.6 } });
 });
 
+test("matches are enlarged by the wheel and by keys, and the line that is pointed at stands out", async ({ page }) => {
+  await openExample(page, "Motorcycle");
+  await expect(page.locator("#match-hint")).toContainText("agree");
+  const canvas = page.locator("#view-matches .lines");
+  const ink = () => canvas.evaluate((lines) => lines.toDataURL());
+  const plain = await ink();
+  const first = await canvas.boundingBox();
+  await slide(page, "thickness", 3);
+  const thick = await ink();
+  expect(thick).not.toBe(plain);
+  for (let x = 0.2; await ink() === thick && x < 0.5; x += 0.01) { // some line crosses this row
+    await page.mouse.move(first.x + x * first.width, first.y + 100);
+    await page.waitForTimeout(100);
+  }
+  expect(await ink()).not.toBe(thick);
+  const anchor = { x: first.x + 0.3 * first.width, y: first.y + 100 };
+  await page.mouse.move(anchor.x, anchor.y);
+  await page.mouse.wheel(0, -600);
+  await expect.poll(async () => (await canvas.boundingBox()).width).toBeGreaterThan(2 * first.width);
+  const box = await canvas.boundingBox();
+  expect((anchor.x - box.x) / box.width).toBeCloseTo(0.3, 1); // what was under the pointer is there still
+  await page.mouse.wheel(0, 900);
+  await expect.poll(async () => (await canvas.boundingBox()).width).toBeLessThan(1.02 * first.width);
+  await page.locator("#view-matches .stage").focus();
+  await page.keyboard.press("+");
+  expect((await canvas.boundingBox()).width).toBeGreaterThan(1.2 * first.width);
+});
+
 test("a plane seen aslant is one, as in Python", async ({ page }) => {
   const graf = join(web, "../../shared/data/oxford/graf");
   test.skip(!existsSync(graf), "needs Oxford's pictures in ../shared");
@@ -186,7 +214,7 @@ test("pictures that show different things have no geometry", async ({ page }) =>
 test("the wipe aligns a plane, and moves by mouse and by keys", async ({ page }) => {
   await openExample(page, "Coffee, turned");
   await expect(page.locator("#match-hint")).toContainText("homography");
-  await page.getByRole("tab", { name: "Wipe" }).click();
+  await page.getByRole("tab", { name: "Compare" }).click();
   await expect(page.locator("#wipe-hint")).toContainText("registered");
   const second = page.locator("#view-wipe .overlay");
   await page.locator("#wipe").focus();
@@ -239,7 +267,7 @@ test("what belongs to two pictures is not said of one", async ({ page }, info) =
   await page.locator("#file").setInputFiles([plain, join(examples, "coffee.jpg")]);
   await expect(page.locator("#match-count")).toHaveText("0 matches");
   await expect(page.locator("#match-hint")).toHaveText("Nothing in one picture is like anything in the other.");
-  await page.getByRole("tab", { name: "Wipe" }).click();
+  await page.getByRole("tab", { name: "Compare" }).click();
   await expect(page.locator("#wipe-hint")).toContainText("No homography");
   await page.locator(".remove").first().click();
   await expect(page.locator("#wipe-hint")).toHaveText("");
@@ -342,9 +370,9 @@ for (const [width, colorScheme] of [[1280, "light"], [1280, "dark"], [390, "ligh
     await check();
     await example(page, "Coffee, turned").click();
     await expect(page.locator("#match-hint")).toContainText("agree");
-    for (const name of ["Keypoints", "Heat map", "Matches", "Wipe"]) {
+    for (const name of ["Keypoints", "Heat map", "Match", "Compare"]) {
       await page.getByRole("tab", { name }).click();
-      if (name === "Wipe") await expect(page.locator("#wipe-hint")).toContainText("registered");
+      if (name === "Compare") await expect(page.locator("#wipe-hint")).toContainText("registered");
       await check();
       if (name !== "Keypoints") continue;
       for (const spread of ["none", "anms"]) {

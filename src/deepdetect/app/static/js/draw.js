@@ -115,9 +115,14 @@ export function composeKeypoints(picture, overlay) {
 /**
  * Draws two pictures beside or above each other, and lines between matches.
  *
- * @param {boolean[] | Uint8Array} good matches to draw in colours; others are thin and red
+ * @param {boolean[] | Uint8Array} good matches to draw in colours; others are red
+ * @param {number | null} hovered the match that stands out
+ * @returns {Line[]} those that are drawn
+ *
+ * @typedef {{k: number, from: [number, number], to: [number, number]}} Line in pixels of the canvas
  */
-export function drawMatches(canvas, pictures, points0, points1, good, { stacked, width }) {
+export function drawMatches(canvas, pictures, points0, points1, good,
+                            { stacked, width, thickness, hovered = null }) {
   const gap = 8;
   const [first, second] = pictures;
   const [widths, heights] = [[first.width, second.width], [first.height, second.height]];
@@ -135,25 +140,48 @@ export function drawMatches(canvas, pictures, points0, points1, good, { stacked,
   const place = (points, k, [left, top]) => [(points[2 * k] + 0.5) * scale + left,
                                              (points[2 * k + 1] + 0.5) * scale + top];
   const step = Math.max(1, good.length / MAX_LINES);
-  const drawn = Array.from({ length: Math.min(good.length, MAX_LINES) }, (_, k) => Math.floor(k * step));
-  const draw = (wanted) => {
-    for (const k of drawn) {
-      if (Boolean(good[k]) !== wanted) continue;
-      const [from, to] = [place(points0, k, [0, 0]), place(points1, k, corner)];
-      // Neighbours have like colours, so that one that goes elsewhere stands out.
-      const hue = 360 * points0[2 * k] / first.width;
-      context.strokeStyle = wanted ? `hsl(${hue} 95% ${45 + 25 * points0[2 * k + 1] / first.height}%)`
-                                   : "rgba(230, 40, 40, 0.55)";
+  const lines = Array.from({ length: Math.min(good.length, MAX_LINES) }, (_, line) => {
+    const k = Math.floor(line * step);
+    return { k, from: place(points0, k, [0, 0]), to: place(points1, k, corner) };
+  });
+  const draw = ({ k, from, to }) => {
+    // Neighbours have like colours, so that one that goes elsewhere stands out.
+    const hue = 360 * points0[2 * k] / first.width;
+    context.strokeStyle = good[k] ? `hsl(${hue} 95% ${45 + 25 * points0[2 * k + 1] / first.height}%)`
+                                  : "rgba(230, 40, 40, 0.55)";
+    context.beginPath();
+    context.moveTo(...from);
+    context.lineTo(...to);
+    context.stroke();
+  };
+  const isHovered = ({ k }) => k === hovered;
+  context.lineWidth = thickness;
+  context.globalAlpha = lines.some(isHovered) ? 0.15 : 0.9;
+  for (const wanted of [false, true]) {
+    for (const line of lines) if (Boolean(good[line.k]) === wanted) draw(line);
+  }
+  context.globalAlpha = 1;
+  for (const line of lines.filter(isHovered)) {
+    context.lineWidth = 2 * thickness;
+    draw(line);
+    for (const end of [line.from, line.to]) {
       context.beginPath();
-      context.moveTo(...from);
-      context.lineTo(...to);
+      context.arc(...end, 5 * thickness, 0, 2 * Math.PI);
       context.stroke();
     }
-  };
-  context.lineWidth = Math.max(1, canvas.width / 1000);
-  context.globalAlpha = 0.9;
-  draw(false);
-  draw(true);
-  context.globalAlpha = 1;
-  return drawn.length;
+  }
+  return lines;
+}
+
+/** The match whose line is nearest to a place, null where none is within reach. @param {Line[]} lines */
+export function nearestLine(lines, x, y, reach) {
+  let [nearest, least] = [null, reach];
+  for (const { k, from, to } of lines) {
+    const [across, down] = [to[0] - from[0], to[1] - from[1]];
+    const along = ((x - from[0]) * across + (y - from[1]) * down) / (across ** 2 + down ** 2 || 1);
+    const share = Math.max(0, Math.min(1, along));
+    const distance = Math.hypot(from[0] + share * across - x, from[1] + share * down - y);
+    if (distance < least) [nearest, least] = [k, distance];
+  }
+  return nearest;
 }

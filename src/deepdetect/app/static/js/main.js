@@ -123,7 +123,7 @@ async function addPictures(files) {
   if (!isOpened()) return;
   const room = MAX_PICTURES - page.pictures.length;
   if (files.length > room) {
-    const advice = page.server ? " or use a folder under “3D and more”." : ".";
+    const advice = page.server ? " or use a folder under “3D, panorama, folder”." : ".";
     throw new Error(room ? `Give at most ${counted(room, "picture")}${advice}`
                          : "There are two pictures already: remove one, or start over.");
   }

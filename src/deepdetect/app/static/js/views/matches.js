@@ -1,13 +1,16 @@
 // Matches of two pictures by descriptors, their lines, and the geometry that they agree with.
 import { Background } from "../background.js";
 import { describe, findPoints } from "../detection.js";
-import { drawMatches, newCanvas } from "../draw.js";
+import { drawMatches, nearestLine, newCanvas } from "../draw.js";
 import { save, savePng, stem, toCsv, toJson } from "../downloads.js";
 import { announce, counted, during, element, onceAFrame, page, rescaled, showError, toOriginal } from "../page.js";
 import { choosePoints } from "../points/detection.js";
 
 const NARROW_PX = 640; // below it the pictures stand above each other
 const SAVED_WIDTH_PX = 1600;
+const MAX_ZOOM = 8;
+const MAX_WIDTH_PX = 4096; // of a canvas: an enlarged one is not drawn finer
+const HOVER_PX = 8; // of the screen, from a line
 const MODELS = {
   homography: "one homography: a plane, or a turn of the camera",
   fundamental: "one epipolar geometry: a scene with depth",
@@ -15,10 +18,13 @@ const MODELS = {
 
 const view = element("view-matches");
 const form = view.querySelector("form");
+const stage = view.querySelector(".stage");
+const canvas = view.querySelector(".lines");
 const background = new Background(new URL("../matching_worker.js", import.meta.url));
 let found = null; // mutual matches of the pictures with their ratios
 let pending = null; // the matching that is at work, or was the last
 let kept = null; // those under the ratio, with their geometry
+let [zoom, lines, hovered] = [1, [], null]; // how the matches are drawn
 let [matchings, filterings] = [0, 0]; // how many were begun: only what the last one finds is shown
 
 export const matchingTask = (task, values) => background.call(task, values);
@@ -29,6 +35,7 @@ const ratio = () => Number(element("ratio").value);
 function showControls() {
   form.querySelector('output[for="match-number"]').textContent = count().toLocaleString("en");
   form.querySelector('output[for="ratio"]').textContent = ratio().toFixed(2);
+  form.querySelector('output[for="thickness"]').textContent = element("thickness").value;
 }
 
 /** The described points of a picture, and the size that they were found in. */
@@ -115,12 +122,13 @@ export function draw() {
   showControls();
   const pair = page.pictures.length === 2;
   view.querySelector(".empty").hidden = pair;
-  const canvas = view.querySelector(".lines");
   canvas.hidden = !pair || !kept;
   if (!pair || !kept) return;
-  const width = Math.max(200, view.querySelector(".stage").clientWidth - 22);
-  const drawn = paint(canvas, width * devicePixelRatio, width < NARROW_PX);
-  canvas.style.width = `${canvas.width / devicePixelRatio}px`;
+  const width = Math.max(200, stage.clientWidth - 22);
+  const painted = Math.min(width * zoom * devicePixelRatio, Math.max(width * devicePixelRatio, MAX_WIDTH_PX));
+  const fine = painted / (width * zoom); // pixels of the canvas per pixel of the screen
+  lines = paint(canvas, painted, width < NARROW_PX, fine * Math.max(1, width / 1000));
+  canvas.style.width = `${canvas.width / fine}px`;
   const agreeing = kept.inliers.reduce((sum, value) => sum + value, 0);
   const text = counted(kept.ratios.length, "match");
   element("match-count").textContent = text;
@@ -128,18 +136,19 @@ export function draw() {
                                    : "Nothing in one picture is like anything in the other.";
   const hint = kept.model === "none" ? doubt
     : `${agreeing.toLocaleString("en")} agree with ${MODELS[kept.model]}.`;
-  const sample = drawn < rowsShown().length ? ` ${drawn} of them are drawn.` : "";
+  const sample = lines.length < rowsShown().length ? ` ${lines.length} of them are drawn.` : "";
   element("match-hint").textContent = hint + sample;
   canvas.setAttribute("aria-label", `${text} between ${kept.first.name} and ${kept.second.name}`);
 }
 
-function paint(canvas, width, stacked) {
+function paint(target, width, stacked, lineWidth) {
   const rows = rowsShown();
   const take = (points) => Float32Array.from({ length: 2 * rows.length },
                                              (_, k) => points[2 * rows[k >> 1] + (k & 1)]);
   const good = rows.map((k) => kept.model === "none" || kept.inliers[k] === 1);
-  return drawMatches(canvas, [kept.first, kept.second], take(kept.points0), take(kept.points1), good,
-              { stacked, width });
+  const thickness = element("thickness").value * lineWidth;
+  return drawMatches(target, [kept.first, kept.second], take(kept.points0), take(kept.points1), good,
+                     { stacked, width, thickness, hovered });
 }
 
 /** Rows of x0, y0, x1, y1, score and inlier, in the photographs' own pixels. */
@@ -161,22 +170,64 @@ const downloads = {
     save(`${name}.json`, toJson(values), "application/json");
   },
   png: (name) => {
-    const canvas = newCanvas(1, 1);
-    paint(canvas, SAVED_WIDTH_PX, false);
-    return savePng(`${name}.png`, canvas);
+    const saved = newCanvas(1, 1);
+    paint(saved, SAVED_WIDTH_PX, false, SAVED_WIDTH_PX / 1000);
+    return savePng(`${name}.png`, saved);
   },
 };
 
 /** Forgets the matches of pictures that are gone. */
 export function reset() {
   [found, pending, kept] = [null, null, null];
+  [zoom, lines, hovered] = [1, [], null];
   matchings++;
   filterings++;
   element("match-count").textContent = "–";
   element("match-hint").textContent = "";
 }
 
+/** Enlarges the matches; what is at a place of the window stays there. */
+function enlarge(factor, clientX, clientY) {
+  const before = canvas.getBoundingClientRect();
+  zoom = Math.max(1, Math.min(MAX_ZOOM, zoom * factor));
+  draw();
+  const after = canvas.getBoundingClientRect();
+  stage.scrollLeft += after.left + (clientX - before.left) / before.width * after.width - clientX;
+  stage.scrollTop += after.top + (clientY - before.top) / before.height * after.height - clientY;
+}
+
+function setUpStage() {
+  const redraw = onceAFrame(draw);
+  stage.addEventListener("wheel", (event) => {
+    if (!kept || event.deltaY >= 0 && zoom === 1) return; // the page scrolls
+    event.preventDefault();
+    enlarge(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), event.clientX, event.clientY);
+  }, { passive: false });
+  stage.onkeydown = ({ key }) => {
+    const factor = { "+": 1.25, "=": 1.25, "-": 0.8 }[key];
+    const box = stage.getBoundingClientRect();
+    if (kept && factor) enlarge(factor, box.left + box.width / 2, box.top + box.height / 2);
+  };
+  stage.onpointermove = (event) => {
+    if (event.buttons & 1) {
+      stage.scrollBy(-event.movementX, -event.movementY);
+      return;
+    }
+    const box = canvas.getBoundingClientRect();
+    const fine = canvas.width / box.width; // pixels of the canvas per pixel of the screen
+    const near = nearestLine(lines, (event.clientX - box.left) * fine, (event.clientY - box.top) * fine, HOVER_PX * fine);
+    if (near === hovered) return;
+    hovered = near;
+    redraw();
+  };
+  stage.onpointerleave = () => {
+    hovered = null;
+    redraw();
+  };
+}
+
 export function setUp() {
+  setUpStage();
   const guarded = (task) => () => task().catch((error) => showError(error.message));
   const refilter = onceAFrame(guarded(filter));
   element("ratio").oninput = () => {
@@ -185,7 +236,7 @@ export function setUp() {
   };
   element("match-number").oninput = showControls;
   element("match-number").onchange = guarded(match);
-  element("agreeing").onchange = draw;
+  element("agreeing").onchange = element("thickness").oninput = draw;
   addEventListener("resize", onceAFrame(() => !view.hidden && draw()));
   for (const button of form.querySelectorAll("[data-download]")) {
     button.onclick = () => kept && downloads[button.dataset.download](

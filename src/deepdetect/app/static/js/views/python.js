@@ -192,7 +192,7 @@ function picture(blob, title) {
 function offerWipe(bitmap, showWipe) {
   const button = document.createElement("button");
   button.type = "button";
-  button.textContent = "Compare in Wipe";
+  button.textContent = "Compare with the first";
   button.onclick = () => {
     compare(bitmap);
     showWipe();
