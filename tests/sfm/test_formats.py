@@ -16,14 +16,12 @@ from deepdetect import Camera, MissingExtraError, OptionError, PointDetector, re
 from deepdetect.datasets.posed_images import load_posed_scenes
 from deepdetect.geometry.point_cloud import EAST_NORTH_UP, PointCloud
 from deepdetect.sfm import MultiViewOptions, MultiViewReconstruction
-from deepdetect.sfm.dense import DENSE_POINT
 from deepdetect.sfm.formats import FORMATS, write_mesh
 from deepdetect.sfm.georeference import Georeference
 from deepdetect.sfm.splat import seen_depths, thinned
 
 from ..io.test_gps import place_tags
 
-FORMATS_OF_ALL = tuple(n for n in FORMATS if n != "mesh" or "normals" in DENSE_POINT.names)
 NAMES, TURNED = ("0003", "0004", "0005", "0006"), "0006"
 METRES_PER_DEGREE = np.array([111_132.95, 78_846.8])
 """Of latitude and longitude, at 45 degrees north, by WGS 84."""
@@ -57,7 +55,7 @@ def placed(
                 exif[Base.Orientation] = 3  # it is stored upside down
                 image = image.transpose(Image.Transpose.ROTATE_180)
             image.save(path, quality=95, exif=exif)
-    options = MultiViewOptions(stride_px=4, formats=FORMATS_OF_ALL)
+    options = MultiViewOptions(stride_px=4, formats=tuple(FORMATS))
     detector = PointDetector(1000)
     return root / "model", reconstruct_many(
         folder, root / "model", detector, options=options, workers=1
@@ -186,6 +184,24 @@ def test_the_splats_model_is_read_by_pycolmap(placed, pycolmap) -> None:
     assert {round(float(p.error), 5) for p in dense} == {
         round(float(error), 5) for error in found.dense_errors
     }
+
+
+def test_normals_are_those_of_the_surface_and_meshed(placed) -> None:
+    """They look at a camera that sees the point, and the mesh is where the points are."""
+    trimesh = pytest.importorskip("trimesh", reason="needs trimesh")
+    output, found = placed
+    cloud = found.dense
+    assert cloud.normals is not None
+    towards = [
+        ((view.centre - cloud.points) * cloud.normals).sum(1) for view in found.views.values()
+    ]
+    assert (np.max(towards, axis=0) > 0).mean() > 0.95
+    header = (output / "model.ply").read_bytes().partition(b"end_header")[0]
+    assert b"property float nx\nproperty float ny\nproperty float nz" in header
+    mesh = trimesh.load(output / "mesh.ply", process=False)
+    low, high = np.percentile(cloud.points, (5, 95), axis=0)
+    assert ((mesh.vertices > low - 1) & (mesh.vertices < high + 1)).all(axis=1).mean() > 0.8
+    assert 0.2 < len(mesh.vertices) / len(cloud) < 5
 
 
 def test_text_is_the_same_model(placed, pycolmap) -> None:

@@ -117,7 +117,7 @@ def write_mesh(found: MultiViewReconstruction, folder: Path, output: Path) -> No
     By screened Poisson reconstruction (Kazhdan and Hoppe, 2013), which COLMAP brings.
     """
     cloud = found.dense
-    if cloud.normals is None or not len(cloud):
+    if not len(cloud):
         raise ReconstructionError("a mesh needs dense points, the other files are written")
     box = robust_box(cloud)
     margin = MESH_MARGIN * (box.high - box.low)

@@ -142,7 +142,6 @@ def reconstruct_many(
     with timer.stage("dense points"):
         dense = stages.dense(folder, sparse) if options.dense else np.empty(0, DENSE_POINT)
     with timer.stage("files"):
-        normals = dense["normals"].copy() if "normals" in (DENSE_POINT.names or ()) else None
         reference = min(sparse.views.values(), key=lambda v: float(np.linalg.norm(v.centre))).name
         unit = "spacing", f"camera of {reference}"
         place = georeference(sparse, dense["points"], folder, control, options.scale_by)
@@ -151,8 +150,7 @@ def reconstruct_many(
             transform_model(model, place.similarity)
             sparse = read_sparse_model(model, sources)
             dense["points"] = place.similarity.apply(dense["points"])
-            if normals is not None:
-                normals = normals @ place.similarity.rotation.T.astype(np.float32)
+            dense["normals"] = dense["normals"] @ place.similarity.rotation.T
         views = dict(sorted(sparse.views.items()))
         found = MultiViewReconstruction(
             georeference=place,
@@ -164,7 +162,9 @@ def reconstruct_many(
             sparse=PointCloud(sparse.points, _sparse_colors(stages.features, sparse), *unit),
             sparse_errors=sparse.errors.astype(np.float32),
             sparse_views=sparse.tracks.astype(np.int32),
-            dense=PointCloud(dense["points"].copy(), dense["colors"].copy(), *unit, normals),
+            dense=PointCloud(
+                dense["points"].copy(), dense["colors"].copy(), *unit, dense["normals"].copy()
+            ),
             dense_errors=dense["errors"].copy(),
             dense_views=dense["views"].copy(),
             keypoints=keypoints,
