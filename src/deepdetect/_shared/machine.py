@@ -46,7 +46,7 @@ BYTES_PER = {
     # Two maps of float32, and room for what is made of them.
     "pixel_of_level": 16,
     # Dense matching, at its peak.
-    "dense_pixel": 700,
+    "dense_pixel": 250,
 }
 """Measured; `needed_memory` adds them up."""
 

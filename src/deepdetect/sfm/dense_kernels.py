@@ -207,7 +207,7 @@ def _compare(gray, y, x, plane, same, m, other, size, radius, spacing, noise):  
 
 
 @compiled(nogil=True)
-def _score(gray, y, x, plane, same, neighbours, sizes, maps, radius, spacing, noise):  # type: ignore[no-untyped-def]
+def _score(gray, y, x, plane, same, neighbours, sizes, maps, radius, spacing, noise, sure):  # type: ignore[no-untyped-def]
     """Return the mean correlation with the two neighbours that correlate best."""
     best = second = np.float32(-1)
     for k in range(len(neighbours)):
@@ -216,6 +216,8 @@ def _score(gray, y, x, plane, same, neighbours, sizes, maps, radius, spacing, no
         )[0]
         second = max(second, min(best, found))
         best = max(best, found)
+        if second >= sure:
+            break
     return np.float32(0.5) * (best + second)
 
 
@@ -251,8 +253,9 @@ def propagate_rows(  # type: ignore[no-untyped-def]
                     if not plane[0] > 0:
                         continue
                     score = _score(
-                        gray, y, x, plane, same, neighbours, sizes, maps, radius, spacing, noise
-                    )
+                        gray, y, x, plane, same, neighbours, sizes, maps, radius, spacing, noise,
+                        sure,
+                    )  # fmt: skip
                     if score > best:
                         best = score
                         out[row, column] = plane
