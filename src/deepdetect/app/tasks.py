@@ -191,7 +191,11 @@ def run_reconstruct(images: Images, options: Options, folder: Path, report: Repo
     report("files", MODEL_STAGES - 1, MODEL_STAGES)
     files = {ending: folder / f"model{ending}" for ending in ENDINGS}
     values = save_reconstruction(found, files, " and ".join(one.name for one in images))
-    focal = f"assumed: {focal_px:.0f} px" if assumed else found.calibration.source
+    focal = (
+        f"{focal_px:.0f} px, assumed: {ASSUMED_FOCAL} times the longer side"
+        if assumed
+        else found.calibration.source
+    )
     numbers = {
         "Points": f"{len(found):,}",
         "Matches": f"{found.matches:,}",
