@@ -94,9 +94,11 @@ def is_repeated(
     homography: np.ndarray,
     sparse: Pair | None = None,
     seed: int = 0,
+    distinct: bool = False,
 ) -> bool:
     """Return whether a shifted copy of a homography explains (N, 2) points as well as it does.
 
+    The points are of dense matches, or of `distinct` ones: sparse matches by the ratio test.
     And the `sparse` matches, (M, 2) in both images, of all that is seen, many of them wrong: what
     does not recur off a plane moves towards an epipole where its homography is the right one.
     """
@@ -126,7 +128,9 @@ def is_repeated(
         alone = np.sum((gain > MIN_ZNCC_GAIN) & ~recurs[known])
         other_alone = np.sum(gain < -MIN_ZNCC_GAIN)
         least = max(MIN_OWN_FRACTION * len(gain), MIN_OWN_RATIO * other_alone)
-        if len(gain) < MIN_COMPARED or alone < least:
+        # Where few can be compared, descriptors that occur once must not be contradicted by any.
+        few = len(gain) < MIN_COMPARED
+        if (few and (not distinct or other_alone)) or (not few and alone < least):
             copy = scaled_homography(other, 1 / scale0, 1 / scale1)
             if sparse is None or not _parallax_decides(
                 first, scale0, sparse, homography, copy, seed

@@ -130,7 +130,8 @@ def guided_matches(
         return geometry, None
     geometry, plane = _with_scene(grays, pixels[0], geometry, matches, seed)
     sparse = None if first.others is None else first.all_points
-    if plane is not None and is_repeated(grays, *plane, sparse, seed):
+    distinct = matches.points0 is not None
+    if plane is not None and is_repeated(grays, *plane, sparse, seed, distinct):
         return replace(geometry, model="none", matrix=None, scene="none"), None
     matches = _with_further_planes(grays, pixels, geometry, matches, first, enough, seed)
     ends = matches.starts(pixels[0]), matches.points1
