@@ -61,6 +61,10 @@ MIN_OWN_FRACTION, MIN_OWN_RATIO = 0.02, 2.0
 """Of the explained places, those that a homography explains alone, and how many times those that
 its shifted copy explains alone."""
 
+MIN_ALIKE_FRACTION = 0.25
+"""Of the places of sparse matches, those that a homography explains: of right ones that few places
+can confirm from 0.44 on, of two unrelated photographs none."""
+
 OFF_PLANE_PX = 6.0
 """Matches that end this far from where the homography takes them are off the plane."""
 
@@ -128,9 +132,12 @@ def is_repeated(
         alone = np.sum((gain > MIN_ZNCC_GAIN) & ~recurs[known])
         other_alone = np.sum(gain < -MIN_ZNCC_GAIN)
         least = max(MIN_OWN_FRACTION * len(gain), MIN_OWN_RATIO * other_alone)
-        # Where few can be compared, descriptors that occur once must not be contradicted by any.
-        few = len(gain) < MIN_COMPARED
-        if (few and (not distinct or other_alone)) or (not few and alone < least):
+        if len(gain) < MIN_COMPARED:
+            # Descriptors that occur once are enough if what they match looks alike, and no place
+            # contradicts them.
+            alike = np.mean(own > MIN_ZNCC) > MIN_ALIKE_FRACTION
+            least = 0 if distinct and alike and not other_alone else np.inf
+        if alone < least:
             copy = scaled_homography(other, 1 / scale0, 1 / scale1)
             if sparse is None or not _parallax_decides(
                 first, scale0, sparse, homography, copy, seed
