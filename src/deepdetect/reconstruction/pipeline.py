@@ -202,12 +202,12 @@ def estimate_pose(
     Example:
         >>> import cv2
         >>> rng = np.random.default_rng(0)
-        >>> scene = cv2.GaussianBlur(rng.integers(0, 256, (96, 200)).astype(np.uint8), (0, 0), 1)
-        >>> x, y = np.meshgrid(np.arange(160, dtype=np.float32), np.arange(96, dtype=np.float32))
-        >>> first = cv2.remap(scene, x + 10 + y / 16, y, cv2.INTER_CUBIC)
-        >>> second = cv2.remap(scene, x + 20 + y * y / 600, y, cv2.INTER_CUBIC)
-        >>> pose = estimate_pose(first, second, focal_px=300)
-        >>> bool(pose.angle < 1), bool(pose.translation[0] < -0.99)
+        >>> scene = cv2.GaussianBlur(rng.integers(0, 256, (240, 360)).astype(np.uint8), (0, 0), 1)
+        >>> x, y = np.meshgrid(np.arange(320, dtype=np.float32), np.arange(240, dtype=np.float32))
+        >>> relief = np.float32(6 * np.sin(x / 40) * np.cos(y / 30))
+        >>> second = cv2.remap(scene, x + 20 + relief, y, cv2.INTER_CUBIC)
+        >>> pose = estimate_pose(scene[:, :320], second, focal_px=300)
+        >>> bool(pose.angle < 2), bool(pose.translation[0] < -0.9)
         (True, True)
     """
     check_model("fundamental", seed, GeometryOptions())
