@@ -61,7 +61,7 @@ MIN_OWN_FRACTION, MIN_OWN_RATIO = 0.02, 2.0
 """Of the explained places, those that a homography explains alone, and how many times those that
 its shifted copy explains alone."""
 
-MIN_ALIKE_FRACTION = 0.25
+MIN_EXPLAINED_FRACTION = 0.25
 """Of the places of sparse matches, those that a homography explains: of right ones that few places
 can confirm from 0.44 on, of two unrelated photographs none."""
 
@@ -135,7 +135,7 @@ def is_repeated(
         if len(gain) < MIN_COMPARED:
             # Descriptors that occur once are enough if what they match looks alike, and no place
             # contradicts them.
-            alike = np.mean(own > MIN_ZNCC) > MIN_ALIKE_FRACTION
+            alike = np.mean(own > MIN_ZNCC) > MIN_EXPLAINED_FRACTION
             least = 0 if distinct and alike and not other_alone else np.inf
         if alone < least:
             copy = scaled_homography(other, 1 / scale0, 1 / scale1)
