@@ -113,10 +113,7 @@ def reconstruct(
         (True, 'baseline')
     """
     check_model("fundamental", seed, GeometryOptions())
-    rgb = load_image(left, channels=channels), load_image(right, channels=channels)
-    grays = luma(rgb[0]), luma(rgb[1])
-    sizes = grays[0].shape[::-1], grays[1].shape[::-1]
-    known = _calibration(calibration, focal_px, (left, right), sizes)
+    rgb, grays, known = _load_pair((left, right), channels, calibration, focal_px)
     timer = StageTimer(progress)
     tentative = rectification = None
     if rectified is None:
@@ -159,7 +156,7 @@ def reconstruct(
         **made,
         colors=rgb[0][rows, columns],
         unit="baseline" if known.baseline_mm is None else "mm",
-        size=sizes[0],
+        size=grays[0].shape[::-1],
         rectified=rectified,
         rectification=rectification,
         calibration=known,
@@ -211,10 +208,7 @@ def estimate_pose(
         (True, True)
     """
     check_model("fundamental", seed, GeometryOptions())
-    rgb = load_image(first, channels=channels), load_image(second, channels=channels)
-    grays = luma(rgb[0]), luma(rgb[1])
-    sizes = grays[0].shape[::-1], grays[1].shape[::-1]
-    known = _calibration(calibration, focal_px, (first, second), sizes)
+    rgb, grays, known = _load_pair((first, second), channels, calibration, focal_px)
     timer = StageTimer(progress)
     with timer.stage("keypoints and matching"):
         matches = match_images(
@@ -322,6 +316,19 @@ def sor_inliers_on_grid(
     near = distances[accompanied]
     isolated = ~accompanied & (accompanied.mean() > 0.5)
     return (distances <= near.mean() + point_filter.sor_std_ratio * near.std() + 1e-6) & ~isolated
+
+
+def _load_pair(
+    images: tuple[Any, Any],
+    channels: Channels,
+    calibration: Calibration | str | Path | None,
+    focal_px: float | None,
+) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray], Calibration]:
+    """Return two images as RGB and as luma, and their calibration."""
+    rgb = load_image(images[0], channels=channels), load_image(images[1], channels=channels)
+    grays = luma(rgb[0]), luma(rgb[1])
+    sizes = grays[0].shape[::-1], grays[1].shape[::-1]
+    return rgb, grays, _calibration(calibration, focal_px, images, sizes)
 
 
 def _calibration(
