@@ -156,6 +156,7 @@ def test_each_number_is_done_once(count: int) -> None:
 
 
 def test_several_threads_work_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(machine, "processor_count", lambda: 3)
     together = threading.Barrier(3, timeout=20)
     waited: list[int] = []

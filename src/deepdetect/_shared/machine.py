@@ -177,7 +177,18 @@ def use_one_thread() -> None:
 
 
 def thread_limit() -> int | None:
-    """Return how many threads this process may use; None: one per processor."""
+    """Return how many threads this process may use, by OMP_NUM_THREADS too; None: a library's own.
+
+    ONNX Runtime's own are bound to processors, in every process to the same ones and also to those
+    that the process may not use: a process that is one of several is given a number.
+    """
+    from multiprocessing import parent_process
+
+    wished = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+    if _max_threads is None and wished.isdecimal() and int(wished):
+        return int(wished)
+    if _max_threads is None and (parent_process() or processor_count() < (os.cpu_count() or 1)):
+        return processor_count()
     return _max_threads
 
 
@@ -211,7 +222,7 @@ def parallel_for(count: int, work: Callable[..., object], *arguments: Any) -> No
     It should release the GIL, and its result must not depend on how the range is divided. In a
     worker of `map_in_processes` it is one thread.
     """
-    threads = min(_max_threads or processor_count(), count)
+    threads = min(thread_limit() or processor_count(), count)
     if threads <= 1:
         work(0, count, *arguments)
         return

@@ -10,6 +10,8 @@ from collections.abc import MutableMapping
 from types import ModuleType
 from typing import Any
 
+from .machine import thread_limit
+
 CPU = "CPUExecutionProvider"
 
 _import_lock = threading.Lock()
@@ -52,7 +54,7 @@ def _import_with(
 
 def start_session(
     model: str | bytes,
-    threads: int | None,
+    threads: int | None = None,
     provider: str = CPU,
     keep_memory: bool = True,
     spin: bool = True,
@@ -67,8 +69,7 @@ def start_session(
     settings.enable_cpu_mem_arena = settings.enable_mem_pattern = keep_memory
     if not spin:
         settings.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    if threads is not None:
-        settings.intra_op_num_threads = int(threads)
+    settings.intra_op_num_threads = int(threads or thread_limit() or 0)
     # Falling back to the CPU after a failure, it would print blocks of text.
     session = onnxruntime.InferenceSession(model, settings, providers=[provider], enable_fallback=0)
     session.disable_fallback()

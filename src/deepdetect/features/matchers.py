@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import OptionError, require_packages
-from .._shared.machine import parallel_for, thread_limit
+from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
 from .._shared.options import look_up
 from .._shared.runtimes import start_session
@@ -160,12 +160,12 @@ def _byte_product() -> tuple[Any, int]:
     The fastest instructions take signed bytes on one side. Processors without VNNI have others of
     the kind, whose sums saturate: they are given bytes without a sign.
     """
-    session = start_session(BYTE_PRODUCT, thread_limit(), spin=False)
+    session = start_session(BYTE_PRODUCT, spin=False)
     most = np.full((8, 64), 255, np.uint8), np.full((64, 64), 127, np.int8)
     if (session.run(None, dict(zip("ab", most, strict=True)))[0] == 64 * 255 * 127).all():
         return session, 128
     unsigned = BYTE_PRODUCT.replace(b"\x08\x03\x12", b"\x08\x02\x12")
-    return start_session(unsigned, thread_limit(), spin=False), 0
+    return start_session(unsigned, spin=False), 0
 
 
 def hamming_neighbours(

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import OptionError, WeightsError, first_line
-from ..._shared.machine import thread_limit
 from ..._shared.opencv import cv2
 from ..._shared.records import file_digest
 from ..._shared.runtimes import start_session
@@ -90,7 +89,7 @@ def descriptor_type(descriptor: str | Path) -> str:
 def _session(path: Path, content: str) -> Any:
     """Start a session of a file, once for each content that it has had."""
     try:
-        session = start_session(str(path), thread_limit())
+        session = start_session(str(path))
         names = [each.name for each in (*session.get_inputs(), *session.get_outputs())]
         if names != ["luma", "xy", "sizes", "descriptors"]:
             raise ValueError("it is no descriptor")
