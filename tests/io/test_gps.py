@@ -10,6 +10,7 @@ from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
 from deepdetect.io.gps import read_gps
+from deepdetect.io.metadata import Metadata
 
 XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description
  xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" {}/></x:xmpmeta>"""
@@ -19,7 +20,10 @@ def write_photograph(path: Path, tags: dict, xmp: str = "", orientation: int = 1
     exif = Image.Exif()
     exif[Base.Orientation] = orientation
     exif.get_ifd(IFD.GPSInfo).update(tags)
-    Image.new("RGB", (32, 24)).save(path, exif=exif, xmp=xmp.encode())
+    if path.suffix == ".tif":  # Pillow would write no place
+        Metadata(exif=exif).write_tiff(np.zeros((24, 32, 3), np.uint8), path)
+    else:
+        Image.new("RGB", (32, 24)).save(path, exif=exif, xmp=xmp.encode())
     return path
 
 
@@ -42,9 +46,10 @@ def place_tags(latitude: float, longitude: float, altitude: float | None = None)
     return tags
 
 
+@pytest.mark.parametrize("name", ["a.jpg", "a.tif", "a.png"])
 @pytest.mark.parametrize("place", [(55.6985, 13.1954, 37.0), (-33.9, -70.6, -4.5)])
-def test_a_fix_of_exif(tmp_path: Path, place: tuple[float, float, float]) -> None:
-    fix = read_gps(write_photograph(tmp_path / "a.jpg", place_tags(*place)))
+def test_a_fix_of_exif(tmp_path: Path, name: str, place: tuple[float, float, float]) -> None:
+    fix = read_gps(write_photograph(tmp_path / name, place_tags(*place)))
     assert fix is not None
     assert (fix.latitude, fix.longitude, fix.altitude) == pytest.approx(place, abs=1e-6)
     assert fix.gravity is None

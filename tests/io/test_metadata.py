@@ -152,8 +152,19 @@ def test_world_files_profiles_and_exif_are_kept(photo: np.ndarray, tmp_path: Pat
     save_picture(photo, tmp_path / "c.jpg", read_metadata(tmp_path / "a.png"))
     with Image.open(tmp_path / "c.jpg") as written:
         assert written.info["icc_profile"] == profile
-    expected, found = (camera_from_exif(tmp_path / n, (256, 256)) for n in ("a.png", "c.jpg"))
-    assert found == expected
+    read_metadata(tmp_path / "a.png").write_tiff(photo.astype(np.uint16), tmp_path / "c.tif")
+    with tifffile.TiffFile(tmp_path / "c.tif") as file:
+        assert file.pages.first.tags["Make"].value == "maker"
+        assert file.pages.first.tags["ExifTag"].value["FocalLengthIn35mmFilm"] == 28
+    read_metadata(tmp_path / "c.tif").write_tiff(photo, tmp_path / "d.tif")
+    for name in ("c.tif", "d.tif"):
+        with Image.open(tmp_path / name) as written:
+            assert written.getexif().get_ifd(IFD.GPSInfo) == {1: "N"}
+            assert written.getexif().get_ifd(IFD.Exif) == fine
+        np.testing.assert_array_equal(tifffile.imread(tmp_path / name), photo)
+    names = ("a.png", "c.jpg", "d.tif")
+    cameras = [camera_from_exif(tmp_path / name, (256, 256)) for name in names]
+    assert cameras[0] == cameras[1] == cameras[2]
 
 
 @pytest.mark.parametrize("point", [False, True])

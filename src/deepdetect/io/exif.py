@@ -90,9 +90,9 @@ def _tags(image: Any) -> tuple[dict[int, Any], int]:
             return {}, 1
         with open_image(image) as opened:
             exif = opened.getexif()
-        # HEIF images are turned when they are opened.
-        orientation = opened.info.get("original_orientation") or exif.get(Base.Orientation, 1)
-        return dict(exif.get_ifd(IFD.Exif)), int(orientation)
+            # HEIF images are turned when they are opened.
+            orientation = opened.info.get("original_orientation") or exif.get(Base.Orientation, 1)
+            return dict(exif.get_ifd(IFD.Exif)), int(orientation)
     except Exception:  # Pillow's readers raise many kinds; broken tags are ignored
         return {}, 1
 

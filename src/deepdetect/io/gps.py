@@ -46,7 +46,7 @@ def read_gps(path: Path) -> GpsFix | None:
     try:
         with open_image(path) as image:
             exif, xmp = image.getexif(), image.info.get("xmp") or b""
-        tags = dict(exif.get_ifd(IFD.GPSInfo))
+            tags = dict(exif.get_ifd(IFD.GPSInfo))
         orientation = exif.get(Base.Orientation, 1)
     except Exception:  # Pillow's readers raise many kinds; broken tags are ignored
         return None

@@ -5,12 +5,14 @@ Where it lies on the Earth (GeoTIFF 1.1, or a world file), its colour profile, a
 
 from __future__ import annotations
 
+import struct
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from .._shared.atomic import atomic_path
@@ -26,6 +28,18 @@ RASTER_TYPE_KEY, POINT = 1025, 2
 """Of the directory: whether whole coordinates are corners of pixels, or their centres."""
 
 ICC_PROFILE = 34675
+
+EXIF_TEXTS = (
+    Base.ImageDescription,
+    Base.Make,
+    Base.Model,
+    Base.Software,
+    Base.DateTime,
+    Base.Artist,
+    Base.Copyright,
+)
+EXIF_DIRECTORIES = (IFD.Exif, IFD.GPSInfo)
+"""What EXIF says beside how pixels are stored."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,19 +84,25 @@ class Metadata:
     def encode(self, rgb: np.ndarray, suffix: str, settings: list[int]) -> bytes:
         """Return a PNG or JPEG file of an (H, W, 3) RGB image."""
         parts = {cv2.IMAGE_METADATA_ICCP: self.profile}
-        if self.exif:
-            height, width = rgb.shape[:2]
-            fine = self.exif.get_ifd(IFD.Exif)
-            size = fine.get(Base.ExifImageWidth), fine.get(Base.ExifImageHeight)
-            if size != (width, height):  # the equivalent is that of the whole frame
-                fine.pop(Base.FocalLengthIn35mmFilm, None)
-            fine |= {Base.ExifImageWidth: width, Base.ExifImageHeight: height}
-            self.exif[Base.Orientation] = 1  # upright
-            parts[cv2.IMAGE_METADATA_EXIF] = self.exif.tobytes().removeprefix(b"Exif\0\0")
+        if exif := self._exif_of(rgb):
+            parts[cv2.IMAGE_METADATA_EXIF] = exif.tobytes().removeprefix(b"Exif\0\0")
         kept = {kind: np.frombuffer(part, np.uint8) for kind, part in parts.items() if part}
         bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
         _, data = cv2.imencodeWithMetadata(suffix, bgr, [*kept], [*kept.values()], settings)
         return data.tobytes()
+
+    def _exif_of(self, picture: np.ndarray) -> Any:
+        """Return the EXIF of an upright picture of another size; or None."""
+        if not self.exif:
+            return None
+        height, width = picture.shape[:2]
+        fine = self.exif.get_ifd(IFD.Exif)
+        size = fine.get(Base.ExifImageWidth), fine.get(Base.ExifImageHeight)
+        if size != (width, height):  # the equivalent is that of the whole frame
+            fine.pop(Base.FocalLengthIn35mmFilm, None)
+        fine |= {Base.ExifImageWidth: width, Base.ExifImageHeight: height}
+        self.exif[Base.Orientation] = 1
+        return self.exif
 
     def write_tiff(self, bands: np.ndarray, path: Path) -> None:
         """Write an (H, W) or (H, W, C) image of any type as TIFF, whole or not at all."""
@@ -100,6 +120,13 @@ class Metadata:
                 tags.append((TRANSFORMATION, "d", 16, tuple(whole.ravel()), True))
         if self.no_data is not None:
             tags.append((NO_DATA, "s", 0, f"{self.no_data:.17g}", True))
+        exif = self._exif_of(bands)
+        texts = {code: exif[code] for code in EXIF_TEXTS if code in exif} if exif else {}
+        tags += [(code, "s", 0, str(text), True) for code, text in texts.items()]
+        directories = {code: exif.get_ifd(code) for code in EXIF_DIRECTORIES} if exif else {}
+        directories = {code: values for code, values in directories.items() if values}
+        # Pointers, which tifffile does not write: they are made of the tags of the codes before.
+        tags += [(code - 1, "I", 1, 0, True) for code in directories]
         bands = bands[:, :, 0] if bands.shape[2:] == (1,) else bands
         colour = bands.shape[2:] == (3,) and bands.dtype in (np.uint8, np.uint16)
         with atomic_path(path) as temporary:
@@ -111,8 +138,29 @@ class Metadata:
                 compression="zlib",
                 iccprofile=self.profile,
                 metadata=None,
+                software=False,
                 extratags=tags,
             )
+            for code, values in directories.items():
+                _append_directory(temporary, code, values)
+
+
+def _append_directory(path: Path, code: int, values: dict[int, Any]) -> None:
+    """Append a directory of EXIF to a TIFF file, whose tag `code - 1` becomes the pointer to it."""
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+    from tifffile import TiffFile
+
+    with TiffFile(path, mode="r+") as tiff:
+        pointer, file = tiff.pages.first.tags[code - 1], tiff.filehandle
+        directory = ImageFileDirectory_v2(prefix=b"II" if tiff.byteorder == "<" else b"MM")
+        directory.update(values)
+        place = file.seek(0, 2)
+        place += place % 2
+        file.seek(place)
+        file.write(directory.tobytes(place))
+        pointer.overwrite(place)
+        file.seek(pointer.offset)
+        file.write(struct.pack(tiff.byteorder + "H", code))
 
 
 def read_metadata(source: Any) -> Metadata:
@@ -127,8 +175,8 @@ def read_metadata(source: Any) -> Metadata:
     with suppress(Exception), open_image(source) as image:  # raw photographs and others have none
         found = replace(found, profile=found.profile or image.info.get("icc_profile"))
         exif = image.getexif()
-        if image.format != "TIFF" and len(exif):
-            found = replace(found, exif=exif)
+        kept = _kept_exif(exif) if image.format == "TIFF" else exif
+        found = replace(found, exif=kept if len(kept) else None)
         if exif.get(Base.Orientation, 1) != 1:  # the place is of it as it is stored
             return replace(found, to_world=None, keys=())
     if path is not None and found.to_world is None:
@@ -140,6 +188,16 @@ def read_metadata(source: Any) -> Metadata:
         with suppress(OSError):
             found = replace(found, projection=path.with_suffix(".prj").read_bytes())
     return found
+
+
+def _kept_exif(exif: Any) -> Any:
+    """Return what a TIFF file's tags say beside how its pixels are stored."""
+    kept = Image.Exif()
+    kept.update({code: exif[code] for code in EXIF_TEXTS if code in exif})
+    for code in set(EXIF_DIRECTORIES).intersection(exif):
+        kept.get_ifd(code).update(exif.get_ifd(code))
+        kept[code] = 0  # a pointer, set when it is written
+    return kept
 
 
 def _of_tiff(file: Any) -> Metadata:
