@@ -3,7 +3,7 @@
     python benchmarks/published_pipeline.py DATA [--geometry-weights dense] [--rounds 5]
 
 DATA holds oxford/ and middlebury/. End to end, from two images in memory to the count of correct
-matches (wall 1-6, graf 1-3, cones). `deepdetect benchmark middlebury` has both pipelines' points.
+matches (wall 1-6, graf 1-3, cones). `deepdetect dev benchmark middlebury` has the points of both.
 
 Published: torch without compilation, lists of `cv2.KeyPoint`, OpenCV's SIFT, FLANN, loops in
 Python. Ours: the default backend, dense RootSIFT, patchmatch, descriptors alone. Both sides run the

@@ -30,7 +30,7 @@ ROOT = Path(__file__).parents[1]
 RESULTS_FOLDER = ROOT / "docs" / "results"
 BLOCK = re.compile(r"(<!-- results:([\w-]+)(?: ([^\n]*?))? -->\n).*?(<!-- /results -->)", re.DOTALL)
 
-BENCHMARK = "-m deepdetect benchmark {} --data {{data}} -o {{output}}"
+BENCHMARK = "-m deepdetect dev benchmark {} --data {{data}} -o {{output}}"
 PEERS = ("xfeat_2048_600x800", "edgepoint2_t32", "edgepoint2_e64")
 XFEAT, _, E64 = (f" --method {{published}}/peers/{name}.onnx" for name in PEERS)
 PAGES = [
@@ -58,12 +58,12 @@ STAGES = {
             "sfm": "sfm",
         }.items()
     },
-    "label-prediction": "-m deepdetect evaluate {data}/label-samples/val --json --scale 0.5 "
+    "label-prediction": "-m deepdetect dev evaluate {data}/label-samples/val --json --scale 0.5 "
     "--scale 2 --compare espnet --compare free "
     "--compare {published}/published_matching.safetensors",
     "validation": "benchmarks/validation_photographs.py {data}/photos/val --weights default "
     "--weights espnet",
-    "labels-stereo": "-m deepdetect evaluate-stereo {data}/middlebury/cones "
+    "labels-stereo": "-m deepdetect dev evaluate-stereo {data}/middlebury/cones "
     "{data}/middlebury/teddy --label-settings paper --label-settings dense --weights default "
     "--weights dense",
     "disparity": "benchmarks/row_matching.py {data}/middlebury",
@@ -333,7 +333,7 @@ def run_stage(stage: str, data: Path, published: Path | None, work: Path) -> Non
 
 
 def evaluated(text: str) -> list[dict[str, Any]]:
-    """Return the rows of what `deepdetect evaluate --json` prints, one for each of the weights."""
+    """Return the rows of what `deepdetect dev evaluate --json` prints, one for each weights."""
     report = json.loads(text)
     rows = []
     for of in (report, *report["compare"]):

@@ -61,7 +61,7 @@ COMMANDS = {
     ),
     "benchmark": Command(
         (
-            *("benchmark", "foreground", "--data", "DATA", "-o", "OUT"),
+            *("dev", "benchmark", "foreground", "--data", "DATA", "-o", "OUT"),
             *("--baselines", "fast,harris,sift,orb"),
         ),
         ("tables/*.csv",),

@@ -199,7 +199,7 @@ def one_line() -> Callable[[BaseException], str]:
 
 @pytest.fixture
 def run_evaluate(tmp_path: Path) -> Callable[..., str]:
-    """Run `deepdetect evaluate` on one sample and return what it prints."""
+    """Run `deepdetect dev evaluate` on one sample and return what it prints."""
     from PIL import Image
 
     from deepdetect.detector.pretrained import pretrained_weights
@@ -213,7 +213,7 @@ def run_evaluate(tmp_path: Path) -> Callable[..., str]:
 
     def run(*arguments: object) -> str:
         given = [pretrained_weights() if str(a).endswith(".onnx") else a for a in arguments]
-        result = run_command(["evaluate", str(tmp_path), *map(str, given)])
+        result = run_command(["dev", "evaluate", str(tmp_path), *map(str, given)])
         assert result.exit_code == 0, result.output
         return result.stdout
 

@@ -64,8 +64,8 @@ def test_commands_have_these_flags(page: str) -> None:
     for part in code(PRESENT[page]):
         for name, rest in re.findall(r"(?<!from )\bdeepdetect ([a-z][a-z-]+)\b([^#|]*)", part):
             command = make_app()[name]
-            word = rest.split()[0] if rest.split() else ""
-            command = command[word] if word in command and word[0] != "-" else command
+            for word in re.findall(r"[a-z][a-z-]+", rest.partition("--")[0])[:2]:
+                command = command[word] if word in command else command  # noqa: SIM401
             flags = {flag for each in command.assemble_argument_collection() for flag in each.names}
             assert set(re.findall(r"(?<!\S)--[\w-]+", rest)) <= flags | {"--help", "--help-all"}, (
                 name,

@@ -1,4 +1,4 @@
-"""Nothing but `deepdetect datasets get` asks for the network."""
+"""Nothing but `deepdetect dev datasets get` asks for the network."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ python docs/figures/day_dark_blurred.py motion-9  # another degradation, to thre
 
 The photographs are the Motorcycle pair of Middlebury 2014 (Scharstein et al., GCPR 2014; free to
 use and publish with citation), which comes with scikit-image. Darkness and blur are those of
-`deepdetect benchmark --protocol degraded`; the numbers are counted here, by the true disparity.
+`deepdetect dev benchmark --protocol degraded`; the numbers are counted here, by the true disparity.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from deepdetect.detector.pretrained import pretrained_weights
 
 @pytest.mark.slow
 def test_the_mean_is_written_as_safetensors_and_onnx(run, tmp_path: Path, photo) -> None:
-    result = run("average", "default", "default", "dense", "-o", tmp_path, "--json")
+    result = run("dev", "average", "default", "default", "dense", "-o", tmp_path, "--json")
     assert result.exit_code == 0, result.output
     files = json.loads(result.output)
     parts = [pretrained_weights(name, ".safetensors") for name in ("default", "dense")]
@@ -40,14 +40,14 @@ def test_the_mean_is_written_as_safetensors_and_onnx(run, tmp_path: Path, photo)
 
 @pytest.mark.slow
 def test_the_mean_of_equals_is_the_same(run, tmp_path: Path) -> None:
-    assert run("average", "default", "default", "-o", tmp_path).exit_code == 0
+    assert run("dev", "average", "default", "default", "-o", tmp_path).exit_code == 0
     own = load_network(pretrained_weights("default", ".safetensors"))
     assert weights_digest(load_network(tmp_path / "best.safetensors")) == weights_digest(own)
 
 
 @pytest.mark.parametrize("words", [["default"], ["default", "matchin"], ["default", "no.onnx"]])
 def test_a_mistake_ends_with_exit_code_2_and_leaves_nothing(run, tmp_path: Path, words) -> None:
-    result = run("average", *words, "-o", tmp_path / "out")
+    result = run("dev", "average", *words, "-o", tmp_path / "out")
     assert result.exit_code == 2
     assert not (tmp_path / "out").exists()
 
@@ -62,11 +62,11 @@ def test_files_of_another_run_are_not_written_over(run, tmp_path: Path) -> None:
         ((trained, "dense"), "would replace an input"),
         (("default", "dense"), "best.safetensors exists"),
     ):
-        result = run("average", *words, "-o", folder)
+        result = run("dev", "average", *words, "-o", folder)
         assert result.exit_code == 2
         assert message in result.stderr
         assert len(result.stderr.splitlines()) == 1
         assert [path.name for path in folder.iterdir()] == ["best.safetensors"]
         assert trained.read_bytes() == before
-    assert run("average", "default", "dense", "-o", folder, "--overwrite").exit_code == 0
+    assert run("dev", "average", "default", "dense", "-o", folder, "--overwrite").exit_code == 0
     assert trained.read_bytes() != before

@@ -30,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def made(folder: Path, tmp_path_factory: pytest.TempPathFactory):
     """The first run, whose results the others find."""
     output = tmp_path_factory.mktemp("output")
-    arguments = ["benchmark", "foreground", "--data", str(folder), "-o", str(output)]
+    arguments = ["dev", "benchmark", "foreground", "--data", str(folder), "-o", str(output)]
     result = run_command([*arguments, "--baselines", "fast, harris"])
     assert result.exit_code == 0, result.output
     return result, output
@@ -57,7 +57,17 @@ def test_the_report_is_written_and_printed(made, folder: Path) -> None:
 def test_json_can_be_parsed_and_names_the_files(made, folder: Path, run) -> None:
     _, output = made
     result = run(
-        *("benchmark", "foreground", "--data", folder, "-o", "out", "--baselines", "fast,harris"),
+        *(
+            "dev",
+            "benchmark",
+            "foreground",
+            "--data",
+            folder,
+            "-o",
+            "out",
+            "--baselines",
+            "fast,harris",
+        ),
         *("--cache", output / "cache", "--json"),
     )
     assert result.exit_code == 0, result.output
@@ -77,7 +87,7 @@ def test_a_further_method_is_one_more_row_and_the_rest_is_found(made, folder: Pa
         "def find(rgb):\n    return {'keypoints': [[1, 1], [70, 1]], 'scores': [1, 1]}\n"
     )
     result = run(
-        *("benchmark", "foreground", "--data", folder / "foreground", "-o", "out"),
+        *("dev", "benchmark", "foreground", "--data", folder / "foreground", "-o", "out"),
         *("--baselines", "fast", "--method", "own_corner_finder:find", "--method", "agast"),
         *("--cache", output / "cache", "--json"),
     )
@@ -93,7 +103,7 @@ def test_what_fails_is_listed_and_the_rest_is_there(made, folder: Path, run) -> 
     _, output = made
     Path("never_works.py").write_text("def find(rgb):\n    raise ValueError('not today')\n")
     arguments = (
-        *("benchmark", "foreground", "--data", folder, "-o", "out", "--baselines", "fast"),
+        *("dev", "benchmark", "foreground", "--data", folder, "-o", "out", "--baselines", "fast"),
         *("--cache", output / "cache", "--method", "never_works:find"),
     )
     result = run(*arguments)
@@ -125,7 +135,7 @@ def test_what_fails_is_listed_and_the_rest_is_there(made, folder: Path, run) -> 
 def test_a_wrong_name_ends_with_one_line_and_exit_code_2(
     run, folder: Path, arguments: str, hint: str
 ) -> None:
-    result = run("benchmark", *arguments.split(), "--data", folder, "-o", "out")
+    result = run("dev", "benchmark", *arguments.split(), "--data", folder, "-o", "out")
     assert result.exit_code == 2, result.output
     message = result.stderr.strip()
     assert message.startswith("deepdetect: ")

@@ -8,12 +8,12 @@ pytest.importorskip("requests", reason="needs requests (pip install '.[data]')")
 
 
 def test_list_names_size_and_licence(run) -> None:
-    result = run("datasets", "list")
+    result = run("dev", "datasets", "list")
     assert result.exit_code == 0
     assert "coco" in result.output
     assert "19,336,861,798" in result.output
     assert "licence" in result.output
-    entries = {e["name"]: e for e in json.loads(run("datasets", "list", "--json").output)}
+    entries = {e["name"]: e for e in json.loads(run("dev", "datasets", "list", "--json").output)}
     names = {"coco", "photographs", "photographs-free", "oxford", "hpatches", "middlebury"}
     assert set(entries) == names
     assert entries["coco"]["images"] == 118_287
@@ -29,12 +29,12 @@ def test_get_reports_what_it_has_written(run, tmp_path, monkeypatch: pytest.Monk
         return folder
 
     monkeypatch.setattr("deepdetect.cli.datasets.get_dataset", fake)
-    result = run("datasets", "get", "coco", "--json")
+    result = run("dev", "datasets", "get", "coco", "--json")
     assert json.loads(result.output)["images"] == 1
     assert (tmp_path / "data" / "coco" / "a.png").exists()
 
 
 def test_an_unknown_name_ends_with_exit_code_2(run) -> None:
-    result = run("datasets", "get", "kodak")
+    result = run("dev", "datasets", "get", "kodak")
     assert result.exit_code == 2
     assert "known: coco" in result.output

@@ -19,6 +19,7 @@ def test_the_command_prints_a_row_for_each(photo: np.ndarray, tmp_path: Path) ->
     truth = {"file": "disparity.png", "value_per_pixel": 4, "unknown": 0}
     (tmp_path / "calib.json").write_text(json.dumps({"ground_truth": truth}))
     arguments = [
+        "dev",
         "evaluate-stereo",
         str(tmp_path),
         "--label-settings",
@@ -44,6 +45,6 @@ def test_the_command_prints_a_row_for_each(photo: np.ndarray, tmp_path: Path) ->
 
 def test_scenes_none_of_which_can_be_read(tmp_path: Path) -> None:
     gone = [str(tmp_path / name) for name in ("first", "second")]
-    result = run_command(["evaluate-stereo", *gone])
+    result = run_command(["dev", "evaluate-stereo", *gone])
     assert result.exit_code == 2, result.output
     assert all(name in result.stderr for name in gone)

@@ -7,20 +7,23 @@ from pathlib import Path
 
 import pytest
 
-from deepdetect.cli._app import COMMANDS, make_app, with_flags
+from deepdetect.cli._app import COMMANDS, DEVELOPMENT, make_app, with_flags
 from tests.command_line import run_command
 
+PARTS = {"export": ("colmap", "hloc", "onnx"), "datasets": ("list", "get"), "dev": ()}
 WORDS = [
-    [name, *([part] if part else [])]
-    for group in COMMANDS.values()
+    [*before, name, *([part] if part else [])]
+    for before, groups in (([], COMMANDS), (["dev"], DEVELOPMENT))
+    for group in groups.values()
     for name in group
-    for part in {"export": ("colmap", "hloc", "onnx"), "datasets": ("list", "get")}.get(name, ("",))
+    for part in PARTS.get(name, ("",))
 ]
 
 
-def test_help_names_every_command() -> None:
-    text = run_command(["--help"]).stdout
-    for name in (name for group in COMMANDS.values() for name in group):
+@pytest.mark.parametrize(("before", "groups"), [([], COMMANDS), (["dev"], DEVELOPMENT)])
+def test_help_names_every_command(before: list[str], groups: dict) -> None:
+    text = run_command([*before, "--help"]).stdout
+    for name in (name for group in groups.values() for name in group):
         assert re.search(rf"^. {name} ", text, re.M)
 
 
@@ -66,8 +69,8 @@ def test_errors_name_flags_instead_of_parameters(message: str, expected: str | N
 @pytest.mark.parametrize(
     ("arguments", "right"),
     [
-        ("benchmark oxford --data x --baselnes sift", "--baselines"),
-        ("evaluate samples --comparee other.onnx", "--compare"),
+        ("dev benchmark oxford --data x --baselnes sift", "--baselines"),
+        ("dev evaluate samples --comparee other.onnx", "--compare"),
         ("detect photo.jpg --max-keypiont 3", "--max-keypoints"),
         ("detect photo.jpg --detector point", "points"),
         ("detec photo.jpg", "detect"),
@@ -86,8 +89,8 @@ def test_what_is_misspelt_names_the_right_word(arguments: str, right: str) -> No
     [
         "detect a --json b",
         "stitch a -o p.jpg b",
-        "average a --output out b",
-        "evaluate-stereo a --weights dense b",
+        "dev average a --output out b",
+        "dev evaluate-stereo a --weights dense b",
         "export hloc a --overwrite b",
     ],
 )

@@ -1,4 +1,4 @@
-"""`deepdetect train` and `deepdetect shards`: options, output, and errors in terms of flags."""
+"""`deepdetect train` and `deepdetect dev shards`: options, output, and errors in terms of flags."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_train_and_shards(run, images: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fixed = ["--short-side", "64", "--detectors", "fast", "--workers", "1"]
-    packed = run("shards", images, "-o", "packed", "--shard-size", "3", *fixed, "--json")
+    packed = run("dev", "shards", images, "-o", "packed", "--shard-size", "3", *fixed, "--json")
     assert packed.exit_code == 0, packed.output
     values = json.loads(packed.stdout)
     assert (values["training"], values["validation"]) == (5, 1)

@@ -45,7 +45,7 @@ def test_weights_tell_where_they_come_from(name: str) -> None:
     # No weights that have seen other photographs stand behind those of free licences.
     assert name != "free" or (not means and not any(" --init" in one["command"] for one in runs))
     for mean in means:
-        assert mean["command"].startswith("deepdetect average ")
+        assert mean["command"].startswith("deepdetect dev average ")
     for run in runs:
         assert run["command"].startswith(("deepdetect train ", "python benchmarks/fast_network/"))
         for word in ("photographs_digest", "versions", "machine", "start", "point"):

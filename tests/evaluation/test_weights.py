@@ -234,7 +234,7 @@ def test_samples_that_cannot_be_read_are_listed_and_not_scored(
     assert [score.images for score in found.masks.values()] == [1]
     assert found.masks["normal"].loss == pytest.approx(whole.masks["normal"].loss)
     assert len(found.failures) == 2
-    result = run_command(["evaluate", str(tmp_path)])
+    result = run_command(["dev", "evaluate", str(tmp_path)])
     assert result.exit_code == 1
     assert "normal" in result.stdout
     *_, told, first, second = result.stderr.splitlines()
@@ -242,7 +242,7 @@ def test_samples_that_cannot_be_read_are_listed_and_not_scored(
     assert "image_a.png" in first
     assert "mask_image_b.png" in second
     (tmp_path / "image_c.png").unlink()
-    assert run_command(["evaluate", str(tmp_path)]).exit_code == 2
+    assert run_command(["dev", "evaluate", str(tmp_path)]).exit_code == 2
 
 
 def test_damaged_photographs_do_not_end_the_measurement_of_the_others(
@@ -271,7 +271,7 @@ def test_damaged_photographs_do_not_end_the_measurement_of_the_others(
         f"foreground of the weights on {name}.png" for name in "ab"
     ]
     run_evaluate()  # writes a sample
-    result = run_command(["evaluate", str(tmp_path), "--foreground", str(photographs)])
+    result = run_command(["dev", "evaluate", str(tmp_path), "--foreground", str(photographs)])
     assert result.exit_code == 1
     assert "foreground: fraction" in result.stdout
     assert "2 of the parts failed, the others are done" in result.stderr
@@ -291,9 +291,9 @@ def test_probabilities_are_calibrated_against_masks_and_labels(tmp_path: Path, p
     assert found.masks == {}
     (score,) = found.scales.values()
     assert 0 < score.calibration_error < 0.2
-    result = run_command(["evaluate", str(tmp_path), "--scale", "0.5", "--json"])
+    result = run_command(["dev", "evaluate", str(tmp_path), "--scale", "0.5", "--json"])
     (told,) = json.loads(result.stdout)["scales"]
     assert told["calibration_error"] == score.calibration_error
     assert told["label_density"] == score.label_density
-    refused = run_command(["evaluate", str(tmp_path)])
+    refused = run_command(["dev", "evaluate", str(tmp_path)])
     assert "there are no samples in" in refused.output

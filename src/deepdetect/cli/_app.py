@@ -47,6 +47,7 @@ COMMANDS = {
         "match-many": ("features", "matches of many pairs of images"),
         "track": ("track", "points followed through a video"),
         "export": ("export", "files for other programs"),
+        "view": ("view", "a result in the browser"),
     },
     "DeepDetect itself": {
         "app": ("app", "a page in the browser, on this computer"),
@@ -54,20 +55,27 @@ COMMANDS = {
         "doctor": ("doctor", "check the installation, and say what to do about it"),
         "completion": ("_app", "completion of commands and options by Tab"),
     },
-    "Development": {
-        "datasets": ("datasets", "download data sets"),
+    "Training": {
         "label": ("train", "training masks from nine classical detectors"),
-        "shards": ("train", "pack images for training on large sets"),
         "train": ("train", "train the network on images"),
-        "train-points": ("train", "train the ranker of keypoints on images"),
         "train-descriptor": ("train", "train the learned descriptor of keypoints on images"),
-        "average": ("train", "the mean of several weights"),
-        "evaluate": ("evaluate", "how good weights are"),
-        "evaluate-stereo": ("evaluate", "correct stereo matches of weights and of label settings"),
-        "benchmark": ("evaluate", "the tables and figures of the paper, with baselines"),
+        "dev": ("_app", "commands of development: benchmarks, data sets, weights"),
     },
 }
-"""All commands by their group, with the module of the function or group, and what they do."""
+DEVELOPMENT = {
+    "Measuring": {
+        "datasets": ("datasets", "download data sets"),
+        "benchmark": ("evaluate", "the tables and figures of the paper, with baselines"),
+        "evaluate": ("evaluate", "how good weights are"),
+        "evaluate-stereo": ("evaluate", "correct stereo matches of weights and of label settings"),
+    },
+    "Weights": {
+        "shards": ("train", "pack images for training on large sets"),
+        "train-points": ("train", "train the ranker of keypoints on images"),
+        "average": ("train", "the mean of several weights"),
+    },
+}
+"""All commands, and those after `dev`, by their group: the function's module, and what it does."""
 
 
 class HelpFormatter(DefaultFormatter):
@@ -103,12 +111,18 @@ def make_app(summaries: bool = False) -> App:
         # Of an option that is repeated the last one counts.
         default_parameter=Parameter(allow_repeating=True, negative_iterable=()),
     )
-    for title, commands in COMMANDS.items():
-        group = Group.create_ordered(title)
-        for number, (name, (module, does)) in enumerate(commands.items()):
-            path = f"{__package__}.{module}:{name.replace('-', '_')}"
-            shown: dict[str, Any] = {"help": does, "group": group, "sort_key": number}
-            app.command(path, name=name, **(shown if summaries else {}))
+    dev = App("dev", help="Benchmarks, data sets, and what else makes DeepDetect itself.")
+    for parent, groups in ((app, COMMANDS), (dev, DEVELOPMENT)):
+        for title, commands in groups.items():
+            group = Group.create_ordered(title)
+            for number, (name, (module, does)) in enumerate(commands.items()):
+                if name == "dev":
+                    dev.group, dev.sort_key = group, number
+                    app.command(dev)
+                    continue
+                path = f"{__package__}.{module}:{name.replace('-', '_')}"
+                shown: dict[str, Any] = {"help": does, "group": group, "sort_key": number}
+                parent.command(path, name=name, **(shown if summaries else {}))
     return app
 
 
@@ -167,8 +181,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _call(words: Sequence[str]) -> int:
-    modules = {name: module for group in COMMANDS.values() for name, (module, _) in group.items()}
-    module = modules.get(words[0]) if words else None
+    groups = DEVELOPMENT if words[:1] == ["dev"] else COMMANDS
+    modules = {name: module for group in groups.values() for name, (module, _) in group.items()}
+    module = modules.get(next((word for word in words if word != "dev"), ""))
     if module is not None:
         importlib.import_module(f".{module}", __package__)  # with its own errors
     FORMATTER.shows_all = "--help-all" in words

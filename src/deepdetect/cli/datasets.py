@@ -1,4 +1,4 @@
-"""`deepdetect datasets`: data sets on the web."""
+"""`deepdetect dev datasets`: data sets on the web."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ def get(
 
     Run it again to resume a download that broke off.
 
-        deepdetect datasets get coco
+        deepdetect dev datasets get coco
         deepdetect train --preset paper data/coco -o run
-        deepdetect datasets get oxford
-        deepdetect benchmark oxford --data data -o report
+        deepdetect dev datasets get oxford
+        deepdetect dev benchmark oxford --data data -o report
 
     Args:
         output: Folder for the images.  [default: data/NAME]

@@ -1,4 +1,4 @@
-"""`deepdetect evaluate`, `evaluate-stereo`, `benchmark` and `demo`: what weights are worth."""
+"""`deepdetect dev evaluate`, `evaluate-stereo`, `benchmark` and `demo`: what weights are worth."""
 
 from __future__ import annotations
 
@@ -59,9 +59,9 @@ def evaluate(
     separately for normal and for low-visibility images; with --oxford also what the paper's
     protocol gives. What cannot be read or measured is listed at the end, and in no score.
 
-        deepdetect evaluate samples/ --weights run/deepdetect.onnx --compare other.onnx
-        deepdetect evaluate photos/ --scale 0.5 --scale 1 --scale 2
-        deepdetect evaluate samples/ --oxford oxford/ --equal-density --compare other.onnx
+        deepdetect dev evaluate samples/ --weights run/deepdetect.onnx --compare other.onnx
+        deepdetect dev evaluate photos/ --scale 0.5 --scale 1 --scale 2
+        deepdetect dev evaluate samples/ --oxford oxford/ --equal-density --compare other.onnx
 
     Args:
         compare: Evaluate these weights too, beside the first; may be repeated.
@@ -135,8 +135,8 @@ def evaluate_stereo(
     Matching uses neither the rows nor the truth; a match is correct within 1 px. Random points of
     the same density and all pixels are the baselines.
 
-        deepdetect evaluate-stereo cones/ teddy/ --weights default --weights dense
-        deepdetect evaluate-stereo cones/ teddy/ --label-settings paper --label-settings mine.toml
+        deepdetect dev evaluate-stereo cones/ teddy/ --weights default --weights dense
+        deepdetect dev evaluate-stereo cones/ teddy/ --label-settings mine.toml
 
     Args:
         weights: default, dense, free or espnet, the pretrained weights, or a file; may be repeated.
@@ -182,9 +182,9 @@ def benchmark(
 
     A second run does only what is new. What cannot be measured is listed at the end (exit code 1).
 
-        deepdetect benchmark oxford --data data --max-pairs 1 --baselines sift -o quick
-        deepdetect benchmark oxford --data data -o report --method xfeat.onnx
-        deepdetect benchmark sfm --data data/fountain -o report
+        deepdetect dev benchmark oxford --data data --max-pairs 1 --baselines sift -o quick
+        deepdetect dev benchmark oxford --data data -o report --method xfeat.onnx
+        deepdetect dev benchmark sfm --data data/fountain -o report
 
     Args:
         data: Folder of the data sets.

@@ -179,7 +179,7 @@ def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli
     best.npz (the weights of the highest validation score), MODEL_CARD.md, curves.csv, curves.png
     and checkpoint.safetensors. An interrupted run resumes when the same command is given again.
 
-        deepdetect train-points photos/train --validation photos/val -o run
+        deepdetect dev train-points photos/train --validation photos/val -o run
 
     Args:
         output: Folder of the run.
@@ -217,7 +217,7 @@ def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Resul
     slow disk or a network. Give both commands the same options. When it is interrupted, the same
     command resumes.
 
-        deepdetect shards --preset paper data/coco -o data/shards
+        deepdetect dev shards --preset paper data/coco -o data/shards
         deepdetect train --preset paper data/shards -o run
 
     Args:
@@ -309,8 +309,8 @@ def average(
     The mean of runs that continue each other is often better than each of them. Files of another
     run are replaced with --overwrite only.
 
-        deepdetect average first/best.safetensors second/best.safetensors -o mean
-        deepdetect evaluate samples/ --weights mean/deepdetect.onnx
+        deepdetect dev average first/best.safetensors second/best.safetensors -o mean
+        deepdetect dev evaluate samples/ --weights mean/deepdetect.onnx
 
     Args:
         output: Folder for both files.

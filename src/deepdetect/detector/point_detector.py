@@ -38,8 +38,8 @@ class PointDetector:
             that are as far from each other as their number allows.
         resolution: "auto" (the image as it is up to two megapixels, larger ones scaled down to
             that) or "native" (always as it is).
-        ranker: npz file of `deepdetect train-points` that ranks the points. None: the one inside
-            the package.
+        ranker: npz file of `deepdetect dev train-points` that ranks the points. None: the one
+            inside the package.
         descriptor: of `extract`: "learned", by a small network that sees the surroundings of a
             keypoint, too; "learned-free", by one that was trained on photographs under free
             licences alone; "cross-modal", for images of different sensors, such as infrared and

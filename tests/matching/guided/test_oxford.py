@@ -22,7 +22,7 @@ BARS = {
     ("ubc", 6): (0.90, 0.93),
     ("bark", 6): (0.85, 0.97),
 }
-"""Share of the ceiling, and precision; of all nine: `deepdetect benchmark --protocol guided`."""
+"""Share of the ceiling, and precision; of all nine: `dev benchmark --protocol guided`."""
 
 
 @pytest.mark.parametrize(("scene", "number"), BARS)

@@ -51,7 +51,7 @@ class Ranker:
 
 
 def load_ranker(path: Path = RANKER) -> Ranker:
-    """Load an npz file, as `deepdetect train-points` writes it."""
+    """Load an npz file, as `deepdetect dev train-points` writes it."""
     if not path.is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")
     try:

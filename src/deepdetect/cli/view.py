@@ -1,0 +1,59 @@
+"""`deepdetect view`: results in a browser."""
+
+from __future__ import annotations
+
+import tempfile
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from .._shared.errors import MissingFileError, OptionError
+from ..io.image import load_image
+from ..io.tables import load_keypoints, load_matches
+from ..viz.draw import save_picture
+from . import _options as cli
+
+SHOWN = (".html", ".jpg", ".jpeg", ".png", ".webp", ".gif", ".svg", ".pdf")
+"""What browsers show as it is."""
+
+
+@cli.command()
+def view(
+    file: Annotated[Path, Parameter(help="What another command has written.")],
+    /,
+    *images: Annotated[Path, Parameter(help="Images of keypoints (one) or of matches (two).")],
+) -> cli.Result:
+    """Show a result in the browser.
+
+    Pages and pictures are shown as they are, a point cloud or depth map by the page or picture of
+    its name beside it. Keypoints and matches are drawn on their images.
+
+        deepdetect view model.ply
+        deepdetect view left.npz left.png
+        deepdetect view left_right.npz left.png right.png
+    """
+    if not file.is_file():
+        raise MissingFileError(
+            f"there is no file {file}: give one that another command has written"
+        )
+    numbers: dict[str, object] = {}
+    if images:
+        result = load_keypoints(file) if len(images) == 1 else load_matches(file)
+        picture = result.draw(*map(load_image, images))
+        shown = Path(tempfile.mkdtemp(prefix="deepdetect-"), file.stem + ".png")
+        save_picture(picture, shown)
+        numbers["keypoints" if len(images) == 1 else "matches"] = len(result)
+    else:
+        beside = (file, file.with_suffix(".html"), file.with_suffix(".jpg"))
+        found = [path for path in beside if path.suffix.lower() in SHOWN and path.is_file()]
+        if not found:
+            raise OptionError(
+                f"{file} is nothing that a browser shows, nor is there such a file of its name: "
+                "keypoints and matches need their images, deepdetect view FILE IMAGE ..."
+            )
+        shown = found[0]
+    if not webbrowser.open(shown.absolute().as_uri()):
+        cli.note(f"no browser was found: open {shown} in one")
+    return cli.Result({**numbers, "shown": shown})
