@@ -4,13 +4,13 @@
 
 DATA holds oxford, middlebury, foreground, and the scenes of `deepdetect dev benchmark pose`. A line
 for each kind of pair: how many pairs, how many were answered with high and with fair confidence,
-and how many of these answers are wrong: less than half of their matches are right, and the pose is not
-right either (the true lines of a moving car are off by pixels). Photographs: all pairs whose truth
-is known. Planes: a photograph covers 10, 20 or 40 % of both images, seen from two places; the rest
-is unrelated, or a rectified pair of a scene with depth. Refusal: unrelated photographs, and facades
-of one window that repeats, of which the second image begins a window later, so that it looks as if
-nothing had moved; alone, between unrelated things, or with a window that occurs once between things
-that both images show: only these can be answered.
+and how many of these answers are wrong: less than half of their matches are right, and the pose is
+not right either (the true lines of a moving car are off by pixels). Photographs: all pairs whose
+truth is known. Planes: a photograph covers 10, 20 or 40 % of both images, seen from two places; the
+rest is unrelated, or a rectified pair of a scene with depth. Refusal: unrelated photographs, and
+facades of one window that repeats, of which the second image begins a window later, so that it
+looks as if nothing had moved; alone, between unrelated things, or with a window that occurs once
+between things that both images show: only these can be answered.
 """
 
 from __future__ import annotations
