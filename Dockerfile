@@ -14,12 +14,12 @@ RUN pip install --no-cache-dir "build>=1.2" \
     && python -m build --wheel --outdir /wheels
 
 FROM python:${PYTHON}-slim
-# Extras beside demo, which brings two photographs to compile with, below.
-ARG EXTRAS=demo
+# scikit-image brings two photographs to compile with, below.
+ARG EXTRAS=app
 ENV NUMBA_CACHE_DIR=/opt/deepdetect/numba \
     PYTHONDONTWRITEBYTECODE=1
 COPY --from=build /wheels /wheels
-RUN pip install --no-cache-dir "$(ls /wheels/*.whl)[${EXTRAS},demo]" \
+RUN pip install --no-cache-dir "$(ls /wheels/*.whl)[${EXTRAS}]" scikit-image \
     && rm -r /wheels \
     && useradd --create-home --uid 1000 deepdetect \
     && install -d -o deepdetect /opt/deepdetect/numba /photos

@@ -48,30 +48,22 @@ class LockFile:
     lowest: bool = False
 
 
-# Ray is large.
-ALL_EXTRAS = tuple(extra for extra in PROJECT["project"]["optional-dependencies"] if extra != "ray")
+EXTRAS = ("all", "train")
 LOCK_FILES = (
     LockFile("uv.txt", groups=("lock",), package=False),
-    LockFile("lock.txt", groups=("dev",), extras=ALL_EXTRAS),
-    LockFile("demo.txt", groups=("build",), extras=("demo", "labels")),
+    LockFile("lock.txt", groups=("dev",), extras=EXTRAS),
+    LockFile("demo.txt", groups=("build", "demo")),
     LockFile(
         "opencv4.txt",
-        groups=("build", "test"),
-        extras=("benchmark", "demo", "onnx"),
+        groups=("build", "test", "benchmark"),
         overrides="requirements/opencv4.in",
     ),
-    LockFile("ray.txt", groups=("build", "test"), extras=("demo", "labels", "ray")),
+    LockFile("ray.txt", groups=("build", "test", "ray")),
     LockFile(
-        "integrations.txt",
-        groups=("build", "test", "integrations"),
-        extras=("demo", "train"),
+        "integrations.txt", groups=("build", "test", "demo", "integrations"), extras=("train",)
     ),
-    LockFile(
-        "docs.txt",
-        groups=("build", "docs", "release", "test"),
-        extras=("demo", "labels"),
-    ),
-    LockFile("lowest.txt", groups=("build", "test"), extras=ALL_EXTRAS, lowest=True),
+    LockFile("docs.txt", groups=("build", "demo", "docs", "release", "test")),
+    LockFile("lowest.txt", groups=("build", "test"), extras=EXTRAS, lowest=True),
 )
 
 

@@ -89,16 +89,16 @@ def test_packages_that_are_too_old_or_absent(monkeypatch: pytest.MonkeyPatch) ->
         "tqdm>=99.1",
         "opencv-python-headless>=4.12",
         'h5py>=3.11 ; extra == "sfm"',
-        "no-such-package>=1.17; extra == 'onnx'",
-        "deepdetect[labels]; extra == 'train'",
+        "no-such-package>=1.17; extra == 'app'",
+        "deepdetect[app,sfm]; extra == 'all'",
     ]
     monkeypatch.setattr(importlib.metadata, "requires", lambda name: lines)
     found = {each.name: each for each in doctor.packages()}
     assert found["numpy"].status == "ok"
     assert found["packages"].status == "problem"
     assert found["packages"].remedy == "pip install 'tqdm>=99.1'"
-    assert found["onnx"].value == "no-such-package, for export onnx"
-    assert not {"train", "labels", "sfm"} & {*found}
+    assert found["app"].value == "no-such-package, for the page in a browser"
+    assert not {"all", "train", "sfm"} & {*found}
 
 
 def test_every_extra_has_a_purpose() -> None:

@@ -14,19 +14,10 @@ from .._shared.opencv import import_opencv, installed_distributions, version_num
 from ._options import Result, command, table
 
 PURPOSES = {
-    "app": "app",
-    "benchmark": "benchmark, and evaluate with the Oxford scenes",
-    "demo": "demo",
-    "geo": "LAZ files, and ground control points",
-    "heif": "images of iPhones (.heic)",
-    "raw": "raw photographs",
-    "tiff": "compressed TIFF of every kind",
-    "labels": "label and train, with all nine detectors",
-    "onnx": "export onnx",
-    "openvino": "--backend openvino and --precision bfloat16",
-    "ray": "extract, match-many, label and shards on a cluster",
-    "sfm": "reconstruct of three images and more, extract, match-many and export",
-    "train": "train, average, and weights in .safetensors",
+    "all": "the fast back end, ONNX files, the demo, HEIC, raw and compressed TIFF images",
+    "app": "the page in a browser",
+    "sfm": "reconstruct of three images and more, extract, match-many, export, control points",
+    "train": "label, train, benchmarks, and weights in .safetensors",
 }
 MAX_BACKEND_DIFFERENCE = 5e-3
 """Between the probabilities of two back ends; five times what is usual."""

@@ -123,7 +123,7 @@ def evaluate(
     Raises:
         ImageError: no sample, scene or photograph can be read, or a file of one is missing.
         OptionError: a scale is not above 0, or `scales` or `equal_density` has no images.
-        MissingExtraError: `oxford` needs the extra "benchmark".
+        MissingExtraError: `oxford` needs the extra `train`.
 
     Example:
         >>> import tempfile
