@@ -46,7 +46,7 @@ install_locked = $(call install,$(1)) --no-deps --require-hashes -r $(2)
 install_torch = $(1)/bin/python -m pip install $(PIP_FLAGS) --no-compile -r requirements/torch.txt
 install_package = $(call install,$(1)) --no-deps --no-build-isolation --editable .
 
-.PHONY: demo test test-all fuzz onnxruntime test-opencv4 test-ray test-integrations test-lowest web test-web coverage lint spelling types contracts check \
+.PHONY: demo test test-all fuzz onnxruntime test-opencv4 test-ray test-integrations test-lowest web test-web coverage hub lint spelling types contracts check \
 	format lock upgrade check-lock audit sbom docs test-docs notebooks figures results dist release-check clean
 
 demo: $(VENV)/.demo
@@ -160,6 +160,11 @@ figures: $(VENV)/.test
 results: $(VENV)/.test
 	$(VENV)/bin/python benchmarks/results.py $(DATA) $(if $(PUBLISHED),--published $(PUBLISHED)) \
 		$(if $(ONLY),--only $(ONLY))
+
+# A folder for each of the weights, as model hubs take them.
+hub: $(VENV)/.test
+	rm -rf dist/hub
+	$(VENV)/bin/python tools/hub.py dist/hub
 
 dist: $(VENV)/.test
 	rm -rf dist

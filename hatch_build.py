@@ -6,6 +6,7 @@ the tag of the version, which is made before the package is published.
 
 from __future__ import annotations
 
+import posixpath
 import re
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 from hatchling.metadata.plugin.interface import MetadataHookInterface
 
 REPOSITORY = "deepdetect/deepdetect"
-PICTURES = (".gif", ".jpg", ".png", ".svg")
+PICTURES = (".gif", ".jpg", ".png", ".svg", ".webp")
 
 
 class ReadmeHook(MetadataHookInterface):
@@ -30,8 +31,8 @@ class ReadmeHook(MetadataHookInterface):
         metadata["readme"] = {"content-type": "text/markdown", "text": text}
 
 
-def absolute_links(markdown: str, tag: str) -> str:
-    """Return a page with links to the repository at a tag in place of relative ones.
+def absolute_links(markdown: str, tag: str, folder: str = "") -> str:
+    """Return a page of a folder with links to the repository at a tag in place of relative ones.
 
     Example:
         >>> absolute_links("[how](docs/a.md#b), ![](c.png), [below](#d)", "v1.0")[:59]
@@ -42,6 +43,7 @@ def absolute_links(markdown: str, tag: str) -> str:
         target = match[1]
         if re.match(r"[a-z]+:|#", target):
             return match[0]
+        target = posixpath.normpath(posixpath.join(folder, target))
         if target.partition("#")[0].endswith(PICTURES):
             return f"](https://raw.githubusercontent.com/{REPOSITORY}/{tag}/{target})"
         return f"](https://github.com/{REPOSITORY}/blob/{tag}/{target})"

@@ -104,7 +104,7 @@ def test_commands_connect_to_nothing(log: Path) -> None:
         "detect left.png right.png -o out",
         "match left.png right.png -o out",
         "label left.png right.png -o masks --workers 2",
-        "datasets list",
+        "dev datasets list",
     )
     result = run(log, "-c", code, *commands)
     assert result.returncode == 0, result.stderr
@@ -127,5 +127,5 @@ def test_only_downloads_and_the_page_import_what_connects() -> None:
             if FOR_THE_NETWORK & {name.partition(".")[0] for name in names}:
                 found.add(path.relative_to(ROOT).as_posix())
     # The page's server listens, on the loopback address only; its command can open a browser.
-    page = {"app/server.py", "cli/app.py"}
+    page = {"app/server.py", "cli/app.py", "cli/view.py"}
     assert found == {"datasets/download.py", *page}

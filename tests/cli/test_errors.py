@@ -42,7 +42,7 @@ CASES = {
     "backend": "detect {bad}/good.png --backend onnxruntim",
     "device": "detect {bad}/good.png --device CUDA",
     "threshold": "detect {bad}/good.png --threshold 2",
-    "stereo without a scene": "evaluate-stereo {bad}/empty",
+    "stereo without a scene": "dev evaluate-stereo {bad}/empty",
     "output is a file": "detect {bad}/good.png -o {bad}/text.png",
     "ignore mask": "detect {bad}/good.png --ignore {bad}/small.png",
     "preset": "match {bad}/good.png {bad}/good.png --preset publishd",
@@ -55,8 +55,8 @@ CASES = {
     "train stage": "train {bad} -o {bad}/out --stage 240",
     "train label settings": "train {bad} -o {bad}/out --label-settings {bad}/matrix.txt",
     "label settings": "label {bad}/good.png -o {bad}/out --label-settings {bad}/no.toml",
-    "evaluate oxford": "evaluate {bad} --oxford {bad}/empty",
-    "evaluate nothing": "evaluate {bad}/empty",
+    "evaluate oxford": "dev evaluate {bad} --oxford {bad}/empty",
+    "evaluate nothing": "dev evaluate {bad}/empty",
 }
 
 

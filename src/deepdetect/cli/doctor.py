@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import importlib.util
 import platform
 import re
-from collections.abc import Iterator
-from typing import Literal, NamedTuple
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+from cyclopts import Parameter
 
 from .._shared.errors import DeepDetectError, first_line, install_command
 from .._shared.opencv import import_opencv, installed_distributions, version_numbers
@@ -21,6 +27,8 @@ PURPOSES = {
 }
 MAX_BACKEND_DIFFERENCE = 5e-3
 """Between the probabilities of two back ends; five times what is usual."""
+TIMED_ROUNDS = 5
+"""Of the benchmark, after one that loads and compiles."""
 MIN_PRECISION = 0.95
 """Of the self-test's matches within 1 px of the truth; all of them where nothing is wrong."""
 
@@ -35,12 +43,22 @@ class Finding(NamedTuple):
 
 
 @command()
-def doctor() -> Result:
+def doctor(
+    *,
+    benchmark: Annotated[bool, Parameter(help="Measure how fast this computer is.")] = False,
+) -> Result:
     """Check the installation: versions, OpenCV, back ends, and a self-test with a known answer.
 
     Ends with exit code 1 if something that is installed does not work. Nothing is sent anywhere;
     please add what --json prints to a report of a problem.
+
+        deepdetect doctor
+        deepdetect doctor --benchmark
     """
+    if benchmark:
+        return Result(
+            measured := speeds(), table(measured, title=f"milliseconds, median of {TIMED_ROUNDS}")
+        )
     findings: list[Finding] = []
     for check in CHECKS:
         try:
@@ -134,6 +152,55 @@ def self_test() -> Iterator[Finding]:
     else:
         remedy = "Try another --backend, and report what `deepdetect doctor --json` prints"
         yield Finding("self-test", "problem", f"wrong results: {value}", remedy)
+
+
+def speeds() -> dict[str, object]:
+    """Time detection and matching of images of 640x480 pixels, and OpenCV's SIFT beside them."""
+    import numpy as np
+
+    from .._shared.machine import processor_count
+    from .._shared.opencv import cv2
+    from ..detector.detector import DeepDetect
+    from ..detector.point_detector import PointDetector
+    from ..matching.pipeline import match_features, match_images
+
+    # Structure of all sizes, so that there are as many keypoints as in a photograph.
+    rng, whole = np.random.default_rng(0), np.zeros((512, 672), np.float32)
+    for octave in range(6):
+        cells = rng.random((16 << octave, 21 << octave), np.float32)
+        whole += cv2.resize(cells, (672, 512), interpolation=cv2.INTER_CUBIC) / (1 + octave) ** 0.5
+    whole = cv2.normalize(whole, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
+    first, second = whole[:480, :640], whole[8:488, 12:652]
+    network, points, sift = DeepDetect(), PointDetector(2048), cv2.SIFT_create(2048)
+    described = points.extract(first), points.extract(second)
+    work: dict[str, Callable[[], object]] = {
+        "dense keypoints": lambda: network.detect(first),
+        "2,048 points": lambda: points.detect(first),
+        "2,048 points with descriptors": lambda: points.extract(first),
+        "SIFT of OpenCV, 2,048 with descriptors": lambda: sift.detectAndCompute(first, None),
+        "descriptors of a pair matched": lambda: match_features(*described),
+        "a pair matched, guided": lambda: match_images(first, second),
+    }
+    times: dict[str, list[float]] = {name: [] for name in work}
+    for _ in range(1 + TIMED_ROUNDS):
+        for name, run in work.items():
+            begun = time.perf_counter()
+            run()
+            times[name].append(1000 * (time.perf_counter() - begun))
+    return {
+        "processor": f"{processor_name()}, {processor_count()} threads",
+        "system": f"{platform.platform()}, Python {platform.python_version()}",
+        "deepdetect": importlib.metadata.version("deepdetect"),
+        "images": "640x480",
+        **{name: round(statistics.median(each[1:]), 1) for name, each in times.items()},
+    }
+
+
+def processor_name() -> str:
+    """Return the name of the processor as people know it, where the system tells."""
+    with contextlib.suppress(OSError, IndexError):
+        return re.findall(r"model name\s*: (.+)", Path("/proc/cpuinfo").read_text())[0]
+    return platform.processor() or platform.machine()
 
 
 CHECKS = (packages, opencv, self_test)

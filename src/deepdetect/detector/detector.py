@@ -6,7 +6,7 @@ import functools
 import itertools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, Self
 
 import numpy as np
 
@@ -54,8 +54,8 @@ class DeepDetect:
     points than the best of these pixels, without the network.
 
     Args:
-        weights: "default", "dense" or "free", the weights inside the package; or an ONNX file, or
-            a safetensors file where torch is installed.
+        weights: "default", "dense", "free" or "espnet", the weights inside the package; or an ONNX
+            file, or a safetensors file where torch is installed.
         resolution: "auto" (the image as it is up to two megapixels, larger ones scaled down to
             that), "native" (always as it is), or a number of pixels: the image is squashed to a
             square of that side, as the paper does with 480.
@@ -112,6 +112,22 @@ class DeepDetect:
         self._portable = weights if weights in PRETRAINED else self.weights.absolute()
         self._runtime = RuntimeOptions(backend, device, threads, precision)
         self._network, self.backend = open_network(self.weights, self._runtime)
+
+    @classmethod
+    def from_pretrained(cls, folder: str | Path, **options: Any) -> Self:
+        """Load the network of a folder, as `train` and the model hub have them: deepdetect.onnx.
+
+        Args:
+            folder: a folder on this computer; nothing is downloaded.
+            **options: as of `DeepDetect`.
+
+        Raises:
+            WeightsError: the folder or its deepdetect.onnx is missing, damaged or does not fit.
+
+        Example:
+            >>> DeepDetect.from_pretrained("run/", resolution="native")  # doctest: +SKIP
+        """
+        return cls(Path(folder, "deepdetect.onnx"), **options)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "_network"}

@@ -1,0 +1,75 @@
+"""Folders of the weights, as model hubs take them: each with its card, config, ONNX, safetensors.
+
+    python tools/hub.py dist/hub
+
+`DeepDetect.from_pretrained(folder)` reads those of networks. Nothing is uploaded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import shutil
+from pathlib import Path
+
+from deepdetect import __version__
+from deepdetect.detector.pretrained import FOLDER, POINTS_GRAPH, PRETRAINED, pretrained_weights
+
+ROOT = Path(__file__).resolve().parents[1]
+CARDS = {name: FOLDER / f"{name.upper()}_CARD.md" for name in PRETRAINED} | {
+    "default": FOLDER / "MODEL_CARD.md"
+}
+DESCRIPTORS = ("descriptor", "descriptor_free", "descriptor_cross_modal")
+FRONT_MATTER = """---
+license: mit
+library_name: deepdetect
+pipeline_tag: keypoint-detection
+tags: [keypoints, local-features, image-matching, onnx]
+---
+
+"""
+
+
+def write_folder(folder: Path, card: Path, files: dict[str, Path], config: dict[str, str]) -> None:
+    """Write one model's folder; links of its card lead to the repository."""
+    hook = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
+    assert hook is not None
+    assert hook.loader is not None
+    module = importlib.util.module_from_spec(hook)
+    hook.loader.exec_module(module)
+    folder.mkdir(parents=True)
+    beside = card.parent.relative_to(ROOT)
+    text = module.absolute_links(card.read_text("utf-8"), f"v{__version__}", str(beside))
+    (folder / "README.md").write_text(FRONT_MATTER + text, "utf-8")
+    (folder / "config.json").write_text(json.dumps(config, indent=1) + "\n", "utf-8")
+    for name, path in files.items():
+        shutil.copyfile(path, folder / name)
+
+
+def main() -> None:
+    """Write all folders into a new one."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("output", type=Path, help="a folder that does not exist")
+    output = parser.parse_args().output
+    about = {"library": "deepdetect", "version": __version__}
+    for name, card in CARDS.items():
+        files = {f"deepdetect{s}": pretrained_weights(name, s) for s in (".onnx", ".safetensors")}
+        config = about | {
+            "kind": "network",
+            "weights": name,
+            "input": "RGB in [0, 1], (1, 3, H, W)",
+        }
+        write_folder(output / f"deepdetect-{name}", card, files, config)
+    points = POINTS_GRAPH.parent
+    files = {name: points / name for name in ("points.onnx", "ranker.npz")}
+    write_folder(
+        output / "deepdetect-points", points / "MODEL_CARD.md", files, about | {"kind": "points"}
+    )
+    files = {f"{name}.onnx": points / f"{name}.onnx" for name in DESCRIPTORS}
+    config = about | {"kind": "descriptors", "dimensions": "64"}
+    write_folder(output / "deepdetect-descriptors", points / "DESCRIPTOR_CARD.md", files, config)
+
+
+if __name__ == "__main__":
+    main()
