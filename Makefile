@@ -152,6 +152,8 @@ notebooks: $(VENV_DOCS)/.test
 # Draws the pictures of the README, of docs/method.md and of docs/points.md again.
 figures: $(VENV)/.test
 	$(VENV)/bin/python docs/figures/day_dark_blurred.py
+	$(VENV)/bin/python docs/figures/day_to_dark.py
+	$(VENV)/bin/python docs/figures/uses.py
 	$(VENV)/bin/python docs/figures/method.py
 	$(VENV)/bin/python docs/figures/times.py
 

@@ -7,7 +7,8 @@ The first line (`make results DATA=... ONLY=...`) runs the benchmarks that the r
 each with a cache, so that what was interrupted goes on, and writes `docs/results/NAME.csv` with the
 command, commit, versions and machine of each in `docs/results/index.json`. The second one fills the
 blocks of the pages between `<!-- results:NAME -->` and `<!-- /results -->` from these
-files; `<!-- results:NAME first|second -->` names the columns. With --check it only says whether
+files; `<!-- results:NAME first|second -->` names the columns, and one cell in a sentence stands
+between `<!-- result:NAME|row|column -->` and `<!-- /result -->`. With --check it only says whether
 the blocks are as the files have them. Some results need the authors' weights.
 """
 
@@ -29,6 +30,8 @@ from deepdetect._shared.provenance import provenance
 ROOT = Path(__file__).parents[1]
 RESULTS_FOLDER = ROOT / "docs" / "results"
 BLOCK = re.compile(r"(<!-- results:([\w-]+)(?: ([^\n]*?))? -->\n).*?(<!-- /results -->)", re.DOTALL)
+
+CELL = re.compile(r"(<!-- result:(.*?) -->)[^<]*(<!-- /result -->)")
 
 BENCHMARK = "-m deepdetect dev benchmark {} --data {{data}} -o {{output}}"
 PEERS = ("xfeat_2048_600x800", "edgepoint2_t32", "edgepoint2_e64")
@@ -410,6 +413,7 @@ def fill_blocks(write: bool) -> list[str]:
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
         filled = BLOCK.sub(lambda m: f"{m[1]}{block(m[2], m[3])}\n{m[4]}", text)
+        filled = CELL.sub(lambda m: f"{m[1]}{shown(cell(m[2]))}{m[3]}", filled)
         if filled != text:
             stale.append(page.name)
             if write:
@@ -448,23 +452,24 @@ def composed_table(name: str) -> list[list[str]]:
     The row is known by its first cell, or the first two; as "best" it is that of the classical
     detector with the highest number.
     """
-
-    def filled(match: re.Match[str]) -> str:
-        (name, _, row), column = match[1].rpartition("|")[0].partition("|"), match[1].split("|")[-1]
-        head, *lines = read_result(name)
-        k = head.index(column)
-        if row == "best":
-            known = [
-                x
-                for x in lines
-                if x[0].startswith(CLASSICAL) and not re.search("paper|as it is|own", x[0])
-            ]
-            best = max(known, key=lambda line: float(line[k] or 0))
-            return f"{best[k]} ({best[0]})"
-        return next(x[k] for x in lines if row in (x[0], ", ".join(x[:2])))
-
     rows: list[list[str]] = json.loads((RESULTS_FOLDER / f"{name}.json").read_text("utf-8"))
-    return [[re.sub(r"{(.*?)}", filled, text) for text in row] for row in rows]
+    return [[re.sub(r"{(.*?)}", lambda m: cell(m[1]), text) for text in row] for row in rows]
+
+
+def cell(place: str) -> str:
+    """Return a cell of a result by its place, as result|row|column."""
+    (name, _, row), column = place.rpartition("|")[0].partition("|"), place.rpartition("|")[2]
+    head, *lines = read_result(name)
+    k = head.index(column)
+    if row == "best":
+        known = [
+            x
+            for x in lines
+            if x[0].startswith(CLASSICAL) and not re.search("paper|as it is|own", x[0])
+        ]
+        best = max(known, key=lambda line: float(line[k] or 0))
+        return f"{best[k]} ({best[0]})"
+    return next(x[k] for x in lines if row in (x[0], ", ".join(x[:2])))
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from tests.command_line import run_command
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+CALLS = (ROOT / "docs/python.md").read_text("utf-8")
 SHELL = [
     line.split("#")[0].strip()
     for block in re.findall(r"```sh\n(.*?)```", README, re.S)
@@ -57,7 +58,7 @@ def test_the_command_lines_run(folder: Path, line: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("line", re.findall(r"\| `([^`]*\([^`]*\))` \|$", README, re.M))
+@pytest.mark.parametrize("line", re.findall(r"\| `([^`]*\([^`]*\))` \|$", CALLS, re.M))
 def test_the_calls_of_the_table_run(folder: Path, line: str) -> None:
     import deepdetect
 

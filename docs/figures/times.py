@@ -1,6 +1,6 @@
-"""The picture of docs/results/times.csv: what is found again and matched, against the time.
+"""The pictures of times.csv and descriptors.csv in docs/results: what is matched, against the time.
 
-python docs/figures/times.py    # writes docs/images/times.png
+python docs/figures/times.py    # writes docs/images/times.png and, for the README, speed.png
 """
 
 from __future__ import annotations
@@ -23,11 +23,90 @@ PANELS = {
 MARKERS = {"own": "o", "RootSIFT": "s", "own size and angle": "^"}
 TIME = "1 thread, ms"
 
+SHOWN = {
+    "times": {
+        "SIFT|own": "SIFT",
+        "ORB|own": "ORB",
+        "|det Hessian|, sigma 3|RootSIFT": "|det Hessian|, one scale",
+        "|det Hessian|, seven scales|own size and angle": "|det Hessian|, seven scales",
+        "points|own size and angle": "points, RootSIFT",
+        "XFeat|own": "XFeat",
+        "EdgePoint2 T32|own": "EdgePoint2 T32",
+        "EdgePoint2 E64|own": "EdgePoint2 E64",
+        "dense, default|RootSIFT": "best dense pixels",
+    },
+    "descriptors": {
+        "SIFT": "SIFT, RootSIFT",
+        "rootsift": "points, RootSIFT",
+        "learned": "points, learned",
+        "XFeat": "XFeat",
+        "EdgePoint2 T32": "EdgePoint2 T32",
+        "EdgePoint2 E64": "EdgePoint2 E64",
+    },
+}
+"""Rows of the picture of the README, and what they are called there."""
+
+
+MOVED = {
+    "best dense pixels": {"xytext": (-9, 0), "ha": "right"},
+    "EdgePoint2 E64": {"xytext": (-7, 0), "ha": "right"},
+    "|det Hessian|, seven scales": {"xytext": (8, -9)},
+}
+"""Names that would lie on others, and where they are instead, in points."""
+
+SPEED_X = (0.04, 5)
+
 
 def main() -> None:
+    """Draw both pictures."""
+    draw_times(read("times"))
+    draw_speed()
+
+
+def read(name: str) -> list[dict[str, str]]:
+    """Read the rows of a table."""
+    with (DOCS / "results" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def draw_speed() -> None:
+    """Draw correct matches against the time in that of SIFT, on Oxford and on HPatches."""
+    oxford = {f"{row['method']}|{row['descriptors']}": row for row in read("times")}
+    hpatches = {row["descriptors"]: row for row in read("descriptors")}
+    unit = float(oxford["SIFT|own"][TIME])
+    tables = {
+        "Oxford, 40 pairs, ratio test": {
+            title: (float(oxford[name][TIME]) / unit, float(oxford[name]["right at 3 px"]))
+            for name, title in SHOWN["times"].items()
+        },
+        "HPatches, which had no say": {
+            title: (float(hpatches[name]["time"]), float(hpatches[name]["HPatches"]))
+            for name, title in SHOWN["descriptors"].items()
+            if name in hpatches
+        },
+    }
+    figure, panels = pyplot.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    for axes, (title, places) in zip(panels, tables.items(), strict=True):
+        for name, (x, y) in places.items():
+            ours = name.startswith(("points", "best dense"))
+            axes.plot(x, y, "o", color="C3" if ours else "C0", markersize=9 if ours else 6)
+            style = {"xytext": (8, 0), "textcoords": "offset points", "va": "center"}
+            style |= {"weight": "bold" if ours else "normal", "fontsize": "small"}
+            axes.annotate(name, (x, y), **(style | MOVED.get(name, {})))
+        axes.set(
+            title=title, xscale="log", xlabel="CPU time of an image, one thread; OpenCV's SIFT = 1"
+        )
+        axes.set(xlim=SPEED_X, ylabel="correct matches of a pair, within 3 px")
+        axes.set_ylim(0, 1.1 * max(y for _, y in places.values()))
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.minorticks_off()
+        axes.grid(alpha=0.3)
+    figure.savefig(DOCS / "images" / "speed.png", dpi=90, metadata={"Software": None})
+
+
+def draw_times(rows: list[dict[str, str]]) -> None:
     """Draw a panel for each measure, a colour for each method, a mark for each descriptor."""
-    with (DOCS / "results" / "times.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
     methods = list(dict.fromkeys(row["method"] for row in rows))
     figure, panels = pyplot.subplots(1, len(PANELS), figsize=(13, 4.6), layout="constrained")
     for axes, (measure, title) in zip(panels, PANELS.items(), strict=True):

@@ -11,8 +11,7 @@ INTRODUCTION = """\
 # Command line
 
 Made from the commands: it says what `deepdetect COMMAND --help-all` says. How results are written,
-when a command goes on where it stopped, and what the exit codes mean is in the
-[README](../README.md#use).
+when a command continues where it stopped, and what the exit codes mean: [commands](commands.md).
 
 `-h` or `--help` shows the common options of a command, `--help-all` shows all, `--version` prints
 the version.

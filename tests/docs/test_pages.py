@@ -90,3 +90,62 @@ def test_points(folder: Path) -> None:
     assert found["spaced"].sizes is None
     assert len(found["points"]) == len(found["spread"]) == 1000
     assert found["spread"].sizes is not None
+
+
+RECIPES = blocks("recipes.md", "python")
+
+
+def write_photographs(folder: Path) -> None:
+    """Write what the recipes name: a stereo pair, a plane from two places, a folder, a video."""
+    import cv2
+    from skimage import data
+
+    left, right = (view[100:340, 220:540] for view in data.stereo_motorcycle()[:2])
+    plane = data.astronaut()
+    tilt = np.array([[0.9, 0.1, 5.0], [-0.1, 0.95, 20.0], [1e-4, 1e-4, 1.0]])
+    tilted = cv2.warpPerspective(plane, tilt, plane.shape[1::-1])
+    (folder / "photos").mkdir()
+    named = {"left": left, "right": right, "field0": plane, "field1": tilted}
+    named |= {"photos/a": left, "photos/b": right}
+    for name, view in named.items():
+        Image.fromarray(view).save(folder / f"{name}.jpg", quality=95)
+    video = cv2.VideoWriter(
+        str(folder / "video.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (320, 240)
+    )
+    for start in range(0, 30, 5):
+        video.write(np.ascontiguousarray(plane[100:340, start : start + 320, ::-1]))
+    video.release()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(len(RECIPES)))
+def test_recipes(folder: Path, number: int) -> None:
+    recipe = RECIPES[number]
+    if "kornia" in recipe:
+        pytest.importorskip("kornia", reason="needs kornia")
+        recipe = recipe.replace('("sift")', "(None, input_dim=128, add_scale_ori=True)")
+    assert recipe.count("\n") <= 8
+    write_photographs(folder)
+    found: dict[str, object] = {}
+    exec(compile(recipe, "recipes.md", "exec"), found)
+    for name in re.findall(r"\"(\w+\.(?:png|jpg|npz))\"\)$", recipe, re.M):
+        assert (folder / name).is_file()
+    if "matches" in found:
+        assert found["matches"].inliers.sum() > 1000
+    if "result" in found:
+        truth = np.array([[0.9, 0.1, 5.0], [-0.1, 0.95, 20.0], [1e-4, 1e-4, 1.0]])
+        np.testing.assert_allclose(found["result"].homography, truth, atol=0.5, rtol=0.02)
+    if "tracks" in found:
+        assert len(found["tracks"]) > 50
+    if "paths" in found:
+        assert sorted(path.name for path in folder.glob("photos/*.npz")) == ["a.npz", "b.npz"]
+
+
+@pytest.mark.slow
+def test_recipe_of_a_database(folder: Path) -> None:
+    pytest.importorskip("pycolmap", reason="needs pycolmap")
+    write_photographs(folder)
+    (line,) = re.findall(r"^deepdetect (export colmap .*)$", blocks("recipes.md", "sh")[0], re.M)
+    result = run_command(shlex.split(line))
+    assert result.exit_code == 0, result.output
+    assert (folder / "database.db").is_file()

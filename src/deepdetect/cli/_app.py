@@ -142,7 +142,7 @@ def completion(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command, and return the exit code that the README documents."""
+    """Run a command, and return the exit code that docs/commands.md documents."""
     from .._shared.kernels import announce_compilation
 
     announce_compilation(

@@ -1,0 +1,99 @@
+"""The moving picture of the README: a pair of which one image fades from day to dark and back.
+
+python docs/figures/day_to_dark.py    # writes docs/images/day-to-dark.webp
+
+Each frame is matched anew. The lines are those of one fixed set of keypoints of the left image, in
+the frames in which they have a match; the numbers are counted by the true disparity. The
+photographs are the Motorcycle pair of Middlebury 2014 (Scharstein et al., GCPR 2014; free to use
+and publish with citation), which comes with scikit-image.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from layout import caption
+from PIL import Image
+
+from deepdetect import DeepDetect, match_images
+from deepdetect._shared.opencv import cv2
+from deepdetect.datasets import StereoPair, load_motorcycle
+from deepdetect.datasets.degradation import Degradation, darken, degrade
+from deepdetect.geometry import disparity_errors
+
+OUTPUT = Path(__file__).parents[1] / "images" / "day-to-dark.webp"
+STEPS, DARKEST = 7, 1 / 8
+"""Frames from full light to the darkest, and its fraction of the light."""
+
+LINES, RIGHT_PX = 70, 1.0
+CELL = (800, 270)
+QUALITY = 62
+HOLD_MS, STEP_MS = 1400, 260
+"""How long the first and the darkest frame are shown, and the others."""
+
+
+def main() -> None:
+    """Write the picture."""
+    pair = load_motorcycle()
+    lights = np.geomspace(1, DARKEST, STEPS)
+    drawn: list[np.ndarray] = []
+    chosen = None
+    for light in lights:
+        frame, chosen = draw(pair, light, chosen)
+        drawn.append(frame)
+    frames = [Image.fromarray(frame) for frame in drawn + drawn[-2:0:-1]]
+    times = [HOLD_MS if k in (0, STEPS - 1) else STEP_MS for k in range(len(frames))]
+    frames[0].save(
+        OUTPUT, save_all=True, append_images=frames[1:], duration=times, quality=QUALITY, method=6
+    )
+    print(f"{OUTPUT}: {len(frames)} frames, {OUTPUT.stat().st_size / 1000:.0f} kB")
+
+
+def draw(
+    pair: StereoPair, light: float, chosen: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Darken the right image, match, and draw the lines of the chosen keypoints.
+
+    Returns:
+        The frame, and the chosen keypoints (N, 2): without any, a sample of this frame's.
+    """
+    darker = Degradation("dark", "", partial(darken, fraction=light))
+    right = degrade(pair.right, darker) if light < 1 else pair.right
+    matches = match_images(pair.left, right, DeepDetect())
+    errors = disparity_errors(matches.points0, matches.points1, pair.disparity)
+    known = np.isfinite(errors)
+    good = errors[known] < RIGHT_PX
+    first, second = matches.points0[known], matches.points1[known]
+    if chosen is None:
+        chosen = first[np.random.default_rng(4).permutation(len(first))[:LINES]]
+    rows = {tuple(xy): k for k, xy in enumerate(first)}
+    shown = [rows[tuple(xy)] for xy in chosen if tuple(xy) in rows]
+    picture = lines(pair.left, right, first[shown], second[shown], good[shown])
+    text = (
+        f"right image at {light:.0%} of the light: {len(matches):,} matches, "
+        f"{good.mean():.1%} within {RIGHT_PX:g} px of the truth"
+    )
+    return caption(picture, text, CELL), chosen
+
+
+def lines(
+    left: np.ndarray, right: np.ndarray, first: np.ndarray, second: np.ndarray, good: np.ndarray
+) -> np.ndarray:
+    """Draw both images side by side, with a line for each match; red: wrong."""
+    canvas = np.concatenate([left, right], axis=1)
+    hues = np.stack([20 + 120 * first[:, 1] / len(left), *np.full((2, len(first)), 240.0)])
+    colors = cv2.cvtColor(np.rint(hues.T).astype(np.uint8)[None], cv2.COLOR_HSV2RGB)[0].tolist()
+    for k, color in enumerate(colors):
+        color = color if good[k] else (255, 0, 0)
+        start = np.rint(first[k]).astype(int).tolist()
+        end = np.rint(second[k] + [left.shape[1], 0]).astype(int).tolist()
+        cv2.line(canvas, start, end, color, 1, cv2.LINE_AA)
+        for place in (start, end):
+            cv2.circle(canvas, place, 5, color, -1, cv2.LINE_AA)
+    return canvas
+
+
+if __name__ == "__main__":
+    main()
