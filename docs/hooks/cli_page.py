@@ -33,15 +33,17 @@ def make_page() -> str:
 
 def walk() -> Iterator[tuple[str, Any]]:
     """Yield all commands that can be run, with their whole names."""
-    from deepdetect.cli._app import COMMANDS, make_app
+    from deepdetect.cli._app import make_app
 
-    for word in (word for group in COMMANDS.values() for word in group):
-        app = make_app()[word]
-        parts = [part for part in app if not part.startswith("-")]
-        for part in parts:
-            yield f"deepdetect {word} {part}", app[part]
-        if not parts:
-            yield f"deepdetect {word}", app
+    yield from _within("deepdetect", make_app())
+
+
+def _within(name: str, app: Any) -> Iterator[tuple[str, Any]]:
+    parts = [part for part in app if not part.startswith("-")]
+    for part in parts:
+        yield from _within(f"{name} {part}", app[part])
+    if not parts:
+        yield name, app
 
 
 def _help(app: Any) -> str:
