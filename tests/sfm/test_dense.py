@@ -138,7 +138,7 @@ def test_the_depth_of_a_steep_ground_is_found(tmp_path: Path) -> None:
         Image.fromarray(seen.clip(0, 255).astype(np.uint8)).save(tmp_path / own.name)
         rows = np.flatnonzero(own.project(points)[1] > 0)
         xys = own.project(points[rows])[0]
-        images.append(RegisteredImage(own, CameraIntrinsics.of_camera(camera), rows, xys, rows))
+        images.append(RegisteredImage(own, CameraIntrinsics.of_camera(camera), rows, xys))
     made = dense.depth_map(tmp_path, images, points, 2)
     rays = camera.rays(np.column_stack([x[::2, ::2].ravel(), y[::2, ::2].ravel()]))
     inverse = ((rays @ rotation)[:, 1] / 1.5).reshape(made.shape)
@@ -189,10 +189,9 @@ def test_neighbours_share_points_at_a_good_angle(monkeypatch: pytest.MonkeyPatch
         for x in (0.0, 0.02, 0.6, 1.2, 9.0):
             own = view(x, str(x))
             intrinsics = CameraIntrinsics.of_camera(own.camera)
-            images[own.name] = RegisteredImage(
-                own, intrinsics, rows, own.project(points[rows])[0], rows
-            )
-        return SparseModel(images, points, np.zeros(200), np.full(200, 5))
+            xy = own.project(points[rows])[0]
+            images[own.name] = RegisteredImage(own, intrinsics, rows, xy)
+        return SparseModel(images, points, np.zeros((200, 3)), np.zeros(200), np.full(200, 5))
 
     found = {first.view.name: others for first, *others in find_references(model(1))}
     assert {each.view.name for each in found["0.0"]} == {"0.6", "1.2"}

@@ -62,9 +62,9 @@ def made_model(
         xy, _ = view.project(inside(points))
         rows = np.arange(len(points))
         intrinsics = CameraIntrinsics.of_camera(CAMERA)
-        images[view.name] = RegisteredImage(view, intrinsics, rows, xy, rows)
+        images[view.name] = RegisteredImage(view, intrinsics, rows, xy)
     zeros = np.zeros(len(points))
-    return SparseModel(images, inside(points), zeros, zeros.astype(int))
+    return SparseModel(images, inside(points), zeros, zeros, zeros.astype(int))
 
 
 @pytest.fixture

@@ -16,10 +16,7 @@ from .._shared.opencv import cv2
 from ..geometry.images import window_sums
 
 PATCH_RADIUS_PX = 4
-"""The patch has 2 radius + 1 pixels a side."""
-
-PATCH_SIGMA_PX = 2.0
-"""Of the Gaussian weight of its pixels."""
+"""The patch has 2 radius + 1 pixels a side, with a Gaussian weight of half the radius."""
 
 MAX_ITERATIONS = 15
 """Of each of the two alignments."""
@@ -102,12 +99,12 @@ def _refine_band(
     some = np.flatnonzero((pixels0 % step_px == 0).all(axis=1))
     affinities = np.broadcast_to(overall, (len(some), 2, 2))
     start, converged = start.copy(), np.zeros(len(start), bool)
-    start[some], converged[some] = _align(
+    start[some], converged[some] = align_patches(
         images, pixels0[some], start[some], affinities, COARSE_CONVERGENCE_PX
     )
     shape = images[0].shape
     affinities = local_affinities(pixels0, start, converged, shape, overall)[own]
-    return _align(images, pixels0[own], start[own], affinities, CONVERGENCE_PX)
+    return align_patches(images, pixels0[own], start[own], affinities)
 
 
 def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
@@ -175,22 +172,28 @@ def local_affinities(
     return (result + overall).astype(np.float32)
 
 
-def _align(
+def align_patches(
     images: tuple[np.ndarray, np.ndarray],
     pixels0: np.ndarray,
     start: np.ndarray,
     affinities: np.ndarray,
-    convergence_px: float,
+    convergence_px: float = CONVERGENCE_PX,
+    radius_px: int = PATCH_RADIUS_PX,
+    max_shift_px: float = MAX_SHIFT_PX,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Align the patches, each warped by its affinity, in threads."""
+    """Align patches of the first image, each warped by its affinity, to the second, in threads.
+
+    Images are (H, W) float32, `pixels0` (N, 2) int64, `start` (N, 2) float64 and `affinities`
+    (N, 2, 2). Returns as `refine_matches`.
+    """
     from .subpixel_kernel import align
 
-    offsets = np.arange(-PATCH_RADIUS_PX, PATCH_RADIUS_PX + 1)
-    window = np.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * PATCH_SIGMA_PX**2))
-    window, affinities = window.astype(np.float32), np.ascontiguousarray(affinities, np.float32)
+    offsets = np.arange(-radius_px, radius_px + 1)
+    window = np.exp(-2 * (offsets[:, None] ** 2 + offsets**2) / radius_px**2).astype(np.float32)
+    affinities = np.ascontiguousarray(affinities, np.float32)
     refined = np.empty((len(pixels0), 2))
     converged = np.empty(len(pixels0), bool)
-    limits = MAX_ITERATIONS, convergence_px, MAX_SHIFT_PX, np.float32(MIN_CORRELATION)
+    limits = MAX_ITERATIONS, convergence_px, max_shift_px, np.float32(MIN_CORRELATION)
     given = *images, pixels0, start, affinities, window, *limits
     parallel_for(len(pixels0), align, *given, refined, converged)
     return refined, converged

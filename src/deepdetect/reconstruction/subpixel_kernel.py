@@ -51,7 +51,7 @@ def align(  # type: ignore[no-untyped-def]
 
     Inverse compositional: the patch of the first image is the template, so that its derivatives
     and the matrix are made once; gain and offset are two more unknowns beside the shift.
-    Arguments are those of `subpixel._align`; `least` is the correlation at the end.
+    Arguments are those of `subpixel.align_patches`; `least` is the correlation at the end.
     """
     side = window.shape[0]
     radius = side // 2

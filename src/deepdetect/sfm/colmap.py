@@ -250,18 +250,6 @@ def write_database(
             database.write_matches(numbers[name0], numbers[name1], found)
 
 
-def write_colmap_model(model: Any, colors: np.ndarray, folder: Path) -> None:
-    """Write a `pycolmap.Reconstruction` with colours (P, 3) of its points, by rising number.
-
-    As COLMAP's binary and text files, which all that read a folder of COLMAP's know.
-    """
-    for number, color in zip(sorted(model.points3D), colors, strict=True):
-        model.points3D[number].color = color
-    folder.mkdir(parents=True, exist_ok=True)
-    with quiet_pycolmap():
-        model.write(folder)
-
-
 def orientations_of(points: Keypoints) -> np.ndarray:
     """Return (N,) orientations in radians, clockwise; 0 where there are none."""
     if points.angles is None:

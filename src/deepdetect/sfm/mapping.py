@@ -44,6 +44,9 @@ may have, and this angle is enough."""
 ROBUST_SCALE_PX = 1.0
 """Of the loss (Cauchy) of the last adjustment: larger errors count less."""
 
+MIN_ANGLE_DEG = 1.0
+"""Between two lines of sight of a point."""
+
 MIN_VIEWS_OF_PRINCIPAL_POINT = 8
 """From so many images of a camera its principal point is estimated, too; else it is the middle."""
 
@@ -52,27 +55,27 @@ MIN_VIEWS_OF_PRINCIPAL_POINT = 8
 class RegisteredImage:
     """An image whose pose is known, and the points that it sees.
 
-    `points` (K,) are their rows, rising, `xy` (K, 2) where it sees them in pixels of the pinhole
-    camera of `view`, and `keypoints` (K,) rows of its keypoints.
+    `points` (K,) are their rows, rising, and `xy` (K, 2) where it sees them, in pixels of the
+    pinhole camera of `view`.
     """
 
     view: PosedView
     intrinsics: CameraIntrinsics
     points: np.ndarray
     xy: np.ndarray
-    keypoints: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class SparseModel:
     """Cameras and sparse points, in the frame and unit of the model.
 
-    Images are in COLMAP's order, points (P, 3), their mean reprojection errors (P,) in pixels, and
-    `tracks` (P,) the number of images that each is seen in.
+    Images are in COLMAP's order, points (P, 3), their sRGB colours (P, 3) uint8, their mean
+    reprojection errors (P,) in pixels, and `tracks` (P,) the number of images that each is seen in.
     """
 
     images: Mapping[str, RegisteredImage]
     points: np.ndarray
+    colors: np.ndarray
     errors: np.ndarray
     tracks: np.ndarray
 
@@ -170,8 +173,9 @@ def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseMode
     """
     seen: dict[int, list[tuple[int, int]]] = {number: [] for number in model.reg_image_ids()}
     points = np.empty((len(model.points3D), 3))
+    colors = np.empty(points.shape, np.uint8)
     for row, number in enumerate(sorted(model.points3D)):
-        points[row] = model.points3D[number].xyz
+        points[row], colors[row] = model.points3D[number].xyz, model.points3D[number].color
         for element in model.points3D[number].track.elements:
             seen[element.image_id].append((row, element.point2D_idx))
     images = {}
@@ -185,11 +189,11 @@ def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseMode
         rows, keypoints = np.array(pairs, np.int64).reshape(-1, 2).T
         places = np.array([image.points2D[keypoint].xy for keypoint in keypoints])
         xy = own.to_pinhole(places.reshape(-1, 2) - PIXEL_CENTRE)
-        images[image.name] = RegisteredImage(view, own, rows, xy, keypoints)
+        images[image.name] = RegisteredImage(view, own, rows, xy)
         distances = np.linalg.norm(view.project(points[rows])[0] - xy, axis=1)
         sums += np.bincount(rows, distances, len(points))
         tracks += np.bincount(rows, minlength=len(points))
-    return SparseModel(images, points, sums / np.maximum(tracks, 1), tracks)
+    return SparseModel(images, points, colors, sums / np.maximum(tracks, 1), tracks)
 
 
 def adjust(model: Any, known_cameras: bool) -> None:
@@ -213,6 +217,12 @@ def adjust(model: Any, known_cameras: bool) -> None:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         pycolmap.create_default_bundle_adjuster(how, config, model).solve()
         model.update_point_3d_errors()
+
+
+def filter_observations(model: Any, max_error_px: float) -> None:
+    """Remove what a model sees farther away than this, and points of too small an angle."""
+    with quiet_pycolmap() as pycolmap:
+        pycolmap.ObservationManager(model).filter_all_points3D(max_error_px, MIN_ANGLE_DEG)
 
 
 def normalise_model(model: Any) -> None:

@@ -18,7 +18,6 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import OptionError, ReconstructionError
 from .._shared.options import suggest_keywords
 from .._shared.progress import StageTimer
-from ..batch.hdf5 import open_hdf5
 from ..batch.pair_list import Pair
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
@@ -27,11 +26,11 @@ from ..geometry.camera import Calibration, Camera, PosedView
 from ..geometry.point_cloud import EAST_NORTH_UP, PointCloud
 from ..io.html_viewer import write_html_page
 from ..io.point_cloud import save_point_cloud
-from .colmap import import_pycolmap, initial_intrinsics, known_cameras, write_colmap_model
+from .colmap import import_pycolmap, initial_intrinsics, known_cameras
 from .dense import DENSE_POINT
 from .formats import FORMATS, FormatName, check_formats
 from .georeference import Georeference, georeference, read_control_points
-from .mapping import MIN_VIEWS, SparseModel, read_sparse_model, transform_model
+from .mapping import MIN_VIEWS, read_sparse_model, transform_model
 from .result import MultiViewReconstruction
 from .splat import write_transforms
 from .stages import WORK, MultiViewOptions, Stages
@@ -159,7 +158,7 @@ def reconstruct_many(
             unregistered=dict(sorted(unregistered.items())),
             components=_without_registered(components, unregistered),
             reference=reference,
-            sparse=PointCloud(sparse.points, _sparse_colors(stages.features, sparse), *unit),
+            sparse=PointCloud(sparse.points, sparse.colors, *unit),
             sparse_errors=sparse.errors.astype(np.float32),
             sparse_views=sparse.tracks.astype(np.int32),
             dense=PointCloud(
@@ -174,7 +173,8 @@ def reconstruct_many(
             seconds=timer.seconds,
             files=output_files(target, options.formats)[:-1],
         )
-        write_colmap_model(model, found.sparse.colors, target / "sparse" / "0")
+        (target / "sparse" / "0").mkdir(parents=True, exist_ok=True)
+        model.write(target / "sparse" / "0")
         _write(found, folder, target, options.formats)
     return found
 
@@ -258,11 +258,3 @@ def _without_registered(
     """Return the names in other components, without what two models share; the largest first."""
     left = [tuple(sorted(names & frozenset(unregistered))) for names in components]
     return tuple(sorted((names for names in left if len(names) > 1), key=len, reverse=True))
-
-
-def _sparse_colors(features: Path, sparse: SparseModel) -> np.ndarray:
-    sums = np.zeros((len(sparse.points), 3))
-    with open_hdf5(features) as file:
-        for name, image in sparse.images.items():
-            np.add.at(sums, image.points, file[name]["colors"][()][image.keypoints])
-    return np.rint(sums / np.maximum(sparse.tracks, 1)[:, None]).astype(np.uint8)

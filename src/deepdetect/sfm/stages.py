@@ -44,8 +44,21 @@ from .dense import (
     merge_dense_points,
 )
 from .formats import FormatName
-from .mapping import RegisteredImage, SparseModel, adjust, map_images, normalise_model, verify_pairs
+from .mapping import (
+    MAX_VERIFICATION_ERROR_PX,
+    RegisteredImage,
+    SparseModel,
+    adjust,
+    filter_observations,
+    map_images,
+    normalise_model,
+    verify_pairs,
+)
 from .pair_selection import COMPARED_KEYPOINTS, SIMILAR, similar_pairs, vlad_vectors
+from .tracks import refine_tracks
+
+MAX_ERROR_PX = 1.0
+"""Of a refined track; patches that are farther away show something else."""
 
 MAX_EXHAUSTIVE = 50
 """Images of which "auto" matches all pairs."""
@@ -226,9 +239,11 @@ class Stages:
         intrinsics: Mapping[str, CameraIntrinsics],
         matches: Mapping[Pair, np.ndarray],
         known: bool,
+        refined: bool = True,
     ) -> tuple[Any, dict[Pair, int], list[frozenset[str]]]:
         """Map, or read what an earlier run has mapped; known intrinsics stay as they are.
 
+        Tracks are `refined`, or are as the keypoints were found, and their points have no colours.
         Returns the model of pycolmap; the number of matches of each pair that agree with its
         geometry; and the names of the images in each other component.
         """
@@ -243,7 +258,7 @@ class Stages:
             [(name, own, points.xy) for name, (points, own) in images.items()],
             [cameras.index(camera) for camera in cameras],
             list(matches.items()),
-            (known, self.seed, pycolmap.__version__, __version__),
+            (known, refined, self.seed, pycolmap.__version__, __version__),
         )
         record = self.work / f"mapping-{made_of}.json"
         database, sparse = self.output / "database.db", self.work / "sparse"
@@ -268,7 +283,14 @@ class Stages:
                 # Those of an attempt that is given up are counted again in the next.
                 lambda count: bar.update(min(count, len(images) - bar.n)),
             )
-        adjust(model, known)
+        if refined:
+            refine_tracks(model, folder)
+            # The first adjustment tells which patches were mistaken.
+            for max_error_px in (MAX_VERIFICATION_ERROR_PX, MAX_ERROR_PX):
+                filter_observations(model, max_error_px)
+                adjust(model, known)
+        else:
+            adjust(model, known)
         normalise_model(model)
         sparse.mkdir(exist_ok=True)
         model.write(sparse)

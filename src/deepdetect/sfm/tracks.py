@@ -1,0 +1,187 @@
+"""Tracks at sub-pixel positions: patches of one image of each, aligned in all others.
+
+A keypoint is where its own image has a maximum, which noise and the angle of view move. Once the
+cameras are known, the image that sees a point from the middle shows its others what to look for: a
+patch of the surface, warped as they see it. Lindenberger et al., "Pixel-Perfect Structure-from-
+Motion with Featuremetric Refinement", 2021, align features of a network instead.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .._shared.opencv import cv2
+from .._shared.records import file_state
+from ..io.image import load_image, luma
+from ..reconstruction.subpixel import align_patches
+from .colmap import PIXEL_CENTRE, quiet_pycolmap
+from .mapping import RegisteredImage, SparseModel, read_sparse_model
+
+PATCH_RADIUS_PX = 6
+"""Of the patches that are aligned."""
+
+MAX_SHIFT_PX = 2.5
+"""From where the model sees a point to where the patch is found."""
+
+BLUR_SIGMA_PX = 0.7
+"""Of the images before: cubic interpolation at other phases dampens noise differently."""
+
+MIN_FACING = 0.3
+"""Cosine of the angle between the normal of a surface and the line of sight of an image that is
+asked for it."""
+
+MAX_GROWTH = 7.0
+"""Of the area of a patch from one image to another, or the other way round."""
+
+MIN_COMMON_POINTS = 10
+"""Of two images, for points of one to be sought in the other."""
+
+CACHED_IMAGES = 8
+"""That are kept in memory: following references share their neighbours."""
+
+
+class Surfaces(NamedTuple):
+    """What is sought of an image: (K, 2) whole pixels, and the planes (K, 3), (K, 3) they lie on.
+
+    Normals are of length 1 and towards the image, in the frame of the model, as the points are.
+    """
+
+    pixels: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+
+
+def refine_tracks(model: Any, folder: Path) -> None:
+    """Put refined tracks in place of those of a `pycolmap.Reconstruction`; cameras stay.
+
+    Each point keeps the image that sees it from the middle, at a whole pixel, and is sought in all
+    images that may see it, whether they have a keypoint there or not. Points have the colour of
+    their pixel.
+    """
+    sparse = read_sparse_model(model)
+    tracks = _Tracks(sparse, folder)
+    for name, surfaces in _central_views(sparse).items():
+        tracks.add(name, surfaces)
+    tracks.write(model)
+
+
+def _central_views(sparse: SparseModel) -> dict[str, Surfaces]:
+    """Return by image the points that it sees from the middle of all directions of their track."""
+    images = [*sparse.images.values()]
+    rows = np.concatenate([image.points for image in images])
+    owners = np.repeat(np.arange(len(images)), [len(image.points) for image in images])
+    sights = sparse.points[rows] - np.array([image.view.centre for image in images])[owners]
+    sights /= np.linalg.norm(sights, axis=1, keepdims=True)
+    middles = np.zeros_like(sparse.points)
+    np.add.at(middles, rows, sights)
+    middles /= np.linalg.norm(middles, axis=1, keepdims=True)
+    order = np.lexsort((-(sights * middles[rows]).sum(axis=1), rows))
+    best = order[np.flatnonzero(np.diff(rows[order], prepend=-1))]
+    pixels = np.concatenate([image.intrinsics.from_pinhole(image.xy) for image in images])
+    found = {}
+    for number, image in enumerate(images):
+        own = best[owners[best] == number]
+        points = rows[own]
+        whole = np.rint(pixels[own]).astype(np.int64)
+        found[image.view.name] = Surfaces(whole, sparse.points[points], -middles[points])
+    return found
+
+
+class _Tracks:
+    """Tracks of a model, as they are found."""
+
+    def __init__(self, sparse: SparseModel, folder: Path) -> None:
+        self.images, self.folder = [*sparse.images.values()], folder
+        self.points = [np.empty((0, 3))]
+        self.colors = [np.empty((0, 3), np.uint8)]
+        self.count = 0
+        none = np.empty(0, np.int64), np.empty((0, 2))
+        self.seen = [[none] for _ in self.images]  # rows of points, and pixels, by image
+        numbers = [np.isin(np.arange(len(sparse.points)), each.points) for each in self.images]
+        common = np.array(numbers, np.float32) @ np.array(numbers, np.float32).T
+        self.together = common >= MIN_COMMON_POINTS
+
+    def add(self, name: str, wanted: Surfaces, min_views: int = 2) -> None:
+        """Seek surfaces of an image in the others; those that enough images see become points."""
+        own = next(k for k, each in enumerate(self.images) if each.view.name == name)
+        pixels, points, _ = wanted
+        found = [(own, np.arange(len(pixels)), pixels.astype(np.float64))]
+        for k in map(int, np.flatnonzero(self.together[own])):
+            if k != own:
+                found.append((k, *self._aligned(self.images[own], self.images[k], wanted)))
+        views = np.bincount(np.concatenate([rows for _, rows, _ in found]), minlength=len(pixels))
+        kept = views >= min_views
+        new = self.count + np.cumsum(kept) - 1
+        for k, rows, xy in found:
+            self.seen[k].append((new[rows[kept[rows]]], xy[kept[rows]]))
+        self.count += int(kept.sum())
+        self.points.append(points[kept])
+        column, row = pixels[kept].T
+        self.colors.append(_read(self.folder, self.images[own])[0][row, column])
+
+    def _aligned(
+        self, image: RegisteredImage, other: RegisteredImage, wanted: Surfaces
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return rows of the surfaces that another image shows, and their pixels there."""
+        pixels, points, normals = wanted
+        view, seen = image.view, []
+        ahead = ((points - view.centre) * normals).sum(axis=1)
+        for step in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
+            rays = view.camera.rays(image.intrinsics.to_pinhole(pixels + step)) @ view.rotation
+            places = view.centre + rays * (ahead / (rays * normals).sum(axis=1))[:, None]
+            xy, depth = other.view.project(places)
+            seen.append(np.column_stack([other.intrinsics.from_pinhole(xy), depth]))
+        start, right, left, below, above = np.array(seen)
+        affinities = np.stack([right - left, below - above], axis=2)[:, :2] / 2
+        sight = other.view.centre - points
+        facing = (sight * normals).sum(axis=1) / np.linalg.norm(sight, axis=1)
+        growth = np.linalg.det(affinities)
+        rows = np.flatnonzero(
+            (np.min(seen, axis=0)[:, 2] > 0)
+            & (facing > MIN_FACING)
+            & (growth > 1 / MAX_GROWTH)
+            & (growth < MAX_GROWTH)
+            & ((start[:, :2] >= 0) & (start[:, :2] < other.intrinsics.size)).all(axis=1)
+        )
+        xy, converged = align_patches(
+            (_read(self.folder, image)[1], _read(self.folder, other)[1]),
+            pixels[rows],
+            np.ascontiguousarray(start[rows, :2]),
+            affinities[rows],
+            radius_px=PATCH_RADIUS_PX,
+            max_shift_px=MAX_SHIFT_PX,
+        )
+        return rows[converged], xy[converged]
+
+    def write(self, model: Any) -> None:
+        """Put the tracks in place of those of a `pycolmap.Reconstruction`."""
+        with quiet_pycolmap() as pycolmap:
+            numbers = {image.name: number for number, image in model.images.items()}
+            model.delete_all_points2D_and_points3D()
+            tracks = [pycolmap.Track() for _ in range(self.count)]
+            for image, seen in zip(self.images, self.seen, strict=True):
+                number = numbers[image.view.name]
+                rows = np.concatenate([rows for rows, _ in seen])
+                xy = np.concatenate([xy for _, xy in seen]) + PIXEL_CENTRE
+                model.images[number].points2D = pycolmap.Point2DList(map(pycolmap.Point2D, xy))
+                for place, row in enumerate(rows):
+                    tracks[row].add_element(number, place)
+            points, colors = np.concatenate(self.points), np.concatenate(self.colors)
+            for point, track, color in zip(points, tracks, colors, strict=True):
+                model.add_point3D(point, track, color)
+
+
+def _read(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, np.ndarray]:
+    """Return an image (H, W, 3), and its blurred grey values (H, W) float32."""
+    path = folder / image.view.name
+    return _read_file(path, file_state(path))
+
+
+@lru_cache(maxsize=CACHED_IMAGES)
+def _read_file(path: Path, state: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    rgb = load_image(path, max_megapixels=np.inf)
+    return rgb, cv2.GaussianBlur(luma(rgb).astype(np.float32), (0, 0), BLUR_SIGMA_PX)

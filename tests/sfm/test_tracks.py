@@ -1,0 +1,92 @@
+"""Tracks of a slanted plane with a texture, whose matches are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deepdetect._shared.opencv import cv2
+from deepdetect.geometry.camera import Camera, PosedView
+from deepdetect.sfm.colmap import CameraIntrinsics
+from deepdetect.sfm.mapping import read_sparse_model
+from deepdetect.sfm.tracks import refine_tracks
+
+SIZE, NORMAL, DISTANCE = (320, 240), np.array([-0.2, 0, 1]), 6.0
+"""Of the plane z = 6 + x / 5."""
+
+
+def view(x: float) -> PosedView:
+    rotation = cv2.Rodrigues(np.array([0, -x / DISTANCE, 0.05 * x]))[0]
+    return PosedView(f"{x:g}.png", Camera(SIZE, 300.0), rotation, -rotation @ [x, 0, 0])
+
+
+VIEWS = [view(x) for x in (-1.0, -0.5, 0.0, 0.5, 1.0)]
+
+
+def on_plane(own: PosedView, xy: np.ndarray) -> np.ndarray:
+    rays = own.camera.rays(xy) @ own.rotation
+    return own.centre + rays * ((DISTANCE - own.centre @ NORMAL) / (rays @ NORMAL))[:, None]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    noise = np.random.default_rng(0).normal(0, 1, (1000, 1000, 3)).astype(np.float32)
+    texture = cv2.GaussianBlur(noise, (0, 0), 3)
+    texture = np.clip(128 + 50 * texture / texture.std(), 0, 255)
+    y, x = np.indices(SIZE[::-1])
+    for own in VIEWS:
+        places = on_plane(own, np.column_stack([x.ravel(), y.ravel()]).astype(float))
+        at = (places[:, :2] * 80 + 500).astype(np.float32).reshape(*SIZE[::-1], 2)
+        image = cv2.remap(texture, at[..., 0], at[..., 1], cv2.INTER_CUBIC)
+        cv2.imwrite(str(tmp_path / own.name), np.rint(image).clip(0, 255).astype(np.uint8))
+    return tmp_path
+
+
+def test_rough_keypoints_become_exact_tracks_of_all_images(pycolmap, folder: Path) -> None:
+    rng = np.random.default_rng(1)
+    points = on_plane(VIEWS[2], rng.uniform((40, 40), (280, 200), (60, 2)))
+    model = pycolmap.Reconstruction()
+    camera = CameraIntrinsics.of_camera(Camera(SIZE, 300.0)).colmap_camera()
+    camera.camera_id = 1
+    model.add_camera_with_trivial_rig(camera)
+    for number, own in enumerate(VIEWS, 1):
+        xy = own.project(points)[0] + rng.normal(0, 0.5, (60, 2)) + 0.5
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(own.rotation), own.translation)
+        image = pycolmap.Image(name=own.name, keypoints=xy, camera_id=1, image_id=number)
+        model.add_image_with_trivial_frame(image, pose)
+    for row, point in enumerate(points):
+        track = pycolmap.Track()
+        for number in (2, 3, 4):  # the outer ones have no keypoint of it
+            track.add_element(number, row)
+        model.add_point3D(point, track)
+    with pytest.raises(AssertionError):
+        check(read_sparse_model(model))
+    for number in (1, 5):  # but share a few points with the others
+        for row in range(12):
+            model.add_observation(row + 1, pycolmap.TrackElement(number, row))
+    refine_tracks(model, folder)
+    sparse = read_sparse_model(model)
+    assert len(sparse.points) > 55
+    assert sparse.tracks.mean() > 4  # of five
+    check(sparse)
+    seen = sparse.images["0.png"]
+    column, row = np.rint(seen.xy).astype(int).T
+    image = cv2.imread(str(folder / "0.png"))[row, column, ::-1].astype(int)
+    assert np.median(np.abs(image - sparse.colors[seen.points])) < 10
+
+
+def check(sparse) -> None:
+    """All images of a track see one point of the plane."""
+    places = [
+        on_plane(image.view, image.xy)[np.argsort(image.points)] for image in sparse.images.values()
+    ]
+    rows = [np.sort(image.points) for image in sparse.images.values()]
+    middles = np.zeros_like(sparse.points)
+    for row, place in zip(rows, places, strict=True):
+        middles[row] += place / sparse.tracks[row, None]
+    apart = np.concatenate(
+        [np.linalg.norm(p - middles[r], axis=1) for r, p in zip(rows, places, strict=True)]
+    )
+    assert np.median(apart) * 300 / DISTANCE < 0.1  # pixels
