@@ -81,11 +81,12 @@ COST_COLUMNS = {
 
 TEXT = (
     "The cameras of all images of a scene and sparse points, as by `reconstruct_many`: every pair "
-    "is matched, COLMAP verifies and maps, and a last adjustment with a robust loss follows. All "
-    "methods have the same stages and options, once with the true intrinsics and once with "
-    "estimated ones; the true poses only evaluate. What differs are the keypoints: the ranked "
-    "points of DeepDetect; as many random points with their sizes; and pycolmap's own SIFT with "
-    "its own matcher, at as many places at most, some of them at two angles.",
+    "is matched, COLMAP verifies and maps, tracks are refined, and a last adjustment with a robust "
+    "loss follows. All methods have the same stages and options, once with the true intrinsics and "
+    "once with estimated ones; the true poses only evaluate. What differs are the keypoints: the "
+    "ranked points of DeepDetect; as many random points with their sizes; and pycolmap's own SIFT "
+    "with its own matcher, at as many places at most, some of them at two angles, once with the "
+    "tracks as they are and once with refined ones.",
 )
 
 CAMERA_NOTE = (
@@ -115,7 +116,8 @@ class SfmMethod:
     """A row of the tables; `name` is also the title, and results depend on `version`, too.
 
     `find` writes the keypoints of the images in a folder, `match` returns the matches of pairs;
-    both are functions of a module. With `chance` the time that finding takes means nothing.
+    both are functions of a module. With `chance` the time that finding takes means nothing; tracks
+    are `refined`, or as COLMAP leaves them.
     """
 
     name: str
@@ -123,6 +125,7 @@ class SfmMethod:
     match: Callable[[Stages, Sequence[Pair]], dict[Pair, np.ndarray]] = Stages.match
     version: str = ""
     chance: bool = False
+    refined: bool = True
 
 
 @lru_cache
@@ -182,16 +185,17 @@ def choose_images(scene: PosedScene, most: int) -> PosedScene:
 
 
 def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
-    """Return the ranked points, SIFT where it is among the baselines, and random points."""
+    """Return the ranked points, SIFT where it is among the baselines (twice), and random points."""
     points = PointDetector(MAX_KEYPOINTS, ranker=options.ranker)
     version, random = (
         f"{points.settings} {points.descriptor_type}",
         "baseline: as many random points",
     )
     ours = SfmMethod("DeepDetect, points", partial(find_points, points), version=version)
-    sift = SfmMethod("SIFT, pycolmap", find_sift, match_sift)
+    sift = SfmMethod("SIFT, pycolmap", find_sift, match_sift, refined=False)
+    aligned = SfmMethod("SIFT, tracks refined", find_sift, match_sift)
     chance = SfmMethod(random, partial(find_random_points, points), version=version, chance=True)
-    return [ours, sift, chance] if "sift" in options.classical else [ours, chance]
+    return [ours, sift, aligned, chance] if "sift" in options.classical else [ours, chance]
 
 
 def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
@@ -378,7 +382,7 @@ def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, 
             intrinsics = initial_intrinsics(folder, sizes, known)
             cpu = time.process_time()
             try:
-                model = stages.map(folder, intrinsics, matches, bool(known))[0]
+                model = stages.map(folder, intrinsics, matches, bool(known), method.refined)[0]
             except NoDepthError:
                 model = None  # a result, too
             row[MAPPING_CPU.format(kind)] = time.process_time() - cpu
