@@ -138,6 +138,8 @@ def shards(generator: np.random.Generator, folder: Path) -> None:
         for k in range(min(len(source), 5)):
             image = source[k]
             for view in (*image.normal, *image.dark):
+                if part is found.validation and view.augmentation is not None:
+                    continue  # those are for training
                 pixels, mask = source.load(k, view)
                 expect(mask.shape == pixels.shape[:2], "a label of another size")
 

@@ -49,6 +49,12 @@ def test_the_checkerboard_has_both(photo: np.ndarray) -> None:
     assert brightness == pytest.approx(0.5, abs=0.05)
 
 
+@pytest.mark.parametrize("one", ["thermal.tif", Path("thermal.tif"), 3])
+def test_further_images_are_a_list(photo: np.ndarray, one: object) -> None:
+    with pytest.raises(OptionError, match="must be a list of images"):
+        register(photo, photo, apply_to=one)
+
+
 @pytest.mark.slow
 def test_images_of_different_things_are_refused(photo: np.ndarray) -> None:
     noise = np.random.default_rng(0).integers(0, 256, photo.shape).astype(np.uint8)

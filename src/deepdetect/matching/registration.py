@@ -131,6 +131,8 @@ def register(
         [-12.0, 0.0]
     """
     check_name("extent", extent, get_args(Extent))
+    if isinstance(apply_to, str | bytes) or not isinstance(apply_to, Sequence):
+        raise OptionError('`apply_to` must be a list of images, as ["thermal.tif"]')
     first, deep = load_image(image0, channels=channels), load_deep(image1, channels)
     second = to_8_bits(deep)
     matches = match_images(
