@@ -16,7 +16,7 @@ from deepdetect.evaluation.metrics.pose import translation_error
 from deepdetect.evaluation.metrics.stereo import stereo_score
 from deepdetect.evaluation.protocols.pose import estimate_pose
 from deepdetect.geometry import transform_points
-from deepdetect.geometry.transforms import epipolar_errors
+from deepdetect.geometry.transforms import epipolar_errors, transfer_errors
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import guided_matches, guiding_geometry
 from deepdetect.matching.guided.pipeline import match_by_homography
@@ -108,6 +108,19 @@ def test_a_plane_that_moves_otherwise_keeps_its_matches_and_spoils_no_others(
     beside = (starts > 20 + side).any(axis=1)
     assert np.count_nonzero(beside) > 0.2 * len(every)
     assert (np.abs(moved[beside, 1]) < 1).mean() > 0.98
+
+
+def test_of_two_motions_alike_in_size_neither_is_trusted_highly(photo: np.ndarray) -> None:
+    # A view that turns within a frame that stands still.
+    column, row = np.meshgrid(np.arange(256), np.arange(256))
+    through = (np.hypot(column - 128, row - 128) < 100)[..., None]
+    frame, turn = photo[::-1, ::-1], cv2.getRotationMatrix2D((128, 128), 20, 1)
+    views = photo, cv2.warpAffine(photo, turn, (256, 256), flags=cv2.INTER_CUBIC)
+    matches = match(*(np.where(through, view, frame) for view in views), Everywhere())
+    for motion in (np.eye(3), np.vstack([turn, [0, 0, 1]])):
+        errors = transfer_errors(matches.points0, matches.points1, motion)
+        assert 0.33 < (errors < 1).mean() < 0.67
+    assert matches.confidence == "fair"
 
 
 @pytest.mark.slow

@@ -76,6 +76,10 @@ DOMINANT_FRACTION, MIN_PLANE_FRACTION = 0.5, 0.2
 MAX_CLEAR_LOG10_NFA, MIN_CLEAR_CORRELATION = -12.0, 0.5
 """Of matches of high confidence."""
 
+MIN_OWN_FRACTION = 0.67
+"""Of these, the geometry's own: of two that move otherwise one may be no scene but what is put
+over it, as the round edge of a microscope's or fundus camera's view, which stands still."""
+
 MIN_MATCHED_FRACTION = 0.02
 """With a smaller fraction of the keypoints of a scene with depth matched, only the sparse matches
 that agree with its geometry are taken."""
@@ -133,10 +137,12 @@ def guided_matches(
     distinct = matches.points0 is not None
     if plane is not None and is_repeated(grays, *plane, sparse, seed, distinct):
         return replace(geometry, model="none", matrix=None, scene="none"), None
+    own = len(matches)
     matches = _with_further_planes(grays, pixels, geometry, matches, first, enough, seed)
     ends = matches.starts(pixels[0]), matches.points1
     correlation, alike = compare_held_out(grays, *ends)
     clear = geometry.log10_nfa < MAX_CLEAR_LOG10_NFA and correlation > MIN_CLEAR_CORRELATION
+    clear = clear and own >= MIN_OWN_FRACTION * len(matches)
     confidence = "high" if clear and matches.points0 is None else "fair"
     geometry = replace(geometry, correlation=correlation, confidence=confidence)
     return geometry, replace(matches, alike=alike)
