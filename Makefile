@@ -104,6 +104,7 @@ lint: $(VENV)/.test spelling
 
 spelling: $(VENV)/.test
 	$(VENV)/bin/codespell
+	$(VENV)/bin/python tools/plain_english.py
 
 types: $(VENV)/.test
 	$(VENV)/bin/mypy

@@ -35,15 +35,15 @@ class AppOptions:
     """Limits of the server of the page.
 
     Attributes:
-        port: of 127.0.0.1; 0 for any that is free.
+        port: port of 127.0.0.1; 0 takes any free one.
         max_file_mb: size of the largest image file, in megabytes.
         max_task_mb: size of all image files of one task, in megabytes.
         max_files: number of images of one task.
         max_megapixels: larger images are refused before they are decoded.
         max_tasks: tasks that are at work at the same time.
         max_task_s: seconds after which a task is ended.
-        abandoned_s: seconds without a question from the page after which a task, or its result,
-            is forgotten. Pages in the background ask once a minute.
+        abandoned_s: discard a task and its result if the page has not asked for it for this many
+            seconds. Pages in the background ask once a minute.
         max_request_s: seconds that the images of a task may take to arrive.
 
     Raises:

@@ -44,14 +44,14 @@ class PairMatchingOptions:
     """How the features of two images are matched.
 
     Attributes:
-        ratio: of the ratio test: the best distance must be below this share of the second-best.
-            None: as of `match_features`.
+        ratio: limit of the ratio test: the best distance must be below this share of the
+            second-best. None: as of `match_features`.
         mutual: keep only mutual nearest neighbours.
         matcher: name of the matcher: "auto", "exact", "patchmatch", "flann" or "faiss".
         verify: keep only the matches that agree with a geometry that is estimated from them:
             "fundamental", "homography" or "auto"; "none" keeps all.
-        inlier_threshold: of this geometry, in pixels.
-        seed: of random choices.
+        inlier_threshold: largest error under this geometry, in pixels.
+        seed: seed of random choices.
 
     Raises:
         OptionError: a value is unknown or out of its range.

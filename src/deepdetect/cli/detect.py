@@ -55,7 +55,7 @@ def detect(
 
     Args:
         ignore: Mask image of the same size: no keypoints where it is bright.
-        pictures: Write pictures, too.
+        pictures: Also write pictures.
     """
     import_opencv()  # what is missing is said before anything is written
     stems = cli.result_stems(cli.expand_images(images, output))

@@ -37,7 +37,7 @@ def extract(
     """Extract the keypoints and descriptors of all images below a folder.
 
     Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. When it is
-    interrupted or killed, the same command goes on; new and changed images are added later, and
+    interrupted or killed, the same command continues; new and changed images are added later, and
     the features of images that are gone are removed.
 
         deepdetect extract photos/ -o features.h5
@@ -69,7 +69,7 @@ def match_many(
     """Match the descriptors in a file of features, pair by pair.
 
     Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. When it is
-    interrupted or killed, the same command goes on; new pairs are added later.
+    interrupted or killed, the same command continues; new pairs are added later.
 
         deepdetect match-many features.h5 --pairs exhaustive
         deepdetect match-many features.h5 --pairs sequential:10 --verify fundamental

@@ -101,13 +101,13 @@ def match(
         deepdetect match a.png b.png --preset published --homography H1to2p
 
     Args:
-        pairs: Of more than two images: exhaustive (all), sequential:1 (each with the next by name),
-            or a text file with the names of two images on each line.
+        pairs: Which of more than two images: exhaustive (all), sequential:1 (each with the next by
+            name), or a text file with the names of two images on each line.
         preset: Options to start from: default, or published (exactly the paper's code).
         homography: Text file of a known 3x3 homography to evaluate matches by.
         camera0: Text file of the 3x3 camera matrix, for the model essential.
         camera1: The same of the second image.  [default: camera0]
-        pictures: Write a picture, too.
+        pictures: Also write a picture.
     """
     many = len(images) != 2 or any(path.is_dir() for path in images)
     endings = {"file": f".{file_format}"} | ({"picture": ".jpg"} if pictures else {})

@@ -71,11 +71,10 @@ def reconstruct(
     times and quality). For rectified pairs the detector only chooses which pixels of a dense
     disparity map become points; --density 1 takes all of them.
 
-    A folder, or three and more images: their cameras are estimated, too. Writes model.ply,
-    model.glb, model.html (with the cameras), model.json, and COLMAP's sparse/0 and database.db.
-    Where the images carry GPS, the model goes east, north and up in metres. When it is interrupted
-    or killed, the same command goes on. Images that cannot be read, or show
-    something else, are left out, and listed.
+    A folder, or three and more images: also estimates their cameras. Writes model.ply, model.glb,
+    model.html (with the cameras), model.json, and COLMAP's sparse/0 and database.db. If the images
+    carry GPS, the model is in metres east, north and up. After an interruption the same command
+    continues. Images that cannot be read, or show something else, are left out and listed.
 
         deepdetect reconstruct left.png right.png --calibration calib.json -o model.ply
         deepdetect reconstruct left.jpg right.jpg --focal 1250

@@ -33,7 +33,7 @@ from ..training import train_points as train_ranker
 from . import _options as cli
 from .features import EXTRACTION
 
-Folder = Annotated[Path, Parameter(help="Folder of the images, of train also of shards.")]
+Folder = Annotated[Path, Parameter(help="Folder of images; `train` also takes shards.")]
 RUN = cli.From(
     train_network,
     "validation init_weights",

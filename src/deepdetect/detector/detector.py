@@ -69,9 +69,9 @@ class DeepDetect:
             images of OpenCV leave it, and give the methods `channels="bgr"`.
         tta: "flip": a flipped or turned image gives the same keypoints of the heat map, in eight
             times the time.
-        tile_megapixels: with `resolution="native"`, larger images are run in tiles of so many
-            megapixels: less memory, about twice the time. "auto": where it is needed. Only weights
-            of the network `fast` can be tiled.
+        tile_megapixels: with `resolution="native"`, the size of the tiles of larger images, in
+            megapixels: less memory, about twice the time. "auto": tiles only if memory is short.
+            Only weights of the network `fast` can be tiled.
 
     Attributes:
         backend: name of the backend that runs.

@@ -40,11 +40,11 @@ class PointDetector:
             that) or "native" (always as it is).
         ranker: npz file of `deepdetect dev train-points` that ranks the points. None: the one
             inside the package.
-        descriptor: of `extract`: "learned", by a small network that sees the surroundings of a
-            keypoint, too; "learned-free", by one that was trained on photographs under free
-            licences alone; "cross-modal", for images of different sensors, such as infrared and
-            visible light, or a map; the ONNX file of `deepdetect train-descriptor`; or
-            "rootsift", for programs that expect SIFT's.
+        descriptor: what `extract` computes: "learned", by a small network that also sees the
+            surroundings of a keypoint; "learned-free", by one trained only on freely licensed
+            images; "cross-modal", for images of different sensors, such as infrared and visible
+            light, or a map; the ONNX file of `deepdetect train-descriptor`; or "rootsift", for
+            programs that expect SIFT's.
 
     Raises:
         WeightsError: the ranker or the descriptor is missing, damaged or does not fit.

@@ -47,10 +47,10 @@ class BenchmarkOptions:
         others: further local features.
         channels: order of the colours in the paper's protocol; "bgr" in the paper's code.
         geometry_weights: the weights for stereo pairs, one or more.
-        max_pairs: of each scene at most this many pairs, evenly spaced; of one the last.
+        max_pairs: at most this many pairs of each scene, evenly spaced; the last one if it is one.
         degraded_images: which images of a pair the protocol "degraded" degrades.
         max_images: at most this many of a scene: of a sequence the first, else evenly spaced.
-        ranker: of the points, as of `PointDetector`.
+        ranker: ranker of the points, as for `PointDetector`.
 
     Raises:
         OptionError: a name is unknown, or a number is out of its range.

@@ -114,7 +114,7 @@ def evaluate(
         oxford: folder of the eight Oxford scenes, for `OxfordScore`.
         foreground: folder of photographs NAME.jpg with their foreground NAME_mask.png: the fraction
             of the keypoints that lies on it.
-        equal_density: of each image of `oxford` and `foreground` as many keypoints are taken as its
+        equal_density: take as many keypoints of each image of `oxford` and `foreground` as its
             label marks, the most probable ones, instead of all above the threshold 0.5. More
             keypoints are more repeatable and have more matches whatever they are, so weights are
             compared in this way.

@@ -83,8 +83,8 @@ class SelectionOptions:
         density: keypoints per pixel, in (0, 1]; replaces the threshold: this fraction of the pixels
             is taken, the most probable ones.
         max_keypoints: at most this many are kept, the most probable ones.
-        nms_radius: of non-maximum suppression in pixels: a pixel is kept when it ranks highest
-            within this distance in x and y (0: no suppression).
+        nms_radius: non-maximum suppression radius in pixels: a pixel is kept if it ranks highest
+            within this distance in x and y; 0 keeps all.
         subpixel: refine to the maximum of a parabola through three pixels in x and in y.
 
     Raises:

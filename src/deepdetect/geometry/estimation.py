@@ -139,7 +139,7 @@ def estimate_geometry(
         points0, points1: (M, 2) matched positions, centre of the first pixel (0, 0).
         model: "homography" (planes, pure rotation), "fundamental" (any static scene), "auto"
             (one of these two; `measure_parallax`), "essential" (known cameras), or "none".
-        seed: of the random samples.
+        seed: seed of the random samples.
         options: how.
 
     Returns:

@@ -100,7 +100,7 @@ def fit_similarity(
         level, level_stds: (L, 3) directions in this frame that are horizontal, and (L,) their
             standard deviations in radians.
         scale: what the scale is, where it is known.
-        seed: of the random choices.
+        seed: seed of the random choices.
 
     Raises:
         ReconstructionError: the points are in one place, or too few of them agree.

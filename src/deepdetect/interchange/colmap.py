@@ -42,7 +42,7 @@ def write_colmap(
         output: ending in .db.
         intrinsics: of the camera of each image; those with the same object share one.
         verify: estimate the two-view geometry of each pair, without which COLMAP maps nothing.
-        seed: of this verification.
+        seed: seed of this verification.
 
     Returns:
         The file.

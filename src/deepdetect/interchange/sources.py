@@ -216,7 +216,7 @@ def match_folder(
     Args:
         folder: of the images.
         detector: as of `extract_features`.
-        pairs: as of `match_pairs`; None: all, of up to 50 images.
+        pairs: as for `match_pairs`; None: all pairs of up to 50 images.
         workers: number of processes; default one per processor.
         quiet: show no progress bars.
 

@@ -89,9 +89,9 @@ def load_image(
         bands: the three bands that become red, green and blue, numbered from 1, of TIFF files and
             arrays: (4, 3, 2) of Landsat 8. None: the first three, of four bands without alpha and
             more it must be given.
-        page: of files with several images, from 0 on, thumbnails not counted. None: the first of
-            the largest of TIFF, else the first.
-        allow_truncated: read files that lack their end; what is missing is black or grey.
+        page: number of the image in a file with several, from 0 on, thumbnails not counted. None:
+            the first of the largest of TIFF, else the first.
+        allow_truncated: read truncated files; the missing part is black or grey.
 
     Returns:
         (H, W, 3) uint8 RGB.

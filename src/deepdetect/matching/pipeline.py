@@ -137,7 +137,7 @@ def match_images(
         tentative_matches: a few matches of any other matcher (LightGlue, LoFTR, a person's clicks),
             two (K, 2) arrays of positions, row by row; they take the place of our own SIFT matches
             that guide, and some may be wrong. Or what `find_tentative_matches` has made already.
-        seed: of all random choices.
+        seed: seed of all random choices.
         options: all else.
         progress: called with the name of each stage when it ends.
 
@@ -210,7 +210,7 @@ def match_features(
         ratio: the distance of the best over that of the second-best must be below this. None: 0.85,
             of learned descriptors 0.88, which is as strict.
         mutual: keep only mutual nearest neighbours.
-        seed: of a matcher that is random.
+        seed: seed of a matcher that is random.
 
     Returns:
         The matches, of the model "none"; their scores are 1 - ratio.

@@ -79,14 +79,14 @@ def reconstruct(
             the first one, whose frame the points are in.
         detector: as of `match_images`; default `DeepDetect("dense")`.
         channels: order of the colours in images that are arrays, as of `load_image`.
-        calibration: file of the cameras, as of `Calibration.load`, or a `Calibration`. Without one
+        calibration: file of the cameras, as for `Calibration.load`, or a `Calibration`. Without one
             the focal length is taken from `focal_px`, or from EXIF.
         focal_px: focal length in pixels of both cameras, instead of a calibration.
         rectified: whether matches lie on the same row of both images. None: detected.
         selection: which pixels of a heat map become keypoints; None: those over 0.5. A density of 1
             takes every pixel, and `DENSE` disparities; `subpixel` does not apply.
         ignore: as of `match_images`; of a rectified pair only the mask of the left image counts.
-        seed: of all random choices.
+        seed: seed of all random choices.
         disparity: of rectified pairs; "auto": `DENSE` for every pixel, else the strict default.
         point_filter: which points are kept.
         progress: called with the name of each stage when it ends.
@@ -182,10 +182,10 @@ def estimate_pose(
         first, second: anything `load_image` takes.
         detector: as of `match_images`; default `DeepDetect()`.
         channels: order of the colours in images that are arrays, as of `load_image`.
-        calibration: file of the cameras, as of `Calibration.load`, or a `Calibration`. Without one
+        calibration: file of the cameras, as for `Calibration.load`, or a `Calibration`. Without one
             the focal length is taken from `focal_px`, or from EXIF.
         focal_px: focal length in pixels of both cameras, instead of a calibration.
-        seed: of all random choices.
+        seed: seed of all random choices.
         progress: called with the name of each stage when it ends.
 
     Returns:

@@ -73,7 +73,7 @@ def reconstruct_many(
             `Camera`, which is taken to be exact. Without one the focal length begins with
             `focal_px`, EXIF, or a guess, and is estimated with the distortion.
         focal_px: focal length in pixels of all images, roughly.
-        seed: of all random choices; COLMAP's threads may still make a small difference.
+        seed: seed of all random choices; COLMAP's threads may still make a small difference.
         options: of all stages.
         workers: number of processes; default one per processor.
         overwrite: do all of it again.

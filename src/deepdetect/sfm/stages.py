@@ -80,10 +80,10 @@ class MultiViewOptions:
         pairs: which images are matched: "exhaustive": all; "sequential:10": each with the 10 that
             follow it by name; "similar": the most alike; "auto": all of up to 50, else the most
             alike.
-        ratio: of the ratio test: the best distance must be below this share of the second-best.
-            None: as of `match_features`.
-        dense: whether dense points are made.
-        stride_px: a dense point is sought at every so many pixels of a row and of a column.
+        ratio: limit of the ratio test: the best distance must be below this share of the
+            second-best. None: as of `match_features`.
+        dense: make dense points.
+        stride_px: distance in pixels between the places of a row or column that are tried.
         single_camera: whether images of one size were taken by one camera; None: where their EXIF
             gives one focal length, or none.
         control_points: file of ground control points as OpenDroneMap's gcp_list.txt, by which the

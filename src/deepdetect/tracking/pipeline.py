@@ -122,7 +122,7 @@ def track(
             frame, track, x, y and score. With .csv itself there is no video.
         detector: that finds the points; None: a `PointDetector` of enough candidates.
         options: how they are followed.
-        every: take each frame with a number that this divides.
+        every: process every N-th frame.
         max_frames: largest number of frames that are taken. None: all.
         max_side: longer sides of frames are scaled down to this many pixels for the search.
         tail: number of positions of a track that are drawn.

@@ -48,7 +48,7 @@ class TrackingOptions:
 
     Attributes:
         max_keypoints: tracks at a time.
-        detect_every: new points are looked for after this many frames, or once many are lost.
+        detect_every: look for new points after this many frames, or once many are lost.
         min_kept: share of the tracks after the last search; with fewer, a search follows.
         max_return_error_px: largest distance of a point from where following it back ends.
 

@@ -55,7 +55,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
 
     Args:
         source: a file, a folder (images in the order of their names), or the number of a camera.
-        every: take each frame with a number that this divides.
+        every: process every N-th frame.
         max_frames: that are taken; None: all.
 
     Attributes:

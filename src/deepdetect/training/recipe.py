@@ -92,7 +92,7 @@ class TrainingOptions:
             luma to a grey level, the only thing that labels and `fast` depend on.
         optimizer: "adam", or "soap", which learns more per image (docs/history.md has the
             measurements).
-        learning_rate: at the start of the cosine annealing to 1e-6.
+        learning_rate: learning rate at the start of the cosine annealing to 1e-6.
         warm_up: fraction of the steps over which the learning rate rises from zero. A run that
             starts from trained weights needs it: the first steps of Adam, whose moments are not
             known yet, would undo much.
@@ -108,7 +108,8 @@ class TrainingOptions:
         low_light_pos_weight: weight of marked pixels in crops of low visibility. None: the same.
         labels: the label detectors and their settings.
         val_count: how many times the validation loss is computed.
-        seed: of the initial weights, the order of the images, the crops and their augmentation.
+        seed: seed of the initial weights, the order of the images, the crops and their
+            augmentation.
 
     Raises:
         OptionError: a value is out of its range.
@@ -232,15 +233,15 @@ class PointsTrainingOptions:
 
     Attributes:
         steps: optimiser steps.
-        pairs: of views in each step.
-        side: of the square views in pixels.
+        pairs: pairs of views in each step.
+        side: side of the square views, in pixels.
         learning_rate: the highest; cosine annealing to 2 % of it.
         min_density, max_density: range of the budgets in keypoints per pixel, log-uniform.
         match_weight: how much more a keypoint is worth whose upright descriptors match, in
             multiples of one that is only found again.
         val_count: how many times the weights are measured after the start.
-        val_pairs: of each kind that they are measured on: zoom, blur, viewpoint, light.
-        seed: of the weights and the pairs.
+        val_pairs: pairs of each kind that they are measured on: zoom, blur, viewpoint, light.
+        seed: seed of the weights and the pairs.
 
     Raises:
         OptionError: a value is out of its range.
@@ -276,13 +277,13 @@ class DescriptorTrainingOptions:
 
     Attributes:
         steps: optimiser steps.
-        pairs: of views in each step.
+        pairs: pairs of views in each step.
         learning_rate: the highest, of Muon, after a warm-up; it falls to 0, linearly.
         val_count: how many times the weights are measured.
-        val_pairs: of each kind that they are measured on: upright, turned, zoomed.
+        val_pairs: pairs of each kind that they are measured on: upright, turned, zoomed.
         cross_modal: whether the views of a pair are as of different sensors: with other mixtures of
             colours, inverted or any other tones, or edges.
-        seed: of the weights and the pairs.
+        seed: seed of the weights and the pairs.
 
     Raises:
         OptionError: a value is out of its range.

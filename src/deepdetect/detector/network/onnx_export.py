@@ -48,7 +48,7 @@ class OnnxOptions:
             runtimes without dynamic shapes. None: any height and width.
         batch: number of images that a file with a size takes; without a size it is free.
         maps: the file gives the network's probability and logits of all pixels.
-        max_keypoints: the file gives this many points, too, those of `PointDetector`. 0: none;
+        max_keypoints: the file also gives this many points, those of `PointDetector`. 0: none;
             OpenCV refuses files with points.
 
     Raises:

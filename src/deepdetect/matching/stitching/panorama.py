@@ -125,7 +125,7 @@ def stitch(
         crop: cut the panorama to the largest rectangle without black.
         reference: number of the image in whose frame a flat panorama is, or that is in the middle
             of a curved one; None for the one in the middle of all.
-        seed: of all random choices.
+        seed: seed of all random choices.
         options: scale, limits and sizes.
         progress: called with the name of each stage (`STAGES`) when it ends.
 
