@@ -226,6 +226,10 @@ test("the wipe aligns a plane, and moves by mouse and by keys", async ({ page })
   await page.mouse.move(box.x + 0.75 * box.width, box.y + 60);
   await page.mouse.up();
   expect(Number(await page.locator("#wipe").inputValue())).toBeCloseTo(75, -0.5);
+  const [video] = await Promise.all([page.waitForEvent("download"),
+                                     page.getByRole("button", { name: "Video" }).click()]);
+  expect(video.suggestedFilename()).toMatch(/^coffee_wipe\.(webm|mp4)$/);
+  expect(readFileSync(await video.path()).length).toBeGreaterThan(20_000);
   // Aligned, both pictures are alike but for their light.
   const correlation = await page.locator("#view-wipe").evaluate((view) => {
     const [a, b] = [...view.querySelectorAll("canvas")].map((canvas) =>

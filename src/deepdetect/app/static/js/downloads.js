@@ -31,5 +31,31 @@ export async function savePng(name, canvas) {
   save(name, blob);
 }
 
+/**
+ * Saves what is drawn on a canvas within some seconds as a video.
+ *
+ * @param {HTMLCanvasElement} canvas @param {(progress: number) => void} drawAt from 0 to 1
+ */
+export async function saveVideo(name, canvas, seconds, drawAt) {
+  if (!canvas.captureStream || typeof MediaRecorder === "undefined") {
+    throw new Error("This browser records no videos: save the picture, or use another browser.");
+  }
+  const recorder = new MediaRecorder(canvas.captureStream());
+  const parts = [];
+  recorder.ondataavailable = ({ data }) => parts.push(data);
+  const stopped = new Promise((resolve) => { recorder.onstop = resolve; });
+  recorder.start();
+  const begin = performance.now();
+  for (let progress = 0; progress < 1;) {
+    const now = await new Promise(requestAnimationFrame);
+    progress = Math.min(1, Math.max(0, (now - begin) / (1000 * seconds)));
+    drawAt(progress);
+  }
+  recorder.stop();
+  await stopped;
+  const type = recorder.mimeType;
+  save(`${name}.${type.includes("mp4") ? "mp4" : "webm"}`, new Blob(parts, { type }));
+}
+
 /** The name of a file without its folder and ending. */
 export const stem = (name) => name.replace(/^.*[\\/]/, "").replace(/\.[^.]*$/, "") || "picture";

@@ -1,8 +1,10 @@
 // Before and after: the second picture in the frame of the first, up to a line that moves.
 import { canvasOf, newCanvas, showPicture } from "../draw.js";
-import { savePng, stem } from "../downloads.js";
-import { during, element, page } from "../page.js";
+import { savePng, saveVideo, stem } from "../downloads.js";
+import { during, element, page, showError } from "../page.js";
 import { matched, matchingTask } from "./matches.js";
+
+const VIDEO_S = 4; // the line goes there and back
 
 const view = element("view-wipe");
 const layers = view.querySelector(".layers");
@@ -60,18 +62,27 @@ export function draw() {
   view.querySelector(".edge").style.left = `${share}%`;
 }
 
-function composed() {
-  const { first, warped } = shown;
-  const canvas = newCanvas(first.width, first.height);
+/** Draws the pictures of a comparison on a canvas of their size, the line at a share of the width. */
+function compose(canvas, { first, warped }, share) {
   const context = canvas.getContext("2d");
-  const edge = Math.round(first.width * element("wipe").value / 100);
+  const edge = Math.round(first.width * share);
   context.drawImage(first.canvas, 0, 0);
+  context.save();
   context.beginPath();
   context.rect(edge, 0, first.width - edge, first.height);
   context.clip();
   context.drawImage(warped, 0, 0);
-  return canvas;
+  context.restore();
 }
+
+const downloads = {
+  png: (name, canvas, pictures) => {
+    compose(canvas, pictures, element("wipe").value / 100);
+    return savePng(`${name}.png`, canvas);
+  },
+  video: (name, canvas, pictures) => during("Recording…", saveVideo(name, canvas, VIDEO_S,
+    (progress) => compose(canvas, pictures, 0.5 + 0.5 * Math.cos(2 * Math.PI * progress)))),
+};
 
 export function reset() {
   shown = null;
@@ -90,7 +101,12 @@ export function setUp() {
     drag(event);
   };
   layers.onpointermove = (event) => layers.hasPointerCapture(event.pointerId) && drag(event);
-  view.querySelector("[data-download]").onclick = () => {
-    if (shown) savePng(`${stem(shown.first.name)}_wipe.png`, composed());
-  };
+  for (const button of view.querySelectorAll("[data-download]")) {
+    button.onclick = () => {
+      if (!shown) return;
+      const { first } = shown;
+      downloads[button.dataset.download](`${stem(first.name)}_wipe`, newCanvas(first.width, first.height), shown)
+        .catch((error) => showError(error.message));
+    };
+  }
 }
