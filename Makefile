@@ -143,11 +143,11 @@ docs: $(VENV_DOCS)/.test
 	NO_MKDOCS_2_WARNING=1 $(VENV_DOCS)/bin/mkdocs build
 
 # The site asks for nothing on other servers, and the notebooks run: five minutes on two cores.
-test-docs: $(VENV_DOCS)/.test
+test-docs: $(VENV_DOCS)/.notebooks
 	$(VENV_DOCS)/bin/python -m pytest -p no:cacheprovider --runslow tests/docs
 
 # Runs the notebooks and keeps their output.
-notebooks: $(VENV_DOCS)/.test
+notebooks: $(VENV_DOCS)/.notebooks
 	$(VENV_DOCS)/bin/python docs/notebooks/run.py
 
 # Draws the pictures of the README, of docs/method.md and of docs/points.md again.
@@ -227,5 +227,12 @@ $(VENV_INTEGRATIONS)/.test: $(VENV_INTEGRATIONS)/bin/uv requirements/integration
 
 $(VENV_DOCS)/.test: $(VENV_DOCS)/bin/uv requirements/docs.txt pyproject.toml
 	$(call install_locked,$(VENV_DOCS),requirements/docs.txt)
+	$(call install_package,$(VENV_DOCS))
+	touch $@
+
+# The notebooks also map and train.
+$(VENV_DOCS)/.notebooks: $(VENV_DOCS)/.test requirements/lock.txt requirements/torch.txt
+	$(call install_locked,$(VENV_DOCS),requirements/lock.txt)
+	$(call install_torch,$(VENV_DOCS))
 	$(call install_package,$(VENV_DOCS))
 	touch $@

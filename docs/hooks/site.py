@@ -99,9 +99,10 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
-    """Leave scripts out of notebooks: they are for formulas and diagrams, from other servers."""
+    """Leave scripts and badges out of notebooks: both are loaded from other servers."""
     if not page.file.src_uri.endswith(".ipynb"):
         return html
+    html = re.sub(r'<img[^>]*src="https://[^>]*>', "Open in Colab", html)
     return re.sub(r"<script.*?</script>", "", html, flags=re.S)
 
 

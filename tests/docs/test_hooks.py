@@ -64,13 +64,16 @@ def test_the_page_in_the_browser_is_embedded_where_it_is_there(
     assert '<iframe src="try/index.html"' in hooks.on_page_markdown(text, page)
 
 
-def test_notebooks_have_no_scripts(hooks: ModuleType) -> None:
+def test_notebooks_load_nothing_from_elsewhere(hooks: ModuleType) -> None:
     html = '<p>a</p><script type="module">\nimport("https://example.org/a.js")\n</script><p>b</p>'
     page, notebook = (
         SimpleNamespace(file=SimpleNamespace(src_uri=uri)) for uri in ("a.md", "a.ipynb")
     )
     assert hooks.on_page_content(html, page) == html
     assert hooks.on_page_content(html, notebook) == "<p>a</p><p>b</p>"
+    badge = '<a href="https://example.org"><img alt="x" src="https://example.org/a.svg" /></a>'
+    shown = '<a href="https://example.org">Open in Colab</a>'
+    assert hooks.on_page_content(badge, notebook) == shown
 
 
 def test_every_page_is_in_the_navigation(hooks: ModuleType) -> None:
