@@ -27,7 +27,7 @@ def test_every_public_name_can_be_imported() -> None:
     assert set(deepdetect.__all__) <= set(dir(deepdetect))
     for name in deepdetect.__all__:
         assert getattr(deepdetect, name).__name__ == name
-    assert deepdetect.__version__ == "0.2.0"
+    assert deepdetect.__version__ == "1.0.0rc1"
     assert len(deepdetect.__all__) <= 30
 
 

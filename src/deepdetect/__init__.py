@@ -9,7 +9,7 @@ The packages in the order of the data: `io` (images) -> `detector` (heat map) ->
 
 import lazy_loader
 
-__version__ = "0.2.0"
+__version__ = "1.0.0rc1"
 
 # Names are imported when they are first used, so that the command line starts fast; which, and
 # from where, is in `__init__.pyi`, which type checkers and editors read, too.
