@@ -310,7 +310,7 @@ def main() -> None:
             run_stage(stage, arguments.data, arguments.published, arguments.work)
         for name in arguments.only:
             write_result(name, arguments.work)
-        if "times" in arguments.only:
+        if {"times", "descriptors"} & set(arguments.only):
             subprocess.run([sys.executable, ROOT / "docs" / "figures" / "times.py"], check=True)
     stale = fill_blocks(write=not arguments.check)
     if arguments.check and stale:

@@ -40,7 +40,7 @@ class AppOptions:
         max_task_mb: size of all image files of one task, in megabytes.
         max_files: number of images of one task.
         max_megapixels: larger images are refused before they are decoded.
-        max_tasks: tasks that are at work at the same time.
+        max_tasks: number of tasks that run at the same time.
         max_task_s: seconds after which a task is ended.
         abandoned_s: discard a task and its result if the page has not asked for it for this many
             seconds. Pages in the background ask once a minute.

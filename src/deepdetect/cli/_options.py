@@ -184,7 +184,7 @@ Image = Annotated[Path, Parameter(help="Image file.")]
 Output = Annotated[Path, Parameter(name=("--output", "-o"))]
 Folder = Annotated[Path, Parameter(name=("--output", "-o"), help="Folder for the results.")]
 Overwrite = Annotated[
-    bool, Parameter(negative="", help="Replace what exists already, and do all of it again.")
+    bool, Parameter(negative="", help="Replace existing files, and do everything again.")
 ]
 Format = Annotated[Literal["npz", "csv"], Parameter("--format", help="Format of the data files.")]
 

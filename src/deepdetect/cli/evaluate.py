@@ -189,7 +189,7 @@ def benchmark(
     Args:
         data: Folder of the data sets.
         output: Folder for the report.
-        protocol: May be repeated.  [default: all but degraded]
+        protocol: paper, standard, guided or degraded; may be repeated.  [default: all but degraded]
         method: A further method, NAME, FILE.onnx or MODULE:FUNCTION; may be repeated.
         baselines: Classical methods, with commas between; none for none. [default: all]
         preset: published: show the network the channels as the paper's code does (BGR).

@@ -21,7 +21,7 @@ SHOWN = (".html", ".jpg", ".jpeg", ".png", ".webp", ".gif", ".svg", ".pdf")
 
 @cli.command()
 def view(
-    file: Annotated[Path, Parameter(help="What another command has written.")],
+    file: Annotated[Path, Parameter(help="A file that another command wrote.")],
     /,
     *images: Annotated[Path, Parameter(help="Images of keypoints (one) or of matches (two).")],
 ) -> cli.Result:

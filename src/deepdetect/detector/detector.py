@@ -64,7 +64,7 @@ class DeepDetect:
         device: "cpu", or "cuda" or the name of any execution provider of ONNX Runtime.
         threads: number of threads. None: the backend's choice.
         precision: what the network computes with, "float32", or "bfloat16" with OpenVINO: faster on
-            processors with instructions for it; a few keypoints are others, and there are no tiles.
+            processors with instructions for it; a few keypoints differ, and there are no tiles.
         network_channels: "rgb", or "bgr" as the paper's published code feeds the network. For
             images of OpenCV leave it, and give the methods `channels="bgr"`.
         tta: "flip": a flipped or turned image gives the same keypoints of the heat map, in eight

@@ -34,8 +34,8 @@ class PointDetector:
 
     Args:
         max_keypoints: at most this many; None: all.
-        spread: "none": the best; "grid": in turn the best of each cell of a grid; "anms": the best
-            that are as far from each other as their number allows.
+        spread: "none": the best; "grid": the best of each cell of a grid in turn; "anms": the best
+            that lie as far apart as their number allows.
         resolution: "auto" (the image as it is up to two megapixels, larger ones scaled down to
             that) or "native" (always as it is).
         ranker: npz file of `deepdetect dev train-points` that ranks the points. None: the one

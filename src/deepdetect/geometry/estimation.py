@@ -65,7 +65,7 @@ class GeometryOptions:
             whose transfer error is below the threshold.
         camera0, camera1: (3, 3) camera matrices, for the model "essential".
         confidence: desired probability that the model is the best one.
-        iterations: maximum number.
+        iterations: maximum number of iterations.
 
     Raises:
         OptionError: a value is unknown, missing or out of its range.

@@ -53,7 +53,7 @@ class MatchingOptions:
     matches by descriptors alone, with `guided_matching=False`.
 
     Attributes:
-        two_view_model: the geometry that guides where `model` leaves it open: "homography",
+        two_view_model: the geometry that guides if `model` leaves it open: "homography",
             "fundamental", or "auto": the one that fits the images.
         descriptor: "sift", "rootsift", or "sift-opencv" for OpenCV's own in any case. None: what a
             `PointDetector` extracts; of others "sift".
@@ -133,7 +133,7 @@ def match_images(
             scene), "essential" (with both cameras in `options.geometry`), "auto" (one of the first
             two) or "none"; it also chooses what guides.
         mutual: keep only mutual nearest neighbours; guided, one-to-one matches that are found from
-            either image, the same ones whichever comes first, in twice the time.
+            either image, the same ones whichever image comes first, in twice the time.
         tentative_matches: a few matches of any other matcher (LightGlue, LoFTR, a person's clicks),
             two (K, 2) arrays of positions, row by row; they take the place of our own SIFT matches
             that guide, and some may be wrong. Or what `find_tentative_matches` has made already.

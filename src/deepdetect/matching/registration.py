@@ -110,7 +110,9 @@ def register(
 
     Args:
         image0, image1: anything `load_image` takes.
-        detector, channels, selection, ignore, mutual, seed, progress: as for `match_images`.
+        detector, channels, selection, ignore, progress: as for `match_images`.
+        mutual: use only matches that are found from either image, in twice the time.
+        seed: seed of all random choices.
         extent: the frame: "reference", that of the first image, or "union", what both show.
         apply_to: further images of the second camera, or its own file for all its bands, which are
             moved by the same homography.

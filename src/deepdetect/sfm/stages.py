@@ -88,8 +88,8 @@ class MultiViewOptions:
             gives one focal length, or none.
         control_points: file of ground control points as OpenDroneMap's gcp_list.txt, by which the
             model gets its scale and place in place of the GPS of the images.
-        scale_by: a distance in metres, and its two ends: two images, for their cameras, or what is
-            at two pixels, as IMG_1.jpg:120,340.
+        scale_by: a distance in metres, and its two ends: two images (their cameras) or two pixels,
+            as IMG_1.jpg:120,340.
         formats: further formats that the model is written in.
 
     Raises:

@@ -70,7 +70,7 @@ class TrainingOptions:
 
     Attributes:
         network: name of the network that is trained: "fast" or "espnet".
-        stages: what is trained on, one stage after the other. Crops as large as the view show all
+        stages: stages of the training, one after the other. Crops as large as the view show all
             that its label depends on (Harris and Sobel labels are relative to the image's largest
             response), which the global term of `fast` needs; smaller ones give many cheap steps.
         interleave: go through all stages at the same time, their steps evenly mixed, so that
@@ -107,7 +107,7 @@ class TrainingOptions:
             keypoints at a probability of 0.5.
         low_light_pos_weight: weight of marked pixels in crops of low visibility. None: the same.
         labels: the label detectors and their settings.
-        val_count: how many times the validation loss is computed.
+        val_count: number of times that the validation loss is computed.
         seed: seed of the initial weights, the order of the images, the crops and their
             augmentation.
 
@@ -235,7 +235,7 @@ class PointsTrainingOptions:
         steps: optimiser steps.
         pairs: pairs of views in each step.
         side: side of the square views, in pixels.
-        learning_rate: the highest; cosine annealing to 2 % of it.
+        learning_rate: highest learning rate; cosine annealing to 2 % of it.
         min_density, max_density: range of the budgets in keypoints per pixel, log-uniform.
         match_weight: how much more a keypoint is worth whose upright descriptors match, in
             multiples of one that is only found again.
@@ -278,11 +278,11 @@ class DescriptorTrainingOptions:
     Attributes:
         steps: optimiser steps.
         pairs: pairs of views in each step.
-        learning_rate: the highest, of Muon, after a warm-up; it falls to 0, linearly.
-        val_count: how many times the weights are measured.
+        learning_rate: highest learning rate (of Muon), after the warm-up; it falls linearly to 0.
+        val_count: number of times that the weights are measured.
         val_pairs: pairs of each kind that they are measured on: upright, turned, zoomed.
-        cross_modal: whether the views of a pair are as of different sensors: with other mixtures of
-            colours, inverted or any other tones, or edges.
+        cross_modal: make the views of a pair look like those of different sensors: with other
+            mixtures of colours, inverted or any other tones, or edges.
         seed: seed of the weights and the pairs.
 
     Raises:

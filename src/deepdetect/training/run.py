@@ -103,10 +103,10 @@ def train_points(
 
     Args:
         images: folder of images.
-        validation: folder of others, by which the best weights are chosen.
+        validation: folder of other images, which choose the best weights.
         output: folder for checkpoint.safetensors, best.npz, MODEL_CARD.md and the curves.
         options: the recipe.
-        num_workers: processes that make the pairs, 0 for none but the one that trains.
+        num_workers: processes that make the pairs; 0: the training process does.
         log: takes lines of text for the user; without it there is no progress bar either.
 
     Returns:
@@ -142,15 +142,15 @@ def train_descriptor(
 
     Args:
         images: folder of images, best of some 480 pixels a side.
-        validation: folder of others, by which the best weights are chosen.
+        validation: folder of other images, which choose the best weights.
         output: folder for checkpoint.safetensors, descriptor.safetensors, descriptor.onnx,
             MODEL_CARD.md and the curves.
         options, log: as of `train_points`.
         init_weights: weights (descriptor.safetensors) to start from. None: random ones, by the
             seed.
         device: "auto" is CUDA if there is a GPU, else the CPU.
-        num_workers: processes that make the pairs, 0 for none but the one that trains. None: 0 on a
-            CPU, one per processor but one beside a GPU.
+        num_workers: processes that make the pairs; 0: the training process does. None: 0 on a CPU,
+            one per processor but one beside a GPU.
 
     Returns:
         The weights' files, of which `PointDetector` takes the ONNX file, and the curves.
