@@ -22,7 +22,7 @@ PHRASES = {
     r"\bso (?:many|few) (?=of|pixels|megapixels)|\b(?:the first|with|of) so (?:many|few|much)\b": (
         "name the number"
     ),
-    r",? \btoo(?=[.;:)|])": "'also', before the verb",
+    r",? \btoo(?=[.;:)|])|, too\b": "'also', before the verb",
     r"\bsuch(?=[.;:)|,])": "name the thing",
     r"\bbeside(?=[.;:)|])": "'beside it', or 'for comparison'",
     r"without a word\b": "'silently'",

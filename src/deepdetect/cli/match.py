@@ -267,7 +267,7 @@ def register(
     _checkerboard.png and _difference.png with the first, and _homography.txt (3x3, from the
     first image to the second). What the first carries is kept: its place on the Earth, its colour
     profile, its EXIF. Where it is a GeoTIFF, or the second has other bands than RGB, the second is
-    a GeoTIFF, too, with all its bands as they are.
+    a GeoTIFF with all its bands as they are.
 
         deepdetect register map.jpg photo-of-the-map.jpg -o registered
         deepdetect register ortho.tif drone.tif --bands 3 2 1 --extent union --apply-to thermal.tif
