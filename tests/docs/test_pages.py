@@ -92,6 +92,19 @@ def test_points(folder: Path) -> None:
     assert found["spread"].sizes is not None
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["comparison.md", "matching.md", "other-programs.md"])
+def test_the_first_lines_of_guides(folder: Path, page: str) -> None:
+    from skimage import data
+
+    for name, view in zip(("left", "right"), data.stereo_motorcycle(), strict=False):
+        Image.fromarray(view[100:340, 220:540]).save(f"{name}.png")
+    found: dict[str, object] = {}
+    exec(compile(blocks(page, "python")[0], page, "exec"), found)
+    (result,) = {"pairs", "good", "keypoints"} & set(found)
+    assert len(found[result]) > 500
+
+
 RECIPES = blocks("recipes.md", "python")
 
 
