@@ -36,6 +36,9 @@ COPIED = {
 APP = ROOT / "web" / "dist"
 """The page that detects and matches in the browser, once it is built."""
 
+API_BOOST = 0.5
+"""Weight of the pages of the interface in a search, of others 1."""
+
 APP_FOLDER = "try"
 APP_MARK = "<!-- The page in the browser is embedded here. -->"
 EMBEDDED = f"""\
@@ -93,6 +96,8 @@ def on_files(files: Any, config: Any) -> Any:
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Turn links, and put in the app."""
     uri = page.file.src_uri
+    if uri.startswith("api/"):  # a search finds the guides first
+        page.meta["search"] = {"boost": API_BOOST}
     embedded = EMBEDDED if (APP / "index.html").is_file() else ""
     markdown = markdown.replace(APP_MARK, embedded)
     return turn_links(markdown, ORIGINS.get(uri, f"docs/{uri}"), uri)
