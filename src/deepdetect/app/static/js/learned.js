@@ -7,7 +7,7 @@ const CONSTANT = 16; // the first numbers are the same in a picture that is turn
 const FREQUENCIES = [12, 8, 4].flatMap((count, k) => Array(count).fill(k + 1));
 export const LENGTH = CONSTANT + 2 * FREQUENCIES.length;
 const UPRIGHT_DEGREES = 15; // the network bears turns up to this
-const TURNED_KEYPOINTS = 512; // the best of each picture tell by how much one is turned
+export const TURNED_KEYPOINTS = 512; // the best of each picture tell by how much one is turned
 const HISTOGRAM_DEGREES = 10;
 const NEAR_DEGREES = 20; // of the fullest bin
 
@@ -32,7 +32,7 @@ export function turnDescriptors(descriptors, degreesOf) {
 /**
  * Matches upright descriptors, of which one picture's are turned back.
  *
- * @typedef {{upright: Float32Array, angles: Float32Array}} Described
+ * @typedef {{upright: Float32Array, angles: Float32Array}} Described angles of `TURNED_KEYPOINTS`
  * @param {Described} first @param {Described} second @returns {import("./matching.js").Pairs}
  */
 export function matchLearned(first, second) {

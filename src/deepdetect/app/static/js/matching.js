@@ -11,42 +11,67 @@ export function mutualMatches(first, second, length) {
   const [count0, count1] = [first.length / length, second.length / length];
   const best0 = new Int32Array(count0).fill(-1);
   const best1 = new Int32Array(count1).fill(-1);
-  const top1 = new Float32Array(count1).fill(-Infinity);
+  const top1 = new Float64Array(count1).fill(-Infinity);
   const ratios = new Float32Array(count0).fill(1);
+  const rows = [first, second].map((values) => Float64Array.from(values)); // converted once
+  const likeness = new Float64Array(2 * count1);
   for (let i = 0; i < count0; i++) {
+    if (i % 2 === 0) multiplyTwo(rows, i, Math.min(i + 1, count0 - 1), length, likeness);
+    const start = i % 2 * count1;
     let [top, next] = [-Infinity, -Infinity];
     for (let j = 0; j < count1; j++) {
-      const likeness = product(first, i * length, second, j * length, length);
-      if (likeness > top) {
+      const value = likeness[start + j];
+      if (value > top) {
         next = top;
-        top = likeness;
+        top = value;
         best0[i] = j;
-      } else if (likeness > next) {
-        next = likeness;
+      } else if (value > next) {
+        next = value;
       }
-      if (likeness > top1[j]) {
-        top1[j] = likeness;
+      if (value > top1[j]) {
+        top1[j] = value;
         best1[j] = i;
       }
     }
     const [near, far] = [Math.max(0, 2 - 2 * top), Math.max(0, 2 - 2 * next)];
     ratios[i] = far > 0 && count1 > 1 ? Math.sqrt(near / far) : 1;
   }
-  const rows0 = Array.from(best0.keys()).filter((i) => best0[i] >= 0 && best1[best0[i]] === i);
+  const kept = Array.from(best0.keys()).filter((i) => best0[i] >= 0 && best1[best0[i]] === i);
   return {
-    rows0: Uint32Array.from(rows0),
-    rows1: Uint32Array.from(rows0, (i) => best0[i]),
-    ratios: Float32Array.from(rows0, (i) => ratios[i]),
+    rows0: Uint32Array.from(kept),
+    rows1: Uint32Array.from(kept, (i) => best0[i]),
+    ratios: Float32Array.from(kept, (i) => ratios[i]),
   };
 }
 
-function product(first, i, second, j, length) {
-  let [a, b, c, d] = [0, 0, 0, 0]; // four sums at once: they do not wait for each other
-  for (let k = 0; k < length; k += 4) {
-    a += first[i + k] * second[j + k];
-    b += first[i + k + 1] * second[j + k + 1];
-    c += first[i + k + 2] * second[j + k + 2];
-    d += first[i + k + 3] * second[j + k + 3];
+/** The products of two rows with all of the others, four by four: each value is loaded for several. */
+function multiplyTwo([first, second], i, next, length, result) {
+  const count = result.length / 2;
+  const [a, b] = [i * length, next * length];
+  for (let j = 0; j < count; j += 4) {
+    const j1 = Math.min(j + 1, count - 1), j2 = Math.min(j + 2, count - 1), j3 = Math.min(j + 3, count - 1);
+    const c = j * length, d = j1 * length, e = j2 * length, f = j3 * length;
+    let ac = 0, ad = 0, ae = 0, af = 0; // not as lists, which the loop would make anew
+    let bc = 0, bd = 0, be = 0, bf = 0;
+    for (let k = 0; k < length; k++) {
+      const x = first[a + k], y = first[b + k];
+      const u = second[c + k], v = second[d + k], w = second[e + k], z = second[f + k];
+      ac += x * u;
+      ad += x * v;
+      ae += x * w;
+      af += x * z;
+      bc += y * u;
+      bd += y * v;
+      be += y * w;
+      bf += y * z;
+    }
+    result[j] = ac;
+    result[j1] = ad;
+    result[j2] = ae;
+    result[j3] = af;
+    result[count + j] = bc;
+    result[count + j1] = bd;
+    result[count + j2] = be;
+    result[count + j3] = bf;
   }
-  return a + b + (c + d);
 }

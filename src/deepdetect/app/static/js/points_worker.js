@@ -1,6 +1,7 @@
 // Ranks and describes the points of pictures, by ONNX Runtime here or by Python, beside the page.
 import { UserError, answer } from "./background.js";
 import { decode } from "./decoding.js";
+import { TURNED_KEYPOINTS } from "./learned.js";
 import { dominantAngles } from "./orientation.js";
 import { GRAY, luma, pointsSize, reduceByArea } from "./pixels.js";
 import { rankingOf } from "./points/ranking.js";
@@ -76,8 +77,9 @@ answer({
 
   /** Describes points. @returns {Promise<import("./learned.js").Described>} */
   async describe({ token, ...picture }) {
-    const { gray, width, height, points } = picture;
+    const { gray, width, height, points: { xy, sizes } } = picture;
+    const best = { xy: xy.subarray(0, 2 * TURNED_KEYPOINTS), sizes: sizes.subarray(0, TURNED_KEYPOINTS) };
     return { upright: await uprightDescriptors(picture, token),
-             angles: dominantAngles(gray, width, height, points) };
+             angles: dominantAngles(gray, width, height, best) };
   },
 }, (reason) => `The points could not be found (${reason}): try a smaller picture.`);
