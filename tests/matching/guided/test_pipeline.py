@@ -61,7 +61,7 @@ def test_nearly_all_points_of_a_plane_are_matched_right(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pair", ["fountain 0-5", "fountain 3-10", "clip 24-44"])
+@pytest.mark.parametrize("pair", ["fountain 0-5", "fountain 3-10", "clip 24-44", "clip 19-44"])
 def test_a_plane_guides_no_scene_with_depth(shared: Path, pair: str) -> None:
     name, numbers = pair.split()
     if name == "fountain":

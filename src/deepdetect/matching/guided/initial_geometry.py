@@ -342,11 +342,16 @@ def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
     views = zip(as_it_is.views, as_it_is.features, strict=True)
     first, second = (describe_learned(*each, CROSS_MODAL) for each in views)
     across = find_tentative_matches(*grays, (first, second), max_side_px=COARSE_SIDE_PX)
+    tentative, geometry = as_it_is, estimate_initial_geometry(as_it_is, model, seed)
     cross_modal = len(across.ratios) > len(as_it_is.ratios) and _is_inverted(across)
-    tentative = across if cross_modal else as_it_is
-    geometry = estimate_initial_geometry(tentative, model, seed)
-    if cross_modal and geometry.log10_nfa > MAX_CROSS_MODAL_LOG10_NFA:
-        geometry = geometry.untrusted()
+    if cross_modal:
+        # Wrong matches, as of the clips 25 frames on, have negative correlations, too.
+        other = estimate_initial_geometry(across, model, seed)
+        cross_modal = other.log10_nfa < geometry.log10_nfa
+        if cross_modal:
+            tentative, geometry = across, other
+        if geometry.log10_nfa > MAX_CROSS_MODAL_LOG10_NFA:
+            geometry = geometry.untrusted()
     return replace(geometry, source=tentative, learned=True, cross_modal=cross_modal)
 
 
