@@ -205,6 +205,19 @@ def test_a_known_camera_stays_as_it_is(write_fountain, shared: Path, tmp_path: P
     assert relative_rotation_error(found.views, true_poses(shared)) < 0.4
 
 
+def test_dense_matches_give_more_and_longer_tracks(small, tmp_path: Path, shared: Path) -> None:
+    folder, output, found = small
+    shutil.copytree(output / "work", tmp_path / "work")
+    options = MultiViewOptions(matches="dense", dense=False)
+    many = reconstruct_many(folder, tmp_path, **{**QUICK, "options": options})
+    assert len(many.sparse) > 2 * len(found.sparse)
+    assert many.sparse_views.mean() > found.sparse_views.mean()
+    assert np.median(many.sparse_errors) < 0.3
+    truth = true_poses(shared)
+    errors = [relative_rotation_error(each.views, truth) for each in (many, found)]
+    assert errors[0] < errors[1] + 0.2
+
+
 def test_photographs_of_another_size_do_not_stop_a_calibrated_run(
     write_fountain, tmp_path: Path, photo: np.ndarray, pycolmap
 ) -> None:

@@ -10,8 +10,9 @@ import pytest
 from deepdetect._shared.opencv import cv2
 from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.sfm.colmap import CameraIntrinsics
+from deepdetect.sfm.dense import DENSE_POINT
 from deepdetect.sfm.mapping import read_sparse_model
-from deepdetect.sfm.tracks import refine_tracks
+from deepdetect.sfm.tracks import add_dense_tracks, refine_tracks
 
 SIZE, NORMAL, DISTANCE = (320, 240), np.array([-0.2, 0, 1]), 6.0
 """Of the plane z = 6 + x / 5."""
@@ -44,49 +45,63 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_rough_keypoints_become_exact_tracks_of_all_images(pycolmap, folder: Path) -> None:
+@pytest.fixture
+def model(pycolmap):
+    """Keypoints of 60 points with noise; the outer images see 12 of them, the others all."""
     rng = np.random.default_rng(1)
     points = on_plane(VIEWS[2], rng.uniform((40, 40), (280, 200), (60, 2)))
-    model = pycolmap.Reconstruction()
+    made = pycolmap.Reconstruction()
     camera = CameraIntrinsics.of_camera(Camera(SIZE, 300.0)).colmap_camera()
     camera.camera_id = 1
-    model.add_camera_with_trivial_rig(camera)
+    made.add_camera_with_trivial_rig(camera)
     for number, own in enumerate(VIEWS, 1):
         xy = own.project(points)[0] + rng.normal(0, 0.5, (60, 2)) + 0.5
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(own.rotation), own.translation)
         image = pycolmap.Image(name=own.name, keypoints=xy, camera_id=1, image_id=number)
-        model.add_image_with_trivial_frame(image, pose)
+        made.add_image_with_trivial_frame(image, pose)
     for row, point in enumerate(points):
         track = pycolmap.Track()
-        for number in (2, 3, 4):  # the outer ones have no keypoint of it
+        for number in (1, 2, 3, 4, 5) if row < 12 else (2, 3, 4):
             track.add_element(number, row)
-        model.add_point3D(point, track)
-    with pytest.raises(AssertionError):
-        check(read_sparse_model(model))
-    for number in (1, 5):  # but share a few points with the others
-        for row in range(12):
-            model.add_observation(row + 1, pycolmap.TrackElement(number, row))
+        made.add_point3D(point, track)
+    return made
+
+
+def test_rough_keypoints_become_exact_tracks_of_all_images(model, folder: Path) -> None:
+    assert distances(read_sparse_model(model)) > 0.3
     refine_tracks(model, folder)
     sparse = read_sparse_model(model)
     assert len(sparse.points) > 55
-    assert sparse.tracks.mean() > 4  # of five
-    check(sparse)
+    assert sparse.tracks.mean() > 2.5
+    assert distances(sparse) < 0.1
     seen = sparse.images["0.png"]
     column, row = np.rint(seen.xy).astype(int).T
     image = cv2.imread(str(folder / "0.png"))[row, column, ::-1].astype(int)
     assert np.median(np.abs(image - sparse.colors[seen.points])) < 10
 
 
-def check(sparse) -> None:
-    """All images of a track see one point of the plane."""
-    places = [
-        on_plane(image.view, image.xy)[np.argsort(image.points)] for image in sparse.images.values()
-    ]
-    rows = [np.sort(image.points) for image in sparse.images.values()]
-    middles = np.zeros_like(sparse.points)
-    for row, place in zip(rows, places, strict=True):
-        middles[row] += place / sparse.tracks[row, None]
-    apart = np.concatenate(
-        [np.linalg.norm(p - middles[r], axis=1) for r, p in zip(rows, places, strict=True)]
-    )
-    assert np.median(apart) * 300 / DISTANCE < 0.1  # pixels
+def test_dense_points_become_tracks_that_images_share(model, folder: Path) -> None:
+    y, x = np.mgrid[20:220:2, 20:300:2]
+    fused = {}
+    for own in VIEWS:
+        found = np.zeros(x.size, DENSE_POINT)
+        found["points"] = on_plane(own, np.column_stack([x.ravel(), y.ravel()]).astype(float))
+        found["normals"] = -NORMAL / np.linalg.norm(NORMAL)
+        fused[own.name] = found
+    add_dense_tracks(model, folder, fused)
+    sparse = read_sparse_model(model)
+    assert len(sparse.points) > 1000
+    assert sparse.tracks.mean() > 3.8
+    assert distances(sparse) < 0.05
+    # What images share is one point, not one from each.
+    assert len(sparse.points) < 2 * len(sparse.images["0.png"].points)
+
+
+def distances(sparse) -> float:
+    """Return how far, in pixels, the points of the plane lie apart that images of a track see."""
+    middles, seen = np.zeros_like(sparse.points), []
+    for image in sparse.images.values():
+        seen.append((image.points, on_plane(image.view, image.xy)))
+        middles[image.points] += seen[-1][1] / sparse.tracks[image.points, None]
+    apart = [np.linalg.norm(places - middles[rows], axis=1) for rows, places in seen]
+    return float(np.median(np.concatenate(apart)) * 300 / DISTANCE)

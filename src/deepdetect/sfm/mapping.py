@@ -44,6 +44,9 @@ may have, and this angle is enough."""
 ROBUST_SCALE_PX = 1.0
 """Of the loss (Cauchy) of the last adjustment: larger errors count less."""
 
+MAX_REFINED_ERROR_PX = 1.0
+"""Of a refined track; a patch that is farther away shows something else."""
+
 MIN_ANGLE_DEG = 1.0
 """Between two lines of sight of a point."""
 
@@ -219,10 +222,12 @@ def adjust(model: Any, known_cameras: bool) -> None:
         model.update_point_3d_errors()
 
 
-def filter_observations(model: Any, max_error_px: float) -> None:
-    """Remove what a model sees farther away than this, and points of too small an angle."""
-    with quiet_pycolmap() as pycolmap:
-        pycolmap.ObservationManager(model).filter_all_points3D(max_error_px, MIN_ANGLE_DEG)
+def adjust_refined(model: Any, known_cameras: bool) -> None:
+    """Adjust a model with refined tracks; the first adjustment tells which are mistaken."""
+    for max_error_px in (MAX_VERIFICATION_ERROR_PX, MAX_REFINED_ERROR_PX):
+        with quiet_pycolmap() as pycolmap:
+            pycolmap.ObservationManager(model).filter_all_points3D(max_error_px, MIN_ANGLE_DEG)
+        adjust(model, known_cameras)
 
 
 def normalise_model(model: Any) -> None:

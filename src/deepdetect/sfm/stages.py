@@ -13,13 +13,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from .. import __version__
 from .._shared.atomic import atomic_path
-from .._shared.errors import MissingImageError, OptionError, ReconstructionError
+from .._shared.errors import MissingImageError, OptionError, ReconstructionError, check_name
 from .._shared.machine import available_memory, map_in_processes, needed_memory, processor_count
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.progress import progress
@@ -32,6 +32,7 @@ from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
 from ..features.selection import SelectionOptions
+from ..geometry.camera import PosedView
 from ..io.image import find_images, name_images
 from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, is_path, read_with, reading_options
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
@@ -45,20 +46,17 @@ from .dense import (
 )
 from .formats import FormatName
 from .mapping import (
-    MAX_VERIFICATION_ERROR_PX,
     RegisteredImage,
     SparseModel,
     adjust,
-    filter_observations,
+    adjust_refined,
     map_images,
     normalise_model,
+    read_sparse_model,
     verify_pairs,
 )
 from .pair_selection import COMPARED_KEYPOINTS, SIMILAR, similar_pairs, vlad_vectors
-from .tracks import refine_tracks
-
-MAX_ERROR_PX = 1.0
-"""Of a refined track; patches that are farther away show something else."""
+from .tracks import add_dense_tracks, refine_tracks
 
 MAX_EXHAUSTIVE = 50
 """Images of which "auto" matches all pairs."""
@@ -82,6 +80,8 @@ class MultiViewOptions:
             alike.
         ratio: limit of the ratio test: the best distance must be below this share of the
             second-best. None: as of `match_features`.
+        matches: "sparse": of keypoints; "dense": points of the depth maps become points of the
+            model, too, and cameras are adjusted to all.
         dense: make dense points.
         stride_px: distance in pixels between the places of a row or column that are tried.
         single_camera: whether images of one size were taken by one camera; None: where their EXIF
@@ -98,6 +98,7 @@ class MultiViewOptions:
 
     pairs: str = "auto"
     ratio: float | None = None
+    matches: Literal["sparse", "dense"] = "sparse"
     dense: bool = True
     stride_px: int = 2
     single_camera: bool | None = None
@@ -112,6 +113,7 @@ class MultiViewOptions:
             raise OptionError(
                 f"`pairs` must be auto, exhaustive, sequential:10 or similar, not {self.pairs}"
             )
+        check_name("matches", self.matches, ("sparse", "dense"))
         check_ranges(self, counts=("stride_px",), fractions=("ratio",))
 
     def pair_choice(self, count: int) -> str:
@@ -258,7 +260,7 @@ class Stages:
             [(name, own, points.xy) for name, (points, own) in images.items()],
             [cameras.index(camera) for camera in cameras],
             list(matches.items()),
-            (known, refined, self.seed, pycolmap.__version__, __version__),
+            (known, refined, self.options.matches, self.seed, pycolmap.__version__, __version__),
         )
         record = self.work / f"mapping-{made_of}.json"
         database, sparse = self.output / "database.db", self.work / "sparse"
@@ -285,13 +287,15 @@ class Stages:
             )
         if refined:
             refine_tracks(model, folder)
-            # The first adjustment tells which patches were mistaken.
-            for max_error_px in (MAX_VERIFICATION_ERROR_PX, MAX_ERROR_PX):
-                filter_observations(model, max_error_px)
-                adjust(model, known)
+            adjust_refined(model, known)
         else:
             adjust(model, known)
         normalise_model(model)
+        if refined and self.options.matches == "dense":
+            fused = self._fused(folder, read_sparse_model(model))
+            add_dense_tracks(model, folder, {view.name: points for view, points in fused})
+            adjust_refined(model, known)
+            normalise_model(model)
         sparse.mkdir(exist_ok=True)
         model.write(sparse)
         noted = {
@@ -304,6 +308,10 @@ class Stages:
 
     def dense(self, folder: Path, sparse: SparseModel) -> np.ndarray:
         """Make the depth maps that earlier runs have not made, and fuse all (`DENSE_POINT`)."""
+        return merge_dense_points(self._fused(folder, sparse), self.options.stride_px)
+
+    def _fused(self, folder: Path, sparse: SparseModel) -> list[tuple[PosedView, np.ndarray]]:
+        """Return the dense points of each reference."""
         store, stride = self.work / "dense", self.options.stride_px
         references = find_references(sparse)
         paths: dict[str, Path] = {}
@@ -332,7 +340,7 @@ class Stages:
         fuse = partial(_fuse_task, paths=paths, stride_px=stride)
         views = (limited_view(images[0].view) for images in references)
         fused = map_in_processes(fuse, references, workers)
-        return merge_dense_points([*zip(views, fused, strict=True)], stride)
+        return [*zip(views, fused, strict=True)]
 
     def _dense_workers(self, sparse: SparseModel) -> int:
         sizes = [limited_view(image.view).camera.size for image in sparse.images.values()]

@@ -1,13 +1,14 @@
 """Tracks at sub-pixel positions: patches of one image of each, aligned in all others.
 
 A keypoint is where its own image has a maximum, which noise and the angle of view move. Once the
-cameras are known, the image that sees a point from the middle shows its others what to look for: a
+cameras are known, the image that sees a point from the middle tells the others what to look for: a
 patch of the surface, warped as they see it. Lindenberger et al., "Pixel-Perfect Structure-from-
 Motion with Featuremetric Refinement", 2021, align features of a network instead.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +18,7 @@ import numpy as np
 from .._shared.opencv import cv2
 from .._shared.records import file_state
 from ..io.image import load_image, luma
-from ..reconstruction.subpixel import align_patches
+from ..reconstruction.subpixel import align_patches, spread_corners
 from .colmap import PIXEL_CENTRE, quiet_pycolmap
 from .mapping import RegisteredImage, SparseModel, read_sparse_model
 
@@ -40,6 +41,15 @@ MAX_GROWTH = 7.0
 MIN_COMMON_POINTS = 10
 """Of two images, for points of one to be sought in the other."""
 
+DENSE_CELLS = 4500
+"""Of an image, for dense tracks: as many corners at most."""
+
+MIN_DISTANCE_PX = 3
+"""From a corner to tracks that its image is part of already."""
+
+MIN_DENSE_VIEWS = 3
+"""Of a dense track: two images only agree with themselves."""
+
 CACHED_IMAGES = 8
 """That are kept in memory: following references share their neighbours."""
 
@@ -58,19 +68,33 @@ class Surfaces(NamedTuple):
 def refine_tracks(model: Any, folder: Path) -> None:
     """Put refined tracks in place of those of a `pycolmap.Reconstruction`; cameras stay.
 
-    Each point keeps the image that sees it from the middle, at a whole pixel, and is sought in all
-    images that may see it, whether they have a keypoint there or not. Points have the colour of
-    their pixel.
+    Each point keeps the image that sees it from the middle, at a whole pixel, and is aligned in the
+    others of its track. Points have the colour of their pixel.
     """
     sparse = read_sparse_model(model)
     tracks = _Tracks(sparse, folder)
-    for name, surfaces in _central_views(sparse).items():
-        tracks.add(name, surfaces)
+    for name, (surfaces, rows) in _central_views(sparse).items():
+        tracks.add(name, surfaces, rows)
     tracks.write(model)
 
 
-def _central_views(sparse: SparseModel) -> dict[str, Surfaces]:
-    """Return by image the points that it sees from the middle of all directions of their track."""
+def add_dense_tracks(model: Any, folder: Path, fused: Mapping[str, np.ndarray]) -> None:
+    """Put tracks of `DENSE_POINT`, by the image that they are seen from, in place of a model's.
+
+    An image gives the best corner in each cell of a grid, where tracks of earlier images have
+    none: what all of them show is matched from one image only.
+    """
+    tracks = _Tracks(read_sparse_model(model), folder)
+    for name, points in fused.items():
+        tracks.add(name, tracks.corners(name, points), min_views=MIN_DENSE_VIEWS)
+    tracks.write(model)
+
+
+def _central_views(sparse: SparseModel) -> dict[str, tuple[Surfaces, np.ndarray]]:
+    """Return by image the points that it sees from the middle of their track, and their rows.
+
+    Their surfaces are taken to face that middle.
+    """
     images = [*sparse.images.values()]
     rows = np.concatenate([image.points for image in images])
     owners = np.repeat(np.arange(len(images)), [len(image.points) for image in images])
@@ -87,7 +111,8 @@ def _central_views(sparse: SparseModel) -> dict[str, Surfaces]:
         own = best[owners[best] == number]
         points = rows[own]
         whole = np.rint(pixels[own]).astype(np.int64)
-        found[image.view.name] = Surfaces(whole, sparse.points[points], -middles[points])
+        surfaces = Surfaces(whole, sparse.points[points], -middles[points])
+        found[image.view.name] = surfaces, points
     return found
 
 
@@ -96,23 +121,50 @@ class _Tracks:
 
     def __init__(self, sparse: SparseModel, folder: Path) -> None:
         self.images, self.folder = [*sparse.images.values()], folder
+        self.numbers = {name: number for number, name in enumerate(sparse.images)}
         self.points = [np.empty((0, 3))]
         self.colors = [np.empty((0, 3), np.uint8)]
         self.count = 0
         none = np.empty(0, np.int64), np.empty((0, 2))
         self.seen = [[none] for _ in self.images]  # rows of points, and pixels, by image
-        numbers = [np.isin(np.arange(len(sparse.points)), each.points) for each in self.images]
-        common = np.array(numbers, np.float32) @ np.array(numbers, np.float32).T
-        self.together = common >= MIN_COMMON_POINTS
+        every = np.arange(len(sparse.points))
+        self.members = np.array([np.isin(every, image.points) for image in self.images])
 
-    def add(self, name: str, wanted: Surfaces, min_views: int = 2) -> None:
-        """Seek surfaces of an image in the others; those that enough images see become points."""
-        own = next(k for k, each in enumerate(self.images) if each.view.name == name)
+    def corners(self, name: str, points: np.ndarray) -> Surfaces:
+        """Choose those of the dense points of an image that become tracks."""
+        image = self.images[self.numbers[name]]
+        gray = luma(_read(self.folder, image)[0])
+        free = np.ones(gray.shape, np.uint8)
+        for _, xy in self.seen[self.numbers[name]]:
+            column, row = np.rint(xy).astype(np.int64).T
+            free[row, column] = 0
+        free = cv2.erode(free, np.ones((2 * MIN_DISTANCE_PX + 1,) * 2, np.uint8))
+        xy = image.intrinsics.from_pinhole(image.view.project(points["points"])[0])
+        pixels = np.rint(xy).astype(np.int64).clip(0, np.array(image.intrinsics.size) - 1)
+        open_ = np.flatnonzero(free[pixels[:, 1], pixels[:, 0]])
+        rows = open_[spread_corners(gray, pixels[open_], DENSE_CELLS)]
+        places, normals = (points[kind][rows].astype(np.float64) for kind in ("points", "normals"))
+        return Surfaces(pixels[rows], places, normals)
+
+    def add(
+        self, name: str, wanted: Surfaces, tracks: np.ndarray | None = None, min_views: int = 2
+    ) -> None:
+        """Seek surfaces of an image in others; those that enough images see become points.
+
+        They are sought in the images of their `tracks`, rows of the model's points, or in all.
+        """
+        own = self.numbers[name]
         pixels, points, _ = wanted
         found = [(own, np.arange(len(pixels)), pixels.astype(np.float64))]
-        for k in map(int, np.flatnonzero(self.together[own])):
-            if k != own:
-                found.append((k, *self._aligned(self.images[own], self.images[k], wanted)))
+        common = (self.members & self.members[own]).sum(axis=1)
+        common[own] = 0
+        for k in map(int, np.flatnonzero(common >= MIN_COMMON_POINTS)):
+            rows = np.arange(len(pixels))
+            if tracks is not None:
+                rows = rows[self.members[k, tracks]]
+            some = Surfaces(*(each[rows] for each in wanted))
+            at, xy = self._aligned(self.images[own], self.images[k], some)
+            found.append((k, rows[at], xy))
         views = np.bincount(np.concatenate([rows for _, rows, _ in found]), minlength=len(pixels))
         kept = views >= min_views
         new = self.count + np.cumsum(kept) - 1
