@@ -15,6 +15,7 @@ from deepdetect._shared.opencv import import_pycolmap
 from deepdetect.datasets import load_posed_scenes, posed_images
 from deepdetect.datasets.pair_selection import FRAME_DISTANCES
 from deepdetect.datasets.posed_images import PosedScene
+from deepdetect.io.gps import read_gps
 
 SIZE = (60, 40)
 INTRINSICS = np.array([[50.0, 0, 31.25], [0, 52, 18.5], [0, 0, 1]])
@@ -281,3 +282,19 @@ def test_the_shared_scenes_are_read(shared: Path, monkeypatch: pytest.MonkeyPatc
     assert (len(clip.images), len(clip.pairs)) == (51, 60)
     forward = [-pair.rotation.T @ pair.translation for pair in clip.pairs[:10]]
     np.testing.assert_allclose(forward, np.tile([0, 0, 1.2], (10, 1)), atol=0.04)
+
+
+def test_satellite_fixes_are_places_in_metres(shared: Path) -> None:
+    pytest.importorskip("pycolmap", reason="needs pycolmap")
+    folder = shared / "data" / "lund"
+    with pytest.raises(ImageError):
+        load_posed_scenes(folder)
+    (scene,) = load_posed_scenes(folder, located=True)
+    assert scene.located_only
+    assert (len(scene.images), scene.pairs) == (15, ())
+    first, last = (read_gps(scene.images[k].path) for k in (0, -1))
+    north = np.radians(last.latitude - first.latitude) * 6_381_000  # radii of curvature at 56 deg
+    east = np.radians(last.longitude - first.longitude) * 6_393_000
+    east *= np.cos(np.radians(first.latitude))
+    moved = scene.images[0].translation - scene.images[-1].translation
+    np.testing.assert_allclose(moved[:2], (east, north), rtol=0.005, atol=0.05)

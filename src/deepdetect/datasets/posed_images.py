@@ -1,4 +1,4 @@
-"""Folders of images with known cameras, in three public layouts.
+"""Folders of images with known cameras, in three public layouts, or with satellite fixes.
 
 - Strecha's (Strecha et al., 2008): NNNN.jpg or .png with NNNN.camera (or NNNN.jpg.camera).
 - KITTI odometry (Geiger et al., 2012): NNNNNN.png or .jpg with calib.txt, whose first line is the
@@ -21,6 +21,7 @@ import numpy as np
 from .._shared.errors import ImageError, first_line
 from .._shared.opencv import import_pycolmap
 from ..geometry.camera import cross_matrix
+from ..io.gps import read_gps
 from ..io.image import ORIENTATION_TAG
 from ..io.image_file import open_image
 from .pair_selection import FRAME_DISTANCES, sequence_pairs, unordered_pairs
@@ -93,20 +94,26 @@ class PosedScene:
         name: the folder's.
         images: all of them, by name.
         pairs: those that were chosen.
+        located_only: whether only the places of the cameras are known, in metres, as GPS has them;
+            intrinsics and rotations say nothing, and there are no pairs.
     """
 
     name: str
     images: tuple[PosedImage, ...]
     pairs: tuple[PosedPair, ...]
+    located_only: bool = False
 
 
-def load_posed_scenes(folder: str | Path, max_pairs: int = 60) -> list[PosedScene]:
+def load_posed_scenes(
+    folder: str | Path, max_pairs: int = 60, located: bool = False
+) -> list[PosedScene]:
     """Read the scene that a folder is, or those that its subfolders are.
 
     Args:
         folder: a scene in one of the three layouts, or a folder of scenes.
         max_pairs: at most this many pairs of a scene. Of images in no order all pairs, where there
             are more an evenly spaced choice; of a sequence as many at each of `FRAME_DISTANCES`.
+        located: take folders, too, whose first image has a satellite fix.
 
     Raises:
         ImageError: there is no scene, or a file of one is missing or damaged.
@@ -114,8 +121,8 @@ def load_posed_scenes(folder: str | Path, max_pairs: int = 60) -> list[PosedScen
     """
     root = Path(folder).resolve()
     below = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
-    folders = [root] if _reader(root) else below
-    readers = {path: read for path in folders if (read := _reader(path)) is not None}
+    folders = [root] if _reader(root, located) else below
+    readers = {path: read for path in folders if (read := _reader(path, located)) is not None}
     if not readers:
         raise ImageError(
             f"there are no images with cameras in {folder}: it, or each of its folders, must hold "
@@ -125,18 +132,26 @@ def load_posed_scenes(folder: str | Path, max_pairs: int = 60) -> list[PosedScen
     return [_load_scene(path, read, max_pairs) for path, read in readers.items()]
 
 
-def _reader(folder: Path) -> Callable[[Path], list[PosedImage]] | None:
+def _reader(folder: Path, located: bool) -> Callable[[Path], list[PosedImage]] | None:
     if any(folder.glob("*.camera")):
         return _read_strecha
     if (folder / "poses.txt").is_file() and _kitti_calibration(folder).is_file():
         return _read_kitti
-    return None if _colmap_model(folder) is None else _read_colmap
+    if _colmap_model(folder) is not None:
+        return _read_colmap
+    if located and folder.is_dir():
+        first = min((path for path in folder.iterdir() if path.suffix in SUFFIXES), default=None)
+        if first is not None and read_gps(first) is not None:
+            return _read_located
+    return None
 
 
 def _load_scene(
     folder: Path, read: Callable[[Path], list[PosedImage]], max_pairs: int
 ) -> PosedScene:
     images, name = read(folder), folder.name
+    if read is _read_located:
+        return PosedScene(name, tuple(images), (), located_only=True)
     pairs = []
     distances = ""
     if read is _read_kitti:
@@ -238,6 +253,20 @@ def _read_colmap(folder: Path) -> list[PosedImage]:
         rotation, translation = pose.rotation.matrix(), np.array(pose.translation)
         images.append(_posed_image(paths[0], matrix, rotation, translation, place))
     return sorted(images, key=lambda image: image.path)
+
+
+def _read_located(folder: Path) -> list[PosedImage]:
+    paths = sorted(path for path in folder.iterdir() if path.suffix in SUFFIXES)
+    fixes = [(path, fix) for path in paths if (fix := read_gps(path)) is not None]
+    places = np.nan_to_num([(fix.latitude, fix.longitude, fix.altitude) for _, fix in fixes])
+    pycolmap = import_pycolmap("places of satellite fixes")
+    ellipsoid = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    metres = np.asarray(ellipsoid.ellipsoid_to_enu(places, *places[0]))
+    nothing = np.eye(3)
+    return [
+        PosedImage(path, nothing, nothing, -place)
+        for (path, _), place in zip(fixes, metres, strict=True)
+    ]
 
 
 def _posed_image(

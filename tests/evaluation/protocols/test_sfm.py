@@ -20,6 +20,7 @@ from deepdetect.sfm import MultiViewOptions
 
 POINTS, RANDOM = "DeepDetect, points", "baseline: as many random points"
 SIFT, REFINED = "SIFT, pycolmap", "SIFT, tracks refined"
+DENSE = "DeepDetect, dense tracks"
 
 
 def model(views: dict, points=0, track_length=float("nan"), error=float("nan")):
@@ -125,9 +126,9 @@ def test_images_of_a_sequence_are_its_first(tmp_path: Path) -> None:
 def test_options_choose_the_methods() -> None:
     detector = DeepDetect()
     titles = [method.name for method in sfm.sfm_methods(BenchmarkOptions(detector))]
-    assert titles == [POINTS, SIFT, REFINED, RANDOM]
+    assert titles == [POINTS, DENSE, SIFT, REFINED, RANDOM]
     without = sfm.sfm_methods(BenchmarkOptions(detector, classical=()))
-    assert [method.name for method in without] == [POINTS, RANDOM]
+    assert [method.name for method in without] == [POINTS, DENSE, RANDOM]
     with pytest.raises(WeightsError, match=r"none\.npz"):
         sfm.sfm_methods(BenchmarkOptions(detector, ranker="none.npz"))
 
@@ -159,7 +160,7 @@ def test_a_whole_run_on_small_images(write_posed_fountain, tmp_path: Path) -> No
     report = run_benchmarks(["sfm"], folder, options, cache=tmp_path / "cache")
     assert report.failures == ()
     cameras, per_image, costs = report.tables()
-    assert len(per_image.rows) == 4 * 2 * len(names)
+    assert len(per_image.rows) == 5 * 2 * len(names)
     assert all(cost > 0 for row in costs.values() for cost in [*row.values()][2:])
     lines = [*cameras.values()]
     given = {row["keypoints"]: row for row in lines if row["intrinsics"] == "true"}

@@ -6,13 +6,14 @@ and for SIFT the matches, are others. Each runs in a process of its own, which t
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -86,7 +87,8 @@ TEXT = (
     "once with estimated ones; the true poses only evaluate. What differs are the keypoints: the "
     "ranked points of DeepDetect; as many random points with their sizes; and pycolmap's own SIFT "
     "with its own matcher, at as many places at most, some of them at two angles, once with the "
-    "tracks as they are and once with refined ones.",
+    "tracks as they are and once with refined ones. Dense tracks are those of `--matches dense`. "
+    "Where only satellite fixes are known, centres are compared with these.",
 )
 
 CAMERA_NOTE = (
@@ -117,7 +119,7 @@ class SfmMethod:
 
     `find` writes the keypoints of the images in a folder, `match` returns the matches of pairs;
     both are functions of a module. With `chance` the time that finding takes means nothing; tracks
-    are `refined`, or as COLMAP leaves them.
+    are `refined`, or as COLMAP leaves them; `tracks` is the option `matches`.
     """
 
     name: str
@@ -126,6 +128,7 @@ class SfmMethod:
     version: str = ""
     chance: bool = False
     refined: bool = True
+    tracks: Literal["sparse", "dense"] = "sparse"
 
 
 @lru_cache
@@ -145,7 +148,7 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
     """Reconstruct all scenes by all methods."""
     import_pycolmap()  # what is missing is said at once
     folder = run.folder("sfm")
-    scenes = load_posed_scenes(run.folder("pose") if folder == run.data else folder)
+    scenes = load_posed_scenes(run.folder("pose") if folder == run.data else folder, located=True)
     chosen = {}
     for each in scenes:
         if len(each.images) < MIN_IMAGES:
@@ -162,6 +165,8 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
     tables = [camera_table(rows), image_table(rows), cost_table]
     figures = []
     for name, scene in chosen.items():
+        if scene.located_only:
+            continue
         errors = {
             f"{row['method']}, {kind} intrinsics": relative_pose_errors(views, true_views(scene))
             for row in where(rows, item=name)
@@ -179,23 +184,24 @@ def choose_images(scene: PosedScene, most: int) -> PosedScene:
 
     Between evenly spaced frames of a long sequence there would be nothing in common.
     """
-    sequence = scene.pairs[0].frame_distance is not None
+    sequence = bool(scene.pairs) and scene.pairs[0].frame_distance is not None
     images = scene.images[:most] if sequence else evenly_spaced(scene.images, most)
     return replace(scene, images=tuple(images))
 
 
 def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
-    """Return the ranked points, SIFT where it is among the baselines (twice), and random points."""
+    """Return the ranked points, SIFT where it is among the baselines, each twice, and chance."""
     points = PointDetector(MAX_KEYPOINTS, ranker=options.ranker)
     version, random = (
         f"{points.settings} {points.descriptor_type}",
         "baseline: as many random points",
     )
     ours = SfmMethod("DeepDetect, points", partial(find_points, points), version=version)
+    dense = replace(ours, name="DeepDetect, dense tracks", tracks="dense")
     sift = SfmMethod("SIFT, pycolmap", find_sift, match_sift, refined=False)
     aligned = SfmMethod("SIFT, tracks refined", find_sift, match_sift)
     chance = SfmMethod(random, partial(find_random_points, points), version=version, chance=True)
-    return [ours, sift, aligned, chance] if "sift" in options.classical else [ours, chance]
+    return [ours, dense, *([sift, aligned] if "sift" in options.classical else []), chance]
 
 
 def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
@@ -212,7 +218,8 @@ def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
         repr(vars(OPTIONS)),
         import_pycolmap().__version__,
     )
-    row = run.cached("sfm", depends, lambda: run_in_child(run_method, method, images, cameras))
+    known = {} if scene.located_only else cameras
+    row = run.cached("sfm", depends, lambda: run_in_child(run_method, method, images, known))
     row["scene"] = scene
     for kind in KINDS:
         poses = zip(row[f"{kind} names"].tolist(), row[f"{kind} poses"], strict=True)
@@ -232,14 +239,18 @@ def camera_table(rows: Rows) -> Table:
         truth = true_views(scene)
         first = next((each for each in where(rows, scene=scene, method=rows[0]["method"])), row)
         for kind in KINDS:
+            if scene.located_only and kind == "true":
+                continue
             views = row[kind]["views"]
-            errors = relative_pose_errors(views, truth)
             line = {
                 **{"scene": scene.name, "keypoints": row["method"], "intrinsics": kind},
                 **{"images": len(scene.images), "registered": len(views)},
-                **{f"AUC at {each:g}°": pose_auc(errors, each) for each in POSE_THRESHOLDS_DEG},
                 **row[kind],
             }
+            if not scene.located_only:
+                errors = relative_pose_errors(views, truth)
+                for each in POSE_THRESHOLDS_DEG:
+                    line[f"AUC at {each:g}°"] = pose_auc(errors, each)
             if len(views) >= MIN_IMAGES:
                 true = [truth[name] for name in views]
                 centres, rotations, _ = camera_errors(list(views.values()), true)
@@ -247,7 +258,8 @@ def camera_table(rows: Rows) -> Table:
                 places = np.array([view.centre for view in truth.values()])
                 extent = np.linalg.norm(places[:, None] - places, axis=2).max()
                 line["centres, ‰ of the extent"] = 1000 * float(centres.mean()) / float(extent)
-                line["rotations, °"] = float(rotations.mean())
+                if not scene.located_only:
+                    line["rotations, °"] = float(rotations.mean())
             if first is not row:
                 apart = _apart(views, first[kind]["views"], truth)
                 line["from the first row's, unit of the truth"] = apart
@@ -264,7 +276,8 @@ def image_table(rows: Rows) -> Table:
             views, errors = row[kind]["views"], {}
             if len(views) >= MIN_IMAGES:
                 found = camera_errors(list(views.values()), [truth[name] for name in views])
-                errors = dict(zip(views, zip(*found[:2], strict=True), strict=True))
+                turned = [None] * len(views) if row["scene"].located_only else found[1]
+                errors = dict(zip(views, zip(found[0], turned, strict=True), strict=True))
             for image in truth:
                 cells = row["scene"].name, row["method"], kind, image
                 cells += errors.get(image, (None, None))
@@ -359,7 +372,8 @@ def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, 
     Returns the `COST_COLUMNS`, and those of `_unpacked` after "true " and "estimated ".
     """
     with tempfile.TemporaryDirectory(prefix="deepdetect-sfm-") as scratch:
-        stages = Stages(Path(scratch) / "model", OPTIONS, 1, True)
+        options = replace(OPTIONS, matches=method.tracks)
+        stages = Stages(Path(scratch) / "model", options, 1, True)
         folder = stages.folder_of(images)
         start = _times()
         method.find(stages, folder)
@@ -380,11 +394,10 @@ def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, 
         }
         for kind, known in zip(KINDS, (cameras, {}), strict=True):
             intrinsics = initial_intrinsics(folder, sizes, known)
-            cpu = time.process_time()
-            try:
-                model = stages.map(folder, intrinsics, matches, bool(known), method.refined)[0]
-            except NoDepthError:
-                model = None  # a result, too
+            cpu, model = time.process_time(), None
+            if known or kind == "estimated":
+                with contextlib.suppress(NoDepthError):  # none is a result, too
+                    model = stages.map(folder, intrinsics, matches, bool(known), method.refined)[0]
             row[MAPPING_CPU.format(kind)] = time.process_time() - cpu
             row |= {f"{kind} {name}": value for name, value in _unpacked(model).items()}
         return row | {"memory, MB": peak_memory() / 1e6}
