@@ -425,7 +425,7 @@ def merge_dense_points(parts: Sequence[tuple[PosedView, np.ndarray]], stride_px:
     """Join the points of all references, without those that an earlier one has given already."""
     kept = [np.empty(0, DENSE_POINT)]
     for view, own in parts:
-        seen = _nearest_depths(view, kept, stride_px)
+        seen = nearest_depths(view, [each["points"] for each in kept], stride_px)
         projected, depth = view.project(own["points"])
         cells = np.rint(projected / stride_px).astype(np.int64)
         column, row = cells.clip(0, np.array(seen.shape[::-1]) - 1).T
@@ -433,12 +433,12 @@ def merge_dense_points(parts: Sequence[tuple[PosedView, np.ndarray]], stride_px:
     return np.concatenate(kept)
 
 
-def _nearest_depths(view: PosedView, parts: Sequence[np.ndarray], stride_px: int) -> np.ndarray:
-    """Return the depth of the nearest point in each cell of a view, infinite without any."""
+def nearest_depths(view: PosedView, parts: Sequence[np.ndarray], stride_px: int) -> np.ndarray:
+    """Return the depth of the nearest of (N, 3) points in each cell of a view; infinite: none."""
     columns, rows = (-(-side // stride_px) for side in view.camera.size)
     nearest = np.full((rows, columns), np.inf)
-    for part in parts:
-        projected, depth = view.project(part["points"])
+    for points in parts:
+        projected, depth = view.project(points)
         cells = np.rint(np.where(depth[:, None] > 0, projected, -1e6) / stride_px)
         inside = ((cells >= 0) & (cells < (columns, rows))).all(axis=1)
         column, row = cells[inside].astype(np.int64).T

@@ -292,7 +292,7 @@ class Stages:
             adjust(model, known)
         normalise_model(model)
         if refined and self.options.matches == "dense":
-            fused = self._fused(folder, read_sparse_model(model))
+            fused = self.fused(folder, read_sparse_model(model))
             add_dense_tracks(model, folder, {view.name: points for view, points in fused})
             adjust_refined(model, known)
             normalise_model(model)
@@ -308,10 +308,10 @@ class Stages:
 
     def dense(self, folder: Path, sparse: SparseModel) -> np.ndarray:
         """Make the depth maps that earlier runs have not made, and fuse all (`DENSE_POINT`)."""
-        return merge_dense_points(self._fused(folder, sparse), self.options.stride_px)
+        return merge_dense_points(self.fused(folder, sparse), self.options.stride_px)
 
-    def _fused(self, folder: Path, sparse: SparseModel) -> list[tuple[PosedView, np.ndarray]]:
-        """Return the dense points of each reference."""
+    def fused(self, folder: Path, sparse: SparseModel) -> list[tuple[PosedView, np.ndarray]]:
+        """Return the dense points of each reference, before what several give is joined."""
         store, stride = self.work / "dense", self.options.stride_px
         references = find_references(sparse)
         paths: dict[str, Path] = {}

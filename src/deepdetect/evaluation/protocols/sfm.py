@@ -36,6 +36,7 @@ from ..options import BenchmarkOptions
 from ..profiling import peak_memory, run_in_child
 from ..report import Figure, Row, Rows, Section, Table, where
 from ..run import Run
+from .dense_points import DENSE_COLUMNS, DENSE_NOTE, measure_dense_points
 from .pose import error_chart, file_name
 
 MIN_IMAGES = 3
@@ -162,7 +163,12 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
     rows = [row for name in chosen for row in where(rows, item=name)]
     costs = [{**row, "scene": row["scene"].name, "keypoints": row["method"]} for row in rows]
     cost_table = Table("sfm_cost", "Seconds and memory", COST_COLUMNS, costs, COST_NOTE)
-    tables = [camera_table(rows), image_table(rows), cost_table]
+    dense = [
+        run.attempt(f"dense points of {name}", dense_row, run, chosen[name]) for name in chosen
+    ]
+    found = [row for row in dense if row is not None]
+    dense_table = Table("sfm_dense", "Dense points", DENSE_COLUMNS, found, DENSE_NOTE)
+    tables = [camera_table(rows), image_table(rows), cost_table, dense_table]
     figures = []
     for name, scene in chosen.items():
         if scene.located_only:
@@ -229,6 +235,16 @@ def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
         }
         row[kind] = {"views": views, **{name: row[f"{kind} {name}"] for name in MODEL_COLUMNS}}
     return row
+
+
+def dense_row(run: Run, scene: PosedScene) -> Row:
+    """Measure the dense points of a scene, or read the result from the cache."""
+    images = tuple(image.path for image in scene.images)
+    cameras = {name: view.camera for name, view in true_views(scene).items()}
+    known = {} if scene.located_only else cameras
+    depends = "dense", images, sorted(known.items()), import_pycolmap().__version__
+    row = run.cached("sfm", depends, lambda: run_in_child(measure_dense_points, images, known))
+    return {"scene": scene.name, **row}
 
 
 def camera_table(rows: Rows) -> Table:
