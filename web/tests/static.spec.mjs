@@ -160,6 +160,43 @@ test("matches of two views agree with the true disparity", async ({ page }) => {
   expect(JSON.parse(json.content)).toMatchObject({ model: "fundamental", options: { ratio: 0.6 } });
 });
 
+test("SIFT in the page finds what OpenCV's finds", async ({ page }) => {
+  const pair = ["coffee.jpg", "coffee-turned.jpg"].map((name) => join(examples, name));
+  const opencv = askPython(`
+import json, sys, cv2
+found = []
+for path in sys.argv[1:]:
+    sift = cv2.SIFT_create(2000, enable_precise_upscale=True)
+    found.append(sift.detectAndCompute(cv2.imread(path, 0), None))
+(keypoints, first), (_, second) = found
+matcher = cv2.BFMatcher(cv2.NORM_L2)
+back = matcher.match(second, first)
+good = [a for a, b in matcher.knnMatch(first, second, 2) if a.distance < 0.8 * b.distance
+        and back[a.trainIdx].trainIdx == a.queryIdx]
+print(json.dumps({"matches": len(good), "xy": [each.pt for each in keypoints]}))
+`, ...pair);
+  await openExample(page, "Coffee, turned");
+  await expect(page.locator("#match-hint")).toContainText("agree");
+  await page.getByLabel("Compare with SIFT").check();
+  await expect(page.locator("#sift-count")).toContainText("agree");
+  const [matches, agreeing] = (await page.locator("#sift-count").textContent()).match(/\d+/g).map(Number);
+  expect(Math.abs(matches / opencv.matches - 1)).toBeLessThan(0.1);
+  expect(agreeing).toBeGreaterThan(0.7 * matches);
+  const xy = await page.evaluate(async () => {
+    const { findSift } = await import("/js/sift.js");
+    const response = await fetch("examples/coffee.jpg");
+    const bitmap = await createImageBitmap(await response.blob());
+    const context = new OffscreenCanvas(bitmap.width, bitmap.height).getContext("2d");
+    context.drawImage(bitmap, 0, 0);
+    const { luma } = await import("/js/pixels.js");
+    const { data } = context.getImageData(0, 0, bitmap.width, bitmap.height);
+    return [...findSift(luma(data), bitmap.width, bitmap.height, 2000).xy];
+  });
+  expect(Math.abs(xy.length / 2 / opencv.xy.length - 1)).toBeLessThan(0.05);
+  const near = opencv.xy.filter(([x, y]) => xy.some((u, k) => k % 2 === 0 && Math.hypot(u - x, xy[k + 1] - y) < 0.5));
+  expect(near.length / opencv.xy.length).toBeGreaterThan(0.95);
+});
+
 test("matches are enlarged by the wheel and by keys, and the line that is pointed at stands out", async ({ page }) => {
   await openExample(page, "Motorcycle");
   await expect(page.locator("#match-hint")).toContainText("agree");

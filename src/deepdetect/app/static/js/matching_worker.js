@@ -2,14 +2,27 @@
 import { answer } from "./background.js";
 import { estimateGeometry, project } from "./geometry.js";
 import { matchLearned } from "./learned.js";
+import { mutualMatches } from "./matching.js";
+import { LENGTH, RATIO, findSift } from "./sift.js";
+
+const take = (xy, rows) => Float32Array.from({ length: 2 * rows.length },
+                                             (_, k) => xy[2 * rows[k >> 1] + (k & 1)]);
 
 answer({
   /** @returns mutual nearest neighbours with their ratios, as positions */
   match({ pictures }) {
     const { rows0, rows1, ratios } = matchLearned(...pictures);
-    const take = (xy, rows) => Float32Array.from({ length: 2 * rows.length },
-                                                 (_, k) => xy[2 * rows[k >> 1] + (k & 1)]);
     return { points0: take(pictures[0].xy, rows0), points1: take(pictures[1].xy, rows1), ratios };
+  },
+
+  /** @returns {{matches: number, agreeing: number}} of SIFT's keypoints, at most `count` of a picture */
+  sift({ pictures, count }) {
+    const [first, second] = pictures.map(({ gray, width, height }) => findSift(gray, width, height, count));
+    const { rows0, rows1, ratios } = mutualMatches(first.descriptors, second.descriptors, LENGTH);
+    const good = [...ratios.keys()].filter((k) => ratios[k] < RATIO);
+    const points = [[first, rows0], [second, rows1]].map(([{ xy }, rows]) => take(xy, good.map((k) => rows[k])));
+    const { inliers } = estimateGeometry(...points, pictures.map(({ width, height }) => [width, height]));
+    return { matches: good.length, agreeing: inliers.reduce((total, value) => total + value, 0) };
   },
 
   geometry({ points0, points1, sizes }) {

@@ -6,6 +6,7 @@ import { roundHalfEven } from "./selection.js";
 const BINS = 36;
 const WINDOW_PER_SIGMA = 1.5;
 const RADIUS_PER_WINDOW = 3;
+const PEAK_FRACTION = 0.8; // of the highest bin, above which a keypoint is also one of that direction
 const fround = Math.fround;
 
 // OpenCV's polynomial for the arc tangent, in degrees: other values would count for other bins.
@@ -43,7 +44,7 @@ export function dominantAngles(gray, width, height, { xy, sizes }) {
 }
 
 /** The votes of the gradients in a Gaussian window around a pixel for each direction. */
-function votesAround({ image, width, height }, x, y, window) {
+export function votesAround({ image, width, height }, x, y, window) {
   const radius = roundHalfEven(RADIUS_PER_WINDOW * window);
   const weights = Array.from({ length: radius + 1 }, (_, k) => Math.exp(-0.5 * (k / window) ** 2));
   const votes = new Float64Array(BINS);
@@ -60,13 +61,28 @@ function votesAround({ image, width, height }, x, y, window) {
   return votes;
 }
 
-/** The direction of the highest bin of the smoothed votes, refined by a parabola. */
-function highest(votes) {
+function smoothed(votes) {
   const at = (bin) => votes[(bin + BINS) % BINS];
-  const smooth = Float64Array.from(votes, (value, k) =>
+  return Float64Array.from(votes, (value, k) =>
     (6 * value + 4 * (at(k - 1) + at(k + 1)) + at(k - 2) + at(k + 2)) / 16);
-  let best = 0;
-  for (let k = 1; k < BINS; k++) if (smooth[k] > smooth[best]) best = k;
+}
+
+/** The direction of the highest bin of the smoothed votes. */
+function highest(votes) {
+  const smooth = smoothed(votes);
+  return refined(smooth, smooth.indexOf(Math.max(...smooth)));
+}
+
+/** The directions of all bins that stand out nearly as much as the highest. */
+export function directions(votes) {
+  const smooth = smoothed(votes);
+  const least = PEAK_FRACTION * Math.max(...smooth);
+  return [...smooth.keys()].filter((k) => smooth[k] >= least && smooth[k] > smooth.at(k - 1)
+    && smooth[k] > smooth[(k + 1) % BINS]).map((k) => refined(smooth, k));
+}
+
+/** The direction of a bin in degrees, refined by a parabola. */
+function refined(smooth, best) {
   const [left, middle, right] = [-1, 0, 1].map((step) => smooth[(best + step + BINS) % BINS]);
   const curvature = left - 2 * middle + right;
   const shift = curvature < 0 ? (left - right) / (2 * curvature) : 0;

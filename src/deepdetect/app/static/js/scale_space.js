@@ -3,9 +3,9 @@
 import { blur } from "./gaussian.js";
 import { roundHalfEven } from "./selection.js";
 
-const LAYERS = 3; // of an octave that hold keypoints
-const BASE_SIGMA_PX = 1.6;
-const CAMERA_SIGMA_PX = 0.5; // blur that a picture is assumed to have
+export const LAYERS = 3; // of an octave that hold keypoints
+export const BASE_SIGMA_PX = 1.6;
+export const CAMERA_SIGMA_PX = 0.5; // blur that a picture is assumed to have
 export const SIZE_PER_SIGMA = 2;
 const MIN_SIDE_PX = 8;
 
@@ -46,7 +46,7 @@ export function* layersOf(gray, width, height, sizes) {
 }
 
 /** Every second pixel of every second row. */
-function halved(image, width, height) {
+export function halved(image, width, height) {
   const [newWidth, newHeight] = [width, height].map((side) => Math.ceil(side / 2));
   const result = new Float32Array(newWidth * newHeight);
   for (let y = 0, at = 0; y < newHeight; y++) {

@@ -25,7 +25,7 @@ let found = null; // mutual matches of the pictures with their ratios
 let pending = null; // the matching that is at work, or was the last
 let kept = null; // those under the ratio, with their geometry
 let [zoom, lines, hovered] = [1, [], null]; // how the matches are drawn
-let [matchings, filterings] = [0, 0]; // how many were begun: only what the last one finds is shown
+let [matchings, filterings, comparisons] = [0, 0, 0]; // how many were begun: only what the last one finds is shown
 
 export const matchingTask = (task, values) => background.call(task, values);
 
@@ -83,6 +83,20 @@ async function matchNew(key, isWanted) {
   result.points1 = seen(result.points1, pictures[1], second);
   found = { key, ...result };
   await filter();
+  compareWithSift().catch((error) => showError(error.message));
+}
+
+/** Says how many matches SIFT finds in the same pictures, where that is asked for. */
+async function compareWithSift() {
+  const [own, output] = [++comparisons, element("sift-count")];
+  output.textContent = "";
+  if (!found || !element("sift").checked) return;
+  const [first, second, number] = found.key;
+  const pictures = [first, second].map(({ ranking: { gray, width, height } }) => ({ gray, width, height }));
+  const sift = await during("Matching by SIFT…", background.call("sift", { pictures, count: number }));
+  if (own !== comparisons) return;
+  output.textContent = `SIFT: ${counted(sift.matches, "match")}, of which ${
+    sift.agreeing.toLocaleString("en")} agree with one geometry.`;
 }
 
 /** Keeps the matches under the ratio, and estimates the geometry that they agree with. */
@@ -182,6 +196,8 @@ export function reset() {
   [zoom, lines, hovered] = [1, [], null];
   matchings++;
   filterings++;
+  comparisons++;
+  element("sift-count").textContent = "";
   element("match-count").textContent = "–";
   element("match-hint").textContent = "";
 }
@@ -236,6 +252,7 @@ export function setUp() {
   };
   element("match-number").oninput = showControls;
   element("match-number").onchange = guarded(match);
+  element("sift").onchange = guarded(compareWithSift);
   element("agreeing").onchange = element("thickness").oninput = draw;
   addEventListener("resize", onceAFrame(() => !view.hidden && draw()));
   for (const button of form.querySelectorAll("[data-download]")) {
