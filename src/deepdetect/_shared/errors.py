@@ -142,9 +142,10 @@ def require_packages(what: str, *packages: str) -> None:
     """Raise a MissingExtraError where something needs a package that is not installed."""
     missing = [package for package in packages if importlib.util.find_spec(package) is None]
     if missing:
+        names = ", ".join(missing)
+        kinds = "packages" if len(missing) > 1 else "package"
         raise MissingExtraError(
-            f"{what} needs the package {' and '.join(missing)}, which is not installed: "
-            f"run {install_command(*missing)}"
+            f"{what} needs the {kinds} {names}: run {install_command(*missing)}"
         )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -182,12 +183,14 @@ def thread_limit() -> int | None:
     ONNX Runtime's own are bound to processors, in every process to the same ones and also to those
     that the process may not use: a process that is one of several is given a number.
     """
-    from multiprocessing import parent_process
-
+    # Who was started by it has it; others need not load it.
+    parent_of = getattr(sys.modules.get("multiprocessing.process"), "parent_process", None)
     wished = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     if _max_threads is None and wished.isdecimal() and int(wished):
         return int(wished)
-    if _max_threads is None and (parent_process() or processor_count() < (os.cpu_count() or 1)):
+    if _max_threads is None and (
+        (parent_of and parent_of()) or processor_count() < (os.cpu_count() or 1)
+    ):
         return processor_count()
     return _max_threads
 

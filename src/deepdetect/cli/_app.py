@@ -146,7 +146,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from .._shared.kernels import announce_compilation
 
     announce_compilation(
-        lambda: say("compiling for the first time, about 10 seconds; it is kept for later runs")
+        lambda: say("compiling what this needs for the first time, about 10 seconds; it is kept")
     )
     words = list(sys.argv[1:] if arguments is None else arguments)
     warn = warnings.showwarning

@@ -48,7 +48,7 @@ PAIR = cli.From(
     match_images,
     "guided_matching model mutual",
     more="seed",
-    flags={"guided_matching": "--guided-matching/--no-guided-matching --unguided"},
+    flags={"guided_matching": "--guided-matching/--unguided"},
     types={"model": Literal[MODEL_NAMES]},
 )
 MATCHING = cli.From(

@@ -32,7 +32,7 @@ def view(
 
         deepdetect view model.ply
         deepdetect view left.npz left.png
-        deepdetect view left_right.npz left.png right.png
+        deepdetect view left_right_matches.npz left.png right.png
     """
     if not file.is_file():
         raise MissingFileError(

@@ -113,7 +113,8 @@ def register(
         detector, channels, selection, ignore, progress: as for `match_images`.
         mutual: use only matches that are found from either image, in twice the time.
         seed: seed of all random choices.
-        extent: the frame: "reference", that of the first image, or "union", what both show.
+        extent: the frame: "reference", that of the first image, or "union", all that either
+            shows.
         apply_to: further images of the second camera, or its own file for all its bands, which are
             moved by the same homography.
 

@@ -159,11 +159,12 @@ class Format(NamedTuple):
     write: Callable[[MultiViewReconstruction, Path, Path], None]
     files: tuple[str, ...]
     packages: tuple[str, ...] = ()
+    placed: bool = False  # on the Earth
 
 
 FORMATS: dict[FormatName, Format] = {
-    "laz": Format(write_laz, ("model.laz",), ("laspy", "lazrs", "pyproj")),
-    "map": Format(write_map, ("height.tif", "orthophoto.tif")),
+    "laz": Format(write_laz, ("model.laz",), ("laspy", "lazrs", "pyproj"), True),
+    "map": Format(write_map, ("height.tif", "orthophoto.tif"), placed=True),
     "mesh": Format(write_mesh, ("mesh.ply", "mesh.glb")),
     "splat": Format(write_splat, ("splat",)),
     "text": Format(write_text, ("sparse_text",)),

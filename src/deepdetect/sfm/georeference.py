@@ -14,6 +14,7 @@ from .._shared.errors import OptionError, ReconstructionError, first_line, requi
 from ..geometry.camera import PosedView
 from ..geometry.similarity import Similarity, SimilarityFit, fit_similarity
 from ..io.gps import read_gps
+from ..io.image import find_images
 from .colmap import import_pycolmap
 from .mapping import SparseModel
 
@@ -158,6 +159,16 @@ def georeference(
         if scale is None:
             return str(error)
     return Georeference(Similarity(scale, np.eye(3), np.zeros(3)), "known distance")
+
+
+def require_fixes(folder: Path, what: str) -> None:
+    """Raise an OptionError where too few images below a folder carry a satellite fix."""
+    found = sum(read_gps(path) is not None for path in find_images(folder))
+    if found < MIN_FIXES:
+        raise OptionError(
+            f"{what} needs a place on the Earth, and {found} images carry a satellite fix: leave "
+            "it out, or give ground control points"
+        )
 
 
 def georeference_by_gps(

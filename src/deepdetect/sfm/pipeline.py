@@ -29,7 +29,7 @@ from ..io.point_cloud import save_point_cloud
 from .colmap import import_pycolmap, initial_intrinsics, known_cameras
 from .dense import DENSE_POINT
 from .formats import FORMATS, FormatName, check_formats
-from .georeference import Georeference, georeference, read_control_points
+from .georeference import Georeference, georeference, read_control_points, require_fixes
 from .mapping import MIN_VIEWS, read_sparse_model, transform_model
 from .result import MultiViewReconstruction
 from .splat import write_transforms
@@ -104,6 +104,8 @@ def reconstruct_many(
         shutil.rmtree(target / WORK, ignore_errors=True)
     stages, timer = Stages(target, options, workers, quiet, seed), StageTimer(None)
     folder = stages.folder_of(images)
+    if control is None and (placed := [n for n in options.formats if FORMATS[n].placed]):
+        require_fixes(folder, f"the format {placed[0]}")
     with timer.stage("features"):
         sizes, keypoints, unregistered = stages.extract(folder, detector, selection)
     for name, count in keypoints.items():

@@ -80,8 +80,8 @@ class MultiViewOptions:
             alike.
         ratio: limit of the ratio test: the best distance must be below this share of the
             second-best. None: as of `match_features`.
-        matches: "sparse": of keypoints; "dense": points of the depth maps become points of the
-            model, too, and cameras are adjusted to all.
+        matches: "sparse": of keypoints; "dense": points of the depth maps also become points
+            of the model, and cameras are adjusted to all.
         dense: make dense points.
         stride_px: distance in pixels between the places of a row or column that are tried.
         single_camera: whether images of one size were taken by one camera; None: where their EXIF

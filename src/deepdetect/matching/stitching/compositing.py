@@ -123,7 +123,8 @@ def plan_plane(
         if depths.min() * MAX_DEPTH_RATIO <= depths.max():
             raise RegistrationError(
                 f"images[{number}] is seen too much from the side of images[{reference}] for a "
-                "flat panorama: choose the projection 'cylindrical', or a `reference` between them"
+                "flat panorama: choose a `reference` between them, or, if the camera only turned, "
+                "the projection 'cylindrical'"
             )
     placed = {number: scaled_homography(matrix, 1, scale) for number, matrix in placed.items()}
     # A pixel belongs to an image when its centre does.
