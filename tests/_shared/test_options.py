@@ -116,7 +116,9 @@ def public_callables() -> dict[str, Any]:
             method = getattr(method, "__func__", method)
             if name.startswith("_") or not inspect.isfunction(method):
                 continue
-            if len(inspect.signature(method).parameters) > 1:
+            parameters = inspect.signature(method).parameters.values()
+            passes_on = any(each.kind is each.VAR_KEYWORD for each in parameters)
+            if len(parameters) > 1 and not passes_on:
                 found[f"{kind.__name__}.{name}"] = method
     return found
 

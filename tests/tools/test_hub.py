@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, WeightsError
+from deepdetect import DeepDetect, OptionError, WeightsError
 from deepdetect.detector.pretrained import PRETRAINED
 
 ROOT = Path(__file__).parents[2]
@@ -31,6 +31,8 @@ def test_a_folder_gives_what_the_name_gives(name: str, hub: Path, photo: np.ndar
     np.testing.assert_array_equal(found.heatmap(photo), DeepDetect(name).heatmap(photo))
     with pytest.raises(WeightsError):
         DeepDetect.from_pretrained(hub)
+    with pytest.raises(OptionError, match="did you mean 'device'"):
+        DeepDetect.from_pretrained(hub / f"deepdetect-{name}", devices="cpu")
 
 
 def test_cards_and_configs(hub: Path) -> None:
