@@ -48,7 +48,7 @@ def test_a_missing_package_is_named_before_any_work(
 ) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     for function in (train, profile):
-        with pytest.raises(MissingExtraError, match="needs the package torch") as caught:
+        with pytest.raises(MissingExtraError, match="needs the packages torch") as caught:
             function(photographs, tmp_path / "run")
         one_line(caught.value)
     assert not (tmp_path / "run").exists()
