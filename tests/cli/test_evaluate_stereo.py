@@ -35,7 +35,7 @@ def test_the_command_prints_a_row_for_each(photo: np.ndarray, tmp_path: Path) ->
     rows = json.loads(result.stdout)
     assert len(rows) == 5
     assert rows[0]["precision"] > 0.9
-    both = [arguments[0], str(tmp_path / "gone"), *arguments[1:]]
+    both = [*arguments[:2], str(tmp_path / "gone"), *arguments[2:]]
     result = run_command([*both, "--json"])
     assert result.exit_code == 1, result.output
     assert json.loads(result.stdout) == rows
