@@ -101,7 +101,7 @@ class Result:
 
     Attributes:
         values: for --json, and as a table for the terminal unless there is a text.
-        text: for the terminal.
+        text: for the terminal: what a user wants to know first, at most a dozen lines.
         failures: a sentence on each input that could not be worked on: exit code 1.
         total, what: number and name of the inputs; what is wrong with a single one is the error.
         exit_code: where nothing failed.
@@ -279,6 +279,17 @@ def note(text: str) -> None:
 
 MAX_DEPTH = 2
 """Of dictionaries within others, in a table."""
+
+
+def headed(sentence: str, values: Mapping[str, Any], names: str) -> str:
+    """Return what was found in a sentence, and the few values that are named in a table below it.
+
+    Times of stages are added up.
+    """
+    shown = {name: values.get(name) for name in names.split()}
+    if isinstance(shown.get("seconds"), Mapping):
+        shown["seconds"] = sum(shown["seconds"].values())
+    return table(shown, title=sentence)
 
 
 def table(*columns: Mapping[str, Any], title: str = "") -> str:

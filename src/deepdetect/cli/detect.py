@@ -91,8 +91,8 @@ def detect(
 
 def _line(result: dict[str, Any]) -> str:
     how = "already done" if result["skipped"] else f"{result['seconds']:.2f} s"
-    found = f"{result['keypoints']:,} keypoint{'' if result['keypoints'] == 1 else 's'}"
-    return f"{result['image']}: {found}, density {result['density']:.3f}, {how} -> {result['file']}"
+    found = f"{result['keypoints']:,} keypoints, {result['density']:.1%} of the pixels"
+    return f"{result['image']}: {found}, {how} -> {result['file']}"
 
 
 @dataclass(frozen=True)

@@ -237,8 +237,12 @@ def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Resu
     folder = cli.output_folder(output)
     numbers = run_demo(load_motorcycle(), detector, folder)
     values = {"weights": detector.weights, "backend": detector.runtime, **numbers}
-    title = "Correct: within 1 px of the true disparity."
-    return cli.Result(values, cli.table(values, title=title))
+    found, random = numbers["all_matches"], numbers["random"]
+    sentence = f"{found['matches']:,} matches, {found['precision']:.0%} of them right (of random "
+    sentence += (
+        f"pixels {random['precision']:.0%}): within {TOLERANCE_PX:g} px of the true disparity"
+    )
+    return cli.Result(values, cli.headed(sentence, values, "keypoints seconds pictures"))
 
 
 def run_demo(pair: StereoPair, detector: HeatmapDetector, folder: Path) -> dict[str, Any]:

@@ -156,9 +156,11 @@ def match(
                 found.append(numbers | {"backend": getattr(chosen, "runtime", None)})
             bar.update(1)
     nothing = not (failures or any(each["matches"] and each["success"] for each in found))
+    one = not many and not failures
+    names = "keypoints0 keypoints1 one_to_one seconds file picture"
     return cli.Result(
-        {"pairs": found, "failures": failures} if many or failures else found[0],
-        "\n".join(map(_line, found)) if many or failures else None,
+        found[0] if one else {"pairs": found, "failures": failures},
+        cli.headed(_headline(found[0]), found[0], names) if one else "\n".join(map(_line, found)),
         failures,
         len(outputs),
         "pairs",
@@ -166,9 +168,18 @@ def match(
     )
 
 
+def _headline(found: dict[str, Any]) -> str:
+    text = f"{found['matches']:,} matches"
+    if found["matches"] and found["model"] != "none":
+        fits = found["inliers"] / found["matches"]
+        text += f", {fits:.0%} of them agree with one geometry ({found['model']})"
+    if geometry := found["two_view_geometry"]:
+        return f"{text}; scene: {geometry['scene']}; confidence: {found['confidence']}"
+    return f"{text}; by descriptors alone"
+
+
 def _line(found: dict[str, Any]) -> str:
-    count = f"{found['matches']:,} matches, confidence {found['confidence']}"
-    return f"{found['image0']} {found['image1']}: {count} -> {found['file']}"
+    return f"{found['image0']} {found['image1']}: {_headline(found)} -> {found['file']}"
 
 
 def _choose_pairs(
@@ -300,18 +311,18 @@ def register(
         save_picture(found.checkerboard(), made["_checkerboard.png"])
         save_picture(found.difference(), made["_difference.png"])
         np.savetxt(made["_homography.txt"], found.homography, fmt="%.12e")
-    return cli.Result(
-        {
-            "image0": image0,
-            "image1": image1,
-            "homography": found.homography.tolist(),
-            "origin": found.origin,
-            "matches": found.matches,
-            "overlap": round(float(found.valid.mean()), 4),
-            "correlation": round(found.zncc, 4),
-            "files": [*files.values()],
-        }
-    )
+    numbers = {
+        "image0": image0,
+        "image1": image1,
+        "homography": found.homography.tolist(),
+        "origin": found.origin,
+        "matches": found.matches,
+        "overlap": round(float(found.valid.mean()), 4),
+        "correlation": round(found.zncc, 4),
+        "files": [*files.values()],
+    }
+    title = f"{image1.name} registered to {image0.name} by {found.matches:,} matches"
+    return cli.Result(numbers, cli.headed(title, numbers, "overlap correlation files"))
 
 
 @cli.command(PANORAMA, OPTIONS, STITCH_KEYPOINTS, POINTS, NETWORK, cli.READING)
@@ -411,4 +422,6 @@ def stitch(
         "file": file,
         "failures": failures,
     }
-    return cli.Result(numbers, None, failures, len(paths))
+    title = f"a panorama of {len(used)} of {len(paths)} images, {width}x{height} pixels"
+    text = cli.headed(title, numbers, "reference residual_px seconds file")
+    return cli.Result(numbers, text, failures, len(paths))

@@ -51,8 +51,8 @@ MANY = cli.From(
 WORKERS = cli.From(reconstruct_many, more="workers")
 """Options that two images do not have."""
 
-MAX_UNREGISTERED = 10
-"""Images that are named with a reason on the terminal."""
+MAX_UNREGISTERED = 4
+"""Images that are named with a reason on the terminal; model.json names all."""
 
 
 @cli.command(CAMERAS, SELECTION, MANY, WORKERS, DESCRIBED_POINTS, NETWORK, cli.READING)
@@ -114,7 +114,12 @@ def reconstruct(
         found = reconstruct_pair(left, right, chosen, selection=selection, progress=done, **values)
         title = f"{left.name} and {right.name}"
         named = {"left": left, "right": right, "files": [*files.values()]}
-        return cli.Result(save_reconstruction(found, made, title, **named))
+        numbers = save_reconstruction(found, made, title, **named)
+    low, high = numbers["depth"]["5%"], numbers["depth"]["95%"]
+    sentence = f"{len(found):,} 3D points, most at depths of {low:,.4g} to {high:,.4g} ({found.unit})"
+    shown = {**numbers, "look_at": [files[".html"], files["_depth.jpg"]], "model": model}
+    names = "scale rectified_why seconds model look_at"
+    return cli.Result(numbers, cli.headed(sentence, shown, names))
 
 
 @cli.command(POSE, NETWORK, cli.READING)
@@ -143,7 +148,9 @@ def pose(first: Path, second: Path, /, **values: Any) -> cli.Result:
         "inliers": int(found.inliers.sum()),
     }
     rows = {f"R, row {k}": row for k, row in enumerate(numbers["R"], 1)}
-    return cli.Result(numbers, cli.table({**rows, **numbers}))
+    agree = f"{numbers['inliers']:,} of {numbers['matches']:,} matches agree"
+    sentence = f"the second camera is turned by {found.angle:.2f} degrees; {agree}"
+    return cli.Result(numbers, cli.table({**rows, "t": numbers["t"]}, title=sentence))
 
 
 def _reconstruct_many(
@@ -166,8 +173,11 @@ def _reconstruct_many(
     with Outputs(files, sorted(images), overwrite=overwrite, growing=True).writing():
         reconstruct_many(source, output, detector, quiet=False, **values)
     numbers = json.loads((output / "model.json").read_text(encoding="utf-8"))
-    # model.json names all, and where each camera is.
     few = dict(islice(numbers["unregistered"].items(), MAX_UNREGISTERED))
-    place = {**numbers.get("georeference", {}), "residuals_m": None}
-    shown = {**numbers, "cameras": None, "unregistered": few, "georeference": place}
-    return cli.Result(numbers, cli.table(shown))
+    place = numbers.get("georeference", {})
+    shown = {**place, **numbers, "unregistered": few, "wrong_positions": place.get("wrong")}
+    shown["look_at"] = output / "model.html"
+    points = f"{numbers['sparse_points']:,} sparse and {numbers['dense_points']:,} dense 3D points"
+    sentence = f"{numbers['registered']} of {numbers['images']} images registered, {points}"
+    names = "unregistered scale note wrong_positions median_residual_across_m seconds look_at"
+    return cli.Result(numbers, cli.headed(sentence, shown, names))

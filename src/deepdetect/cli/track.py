@@ -68,4 +68,7 @@ def track(
     if report.expected is not None and total < report.expected:
         cli.note(f"the file states {report.expected:,} frames, and may be cut off")
     code = 0 if report.tracks or live else cli.NOTHING_FOUND
-    return cli.Result(vars(report), None, report.failures, total, "frames", code)
+    sentence = f"{report.tracks:,} tracks in {report.frames:,} frames"
+    names = "tracks_per_frame frames_per_track fps seconds files"
+    text = cli.headed(sentence, vars(report), names)
+    return cli.Result(vars(report), text, report.failures, total, "frames", code)
