@@ -116,7 +116,7 @@ def reconstruct(
         named = {"left": left, "right": right, "files": [*files.values()]}
         numbers = save_reconstruction(found, made, title, **named)
     low, high = numbers["depth"]["5%"], numbers["depth"]["95%"]
-    sentence = f"{len(found):,} 3D points, most at depths of {low:,.4g} to {high:,.4g} ({found.unit})"
+    sentence = f"{len(found):,} 3D points, most {low:,.4g} to {high:,.4g} ({found.unit}) deep"
     shown = {**numbers, "look_at": [files[".html"], files["_depth.jpg"]], "model": model}
     names = "scale rectified_why seconds model look_at"
     return cli.Result(numbers, cli.headed(sentence, shown, names))
