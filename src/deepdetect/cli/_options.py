@@ -287,8 +287,8 @@ def headed(sentence: str, values: Mapping[str, Any], names: str) -> str:
     Times of stages are added up.
     """
     shown = {name: values.get(name) for name in names.split()}
-    if isinstance(shown.get("seconds"), Mapping):
-        shown["seconds"] = sum(shown["seconds"].values())
+    if isinstance(seconds := shown.get("seconds"), Mapping):
+        shown["seconds"] = sum(seconds.values())
     return table(shown, title=sentence)
 
 
