@@ -82,12 +82,12 @@ def test_rough_keypoints_become_exact_tracks_of_all_images(model, folder: Path) 
 
 def test_dense_points_become_tracks_that_images_share(model, folder: Path) -> None:
     y, x = np.mgrid[20:220:2, 20:300:2]
-    fused = {}
+    fused = []
     for own in VIEWS:
         found = np.zeros(x.size, DENSE_POINT)
         found["points"] = on_plane(own, np.column_stack([x.ravel(), y.ravel()]).astype(float))
         found["normals"] = -NORMAL / np.linalg.norm(NORMAL)
-        fused[own.name] = found
+        fused.append((own, found))
     add_dense_tracks(model, folder, fused)
     sparse = read_sparse_model(model)
     assert len(sparse.points) > 1000

@@ -12,9 +12,10 @@ import platform
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -31,6 +32,9 @@ Outcome = TypeVar("Outcome")
 
 PARTS_PER_THREAD = 4
 """More than one, so that a thread with easy parts takes more of them."""
+
+TASKS_PER_WORKER = 8
+"""Of `map_in_processes` that are given out at a time: others are done while the first one lasts."""
 
 UNWANTED_TASK_S = 20.0
 """How long a task may take to end after the work was interrupted or has failed."""
@@ -78,6 +82,8 @@ def map_in_processes(
 ) -> Iterator[Outcome]:
     """Apply a function of a module to every task, one in each of several processes at a time.
 
+    Outcomes are in the order of the tasks.
+
     Raises:
         OptionError: `workers` is below 1; with 1 the work is done in this process.
         DeepDetectError: a worker process died.
@@ -91,7 +97,7 @@ def map_in_processes(
             yield from map(function, tasks)
         return
     import multiprocessing
-    from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+    from concurrent.futures import ProcessPoolExecutor
     from concurrent.futures.process import BrokenProcessPool
 
     # Spawned, not forked: a fork copies the locks of the parent's threads.
@@ -99,22 +105,19 @@ def map_in_processes(
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
     remaining = iter(tasks)
 
-    def submit(places: Iterable[object]) -> set[Future[Outcome]]:
+    pending: deque[Future[Outcome]] = deque()
+
+    def submit(most: int) -> None:
         # By the processes that are started, until their first task.
         with signals_held(), _one_thread_inherited():
-            return {
-                pool.submit(_run_task, function, task)
-                for _, task in zip(places, remaining, strict=False)
-            }
+            for task in islice(remaining, most):
+                pending.append(pool.submit(_run_task, function, task))
 
-    pending: set[Future[Outcome]] = set()
     try:
-        pending = submit(range(4 * count))
+        submit(TASKS_PER_WORKER * count)
         while pending:
-            done, pending = wait(pending, return_when=FIRST_COMPLETED)
-            for future in done:
-                yield future.result()
-            pending |= submit(done)
+            yield pending.popleft().result()
+            submit(1)
     except BrokenProcessPool:
         raise DeepDetectError(
             "a worker process died, most likely for lack of memory: "

@@ -10,9 +10,10 @@ neighbours agree.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import compress, product
 from pathlib import Path
 
 import numpy as np
@@ -149,10 +150,11 @@ def find_references(sparse: SparseModel) -> list[list[RegisteredImage]]:
     found = []
     for image in sorted(sparse.images.values(), key=lambda image: -len(image.points)):
         scored: list[tuple[float, RegisteredImage]] = []
-        for other in sparse.images.values():
-            common = np.intersect1d(image.points, other.points)
-            if other is image or len(common) < MIN_COMMON_POINTS:
+        shared = sparse.common_points(image)
+        for other, count in zip(sparse.images.values(), shared, strict=True):
+            if other is image or count < MIN_COMMON_POINTS:
                 continue
+            common = np.intersect1d(image.points, other.points)
             lines = [sparse.points[common] - each.view.centre for each in (image, other)]
             angle = np.degrees(angles_between(*lines))
             weights = np.minimum(angle / IDEAL_ANGLE_DEG, 1) ** 1.5
@@ -421,16 +423,30 @@ def fuse_depth_maps(
     return made
 
 
-def merge_dense_points(parts: Sequence[tuple[PosedView, np.ndarray]], stride_px: int) -> np.ndarray:
+def merge_dense_points(parts: Iterable[tuple[PosedView, np.ndarray]], stride_px: int) -> np.ndarray:
     """Join the points of all references, without those that an earlier one has given already."""
-    kept = [np.empty(0, DENSE_POINT)]
+    kept, boxes = [np.empty(0, DENSE_POINT)], [np.empty((0, 3))]
     for view, own in parts:
-        seen = nearest_depths(view, [each["points"] for each in kept], stride_px)
+        near = (_may_show(view, box, stride_px) for box in boxes)
+        seen = nearest_depths(view, [each["points"] for each in compress(kept, near)], stride_px)
         projected, depth = view.project(own["points"])
         cells = np.rint(projected / stride_px).astype(np.int64)
         column, row = cells.clip(0, np.array(seen.shape[::-1]) - 1).T
         kept.append(own[np.abs(seen[row, column] - depth) > DUPLICATE_DEPTH * depth])
+        if len(kept[-1]):
+            ends = zip(*(end(kept[-1]["points"], axis=0) for end in (np.min, np.max)), strict=True)
+            boxes.append(np.array([*product(*ends)]))
+        else:
+            kept.pop()
     return np.concatenate(kept)
+
+
+def _may_show(view: PosedView, corners: np.ndarray, margin_px: int) -> bool:
+    """Whether a view may show something of a box: no side of its frustum has all corners beyond."""
+    seen = (corners @ view.rotation.T + view.translation) @ view.camera.matrix.T
+    xy, depth = seen[:, :2], seen[:, 2:]
+    inside = [depth, xy + margin_px * depth, (np.array(view.camera.size) + margin_px) * depth - xy]
+    return bool((np.hstack(inside) > 0).any(axis=0).all())
 
 
 def nearest_depths(view: PosedView, parts: Sequence[np.ndarray], stride_px: int) -> np.ndarray:

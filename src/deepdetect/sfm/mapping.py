@@ -87,6 +87,12 @@ class SparseModel:
         """Cameras by the names of the images."""
         return {name: image.view for name, image in self.images.items()}
 
+    def common_points(self, image: RegisteredImage) -> list[int]:
+        """Count the points that each of the images shares with one."""
+        seen = np.zeros(len(self.points), bool)
+        seen[image.points] = True
+        return [int(seen[other.points].sum()) for other in self.images.values()]
+
 
 def verify_pairs(database: Path, seed: int = 0, workers: int | None = None) -> dict[Pair, int]:
     """Estimate the two-view geometries of matched pairs, and store them in the database.
@@ -174,24 +180,24 @@ def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseMode
 
     `sources` says where the intrinsics of each image began.
     """
-    seen: dict[int, list[tuple[int, int]]] = {number: [] for number in model.reg_image_ids()}
     points = np.empty((len(model.points3D), 3))
     colors = np.empty(points.shape, np.uint8)
+    row_of = {}
     for row, number in enumerate(sorted(model.points3D)):
+        row_of[number] = row
         points[row], colors[row] = model.points3D[number].xyz, model.points3D[number].color
-        for element in model.points3D[number].track.elements:
-            seen[element.image_id].append((row, element.point2D_idx))
     images = {}
     sums, tracks = np.zeros(len(points)), np.zeros(len(points), np.int64)
-    for number, pairs in seen.items():
+    for number in model.reg_image_ids():
         image = model.images[number]
         pose = image.cam_from_world()
         own = CameraIntrinsics.of_colmap(image.camera, sources.get(image.name, "given"))
         rotation, translation = pose.rotation.matrix(), np.array(pose.translation)
         view = PosedView(image.name, own.pinhole, rotation, translation)
-        rows, keypoints = np.array(pairs, np.int64).reshape(-1, 2).T
-        places = np.array([image.points2D[keypoint].xy for keypoint in keypoints])
-        xy = own.to_pinhole(places.reshape(-1, 2) - PIXEL_CENTRE)
+        seen = sorted((row_of[p.point3D_id], *p.xy) for p in image.points2D if p.has_point3D())
+        rows, *places = np.array(seen).reshape(-1, 3).T
+        rows = rows.astype(np.int64)
+        xy = own.to_pinhole(np.column_stack(places) - PIXEL_CENTRE)
         images[image.name] = RegisteredImage(view, own, rows, xy)
         distances = np.linalg.norm(view.project(points[rows])[0] - xy, axis=1)
         sums += np.bincount(rows, distances, len(points))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -232,7 +232,7 @@ class Stages:
             for pair in pairs:
                 matches = file[pair_name(*pair)]["matches0"][()]
                 rows = np.flatnonzero(matches >= 0)
-                found[pair] = np.column_stack([rows, matches[rows]])
+                found[pair] = np.column_stack([rows, matches[rows]]).astype(np.uint32)
         return found
 
     def map(
@@ -293,7 +293,7 @@ class Stages:
         normalise_model(model)
         if refined and self.options.matches == "dense":
             fused = self.fused(folder, read_sparse_model(model))
-            add_dense_tracks(model, folder, {view.name: points for view, points in fused})
+            add_dense_tracks(model, folder, fused)
             adjust_refined(model, known)
             normalise_model(model)
         sparse.mkdir(exist_ok=True)
@@ -310,8 +310,8 @@ class Stages:
         """Make the depth maps that earlier runs have not made, and fuse all (`DENSE_POINT`)."""
         return merge_dense_points(self.fused(folder, sparse), self.options.stride_px)
 
-    def fused(self, folder: Path, sparse: SparseModel) -> list[tuple[PosedView, np.ndarray]]:
-        """Return the dense points of each reference, before what several give is joined."""
+    def fused(self, folder: Path, sparse: SparseModel) -> Iterator[tuple[PosedView, np.ndarray]]:
+        """Yield the dense points of each reference, before what several give is joined."""
         store, stride = self.work / "dense", self.options.stride_px
         references = find_references(sparse)
         paths: dict[str, Path] = {}
@@ -340,7 +340,7 @@ class Stages:
         fuse = partial(_fuse_task, paths=paths, stride_px=stride)
         views = (limited_view(images[0].view) for images in references)
         fused = map_in_processes(fuse, references, workers)
-        return [*zip(views, fused, strict=True)]
+        yield from zip(views, fused, strict=True)
 
     def _dense_workers(self, sparse: SparseModel) -> int:
         sizes = [limited_view(image.view).camera.size for image in sparse.images.values()]

@@ -8,7 +8,7 @@ Motion with Featuremetric Refinement", 2021, align features of a network instead
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,6 +17,7 @@ import numpy as np
 
 from .._shared.opencv import cv2
 from .._shared.records import file_state
+from ..geometry.camera import PosedView
 from ..io.image import load_image, luma
 from ..reconstruction.subpixel import align_patches, spread_corners
 from .colmap import PIXEL_CENTRE, quiet_pycolmap
@@ -78,15 +79,17 @@ def refine_tracks(model: Any, folder: Path) -> None:
     tracks.write(model)
 
 
-def add_dense_tracks(model: Any, folder: Path, fused: Mapping[str, np.ndarray]) -> None:
-    """Put tracks of `DENSE_POINT`, by the image that they are seen from, in place of a model's.
+def add_dense_tracks(
+    model: Any, folder: Path, fused: Iterable[tuple[PosedView, np.ndarray]]
+) -> None:
+    """Put tracks of `DENSE_POINT`, with the view that they are seen from, in place of a model's.
 
     An image gives the best corner in each cell of a grid, where tracks of earlier images have
     none: what all of them show is matched from one image only.
     """
     tracks = _Tracks(read_sparse_model(model), folder)
-    for name, points in fused.items():
-        tracks.add(name, tracks.corners(name, points), min_views=MIN_DENSE_VIEWS)
+    for view, points in fused:
+        tracks.add(view.name, tracks.corners(view.name, points), min_views=MIN_DENSE_VIEWS)
     tracks.write(model)
 
 
@@ -120,15 +123,13 @@ class _Tracks:
     """Tracks of a model, as they are found."""
 
     def __init__(self, sparse: SparseModel, folder: Path) -> None:
-        self.images, self.folder = [*sparse.images.values()], folder
+        self.sparse, self.images, self.folder = sparse, [*sparse.images.values()], folder
         self.numbers = {name: number for number, name in enumerate(sparse.images)}
         self.points = [np.empty((0, 3))]
         self.colors = [np.empty((0, 3), np.uint8)]
         self.count = 0
         none = np.empty(0, np.int64), np.empty((0, 2))
         self.seen = [[none] for _ in self.images]  # rows of points, and pixels, by image
-        every = np.arange(len(sparse.points))
-        self.members = np.array([np.isin(every, image.points) for image in self.images])
 
     def corners(self, name: str, points: np.ndarray) -> Surfaces:
         """Choose those of the dense points of an image that become tracks."""
@@ -156,12 +157,12 @@ class _Tracks:
         own = self.numbers[name]
         pixels, points, _ = wanted
         found = [(own, np.arange(len(pixels)), pixels.astype(np.float64))]
-        common = (self.members & self.members[own]).sum(axis=1)
-        common[own] = 0
-        for k in map(int, np.flatnonzero(common >= MIN_COMMON_POINTS)):
+        for k, common in enumerate(self.sparse.common_points(self.images[own])):
+            if k == own or common < MIN_COMMON_POINTS:
+                continue
             rows = np.arange(len(pixels))
             if tracks is not None:
-                rows = rows[self.members[k, tracks]]
+                rows = rows[np.isin(tracks, self.images[k].points)]
             some = Surfaces(*(each[rows] for each in wanted))
             at, xy = self._aligned(self.images[own], self.images[k], some)
             found.append((k, rows[at], xy))

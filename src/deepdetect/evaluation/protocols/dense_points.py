@@ -64,7 +64,7 @@ def measure_dense_points(images: Sequence[Path], cameras: Mapping[str, Camera]) 
         views = [limited_view(view) for view in sparse.views.values()]
         stride = options.stride_px
         start = time.process_time()
-        parts = stages.fused(folder, sparse)
+        parts = [*stages.fused(folder, sparse)]
         dense = merge_dense_points(parts, stride)
         seconds = time.process_time() - start
         own = {view.name: len(points) for view, points in parts}
