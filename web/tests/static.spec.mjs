@@ -160,6 +160,22 @@ test("matches of two views agree with the true disparity", async ({ page }) => {
   expect(JSON.parse(json.content)).toMatchObject({ model: "fundamental", options: { ratio: 0.6 } });
 });
 
+test("matches of a camera that moved forward run away from one point", async ({ page }) => {
+  await openExample(page, "Motorcycle, nearer");
+  await expect(page.locator("#match-hint")).toContainText("epipolar geometry");
+  const { content } = await downloaded(page, page.locator("#view-matches [data-download=csv]"));
+  const rows = table(content);
+  expect(rows.length).toBeGreaterThan(500);
+  // The camera's principal point, where it moved to: tools/forward_example.py.
+  const [cx, cy] = [311.193, 254.877];
+  const right = rows.filter(([x0, y0, x1, y1]) => {
+    const [before, after] = [Math.hypot(x0 - cx, y0 - cy), Math.hypot(x1 - cx, y1 - cy)];
+    const beside = Math.abs((x0 - cx) * (y1 - cy) - (y0 - cy) * (x1 - cx)) / before;
+    return beside < 2 && before - 2 < after && after < 1.2 * before + 2;
+  });
+  expect(right.length / rows.length).toBeGreaterThan(0.9);
+});
+
 test("SIFT in the page finds what OpenCV's finds", async ({ page }) => {
   const pair = ["coffee.jpg", "coffee-turned.jpg"].map((name) => join(examples, name));
   const opencv = askPython(`
@@ -330,7 +346,7 @@ test("nothing is added after starting over", async ({ page }, info) => {
 
 test("pictures are dropped on the page", async ({ page }) => {
   await page.goto("./");
-  await expect(page.locator("#examples button")).toHaveCount(3);
+  await expect(page.locator("#examples button")).toHaveCount(4);
   const bytes = [...readFileSync(join(examples, "coffee.jpg"))];
   await page.evaluate((content) => {
     const transfer = new DataTransfer();
@@ -375,7 +391,7 @@ test("two tabs at once", async ({ page, context }) => {
 
 test("by keys alone", async ({ page }) => {
   await page.goto("./");
-  await expect(page.locator("#examples button")).toHaveCount(3);
+  await expect(page.locator("#examples button")).toHaveCount(4);
   const reach = async (id) => {
     for (let k = 0; k < 40; k++) {
       if (await page.evaluate((wanted) => document.activeElement.matches(wanted), id)) return;
@@ -383,7 +399,7 @@ test("by keys alone", async ({ page }) => {
     }
     throw new Error(`${id} cannot be reached by Tab`);
   };
-  await reach("#examples li:nth-child(2) button");
+  await reach("#examples li:nth-child(3) button");
   await page.keyboard.press("Enter");
   await expect(page.locator("#count")).toContainText("keypoint");
   await reach("#threshold");
@@ -407,7 +423,7 @@ for (const [width, colorScheme] of [[1280, "light"], [1280, "dark"], [390, "ligh
       expect(await page.evaluate(() => document.documentElement.scrollWidth)).toBeLessThanOrEqual(width);
     };
     await page.goto("./");
-    await expect(page.locator("#examples button")).toHaveCount(3);
+    await expect(page.locator("#examples button")).toHaveCount(4);
     await check();
     await example(page, "Coffee, turned").click();
     await expect(page.locator("#match-hint")).toContainText("agree");

@@ -1,0 +1,55 @@
+"""The second picture of the page's example of forward motion.
+
+    python tools/forward_example.py
+
+It is the left view of the motorcycle (Middlebury 2014, in scikit-image), seen from a camera that
+moved ahead: each pixel goes where its measured depth says, and what nothing shows is filled in.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from deepdetect.datasets import load_motorcycle
+from deepdetect.viz.draw import save_picture
+
+OUTPUT = Path("src/deepdetect/app/static/examples/motorcycle-ahead.jpg")
+
+AHEAD = 0.16
+"""The way of the camera, as a fraction of the depth of the nearest point."""
+
+FOCAL_PX, CENTRE, OFFSET_PX = 994.978, (311.193, 254.877), 31.086
+"""Of the left camera, and the difference of cx: Middlebury's calibration at this size."""
+
+SCALE = 4
+"""Pixels are moved as squares of 1/4 px, so that what comes nearer has no gaps."""
+
+
+def main() -> None:
+    """Write the picture."""
+    pair = load_motorcycle()
+    unknown = np.isnan(pair.disparity).astype(np.uint8)
+    known_ones = np.nan_to_num(pair.disparity).astype(np.float32)
+    levels = cv2.inpaint(known_ones, unknown, 3, cv2.INPAINT_NS)
+    height, width = levels.shape
+    size = width * SCALE, height * SCALE
+    rgb = cv2.resize(pair.left, size, interpolation=cv2.INTER_CUBIC)
+    depth = 1 / (cv2.resize(levels, size, interpolation=cv2.INTER_NEAREST) + OFFSET_PX)
+    nearer = depth - AHEAD * depth.min()
+    y, x = np.mgrid[: size[1], : size[0]] / SCALE
+    xy = [np.rint((v - c) * depth / nearer + c) for v, c in zip((x, y), CENTRE, strict=True)]
+    column, row = (each.astype(int) for each in xy)
+    seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    order = np.argsort(-nearer[seen])  # the nearest last: of several the last one stays
+    picture, known = np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.uint8)
+    picture[row[seen][order], column[seen][order]] = rgb[seen][order]
+    known[row[seen], column[seen]] = 1
+    save_picture(cv2.inpaint(picture, 1 - known, 3, cv2.INPAINT_TELEA), OUTPUT)
+    print(f"{OUTPUT}: {1 - known.mean():.1%} filled in")
+
+
+if __name__ == "__main__":
+    main()
