@@ -10,6 +10,7 @@ import json
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ import numpy as np
 from .._shared.atomic import atomic_path
 from .._shared.errors import OptionError, ReconstructionError
 from .._shared.options import suggest_keywords
-from .._shared.progress import StageTimer
+from .._shared.progress import StageTimer, say
 from ..batch.pair_list import Pair
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
@@ -28,6 +29,7 @@ from ..io.html_viewer import write_html_page
 from ..io.point_cloud import save_point_cloud
 from .colmap import import_pycolmap, initial_intrinsics, known_cameras
 from .dense import DENSE_POINT
+from .forecast import expected_seconds
 from .formats import FORMATS, FormatName, check_formats
 from .georeference import Georeference, georeference, read_control_points, require_fixes
 from .mapping import MIN_VIEWS, read_sparse_model, transform_model
@@ -102,10 +104,14 @@ def reconstruct_many(
         raise ReconstructionError("give `calibration` or `focal_px`, not both")
     if overwrite:
         shutil.rmtree(target / WORK, ignore_errors=True)
-    stages, timer = Stages(target, options, workers, quiet, seed), StageTimer(None)
+    stages = Stages(target, options, workers, quiet, seed)
     folder = stages.folder_of(images)
     if control is None and (placed := [n for n in options.formats if FORMATS[n].placed]):
         require_fixes(folder, f"the format {placed[0]}")
+    timer = StageTimer(None if quiet else lambda _: _say_left(timer))
+    timer.expected = expected_seconds(stages, folder, detector, selection)
+    if not quiet:
+        _say_left(timer)
     with timer.stage("features"):
         sizes, keypoints, unregistered = stages.extract(folder, detector, selection)
     for name, count in keypoints.items():
@@ -173,6 +179,7 @@ def reconstruct_many(
             pairs=len(pairs),
             pair_choice=options.pair_choice(len(sizes)),
             seconds=timer.seconds,
+            expected_seconds=timer.expected,
             files=output_files(target, options.formats)[:-1],
         )
         (target / "sparse" / "0").mkdir(parents=True, exist_ok=True)
@@ -238,6 +245,11 @@ def _seen_from(
         moved = each.translation - rotation @ view.translation
         cameras.append(replace(each, rotation=rotation, translation=moved))
     return PointCloud(points, found.cloud.colors, found.cloud.unit, frame), cameras
+
+
+def _say_left(timer: StageTimer) -> None:
+    if timer.left:
+        say(f"time left, hours:minutes:seconds: about {timedelta(seconds=round(timer.left))}")
 
 
 def _why_unregistered(
