@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -192,6 +193,30 @@ def test_a_run_goes_on_where_it_was_killed(small, tmp_path: Path, monkeypatch) -
         reconstruct_many(folder, output, **QUICK)
     with pytest.raises(OptionError, match=r"max_keypoints.*--overwrite"):
         reconstruct_many(folder, output, workers=1, detector=PointDetector(700))
+
+
+KILLED_IN_MAPPING = """
+import os, signal, sys
+from deepdetect import PointDetector, reconstruct_many
+from deepdetect.sfm import MultiViewOptions, stages
+
+real = stages.map_images
+kill = lambda count: os.kill(os.getpid(), signal.SIGKILL)
+stages.map_images = lambda *arguments: real(*arguments[:-1], kill)
+options = MultiViewOptions(dense=False)
+reconstruct_many(*sys.argv[1:], PointDetector(1000), workers=1, options=options)
+"""
+
+
+def test_images_are_added_to_a_run_that_was_killed(
+    write_fountain, tmp_path: Path, pycolmap
+) -> None:
+    folder = write_fountain(tmp_path / "photos", ("0004", "0005", "0006"))
+    code = [sys.executable, "-c", KILLED_IN_MAPPING, folder, tmp_path / "model"]
+    assert subprocess.run(code).returncode == -signal.SIGKILL
+    write_fountain(folder, ("0003", "0007", "0008"))
+    assert len(reconstruct_many(folder, tmp_path / "model", **SPARSE).views) == 6
+    assert not [*(tmp_path / "model").glob("database.db-*")]
 
 
 def test_a_known_camera_stays_as_it_is(write_fountain, shared: Path, tmp_path: Path, pycolmap):

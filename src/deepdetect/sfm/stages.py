@@ -269,7 +269,8 @@ class Stages:
             verified = {(a, b): count for a, b, count in noted["verified"]}
             components = [frozenset(names) for names in noted["components"]]
             return pycolmap.Reconstruction(sparse), verified, components
-        for old in self.work.glob("mapping-*.json"):
+        # A log of SQLite's that a killed run has left would be taken for that of the new database.
+        for old in (*self.work.glob("mapping-*.json"), *self.output.glob("database.db-*")):
             old.unlink()
         with atomic_path(database) as path:
             path.unlink()
