@@ -75,6 +75,9 @@ CHUNK = 2048
 OCTAVES, REACH = 3, 15
 """Of SIFT's scale space and the windows of gradients in it that points' sizes ask for."""
 
+TOGETHER = 16
+"""Neighbours that are smoothed at a time."""
+
 BLOCK = 256
 """Points that are compared with each other at a time."""
 
@@ -105,16 +108,18 @@ def points_model() -> onnx.ModelProto:
     tensors = xy, scores, sizes, directions(gray, x, y, sizes)
     shapes = [["batch", "count", *last] for last in ([2], [], [], [])]
     outputs = [(name, FLOAT, shape) for name, shape in zip(POINTS, shapes, strict=True)]
-    return graph.model(("image", FLOAT, ["batch", 3, "height", "width"]), outputs, tensors)
+    return graph.model([("image", FLOAT, ["batch", 3, "height", "width"])], outputs, tensors)
 
 
 def candidates_model() -> onnx.ModelProto:
-    """Make the graph that maps grey images to all of their candidates, ranked."""
+    """Make the graph that maps grey images to their candidates, at most a limit, ranked."""
     graph = Graph(PREFIX)
-    x, y, level, logits = rank_candidates(Tensor(graph, "gray").Cast(to=FLOAT))
+    gray, limit = Tensor(graph, "gray").Cast(to=FLOAT), Tensor(graph, "limit")
+    x, y, level, logits = rank_candidates(gray, limit)
     tensors = x, y, graph.tensor(SIGMAS_PX).Gather(level), logits
     outputs = [(name, FLOAT, ["batch", "count"]) for name in ("x", "y", "sigmas", "logits")]
-    return graph.model(("gray", UINT8, ["batch", 1, "height", "width"]), outputs, tensors)
+    inputs = ("gray", UINT8, ["batch", 1, "height", "width"]), ("limit", INT64, [1])
+    return graph.model(inputs, outputs, tensors)
 
 
 def _operator(kind: str) -> Callable[[Tensor, Any], Any]:
@@ -188,14 +193,17 @@ class Graph:
         return self.add("Loop", count, True, *state, outputs=len(results) - 1, body=graph)
 
     def model(
-        self, given: tuple[Any, ...], outputs: list[tuple[Any, ...]], tensors: Sequence[Tensor]
+        self,
+        inputs: Sequence[tuple[Any, ...]],
+        outputs: Sequence[tuple[Any, ...]],
+        tensors: Sequence[Tensor],
     ) -> onnx.ModelProto:
-        """Return the model with an input and outputs of names, types and shapes."""
+        """Return the model with inputs and outputs of names, types and shapes."""
         for output, tensor in zip(outputs, tensors, strict=True):
             self.nodes.append(helper.make_node("Identity", [tensor.name], [output[0]]))
-        first, *others = (helper.make_tensor_value_info(*each) for each in (given, *outputs))
+        ends = [[helper.make_tensor_value_info(*one) for one in end] for end in (inputs, outputs)]
         constants = [*self.constants.values()]
-        graph = helper.make_graph(self.nodes, "points", [first], others, constants)
+        graph = helper.make_graph(self.nodes, "points", *ends, constants)
         opsets = [helper.make_opsetid("", OPSET)]
         return helper.make_model(graph, opset_imports=opsets, ir_version=IR_VERSION)
 
@@ -206,7 +214,7 @@ def gray_of(image: Any) -> Any:
     return ((gray + LUMA_UNIT / 2) / LUMA_UNIT).Floor()
 
 
-def rank_candidates(gray: Any, limit: Any = None) -> tuple[Any, Any, Any, Any]:
+def rank_candidates(gray: Any, limit: Any) -> tuple[Any, Any, Any, Any]:
     """Find the strongest candidates of (B, 1, H, W) grey images, at most so many, and rank them.
 
     Returns:
@@ -220,7 +228,7 @@ def rank_candidates(gray: Any, limit: Any = None) -> tuple[Any, Any, Any, Any]:
     strength = graph.join(peaks[FIRST : LAST + 1], axis=1)
     count = strength.Greater(0.0).Cast(to=FLOAT).ReduceSum([1], keepdims=0)
     count = count.ReduceMax(axes=[0]).Cast(to=INT64)
-    count = (count.Min(limit) if limit else count).Max([1])
+    count = count.Min(limit).Max([1])
     missing = count.Mod(CHUNK) * -1 + CHUNK
     padding = graph.join([[0, 0, 0], missing], axis=0)
     strength, place = (each.Pad(padding) for each in strength.TopK(count, axis=1, outputs=2))
@@ -269,19 +277,38 @@ def _levels(smooth: Any, height: Any, width: Any) -> Iterator[tuple[Any, Any]]:
         yield frame, peak.Where(response, 0.0).Flatten()
 
 
-def _framed(values: Any, radius: int, axis: int, side: Any) -> Any:
-    """Return images with more rows (axis 2) or columns (3), mirrored at the outermost ones."""
-    period = (side * 2 - 2).Max([1])
-    place = values.graph.add("Range", -radius, side.Squeeze() + radius, 1).Mod(period)
-    return values.Gather(place.Min(period - place), axis=axis)
+def _framed(values: Any, radius: int, axis: int, side: Any, more: Any = 0) -> Any:
+    """Return images with more rows (axis 2) or columns (3), mirrored at the outermost ones.
+
+    `more` is how many more come behind the last one.
+    """
+    graph, period = values.graph, (side * 2 - 2).Max([1])
+    ends = (-radius, 0), (side.Squeeze(), (side + radius + more).Squeeze())
+    places = (graph.add("Range", *end, 1).Mod(period) for end in ends)
+    before, after = (values.Gather(each.Min(period - each), axis=axis) for each in places)
+    return graph.join([before, values, after], axis=axis)  # most are copied in long rows
 
 
 def _blur(values: Any, sigma: float, height: Any, width: Any) -> Any:
-    """Return images smoothed as `cv2.GaussianBlur` does it."""
-    radius = round(2 * REACH_PER_SIGMA * sigma + 1) // 2
-    kernel = cv2.getGaussianKernel(2 * radius + 1, float(sigma), cv2.CV_32F)
-    values = _framed(values, radius, 3, width).Conv(kernel.reshape(1, 1, 1, -1))
-    return _framed(values, radius, 2, height).Conv(kernel.reshape(1, 1, -1, 1))
+    """Return images smoothed as `cv2.GaussianBlur` does it.
+
+    A convolution with one channel is slow: `TOGETHER` neighbours are channels of its result.
+    """
+    graph, radius = values.graph, round(2 * REACH_PER_SIGMA * sigma + 1) // 2
+    kernel = cv2.getGaussianKernel(2 * radius + 1, float(sigma), cv2.CV_32F)[:, 0]
+    reach = TOGETHER - 1
+    places = graph.constant(np.arange(len(kernel) + reach)) - np.arange(-reach, 1)[:, None]
+    shifted = graph.constant(np.pad(kernel, reach)).Gather(places)  # small in a file
+    for axis, side in ((3, width), (2, height)):
+        missing = (side * -1).Mod([TOGETHER])
+        shape, strides = [(-1, 1), (1, -1)][axis - 2], [(TOGETHER, 1), (1, TOGETHER)][axis - 2]
+        weights = shifted.Reshape([TOGETHER, 1, *shape])
+        parts = _framed(values, radius, axis, side, missing).Conv(weights, strides=strides)
+        # (B, TOGETHER, H, W) with one side of those: back into the row or column.
+        rows = parts.Transpose(perm=[0, 2, 3, 1] if axis == 3 else [0, 2, 1, 3])
+        whole = graph.join([[0, -1], side + missing if axis == 3 else width], axis=0)
+        values = rows.Reshape(whole).Unsqueeze([1]).Slice([0], side, [axis])
+    return values
 
 
 def _measure(

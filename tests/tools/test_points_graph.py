@@ -50,7 +50,7 @@ def test_gray_is_that_of_opencv(script: Any) -> None:
     graph = script.Graph("")
     gray = script.gray_of(script.Tensor(graph, "image"))
     given = "image", script.FLOAT, [1, 3, 512, 512]
-    model = graph.model(given, [("gray", script.FLOAT, None)], [gray])
+    model = graph.model([given], [("gray", script.FLOAT, None)], [gray])
     rgb = np.random.default_rng(0).integers(0, 256, (512, 512, 3), np.uint8)
     rgb[:4, :64] = np.arange(256).reshape(4, 64, 1)
     image = np.ascontiguousarray(rgb.transpose(2, 0, 1)[None] / np.float32(255))
@@ -62,7 +62,8 @@ def test_candidates_of_the_page_are_all_those_of_the_package(
 ) -> None:
     gray = luma(np.ascontiguousarray(photo[:150, :200]))
     x, y, sigmas, logits = (
-        each[0] for each in run(script.candidates_model(), gray=gray[None, None])
+        each[0]
+        for each in run(script.candidates_model(), gray=gray[None, None], limit=np.array([10**6]))
     )
     found = np.flatnonzero(np.isfinite(logits))
     np.testing.assert_array_equal(found, np.arange(len(found)))  # none behind the last
@@ -73,6 +74,9 @@ def test_candidates_of_the_page_are_all_those_of_the_package(
     assert abs(len(kept) - len(expected)) <= 2
     gaps = np.linalg.norm(xy[kept][:, None] - expected.xy, axis=2)
     assert (gaps.min(0) < 0.05).mean() > 0.99
+    few = run(script.candidates_model(), gray=gray[None, None], limit=np.array([300]))
+    assert np.isfinite(few[3]).sum() == 300 < len(found)
+    np.testing.assert_array_equal(few[3][0, :300], logits[:300])
 
 
 def test_suppression_is_greedy_at_any_density(script: Any) -> None:
@@ -82,7 +86,7 @@ def test_suppression_is_greedy_at_any_density(script: Any) -> None:
     given = {"x": 1, "y": 1, "level": 7, "logits": 1}
     outputs = script.choose(*(script.Tensor(graph, name) for name in given), graph.constant([900]))
     model = graph.model(
-        ("x", 1, ["batch", "count"]),
+        [("x", 1, ["batch", "count"])],
         [(f"kept_{name}", 1, None) for name in ("x", "y", "scores", "sizes")],
         outputs,
     )

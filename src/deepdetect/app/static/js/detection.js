@@ -2,6 +2,7 @@
 // network is run, and its points, for which it is not.
 import { Background, CancellableBackground } from "./background.js";
 import { during, page } from "./page.js";
+import { ALL_CANDIDATES } from "./points/ranking.js";
 
 const pictureWorker = new Background(new URL("picture_worker.js", import.meta.url));
 const pointsWorker = new CancellableBackground(new URL("points_worker.js", import.meta.url));
@@ -52,17 +53,21 @@ export async function findHeatMap(picture) {
 
 const token = () => (page.server ? page.token : null);
 
+/** Whether so many of the strongest candidates of a picture are ranked. */
+export const isRanked = (picture, limit = ALL_CANDIDATES) => picture.ranking?.limit >= limit;
+
 /** Ranks the points of a picture, where that has not been done; it fails where the picture is removed. */
-export async function findPoints(picture) {
-  if (picture.ranking) return;
-  await once(picture, "ranking", async () => {
-    const { file, name, rgba, width, height, original } = picture;
-    const values = { file, name, rgba, width, height, original, token: token() };
-    const found = pointsWorker.call("rank", values, picture.removal.signal);
-    const ranking = await during("Finding points…", found);
-    counted("points");
-    return ranking;
-  });
+export async function findPoints(picture, limit = ALL_CANDIDATES) {
+  while (!isRanked(picture, limit)) { // fewer may be at work
+    await once(picture, "ranking", async () => {
+      const { file, name, rgba, width, height, original } = picture;
+      const values = { file, name, rgba, width, height, original, limit, token: token() };
+      const found = pointsWorker.call("rank", values, picture.removal.signal);
+      const ranking = await during("Finding points…", found);
+      counted("points");
+      return ranking;
+    });
+  }
 }
 
 /** Describes points of a picture. @returns {Promise<import("./learned.js").Described>} */

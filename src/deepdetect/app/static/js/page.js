@@ -10,7 +10,7 @@ export const element = (id) => document.getElementById(id);
  * @property {Uint8ClampedArray} rgba @property {HTMLCanvasElement} canvas
  * @property {AbortController} removal ends what is done for it alone
  * @property {import("./selection.js").HeatMap} [map] once the network was run (`findHeatMap`)
- * @property {import("./points/ranking.js").Ranking & {gray: Uint8Array, width: number, height: number}}
+ * @property {import("./points/ranking.js").Ranking & {gray: Uint8Array, width: number, height: number, limit: number}}
  *   [ranking] once its points were ranked (`findPoints`)
  */
 

@@ -4,7 +4,7 @@ import { decode } from "./decoding.js";
 import { TURNED_KEYPOINTS } from "./learned.js";
 import { dominantAngles } from "./orientation.js";
 import { GRAY, luma, pointsSize, reduceByArea } from "./pixels.js";
-import { rankingOf } from "./points/ranking.js";
+import { ALL_CANDIDATES, rankingOf } from "./points/ranking.js";
 import { askPython, openModel } from "./runtime.js";
 
 const STRIDE = 128; // the network of the descriptors halves a picture seven times
@@ -19,8 +19,8 @@ async function opened(name) {
   }
 }
 
-/** Candidates, the strongest first: x, y, sigmas and logits. */
-async function candidatesOf({ gray, width, height }, token) {
+/** Candidates, the strongest first: x, y, sigmas and logits. Python gives all. */
+async function candidatesOf({ gray, width, height }, limit, token) {
   if (token !== null) {
     const rows = await askPython("candidates", width, height, gray, token);
     const count = rows.length / 4;
@@ -28,7 +28,8 @@ async function candidatesOf({ gray, width, height }, token) {
     return { x, y, sigmas, logits };
   }
   const model = await opened("points.onnx");
-  return model({ gray: ["uint8", gray, [1, 1, height, width]] });
+  return model({ gray: ["uint8", gray, [1, 1, height, width]],
+                 limit: ["int64", BigInt64Array.of(BigInt(limit)), [1]] });
 }
 
 /** Descriptors of points as in a picture that is not turned, rows of 64. */
@@ -66,10 +67,11 @@ answer({
    * Ranks the candidates of a picture; what the network sees is enough where it is the whole. The
    * token is that of Python, null where the browser is alone.
    */
-  async rank({ file, name, rgba, width, height, original, token }) {
+  async rank({ file, name, rgba, width, height, original, limit, token }) {
     const whole = width === original.width && height === original.height;
     const seen = whole ? { gray: luma(rgba), width, height } : await reducedLuma(file, name);
-    return { ...seen, ...rankingOf(await candidatesOf(seen, token)) };
+    const ranked = token === null ? limit : ALL_CANDIDATES;
+    return { ...seen, limit: ranked, ...rankingOf(await candidatesOf(seen, limit, token)) };
   },
 
   /** @returns {Float32Array} angles of points in degrees */

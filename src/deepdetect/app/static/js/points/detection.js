@@ -46,9 +46,11 @@ export function choosePoints(ranking, count, spread = "none") {
 /** A logit of the ranker as a score in (0, 1), without ties at its ends. */
 const scoreOf = (logit) => 0.5 + 0.5 * logit / (1 + Math.abs(logit));
 
-/** The candidates that are ranked where so many points are wanted: those of the strongest response. */
+/** How many candidates are ranked where so many points are wanted: those of the strongest response. */
+export const candidatesFor = (count) => Math.max(CANDIDATES_PER_KEYPOINT * count, MIN_CANDIDATES);
+
 function strongest({ strengthRanks }, count) {
-  const most = Math.max(CANDIDATES_PER_KEYPOINT * count, MIN_CANDIDATES);
+  const most = candidatesFor(count);
   const rows = new Uint32Array(Math.min(most, strengthRanks.length));
   for (let row = 0, found = 0; found < rows.length; row++) {
     if (strengthRanks[row] < most) rows[found++] = row;

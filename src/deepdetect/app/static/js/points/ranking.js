@@ -1,5 +1,7 @@
-// All candidates of a picture in the order of the ranker: then points of any number are chosen in
+// The candidates of a picture in the order of the ranker: of all, points of any number are chosen in
 // milliseconds.
+
+export const ALL_CANDIDATES = Number.MAX_SAFE_INTEGER;
 
 /**
  * Candidates, best first.

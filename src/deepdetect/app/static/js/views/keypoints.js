@@ -1,5 +1,5 @@
 // The keypoints of a picture: which ones, how many, and files of them.
-import { anglesOf, findHeatMap, findPoints } from "../detection.js";
+import { anglesOf, findHeatMap, findPoints, isRanked } from "../detection.js";
 import { composeKeypoints, drawCircles, drawPixels, showPicture } from "../draw.js";
 import { save, savePng, stem, toCsv, toJson } from "../downloads.js";
 import { activePicture, announce, counted, element, enlargement, onceAFrame, page, rescaled, showError,
@@ -17,7 +17,7 @@ const KINDS = {
     hint: "Every pixel that passes, as DeepDetect gives them.",
   },
   points: {
-    find: findPoints, isFound: (picture) => picture.ranking, choose: chooseOfAllScales,
+    find: (picture) => findPoints(picture), isFound: (picture) => isRanked(picture), choose: chooseOfAllScales,
     hint: "The best places of all scales to find again in another photograph, with their sizes, as "
       + "PointDetector(N) gives them. The network is not run for them.",
   },

@@ -4,7 +4,7 @@ import { describe, findPoints } from "../detection.js";
 import { drawMatches, nearestLine, newCanvas } from "../draw.js";
 import { save, savePng, stem, toCsv, toJson } from "../downloads.js";
 import { announce, counted, during, element, onceAFrame, page, rescaled, showError, toOriginal } from "../page.js";
-import { choosePoints } from "../points/detection.js";
+import { candidatesFor, choosePoints } from "../points/detection.js";
 
 const NARROW_PX = 640; // below it the pictures stand above each other
 const SAVED_WIDTH_PX = 1600;
@@ -40,7 +40,7 @@ function showControls() {
 
 /** The described points of a picture, and the size that they were found in. */
 async function pointsOf(picture, number) {
-  await findPoints(picture);
+  await findPoints(picture, candidatesFor(number));
   const { width, height } = picture.ranking;
   const { xy, sizes } = choosePoints(picture.ranking, number);
   return { width, height, xy, ...await during("Describing points…", describe(picture, { xy, sizes })) };
