@@ -57,18 +57,14 @@ def start_session(
     threads: int | None = None,
     provider: str = CPU,
     keep_memory: bool = True,
-    spin: bool = True,
 ) -> Any:
-    """Start a session that prints nothing, for a file or its content.
-
-    Threads that `spin` while they wait begin sooner, at the cost of processor time.
-    """
+    """Start a session that prints nothing, for a file or its content."""
     onnxruntime = import_onnxruntime()
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = 4  # what fails is said by the exception, and by us
     settings.enable_cpu_mem_arena = settings.enable_mem_pattern = keep_memory
-    if not spin:
-        settings.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    # Threads that spin begin sooner, but take processors from what follows, long after each run.
+    settings.add_session_config_entry("session.intra_op.allow_spinning", "0")
     settings.intra_op_num_threads = int(threads or thread_limit() or 0)
     # Falling back to the CPU after a failure, it would print blocks of text.
     session = onnxruntime.InferenceSession(model, settings, providers=[provider], enable_fallback=0)

@@ -160,12 +160,12 @@ def _byte_product() -> tuple[Any, int]:
     The fastest instructions take signed bytes on one side. Processors without VNNI have others of
     the kind, whose sums saturate: they are given bytes without a sign.
     """
-    session = start_session(BYTE_PRODUCT, spin=False)
+    session = start_session(BYTE_PRODUCT)
     most = np.full((8, 64), 255, np.uint8), np.full((64, 64), 127, np.int8)
     if (session.run(None, dict(zip("ab", most, strict=True)))[0] == 64 * 255 * 127).all():
         return session, 128
     unsigned = BYTE_PRODUCT.replace(b"\x08\x03\x12", b"\x08\x02\x12")
-    return start_session(unsigned, spin=False), 0
+    return start_session(unsigned), 0
 
 
 def hamming_neighbours(
