@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetectError, OptionError
-from deepdetect.tracking import TrackedFrame, load_tracks, save_tracks
+from deepdetect.tracking import TrackedFrame, load_tracks
 from deepdetect.tracking.tracks import TrackDrawer, track_color, write_tracks
 
 
@@ -20,7 +20,9 @@ def frame(number: int, tracks: list[int], ages: list[int]) -> TrackedFrame:
 
 def test_the_table_is_read_by_other_programs_and_by_us(tmp_path: Path) -> None:
     frames = [frame(0, [0, 1], [0, 0]), frame(2, [1, 4], [1, 0]), frame(4, [4], [1])]
-    save_tracks(frames, tmp_path / "t.csv")
+    with write_tracks(tmp_path / "t.csv") as write:
+        for each in frames:
+            write(each)
     with (tmp_path / "t.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert rows[2] == {"frame": "2", "track": "1", "x": "10.250", "y": "2.000", "score": "0.5"}
@@ -58,7 +60,8 @@ def test_a_table_is_whole_or_not_there(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
     with pytest.raises(OptionError), write_tracks(tmp_path / "t.txt"):
         pass
-    save_tracks([], tmp_path / "t.csv")
+    with write_tracks(tmp_path / "t.csv"):
+        pass
     assert load_tracks(tmp_path / "t.csv") == []
 
 

@@ -324,14 +324,6 @@ class PosedView:
         return np.asarray((rays - self.translation) @ self.rotation)
 
 
-def relative_fundamental(first: PosedView, second: PosedView) -> np.ndarray:
-    """Return the fundamental matrix of two views, (3, 3) with x1^T F x0 = 0."""
-    rotation = second.rotation @ first.rotation.T
-    translation = second.translation - rotation @ first.translation
-    inverses = [np.linalg.inv(view.camera.matrix) for view in (first, second)]
-    return np.asarray(inverses[1].T @ cross_matrix(translation) @ rotation @ inverses[0])
-
-
 def camera_spacing(centres: np.ndarray) -> float:
     """Return the median distance from each of (V, 3) centres of cameras to the nearest other."""
     distances = np.linalg.norm(centres[:, None] - centres, axis=2)

@@ -2,7 +2,7 @@
 
 from .pipeline import TrackingReport, point_candidates, track, track_frames
 from .tracker import Tracker, TrackingOptions
-from .tracks import TrackedFrame, load_tracks, save_tracks
+from .tracks import TrackedFrame, load_tracks
 from .video import Frame, FrameSource
 
 __all__ = [
@@ -14,7 +14,6 @@ __all__ = [
     "TrackingReport",
     "load_tracks",
     "point_candidates",
-    "save_tracks",
     "track",
     "track_frames",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import colorsys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,24 +78,8 @@ def write_tracks(path: str | Path) -> Iterator[Callable[[TrackedFrame], None]]:
         yield write
 
 
-def save_tracks(frames: Iterable[TrackedFrame], path: str | Path) -> None:
-    """Write the tracks of frames as CSV: columns frame, track, x, y and score.
-
-    Args:
-        frames: in their order.
-        path: ending in .csv.
-
-    Raises:
-        OptionError: the ending is another.
-        DeepDetectError: the file cannot be written.
-    """
-    with write_tracks(path) as write:
-        for frame in frames:
-            write(frame)
-
-
 def load_tracks(path: str | Path) -> list[TrackedFrame]:
-    """Read the CSV file that `save_tracks` or `deepdetect track` wrote.
+    """Read the CSV file that `deepdetect track` wrote.
 
     Returns:
         The frames that have tracks, in their order.
@@ -107,7 +91,8 @@ def load_tracks(path: str | Path) -> list[TrackedFrame]:
         >>> import tempfile
         >>> frame = TrackedFrame(4, np.array([7]), np.array([[1.5, 2]]), np.ones(1), np.zeros(1))
         >>> path = Path(tempfile.mkdtemp()) / "tracks.csv"
-        >>> save_tracks([frame], path)
+        >>> with write_tracks(path) as write:
+        ...     write(frame)
         >>> load_tracks(path)[0].xy.tolist()
         [[1.5, 2.0]]
     """
