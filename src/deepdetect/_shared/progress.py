@@ -110,9 +110,8 @@ class StageTimer:
     def left(self) -> float:
         """Expected seconds of the stages to come, at the pace of those that have ended."""
         ended = self.expected.keys() & self.seconds
-        pace = [sum(times[name] for name in ended) for times in (self.seconds, self.expected)]
-        to_come = sum(self.expected[name] for name in self.expected.keys() - ended)
-        return to_come * pace[0] / pace[1] if ended else to_come
+        to_come = sum(self.expected.values()) - (thought := sum(self.expected[k] for k in ended))
+        return to_come * sum(self.seconds[k] for k in ended) / thought if ended else to_come
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

@@ -432,12 +432,11 @@ def merge_dense_points(parts: Iterable[tuple[PosedView, np.ndarray]], stride_px:
         projected, depth = view.project(own["points"])
         cells = np.rint(projected / stride_px).astype(np.int64)
         column, row = cells.clip(0, np.array(seen.shape[::-1]) - 1).T
-        kept.append(own[np.abs(seen[row, column] - depth) > DUPLICATE_DEPTH * depth])
-        if len(kept[-1]):
-            ends = zip(*(end(kept[-1]["points"], axis=0) for end in (np.min, np.max)), strict=True)
+        new = own[np.abs(seen[row, column] - depth) > DUPLICATE_DEPTH * depth]
+        if len(new):
+            ends = zip(new["points"].min(axis=0), new["points"].max(axis=0), strict=True)
+            kept.append(new)
             boxes.append(np.array([*product(*ends)]))
-        else:
-            kept.pop()
     return np.concatenate(kept)
 
 

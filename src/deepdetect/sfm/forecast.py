@@ -14,11 +14,7 @@ import numpy as np
 from .._shared.errors import DeepDetectError
 from .._shared.machine import map_in_processes, processor_count
 from ..batch.pair_list import following, list_pairs
-from ..detector.detector import DeepDetect
 from ..detector.heatmap import MAX_AUTO_PIXELS
-from ..detector.point_detector import PointDetector
-from ..features.selection import SelectionOptions
-from ..io.image_file import ReadingOptions, read_with, reading_options
 from .dense import MAX_SIDE_PX
 from .pair_selection import SIMILAR
 from .stages import MultiViewOptions, Stages, check_images
@@ -30,30 +26,22 @@ UNIQUE_SHARE = 0.7
 """Pairs over `SIMILAR` an image: often both are among the most similar images of the other."""
 
 MEGAPIXEL_S, KEYPOINT_S = 0.22, 2e-5
-"""CPU seconds of features where the following were measured."""
-
 MAPPED_IMAGE_S, MAPPED_PAIR_S, DENSE_MEGAPIXEL_S = 2.2, 0.15, 2.5
-"""CPU seconds of mapping and of dense points. Mapping differs by a factor of two among scenes."""
+"""CPU seconds on one machine, of features, and of mapping and dense points: what the first take on
+this machine tells what the others will. Mapping differs by a factor of two among scenes."""
 
 
-def expected_seconds(
-    stages: Stages,
-    folder: Path,
-    detector: DeepDetect | PointDetector,
-    selection: SelectionOptions | None = None,
-) -> dict[str, float]:
+def expected_seconds(stages: Stages, folder: Path, *how: Any) -> dict[str, float]:
     """Extract and match a few images below a folder, and return what each stage will take of all.
 
-    It is empty for few images, and where an earlier run has begun.
+    `how` is as of `Stages.extract`. It is empty for few images, and where an earlier run has begun.
     """
     names, options = [*check_images(folder)], stages.options
-    count = len(names)
+    count, workers = len(names), min(stages.workers or processor_count(), len(names))
     if count < MIN_IMAGES or any(stages.work.glob(f"{stages.features.name}*")):
         return {}
     few = [folder / names[k * count // MEASURED] for k in range(MEASURED)]
-    workers = min(stages.workers or processor_count(), count)
-    task = few, detector, selection, options, reading_options()
-    measured = [*map_in_processes(_measure, [task] * workers, workers)]
+    measured = [*map_in_processes(_measure, [(few, options, how)] * workers, workers)]
     image_s, pair_s, megapixels, keypoints = map(float, np.mean(measured, axis=0))
     if not pair_s:
         return {}
@@ -69,22 +57,21 @@ def expected_seconds(
     }
 
 
-def _measure(task: tuple[Sequence[Path], Any, Any, MultiViewOptions, ReadingOptions]) -> Any:
+def _measure(task: tuple[Sequence[Path], MultiViewOptions, Sequence[Any]]) -> tuple[float, ...]:
     """Return the seconds of an image and of a pair, and megapixels and keypoints of an image."""
-    images, detector, selection, options, reading = task
-    with read_with(reading), tempfile.TemporaryDirectory(prefix="deepdetect-") as scratch:
+    images, options, how = task
+    with tempfile.TemporaryDirectory(prefix="deepdetect-") as scratch:
         try:
             for attempt in "12":  # the first also loads what both need
                 stages = Stages(Path(scratch, attempt), options, 1, True)
-                folder = stages.folder_of(images)
                 start = time.perf_counter()
-                sizes, keypoints, _ = stages.extract(folder, detector, selection)
-                extracted = time.perf_counter()
+                sizes, keypoints, _ = stages.extract(stages.folder_of(images), *how)
+                image_s = (time.perf_counter() - start) / len(images)
             pairs = list_pairs("exhaustive", [*sizes])
+            start = time.perf_counter()
             stages.match(pairs)
-            pair_s = (time.perf_counter() - extracted) / len(pairs)
+            pair_s = (time.perf_counter() - start) / len(pairs)
         except (DeepDetectError, ZeroDivisionError):  # too few can be read
             return 0, 0, 0, 0
     areas = [math.prod(size) * min(1, MAX_SIDE_PX / max(size)) ** 2 for size in sizes.values()]
-    image_s = (extracted - start) / len(sizes)
-    return image_s, pair_s, np.mean(areas) / 1e6, np.mean([*keypoints.values()])
+    return image_s, pair_s, float(np.mean(areas)) / 1e6, float(np.mean([*keypoints.values()]))

@@ -109,9 +109,8 @@ def reconstruct_many(
     if control is None and (placed := [n for n in options.formats if FORMATS[n].placed]):
         require_fixes(folder, f"the format {placed[0]}")
     timer = StageTimer(None if quiet else lambda _: _say_left(timer))
-    timer.expected = expected_seconds(stages, folder, detector, selection)
-    if not quiet:
-        _say_left(timer)
+    with timer.stage("first images"):
+        timer.expected = expected_seconds(stages, folder, detector, selection)
     with timer.stage("features"):
         sizes, keypoints, unregistered = stages.extract(folder, detector, selection)
     for name, count in keypoints.items():
