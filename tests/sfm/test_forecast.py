@@ -23,7 +23,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("pairs", "count"), [("exhaustive", 4950), ("sequential:10", 1000), ("auto", 1400)]
+    ("pairs", "count"), [("exhaustive", 4950), ("sequential:10", 1000), ("auto", 1200)]
 )
 def test_stages_take_what_a_few_images_take(
     folder: Path, monkeypatch: pytest.MonkeyPatch, pairs: str, count: int
@@ -36,7 +36,7 @@ def test_stages_take_what_a_few_images_take(
     found = expected_seconds(stages, folder, PointDetector())
     assert found["features"] == pytest.approx(100 * image_s / 2)
     assert found["matching"] == pytest.approx(count * 0.4 / 2)
-    mapping = 100 * forecast.MAPPED_IMAGE_S + count * forecast.MAPPED_PAIR_S
+    mapping = 100 * forecast.MAPPED_IMAGE_S + count * 8192 * forecast.PAIRED_KEYPOINT_S
     assert found["mapping"] == pytest.approx(2 * mapping)
     assert found["dense points"] == pytest.approx(2 * 50 * forecast.DENSE_MEGAPIXEL_S / 2)
 

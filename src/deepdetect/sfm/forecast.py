@@ -22,11 +22,11 @@ from .stages import MultiViewOptions, Stages, check_images
 MIN_IMAGES, MEASURED = 10, 3
 """Least images of which it is told, and how many of them are extracted and matched to tell it."""
 
-UNIQUE_SHARE = 0.7
+UNIQUE_SHARE = 0.6
 """Pairs over `SIMILAR` an image: often both are among the most similar images of the other."""
 
-MEGAPIXEL_S, KEYPOINT_S = 0.22, 2e-5
-MAPPED_IMAGE_S, MAPPED_PAIR_S, DENSE_MEGAPIXEL_S = 2.2, 0.15, 2.5
+MEGAPIXEL_S, KEYPOINT_S = 0.26, 2e-5
+MAPPED_IMAGE_S, PAIRED_KEYPOINT_S, DENSE_MEGAPIXEL_S = 1.7, 2.6e-5, 3.1
 """CPU seconds on one machine, of features, and of mapping and dense points: what the first take on
 this machine tells what the others will. Mapping differs by a factor of two among scenes."""
 
@@ -52,7 +52,7 @@ def expected_seconds(stages: Stages, folder: Path, *how: Any) -> dict[str, float
     return {
         "features": count * image_s / workers,
         "matching": pairs * pair_s / workers,
-        "mapping": pace * (count * MAPPED_IMAGE_S + pairs * MAPPED_PAIR_S),
+        "mapping": pace * (count * MAPPED_IMAGE_S + pairs * keypoints * PAIRED_KEYPOINT_S),
         "dense points": pace * options.dense * count * megapixels * DENSE_MEGAPIXEL_S / workers,
     }
 
