@@ -189,50 +189,50 @@ web/node_modules/.package-lock.json: web/package-lock.json
 %/bin/uv: requirements/uv.txt
 	$(PYTHON) -m venv $*
 	$*/bin/python -m pip install $(PIP_FLAGS) --require-hashes -r requirements/uv.txt
-	touch $@
+	@touch $@
 
 $(VENV)/.demo: $(VENV)/bin/uv requirements/demo.txt pyproject.toml
 	$(call install_locked,$(VENV),requirements/demo.txt)
 	$(call install_package,$(VENV))
-	touch $@
+	@touch $@
 
 # It holds what the demonstration needs, too.
 $(VENV)/.test: $(VENV)/bin/uv requirements/lock.txt requirements/torch.txt pyproject.toml
 	$(call install_locked,$(VENV),requirements/lock.txt)
 	$(call install_torch,$(VENV))
 	$(call install_package,$(VENV))
-	touch $(VENV)/.demo $@
+	@touch $(VENV)/.demo $@
 
 $(VENV_OPENCV4)/.test: $(VENV_OPENCV4)/bin/uv requirements/opencv4.txt pyproject.toml
 	$(call install_locked,$(VENV_OPENCV4),requirements/opencv4.txt)
 	$(call install_package,$(VENV_OPENCV4))
-	touch $@
+	@touch $@
 
 $(VENV_LOWEST)/.test: $(VENV_LOWEST)/bin/uv requirements/lowest.txt requirements/torch.txt pyproject.toml
 	$(call install_locked,$(VENV_LOWEST),requirements/lowest.txt)
 	$(call install_torch,$(VENV_LOWEST))
 	$(call install_package,$(VENV_LOWEST))
-	touch $@
+	@touch $@
 
 $(VENV_RAY)/.test: $(VENV_RAY)/bin/uv requirements/ray.txt pyproject.toml
 	$(call install_locked,$(VENV_RAY),requirements/ray.txt)
 	$(call install_package,$(VENV_RAY))
-	touch $@
+	@touch $@
 
 $(VENV_INTEGRATIONS)/.test: $(VENV_INTEGRATIONS)/bin/uv requirements/integrations.txt requirements/torch.txt pyproject.toml
 	$(call install_locked,$(VENV_INTEGRATIONS),requirements/integrations.txt)
 	$(call install_torch,$(VENV_INTEGRATIONS))
 	$(call install_package,$(VENV_INTEGRATIONS))
-	touch $@
+	@touch $@
 
 $(VENV_DOCS)/.test: $(VENV_DOCS)/bin/uv requirements/docs.txt pyproject.toml
 	$(call install_locked,$(VENV_DOCS),requirements/docs.txt)
 	$(call install_package,$(VENV_DOCS))
-	touch $@
+	@touch $@
 
 # The notebooks also map and train.
 $(VENV_DOCS)/.notebooks: $(VENV_DOCS)/.test requirements/lock.txt requirements/torch.txt
 	$(call install_locked,$(VENV_DOCS),requirements/lock.txt)
 	$(call install_torch,$(VENV_DOCS))
 	$(call install_package,$(VENV_DOCS))
-	touch $@
+	@touch $@

@@ -92,7 +92,8 @@ def detect(
 def _line(result: dict[str, Any]) -> str:
     how = "already done" if result["skipped"] else f"{result['seconds']:.2f} s"
     found = f"{result['keypoints']:,} keypoints, {result['density']:.1%} of the pixels"
-    return f"{result['image']}: {found}, {how} -> {result['file']}"
+    also = " and pictures" if result["pictures"] else ""
+    return f"{result['image']}: {found}, {how} -> {result['file']}{also}"
 
 
 @dataclass(frozen=True)

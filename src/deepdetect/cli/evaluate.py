@@ -238,10 +238,8 @@ def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Resu
     numbers = run_demo(load_motorcycle(), detector, folder)
     values = {"weights": detector.weights, "backend": detector.runtime, **numbers}
     found, random = numbers["all_matches"], numbers["random"]
-    sentence = f"{found['matches']:,} matches, {found['precision']:.0%} of them right (of random "
-    sentence += (
-        f"pixels {random['precision']:.0%}): within {TOLERANCE_PX:g} px of the true disparity"
-    )
+    sentence = f"{found['matches']:,} matches, {found['precision']:.0%} of them within "
+    sentence += f"{TOLERANCE_PX:g} px of the truth (of random pixels {random['precision']:.0%})"
     return cli.Result(values, cli.headed(sentence, values, "keypoints seconds pictures"))
 
 

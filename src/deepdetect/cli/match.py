@@ -169,8 +169,10 @@ def match(
 
 
 def _headline(found: dict[str, Any]) -> str:
+    if not found["matches"]:
+        return "no matches"
     text = f"{found['matches']:,} matches"
-    if found["matches"] and found["model"] != "none":
+    if found["model"] != "none":
         fits = found["inliers"] / found["matches"]
         text += f", {fits:.0%} of them agree with one geometry ({found['model']})"
     if geometry := found["two_view_geometry"]:

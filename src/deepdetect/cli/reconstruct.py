@@ -115,8 +115,9 @@ def reconstruct(
         title = f"{left.name} and {right.name}"
         named = {"left": left, "right": right, "files": [*files.values()]}
         numbers = save_reconstruction(found, made, title, **named)
-    low, high = numbers["depth"]["5%"], numbers["depth"]["95%"]
-    sentence = f"{len(found):,} 3D points, most {low:,.4g} to {high:,.4g} ({found.unit}) deep"
+    low, high = (f"{numbers['depth'][percent]:,.4g}" for percent in ("5%", "95%"))
+    unit = "mm" if found.unit == "mm" else f"{found.unit}s"
+    sentence = f"{len(found):,} 3D points, most of them {low} to {high} {unit} away"
     shown = {**numbers, "look_at": [files[".html"], files["_depth.jpg"]], "model": model}
     names = "scale rectified_why seconds model look_at"
     return cli.Result(numbers, cli.headed(sentence, shown, names))
