@@ -62,9 +62,10 @@ def turn_descriptors(descriptors: np.ndarray, degrees: np.ndarray | float) -> np
     By (N,) or one angle, as `Keypoints.angles`: from the axis of x to that of y.
     """
     real = CONSTANT + len(FREQUENCIES)
-    turns = np.exp(1j * np.radians(np.reshape(degrees, (-1, 1))) * FREQUENCIES)
+    once = np.exp(1j * np.radians(np.reshape(degrees, -1))).astype(np.complex64)
+    turns = np.stack([once, once**2, once**3], axis=1)[:, FREQUENCIES - 1]
     numbers = (descriptors[:, CONSTANT:real] + 1j * descriptors[:, real:]) * turns
-    return np.hstack([descriptors[:, :CONSTANT], numbers.real, numbers.imag]).astype(np.float32)
+    return np.hstack([descriptors[:, :CONSTANT], numbers.real, numbers.imag])
 
 
 def match_learned(

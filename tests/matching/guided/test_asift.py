@@ -56,7 +56,7 @@ def test_fine_stripes_are_blurred_before_they_are_shortened(tilt: float) -> None
 
 def test_keypoints_lie_at_their_positions_in_the_image_itself() -> None:
     """A spot four times wider than high is round in the view without a turn."""
-    found = next(simulated_views(blob(110, 70, 12, 3), 100))
+    _, found = next(simulated_views((blob(110, 70, 12, 3),) * 2, 100))
     gaps = found.xy - [110, 70]
     near = gaps[np.argmin(np.linalg.norm(gaps, axis=1))]
     assert abs(near[0]) < 0.6

@@ -48,21 +48,27 @@ def _detector(max_keypoints: int) -> PointDetector:
     return PointDetector(max_keypoints, descriptor=LEARNED)
 
 
-def simulated_views(gray: np.ndarray, max_keypoints: int) -> Iterator[Keypoints]:
-    """Yield the described points of views from the side, at their positions in the image."""
-    size = gray.shape[1], gray.shape[0]
+def simulated_views(
+    grays: tuple[np.ndarray, np.ndarray], max_keypoints: int
+) -> Iterator[tuple[int, Keypoints]]:
+    """Yield the described points of views from the side, at their positions in an image.
 
-    def see(rotation_deg: float) -> Keypoints:
+    First those of the first image, each with the number of the image.
+    """
+
+    def see(side: int, rotation_deg: float) -> tuple[int, Keypoints]:
+        gray = grays[side]
+        size = gray.shape[1], gray.shape[0]
         view, to_view = simulate_view(gray, TILT, rotation_deg)
         keypoints = learned_points(view, max_keypoints)
         back = cv2.invertAffineTransform(to_view)
         xy = keypoints.xy @ back[:, :2].T.astype(np.float32) + back[:, 2].astype(np.float32)
         moved = replace(keypoints, xy=xy, image_size=size)
-        return moved[((xy > 0) & (xy < np.array(size) - 1)).all(1)]
+        return side, moved[((xy > 0) & (xy < np.array(size) - 1)).all(1)]
 
     rotations = np.linspace(0, 180, DIRECTIONS, endpoint=False).tolist()
     with ThreadPoolExecutor(processor_count()) as pool:
-        yield from pool.map(see, rotations)
+        yield from pool.map(see, np.repeat([0, 1], DIRECTIONS).tolist(), 2 * rotations)
 
 
 def simulate_view(

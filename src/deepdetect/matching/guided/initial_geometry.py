@@ -340,7 +340,8 @@ def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
     """
     as_it_is = _learned_matches(grays, COARSE_SIDE_PX, LEARNED_KEYPOINTS)
     views = zip(as_it_is.views, as_it_is.features, strict=True)
-    first, second = (describe_learned(*each, CROSS_MODAL) for each in views)
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(lambda each: describe_learned(*each, CROSS_MODAL), views)
     across = find_tentative_matches(*grays, (first, second), max_side_px=COARSE_SIDE_PX)
     tentative, geometry = as_it_is, estimate_initial_geometry(as_it_is, model, seed)
     cross_modal = len(across.ratios) > len(as_it_is.ratios) and _is_inverted(across)
@@ -363,7 +364,8 @@ def _is_inverted(tentative: TentativeMatches) -> bool:
 
 def _learned_matches(grays: Pair, side_px: int, keypoints: int) -> TentativeMatches:
     views = downscale(grays[0], side_px)[0], downscale(grays[1], side_px)[0]
-    first, second = (learned_points(view, keypoints) for view in views)
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(learned_points, views, (keypoints, keypoints))
     return find_tentative_matches(*grays, (first, second), max_side_px=side_px)
 
 
@@ -447,14 +449,12 @@ def _more_and_more_matches(
     if not view_keypoints:
         return
     views = 0
-    for side in (0, 1):
-        other = tentative.features[1 - side]
-        for seen in simulated_views(tentative.views[side], view_keypoints):
-            further = _match_sparse(seen, other)
-            points0 = np.concatenate([points0, further[side]])
-            points1 = np.concatenate([points1, further[1 - side]])
-            ratios = np.concatenate([ratios, further[2]])
-            views += 1
+    for side, seen in simulated_views(tentative.views, view_keypoints):
+        further = _match_sparse(seen, tentative.features[1 - side])
+        points0 = np.concatenate([points0, further[side]])
+        points1 = np.concatenate([points1, further[1 - side]])
+        ratios = np.concatenate([ratios, further[2]])
+        views += 1
     points0, points1, ratios = _separate(points0, points1, ratios)
     yield (points0, points1), ratios, views
 
