@@ -339,9 +339,9 @@ def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
     exactly where they belong, which tells depth from a plane.
     """
     as_it_is = _learned_matches(grays, COARSE_SIDE_PX, LEARNED_KEYPOINTS)
-    views = zip(as_it_is.views, as_it_is.features, strict=True)
+    seen = as_it_is.views, as_it_is.features
     with ThreadPoolExecutor(2) as pool:
-        first, second = pool.map(lambda each: describe_learned(*each, CROSS_MODAL), views)
+        first, second = pool.map(describe_learned, *seen, 2 * (CROSS_MODAL,))
     across = find_tentative_matches(*grays, (first, second), max_side_px=COARSE_SIDE_PX)
     tentative, geometry = as_it_is, estimate_initial_geometry(as_it_is, model, seed)
     cross_modal = len(across.ratios) > len(as_it_is.ratios) and _is_inverted(across)
