@@ -22,7 +22,7 @@ from ..io.image import load_image
 from ..io.tables import save_keypoints, save_matches
 from ..matching.pipeline import GUIDED_STAGES, match_images
 from ..matching.registration import register
-from ..matching.stitching import STAGES, stitch
+from ..matching.stitching import stages_of, stitch
 from ..reconstruction.files import ENDINGS, save_reconstruction
 from ..reconstruction.pipeline import reconstruct
 from ..sfm.pipeline import reconstruct_many
@@ -154,7 +154,7 @@ def run_register(images: Images, options: Options, folder: Path, report: Report)
 
 def run_stitch(images: Images, options: Options, folder: Path, report: Report) -> TaskResult:
     """Make a panorama."""
-    stages = _stages(STAGES, report)
+    stages = _stages(stages_of(len(images)), report)
     panorama = stitch([one.path for one in images], progress=stages)
     save_picture(panorama.image, folder / "panorama.jpg")
     height, width = panorama.image.shape[:2]

@@ -277,10 +277,6 @@ def note(text: str) -> None:
     print(text, file=STDERR)
 
 
-MAX_DEPTH = 2
-"""Of dictionaries within others, in a table."""
-
-
 def headed(sentence: str, values: Mapping[str, Any], names: str) -> str:
     """Return what was found in a sentence, and the few values that are named in a table below it.
 
@@ -308,7 +304,7 @@ def _table_rows(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[s
             continue
         title = prefix + str(name).replace("_", " ")
         if isinstance(value, Mapping):
-            yield from () if prefix.count(":") == MAX_DEPTH else _table_rows(value, f"{title}: ")
+            yield from _table_rows(value, f"{title}: ")
         elif isinstance(value, (list, tuple)):
             if value and not any(isinstance(each, (list, tuple, Mapping)) for each in value):
                 yield title, ", ".join(map(_text, value))

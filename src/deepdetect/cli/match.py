@@ -38,7 +38,7 @@ from ..matching.pipeline import (
     match_images,
 )
 from ..matching.registration import register as register_images
-from ..matching.stitching import STAGES, StitchingOptions
+from ..matching.stitching import StitchingOptions, stages_of
 from ..matching.stitching import stitch as stitch_images
 from ..viz.draw import add_caption, picture_suffix, save_picture
 from . import _options as cli
@@ -370,7 +370,7 @@ def stitch(
     cli.check_outputs([file], paths)
     with cli.writing({"file": file}, images, overwrite) as made:
         try:
-            with stage_progress("stitching", STAGES) as done:
+            with stage_progress("stitching", stages_of(len(images))) as done:
                 panorama = stitch_images(
                     images,
                     detector=chosen,

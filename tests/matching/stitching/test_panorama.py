@@ -12,14 +12,18 @@ from PIL import Image
 from deepdetect import DeepDetect, DeepDetectError, ImageError, OptionError, PointDetector
 from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.geometry import transform_points
-from deepdetect.matching.stitching import Panorama, StitchingOptions, stitch
+from deepdetect.matching.stitching import Panorama, StitchingOptions, stages_of, stitch
 
 HALF = StitchingOptions(scale=0.5)
 
 
 @pytest.fixture(scope="module")
 def panorama(views) -> Panorama:
-    return stitch([views.images[2], views.images[0], views.images[1]])
+    stages: list[str] = []
+    images = [views.images[2], views.images[0], views.images[1]]
+    panorama = stitch(images, progress=stages.append)
+    assert stages == stages_of(3)
+    return panorama
 
 
 def test_the_homographies_are_known_to_a_pixel(panorama: Panorama, views) -> None:

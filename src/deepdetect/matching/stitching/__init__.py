@@ -1,5 +1,5 @@
 """Panoramas: images registered with each other by dense matches, and composited."""
 
-from .panorama import STAGES, Panorama, StitchingOptions, stitch
+from .panorama import Panorama, StitchingOptions, stages_of, stitch
 
-__all__ = ["STAGES", "Panorama", "StitchingOptions", "stitch"]
+__all__ = ["Panorama", "StitchingOptions", "stages_of", "stitch"]

@@ -21,7 +21,6 @@ from .bundle_adjustment import RotatingCamera, level_cameras
 from .compositing import Canvas, composite, crop_box, least_distorted, plan_curved, plan_plane
 from .registration import JointRegistration, register_images
 
-STAGES = ("reading", "registration", "compositing")
 Projection = Literal["plane", "cylindrical", "spherical"]
 PROJECTIONS = get_args(Projection)
 
@@ -94,6 +93,12 @@ class Panorama:
         )
 
 
+def stages_of(count: int) -> list[str]:
+    """Return what `stitch` reports of so many images: each image and each pair, too."""
+    each = ["keypoints"] * count + ["overlaps"] * (count * (count - 1) // 2)
+    return ["reading", *each, "registration", "compositing"]
+
+
 @suggest_keywords
 def stitch(
     images: Sequence[Any],
@@ -127,7 +132,7 @@ def stitch(
             of a curved one; None for the one in the middle of all.
         seed: seed of all random choices.
         options: scale, limits and sizes.
-        progress: called with the name of each stage (`STAGES`) when it ends.
+        progress: called with the name of each stage (`stages_of`) when it ends.
 
     Returns:
         The panorama, of all images that could be connected.
@@ -173,6 +178,7 @@ def stitch(
             reference=reference,
             turning=projection != "plane",
             seed=seed,
+            progress=progress,
         )
     scales = {number: scale for number, (_, scale) in small.items()}
     canvas, homographies, reference = _plan(

@@ -7,7 +7,7 @@ spanning tree; homographies composed along it are the start of a fit to all pair
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
@@ -71,6 +71,7 @@ def register_images(
     reference: int | None = None,
     turning: bool = False,
     seed: int = 0,
+    progress: Callable[[str], object] | None = None,
 ) -> JointRegistration:
     """Find the homographies of overlapping images, (H, W, 3) uint8 RGB, to a common frame.
 
@@ -78,8 +79,12 @@ def register_images(
     SIFT's keypoints find them and dense ones confirm. `reference` is the number of an image that
     must be among them, None for the most images; `turning` finds the cameras, too.
     """
-    views = [_prepare(image, detector) for image in images]
-    pairs = _registered_pairs(views, seed)
+    done = progress or (lambda _: None)
+    views = []
+    for image in images:
+        views.append(_prepare(image, detector))
+        done("keypoints")
+    pairs = _registered_pairs(views, seed, done)
     groups = sorted({tuple(sorted(_connected(k, pairs))) for k in range(len(images))})
     if reference is not None:
         group = next(group for group in groups if reference in group)
@@ -130,7 +135,9 @@ def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
     return _Image(gray, detect_sift(gray, SIFT_KEYPOINTS), keypoints.xy)
 
 
-def _registered_pairs(views: Sequence[_Image], seed: int) -> list[RegisteredPair]:
+def _registered_pairs(
+    views: Sequence[_Image], seed: int, done: Callable[[str], object]
+) -> list[RegisteredPair]:
     overlaps: list[tuple[InitialGeometry, int, int]] = []
     for first, second in combinations(range(len(views)), 2):
         a, b = views[first], views[second]
@@ -138,6 +145,7 @@ def _registered_pairs(views: Sequence[_Image], seed: int) -> list[RegisteredPair
         geometry = estimate_initial_geometry(tentative, "homography", seed)
         if geometry.model != "none":
             overlaps.append((geometry, first, second))
+        done("overlaps")
     overlaps.sort(key=lambda overlap: -len(overlap[0].points0))
     pairs: list[RegisteredPair] = []
     partners = [0] * len(views)
