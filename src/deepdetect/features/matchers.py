@@ -33,6 +33,14 @@ BYTE_PRODUCT = (
 )
 """An ONNX file of one node, MatMulInteger: y (n, m) int32 of a (n, d) uint8 and b (d, m) int8."""
 
+FLOAT_PRODUCT = (
+    b'\x08\x08:[\n\x11\n\x01a\n\x01b\x12\x01y"\x06MatMul\x12\x01gZ\x15\n\x01a\x12\x10\n\x0e\x08\x01\x12'
+    b"\n\n\x03\x12\x01n\n\x03\x12\x01dZ\x15\n\x01b\x12\x10\n\x0e\x08\x01\x12\n\n\x03\x12\x01d\n\x03"
+    b"\x12\x01mb\x15\n\x01y\x12\x10\n\x0e\x08\x01\x12\n\n\x03\x12\x01n\n\x03\x12\x01mB\x04\n\x00\x10\r"
+)
+"""The same of MatMul: all are float32. NumPy's own product takes twice the time, and its threads
+take processors from what follows."""
+
 MAX_EXACT_PRODUCT = 4e8
 """Keypoints of both images, multiplied, up to which all distances are computed in a moment."""
 
@@ -90,22 +98,14 @@ def _search_both_ways(
     width = base.shape[1]
     whole = queries.dtype == base.dtype == np.uint8 and width <= MAX_EXACT_BYTES
     terms0, terms1 = (np.einsum("ij,ij->i", a, a, dtype=np.float64) for a in (queries, base))
-    multiply: Callable[[np.ndarray], np.ndarray]
     if whole:
         session, offset = _byte_product()
         factor = np.ascontiguousarray(base.T) - np.uint8(offset)
         factor = factor.view(np.int8) if offset else factor
         terms0 -= 2 * offset * queries.sum(1, dtype=np.float64)
-
-        def multiply(block: np.ndarray) -> np.ndarray:
-            return session.run(None, {"a": block, "b": factor})[0]
     else:
         queries, base = (np.asarray(part, np.float32) for part in (queries, base))
-        transposed = np.ascontiguousarray(base.T)
-
-        def multiply(block: np.ndarray) -> np.ndarray:
-            return block @ transposed
-
+        session, factor = _float_product(), np.ascontiguousarray(base.T)
     found = min(count + 1, len(base))  # one more tells whether rounding could change the others
     rows = np.empty((len(queries), found), np.int32)
     squared = np.empty((len(queries), found), np.float32)
@@ -115,7 +115,8 @@ def _search_both_ways(
     parts = [slice(start, start + step) for start in range(0, len(queries), step)]
     terms = terms0.astype(np.float32), terms1.astype(np.float32)
     for part in parts:
-        block = multiply(queries[part]), terms[0][part], terms[1], part.start
+        product = session.run(None, {"a": queries[part], "b": factor})[0]
+        block = product, terms[0][part], terms[1], part.start
         scan_products(*block, rows[part], squared[part], nearest, best, second)
     if whole or not len(queries):
         return rows[:, :count], np.sqrt(squared[:, :count]), nearest
@@ -151,6 +152,11 @@ def _nearest_in_double(queries: np.ndarray, base: np.ndarray, count: int) -> np.
             rows[start : start + step, rank] = nearest = block.argmin(1)
             block[np.arange(len(block)), nearest] = np.inf
     return rows
+
+
+@functools.cache
+def _float_product() -> Any:
+    return start_session(FLOAT_PRODUCT)
 
 
 @functools.cache
