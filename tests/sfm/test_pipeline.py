@@ -17,6 +17,7 @@ from PIL import Image, ImageOps
 from deepdetect import (
     Camera,
     ImageError,
+    Keypoints,
     MissingExtraError,
     OptionError,
     PointDetector,
@@ -24,9 +25,11 @@ from deepdetect import (
     load_image,
     reconstruct_many,
 )
+from deepdetect.batch.hdf5 import open_hdf5
 from deepdetect.datasets.posed_images import load_posed_scenes
 from deepdetect.sfm import MultiViewOptions, MultiViewReconstruction, forecast, stages
-from deepdetect.sfm.mapping import read_sparse_model
+from deepdetect.sfm.colmap import CameraIntrinsics, write_database
+from deepdetect.sfm.mapping import read_sparse_model, verify_pairs
 from deepdetect.sfm.stages import Stages, check_images
 
 QUICK = {
@@ -341,6 +344,28 @@ def test_the_order_of_imports_does_not_matter(pycolmap) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stdout.strip()) == (0, "pycolmap"), done.stderr
+
+
+def test_many_keypoints_of_different_things_do_not_agree(
+    write_fountain, shared: Path, tmp_path: Path, pycolmap
+) -> None:
+    folder = write_fountain(tmp_path / "photos", ("0003", "0006"), 1024)
+    for name in ("05.jpg", "11.jpg"):
+        shutil.copy(shared / "data" / "lund" / name, folder)
+    made = Stages(tmp_path / "model", MultiViewOptions(), 1, True)
+    sizes, *_ = made.extract(folder, PointDetector(8192))
+    matches = made.match(made.choose_pairs(list(sizes)))
+    images = {}
+    with open_hdf5(made.features) as file:
+        for name, size in sizes.items():
+            xy = file[name]["keypoints"][()]
+            points = Keypoints(xy, np.ones(len(xy), np.float32), size)
+            images[name] = points, CameraIntrinsics.initial(size)
+    write_database(tmp_path / "database.db", images, matches)
+    assert set(verify_pairs(tmp_path / "database.db")) == {
+        ("0003.jpg", "0006.jpg"),
+        ("05.jpg", "11.jpg"),
+    }
 
 
 @pytest.mark.slow
