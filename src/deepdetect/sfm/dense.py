@@ -115,6 +115,10 @@ MAX_DEPTH_DIFFERENCE = 0.01
 EDGE_RADIUS, MIN_VIEWS_AT_EDGES = 4, 5
 """Pixels of a depth map from a farther surface within which so many images must agree."""
 
+SUPPORT_SIDE, MIN_SUPPORT = 9, 0.4
+"""Side of the square of pixels of a depth map around one, and the share of them that must be agreed
+on, too, or one image more must agree: small patches apart are where most wrong points are."""
+
 MIN_TRIANGULATION_DEG = 1.0
 """Smallest angle between two of the lines of sight."""
 
@@ -409,7 +413,9 @@ def fuse_depth_maps(
     farthest = cv2.erode(known, np.ones((2 * EDGE_RADIUS + 1,) * 2, np.uint8))
     slanted = EDGE_RADIUS * stride_px * np.abs(planes[..., 1:]).sum(axis=2)
     edge = planes[..., 0] - farthest > MAX_DEPTH_DIFFERENCE * planes[..., 0] + slanted
-    row, column = np.nonzero(count >= np.where(edge, MIN_VIEWS_AT_EDGES, MIN_VIEWS))
+    agreed = count >= np.where(edge, MIN_VIEWS_AT_EDGES, MIN_VIEWS)
+    support = cv2.boxFilter(agreed.astype(np.float32), -1, (SUPPORT_SIDE, SUPPORT_SIDE))
+    row, column = np.nonzero(agreed & ((count > MIN_VIEWS) | (support >= MIN_SUPPORT)))
     found, plane = maps[0][row, column], planes[row, column].astype(np.float64)
     xy, near = np.column_stack([column, row]) * float(stride_px), inverse[row, column]
     made = np.empty(len(row), DENSE_POINT)
