@@ -179,7 +179,7 @@ def depth_map(
     It has every `stride_px` pixels of a row and of a column. `points` are those of the sparse
     model, among whose depths it searches.
     """
-    rgbs, views = zip(*(_prepared(folder, image) for image in images), strict=True)
+    rgbs, views = zip(*(prepared_image(folder, image) for image in images), strict=True)
     grays = [luma(rgb) for rgb in rgbs]
     size = np.array(views[0].camera.size)
     xy, depth = views[0].project(points)
@@ -360,14 +360,14 @@ def _parallax(first: PosedView, second: PosedView, inverse_depth: float) -> floa
     return float(np.quantile(lengths, PARALLAX_QUANTILE)) if len(lengths) else 0.0
 
 
-def _prepared(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, PosedView]:
+def prepared_image(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, PosedView]:
     """Return an image without its distortion at most `MAX_SIDE_PX` long, and its view."""
     path, view = folder / image.view.name, limited_view(image.view)
-    return _prepared_image(path, file_state(path), image.intrinsics, view.camera), view
+    return _undistorted(path, file_state(path), image.intrinsics, view.camera), view
 
 
 @lru_cache(maxsize=CACHED_IMAGES)
-def _prepared_image(
+def _undistorted(
     path: Path, state: tuple[int, int], intrinsics: CameraIntrinsics, camera: Camera
 ) -> np.ndarray:
     """Read an image of this `file_state`, which extraction has let pass, without its distortion."""

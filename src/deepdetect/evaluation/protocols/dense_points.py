@@ -1,7 +1,11 @@
-"""Dense points of many images: how much of the images they cover, and whether halves agree."""
+"""Dense points of many images: how much of the images they cover, and whether halves agree.
+
+Beside them OpenCV's semi-global matching of pairs, rectified by the same cameras.
+"""
 
 from __future__ import annotations
 
+import math
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -11,20 +15,31 @@ from pathlib import Path
 import numpy as np
 
 from ..._shared.errors import NoDepthError
+from ..._shared.opencv import cv2
 from ...detector.point_detector import PointDetector
-from ...geometry.camera import Camera
+from ...geometry.camera import Camera, PosedView
 from ...sfm.colmap import initial_intrinsics
-from ...sfm.dense import limited_view, merge_dense_points, nearest_depths
+from ...sfm.dense import (
+    find_references,
+    limited_view,
+    merge_dense_points,
+    nearest_depths,
+    prepared_image,
+)
 from ...sfm.mapping import SparseModel, read_sparse_model
 from ...sfm.pipeline import MAX_KEYPOINTS
 from ...sfm.stages import MultiViewOptions, Stages
 from ..report import Row
+from .stereo_pipelines import sgbm_disparity
+
+SGBM = "SGBM, OpenCV"
 
 APART = 0.01
 """Relative difference of two depths that are not of one surface."""
 
 DENSE_COLUMNS = {
     "scene": "",
+    "depth maps": "",
     "points": ",d",
     "share, own map": ".3f",
     "share, all maps": ".3f",
@@ -40,14 +55,16 @@ DENSE_NOTE = (
     "over the images. Error: from a point to the matches of its image alone. Halves: every other "
     "image makes points without the others; of the pixels at which both have one, the relative "
     "difference of the depths, and the share of those that differ by over 1 %. CPU seconds: of "
-    "depth maps and their fusion."
+    "depth maps and their fusion. SGBM: each image with its best neighbour, rectified by the same "
+    "cameras; in place of halves, its maps by the best and by the second-best neighbour."
 )
 
 
 def measure_dense_points(images: Sequence[Path], cameras: Mapping[str, Camera]) -> Row:
     """Make dense points of images; to be called in a process of its own.
 
-    Returns the `DENSE_COLUMNS` but the scene; only "points", 0, where there is no model.
+    Returns the `DENSE_COLUMNS` from "points" on, and those of SGBM after its name and a space; only
+    "points", 0, where there is no model.
     """
     with tempfile.TemporaryDirectory(prefix="deepdetect-dense-") as scratch:
         options = MultiViewOptions(pairs="exhaustive")
@@ -67,24 +84,83 @@ def measure_dense_points(images: Sequence[Path], cameras: Mapping[str, Camera]) 
         parts = [*stages.fused(folder, sparse)]
         dense = merge_dense_points(parts, stride)
         seconds = time.process_time() - start
-        own = {view.name: len(points) for view, points in parts}
+        counts = {view.name: len(points) for view, points in parts}
         made = [[dense["points"]], *([stages.dense(folder, k)["points"]] for k in _halves(sparse))]
-        shares, differences = [], []
+        shares, pairs = [], []
         for view in views:
-            whole, first, second = (nearest_depths(view, points, stride) for points in made)
-            shares.append((own.get(view.name, 0) / whole.size, np.isfinite(whole).mean()))
-            both = np.isfinite(first) & np.isfinite(second)
-            differences.append(np.abs(first[both] / second[both] - 1))
-        share, difference = np.mean(shares, axis=0), np.concatenate(differences)
-        return {
+            whole, *halves = (nearest_depths(view, points, stride) for points in made)
+            shares.append((counts.get(view.name, 0) / whole.size, np.isfinite(whole).mean()))
+            pairs.append(halves)
+        share = np.mean(shares, axis=0)
+        row = {
             "points": len(dense),
             "share, own map": float(share[0]),
             "share, all maps": float(share[1]),
             "median error, px": float(np.median(dense["errors"])),
-            "halves: median difference": float(np.median(difference)),
-            "halves: share apart": float((difference > APART).mean()),
+            **_agreement(pairs),
             "CPU s an image": seconds / len(views),
         }
+        start, pairs = time.process_time(), []
+        for image, first, second, *_ in find_references(sparse):
+            own, *others = (prepared_image(folder, each) for each in (image, first, second))
+            clouds = (_sgbm_points(own, other, sparse.points) for other in others)
+            pairs.append([nearest_depths(own[1], [cloud], stride) for cloud in clouds])
+        sgbm = {
+            "share, own map": float(np.mean([np.isfinite(first).mean() for first, _ in pairs])),
+            **_agreement(pairs),
+            "CPU s an image": (time.process_time() - start) / (2 * len(pairs)),
+        }
+        return row | {f"{SGBM} {name}": value for name, value in sgbm.items()}
+
+
+def _agreement(pairs: Sequence[Sequence[np.ndarray]]) -> Row:
+    """Compare two depth maps of each of some views, infinite where they have none."""
+    differences = []
+    for first, second in pairs:
+        both = np.isfinite(first) & np.isfinite(second)
+        differences.append(np.abs(first[both] / second[both] - 1))
+    difference = np.concatenate(differences)
+    return {
+        "halves: median difference": float(np.median(difference)),
+        "halves: share apart": float((difference > APART).mean()),
+    }
+
+
+def _sgbm_points(
+    one: tuple[np.ndarray, PosedView], other: tuple[np.ndarray, PosedView], seen: np.ndarray
+) -> np.ndarray:
+    """Return (N, 3) points of an image by OpenCV's matching with another, of RGB and views.
+
+    Disparities are sought among those of sparse points.
+    """
+    (rgb0, view0), (rgb1, view1) = one, other
+    rotation = view1.rotation @ view0.rotation.T
+    moved = (view1.translation - rotation @ view0.translation)[:, None]
+    size, matrices = view0.camera.size, [view.camera.matrix for view in (view0, view1)]
+    turn0, turn1, first, second, *_ = cv2.stereoRectify(
+        matrices[0], None, matrices[1], None, size, rotation, moved, alpha=0
+    )
+    views = [
+        cv2.remap(rgb, *cv2.initUndistortRectifyMap(matrix, None, turn, projection, size, 5), 1)
+        for rgb, matrix, turn, projection in zip(
+            (rgb0, rgb1), matrices, (turn0, turn1), (first, second), strict=True
+        )
+    ]
+    # One above the other: along columns. Otherwise along rows, which may be the wrong way round.
+    axis = int(abs(second[1, 3]) > abs(second[0, 3]))
+    if axis:
+        views = [np.ascontiguousarray(view.transpose(1, 0, 2)) for view in views]
+    within = ((view0.project(seen)[0] >= 0) & (view0.project(seen)[0] < size)).all(axis=1)
+    depths = ((seen @ view0.rotation.T + view0.translation) @ turn0.T)[within, 2]
+    scale = -float(second[axis, 3])
+    low, high = np.quantile(scale / depths[depths > 0], [0.01, 0.99])
+    lowest, count = math.floor(low) - 16, 16 * math.ceil((high - low + 32) / 16)
+    disparity = sgbm_disparity(*views, count, (max(lowest + count, 0), max(-lowest, 0)), lowest)
+    disparity = disparity.T if axis else disparity
+    row, column = np.nonzero(np.isfinite(disparity) & (scale * disparity > 0))
+    rays = np.column_stack([column, row, np.ones(len(row))]) @ np.linalg.inv(first[:, :3]).T
+    places = rays * (scale / disparity[row, column])[:, None]
+    return (places @ turn0 - view0.translation) @ view0.rotation
 
 
 def _halves(sparse: SparseModel) -> list[SparseModel]:

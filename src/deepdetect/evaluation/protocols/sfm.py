@@ -36,7 +36,7 @@ from ..options import BenchmarkOptions
 from ..profiling import peak_memory, run_in_child
 from ..report import Figure, Row, Rows, Section, Table, where
 from ..run import Run
-from .dense_points import DENSE_COLUMNS, DENSE_NOTE, measure_dense_points
+from .dense_points import DENSE_COLUMNS, DENSE_NOTE, SGBM, measure_dense_points
 from .pose import error_chart, file_name
 
 MIN_IMAGES = 3
@@ -164,9 +164,9 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
     costs = [{**row, "scene": row["scene"].name, "keypoints": row["method"]} for row in rows]
     cost_table = Table("sfm_cost", "Seconds and memory", COST_COLUMNS, costs, COST_NOTE)
     dense = [
-        run.attempt(f"dense points of {name}", dense_row, run, chosen[name]) for name in chosen
+        run.attempt(f"dense points of {name}", dense_rows, run, chosen[name]) for name in chosen
     ]
-    found = [row for row in dense if row is not None]
+    found = [row for rows in dense for row in rows or ()]
     dense_table = Table("sfm_dense", "Dense points", DENSE_COLUMNS, found, DENSE_NOTE)
     tables = [camera_table(rows), image_table(rows), cost_table, dense_table]
     figures = []
@@ -237,14 +237,17 @@ def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
     return row
 
 
-def dense_row(run: Run, scene: PosedScene) -> Row:
+def dense_rows(run: Run, scene: PosedScene) -> Rows:
     """Measure the dense points of a scene, or read the result from the cache."""
     images = tuple(image.path for image in scene.images)
     cameras = {name: view.camera for name, view in true_views(scene).items()}
     known = {} if scene.located_only else cameras
-    depends = "dense", images, sorted(known.items()), import_pycolmap().__version__
+    depends = "dense and SGBM", images, sorted(known.items()), import_pycolmap().__version__
     row = run.cached("sfm", depends, lambda: run_in_child(measure_dense_points, images, known))
-    return {"scene": scene.name, **row}
+    sgbm = {name.removeprefix(f"{SGBM} "): row[name] for name in row if name.startswith(SGBM)}
+    ours = {name: value for name, value in row.items() if not name.startswith(SGBM)}
+    named = {"DeepDetect": ours, SGBM: sgbm}
+    return [{"scene": scene.name, "depth maps": name, **row} for name, row in named.items()]
 
 
 def camera_table(rows: Rows) -> Table:
