@@ -155,7 +155,9 @@ def _sgbm_points(
     scale = -float(second[axis, 3])
     low, high = np.quantile(scale / depths[depths > 0], [0.01, 0.99])
     lowest, count = math.floor(low) - 16, 16 * math.ceil((high - low + 32) / 16)
-    disparity = sgbm_disparity(*views, count, (max(lowest + count, 0), max(-lowest, 0)), lowest)
+    disparity = sgbm_disparity(
+        views[0], views[1], count, (max(lowest + count, 0), max(-lowest, 0)), lowest
+    )
     disparity = disparity.T if axis else disparity
     row, column = np.nonzero(np.isfinite(disparity) & (scale * disparity > 0))
     rays = np.column_stack([column, row, np.ones(len(row))]) @ np.linalg.inv(first[:, :3]).T
