@@ -56,7 +56,8 @@ DENSE_NOTE = (
     "image makes points without the others; of the pixels at which both have one, the relative "
     "difference of the depths, and the share of those that differ by over 1 %. CPU seconds: of "
     "depth maps and their fusion. SGBM: each image with its best neighbour, rectified by the same "
-    "cameras; in place of halves, its maps by the best and by the second-best neighbour."
+    "cameras, as far as they overlap then; in place of halves, its maps by the best and by the "
+    "second-best neighbour."
 )
 
 
@@ -138,7 +139,7 @@ def _sgbm_points(
     moved = (view1.translation - rotation @ view0.translation)[:, None]
     size, matrices = view0.camera.size, [view.camera.matrix for view in (view0, view1)]
     turn0, turn1, first, second, *_ = cv2.stereoRectify(
-        matrices[0], None, matrices[1], None, size, rotation, moved, alpha=0
+        matrices[0], None, matrices[1], None, size, rotation, moved, flags=0, alpha=-1
     )
     views = [
         cv2.remap(rgb, *cv2.initUndistortRectifyMap(matrix, None, turn, projection, size, 5), 1)
@@ -152,16 +153,18 @@ def _sgbm_points(
         views = [np.ascontiguousarray(view.transpose(1, 0, 2)) for view in views]
     within = ((view0.project(seen)[0] >= 0) & (view0.project(seen)[0] < size)).all(axis=1)
     depths = ((seen @ view0.rotation.T + view0.translation) @ turn0.T)[within, 2]
-    scale = -float(second[axis, 3])
-    low, high = np.quantile(scale / depths[depths > 0], [0.01, 0.99])
+    scale, offset = -float(second[axis, 3]), float(first[axis, 2] - second[axis, 2])
+    low, high = offset + np.quantile(scale / depths[depths > 0], [0.01, 0.99])
     lowest, count = math.floor(low) - 16, 16 * math.ceil((high - low + 32) / 16)
-    disparity = sgbm_disparity(
-        views[0], views[1], count, (max(lowest + count, 0), max(-lowest, 0)), lowest
-    )
+    borders_px = max(lowest + count, 0), max(-lowest, 0)
+    if sum(borders_px) > max(size):  # rectified, they hardly overlap
+        return np.empty((0, 3))
+    disparity = sgbm_disparity(views[0], views[1], count, borders_px, lowest)
     disparity = disparity.T if axis else disparity
-    row, column = np.nonzero(np.isfinite(disparity) & (scale * disparity > 0))
+    ahead = scale / (disparity - offset)
+    row, column = np.nonzero(ahead > 0)
     rays = np.column_stack([column, row, np.ones(len(row))]) @ np.linalg.inv(first[:, :3]).T
-    places = rays * (scale / disparity[row, column])[:, None]
+    places = rays * ahead[row, column][:, None]
     return (places @ turn0 - view0.translation) @ view0.rotation
 
 
