@@ -215,5 +215,5 @@ def test_what_was_extracted_is_not_too_large(tmp_path: Path, photo: np.ndarray) 
     with read_with(
         reading_options(max_megapixels=1e-3)
     ):  # as in another process than that of the command
-        rgb = dense._prepared_image(tmp_path / "a.png", (0, 0), camera, camera.pinhole)
+        rgb = dense._undistorted(tmp_path / "a.png", (0, 0), camera, camera.pinhole)
     np.testing.assert_array_equal(rgb, photo)
