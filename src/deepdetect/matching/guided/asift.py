@@ -78,24 +78,23 @@ def simulate_view(
 
     Returns the view, gray outside the image, and the (2, 3) affine map from the image to it.
     """
-    rotated, affine = _rotated(gray, rotation_deg)
+    angle = np.deg2rad(rotation_deg)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    size, to_rotated = _fitting(gray, turn)
+    rotated = cv2.warpAffine(gray, to_rotated, size, **OUTSIDE)
     blur = BLUR * np.sqrt(tilt**2 - 1)
     rotated = cv2.GaussianBlur(rotated, (0, 0), sigmaX=blur, sigmaY=0.01)
-    size = max(1, round(rotated.shape[1] / tilt)), rotated.shape[0]
-    shorten = np.array([[1 / tilt, 0, 0], [0, 1.0, 0]])
-    short = cv2.warpAffine(rotated, shorten, size, flags=cv2.INTER_LINEAR, **OUTSIDE)
-    view, back = _rotated(short, -rotation_deg)
-    affine[0] /= tilt
-    return view, back @ np.vstack([affine, [0, 0, 1]])
+    shorten = turn.T @ np.diag([1 / tilt, 1.0])
+    size, to_view = _fitting(gray, shorten @ turn)
+    offset = to_view[:, 2] - shorten @ to_rotated[:, 2]
+    from_rotated = np.column_stack([shorten, offset])
+    return cv2.warpAffine(rotated, from_rotated, size, **OUTSIDE), to_view
 
 
-def _rotated(gray: np.ndarray, rotation_deg: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rotate an image, gray outside; return the (2, 3) affine map, too."""
+def _fitting(gray: np.ndarray, linear: np.ndarray) -> tuple[tuple[int, int], np.ndarray]:
+    """Return the size that just holds the image under a linear map, and the (2, 3) affine map."""
     height, width = gray.shape
-    angle = np.deg2rad(rotation_deg)
-    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) @ rotation.T
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) @ linear.T
     low = corners.min(0)
-    size = np.ceil(corners.max(0) - low).astype(int).clip(1).tolist()
-    affine = np.column_stack([rotation, -low])
-    return cv2.warpAffine(gray, affine, size, **OUTSIDE), affine
+    columns, rows = np.ceil(corners.max(0) - low - 1e-9).astype(int).clip(1).tolist()
+    return (columns, rows), np.column_stack([linear, -low])
