@@ -28,6 +28,10 @@ from ..io.image_file import MAX_MEGAPIXELS, read_with, reading_options
 from ._app import MORE
 from ._app import NOTHING_FOUND as NOTHING_FOUND
 
+CELL_WIDTH, LINE_WIDTH = 18, 80
+"""Characters of a cell of a table, at least, and of a list in it: the items of a longer one stand
+below each other."""
+
 ALIASES = {"max_keypoints": ("--num-keypoints", "--top-k", "--max-num-keypoints")}
 
 
@@ -294,7 +298,9 @@ def table(*columns: Mapping[str, Any], title: str = "") -> str:
     names = dict.fromkeys(name for column in texts for name in column)
     width = max(map(len, names), default=0)
     rows = [[f"  {name:<{width}}", *(column.get(name, "-") for column in texts)] for name in names]
-    lines = ["  ".join(f"{text:<18}" for text in row).rstrip() for row in rows]
+    below = "\n" + (max(CELL_WIDTH, width + 2) + 2) * " "
+    lines = ["  ".join(f"{text:<{CELL_WIDTH}}" for text in row).rstrip() for row in rows]
+    lines = [line.replace("\n", below) for line in lines]
     return "\n".join([title, *lines] if title else lines)
 
 
@@ -307,7 +313,9 @@ def _table_rows(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[s
             yield from _table_rows(value, f"{title}: ")
         elif isinstance(value, (list, tuple)):
             if value and not any(isinstance(each, (list, tuple, Mapping)) for each in value):
-                yield title, ", ".join(map(_text, value))
+                texts = [*map(_text, value)]
+                line = ", ".join(texts)
+                yield title, line if len(line) <= LINE_WIDTH else "\n".join(texts)
         elif value is not None:
             yield title, _text(value)
 
