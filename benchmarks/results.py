@@ -78,6 +78,7 @@ STAGES = {
     "descriptors": "benchmarks/descriptors.py {data}"
     + "".join(f" --method {{published}}/peers/{name}.onnx" for name in PEERS),
     "fuzz": "-m fuzz",
+    "mappers": "benchmarks/mappers.py",
 }
 """Arguments of Python by the stage's name. What writes no report prints its tables, or JSON."""
 
@@ -287,6 +288,7 @@ RESULTS = {
     "published-pipeline": Result("published-pipeline", "0"),
     "descriptors": Result("descriptors", "0"),
     "fuzz": Result("fuzz", "0"),
+    "mappers": Result("mappers", "0"),
     "foreground": Result(
         "foreground",
         "foreground",

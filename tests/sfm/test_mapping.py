@@ -14,6 +14,7 @@ from deepdetect.sfm import mapping
 from deepdetect.sfm.colmap import CameraIntrinsics, write_database
 from deepdetect.sfm.mapping import (
     adjust,
+    map_globally,
     map_images,
     normalise_model,
     read_sparse_model,
@@ -154,3 +155,16 @@ def test_a_drive_beside_a_smaller_scene(attempts, ahead: int, calls: int, tmp_pa
     else:
         assert names == {f"ahead{number}.jpg" for number in range(ahead)}
         assert others == [aside]
+
+
+def test_all_poses_at_once_and_the_smaller_scene_apart(tmp_path: Path) -> None:
+    write_scenes(tmp_path / "database.db", {"aside": (ASIDE, 6), "up": (ASIDE[[1, 0, 2]], 4)})
+    verify_pairs(tmp_path / "database.db")
+    model, others = map_globally(tmp_path / "database.db", tmp_path, True)
+    views = sorted(read_sparse_model(model).views.values(), key=lambda view: view.name)
+    assert [view.name for view in views] == [f"aside{number}.jpg" for number in range(6)]
+    assert others == [frozenset(f"up{number}.jpg" for number in range(4))]
+    steps = np.diff([view.centre for view in views], axis=0)
+    np.testing.assert_allclose(steps, np.tile(steps.mean(axis=0), (5, 1)), atol=0.02)
+    pointing = views[0].rotation @ (views[-1].centre - views[0].centre)
+    np.testing.assert_allclose(pointing / np.linalg.norm(pointing), [1, 0, 0], atol=0.02)

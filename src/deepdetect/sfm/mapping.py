@@ -1,13 +1,14 @@
-"""Poses of all images and sparse points: COLMAP's incremental mapping, and a last adjustment.
+"""Poses of all images and sparse points: COLMAP's mapping, and a last adjustment.
 
-Schönberger and Frahm, "Structure-from-Motion Revisited", 2016.
+Schönberger and Frahm, "Structure-from-Motion Revisited", 2016; Pan, Baráth, Pollefeys and
+Schönberger, "Global Structure-from-Motion Revisited", 2024.
 """
 
 from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -164,6 +165,25 @@ def map_images(
             left = [pair for pair in verified if mapped.isdisjoint(pair)]
             if found and largest_component(left) <= _size(found[0]):
                 break
+    return _largest(found)
+
+
+def map_globally(
+    database: Path, folder: Path, known_cameras: bool, seed: int = 0
+) -> tuple[Any, list[frozenset[str]]]:
+    """Estimate the poses of all images at once, otherwise as `map_images`."""
+    with quiet_pycolmap() as pycolmap, tempfile.TemporaryDirectory(prefix="deepdetect-") as space:
+        how = pycolmap.GlobalPipelineOptions()
+        how.min_model_size, how.min_num_matches, how.random_seed = MIN_VIEWS, MIN_VERIFIED, seed
+        if known_cameras:
+            how.mapper.bundle_adjustment.refine_focal_length = False
+            how.mapper.bundle_adjustment.refine_extra_params = False
+        models = pycolmap.global_mapping(database, folder, space, how)
+    return _largest(sorted(models.values(), key=_size, reverse=True))
+
+
+def _largest(found: Sequence[Any]) -> tuple[Any, list[frozenset[str]]]:
+    """Return the first of several models, and the names in the others."""
     if not found or _size(found[0]) < MIN_VIEWS:
         raise NoDepthError(
             "the images do not hang together: take them so that each shows most of what the "

@@ -50,6 +50,7 @@ from .mapping import (
     SparseModel,
     adjust,
     adjust_refined,
+    map_globally,
     map_images,
     normalise_model,
     read_sparse_model,
@@ -82,6 +83,8 @@ class MultiViewOptions:
             second-best. None: as of `match_features`.
         matches: "sparse": of keypoints; "dense": points of the depth maps also become points
             of the model, and cameras are adjusted to all.
+        mapper: how COLMAP finds the poses: "incremental": one image after the other, "global": of
+            all images at once, which takes less time where there are thousands.
         dense: make dense points.
         stride_px: distance in pixels between the places of a row or column that are tried.
         single_camera: whether images of one size were taken by one camera; None: where their EXIF
@@ -99,6 +102,7 @@ class MultiViewOptions:
     pairs: str = "auto"
     ratio: float | None = None
     matches: Literal["sparse", "dense"] = "sparse"
+    mapper: Literal["incremental", "global"] = "incremental"
     dense: bool = True
     stride_px: int = 2
     single_camera: bool | None = None
@@ -114,6 +118,7 @@ class MultiViewOptions:
                 f"`pairs` must be auto, exhaustive, sequential:10 or similar, not {self.pairs}"
             )
         check_name("matches", self.matches, ("sparse", "dense"))
+        check_name("mapper", self.mapper, ("incremental", "global"))
         check_ranges(self, counts=("stride_px",), fractions=("ratio",))
 
     def pair_choice(self, count: int) -> str:
@@ -249,7 +254,7 @@ class Stages:
         Returns the model of pycolmap; the number of matches of each pair that agree with its
         geometry; and the names of the images in each other component.
         """
-        pycolmap = import_pycolmap()
+        pycolmap, options = import_pycolmap(), self.options
         images = {}
         with open_hdf5(self.features) as file:
             for name, own in intrinsics.items():
@@ -260,7 +265,8 @@ class Stages:
             [(name, own, points.xy) for name, (points, own) in images.items()],
             [cameras.index(camera) for camera in cameras],
             list(matches.items()),
-            (known, refined, self.options.matches, self.seed, pycolmap.__version__, __version__),
+            (known, refined, options.matches, options.mapper, self.seed),
+            (pycolmap.__version__, __version__),
         )
         record = self.work / f"mapping-{made_of}.json"
         database, sparse = self.output / "database.db", self.work / "sparse"
@@ -276,23 +282,26 @@ class Stages:
             path.unlink()
             write_database(path, images, matches)
             verified = verify_pairs(path, self.seed, self.workers)
-        with progress(len(images), "mapping", "image", self.quiet) as bar:
-            model, components = map_images(
-                database,
-                folder,
-                verified,
-                known,
-                self.seed,
-                # Those of an attempt that is given up are counted again in the next.
-                lambda count: bar.update(min(count, len(images) - bar.n)),
-            )
+        if options.mapper == "global":
+            model, components = map_globally(database, folder, known, self.seed)
+        else:
+            with progress(len(images), "mapping", "image", self.quiet) as bar:
+                model, components = map_images(
+                    database,
+                    folder,
+                    verified,
+                    known,
+                    self.seed,
+                    # Those of an attempt that is given up are counted again in the next.
+                    lambda count: bar.update(min(count, len(images) - bar.n)),
+                )
         if refined:
             refine_tracks(model, folder)
             adjust_refined(model, known)
         else:
             adjust(model, known)
         normalise_model(model)
-        if refined and self.options.matches == "dense":
+        if refined and options.matches == "dense":
             fused = self.fused(folder, read_sparse_model(model))
             add_dense_tracks(model, folder, fused)
             adjust_refined(model, known)
