@@ -22,13 +22,7 @@ from deepdetect.evaluation.metrics.pose import camera_errors
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.sfm.colmap import CameraIntrinsics, write_database
-from deepdetect.sfm.mapping import (
-    adjust,
-    map_globally,
-    map_images,
-    read_sparse_model,
-    verify_pairs,
-)
+from deepdetect.sfm.mapping import adjust, map_globally, map_images, read_sparse_model, verify_pairs
 from deepdetect.sfm.pair_selection import SIMILAR
 
 COUNTS = (60, 120, 250, 500, 1000)
@@ -37,7 +31,7 @@ STEP, APART = 0.3 * SIZE[1], 0.4 * SIZE[0]
 """Between images of a line, and between lines, in pixels of an image on the ground."""
 
 RELIEF, PLACE_NOISE, TILT_DEG, NOISE_PX = 36.0, 12.0, 4.0, 0.4
-"""Standard deviations: of the ground's height, of places and angles of the cameras, of keypoints."""
+"""Standard deviations: of heights of the ground, places and angles of cameras, keypoints."""
 
 SEEN_POINTS, LOST, WRONG = 1500, 0.4, 0.4
 """In an image; of the matches of a pair, the share that is lost and that is wrong."""
@@ -47,26 +41,24 @@ def fly(count: int, rng: Generator) -> tuple[list[PosedView], list[np.ndarray], 
     """Return the true views, and of each the rows of the points it sees, and where."""
     each = -(-count // max(2, round((0.8 * count) ** 0.5)))
     line, place = np.divmod(np.arange(count), each)
+    place = np.where(line % 2, each - 1 - place, place)
     ground = (line.max() + 1) * APART + SIZE[0], each * STEP + SIZE[1]
     number = round(SEEN_POINTS * ground[0] * ground[1] / (SIZE[0] * SIZE[1]))
     points = np.column_stack([rng.uniform(0, 1, (number, 2)) * ground, np.zeros(number)])
     for length in (1200, 500, 200):
         waves = rng.normal(0, 2 * np.pi / length, (2, 8))
-        points[:, 2] += np.cos(points[:, :2] @ waves + rng.uniform(0, 7, 8)).sum(1) / 24**0.5
-    points[:, 2] *= RELIEF * 2**0.5
+        points[:, 2] += np.cos(points[:, :2] @ waves + rng.uniform(0, 7, 8)).sum(1)
+    points[:, 2] *= RELIEF / points[:, 2].std()
     camera, views, rows, places = Camera(SIZE, FOCAL_PX), [], [], []
     for k in range(count):
-        along = (each - 1 - place[k] if line[k] % 2 else place[k]) * STEP
-        centre = np.array([line[k] * APART + SIZE[0] / 2, along + SIZE[1] / 2, -FOCAL_PX])
+        centre = np.array([line[k] * APART + SIZE[0] / 2, place[k] * STEP + SIZE[1] / 2, -FOCAL_PX])
         centre += rng.normal(0, PLACE_NOISE, 3)
         turn = rng.normal(0, np.radians(TILT_DEG), 3) + (0, 0, np.pi * (line[k] % 2))
         rotation = cv2.Rodrigues(turn * (1, 1, 0))[0] @ cv2.Rodrigues(turn * (0, 0, 1))[0]
-        view = PosedView(f"{k:04d}.jpg", camera, rotation, -rotation @ centre)
-        xy = view.project(points)[0]
-        seen = np.flatnonzero(((xy > 1) & (xy < np.array(SIZE) - 2)).all(1))
-        views.append(view)
-        rows.append(seen)
-        noisy = xy[seen] + rng.normal(0, NOISE_PX, (len(seen), 2))
+        views.append(PosedView(f"{k:04d}.jpg", camera, rotation, -rotation @ centre))
+        xy = views[-1].project(points)[0]
+        rows.append(np.flatnonzero(((xy > 1) & (xy < np.array(SIZE) - 2)).all(1)))
+        noisy = xy[rows[-1]] + rng.normal(0, NOISE_PX, (len(rows[-1]), 2))
         places.append(noisy.clip(0, np.array(SIZE) - 1).astype(np.float32))
     return views, rows, places
 
@@ -74,7 +66,7 @@ def fly(count: int, rng: Generator) -> tuple[list[PosedView], list[np.ndarray], 
 def write_flight(path: Path, count: int, rng: Generator) -> list[PosedView]:
     """Write a database of keypoints and matches, and return the true views."""
     views, rows, places = fly(count, rng)
-    intrinsics = CameraIntrinsics.initial(SIZE, WRONG_FOCAL * FOCAL_PX, "EXIF")
+    intrinsics = CameraIntrinsics.initial(SIZE, WRONG_FOCAL * FOCAL_PX)
     images = {
         view.name: (Keypoints(xy, np.ones(len(xy), np.float32), SIZE), intrinsics)
         for view, xy in zip(views, places, strict=True)
@@ -94,26 +86,26 @@ def write_flight(path: Path, count: int, rng: Generator) -> list[PosedView]:
 
 
 def main() -> None:
-    """Print a row for each mapper and number of images."""
+    """Print a row for each number of images and mapper."""
     print("| images | mapper | registered | centres, px on the ground | largest | CPU s |")
     print("|---|---|---:|---:|---:|---:|")
     for count in map(int, sys.argv[1:] or COUNTS):
         with tempfile.TemporaryDirectory() as scratch:
-            database = Path(scratch, "database.db")
+            database, folder = Path(scratch, "database.db"), Path(scratch)
             truth = write_flight(database, count, np.random.default_rng(count))
             verified = verify_pairs(database)
-            for mapper in ("incremental", "global"):
+            for name, mapper, pairs in (
+                ("incremental", map_images, [verified]),
+                ("global", map_globally, []),
+            ):
                 start = time.process_time()
-                if mapper == "global":
-                    model, _ = map_globally(database, Path(scratch), False)
-                else:
-                    model, _ = map_images(database, Path(scratch), verified, False)
+                model = mapper(database, folder, *pairs, False)[0]
                 adjust(model, False)
                 seconds = time.process_time() - start
                 views = read_sparse_model(model).views
                 true = [view for view in truth if view.name in views]
                 errors = camera_errors([views[view.name] for view in true], true)[0]
-                row = count, mapper, len(views), errors.mean(), errors.max(), seconds
+                row = count, name, len(views), errors.mean(), errors.max(), seconds
                 print("| {} | {} | {} | {:.2f} | {:.2f} | {:.0f} |".format(*row), flush=True)
 
 
