@@ -6,7 +6,7 @@ import pytest
 
 from deepdetect import OptionError
 from deepdetect.features.sift import to_root_sift
-from deepdetect.sfm.pair_selection import similar_pairs, vlad_vectors
+from deepdetect.sfm.pair_selection import similar_pairs, thin_out, vlad_vectors
 from deepdetect.sfm.stages import MultiViewOptions
 
 
@@ -17,10 +17,17 @@ def test_small_sets_are_matched_exhaustively_and_large_ones_by_likeness() -> Non
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"pairs": "sequental:3"}, {"pairs": "sequential:0"}, {"stride_px": 1.5}]
+    "wrong",
+    [
+        {"pairs": "sequental:3"},
+        {"pairs": "sequential:0"},
+        {"stride_px": 1.5},
+        {"mapper": "globally"},
+        {"min_motion": 2},
+    ],
 )
 def test_wrong_options_are_refused(wrong: dict) -> None:
-    with pytest.raises(OptionError, match=r"sequential|must be"):
+    with pytest.raises(OptionError, match=r"sequential|must|unknown"):
         MultiViewOptions(**wrong)
 
 
@@ -71,3 +78,10 @@ def test_of_a_large_set_those_that_see_the_same_are_matched() -> None:
     for step, share in ((1, 1.0), (2, 0.95)):  # three and two quarters in common
         asked = {(k, k + step) for k in range(count - step)}
         assert len(asked & found) >= share * len(asked)
+
+
+def test_frames_are_left_out_up_to_the_first_that_shows_something_new() -> None:
+    motions = {("a", "b"): 0.02, ("b", "c"): 0.02, ("a", "c"): 0.06, ("c", "d"): 0.03}
+    assert thin_out("abcd", motions, 0.04) == {"b": "a", "d": "c"}
+    assert thin_out("dcba", motions, 0.04) == {"c": "d", "a": "b"}
+    assert thin_out("abcd", motions, 0.01) == {}

@@ -19,6 +19,7 @@ from deepdetect import (
     ImageError,
     Keypoints,
     MissingExtraError,
+    NoDepthError,
     OptionError,
     PointDetector,
     ReconstructionError,
@@ -411,3 +412,22 @@ def test_the_fountain_is_as_good_as_with_sift(shared: Path, tmp_path: Path, pyco
             assert np.median(found.dense_errors) < 0.5
     if behind:
         pytest.xfail("rotations with known intrinsics are not yet as exact as SIFT's")
+
+
+def test_frames_that_show_the_same_are_left_out(write_fountain, pycolmap, tmp_path: Path) -> None:
+    names = ("0004", "0005", "0006")
+    folder = write_fountain(tmp_path / "frames", names, 288)
+    for name in names:
+        with Image.open(folder / f"{name}.jpg") as image:
+            image.crop((3, 2, 288, 192)).save(folder / f"{name}b.jpg", quality=95)
+    options = MultiViewOptions(dense=False, min_motion=0.018)
+    found = reconstruct_many(folder, tmp_path / "model", **{**SPARSE, "options": options})
+    assert [*found.views] == [f"{name}.jpg" for name in names]
+    same = {f"{name}b.jpg": f"it shows nearly the same as {name}.jpg" for name in names}
+    assert found.unregistered == same
+    assert found.pairs == 3
+    still = write_fountain(tmp_path / "still", names[:1], 288)
+    for copy in "bcd":
+        shutil.copy(still / "0004.jpg", still / f"{copy}.jpg")
+    with pytest.raises(NoDepthError, match="all images but 1 show nearly the same"):
+        reconstruct_many(still, tmp_path / "none", **{**SPARSE, "options": options})

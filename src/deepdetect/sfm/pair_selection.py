@@ -1,4 +1,4 @@
-"""Which images are matched with each other.
+"""Which images are matched with each other, and which show nothing new.
 
 All pairs of a small set; neighbours of a sequence; the most alike of a large set, by VLAD (Jégou et
 al., "Aggregating local descriptors into a compact image representation", 2010) of the best ranked
@@ -7,7 +7,7 @@ keypoints, with a vocabulary of the set itself.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -46,6 +46,27 @@ def largest_component(pairs: Sequence[Pair]) -> int:
         components = [names for names in components if names.isdisjoint(pair)]
         components.append(set(pair).union(*touched))
     return max(map(len, components), default=0)
+
+
+def thin_out(
+    names: Sequence[str], motions: Mapping[Pair, float], min_motion: float
+) -> dict[str, str]:
+    """Return images that moved less than this from one before them, and the name of that one.
+
+    Images that are left out do not count.
+    """
+    partners: dict[str, dict[str, float]] = {name: {} for name in names}
+    for (first, second), motion in motions.items():
+        partners[first][second] = partners[second][first] = motion
+    kept: dict[str, None] = {}
+    dropped = {}
+    for name in names:
+        nearest = min(partners[name].keys() & kept, key=partners[name].__getitem__, default=None)
+        if nearest is not None and partners[name][nearest] < min_motion:
+            dropped[name] = nearest
+        else:
+            kept[name] = None
+    return dropped
 
 
 def vlad_vectors(descriptors: Sequence[np.ndarray], seed: int = 0) -> np.ndarray:

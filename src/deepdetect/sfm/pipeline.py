@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import OptionError, ReconstructionError
+from .._shared.errors import NoDepthError, OptionError, ReconstructionError
 from .._shared.options import suggest_keywords
 from .._shared.progress import StageTimer, say
 from ..batch.pair_list import Pair
@@ -135,8 +135,12 @@ def reconstruct_many(
                 )
         sizes = {name: sizes[name] for name in known}
     with timer.stage("matching"):
-        pairs = stages.choose_pairs(list(sizes))
-        matches = stages.match(pairs)
+        matches, alike = stages.match_images(sizes)
+    for name, other in alike.items():
+        unregistered[name] = f"it shows nearly the same as {other}"
+        del sizes[name]
+    if len(sizes) < MIN_VIEWS:
+        raise NoDepthError(f"all images but {len(sizes)} show nearly the same: move the camera")
     intrinsics = initial_intrinsics(folder, sizes, known, focal_px, options.single_camera)
     with timer.stage("mapping"):
         model, verified, components = stages.map(folder, intrinsics, matches, bool(known))
@@ -175,7 +179,7 @@ def reconstruct_many(
             dense_views=dense["views"].copy(),
             keypoints=keypoints,
             matched=verified,
-            pairs=len(pairs),
+            pairs=len(matches),
             pair_choice=options.pair_choice(len(sizes)),
             seconds=timer.seconds,
             expected_seconds=timer.expected,

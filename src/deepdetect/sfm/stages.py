@@ -56,7 +56,13 @@ from .mapping import (
     read_sparse_model,
     verify_pairs,
 )
-from .pair_selection import COMPARED_KEYPOINTS, SIMILAR, similar_pairs, vlad_vectors
+from .pair_selection import (
+    COMPARED_KEYPOINTS,
+    SIMILAR,
+    similar_pairs,
+    thin_out,
+    vlad_vectors,
+)
 from .tracks import add_dense_tracks, refine_tracks
 
 MAX_EXHAUSTIVE = 50
@@ -79,6 +85,8 @@ class MultiViewOptions:
         pairs: which images are matched: "exhaustive": all; "sequential:10": each with the 10 that
             follow it by name; "similar": the most alike; "auto": all of up to 50, else the most
             alike.
+        min_motion: images from which most matches with one before them are less than this share of
+            the longer side away are left out, as many frames of a video are; None: none is.
         ratio: limit of the ratio test: the best distance must be below this share of the
             second-best. None: as of `match_features`.
         matches: "sparse": of keypoints; "dense": points of the depth maps also become points
@@ -100,6 +108,7 @@ class MultiViewOptions:
     """
 
     pairs: str = "auto"
+    min_motion: float | None = None
     ratio: float | None = None
     matches: Literal["sparse", "dense"] = "sparse"
     mapper: Literal["incremental", "global"] = "incremental"
@@ -119,7 +128,7 @@ class MultiViewOptions:
             )
         check_name("matches", self.matches, ("sparse", "dense"))
         check_name("mapper", self.mapper, ("incremental", "global"))
-        check_ranges(self, counts=("stride_px",), fractions=("ratio",))
+        check_ranges(self, counts=("stride_px",), fractions=("ratio", "min_motion"))
 
     def pair_choice(self, count: int) -> str:
         """Return how the pairs of so many images are chosen."""
@@ -224,6 +233,30 @@ class Stages:
                 best = np.argsort(-file[name]["scores"][()], kind="stable")[:COMPARED_KEYPOINTS]
                 descriptors.append(file[name]["descriptors"][()].T[best])
         return similar_pairs(names, vlad_vectors(descriptors, seed=self.seed), SIMILAR)
+
+    def match_images(
+        self, sizes: Mapping[str, tuple[int, int]]
+    ) -> tuple[dict[Pair, np.ndarray], dict[str, str]]:
+        """Match images of (width, height) with those chosen; return the matches, as `match`.
+
+        And the images that were left out, with the one that shows nearly the same.
+        """
+        names, dropped, limit = [*sizes], dict[str, str](), self.options.min_motion
+        while True:
+            matches = self.match(self.choose_pairs(names))
+            if limit is None:
+                return matches, dropped
+            motions = {}
+            with open_hdf5(self.features) as file:
+                xy = {name: file[name]["keypoints"][()] for name in names}
+            for (a, b), rows in matches.items():
+                moved = np.linalg.norm(xy[b][rows[:, 1]] - xy[a][rows[:, 0]], axis=1)
+                motions[a, b] = np.median(moved) / max(sizes[a]) if len(moved) else np.inf
+            # Of those most alike, which are matched, all may be left out: then others are.
+            if not (further := thin_out(names, motions, limit)):
+                return matches, dropped
+            dropped |= further
+            names = [name for name in names if name not in further]
 
     def match(self, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
         """Match pairs; return (K, 2) rows of keypoints of each."""
