@@ -27,7 +27,7 @@ from ..geometry.estimation import check_model
 from ..geometry.transforms import epipolar_errors, transfer_errors
 from ..io.image import Images, ignore_masks, load_image, luma
 from .guided import TentativeMatches, guided_matches, guiding_geometry
-from .guided.initial_geometry import checked_positions
+from .guided.tentative_matches import checked_positions
 
 GUIDED_STAGES = ("initial geometry", "keypoints", "guided matching", "geometry")
 """A `PointDetector` has no first of them: its points give the geometry."""

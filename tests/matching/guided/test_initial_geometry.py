@@ -14,14 +14,12 @@ from deepdetect.io.image import load_image, luma
 from deepdetect.matching.guided import initial_geometry as module
 from deepdetect.matching.guided.asift import DIRECTIONS, learned_points
 from deepdetect.matching.guided.initial_geometry import (
-    MAX_SIDE_PX as LONGEST,
-)
-from deepdetect.matching.guided.initial_geometry import (
     InitialGeometry,
     estimate_initial_geometry,
-    find_tentative_matches,
     guiding_geometry,
 )
+from deepdetect.matching.guided.tentative_matches import MAX_SIDE_PX as LONGEST
+from deepdetect.matching.guided.tentative_matches import find_tentative_matches
 
 MILD = np.array([[0.9, -0.12, 25.0], [0.15, 0.95, -8.0], [2e-4, -1e-4, 1.0]])
 ODD = [
@@ -177,7 +175,7 @@ def test_matches_that_are_there_already_are_not_made_again(
     other = warped(gray, MILD, (256, 256))
     expected = initial_geometry(gray, other)
     tentative = find_tentative_matches(gray, other)
-    monkeypatch.setattr("deepdetect.matching.guided.initial_geometry.detect_sift", None)
+    monkeypatch.setattr("deepdetect.matching.guided.tentative_matches.detect_sift", None)
     found = estimate_initial_geometry(tentative)
     np.testing.assert_array_equal(found.matrix, expected.matrix)
 

@@ -10,8 +10,8 @@ from deepdetect import Keypoints, PointDetector
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import guided_matches, guiding_geometry
-from deepdetect.matching.guided import initial_geometry as module
-from deepdetect.matching.guided.initial_geometry import matches_of_points
+from deepdetect.matching.guided import tentative_matches as module
+from deepdetect.matching.guided.tentative_matches import matches_of_points
 
 TURNED = np.vstack([cv2.getRotationMatrix2D((128, 128), 30, 1.2), [0, 0, 1]])
 

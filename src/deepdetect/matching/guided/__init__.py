@@ -1,11 +1,8 @@
 """Guided matching: a geometry from a few matches proposes dense ones, which are verified."""
 
-from .initial_geometry import (
-    TentativeMatches,
-    find_tentative_matches,
-    guiding_geometry,
-)
+from .initial_geometry import guiding_geometry
 from .pipeline import guided_matches
+from .tentative_matches import TentativeMatches, find_tentative_matches
 
 __all__ = [
     "TentativeMatches",

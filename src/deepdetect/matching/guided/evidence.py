@@ -35,7 +35,7 @@ from ...geometry.transforms import (
     transfer_errors,
     transform_points,
 )
-from .initial_geometry import Pair
+from .tentative_matches import Pair
 
 COMPARED_SIDE_PX = 320
 """Longer side to which images are reduced for shifts: periods of a pattern are many pixels."""

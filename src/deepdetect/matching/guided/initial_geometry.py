@@ -1,4 +1,4 @@
-"""Tentative matches of a pair, and the initial geometry they show, or that none can be trusted.
+"""The initial geometry that tentative matches of a pair show, or that none can be trusted.
 
 A coarse pass on small copies first, which is enough where the pair is clearly a plane or clearly
 has depth; then plain SIFT on larger ones; learned descriptors, and simulated views (`asift`), only
@@ -12,18 +12,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
 
 import numpy as np
 
-from ..._shared.errors import OptionError
 from ...detector.points.descriptor import describe_learned
 from ...features.keypoints import Keypoints
-from ...features.learned import CROSS_MODAL, is_learned, match_learned
-from ...features.matchers import exact_neighbours, match_descriptors
+from ...features.learned import CROSS_MODAL
 from ...features.matches import TwoViewGeometry
-from ...features.sift import detect_sift
 from ...geometry.estimation import TwoViewModel
 from ...geometry.images import downscale, zncc_at_points
 from ...geometry.semi_calibrated import MATCH_SIGMA_PX, refine_fundamental
@@ -36,29 +31,19 @@ from ...geometry.transforms import (
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX, choose_model
 from .asift import learned_points, simulated_views
 from .epipolar_search import epipolar_search, log10_p_value
-
-Pair = tuple[np.ndarray, np.ndarray]
-"""Something of both images: themselves, (H, W) uint8 luma, or (M, 2) matched positions."""
-
-MAX_SIDE_PX = 1200
-"""Longer sides are scaled down to this: the initial geometry need not be fine."""
-
-MAX_KEYPOINTS = 4000
-"""Of SIFT in each image."""
+from .tentative_matches import (
+    MAX_RATIOS,
+    MAX_SIDE_PX,
+    Pair,
+    TentativeMatches,
+    find_tentative_matches,
+    match_sparse,
+    matches_of_points,
+    separate,
+)
 
 LEARNED_KEYPOINTS = 2048
 """Of points with learned descriptors, which are asked where SIFT's keypoints show nothing."""
-
-MIN_POINTS = 1000
-"""Where both images have at least so many points of all scales (a budget was asked for), these take
-the place of SIFT's keypoints."""
-
-MAX_RATIOS = (0.85, 0.8)
-"""Of the ratio test, in the order in which they are tried: fewer matches, with fewer wrong ones
-among them, may show what more do not."""
-
-MIN_SEPARATION_PX = 2.0
-"""Matches that begin or end nearer together than this count as one."""
 
 COARSE_SIDE_PX, COARSE_KEYPOINTS = 640, 2000
 """Longer side of the copies of the coarse pass, and keypoints of each."""
@@ -97,122 +82,10 @@ MAX_HINT_LOG10_NFA = 0.0
 may be more than chance: further matches along epipolar lines are counted."""
 
 
-@dataclass(frozen=True, eq=False)
-class TentativeMatches:
-    """Sparse matches of two images, before any geometry.
-
-    Attributes:
-        views: both images as uint8 luma, scaled down where they are large.
-        scales: of the views, at most 1.
-        features: keypoints of the views, with their descriptors.
-        matched: (M, 2) positions in both views.
-        ratios: (M,) of the ratio test.
-    """
-
-    views: tuple[np.ndarray, np.ndarray]
-    scales: tuple[float, float]
-    features: tuple[Keypoints, Keypoints]
-    matched: Pair
-    ratios: np.ndarray
-
-    @property
-    def points0(self) -> np.ndarray:
-        """Matched positions in the first image at its own size, (M, 2) float64."""
-        return scaled_points(self.matched[0], 1 / self.scales[0])
-
-    @property
-    def points1(self) -> np.ndarray:
-        """Matched positions in the second image at its own size, (M, 2) float64."""
-        return scaled_points(self.matched[1], 1 / self.scales[1])
-
-    def swapped(self) -> TentativeMatches:
-        """Return the matches from the second image to the first."""
-        views, scales, features = self.views[::-1], self.scales[::-1], self.features[::-1]
-        return TentativeMatches(views, scales, features, self.matched[::-1], self.ratios)
-
-
 Source = TentativeMatches | Pair | tuple[Keypoints, Keypoints] | None
 """What a geometry is found from: matches that have been made already, (K, 2) positions in both
 images of another matcher, or keypoints: these make the matches where they are points of all scales
 and enough. Else SIFT does."""
-
-
-def find_tentative_matches(
-    gray0: np.ndarray,
-    gray1: np.ndarray,
-    features: tuple[Keypoints, Keypoints] | None = None,
-    *,
-    max_side_px: int = MAX_SIDE_PX,
-    max_keypoints: int = MAX_KEYPOINTS,
-) -> TentativeMatches:
-    """Match sparse SIFT keypoints of two images, exactly, mutually and by the ratio test.
-
-    Args:
-        gray0, gray1: (H, W) uint8 luma.
-        features: keypoints of both images, scaled down where they are large, with their
-            descriptors; None: they are detected.
-        max_side_px: longer sides are scaled down to this.
-        max_keypoints: that are detected in each image.
-
-    Example:
-        >>> image = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
-        >>> matches = find_tentative_matches(image, image)
-        >>> bool((matches.points0 == matches.points1).all()), len(matches.points0) > 10
-        (True, True)
-    """
-    (view0, scale0), (view1, scale1) = (downscale(gray, max_side_px) for gray in (gray0, gray1))
-    if features is None:
-        with ThreadPoolExecutor(2) as pool:  # OpenCV's SIFT leaves a second processor idle
-            of_first = pool.submit(detect_sift, view0, max_keypoints)
-            of_second = detect_sift(view1, max_keypoints)
-            features = of_first.result(), of_second
-    points0, points1, ratios = _match_sparse(*features)
-    return TentativeMatches((view0, view1), (scale0, scale1), features, (points0, points1), ratios)
-
-
-def matches_of_points(grays: Pair, points: tuple[Keypoints, Keypoints]) -> TentativeMatches | None:
-    """Match points of all scales, best first, at their own sizes and angles, as sparse keypoints.
-
-    Of two images in unlike light, or of which one is blurred, they give two to five times as many
-    correct matches as SIFT's. None where there are too few, or they have no sizes and angles.
-    """
-    if min(len(each) for each in points) < MIN_POINTS:
-        return None
-    described = []
-    for gray, each in zip(grays, points, strict=True):
-        if each.sizes is None or each.angles is None:
-            return None
-        view, scale = downscale(gray, MAX_SIDE_PX)
-        best = describe_learned(view, each[:MAX_KEYPOINTS])
-        xy, size = scaled_points(best.xy, scale), (view.shape[1], view.shape[0])
-        described.append(replace(best, xy=xy, image_size=size))
-    features = described[0], described[1]
-    return find_tentative_matches(*grays, features, max_side_px=MAX_SIDE_PX)
-
-
-def _match_sparse(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, ...]:
-    """Return matched positions in both images, and the ratios of the ratio test."""
-    assert first.descriptors is not None
-    assert second.descriptors is not None
-    match = partial(match_descriptors, matcher=exact_neighbours, ratio=max(MAX_RATIOS), mutual=True)
-    if is_learned(first.descriptor_type):
-        matches = match_learned(first, second, match)
-    else:
-        matches = match(first.descriptors, second.descriptors)
-    return _separate(first.xy[matches.indices0], second.xy[matches.indices1], matches.ratios)
-
-
-def _separate(*matches: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Keep each place once in each image: one corner in many views is no further evidence.
-
-    The first two arrays are the positions in both images; others are kept like them.
-    """
-    for side in (0, 1):
-        cells = np.rint(matches[side] / MIN_SEPARATION_PX)
-        _, kept = np.unique(cells, axis=0, return_index=True)
-        kept.sort()
-        matches = tuple(values[kept] for values in matches)
-    return matches
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -377,21 +250,6 @@ def _is_clear(geometry: InitialGeometry) -> bool:
     return geometry.matrix is not None and most
 
 
-def checked_positions(points: Any) -> Pair:
-    """Return sparse matches of another matcher, two (K, 2) arrays of finite numbers, as float64."""
-    try:
-        points0, points1 = (np.array(each, np.float64) for each in points)
-    except (TypeError, ValueError):
-        points0 = points1 = np.empty(0)
-    if points0.ndim != 2 or points0.shape[1:] != (2,) or points0.shape != points1.shape:
-        raise OptionError(
-            "tentative matches must be two arrays of shape (K, 2): positions in both images"
-        )
-    if not (np.isfinite(points0).all() and np.isfinite(points1).all()):
-        raise OptionError("tentative matches must be finite positions: leave out the others")
-    return points0, points1
-
-
 def _geometry_of_positions(grays: Pair, points: Pair, model: str, seed: int) -> InitialGeometry:
     """Estimate the geometry from sparse matches of another matcher, some of them wrong."""
     # The thresholds hold for images of this size.
@@ -400,7 +258,7 @@ def _geometry_of_positions(grays: Pair, points: Pair, model: str, seed: int) -> 
         (round(gray.shape[1] * scale), round(gray.shape[0] * scale))
         for gray, scale in zip(grays, (scale0, scale1), strict=True)
     )
-    scaled0, scaled1 = _separate(scaled_points(points[0], scale0), scaled_points(points[1], scale1))
+    scaled0, scaled1 = separate(scaled_points(points[0], scale0), scaled_points(points[1], scale1))
     chosen = choose_model(scaled0, scaled1, (size0, size1), model, seed)
     geometry = InitialGeometry.of(chosen, scaled0, scaled1, model)
     return geometry.rescaled(scale0, scale1) if geometry.trusted else geometry.untrusted()
@@ -450,12 +308,12 @@ def _more_and_more_matches(
         return
     views = 0
     for side, seen in simulated_views(tentative.views, view_keypoints):
-        further = _match_sparse(seen, tentative.features[1 - side])
+        further = match_sparse(seen, tentative.features[1 - side])
         points0 = np.concatenate([points0, further[side]])
         points1 = np.concatenate([points1, further[1 - side]])
         ratios = np.concatenate([ratios, further[2]])
         views += 1
-    points0, points1, ratios = _separate(points0, points1, ratios)
+    points0, points1, ratios = separate(points0, points1, ratios)
     yield (points0, points1), ratios, views
 
 
@@ -479,7 +337,7 @@ def _with_further_matches(
         return geometry
     assert geometry.matrix is not None
     further = epipolar_search(*tentative.features, geometry.matrix)
-    points0, points1 = _separate(
+    points0, points1 = separate(
         np.concatenate([geometry.points0, further[0]]),
         np.concatenate([geometry.points1, further[1]]),
     )

@@ -30,8 +30,9 @@ from ...geometry.two_view import (
     is_usual_rotation,
 )
 from .evidence import OFF_PLANE_PX, compare_held_out, is_repeated, moving_alike
-from .initial_geometry import InitialGeometry, Pair, guiding_geometry
+from .initial_geometry import InitialGeometry, guiding_geometry
 from .rectified import match_by_rectification
+from .tentative_matches import Pair
 from .verification import dissimilarity
 
 MIN_VERIFIED_FRACTION = 0.5

@@ -33,7 +33,7 @@ from ..stereo.matching import (
     range_with_margin,
 )
 from ..stereo.sgm import DisparityRange
-from .initial_geometry import Pair
+from .tentative_matches import Pair
 
 DISPARITY = DisparityOptions(discontinuity_margin_px=1)
 """How rows are matched; the range is found."""

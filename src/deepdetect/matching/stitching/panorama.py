@@ -16,7 +16,7 @@ from ...detector.detector import AnyDetector, DeepDetect
 from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography, translation_matrix
 from ...io.image import load_deep
-from ..guided.initial_geometry import MAX_SIDE_PX
+from ..guided.tentative_matches import MAX_SIDE_PX
 from .bundle_adjustment import RotatingCamera, level_cameras
 from .compositing import Canvas, composite, crop_box, least_distorted, plan_curved, plan_plane
 from .registration import JointRegistration, register_images
