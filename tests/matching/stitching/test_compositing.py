@@ -9,14 +9,13 @@ from deepdetect._shared import machine
 from deepdetect._shared.image_array import to_8_bits
 from deepdetect.geometry.images import downscale
 from deepdetect.matching.stitching.bundle_adjustment import RotatingCamera
-from deepdetect.matching.stitching.compositing import (
+from deepdetect.matching.stitching.canvas import (
     Canvas,
-    composite,
-    crop_box,
     least_distorted,
     plan_curved,
     plan_plane,
 )
+from deepdetect.matching.stitching.compositing import composite, crop_box
 
 CAMERA = np.array([[400.0, 0, 199.5], [0, 400, 149.5], [0, 0, 1]])
 SIZE = (400, 300)

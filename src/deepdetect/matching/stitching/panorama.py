@@ -18,7 +18,8 @@ from ...geometry.transforms import scaled_homography, translation_matrix
 from ...io.image import load_deep
 from ..guided.tentative_matches import MAX_SIDE_PX
 from .bundle_adjustment import RotatingCamera, level_cameras
-from .compositing import Canvas, composite, crop_box, least_distorted, plan_curved, plan_plane
+from .canvas import Canvas, least_distorted, plan_curved, plan_plane
+from .compositing import composite, crop_box
 from .registration import JointRegistration, register_images
 
 Projection = Literal["plane", "cylindrical", "spherical"]
