@@ -1,0 +1,248 @@
+"""Where the images of a panorama lie, on a plane, a cylinder or a sphere.
+
+Size and memory of a canvas are known before anything is drawn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..._shared.errors import OptionError, RegistrationError
+from ..._shared.machine import require_memory
+from ..._shared.opencv import cv2
+from ...geometry.images import downscale
+from ...geometry.transforms import scaled_homography, transform_points, translation_matrix
+from .bundle_adjustment import Cameras, Matrices, Sizes
+
+Box = tuple[int, int, int, int]
+"""Left, top, right and bottom in pixels, right and bottom outside."""
+
+MAX_DEPTH_RATIO = 5.0
+"""How many times farther from the camera one corner of an image may lie on a flat canvas than
+another: near the horizon an image is stretched without bound."""
+
+MIN_WARP_SCALE = 0.67
+"""An image that the canvas shows smaller than this is downscaled first, against aliasing."""
+
+
+@dataclass(frozen=True, eq=False)
+class WarpedImage:
+    """An image on the canvas, mirrored beyond its borders, whose left and top are the `corner`.
+
+    The image is (h, w, 3) uint8 or uint16; the mask, (h, w) uint8, is 255 inside.
+    """
+
+    image: np.ndarray
+    mask: np.ndarray
+    corner: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Canvas:
+    """Where images lie on a canvas: boxes by the number of the image, or ~number of its rest.
+
+    `draw(place, rgb, scale_of_image, scale_of_canvas)` draws one, both made smaller. A `closed`
+    canvas shows all around: its right end goes on at its left one.
+    """
+
+    boxes: dict[int, Box]
+    draw: Callable[[int, np.ndarray, float, float], WarpedImage]
+    closed: bool = False
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        _, _, right, bottom = np.max(list(self.boxes.values()), axis=0).tolist()
+        return right, bottom
+
+    def check_size(self, max_megapixels: float) -> None:
+        """Raise an OptionError if it has too many pixels, or needs more memory than there is."""
+        width, height = self.size
+        if width * height > max_megapixels * 1e6:
+            raise OptionError(
+                f"the panorama would be {width}x{height} pixels, {width * height / 1e6:.0f} "
+                f"megapixels and more than max_canvas_megapixels ({max_megapixels:g}): raise it, "
+                "or make `scale` smaller"
+            )
+        require_memory(
+            f"a panorama of {width}x{height} pixels would",
+            "make `scale` smaller",
+            canvas_pixel=width * height,
+            blended_pixel=max((box[2] - box[0]) * (box[3] - box[1]) for box in self.boxes.values()),
+        )
+
+
+def least_distorted(sizes: Sizes, homographies: Matrices) -> int:
+    """Return the number of the image in whose frame all images are least distorted."""
+
+    def stretch(frame: int) -> float:
+        back = np.linalg.inv(homographies[frame])
+        depths = [_depths(sizes[number], back @ homographies[number]) for number in homographies]
+        least = np.min(depths)
+        return round(float(np.max(depths) / least), 1) if least > 0 else np.inf
+
+    return min(homographies, key=stretch)
+
+
+def plan_plane(
+    sizes: Sizes, homographies: Matrices, reference: int, scale: float
+) -> tuple[Canvas, dict[int, np.ndarray]]:
+    """Find the smallest flat canvas of all images, with so many pixels per pixel of the reference.
+
+    The homographies go to any common frame; those that are returned go to the canvas.
+    """
+    back = np.linalg.inv(homographies[reference])
+    placed = {number: back @ matrix for number, matrix in homographies.items()}
+    for number, matrix in placed.items():
+        depths = _depths(sizes[number], matrix)
+        if depths.min() * MAX_DEPTH_RATIO <= depths.max():
+            raise RegistrationError(
+                f"images[{number}] is seen too much from the side of images[{reference}] for a "
+                "flat panorama: choose a `reference` between them, or, if the camera only turned, "
+                "the projection 'cylindrical'"
+            )
+    placed = {number: scaled_homography(matrix, 1, scale) for number, matrix in placed.items()}
+    # A pixel belongs to an image when its centre does.
+    edges = {n: transform_points(_edges(sizes[n]), matrix) for n, matrix in placed.items()}
+    low = np.ceil(np.min([edge.min(0) for edge in edges.values()], axis=0))
+    boxes = {}
+    for number, edge in edges.items():
+        left, top = (np.ceil(edge.min(0)) - low).astype(int).tolist()
+        right, bottom = (np.floor(edge.max(0)) - low).astype(int).tolist()
+        boxes[number] = (left, top, right + 1, bottom + 1)
+    placed = {number: translation_matrix(*-low) @ matrix for number, matrix in placed.items()}
+
+    def draw(number: int, rgb: np.ndarray, image_scale: float, canvas_scale: float) -> WarpedImage:
+        homography, (left, top, right, bottom) = placed[number], boxes[number]
+        if (image_scale, canvas_scale) != (1, 1):
+            homography = scaled_homography(homography, image_scale, canvas_scale)
+            left, top = (int(np.floor(side * canvas_scale)) for side in (left, top))
+            right, bottom = (int(np.ceil(side * canvas_scale)) for side in (right, bottom))
+        middle = np.array([(rgb.shape[1] - 1) / 2, (rgb.shape[0] - 1) / 2])
+        around = transform_points(middle + [[0, 0], [1, 0], [0, 1]], homography)
+        shown = float(np.sqrt(abs(np.linalg.det(around[1:] - around[0]))))
+        rgb, smaller = _downscaled(rgb, shown)
+        if smaller < 1:
+            homography = scaled_homography(homography, smaller, 1)
+        homography = translation_matrix(-left, -top) @ homography
+        size = (right - left, bottom - top)
+        drawn = cv2.warpPerspective(
+            rgb, homography, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+        )
+        whole = np.full(rgb.shape[:2], 255, np.uint8)
+        mask = cv2.warpPerspective(whole, homography, size, flags=cv2.INTER_NEAREST)
+        return WarpedImage(drawn, mask, (left, top))
+
+    return Canvas(boxes, draw), placed
+
+
+def plan_curved(
+    projection: str, sizes: Sizes, cameras: Cameras, reference: int, scale: float
+) -> Canvas:
+    """Find the smallest canvas of all images on a cylinder or a sphere.
+
+    It has `scale` pixels per pixel in the middle of the reference, but for a turn of whole pixels.
+    Where images show all around, it is cut through the middle of the one that is most behind.
+    """
+    turn = round(2 * np.pi * cameras[reference].focal_px * scale)
+    angles = {n: float(np.arctan2(*one.rotation[[0, 2], 2])) for n, one in cameras.items()}
+
+    def warp(number: int, start: float, canvas_scale: float) -> tuple[Any, Any, int]:
+        """Return a warper, its arguments, and the column that is 0 for it.
+
+        It draws each image ahead, where it is in one piece.
+        """
+        radius = turn * canvas_scale / (2 * np.pi)
+        middle = round((angles[number] - start) % (2 * np.pi) * radius)
+        ahead = cv2.Rodrigues(np.array([0, -middle / radius - start, 0]))[0]
+        matrices = cameras[number].intrinsics(sizes[number]), ahead @ cameras[number].rotation
+        arguments = sizes[number], *(matrix.astype(np.float32) for matrix in matrices)
+        return cv2.PyRotationWarper(projection, radius), arguments, middle
+
+    def find_boxes(start: float) -> dict[int, Box]:
+        boxes = {}
+        for number in cameras:
+            warper, arguments, middle = warp(number, start, 1)
+            left, top, width, height = warper.warpRoi(*arguments)
+            boxes[number] = (left + middle, top, left + middle + width, top + height)
+        return boxes
+
+    columns = [np.arange(left, right) % turn for left, _, right, _ in find_boxes(0.0).values()]
+    closed = len(np.unique(np.concatenate(columns))) == turn
+    if closed:
+        start = min(angles.values(), key=lambda angle: np.cos(angle - angles[reference]))
+    else:  # in the widest gap
+        order = np.sort([*angles.values()])
+        gaps = np.diff(np.append(order, order[0] + 2 * np.pi))
+        start = float((order + gaps / 2)[gaps.argmax()])
+    boxes = find_boxes(start)
+    top = min(box[1] for box in boxes.values())
+    origin = 0 if closed else min(box[0] for box in boxes.values())
+    if closed:  # what reaches over an end goes on at the other
+        wrapped = {}
+        for number, (left, up, right, down) in boxes.items():
+            wrapped[number] = (max(left, 0), up, min(right, turn), down)
+            if left < 0 or right > turn:
+                left, right = (side + (turn if left < 0 else -turn) for side in (left, right))
+                wrapped[~number] = (max(left, 0), up, min(right, turn), down)
+        boxes = wrapped
+    boxes = {n: (b[0] - origin, b[1] - top, b[2] - origin, b[3] - top) for n, b in boxes.items()}
+
+    def draw(place: int, rgb: np.ndarray, image_scale: float, canvas_scale: float) -> WarpedImage:
+        number = image_of(place)
+        warper, arguments, middle = warp(number, start, canvas_scale)
+        (left, up, _, _), *maps = warper.buildMaps(*arguments)
+        left += middle
+        if closed:
+            around = round(turn * canvas_scale)
+            left += 0 if place == number else around if left < 0 else -around
+            first, last = max(-left, 0), min(around - left, maps[0].shape[1])
+            maps = [np.ascontiguousarray(one[:, first:last]) for one in maps]
+            left += first
+        size = sizes[number]
+        inside = [(one > -0.5) & (one < side - 0.5) for one, side in zip(maps, size, strict=True)]
+        radius = turn * canvas_scale / (2 * np.pi)
+        rgb, smaller = _downscaled(rgb, radius / (cameras[number].focal_px * image_scale))
+        for one in maps:  # to pixels of the image that is drawn
+            one += np.float32(0.5)
+            one *= np.float32(image_scale * smaller)
+            one -= np.float32(0.5)
+        drawn = cv2.remap(rgb, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        mask = np.logical_and(*inside).astype(np.uint8) * np.uint8(255)
+        corner = left - round(origin * canvas_scale), up - round(top * canvas_scale)
+        return WarpedImage(drawn, mask, corner)
+
+    return Canvas(boxes, draw, closed)
+
+
+def image_of(place: int) -> int:
+    """Return the number of the image in a place: ~number is where its rest goes on."""
+    return max(place, ~place)
+
+
+def _downscaled(rgb: np.ndarray, shown: float) -> tuple[np.ndarray, float]:
+    """Make an image smaller that is shown much smaller; return its scale, too."""
+    if shown >= MIN_WARP_SCALE:
+        return rgb, 1.0
+    return downscale(rgb, max(16, int(np.ceil(shown * max(rgb.shape[:2])))))
+
+
+def _edges(size: tuple[int, int]) -> np.ndarray:
+    """Return the outer corners of an image, half a pixel beyond the outermost centres; (4, 2)."""
+    right, bottom = size[0] - 0.5, size[1] - 0.5
+    return np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
+
+
+def _depths(size: tuple[int, int], homography: np.ndarray) -> np.ndarray:
+    """Return how far before the camera of the frame the corners of an image lie, (4,).
+
+    For images of equal cameras that only turned it is the cosine of the angle off the axis, but for
+    a factor; below 0 is behind the horizon.
+    """
+    # Matrices are known but for a factor; rotations do not mirror.
+    matrix = homography / np.cbrt(np.linalg.det(homography))
+    return _edges(size) @ matrix[2, :2] + matrix[2, 2]
