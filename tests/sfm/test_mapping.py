@@ -166,5 +166,6 @@ def test_all_poses_at_once_and_the_smaller_scene_apart(tmp_path: Path) -> None:
     assert others == [frozenset(f"up{number}.jpg" for number in range(4))]
     steps = np.diff([view.centre for view in views], axis=0)
     np.testing.assert_allclose(steps, np.tile(steps.mean(axis=0), (5, 1)), atol=0.02)
+    assert {view.camera.focal_px for view in views} == {(500, 500)}  # known, so it stays
     pointing = views[0].rotation @ (views[-1].centre - views[0].centre)
     np.testing.assert_allclose(pointing / np.linalg.norm(pointing), [1, 0, 0], atol=0.02)

@@ -28,9 +28,11 @@ from ..io.image_file import MAX_MEGAPIXELS, read_with, reading_options
 from ._app import MORE
 from ._app import NOTHING_FOUND as NOTHING_FOUND
 
-CELL_WIDTH, LINE_WIDTH = 18, 80
-"""Characters of a cell of a table, at least, and of a list in it: the items of a longer one stand
-below each other."""
+CELL_WIDTH = 18
+"""Least characters of a cell of a table."""
+
+LIST_WIDTH = 80
+"""Most characters of a list in one line."""
 
 ALIASES = {"max_keypoints": ("--num-keypoints", "--top-k", "--max-num-keypoints")}
 
@@ -284,9 +286,12 @@ def note(text: str) -> None:
 def headed(sentence: str, values: Mapping[str, Any], names: str) -> str:
     """Return what was found in a sentence, and the few values that are named in a table below it.
 
-    Times of stages are added up.
+    Times of stages are added up; the items of a long list stand below each other.
     """
     shown = {name: values.get(name) for name in names.split()}
+    for name, value in shown.items():
+        if isinstance(value, list) and sum(len(str(each)) for each in value) > LIST_WIDTH:
+            shown[name] = ("\n" + (CELL_WIDTH + 2) * " ").join(map(str, value))
     if isinstance(seconds := shown.get("seconds"), Mapping):
         shown["seconds"] = sum(seconds.values())
     return table(shown, title=sentence)
@@ -298,9 +303,7 @@ def table(*columns: Mapping[str, Any], title: str = "") -> str:
     names = dict.fromkeys(name for column in texts for name in column)
     width = max(map(len, names), default=0)
     rows = [[f"  {name:<{width}}", *(column.get(name, "-") for column in texts)] for name in names]
-    below = "\n" + (max(CELL_WIDTH, width + 2) + 2) * " "
     lines = ["  ".join(f"{text:<{CELL_WIDTH}}" for text in row).rstrip() for row in rows]
-    lines = [line.replace("\n", below) for line in lines]
     return "\n".join([title, *lines] if title else lines)
 
 
@@ -313,9 +316,7 @@ def _table_rows(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[s
             yield from _table_rows(value, f"{title}: ")
         elif isinstance(value, (list, tuple)):
             if value and not any(isinstance(each, (list, tuple, Mapping)) for each in value):
-                texts = [*map(_text, value)]
-                line = ", ".join(texts)
-                yield title, line if len(line) <= LINE_WIDTH else "\n".join(texts)
+                yield title, ", ".join(map(_text, value))
         elif value is not None:
             yield title, _text(value)
 

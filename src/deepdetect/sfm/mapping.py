@@ -29,9 +29,9 @@ some 20 of 8,192 keypoints agree by chance, and wrong pairs make the mapping ten
 MAX_VERIFICATION_ERROR_PX = 4.0
 """Of a match that agrees."""
 
-MAX_TRIALS = 2500
-"""Of a pair's random samples. COLMAP's 10,000, which only pairs of different places reach, take
-twice the time of the mapping where many are compared, and find nothing else but chance."""
+MAX_TRIALS = 5000
+"""Of a pair's random samples. COLMAP's 10,000, which few but pairs of different places reach, take
+more time than the mapping where many are compared."""
 
 MIN_VIEWS = 3
 """Of a model; smaller ones are given up."""

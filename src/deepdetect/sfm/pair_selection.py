@@ -23,6 +23,9 @@ WORDS = 64
 SIMILAR = 20
 """Most similar images that each one is matched with."""
 
+MIN_MATCHED = 0.5
+"""Of the keypoints of the image with fewer, matches by which images are said to show the same."""
+
 KMEANS_ITERATIONS = 10
 MAX_TRAINING_DESCRIPTORS = 50_000
 
@@ -48,25 +51,40 @@ def largest_component(pairs: Sequence[Pair]) -> int:
     return max(map(len, components), default=0)
 
 
-def thin_out(
-    names: Sequence[str], motions: Mapping[Pair, float], min_motion: float
-) -> dict[str, str]:
-    """Return images that moved less than this from one before them, and the name of that one.
+def motion(first: np.ndarray, second: np.ndarray, matches: np.ndarray) -> float:
+    """Return how far most matched keypoints are from their partners, in pixels; infinite in doubt.
 
-    Images that are left out do not count.
+    Keypoints are (N, 2) and (M, 2) pixels of two images, matches (K, 2) rows of both. Few of them
+    may be of what stands still in the frame, as a bonnet or a time that is shown.
+    """
+    if len(matches) < MIN_MATCHED * min(len(first), len(second)):
+        return np.inf
+    return float(np.median(np.linalg.norm(second[matches[:, 1]] - first[matches[:, 0]], axis=1)))
+
+
+def thin_out(
+    names: Sequence[str], near: Mapping[Pair, float], dropped: Mapping[str, str] = {}
+) -> dict[str, str]:
+    """Leave out images that are near to one before them that is kept, and return that one, too.
+
+    Args:
+        names: in their order.
+        near: pairs that are too near to each other, with their distance.
+        dropped: what was left out before; what it is near to is kept.
     """
     partners: dict[str, dict[str, float]] = {name: {} for name in names}
-    for (first, second), motion in motions.items():
-        partners[first][second] = partners[second][first] = motion
+    for (first, second), distance in near.items():
+        partners[first][second] = partners[second][first] = distance
+    needed = {*dropped.values()}
     kept: dict[str, None] = {}
-    dropped = {}
+    found = {}
     for name in names:
-        nearest = min(partners[name].keys() & kept, key=partners[name].__getitem__, default=None)
-        if nearest is not None and partners[name][nearest] < min_motion:
-            dropped[name] = nearest
+        before = kept.keys() & partners[name]
+        if before and name not in needed:
+            found[name] = min(before, key=partners[name].__getitem__)
         else:
             kept[name] = None
-    return dropped
+    return found
 
 
 def vlad_vectors(descriptors: Sequence[np.ndarray], seed: int = 0) -> np.ndarray:

@@ -136,10 +136,12 @@ def reconstruct_many(
         sizes = {name: sizes[name] for name in known}
     with timer.stage("matching"):
         matches, alike = stages.match_images(sizes)
+    for stage in timer.expected.keys() - timer.seconds:
+        timer.expected[stage] *= 1 - len(alike) / len(sizes)
     for name, other in alike.items():
         unregistered[name] = f"it shows nearly the same as {other}"
         del sizes[name]
-    if len(sizes) < MIN_VIEWS:
+    if alike and len(sizes) < MIN_VIEWS:
         raise NoDepthError(f"all images but {len(sizes)} show nearly the same: move the camera")
     intrinsics = initial_intrinsics(folder, sizes, known, focal_px, options.single_camera)
     with timer.stage("mapping"):

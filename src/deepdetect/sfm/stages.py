@@ -59,6 +59,7 @@ from .mapping import (
 from .pair_selection import (
     COMPARED_KEYPOINTS,
     SIMILAR,
+    motion,
     similar_pairs,
     thin_out,
     vlad_vectors,
@@ -85,8 +86,9 @@ class MultiViewOptions:
         pairs: which images are matched: "exhaustive": all; "sequential:10": each with the 10 that
             follow it by name; "similar": the most alike; "auto": all of up to 50, else the most
             alike.
-        min_motion: images from which most matches with one before them are less than this share of
-            the longer side away are left out, as many frames of a video are; None: none is.
+        min_motion: leave out images that show nearly the same as one before them, such as most
+            frames of a video: those in which half of the matched keypoints moved by less than this
+            share of the longer side. None: use all.
         ratio: limit of the ratio test: the best distance must be below this share of the
             second-best. None: as of `match_features`.
         matches: "sparse": of keypoints; "dense": points of the depth maps also become points
@@ -246,14 +248,16 @@ class Stages:
             matches = self.match(self.choose_pairs(names))
             if limit is None:
                 return matches, dropped
-            motions = {}
             with open_hdf5(self.features) as file:
                 xy = {name: file[name]["keypoints"][()] for name in names}
-            for (a, b), rows in matches.items():
-                moved = np.linalg.norm(xy[b][rows[:, 1]] - xy[a][rows[:, 0]], axis=1)
-                motions[a, b] = np.median(moved) / max(sizes[a]) if len(moved) else np.inf
-            # Of those most alike, which are matched, all may be left out: then others are.
-            if not (further := thin_out(names, motions, limit)):
+            motions = {(a, b): motion(xy[a], xy[b], rows) for (a, b), rows in matches.items()}
+            near = {
+                pair: moved
+                for pair, moved in motions.items()
+                if moved < limit * max(sizes[pair[0]]) and sizes[pair[0]] == sizes[pair[1]]
+            }
+            # Those most alike, which are matched, may all be left out: then others are.
+            if not (further := thin_out(names, near, dropped)):
                 return matches, dropped
             dropped |= further
             names = [name for name in names if name not in further]
@@ -315,10 +319,11 @@ class Stages:
             path.unlink()
             write_database(path, images, matches)
             verified = verify_pairs(path, self.seed, self.workers)
-        if options.mapper == "global":
-            model, components = map_globally(database, folder, known, self.seed)
-        else:
-            with progress(len(images), "mapping", "image", self.quiet) as bar:
+        with progress(len(images), "mapping", "image", self.quiet) as bar:
+            if options.mapper == "global":
+                model, components = map_globally(database, folder, known, self.seed)
+                bar.update(len(images))
+            else:
                 model, components = map_images(
                     database,
                     folder,

@@ -32,6 +32,8 @@ def test_the_whole_image_is_within_the_view_and_grey_outside(tilt: float, turn: 
     corners = np.array([[0, 0, 1], [139, 0, 1], [139, 89, 1], [0, 89, 1]]) @ affine.T
     assert (corners > -1).all()
     assert (corners < (width + 0.5, height + 0.5)).all()  # a column less, at the most
+    assert (corners.min(axis=0) < 1).all()  # no room beside it
+    assert (corners.max(axis=0) > (width - 2.5, height - 2.5)).all()
     row, column = np.indices(view.shape)
     back = cv2.invertAffineTransform(affine)
     x, y = back @ np.stack([column.ravel(), row.ravel(), np.ones(view.size)])

@@ -26,6 +26,9 @@ from ...io.image import MINIMUM_SIDE
 BLUR = 0.8
 """Sigma of the blur before an image is shortened, in units of sqrt(tilt^2 - 1)."""
 
+ROUNDING = 1e-9
+"""Pixels: more is no further row or column of a view."""
+
 OUTSIDE: dict[str, Any] = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": 128}
 
 TILT, DIRECTIONS = 4.0, 8
@@ -96,5 +99,5 @@ def _fitting(gray: np.ndarray, linear: np.ndarray) -> tuple[tuple[int, int], np.
     height, width = gray.shape
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) @ linear.T
     low = corners.min(0)
-    columns, rows = np.ceil(corners.max(0) - low - 1e-9).astype(int).clip(1).tolist()
+    columns, rows = np.ceil(corners.max(0) - low - ROUNDING).astype(int).clip(1).tolist()
     return (columns, rows), np.column_stack([linear, -low])
