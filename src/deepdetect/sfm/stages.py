@@ -334,7 +334,7 @@ class Stages:
                     lambda count: bar.update(min(count, len(images) - bar.n)),
                 )
         if refined:
-            refine_tracks(model, folder)
+            refine_tracks(model, folder, self.quiet)
             adjust_refined(model, known)
         else:
             adjust(model, known)

@@ -8,6 +8,7 @@ Motion with Featuremetric Refinement", 2021, align features of a network instead
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._shared.opencv import cv2
-from .._shared.records import file_state
+from .._shared.progress import progress
 from ..geometry.camera import PosedView
 from ..io.image import load_image, luma
 from ..reconstruction.subpixel import align_patches, spread_corners
@@ -51,8 +52,9 @@ MIN_DISTANCE_PX = 3
 MIN_DENSE_VIEWS = 3
 """Of a dense track: two images only agree with themselves."""
 
-CACHED_IMAGES = 8
-"""That are kept in memory: following references share their neighbours."""
+CACHED_IMAGES, CACHED_PIXELS = 8, 1e8
+"""That are kept in memory, of seven bytes each, as many images as fit but at least so many:
+following references share their neighbours."""
 
 
 class Surfaces(NamedTuple):
@@ -66,16 +68,18 @@ class Surfaces(NamedTuple):
     normals: np.ndarray
 
 
-def refine_tracks(model: Any, folder: Path) -> None:
+def refine_tracks(model: Any, folder: Path, quiet: bool = True) -> None:
     """Put refined tracks in place of those of a `pycolmap.Reconstruction`; cameras stay.
 
     Each point keeps the image that sees it from the middle, at a whole pixel, and is aligned in the
-    others of its track. Points have the colour of their pixel.
+    others of its track. Points have the colour of their pixel. `quiet` shows no bar.
     """
     sparse = read_sparse_model(model)
     tracks = _Tracks(sparse, folder)
-    for name, (surfaces, rows) in _central_views(sparse).items():
-        tracks.add(name, surfaces, rows)
+    with progress(len(sparse.images), "aligning tracks", "image", quiet) as bar:
+        for name, (surfaces, rows) in _central_views(sparse).items():
+            tracks.add(name, surfaces, rows)
+            bar.update()
     tracks.write(model)
 
 
@@ -130,11 +134,13 @@ class _Tracks:
         self.count = 0
         none = np.empty(0, np.int64), np.empty((0, 2))
         self.seen = [[none] for _ in self.images]  # rows of points, and pixels, by image
+        largest = max(math.prod(image.intrinsics.size) for image in self.images)
+        self.read = lru_cache(max(CACHED_IMAGES, int(CACHED_PIXELS / largest)))(self._read)
 
     def corners(self, name: str, points: np.ndarray) -> Surfaces:
         """Choose those of the dense points of an image that become tracks."""
         image = self.images[self.numbers[name]]
-        gray = luma(_read(self.folder, image)[0])
+        gray = luma(self.read(image.view.name)[0])
         free = np.ones(gray.shape, np.uint8)
         for _, xy in self.seen[self.numbers[name]]:
             column, row = np.rint(xy).astype(np.int64).T
@@ -174,7 +180,7 @@ class _Tracks:
         self.count += int(kept.sum())
         self.points.append(points[kept])
         column, row = pixels[kept].T
-        self.colors.append(_read(self.folder, self.images[own])[0][row, column])
+        self.colors.append(self.read(name)[0][row, column])
 
     def _aligned(
         self, image: RegisteredImage, other: RegisteredImage, wanted: Surfaces
@@ -201,7 +207,7 @@ class _Tracks:
             & ((start[:, :2] >= 0) & (start[:, :2] < other.intrinsics.size)).all(axis=1)
         )
         xy, converged = align_patches(
-            (_read(self.folder, image)[1], _read(self.folder, other)[1]),
+            (self.read(image.view.name)[1], self.read(other.view.name)[1]),
             pixels[rows],
             np.ascontiguousarray(start[rows, :2]),
             affinities[rows],
@@ -227,14 +233,7 @@ class _Tracks:
             for point, track, color in zip(points, tracks, colors, strict=True):
                 model.add_point3D(point, track, color)
 
-
-def _read(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, np.ndarray]:
-    """Return an image (H, W, 3), and its blurred grey values (H, W) float32."""
-    path = folder / image.view.name
-    return _read_file(path, file_state(path))
-
-
-@lru_cache(maxsize=CACHED_IMAGES)
-def _read_file(path: Path, state: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    rgb = load_image(path, max_megapixels=np.inf)
-    return rgb, cv2.GaussianBlur(luma(rgb).astype(np.float32), (0, 0), BLUR_SIGMA_PX)
+    def _read(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return an image (H, W, 3), and its blurred grey values (H, W) float32."""
+        rgb = load_image(self.folder / name, max_megapixels=np.inf)
+        return rgb, cv2.GaussianBlur(luma(rgb).astype(np.float32), (0, 0), BLUR_SIGMA_PX)
