@@ -9,7 +9,6 @@ Oxford and Middlebury, Strecha's fountain and a KITTI clip.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -70,9 +69,6 @@ ten have one, of facades and photographs in other light none of a hundred."""
 MAX_CROSS_MODAL_LOG10_NFA = -20.0
 """Of what cross-modal descriptors show: they see the edges of small images, too, which lie in the
 same places, so that noise of 160x120 has -7; visible and infrared light have -33 and less."""
-
-MIN_WITHOUT_VIEWS = 20
-"""Matches that agree with a geometry, for it to be taken without those of simulated views."""
 
 MAX_MATCHES_TO_SEARCH = 200
 """With fewer that agree with a fundamental matrix, more are searched for along its lines."""
@@ -274,47 +270,41 @@ def estimate_initial_geometry(
 ) -> InitialGeometry:
     """Estimate the geometry of a pair from its tentative matches, and those of simulated views.
 
-    Views are simulated where the matches alone give nothing, each with `view_keypoints`; with 0
-    none is. The other arguments are those of `choose_model`.
+    Each view has `view_keypoints`; with 0 none is simulated. The other arguments are those of
+    `choose_model`.
     """
     sizes = tentative.views[0].shape[::-1], tentative.views[1].shape[::-1]
     nowhere = np.empty((0, 2))
     nothing = TwoViewModel("none", None, np.zeros(0, bool), float("inf"))
     best = InitialGeometry.of(nothing, nowhere, nowhere, model)
-    views = 0
-    more = _more_and_more_matches(tentative, view_keypoints)
-    for points, ratios, views, ratio in ((*each, ratio) for each in more for ratio in MAX_RATIOS):
+    points, ratios, views = tentative.matched, tentative.ratios, 0
+    if view_keypoints:
+        points, ratios, views = _matches_of_views(tentative, view_keypoints)
+    for ratio in MAX_RATIOS:
         chosen = points[0][ratios < ratio], points[1][ratios < ratio]
         two_view = choose_model(*chosen, sizes, model, seed, semi_calibrated)
         geometry = InitialGeometry.of(two_view, *chosen, model)
         geometry = _with_further_evidence(geometry, chosen[0], tentative)
         if geometry.log10_nfa < best.log10_nfa:
-            best = replace(geometry, num_views=views)
-        enough = views or not view_keypoints or len(best.points0) >= MIN_WITHOUT_VIEWS
-        if best.trusted and enough:
+            best = geometry
+        if best.trusted:
             break
+    best = replace(best, num_views=views)
     if not best.trusted:
-        return replace(best, num_views=views).untrusted()
+        return best.untrusted()
     return _with_further_matches(best, tentative).rescaled(*tentative.scales)
 
 
-def _more_and_more_matches(
+def _matches_of_views(
     tentative: TentativeMatches, view_keypoints: int
-) -> Iterator[tuple[Pair, np.ndarray, int]]:
-    """Yield matched positions, ratios and the number of simulated views."""
-    (points0, points1), ratios = tentative.matched, tentative.ratios
-    yield (points0, points1), ratios, 0
-    if not view_keypoints:
-        return
-    views = 0
+) -> tuple[Pair, np.ndarray, int]:
+    """Return positions and ratios, those of simulated views too, and how many views these are."""
+    found = [(*tentative.matched, tentative.ratios)]
     for side, seen in simulated_views(tentative.views, view_keypoints):
         further = match_sparse(seen, tentative.features[1 - side])
-        points0 = np.concatenate([points0, further[side]])
-        points1 = np.concatenate([points1, further[1 - side]])
-        ratios = np.concatenate([ratios, further[2]])
-        views += 1
-    points0, points1, ratios = separate(points0, points1, ratios)
-    yield (points0, points1), ratios, views
+        found.append((further[side], further[1 - side], further[2]))
+    points0, points1, ratios = separate(*map(np.concatenate, zip(*found, strict=True)))
+    return (points0, points1), ratios, len(found) - 1
 
 
 def _with_further_evidence(
