@@ -148,3 +148,13 @@ def test_a_check_that_fails_is_a_finding(run: Run, monkeypatch: pytest.MonkeyPat
     first, second = json.loads(result.stdout)["findings"]
     assert (first["name"], first["remedy"]) == ("moon", "RuntimeError: dark side")
     assert second["status"] == "ok"
+
+
+def test_long_lines_are_wrapped_and_commands_are_not(run: Run, monkeypatch) -> None:
+    words, command = "every word is kept " * 9, "pip install " + "a-package " * 20
+    findings = [doctor.Finding("one", "ok", words), doctor.Finding("two", "problem", "", command)]
+    monkeypatch.setattr(doctor, "CHECKS", (lambda: iter(findings),))
+    above, _, below = run("doctor").output.partition("what to do\n")
+    assert max(map(len, above.splitlines())) <= 100
+    assert above.split() == ["one", *words.split(), "two", "PROBLEM:"]
+    assert command.strip() in below

@@ -31,8 +31,8 @@ from ._app import NOTHING_FOUND as NOTHING_FOUND
 CELL_WIDTH = 18
 """Least characters of a cell of a table."""
 
-LIST_WIDTH = 80
-"""Most characters of a list in one line."""
+TEXT_WIDTH = 100
+"""Characters of a line of a wrapped table, at most; only words may be longer."""
 
 ALIASES = {"max_keypoints": ("--num-keypoints", "--top-k", "--max-num-keypoints")}
 
@@ -286,25 +286,33 @@ def note(text: str) -> None:
 def headed(sentence: str, values: Mapping[str, Any], names: str) -> str:
     """Return what was found in a sentence, and the few values that are named in a table below it.
 
-    Times of stages are added up; the items of a long list stand below each other.
+    Times of stages are added up.
     """
     shown = {name: values.get(name) for name in names.split()}
-    for name, value in shown.items():
-        if isinstance(value, list) and sum(len(str(each)) for each in value) > LIST_WIDTH:
-            shown[name] = ("\n" + (CELL_WIDTH + 2) * " ").join(map(str, value))
     if isinstance(seconds := shown.get("seconds"), Mapping):
         shown["seconds"] = sum(seconds.values())
-    return table(shown, title=sentence)
+    return table(shown, title=sentence, wrapped=True)
 
 
-def table(*columns: Mapping[str, Any], title: str = "") -> str:
-    """Return names with their value in each column; tables and matrices are left to JSON."""
+def table(*columns: Mapping[str, Any], title: str = "", wrapped: bool = False) -> str:
+    """Return names with their value in each column; tables and matrices are left to JSON.
+
+    Long values of one column are `wrapped`, or left as they are, to be copied.
+    """
     texts = [dict(_table_rows(values)) for values in columns]
     names = dict.fromkeys(name for column in texts for name in column)
     width = max(map(len, names), default=0)
+    indent = max(CELL_WIDTH, width + 2) + 2
     rows = [[f"  {name:<{width}}", *(column.get(name, "-") for column in texts)] for name in names]
+    if wrapped:
+        rows = [[name, _wrapped(text, indent)] for name, text in rows]
     lines = ["  ".join(f"{text:<{CELL_WIDTH}}" for text in row).rstrip() for row in rows]
     return "\n".join([title, *lines] if title else lines)
+
+
+def _wrapped(text: str, indent: int) -> str:
+    lines = textwrap.wrap(text, TEXT_WIDTH - indent, break_long_words=False, break_on_hyphens=False)
+    return ("\n" + indent * " ").join(lines)
 
 
 def _table_rows(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:

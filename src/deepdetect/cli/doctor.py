@@ -72,7 +72,8 @@ def doctor(
     healthy = not any(finding.status == "problem" for finding in findings)
     marks = {"ok": "", "problem": "PROBLEM: ", "missing": "not installed: "}
     remedies = {each.name: each.remedy for each in findings if each.remedy}
-    text = table({each.name: marks[each.status] + each.value for each in findings}) + "\n\n"
+    rows = {each.name: marks[each.status] + each.value for each in findings}
+    text = table(rows, wrapped=True) + "\n\n"
     text += table(remedies, title="what to do") if remedies else "all that is installed works"
     values = {"ok": healthy, "findings": [finding._asdict() for finding in findings]}
     return Result(values, text, exit_code=0 if healthy else 1)
