@@ -36,7 +36,8 @@ def test_stages_take_what_a_few_images_take(
     found = expected_seconds(stages, folder, PointDetector())
     assert found["features"] == pytest.approx(100 * image_s / 2)
     assert found["matching"] == pytest.approx(count * 0.4 / 2)
-    mapping = 100 * forecast.MAPPED_IMAGE_S + count * 8192 * forecast.PAIRED_KEYPOINT_S
+    later = 1 + 100 / forecast.ADJUSTED_IMAGES
+    mapping = 100 * later * forecast.MAPPED_IMAGE_S + count * 8192 * forecast.PAIRED_KEYPOINT_S
     assert found["mapping"] == pytest.approx(2 * mapping)
     assert found["dense points"] == pytest.approx(2 * 50 * forecast.DENSE_MEGAPIXEL_S / 2)
 

@@ -25,10 +25,14 @@ MIN_IMAGES, MEASURED = 10, 3
 UNIQUE_SHARE = 0.6
 """Pairs over `SIMILAR` an image: often both are among the most similar images of the other."""
 
-MEGAPIXEL_S, KEYPOINT_S = 0.26, 2e-5
-MAPPED_IMAGE_S, PAIRED_KEYPOINT_S, DENSE_MEGAPIXEL_S = 1.7, 2.6e-5, 3.1
-"""CPU seconds on one machine, of features, and of mapping and dense points: what the first take on
+MEGAPIXEL_S, KEYPOINT_S = 0.14, 9.5e-6
+MAPPED_IMAGE_S, PAIRED_KEYPOINT_S, DENSE_MEGAPIXEL_S = 0.75, 2.5e-6, 3.1
+"""Seconds on one machine, of features, and of mapping and dense points: what the first take on
 this machine tells what the others will. Mapping differs by a factor of two among scenes."""
+
+ADJUSTED_IMAGES = 250
+"""The more images are mapped already, the longer an adjustment takes: with so many, the mapping of
+an image takes twice as long as the first."""
 
 
 def expected_seconds(stages: Stages, folder: Path, *how: Any) -> dict[str, float]:
@@ -49,10 +53,11 @@ def expected_seconds(stages: Stages, folder: Path, *how: Any) -> dict[str, float
     pairs = count * min(partners, (count - 1) / 2)
     scaled = min(megapixels, MAX_AUTO_PIXELS / 1e6)
     pace = image_s / (scaled * MEGAPIXEL_S + keypoints * KEYPOINT_S)
+    mapped = count * (1 + count / ADJUSTED_IMAGES) * MAPPED_IMAGE_S
     return {
         "features": count * image_s / workers,
         "matching": pairs * pair_s / workers,
-        "mapping": pace * (count * MAPPED_IMAGE_S + pairs * keypoints * PAIRED_KEYPOINT_S),
+        "mapping": pace * (mapped + pairs * keypoints * PAIRED_KEYPOINT_S),
         "dense points": pace * options.dense * count * megapixels * DENSE_MEGAPIXEL_S / workers,
     }
 

@@ -115,12 +115,17 @@ def measure_dense_points(images: Sequence[Path], cameras: Mapping[str, Camera]) 
 
 
 def _agreement(pairs: Sequence[Sequence[np.ndarray]]) -> Row:
-    """Compare two depth maps of each of some views, infinite where they have none."""
+    """Compare two depth maps of each of some views, infinite where they have none.
+
+    Returns nothing where no pixel has two depths.
+    """
     differences = []
     for first, second in pairs:
         both = np.isfinite(first) & np.isfinite(second)
         differences.append(np.abs(first[both] / second[both] - 1))
     difference = np.concatenate(differences)
+    if not len(difference):
+        return {}
     return {
         "halves: median difference": float(np.median(difference)),
         "halves: share apart": float((difference > APART).mean()),
