@@ -218,6 +218,7 @@ class _Tracks:
 
     def write(self, model: Any) -> None:
         """Put the tracks in place of those of a `pycolmap.Reconstruction`."""
+        self.read.cache_clear()  # the adjustment that follows needs the memory
         with quiet_pycolmap() as pycolmap:
             numbers = {image.name: number for number, image in model.images.items()}
             model.delete_all_points2D_and_points3D()
