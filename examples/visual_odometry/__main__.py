@@ -5,8 +5,8 @@
 The folder holds frames, calib.txt or K.txt, and poses.txt as KITTI's odometry benchmark has them.
 All keypoints go the same roads: followed by Lucas-Kanade, or matched by descriptors (learned ones
 of DeepDetect, RootSIFT of SIFT), then `odometry`. The truth is used for one
-number, the scale of each path, and to measure the errors. Errors at the end of one path differ by
-several per cent from one number of keypoints to the next: give several to compare methods.
+number, the scale of each path, and to measure the errors. Errors of one path differ by several per
+cent from one number of keypoints to the next: methods are compared by their means over several.
 """
 
 from __future__ import annotations
@@ -39,9 +39,10 @@ from deepdetect.io.image import luma
 from deepdetect.tracking import TrackedFrame, Tracker, TrackingOptions, point_candidates
 from deepdetect.tracking.tracker import CANDIDATES
 
+NUMBERS = (250, 500, 1000)  # of keypoints; the means are over these
 SEGMENTS_M = (10.0, 20.0, 30.0, 40.0, 50.0)  # KITTI's own, 100 to 800 m, are longer than a clip
 FEATURES = ("DeepDetect", "SIFT", "ORB")
-HEADER = "method and frames              end %    mean %   end °/m    seg. %  seg. °/m     CPU s"
+HEADER = "   end %    mean %   end °/m    seg. %  seg. °/m     CPU s"
 
 
 def trackers(count: int) -> dict[str, Tracker | Matcher]:
@@ -138,6 +139,12 @@ def trajectory_errors(poses: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
     }
 
 
+def print_row(name: str, values: list[float | None]) -> None:
+    """Print one row of the table."""
+    columns = ("        -" if e is None or np.isnan(e) else f"{e:9.4f}" for e in values)
+    print(f"{name:30} {' '.join(columns)}", flush=True)
+
+
 def plot(paths: dict[str, np.ndarray], truth: np.ndarray, file: Path) -> None:
     """Draw trajectories from above against the truth."""
     figure = Figure(figsize=(8, 4), layout="constrained")
@@ -161,15 +168,16 @@ def compare(arguments: argparse.Namespace) -> None:
     camera = Camera((width, height), (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))
     arguments.output.mkdir(parents=True, exist_ok=True)
     numbers, shown = {}, {}
-    print(f"{len(images)} frames\n{HEADER}")
-    several = len(arguments.max_keypoints) > 1
+    print(f"{len(images)} frames\n{'method and frames':30} {HEADER}")
     methods = {
-        f"{name}, {count}" if several else name: tracker
+        (name, count): tracker
         for count in arguments.max_keypoints
         for name, tracker in trackers(count).items()
         if name.partition(",")[0] in arguments.methods
     }
-    for name, tracker in methods.items():
+    whole: dict[str, list[list[float]]] = {}
+    for (method, count), tracker in methods.items():
+        name = f"{method}, {count}"
         odometry = VisualOdometry(camera)
         begun = time.process_time()
         for image in images:
@@ -181,16 +189,19 @@ def compare(arguments: argparse.Namespace) -> None:
             path = f"{name} {frames[0]}-{frames[-1]}"
             shown[path] = errors.pop("centres")
             paths.append({"first": int(frames[0]), "frames": len(frames), **errors})
-            columns = " ".join(
-                f"{e:9.4f}" if e is not None else "        -" for e in errors.values()
-            )
-            print(f"{path:26} {columns} {seconds:9.4f}", flush=True)
+            print_row(path, [*errors.values(), seconds])
+            if len(frames) == len(images):
+                values = [np.nan if e is None else e for e in errors.values()]
+                whole.setdefault(method, []).append([*values, seconds])
             poses = poses.reshape(-1, 12)  # KITTI's format
             np.savetxt(arguments.output / f"{path.lower()}.txt", poses, fmt="%.9e")
         for frame in odometry.lost:
             print(f"{name} was LOST at {frame}: what follows has another scale")
         if not paths:
             print(f"{name}: no path was found")
+    for method, rows in whole.items():
+        if len(rows) == len(arguments.max_keypoints) > 1:
+            print_row(f"{method}, mean", np.mean(rows, axis=0).tolist())
     plot(shown, truth[..., 3], arguments.output / "trajectory.jpg")
     (arguments.output / "errors.json").write_text(json.dumps(numbers, indent=2), encoding="utf-8")
 
@@ -200,8 +211,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("odometry"))
-    default = [TrackingOptions.max_keypoints]
-    parser.add_argument("--max-keypoints", type=int, nargs="+", default=default)
+    parser.add_argument("--max-keypoints", type=int, nargs="+", default=NUMBERS)
     parser.add_argument("--methods", nargs="+", choices=FEATURES, default=FEATURES)
     try:
         compare(parser.parse_args())

@@ -132,7 +132,8 @@ def test_clips_are_whole(shared: Path, tmp_path: Path, clip: str, frames: int, e
     done = run_example(shared / "data" / clip, *words)
     assert done.returncode == 0, done.stderr
     numbers = json.loads((tmp_path / "errors.json").read_text())
-    assert list(numbers) == ["DeepDetect", "SIFT", "DeepDetect, matched", "SIFT, matched"]
+    roads = ("DeepDetect", "SIFT", "DeepDetect, matched", "SIFT, matched")
+    assert list(numbers) == [f"{road}, {count}" for count in (250, 500, 1000) for road in roads]
     for name, method in numbers.items():
         assert method["lost"] == []
         (path,) = method["paths"]
@@ -142,8 +143,11 @@ def test_clips_are_whole(shared: Path, tmp_path: Path, clip: str, frames: int, e
         assert path["end_deg_per_m"] < 0.03
         poses = tmp_path / f"{name.lower()} 0-{frames - 1}.txt"
         assert len(poses.read_text().splitlines()) == frames
-    errors = [numbers[name]["paths"][0]["end_percent"] for name in numbers if "matched" in name]
-    assert errors[0] < 1.05 * errors[1]
+    for error in ("end_percent", "mean_percent", "segment_percent"):
+        paths = [method["paths"][0][error] for method in numbers.values()]
+        ours, sift, ours_matched, sift_matched = np.reshape(paths, (3, 4)).mean(axis=0)
+        assert ours <= sift
+        assert ours_matched <= sift_matched
     assert (tmp_path / "trajectory.jpg").stat().st_size > 10_000
 
 
@@ -169,4 +173,4 @@ def test_black_frames_give_no_path(tmp_path: Path) -> None:
     (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
     done = run_example(tmp_path, "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("no path was found") == 5
+    assert done.stdout.count("no path was found") == 15
