@@ -138,6 +138,18 @@ def test_errors_of_cameras_have_the_size_that_they_were_given() -> None:
     np.testing.assert_allclose(rotations, 0.5, atol=0.05)
 
 
+def test_cameras_on_a_line_have_no_rotations() -> None:
+    rng = np.random.default_rng(2)
+    drive = {
+        f"{k}": posed(f"{k}", turned((0, 0.1 * k, 0)), np.array([0.02 * rng.normal(), 0, k]))
+        for k in range(20)
+    }
+    own = in_another_frame(drive, 0.5)
+    centres, rotations, _ = camera_errors(list(own.values()), list(drive.values()))
+    np.testing.assert_allclose(centres, 0, atol=1e-9)
+    assert np.isnan(rotations).all()
+
+
 def test_pairs_with_a_missing_camera_have_no_pose() -> None:
     truth = cameras(6)
     views = {name: view for name, view in truth.items() if name != "2"}

@@ -14,6 +14,9 @@ from ...geometry.transforms import epipolar_errors
 POSE_THRESHOLDS_DEG = (5.0, 10.0, 20.0)
 """Of the AUC."""
 
+LINE_WIDTH = 0.01
+"""Centres are on a line if their spread beside it is a smaller share of that along it."""
+
 EPIPOLAR_THRESHOLD_PX = 1.0
 """Within which a match agrees with the true pose."""
 
@@ -67,9 +70,9 @@ def camera_errors(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Compare three or more cameras with the true ones, after a rotation, a shift and a scale.
 
-    These bring the centres nearest to the true ones (least squares; Umeyama, 1991); of cameras on a
-    line they leave a rotation open. Returns the distances of the centres in the unit of the truth,
-    the angles of the rotations in degrees, and the scale.
+    These bring the centres nearest to the true ones (least squares; Umeyama, 1991). Returns the
+    distances of the centres in the unit of the truth, the angles of the rotations in degrees, and
+    the scale. Cameras on a line may turn about it: the angles are NaN.
     """
     own = np.array([view.centre for view in views])
     true = np.array([view.centre for view in truth])
@@ -79,11 +82,16 @@ def camera_errors(
     turn = left * signs @ right
     scale = float((values * signs).sum() / ((own - means[0]) ** 2).sum())
     placed = scale * (own - means[0]) @ turn.T + means[1]
-    angles = [
-        rotation_error(view.rotation @ turn.T, other.rotation)
-        for view, other in zip(views, truth, strict=True)
-    ]
-    return np.linalg.norm(placed - true, axis=1), np.array(angles), scale
+    angles = np.array(
+        [
+            rotation_error(view.rotation @ turn.T, other.rotation)
+            for view, other in zip(views, truth, strict=True)
+        ]
+    )
+    along, beside, _ = np.linalg.svd(true - means[1], compute_uv=False)
+    if beside < LINE_WIDTH * along:
+        angles[:] = np.nan
+    return np.linalg.norm(placed - true, axis=1), angles, scale
 
 
 def relative_pose_errors(

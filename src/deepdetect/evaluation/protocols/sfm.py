@@ -98,9 +98,10 @@ CAMERA_NOTE = (
     "registered. Centres and rotations: mean errors of the registered cameras after the alignment "
     "of their centres; extent: the largest distance of two true cameras. From the first row's: "
     "mean distance of the centres from the first method's; where that is much less than the errors "
-    "of both, these are the truth's, or common to both. Of cameras on a straight line the "
-    "alignment leaves a rotation open: take the AUC. Track length: mean number of images that see "
-    "a point. Reprojection error: mean over the method's own points, so no error of the cameras."
+    "of both, these are the truth's, or common to both. Cameras on a straight line may "
+    "turn about it, so they have no rotations there: take the AUC. Track length: mean number of "
+    "images that see a point. Reprojection error: mean over the method's own points, so no error of "
+    "the cameras."
 )
 
 COST_NOTE = (
