@@ -100,8 +100,8 @@ CAMERA_NOTE = (
     "mean distance of the centres from the first method's; where that is much less than the errors "
     "of both, these are the truth's, or common to both. Cameras on a straight line may "
     "turn about it, so they have no rotations there: take the AUC. Track length: mean number of "
-    "images that see a point. Reprojection error: mean over the method's own points, so no error of "
-    "the cameras."
+    "images that see a point. Reprojection error: mean over the method's own points, so no error "
+    "of the cameras."
 )
 
 COST_NOTE = (
