@@ -262,7 +262,7 @@ RESULTS = {
         {
             "keypoints": ("keypoints", ""),
             "keypoints and matches, CPU s": ("keypoints and matches, CPU s", ".1f"),
-            "mapping, CPU s": ("mapping, true intrinsics, CPU s", ".1f"),
+            "mapping, CPU s": ("mapping, estimated intrinsics, CPU s", ".1f"),
             "MB": ("memory, MB", ".0f"),
         },
     ),

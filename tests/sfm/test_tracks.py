@@ -97,6 +97,20 @@ def test_dense_points_become_tracks_that_images_share(model, folder: Path) -> No
     assert len(sparse.points) < 2 * len(sparse.images["0.png"].points)
 
 
+def test_tracks_stay_where_there_are_no_dense_points(model, folder: Path) -> None:
+    before = read_sparse_model(model)
+    own = VIEWS[0]
+    y, x = np.mgrid[20:220:2, 20:150:2]
+    found = np.zeros(x.size, DENSE_POINT)
+    found["points"] = on_plane(own, np.column_stack([x.ravel(), y.ravel()]).astype(float))
+    found["normals"] = -NORMAL / np.linalg.norm(NORMAL)
+    add_dense_tracks(model, folder, [(own, found)])
+    after = read_sparse_model(model)
+    covered, covered_before = (each.images["0.png"].xy[:, 0] < 150 for each in (after, before))
+    assert covered.sum() > 3 * covered_before.sum()
+    assert (~covered).sum() > 0.8 * (~covered_before).sum()
+
+
 def distances(sparse) -> float:
     """Return how far, in pixels, the points of the plane lie apart that images of a track see."""
     middles, seen = np.zeros_like(sparse.points), []

@@ -86,14 +86,19 @@ def refine_tracks(model: Any, folder: Path, quiet: bool = True) -> None:
 def add_dense_tracks(
     model: Any, folder: Path, fused: Iterable[tuple[PosedView, np.ndarray]]
 ) -> None:
-    """Put tracks of `DENSE_POINT`, with the view that they are seen from, in place of a model's.
+    """Add tracks of `DENSE_POINT`, with the view that they are seen from, to those of a model.
 
     An image gives the best corner in each cell of a grid, where tracks of earlier images have
-    none: what all of them show is matched from one image only.
+    none: what all of them show is matched from one image only. The model's own tracks, which are
+    shorter, stay where no other is near.
     """
-    tracks = _Tracks(read_sparse_model(model), folder)
+    sparse = read_sparse_model(model)
+    tracks = _Tracks(sparse, folder)
     for view, points in fused:
         tracks.add(view.name, tracks.corners(view.name, points), min_views=MIN_DENSE_VIEWS)
+    for name, (surfaces, rows) in _central_views(sparse).items():
+        free = tracks.free(name, surfaces.pixels)
+        tracks.add(name, Surfaces(*(each[free] for each in surfaces)), rows[free])
     tracks.write(model)
 
 
@@ -140,18 +145,22 @@ class _Tracks:
     def corners(self, name: str, points: np.ndarray) -> Surfaces:
         """Choose those of the dense points of an image that become tracks."""
         image = self.images[self.numbers[name]]
-        gray = luma(self.read(image.view.name)[0])
-        free = np.ones(gray.shape, np.uint8)
-        for _, xy in self.seen[self.numbers[name]]:
+        xy = image.intrinsics.from_pinhole(image.view.project(points["points"])[0])
+        pixels = np.rint(xy).astype(np.int64).clip(0, np.array(image.intrinsics.size) - 1)
+        rows = self.free(name, pixels)
+        rows = rows[spread_corners(luma(self.read(name)[0]), pixels[rows], DENSE_CELLS)]
+        places, normals = (points[kind][rows].astype(np.float64) for kind in ("points", "normals"))
+        return Surfaces(pixels[rows], places, normals)
+
+    def free(self, name: str, pixels: np.ndarray) -> np.ndarray:
+        """Return rows of (K, 2) pixels of an image that are not near its tracks."""
+        number = self.numbers[name]
+        free = np.ones(self.images[number].intrinsics.size[::-1], np.uint8)
+        for _, xy in self.seen[number]:
             column, row = np.rint(xy).astype(np.int64).T
             free[row, column] = 0
         free = cv2.erode(free, np.ones((2 * MIN_DISTANCE_PX + 1,) * 2, np.uint8))
-        xy = image.intrinsics.from_pinhole(image.view.project(points["points"])[0])
-        pixels = np.rint(xy).astype(np.int64).clip(0, np.array(image.intrinsics.size) - 1)
-        open_ = np.flatnonzero(free[pixels[:, 1], pixels[:, 0]])
-        rows = open_[spread_corners(gray, pixels[open_], DENSE_CELLS)]
-        places, normals = (points[kind][rows].astype(np.float64) for kind in ("points", "normals"))
-        return Surfaces(pixels[rows], places, normals)
+        return np.flatnonzero(free[pixels[:, 1], pixels[:, 0]])
 
     def add(
         self, name: str, wanted: Surfaces, tracks: np.ndarray | None = None, min_views: int = 2

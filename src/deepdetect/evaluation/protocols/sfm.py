@@ -414,11 +414,13 @@ def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, 
         }
         for kind, known in zip(KINDS, (cameras, {}), strict=True):
             intrinsics = initial_intrinsics(folder, sizes, known)
-            cpu, model = time.process_time(), None
+            model, seconds = None, np.nan
             if known or kind == "estimated":
+                cpu = time.process_time()
                 with contextlib.suppress(NoDepthError):  # none is a result, too
                     model = stages.map(folder, intrinsics, matches, bool(known), method.refined)[0]
-            row[MAPPING_CPU.format(kind)] = time.process_time() - cpu
+                seconds = time.process_time() - cpu
+            row[MAPPING_CPU.format(kind)] = seconds
             row |= {f"{kind} {name}": value for name, value in _unpacked(model).items()}
         return row | {"memory, MB": peak_memory() / 1e6}
 
@@ -432,15 +434,17 @@ def _unpacked(model: Any) -> Row:
 
     The "names" and (N, 12) "poses" (rotation, translation) of its images, and `MODEL_COLUMNS`.
     """
+    columns: Row = {**dict.fromkeys(MODEL_COLUMNS, np.nan), "sparse points": 0}
     if model is None:
-        nothing = {"names": np.empty(0, np.str_), "poses": np.empty((0, 12))}
-        return {**nothing, **dict.fromkeys(MODEL_COLUMNS, np.nan), "sparse points": 0}
+        return {"names": np.empty(0, np.str_), "poses": np.empty((0, 12)), **columns}
     sparse = read_sparse_model(model)
     views = sorted(sparse.views.values(), key=lambda view: view.name)
+    if len(sparse.points):
+        columns["sparse points"] = len(sparse.points)
+        columns["track length"] = sparse.tracks.mean()
+        columns["reprojection error, px"] = sparse.errors.mean()
     return {
         "names": [view.name for view in views],
         "poses": [[*view.rotation.ravel(), *np.ravel(view.translation)] for view in views],
-        "sparse points": len(sparse.points),
-        "track length": sparse.tracks.mean(),
-        "reprojection error, px": sparse.errors.mean(),
+        **columns,
     }
