@@ -262,7 +262,7 @@ RESULTS = {
         {
             "keypoints": ("keypoints", ""),
             "keypoints and matches, CPU s": ("keypoints and matches, CPU s", ".1f"),
-            "mapping, CPU s": ("mapping, estimated intrinsics, CPU s", ".1f"),
+            "mapping, intrinsics estimated, CPU s": ("mapping, estimated intrinsics, CPU s", ".1f"),
             "MB": ("memory, MB", ".0f"),
         },
     ),
@@ -488,7 +488,7 @@ def cell(place: str) -> str:
         ]
         best = max(known, key=lambda line: float(line[k] or 0))
         return f"{best[k]} ({best[0]})"
-    return next(x[k] for x in lines if row in (x[0], ", ".join(x[:2])))
+    return next(x[k] or "–" for x in lines if row in (x[0], ", ".join(x[:2])))
 
 
 if __name__ == "__main__":

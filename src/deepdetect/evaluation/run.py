@@ -37,7 +37,7 @@ STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
     "repeatability_mutual_nn": (1, ("keypoints",)),
     "corner_errors": (1, ("matches",)),
     "pose": (8, ("matches", "guided")),
-    "sfm": (2, ()),
+    "sfm": (3, ()),
 }
 """Version of each stage, and the stages it is made from.
 

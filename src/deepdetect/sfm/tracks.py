@@ -47,7 +47,7 @@ DENSE_CELLS = 4500
 """Of an image, for dense tracks: as many corners at most."""
 
 MIN_DISTANCE_PX = 3
-"""From a corner to tracks that its image is part of already."""
+"""From a new track to those that its image is part of already."""
 
 MIN_DENSE_VIEWS = 3
 """Of a dense track: two images only agree with themselves."""
@@ -90,15 +90,17 @@ def add_dense_tracks(
 
     An image gives the best corner in each cell of a grid, where tracks of earlier images have
     none: what all of them show is matched from one image only. The model's own tracks, which are
-    shorter, stay where no other is near.
+    shorter, are aligned again where no other is near.
     """
     sparse = read_sparse_model(model)
     tracks = _Tracks(sparse, folder)
     for view, points in fused:
         tracks.add(view.name, tracks.corners(view.name, points), min_views=MIN_DENSE_VIEWS)
-    for name, (surfaces, rows) in _central_views(sparse).items():
-        free = tracks.free(name, surfaces.pixels)
-        tracks.add(name, Surfaces(*(each[free] for each in surfaces)), rows[free])
+    central = _central_views(sparse)
+    free = {name: tracks.free(name, surfaces.pixels) for name, (surfaces, _) in central.items()}
+    for name, (surfaces, rows) in central.items():
+        left = Surfaces(*(each[free[name]] for each in surfaces))
+        tracks.add(name, left, rows[free[name]])
     tracks.write(model)
 
 
@@ -178,6 +180,8 @@ class _Tracks:
             rows = np.arange(len(pixels))
             if tracks is not None:
                 rows = rows[np.isin(tracks, self.images[k].points)]
+            if not len(rows):
+                continue
             some = Surfaces(*(each[rows] for each in wanted))
             at, xy = self._aligned(self.images[own], self.images[k], some)
             found.append((k, rows[at], xy))

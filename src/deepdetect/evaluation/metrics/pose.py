@@ -15,7 +15,7 @@ POSE_THRESHOLDS_DEG = (5.0, 10.0, 20.0)
 """Of the AUC."""
 
 LINE_WIDTH = 0.01
-"""Centres are on a line if their spread beside it is a smaller share of that along it."""
+"""Of the spread of centres along a line: with less across it, they are on it."""
 
 EPIPOLAR_THRESHOLD_PX = 1.0
 """Within which a match agrees with the true pose."""
@@ -72,7 +72,7 @@ def camera_errors(
 
     These bring the centres nearest to the true ones (least squares; Umeyama, 1991). Returns the
     distances of the centres in the unit of the truth, the angles of the rotations in degrees, and
-    the scale. Cameras on a line may turn about it: the angles are NaN.
+    the scale. Centres on a line leave the rotation about it open: the angles are NaN.
     """
     own = np.array([view.centre for view in views])
     true = np.array([view.centre for view in truth])
@@ -88,8 +88,8 @@ def camera_errors(
             for view, other in zip(views, truth, strict=True)
         ]
     )
-    along, beside, _ = np.linalg.svd(true - means[1], compute_uv=False)
-    if beside < LINE_WIDTH * along:
+    along, across, _ = np.linalg.svd(true - means[1], compute_uv=False)
+    if across <= LINE_WIDTH * along:
         angles[:] = np.nan
     return np.linalg.norm(placed - true, axis=1), angles, scale
 

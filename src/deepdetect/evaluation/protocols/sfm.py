@@ -98,10 +98,10 @@ CAMERA_NOTE = (
     "registered. Centres and rotations: mean errors of the registered cameras after the alignment "
     "of their centres; extent: the largest distance of two true cameras. From the first row's: "
     "mean distance of the centres from the first method's; where that is much less than the errors "
-    "of both, these are the truth's, or common to both. Cameras on a straight line may "
-    "turn about it, so they have no rotations there: take the AUC. Track length: mean number of "
-    "images that see a point. Reprojection error: mean over the method's own points, so no error "
-    "of the cameras."
+    "of both, these are the truth's, or common to both. The alignment leaves the rotation "
+    "about a straight line of cameras open, so these have no rotations: take the AUC. Track "
+    "length: mean number of images that see a point. Reprojection error: mean over the method's "
+    "own points, so no error of the cameras."
 )
 
 COST_NOTE = (
@@ -302,7 +302,7 @@ def image_table(rows: Rows) -> Table:
                 cells = row["scene"].name, row["method"], kind, image
                 cells += errors.get(image, (None, None))
                 lines.append(dict(zip(IMAGE_COLUMNS, cells, strict=True)))
-    note = "After the alignment of all centres; a dash: the image is not registered."
+    note = "After the alignment of all centres; a dash: not registered, or not known."
     return Table("sfm_images", "All images", IMAGE_COLUMNS, lines, note, in_text=False)
 
 
