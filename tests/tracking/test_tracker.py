@@ -32,6 +32,26 @@ def test_tracks_move_as_the_photograph_does(moving_photo) -> None:
     np.testing.assert_array_equal(last.scores, first.scores[rows])
 
 
+@pytest.mark.parametrize("kind", ["nearer", "turn"])
+def test_errors_do_not_add_up(photo, kind) -> None:
+    """Known answer: the camera turns by 1.5 degrees or comes nearer by 2 % a frame, with noise."""
+    rng, size = np.random.default_rng(0), photo.shape[1]
+    middle = (size - 1) / 2, (size - 1) / 2
+    tracker = Tracker(grid_keypoints, TrackingOptions(detect_every=99, min_kept=0))
+    frames = []
+    for k in range(21):
+        angle, scale = (1.5 * k, 1) if kind == "turn" else (0, 1.02**k)
+        motion = cv2.getRotationMatrix2D(middle, angle, scale)
+        seen = cv2.warpAffine(photo, motion, (size, size), flags=cv2.INTER_CUBIC)
+        seen = np.clip(seen + rng.normal(0, 3, seen.shape), 0, 255).round().astype(np.uint8)
+        frames.append(tracker.update(seen))
+    first, last = frames[0], frames[-1]
+    true = cv2.transform(first.xy[last.tracks][None], motion)[0]
+    errors = np.linalg.norm(last.xy - true, axis=1)
+    assert len(last) > 0.3 * len(first)
+    assert np.median(errors) < 0.25  # only followed from frame to frame: 2.2
+
+
 def test_positions_agree_with_another_implementation(moving_photo) -> None:
     """Template matching of whole patches finds the same places."""
     tracker = Tracker(grid_keypoints, TrackingOptions(detect_every=99, min_kept=0))

@@ -2,6 +2,8 @@
 
 Lucas and Kanade, "An iterative image registration technique", 1981; Bouguet's pyramid; tracks that
 do not come back to where they started are dropped (Kalal et al., "Forward-backward error", 2010).
+So that errors do not add up, each point is then put where its first patch fits best, as the surface
+has turned and come nearer since (Shi and Tomasi, "Good features to track", 1994).
 Where a cell of the image has no track, the best keypoint of that cell begins one.
 """
 
@@ -20,6 +22,7 @@ from .._shared.options import check_ranges, suggest_keywords
 from ..features.keypoints import Keypoints
 from ..geometry.images import track_round_trip
 from ..io.image import load_image, luma
+from .alignment import Patches, cut_patches, find_patches, smooth
 from .tracks import TrackedFrame
 
 Detect = Callable[[np.ndarray], Keypoints]
@@ -99,6 +102,7 @@ class Tracker:
             "scores": np.empty(0, np.float32),
             "ages": np.empty(0, np.int64),
         }
+        self._patches = Patches.none()
 
     @suggest_keywords
     def update(
@@ -125,13 +129,15 @@ class Tracker:
                     f"{before_width}x{before_height}: use a tracker for each size"
                 )
             self._follow(self._gray, gray)
+        image = smooth(gray)
+        self._return_to_patches(image)
         count = len(self._points["xy"])
         if (
             not count
             or self._since_detection >= options.detect_every
             or count < options.min_kept * self._most
         ):
-            self._add(self.detect(rgb))
+            self._add(self.detect(rgb), image)
             self._most = len(self._points["xy"])
             self._since_detection = 0
         self._since_detection += 1
@@ -158,8 +164,20 @@ class Tracker:
         )
         self._points["xy"] = there
         self._points = {name: values[kept] for name, values in self._points.items()}
+        self._patches = self._patches.select(kept)
 
-    def _add(self, keypoints: Keypoints) -> None:
+    def _return_to_patches(self, image: np.ndarray) -> None:
+        """Move the points to where their first patches fit; take new patches where none does."""
+        xy = self._points["xy"]
+        places, affinities, found = find_patches(image, self._patches, xy)
+        xy[found] = places[found]
+        self._patches = self._patches._replace(affinities=affinities)
+        if not found.all():
+            new = cut_patches(image, xy[~found])
+            for values, others in zip(self._patches, new, strict=True):
+                values[~found] = others
+
+    def _add(self, keypoints: Keypoints, image: np.ndarray) -> None:
         """Begin tracks with the best keypoints that are far enough from all tracks."""
         xy = self._points["xy"]
         rows = free_keypoints(keypoints, xy, MIN_DISTANCE_PX, self.options.max_keypoints - len(xy))
@@ -172,6 +190,9 @@ class Tracker:
         self._next_track += len(rows)
         for name, values in self._points.items():
             self._points[name] = np.concatenate([values, new[name]])
+        if len(rows):
+            patches = zip(self._patches, cut_patches(image, new["xy"]), strict=True)
+            self._patches = Patches(*map(np.concatenate, patches))
 
 
 def free_keypoints(

@@ -1,0 +1,143 @@
+"""Patches of an image found again in later ones by Gauss-Newton, with their affine deformation.
+
+Baker and Matthews, "Lucas-Kanade 20 years on", 2004 (inverse compositional: all but the residuals
+is computed once for each patch); gain and offset of the light drop out of the equations.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from .._shared.opencv import cv2
+
+RADIUS_PX = 10
+"""Of a patch; its middle counts most."""
+
+BLUR_SIGMA_PX = 1.0
+"""Of images before their patches are read: what lies between pixels is then well defined."""
+
+MAX_ITERATIONS = 30
+CONVERGENCE_PX = 0.01
+"""A patch that moves by less has arrived."""
+
+MAX_SHIFT_PX = 3.0
+"""From where a patch is expected; translation alone is off by this on surfaces that come nearer."""
+
+MIN_CORRELATION = 0.8
+"""Of a patch that is found."""
+
+MAX_GROWTH = 4.0
+"""Of the area of a patch: beyond it, too few of its pixels are seen in one of the images."""
+
+RIDGE = 1e-4
+"""Added to the equations, as a share of their size: patches of parallel edges can be solved."""
+
+OFFSETS = np.indices((2 * RADIUS_PX + 1,) * 2, np.float32)[::-1].reshape(2, -1) - RADIUS_PX
+WINDOW = np.exp(-2 * (OFFSETS**2).sum(axis=0) / RADIUS_PX**2)
+WINDOW /= WINDOW.sum()
+
+MOST_READ = 1 << 14
+"""Patches that are read at once: OpenCV's limit for the sides of an image is 32,767."""
+
+
+class Patches(NamedTuple):
+    """Patches of P pixels: float32 values (N, P), step for each residual (N, 6, P), variance (N,).
+
+    Steps are those of the place and of the deformation, row by row. `affinities` (N, 2, 2) float64
+    map offsets of pixels in the patches to offsets in the image in which they were found last.
+    """
+
+    values: np.ndarray
+    steps: np.ndarray
+    variances: np.ndarray
+    affinities: np.ndarray
+
+    @classmethod
+    def none(cls) -> Patches:
+        """Return no patches."""
+        values = np.empty((0, OFFSETS.shape[1]), np.float32)
+        steps = np.empty((0, 6, OFFSETS.shape[1]), np.float32)
+        return cls(values, steps, np.empty(0, np.float32), np.empty((0, 2, 2)))
+
+    def select(self, rows: np.ndarray) -> Patches:
+        """Return some of the patches, by a mask or by rows."""
+        return Patches(*(each[rows] for each in self))
+
+
+def smooth(gray: np.ndarray) -> np.ndarray:
+    """Return the (H, W) float32 image that patches are read from."""
+    return cv2.GaussianBlur(gray.astype(np.float32), (0, 0), BLUR_SIGMA_PX)
+
+
+def cut_patches(image: np.ndarray, xy: np.ndarray) -> Patches:
+    """Return the patches around (N, 2) points of a `smooth` image."""
+    affinities = np.tile(np.eye(2), (len(xy), 1, 1))
+    slopes = [
+        _read(cv2.Sobel(image, cv2.CV_32F, *axis, ksize=1, scale=0.5), xy, affinities)
+        for axis in ((1, 0), (0, 1))
+    ]
+    slope = np.stack(slopes, axis=1)
+    deformation = (slope[:, :, None] * OFFSETS).reshape(len(xy), 4, -1)
+    changes = _centred(np.concatenate([slope, deformation], axis=1))
+    values = _centred(_read(image, xy, affinities))
+    variances = np.maximum((values**2) @ WINDOW, 1e-6)
+    by_gain = changes @ (values * WINDOW)[..., None] / variances[:, None, None]
+    changes -= by_gain * values[:, None]
+    weighted = changes * WINDOW
+    normal = weighted @ changes.transpose(0, 2, 1)
+    scale = np.trace(normal[:, :2, :2], axis1=1, axis2=2) + 1e-6
+    ridge = RIDGE * np.diag([1.0] * 2 + [WINDOW @ OFFSETS[0] ** 2] * 4)
+    normal += scale[:, None, None] * ridge
+    steps = np.linalg.inv(normal).astype(np.float32) @ weighted
+    return Patches(values, steps, variances, affinities)
+
+
+def find_patches(
+    image: np.ndarray, patches: Patches, xy: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find patches in a `smooth` image near (N, 2) expected positions.
+
+    Returns (N, 2) positions and (N, 2, 2) affinities, float64, and (N,) whether each was found; the
+    others have no meaning.
+    """
+    found, affinities = xy.astype(np.float64), patches.affinities.copy()
+    arrived = np.zeros(len(xy), bool)
+    rows = np.arange(len(xy))
+    most = np.array(image.shape[::-1]) - 1
+    for _ in range(MAX_ITERATIONS):
+        spread = RADIUS_PX * np.abs(affinities[rows]).sum(axis=2)
+        rows = rows[((found[rows] >= spread) & (found[rows] <= most - spread)).all(axis=1)]
+        if not len(rows):
+            break
+        values, steps, variances, _ = patches.select(rows)
+        seen = _centred(_read(image, found[rows], affinities[rows]))
+        shared = (seen * values) @ WINDOW
+        correlation = shared / np.sqrt(np.maximum((seen**2) @ WINDOW, 1e-6) * variances)
+        step = (steps @ seen[..., None])[..., 0] * (variances / np.maximum(shared, 1e-6))[:, None]
+        deformed = np.eye(2) + step[:, 2:].reshape(-1, 2, 2)
+        regular = (shared > 0) & (np.linalg.det(deformed) > 1 / MAX_GROWTH)
+        rows, step, correlation = rows[regular], step[regular], correlation[regular]
+        affinities[rows] @= np.linalg.inv(deformed[regular])
+        found[rows] -= (affinities[rows] @ step[:, :2, None])[..., 0]
+        near = np.linalg.norm(found[rows] - xy[rows], axis=1) <= MAX_SHIFT_PX
+        still = np.linalg.norm(step[:, :2], axis=1) < CONVERGENCE_PX
+        arrived[rows[near & still & (correlation >= MIN_CORRELATION)]] = True
+        rows = rows[near & ~still]
+    growth = np.linalg.det(affinities)
+    return found, affinities, arrived & (growth > 1 / MAX_GROWTH) & (growth < MAX_GROWTH)
+
+
+def _read(image: np.ndarray, xy: np.ndarray, affinities: np.ndarray) -> np.ndarray:
+    """Return the (N, P) values of an image around points, where the affinities put the pixels."""
+    places = xy.astype(np.float32)[:, :, None] + affinities.astype(np.float32) @ OFFSETS
+    parts = np.array_split(places, len(places) // MOST_READ + 1)
+    return np.concatenate(
+        [cv2.remap(image, *part.transpose(1, 0, 2), cv2.INTER_CUBIC) for part in parts]
+    )
+
+
+def _centred(values: np.ndarray) -> np.ndarray:
+    """Subtract the weighted mean of each patch."""
+    return values - (values @ WINDOW)[..., None]
