@@ -25,7 +25,7 @@ from deepdetect.sfm.colmap import CameraIntrinsics, write_database
 from deepdetect.sfm.mapping import adjust, map_globally, map_images, read_sparse_model, verify_pairs
 from deepdetect.sfm.pair_selection import SIMILAR
 
-COUNTS = (60, 120, 250, 500)
+COUNTS = (60, 120, 250, 500, 1000)
 SIZE, FOCAL_PX, WRONG_FOCAL = (640, 480), 600.0, 1.03
 STEP, APART = 0.3 * SIZE[1], 0.4 * SIZE[0]
 """Between images of a line, and between lines, in pixels of an image on the ground."""
