@@ -52,6 +52,19 @@ def test_errors_do_not_add_up(photo, kind) -> None:
     assert np.median(errors) < 0.25  # only followed from frame to frame: 2.2
 
 
+def test_points_that_come_from_the_border_are_not_moved_off(moving_photo) -> None:
+    """Known answer: two pixels a frame. Their first patches would reach over the border."""
+    frames = [moving_photo(k, (-2, 0)) for k in range(-60, -56)]
+    near = np.zeros((240, 320), np.uint8)
+    near[15:-15, 3:9] = 1
+    corners = cv2.goodFeaturesToTrack(luma(frames[0]), 100, 0.01, 8, mask=near).reshape(-1, 2)
+    found = Keypoints(corners, np.ones(len(corners)), (320, 240))
+    tracker = Tracker(lambda rgb: found, TrackingOptions(detect_every=99, min_kept=0))
+    first, *_, last = [tracker.update(frame) for frame in frames]
+    assert len(last) > 5
+    np.testing.assert_allclose(last.xy, first.xy[last.tracks] + (6, 0), atol=0.01)
+
+
 def test_positions_agree_with_another_implementation(moving_photo) -> None:
     """Template matching of whole patches finds the same places."""
     tracker = Tracker(grid_keypoints, TrackingOptions(detect_every=99, min_kept=0))
@@ -96,6 +109,15 @@ def test_a_point_that_is_covered_is_lost(moving_photo) -> None:
     covered[:, :160] = np.random.default_rng(0).integers(0, 256, (240, 160, 3))
     found = tracker.update(covered)
     assert np.count_nonzero(found.xy[:, 0] < 140) < 0.05 * np.count_nonzero(found.xy[:, 0] > 180)
+
+
+def test_a_frame_without_corners_is_no_error() -> None:
+    """Its equations cannot be solved without what is added to them."""
+    ramp = np.add.outer(range(96), range(128)).astype(np.uint8)
+    tracker = Tracker(grid_keypoints)
+    for _ in range(3):
+        frame = tracker.update(ramp)
+    assert np.isfinite(frame.xy).all()
 
 
 def test_a_black_frame_loses_all_points_of_deepdetect_and_is_no_error(moving_photo) -> None:

@@ -18,12 +18,15 @@ RADIUS_PX = 10
 BLUR_SIGMA_PX = 1.0
 """Of images before their patches are read: what lies between pixels is then well defined."""
 
+BORDER_PX = 3
+"""Of an image, that its blur makes unlike what other images show there."""
+
 MAX_ITERATIONS = 30
-CONVERGENCE_PX = 0.01
-"""A patch that moves by less has arrived."""
+CONVERGENCE_PX = 0.03
+"""A patch that moves by less has arrived; OpenCV 4 reads images at steps of 1/32."""
 
 MAX_SHIFT_PX = 3.0
-"""From where a patch is expected; translation alone is off by this on surfaces that come nearer."""
+"""From where a patch is expected; translation alone may be off by it where surfaces come nearer."""
 
 MIN_CORRELATION = 0.8
 """Of a patch that is found."""
@@ -66,13 +69,11 @@ class Patches(NamedTuple):
         return Patches(*(each[rows] for each in self))
 
 
-def smooth(gray: np.ndarray) -> np.ndarray:
-    """Return the (H, W) float32 image that patches are read from."""
-    return cv2.GaussianBlur(gray.astype(np.float32), (0, 0), BLUR_SIGMA_PX)
-
-
 def cut_patches(image: np.ndarray, xy: np.ndarray) -> Patches:
-    """Return the patches around (N, 2) points of a `smooth` image."""
+    """Return the patches around (N, 2) points of a blurred image.
+
+    One that the border or its blur reaches is empty, and is never found.
+    """
     affinities = np.tile(np.eye(2), (len(xy), 1, 1))
     slopes = [
         _read(cv2.Sobel(image, cv2.CV_32F, *axis, ksize=1, scale=0.5), xy, affinities)
@@ -81,13 +82,16 @@ def cut_patches(image: np.ndarray, xy: np.ndarray) -> Patches:
     slope = np.stack(slopes, axis=1)
     deformation = (slope[:, :, None] * OFFSETS).reshape(len(xy), 4, -1)
     changes = _centred(np.concatenate([slope, deformation], axis=1))
-    values = _centred(_read(image, xy, affinities))
+    margin = RADIUS_PX + BORDER_PX
+    most = np.array(image.shape[::-1]) - 1 - margin
+    inside = np.all((xy >= margin) & (xy <= most), axis=1)
+    values = _centred(_read(image, xy, affinities)) * inside[:, None]
     variances = np.maximum((values**2) @ WINDOW, 1e-6)
     by_gain = changes @ (values * WINDOW)[..., None] / variances[:, None, None]
     changes -= by_gain * values[:, None]
     weighted = changes * WINDOW
     normal = weighted @ changes.transpose(0, 2, 1)
-    scale = np.trace(normal[:, :2, :2], axis1=1, axis2=2) + 1e-6
+    scale = (slope**2 @ WINDOW).sum(axis=1) + 1e-6
     ridge = RIDGE * np.diag([1.0] * 2 + [WINDOW @ OFFSETS[0] ** 2] * 4)
     normal += scale[:, None, None] * ridge
     steps = np.linalg.inv(normal).astype(np.float32) @ weighted
@@ -97,7 +101,7 @@ def cut_patches(image: np.ndarray, xy: np.ndarray) -> Patches:
 def find_patches(
     image: np.ndarray, patches: Patches, xy: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find patches in a `smooth` image near (N, 2) expected positions.
+    """Find patches in a blurred image near (N, 2) expected positions.
 
     Returns (N, 2) positions and (N, 2, 2) affinities, float64, and (N,) whether each was found; the
     others have no meaning.
@@ -107,7 +111,7 @@ def find_patches(
     rows = np.arange(len(xy))
     most = np.array(image.shape[::-1]) - 1
     for _ in range(MAX_ITERATIONS):
-        spread = RADIUS_PX * np.abs(affinities[rows]).sum(axis=2)
+        spread = RADIUS_PX * np.abs(affinities[rows]).sum(axis=2) + BORDER_PX
         rows = rows[((found[rows] >= spread) & (found[rows] <= most - spread)).all(axis=1)]
         if not len(rows):
             break

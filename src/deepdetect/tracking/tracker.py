@@ -2,7 +2,7 @@
 
 Lucas and Kanade, "An iterative image registration technique", 1981; Bouguet's pyramid; tracks that
 do not come back to where they started are dropped (Kalal et al., "Forward-backward error", 2010).
-So that errors do not add up, each point is then put where its first patch fits best, as the surface
+So that errors hardly add up, each point is then put where its first patch fits best, as the surface
 has turned and come nearer since (Shi and Tomasi, "Good features to track", 1994).
 Where a cell of the image has no track, the best keypoint of that cell begins one.
 """
@@ -20,9 +20,9 @@ from .._shared.image_array import Channels
 from .._shared.opencv import cv2
 from .._shared.options import check_ranges, suggest_keywords
 from ..features.keypoints import Keypoints
-from ..geometry.images import track_round_trip
+from ..geometry.images import gaussian_blur, track_round_trip
 from ..io.image import load_image, luma
-from .alignment import Patches, cut_patches, find_patches, smooth
+from .alignment import BLUR_SIGMA_PX, Patches, cut_patches, find_patches
 from .tracks import TrackedFrame
 
 Detect = Callable[[np.ndarray], Keypoints]
@@ -129,7 +129,7 @@ class Tracker:
                     f"{before_width}x{before_height}: use a tracker for each size"
                 )
             self._follow(self._gray, gray)
-        image = smooth(gray)
+        image = gaussian_blur(gray, BLUR_SIGMA_PX)
         self._return_to_patches(image)
         count = len(self._points["xy"])
         if (
