@@ -94,6 +94,14 @@ def test_new_points_only_where_there_are_no_tracks(moving_photo) -> None:
             assert gaps.min() > 8 - 1.5  # of the nearest pixels
 
 
+def test_few_points_are_all_over_the_image(moving_photo) -> None:
+    tracker = Tracker(grid_keypoints, TrackingOptions(max_keypoints=20))
+    xy = tracker.update(moving_photo(0)).xy
+    gaps = np.linalg.norm(xy[:, None] - xy, axis=2) + 99 * np.eye(len(xy))
+    assert len(xy) == 20
+    assert gaps.min() > 0.3 * (320 * 240 / 20) ** 0.5
+
+
 def test_changes_of_a_frame_do_not_move_the_tracks(moving_photo) -> None:
     trackers = Tracker(grid_keypoints), Tracker(grid_keypoints)
     for tracker in trackers:

@@ -9,6 +9,7 @@ Where a cell of the image has no track, the best keypoint of that cell begins on
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -31,8 +32,9 @@ Detect = Callable[[np.ndarray], Keypoints]
 CANDIDATES = 3
 """Keypoints that are detected for each track that is wanted: the best well apart are taken."""
 
-MIN_DISTANCE_PX = 8.0
-"""Smallest distance of a new point from all tracks."""
+MIN_DISTANCE_PX, MIN_SPACING = 8.0, 0.35
+"""Smallest distance of a new point from all tracks, also as a share of the spacing of a grid of as
+many points as are wanted: points all over the image tell more about the motion of the camera."""
 
 WINDOW_PX = 21
 """Side of the patch that is followed."""
@@ -179,8 +181,9 @@ class Tracker:
 
     def _add(self, keypoints: Keypoints, image: np.ndarray) -> None:
         """Begin tracks with the best keypoints that are far enough from all tracks."""
-        xy = self._points["xy"]
-        rows = free_keypoints(keypoints, xy, MIN_DISTANCE_PX, self.options.max_keypoints - len(xy))
+        xy, most = self._points["xy"], self.options.max_keypoints
+        distance = max(MIN_DISTANCE_PX, MIN_SPACING * math.sqrt(image.size / most))
+        rows = free_keypoints(keypoints, xy, distance, most - len(xy))
         new = {
             "tracks": np.arange(len(rows)) + self._next_track,
             "xy": keypoints.xy[rows],
