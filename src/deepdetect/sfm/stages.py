@@ -94,7 +94,7 @@ class MultiViewOptions:
         matches: "sparse": of keypoints; "dense": points of the depth maps also become points
             of the model, and cameras are adjusted to all.
         mapper: how COLMAP finds the poses: "incremental": one image after the other; "global": of
-            all images at once, for thousands: of a few hundred it takes as long.
+            all images at once, for a thousand or more: of a few hundred it takes as long.
         dense: make dense points.
         stride_px: distance in pixels between the places of a row or column that are tried.
         single_camera: whether images of one size were taken by one camera; None: where their EXIF
