@@ -331,7 +331,8 @@ def get_matcher(name: str) -> Matcher:
 class DescriptorMatches:
     """Matched rows (M,) of two sets of descriptors.
 
-    `ratios` are Lowe's, (M,) float32: the distance of the best over that of the second-best.
+    `ratios` are Lowe's, (M,) float32: the distance of the best over that of the second-best; after
+    `filter_matches` how likely matches are wrong.
     """
 
     indices0: np.ndarray

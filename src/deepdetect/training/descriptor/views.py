@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +24,7 @@ from ...geometry.transforms import transform_points
 from ...io.image import load_image, luma
 
 SIDE_PX, KEYPOINTS = 256, 256
-"""Of the square views, and of a pair at most."""
+"""Of the square views, unless they are drawn larger, and of a pair at most."""
 
 LEAST_KEYPOINTS, LEAST_IF_ZOOMED = 64, 40
 """Pairs that share fewer are drawn again; zoomed are those by more than e^0.8."""
@@ -42,8 +43,6 @@ MIN_GROWTH = 0.02
 
 ITERATIONS = 5
 """That invert a relief, whose slopes are small."""
-
-PIXELS = np.stack(np.meshgrid(*[np.arange(SIDE_PX, dtype=np.float32)] * 2), -1)
 
 
 class Pair(NamedTuple):
@@ -75,6 +74,7 @@ class View:
 
     matrix: np.ndarray
     relief: np.ndarray | None = None
+    side_px: int = SIDE_PX
 
     def to_photograph(self, xy: np.ndarray) -> np.ndarray:
         """Map (N, 2) or (H, W, 2) positions of the view."""
@@ -90,7 +90,7 @@ class View:
 
     def render(self, image: np.ndarray, border: int = cv2.BORDER_REFLECT_101) -> np.ndarray:
         """Return what the view shows of an image, (S, S) float32."""
-        at = self.to_photograph(PIXELS)
+        at = self.to_photograph(_pixels(self.side_px))
         return cv2.remap(image, at, None, cv2.INTER_LINEAR, borderMode=border).astype(np.float32)
 
     def _moved(self, xy: np.ndarray) -> np.ndarray:
@@ -110,15 +110,22 @@ class Layer(NamedTuple):
 
 
 def _draw_matrix(
-    rng: np.random.Generator, middle: Any, scale: float, angle: float, tilt: float, bend: float = 1
+    rng: np.random.Generator,
+    side_px: int,
+    middle: Any,
+    scale: float,
+    angle: float,
+    tilt: float,
+    bend: float = 1,
 ) -> np.ndarray:
     """Draw a homography from a view's pixels to those of a photograph, around a middle in it."""
+    bend *= SIDE_PX / side_px
     azimuth, perspective = rng.uniform(0, math.pi), bend * rng.normal(0, 0.0009, 2)
     stretch = np.diag([math.sqrt(tilt), 1 / math.sqrt(tilt)])
     affine, shift, bent = np.eye(3), np.eye(3), np.eye(3)
     affine[:2, :2] = _rotation(angle) @ _rotation(azimuth) @ stretch @ _rotation(-azimuth) * scale
     affine[:2, 2] = middle
-    shift[:2, 2] = -(SIDE_PX - 1) / 2
+    shift[:2, 2] = -(side_px - 1) / 2
     bent[2, :2] = perspective
     return affine @ bent @ shift
 
@@ -134,14 +141,19 @@ which one is of another mixture of colours."""
 
 
 def _smooth_noise(
-    rng: np.random.Generator, cells: tuple[int, int] = (3, 8), side: int = SIDE_PX
+    rng: np.random.Generator, side_px: int, cells: tuple[int, int] = (3, 8)
 ) -> np.ndarray:
     noise = rng.standard_normal((int(rng.integers(*cells)),) * 2).astype(np.float32)
-    return cv2.resize(noise, (side, side), interpolation=cv2.INTER_CUBIC)
+    return cv2.resize(noise, (side_px, side_px), interpolation=cv2.INTER_CUBIC)
+
+
+@lru_cache
+def _pixels(side_px: int) -> np.ndarray:
+    return np.stack(np.meshgrid(*[np.arange(side_px, dtype=np.float32)] * 2), -1)
 
 
 def draw_layers(
-    rng: np.random.Generator, files: Sequence[Path]
+    rng: np.random.Generator, files: Sequence[Path], side_px: int = SIDE_PX
 ) -> tuple[list[Layer], list[float], float]:
     """Draw what two views show, from the back: layers, the views' scales, the turn in radians."""
     normal, uniform, chance = rng.normal, rng.uniform, rng.random
@@ -164,25 +176,27 @@ def draw_layers(
     base = uniform(-math.pi, math.pi) if chance() < 0.3 else normal(0, 0.12)
     turn = uniform(-math.pi, math.pi) if chance() < 0.45 else normal(0, 0.15)
     tilt = math.exp(abs(normal(0, 0.35)) if chance() < 0.7 else uniform(0, math.log(2.5)))
-    first = View(_draw_matrix(rng, middle, scales[0], base, 1 + 0.15 * chance(), 0.5))
+    own = _draw_matrix(rng, side_px, middle, scales[0], base, 1 + 0.15 * chance(), 0.5)
+    first = View(own, None, side_px)
     moved, relief = middle + normal(0, 18, 2) * scales[0], None
     if chance() < 0.45:
-        azimuth, height = uniform(0, 2 * math.pi), _smooth_noise(rng) * uniform(1.5, 5)
+        azimuth, height = uniform(0, 2 * math.pi), _smooth_noise(rng, side_px) * uniform(1.5, 5)
         relief = np.stack([height * math.cos(azimuth), height * math.sin(azimuth)], -1)
         relief = relief.astype(np.float32)
-    second = View(_draw_matrix(rng, moved, scales[1], base + turn, tilt), relief)
+    second = View(_draw_matrix(rng, side_px, moved, scales[1], base + turn, tilt), relief, side_px)
     layers = [Layer(photograph, (first, second))]
     for _ in range(int(rng.choice([1, 1, 2, 3])) if chance() < 0.5 else 0):
         other = draw_photograph() if chance() < 0.8 else photograph
-        noise = _smooth_noise(rng, side=480)
+        noise = _smooth_noise(rng, 480)
         shape = (noise > np.quantile(noise, uniform(0.6, 0.88))).astype(np.float32)
         place = middle + uniform(-60, 60, 2), scales[0] * math.exp(normal(0, 0.2))
-        own = _draw_matrix(rng, *place, base + normal(0, 0.3), 1 + 0.3 * chance(), 0.5)
+        own = _draw_matrix(rng, side_px, *place, base + normal(0, 0.3), 1 + 0.3 * chance(), 0.5)
         # It moves as the photograph behind it does, and a little more.
         place = moved + normal(0, 22, 2) * scales[0], scales[1] * math.exp(normal(0, 0.12))
         tilted = base + turn + normal(0, 0.06), tilt * math.exp(normal(0, 0.15))
-        motion = np.linalg.inv(first.matrix) @ _draw_matrix(rng, *place, *tilted)
-        layers.append(Layer(other, (View(own), View(own @ motion)), shape))
+        motion = np.linalg.inv(first.matrix) @ _draw_matrix(rng, side_px, *place, *tilted)
+        pair = View(own, None, side_px), View(own @ motion, None, side_px)
+        layers.append(Layer(other, pair, shape))
     return layers, scales, abs(turn)
 
 
@@ -193,7 +207,8 @@ def render_layers(
 
     In luma, or in a (1, 3) mixture of colours.
     """
-    view, top = np.zeros((SIDE_PX, SIDE_PX), np.float32), np.zeros((SIDE_PX, SIDE_PX), np.uint8)
+    size = (layers[0].views[side].side_px,) * 2
+    view, top = np.zeros(size, np.float32), np.zeros(size, np.uint8)
     for number, (photograph, views, shape) in enumerate(layers):
         smooth = luma(photograph) if mixture is None else mix_colours(photograph, mixture)
         if scale > 1.15:  # so that it is not aliased
@@ -229,12 +244,12 @@ def correspond(
             ends = (first.to_photograph(xy[rows] + sign * step) for sign in (1, -1))
             after, before = map(second.from_photograph, ends)
             jacobians[rows, :, axis] = (after - before) / 4
-    inside = ((there > MARGIN_PX) & (there < SIDE_PX - 1 - MARGIN_PX)).all(1)
+    inside = ((there > MARGIN_PX) & (there < len(tops[1]) - 1 - MARGIN_PX)).all(1)
     return there, jacobians, visible & inside & (_at(tops[1], there) == layer_of)
 
 
 def _at(numbers: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    column, row = np.clip(np.rint(xy), 0, SIDE_PX - 1).astype(int).T
+    column, row = np.clip(np.rint(xy), 0, len(numbers) - 1).astype(int).T
     return numbers[row, column]
 
 
@@ -282,7 +297,7 @@ def draw_pair(
 def find_keypoints(view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return (N, 2) positions and (N,) sigmas of the strongest candidates for points."""
     found = find_candidates(build_scale_space(view))
-    inside = (found.xy > MARGIN_PX) & (found.xy < SIDE_PX - 1 - MARGIN_PX)
+    inside = (found.xy > MARGIN_PX) & (found.xy < len(view) - 1 - MARGIN_PX)
     rows = np.flatnonzero(inside.all(1) & (found.sigma_px < MAX_FIRST_SIGMA_PX))
     rows = rows[np.argsort(found.rank[rows])][:STRONGEST]
     return found.xy[rows], found.sigma_px[rows]
@@ -320,7 +335,7 @@ def change_tones(rng: np.random.Generator, view: np.ndarray) -> np.ndarray:
     if kind < 0.7:
         return curve()
     if kind < 0.88:
-        field = _smooth_noise(rng, (2, 5))
+        field = _smooth_noise(rng, len(view), (2, 5))
         share = np.clip(0.5 + field / (2 * np.abs(field).max()), 0, 1)
         return curve() * share + curve() * (1 - share)
     smooth = cv2.GaussianBlur(view, (0, 0), rng.uniform(0.7, 1.5))
@@ -335,11 +350,11 @@ def relight(rng: np.random.Generator, view: np.ndarray) -> np.ndarray:
     if chance() < 0.15:
         return np.clip(view * 255, 0, 255).astype(np.uint8)
     if chance() < 0.25:
-        field, strength = _smooth_noise(rng, (2, 5)), 0.7 * chance() ** 0.5
+        field, strength = _smooth_noise(rng, len(view), (2, 5)), 0.7 * chance() ** 0.5
         view = view * np.clip(1 + strength * field / np.abs(field).max(), 0.15, 1.6)
     if chance() < 0.15:  # a shadow with an edge
         direction = _rotation(uniform(0, 2 * math.pi))[0]
-        side = (PIXELS - SIDE_PX / 2) @ direction > uniform(-80, 80)
+        side = (_pixels(len(view)) - len(view) / 2) @ direction > uniform(-80, 80)
         shadow = cv2.GaussianBlur(side.astype(np.float32), (0, 0), uniform(0.7, 8))
         view = view * (1 - shadow * uniform(0.2, 0.75))
     if chance() < 0.5:

@@ -1,0 +1,154 @@
+"""Right matches by neighbours and by the ratio test, of the same points.
+
+    python benchmarks/match_filter.py DATA
+
+DATA holds the folders oxford, hpatches, fountain, entry and the clips of KITTI. 2,048 keypoints of
+an image, mutual nearest neighbours. Right: within 3 px of the homography, of the others within
+1.5 px of the true lines, on which a wrong match may lie by chance; of all pairs, in sums. As
+precise: by the ratio test at the highest ratio that is as precise as the filter. Poses: area under
+the curve to 5 degrees, a mean over five orders of the matches; clips: 30 pairs of each. Unrelated:
+the first images of neighbouring scenes of HPatches, where all matches are wrong. Time: of both
+images' matches, processor time on one processor, in that of the ratio test; medians.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable, Sequence
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from descriptors import CLIP_PAIRS, CLIPS, KEYPOINTS, ORDERS, RIGHT_PX, ROUNDS, auc
+
+from deepdetect import Keypoints, Matches, PointDetector, match_features
+from deepdetect.datasets.planar import load_hpatches, load_oxford
+from deepdetect.datasets.posed_images import load_posed_scenes
+from deepdetect.evaluation.protocols.planar import pairs_of
+from deepdetect.evaluation.protocols.pose import ERROR, estimate_pose, pose_errors
+from deepdetect.evaluation.report import Row, Table
+from deepdetect.geometry.transforms import epipolar_errors, transfer_errors
+from deepdetect.io.image import load_image
+
+NEAR_LINE_PX = 1.5
+
+Errors = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""Of (M, 2) matched positions of both images, in pixels."""
+
+
+def compare(pairs: Sequence[tuple[Keypoints, Keypoints, Errors]], right_px: float) -> Row:
+    """Return right matches and precisions of the filter and of ratio tests, over all pairs."""
+    filtered, ratio, errors, scores = [], [], [], []
+    for first, second, of in pairs:
+        by_neighbours = match_features(first, second, filter_by="neighbours")
+        filtered.append(of(by_neighbours.points0, by_neighbours.points1) <= right_px)
+        by_ratio = match_features(first, second)
+        ratio.append(of(by_ratio.points0, by_ratio.points1) <= right_px)
+        every = match_features(first, second, ratio=1)
+        errors.append(of(every.points0, every.points1) <= right_px)
+        scores.append(every.scores)
+    kept, default, right = (np.concatenate(each) for each in (filtered, ratio, errors))
+    right = right[np.argsort(-np.concatenate(scores), kind="stable")]
+    found = right.cumsum()
+    as_precise = found[found >= kept.mean() * np.arange(1, len(found) + 1)]
+    as_precise = int(as_precise[-1]) if len(as_precise) else 0
+    return {
+        "ratio test": int(default.sum()),
+        "its precision": float(default.mean()),
+        "neighbours": int(kept.sum()),
+        "precision": float(kept.mean()),
+        "as precise by ratio": as_precise,
+        "gain": float(kept.sum() / max(as_precise, 1) - 1),
+    }
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("data", type=Path)
+    data = parser.parse_args().data
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[-1:])
+    cv2.setNumThreads(1)
+    rows: list[Row] = []
+    for kind in ("learned", "rootsift"):
+        extract = PointDetector(KEYPOINTS, descriptor=kind).extract
+        features = cache(lambda path, extract=extract: extract(load_image(path)))
+        planar = {
+            "HPatches": pairs_of(load_hpatches(data / "hpatches")),
+            "Oxford": pairs_of(load_oxford(data / "oxford", "refined")),
+        }
+        for name, pairs in planar.items():
+            given = [
+                (
+                    features(pair.first),
+                    features(pair.second),
+                    lambda a, b, pair=pair: transfer_errors(a, b, pair.homography),
+                )
+                for pair in pairs
+            ]
+            rows.append({"descriptors": kind, "data": name, **compare(given, RIGHT_PX)})
+        for name, folders in {"fountain": ["fountain"], "entry": ["entry"], "clips": CLIPS}.items():
+            most = CLIP_PAIRS if name == "clips" else 60
+            scenes = [s for folder in folders for s in load_posed_scenes(data / folder, most)]
+            posed = [pair for scene in scenes for pair in scene.pairs]
+            given = [
+                (
+                    features(pair.first.path),
+                    features(pair.second.path),
+                    lambda a, b, pair=pair: epipolar_errors(a, b, pair.fundamental),
+                )
+                for pair in posed
+            ]
+            row = {"descriptors": kind, "data": name, **compare(given, NEAR_LINE_PX)}
+            for title, how in (("ratio", "ratio"), ("neighbours", "neighbours")):
+                by_pair: dict[str, list[float]] = {}
+                for pair, (first, second, _) in zip(posed, given, strict=True):
+                    found = match_features(first, second, filter_by=how)
+                    by_pair[pair.name] = errors_of(found, pair)
+                row[f"pose, {title}"] = auc(by_pair)
+            rows.append(row)
+        firsts = list(dict.fromkeys(pair.first for pair in planar["HPatches"]))
+        unrelated = [(features(a), features(b)) for a, b in pairwise(firsts)]
+        row = {"descriptors": kind, "data": "unrelated"}
+        counts = [
+            sum(len(match_features(*pair, filter_by=how)) for pair in unrelated)
+            for how in ("ratio", "neighbours")
+        ]
+        rows.append({**row, "ratio test": counts[0], "neighbours": counts[1]})
+        pair = features(planar["Oxford"][0].first), features(planar["Oxford"][0].second)
+        seconds = np.array([times(*pair) for _ in range(ROUNDS)])
+        own = float(np.median(seconds[:, 1]) / np.median(seconds[:, 0]))
+        rows.append({"descriptors": kind, "data": "time", "ratio test": 1.0, "neighbours": own})
+        print(rows[-1], np.median(seconds, 0), flush=True)
+    styles = {"descriptors": "", "data": "", "ratio test": ",.6g", "its precision": ".3f"}
+    styles |= {"neighbours": ",.6g", "precision": ".3f", "as precise by ratio": ",d", "gain": ".1%"}
+    styles |= {"pose, ratio": ".3f", "pose, neighbours": ".3f"}
+    print(Table("match_filter", "match_filter", styles, rows).to_markdown())
+
+
+def errors_of(found: Matches, pair: object) -> list[float]:
+    """Return the errors of the pose, in five orders of the matches."""
+    cameras = pair.first.intrinsics, pair.second.intrinsics
+    errors = []
+    for order in range(ORDERS):
+        rows = np.random.default_rng(order).permutation(len(found))
+        pose = estimate_pose(found.points0[rows], found.points1[rows], *cameras)
+        errors.append(pose_errors(pose, pair)[ERROR])
+    return errors
+
+
+def times(first: Keypoints, second: Keypoints) -> tuple[float, float]:
+    """Return the processor time of both ways."""
+    begin = time.process_time()
+    match_features(first, second)
+    middle = time.process_time()
+    match_features(first, second, filter_by="neighbours")
+    return middle - begin, time.process_time() - middle
+
+
+if __name__ == "__main__":
+    main()
