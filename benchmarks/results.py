@@ -79,6 +79,7 @@ STAGES = {
     + "".join(f" --method {{published}}/peers/{name}.onnx" for name in PEERS),
     "fuzz": "-m fuzz",
     "mappers": "benchmarks/mappers.py",
+    "match-filter": "benchmarks/match_filter.py {data}",
 }
 """Arguments of Python by the stage's name. What writes no report prints its tables, or JSON."""
 
@@ -289,6 +290,7 @@ RESULTS = {
     "descriptors": Result("descriptors", "0"),
     "fuzz": Result("fuzz", "0"),
     "mappers": Result("mappers", "0"),
+    "match-filter": Result("match-filter", "0"),
     "foreground": Result(
         "foreground",
         "foreground",
