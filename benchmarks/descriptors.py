@@ -35,7 +35,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from deepdetect import Keypoints, PointDetector, match_features
+from deepdetect import Keypoints, Matches, PointDetector, match_features
 from deepdetect.datasets.planar import load_hpatches, load_oxford
 from deepdetect.datasets.posed_images import PosedPair, load_posed_scenes
 from deepdetect.evaluation.baselines.external import onnx_feature
@@ -179,19 +179,24 @@ def _pose_errors(
     features: Callable[[Path], Keypoints], data: Path, names: Sequence[str], pairs: int = 60
 ) -> dict[str, list[float]]:
     scenes = (scene for name in names for scene in load_posed_scenes(data / name, pairs))
-    return {pair.name: _errors_of(features, pair) for scene in scenes for pair in scene.pairs}
+    return {
+        pair.name: errors_in_orders(
+            match_features(features(pair.first.path), features(pair.second.path)), pair
+        )
+        for scene in scenes
+        for pair in scene.pairs
+    }
 
 
-def _errors_of(features: Callable[[Path], Keypoints], pair: PosedPair) -> list[float]:
-    both = features(pair.first.path), features(pair.second.path)
-    found = match_features(*both)
+def errors_in_orders(found: Matches, pair: PosedPair) -> list[float]:
+    """Return the errors of the pose, in each order of the matches."""
     cameras = pair.first.intrinsics, pair.second.intrinsics
-    found_errors = []
+    errors = []
     for order in range(ORDERS):
         rows = np.random.default_rng(order).permutation(len(found))
         pose = estimate_pose(found.points0[rows], found.points1[rows], *cameras)
-        found_errors.append(pose_errors(pose, pair)[ERROR])
-    return found_errors
+        errors.append(pose_errors(pose, pair)[ERROR])
+    return errors
 
 
 def main() -> None:

@@ -23,13 +23,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from descriptors import CLIP_PAIRS, CLIPS, KEYPOINTS, ORDERS, RIGHT_PX, ROUNDS, auc
+from descriptors import CLIP_PAIRS, CLIPS, KEYPOINTS, RIGHT_PX, ROUNDS, auc, errors_in_orders
 
-from deepdetect import Keypoints, Matches, PointDetector, match_features
+from deepdetect import Keypoints, PointDetector, match_features
 from deepdetect.datasets.planar import load_hpatches, load_oxford
 from deepdetect.datasets.posed_images import load_posed_scenes
 from deepdetect.evaluation.protocols.planar import pairs_of
-from deepdetect.evaluation.protocols.pose import ERROR, estimate_pose, pose_errors
 from deepdetect.evaluation.report import Row, Table
 from deepdetect.geometry.transforms import epipolar_errors, transfer_errors
 from deepdetect.io.image import load_image
@@ -108,7 +107,7 @@ def main() -> None:
                 by_pair: dict[str, list[float]] = {}
                 for pair, (first, second, _) in zip(posed, given, strict=True):
                     found = match_features(first, second, filter_by=how)
-                    by_pair[pair.name] = errors_of(found, pair)
+                    by_pair[pair.name] = errors_in_orders(found, pair)
                 row[f"pose, {title}"] = auc(by_pair)
             rows.append(row)
         firsts = list(dict.fromkeys(pair.first for pair in planar["HPatches"]))
@@ -123,22 +122,10 @@ def main() -> None:
         seconds = np.array([times(*pair) for _ in range(ROUNDS)])
         own = float(np.median(seconds[:, 1]) / np.median(seconds[:, 0]))
         rows.append({"descriptors": kind, "data": "time", "ratio test": 1.0, "neighbours": own})
-        print(rows[-1], np.median(seconds, 0), flush=True)
     styles = {"descriptors": "", "data": "", "ratio test": ",.6g", "its precision": ".3f"}
     styles |= {"neighbours": ",.6g", "precision": ".3f", "as precise by ratio": ",d", "gain": ".1%"}
     styles |= {"pose, ratio": ".3f", "pose, neighbours": ".3f"}
     print(Table("match_filter", "match_filter", styles, rows).to_markdown())
-
-
-def errors_of(found: Matches, pair: object) -> list[float]:
-    """Return the errors of the pose, in five orders of the matches."""
-    cameras = pair.first.intrinsics, pair.second.intrinsics
-    errors = []
-    for order in range(ORDERS):
-        rows = np.random.default_rng(order).permutation(len(found))
-        pose = estimate_pose(found.points0[rows], found.points1[rows], *cameras)
-        errors.append(pose_errors(pose, pair)[ERROR])
-    return errors
 
 
 def times(first: Keypoints, second: Keypoints) -> tuple[float, float]:
