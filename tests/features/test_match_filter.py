@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from deepdetect import Keypoints, OptionError, PointDetector, match_features
-from deepdetect.features.match_filter import nearest_rows
+from deepdetect.features.match_filter import filter_inputs, nearest_rows
+from deepdetect.features.matchers import DescriptorMatches
 from deepdetect.geometry.transforms import transfer_errors
 
 TURNED = np.array([[0.6, -0.35, 100], [0.35, 0.6, 10], [0.0002, 0, 1]])
@@ -51,7 +52,7 @@ def test_unrelated_images_hardly_match(pair, photo: np.ndarray) -> None:
     assert len(match_features(pair[0], described, filter_by="neighbours")) < 10
 
 
-def test_the_order_of_images_and_turned_images_change_little(pair) -> None:
+def test_the_order_of_images_changes_little(pair) -> None:
     first, second = pair
     there = match_features(first, second, filter_by="neighbours")
     back = match_features(second, first, filter_by="neighbours")
@@ -59,13 +60,37 @@ def test_the_order_of_images_and_turned_images_change_little(pair) -> None:
     assert len(pairs[0] & pairs[1]) > 0.9 * len(pairs[0] | pairs[1])
 
 
-@pytest.mark.parametrize("count", [0, 1, 2, 5, 9])
-def test_few_keypoints_are_filtered_too(pair, count: int) -> None:
-    few = [features[: 2 * count] for features in pair]
-    assert len(match_features(*few, filter_by="neighbours")) <= 2 * count
+@pytest.mark.parametrize("count", [0, 1, 8])
+def test_of_too_few_matches_none_is_kept(pair, count: int) -> None:
+    first, second = pair
+    matches = match_features(first, second, filter_by="neighbours")
+    few = first[matches.indices0[:count]], second[matches.indices1[:count]]
+    assert len(match_features(*few, filter_by="neighbours")) == 0
 
 
-def test_the_nearest_rows_are_others_or_the_own_one() -> None:
+def test_of_few_right_matches_most_are_kept(pair) -> None:
+    first, second = pair
+    matches = match_features(first, second, filter_by="neighbours")
+    rows = np.flatnonzero(right(matches))[:: max(1, right(matches).sum() // 20)][:20]
+    few = first[matches.indices0[rows]], second[matches.indices1[rows]]
+    assert len(match_features(*few, filter_by="neighbours")) >= 12
+
+
+def test_one_image_is_turned_back() -> None:
+    rng = np.random.default_rng(2)
+    xy, c, s = rng.uniform(0, 200, (40, 2)), np.cos(np.radians(70)), np.sin(np.radians(70))
+    there = xy @ np.array([[c, s], [-s, c]])  # by 70 degrees from x to y
+    angles = rng.uniform(0, 360, 40)
+    common = {"scores": np.ones(40), "image_size": (400, 400), "sizes": np.full(40, 5.0)}
+    first = Keypoints(xy=xy, angles=angles, **common)
+    second = Keypoints(xy=there, angles=(angles + 70) % 360, **common)
+    rows = np.arange(40, dtype=np.int32)
+    values = filter_inputs(first, second, DescriptorMatches(rows, rows, np.full(40, 0.5)))
+    np.testing.assert_allclose(values["xy1"], values["xy0"], atol=1e-3)
+    np.testing.assert_allclose(np.cos(values["turns"]), 1, atol=1e-5)
+
+
+def test_the_nearest_rows_are_those_of_others() -> None:
     xy = np.random.default_rng(1).uniform(0, 50, (40, 2)).astype(np.float32)
     xy[3] = xy[4]
     gaps = np.linalg.norm(xy[:, None] - xy, axis=2)
@@ -75,17 +100,20 @@ def test_the_nearest_rows_are_others_or_the_own_one() -> None:
     np.testing.assert_allclose(
         np.take_along_axis(gaps, rows, 1), np.sort(gaps, 1)[:, :8], atol=1e-4
     )
-    assert (nearest_rows(xy[:3]) == np.arange(3)[:, None]).sum() == 3 * 6
     assert (nearest_rows(np.zeros((12, 2), np.float32)) != np.arange(12)[:, None]).all()
 
 
 def test_what_does_not_suit_is_refused(pair) -> None:
     first, second = pair
     for options in ({"ratio": 0.9}, {"mutual": False}):
-        with pytest.raises(OptionError, match="takes mutual neighbours and no ratio"):
+        with pytest.raises(OptionError, match="needs `mutual=True` and no `ratio`"):
             match_features(first, second, filter_by="neighbours", **options)
-    with pytest.raises(OptionError, match="filter"):
+    with pytest.raises(OptionError, match="filter_by"):
         match_features(first, second, filter_by="neighbors")
-    bare = dataclasses.replace(first, sizes=None)
+    flat = np.zeros(len(first), np.float32)
+    for changes in ({"sizes": None}, {"sizes": flat}, {"angles": flat - 1}):
+        with pytest.raises(OptionError, match="with sizes and angles"):
+            match_features(dataclasses.replace(first, **changes), second, filter_by="neighbours")
+    other = [dataclasses.replace(each, descriptor_type="cross-modal") for each in pair]
     with pytest.raises(OptionError, match="with sizes and angles"):
-        match_features(bare, second, filter_by="neighbours")
+        match_features(*other, filter_by="neighbours")

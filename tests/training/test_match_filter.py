@@ -40,23 +40,23 @@ def test_samples_know_which_matches_are_right(samples: list[Sample]) -> None:
 
 
 def test_what_is_right_lies_alike_after_it_is_varied(samples: list[Sample]) -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        values, errors = vary(rng, samples[1])
+    rng, turns, growths = np.random.default_rng(0), [], []
+    for k in range(40):
+        values, errors = vary(rng, samples[1 + k % 6])
         first, second = values["xy0"], values["xy1"]
-        right = errors < RIGHT_PX
-        if right.sum() < 20:
+        right = np.flatnonzero(errors < RIGHT_PX)
+        if len(right) < 20:
             continue
-        there = np.column_stack([first, np.ones(len(first))])
-        fitted = np.linalg.lstsq(there[right], second[right], rcond=None)[0]
-        gaps = np.linalg.norm(there @ fitted - second, axis=1)
-        assert np.median(gaps[right]) < 20
+        fitted, inliers = cv2.estimateAffine2D(first[right], second[right], None, cv2.RANSAC, 8)
+        alike = right[inliers.ravel() > 0]  # of one part of the photograph
         # Keypoints turn and grow as the images do.
-        turn = np.arctan2(fitted[0, 1] - fitted[1, 0], fitted[0, 0] + fitted[1, 1])
-        off = (np.median(values["turns"][right]) - turn + np.pi) % (2 * np.pi) - np.pi
-        assert abs(off) < 0.4
-        growth = np.log(values["sizes1"] / values["sizes0"])[right]
-        assert abs(np.median(growth) - np.log(abs(np.linalg.det(fitted[:2]))) / 2) < 0.4
+        turn = np.arctan2(fitted[1, 0] - fitted[0, 1], fitted[0, 0] + fitted[1, 1])
+        turns.append((np.median(values["turns"][alike]) - turn + np.pi) % (2 * np.pi) - np.pi)
+        growth = np.median(np.log(values["sizes1"] / values["sizes0"])[alike])
+        growths.append(growth - np.log(abs(np.linalg.det(fitted[:, :2]))) / 2)
+    assert len(turns) > 10
+    assert np.quantile(np.abs(turns), 0.8) < 0.3
+    assert np.quantile(np.abs(growths), 0.8) < 0.3
 
 
 def test_it_learns_and_its_file_does_the_same(samples: list[Sample], tmp_path: Path) -> None:

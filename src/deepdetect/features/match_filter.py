@@ -1,9 +1,9 @@
 """Which mutual nearest neighbours are right, by what those around them do.
 
-Right matches move, turn and grow as their neighbours do, wrong ones as it happens. A network of
-25,000 parameters (MATCH_FILTER_CARD.md) has learned how alike these are where surfaces bend and
-move; descriptors take part by their ratio alone, so that it serves several kinds. It stands in for
-the ratio test, which throws away what is right and occurs twice.
+Right matches move, turn and grow as their neighbours do, wrong ones at random. A network of 25,000
+parameters (MATCH_FILTER_CARD.md) has learned how alike these are where surfaces bend and move;
+descriptors take part by their ratio alone, so that it serves several kinds. It stands in for the
+ratio test, which discards right matches that have a rival.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from .._shared.runtimes import start_session
 from .keypoints import Keypoints
-from .learned import UPRIGHT_DEGREES, common_turn, is_learned
+from .learned import CROSS_MODAL, UPRIGHT_DEGREES, common_turn, is_learned
 from .matchers import DescriptorMatches, automatic_neighbours
 from .sift import ROOT_SIFT
 
@@ -30,9 +30,15 @@ MOST_DISTINCT = 512
 
 
 def suits_filter(features: Keypoints) -> bool:
-    """Return whether keypoints have what the filter looks at, and descriptors that it knows."""
-    known = is_learned(features.descriptor_type) or features.descriptor_type == ROOT_SIFT
-    return known and features.sizes is not None and features.angles is not None
+    """Return whether keypoints have what the filter looks at, and descriptors that it serves.
+
+    Not cross-modal ones: where tones are inverted, keypoints may be turned by half a turn.
+    """
+    kind, sizes, angles = features.descriptor_type, features.sizes, features.angles
+    served = kind == ROOT_SIFT or (is_learned(kind) and not str(kind).startswith(CROSS_MODAL))
+    if not served or sizes is None or angles is None:
+        return False
+    return bool((sizes > 0).all() and (angles >= 0).all())
 
 
 def filter_matches(
@@ -40,11 +46,12 @@ def filter_matches(
 ) -> DescriptorMatches:
     """Keep the mutual nearest neighbours that are more likely right than wrong.
 
-    The keypoints have sizes and angles. In place of the ratios the result has the probability of
-    being wrong.
+    Of `AROUND` and fewer none: they have too few around them. The keypoints suit the filter. In
+    place of the ratios the result has the network's probability of being wrong.
     """
-    if not len(matches):
-        return matches
+    if len(matches) <= AROUND:
+        none = np.empty(0, np.int32)
+        return DescriptorMatches(none, none, np.empty(0, np.float32))
     logits = _session().run(None, filter_inputs(features0, features1, matches))[0]
     kept = logits > 0
     wrong = 1 / (1 + np.exp(logits[kept]))
@@ -80,12 +87,11 @@ def filter_inputs(
 
 
 def nearest_rows(xy: np.ndarray) -> np.ndarray:
-    """Return the rows of the `AROUND` nearest others; where there are fewer, the own one."""
+    """Return the (N, `AROUND`) rows of the nearest others of more than so many positions."""
     own = np.arange(len(xy))[:, None]
-    near = automatic_neighbours(xy, xy, min(AROUND + 1, len(xy)), 0)[0].astype(np.int64)
+    near = automatic_neighbours(xy, xy, AROUND + 1, 0)[0].astype(np.int64)
     # The own one comes last then; it is not among them where many are at one place.
-    others = np.take_along_axis(near, np.argsort(near == own, axis=1, kind="stable"), 1)[:, :-1]
-    return np.hstack([others, np.repeat(own, AROUND - others.shape[1], axis=1)])
+    return np.take_along_axis(near, np.argsort(near == own, axis=1, kind="stable"), 1)[:, :-1]
 
 
 @functools.cache

@@ -211,16 +211,17 @@ def match_features(
         matcher: "auto" ("exact" for few keypoints, else "patchmatch" for dense ones and "flann" for
             others), "flann", "exact", "faiss", "patchmatch", or "hamming" for binary descriptors.
         filter_by: which nearest neighbours are matches: "ratio" (Lowe's test), or "neighbours":
-            those that move, turn and grow as the matches around them do, by a small network. It
-            finds more, and fewer that are wrong, where 100 and more match; for mutual ones of
-            learned descriptors and RootSIFT, at keypoints with sizes and angles.
+            those that move, turn and grow as the matches around them do, by a small network: more
+            right ones, and fewer wrong. It needs nine mutual neighbours at least, of learned
+            descriptors (not cross-modal) or RootSIFT, at keypoints with sizes and angles.
         ratio: the distance of the best over that of the second-best must be below this. None: 0.85,
             of learned descriptors 0.88, which is as strict.
         mutual: keep only mutual nearest neighbours.
         seed: seed of a matcher that is random.
 
     Returns:
-        The matches, of the model "none"; their scores are 1 - ratio, or how likely they are right.
+        The matches, of the model "none"; their scores are 1 - ratio; by neighbours the network's,
+        above 0.5, higher ones being more often right.
 
     Raises:
         OptionError: an option is unknown or out of its range or does not suit the others, keypoints
@@ -245,14 +246,14 @@ def match_features(
             f"{features1.descriptor_type} ({length1}) cannot be compared: extract both alike"
         )
     learned = is_learned(features0.descriptor_type)
-    check_name("filter", filter_by, ("ratio", "neighbours"))
+    check_name("filter_by", filter_by, ("ratio", "neighbours"))
     by_neighbours = filter_by == "neighbours"
     if by_neighbours and (ratio is not None or not mutual):
-        raise OptionError("the filter neighbours takes mutual neighbours and no ratio")
+        raise OptionError("`filter_by='neighbours'` needs `mutual=True` and no `ratio`")
     if by_neighbours and not (suits_filter(features0) and suits_filter(features1)):
         raise OptionError(
-            "the filter neighbours needs keypoints with sizes and angles and learned descriptors "
-            "or RootSIFT, as `PointDetector.extract` returns them: take ratio"
+            "`filter_by='neighbours'` needs keypoints with sizes and angles, and learned "
+            "descriptors or RootSIFT, as `PointDetector.extract` returns them: take 'ratio'"
         )
     if ratio is None:
         ratio = LEARNED_RATIO if learned else RATIO

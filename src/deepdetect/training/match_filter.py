@@ -46,7 +46,7 @@ SIDE_PX, KEYPOINTS, LEAST_MATCHES = 512, 2048, 9
 """Of the views, of each at most, and of a pair."""
 
 UNRELATED = 7
-"""Of so many pairs one shows two photographs; odd, so that both descriptors have some."""
+"""One pair in this many shows two photographs; odd, so that both descriptors have some."""
 
 RIGHT_PX, WRONG_PX = 3.0, 5.0
 """From the truth; what is between is neither."""
@@ -122,11 +122,11 @@ class MatchFilter(nn.Module):
         expected = torch.stack([c * x - s * y, s * x + c * y], 2) * growth.exp()[:, None, None]
         lengths = [there0, there1, 2 * (there1 - there0), 2 * (there1 - expected)]
         stretch = ((away1 + 1) / (away0 + 1)).log()
-        ratios = [stretch, growth[:, None] - stretch, growth[around] - growth[:, None]]
+        growths = [stretch, growth[:, None] - stretch, growth[around] - growth[:, None]]
         scaled = torch.cat(lengths, 2) / unit
         # The inverse hyperbolic sine, which the exporter does not know.
         scaled = scaled.sign() * (scaled.abs() + (scaled * scaled + 1).sqrt()).log()
-        return torch.cat([scaled, torch.stack(ratios, 2)], 2)
+        return torch.cat([scaled, torch.stack(growths, 2)], 2)
 
 
 def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
