@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 
@@ -26,6 +27,8 @@ def main() -> None:
     os.close(number)
     for name, value in OPENCV_SETTINGS.items():
         os.environ.setdefault(name, value)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="surrogateescape")  # names of files may be any bytes
     with noted_interrupts() as interrupts:
         try:
             from .cli import main as command

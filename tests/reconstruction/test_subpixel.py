@@ -8,7 +8,6 @@ import pytest
 
 from deepdetect import Matches
 from deepdetect.io.image import luma
-from deepdetect.reconstruction import subpixel
 from deepdetect.reconstruction.subpixel import (
     local_affinities,
     refine_matches,
@@ -100,18 +99,6 @@ def test_what_cannot_be_aligned_stays_and_says_so(gray: np.ndarray) -> None:
     stripes = np.broadcast_to(np.uint8(100 + 80 * np.sin(np.arange(256) / 3)), (220, 256)).copy()
     for images in ((flat, gray), (gray, flat), (flat, flat), (stripes, stripes)):
         assert not refine_matches(*images, pixels, start)[1].any()
-
-
-def test_bands_of_rows_do_not_matter(
-    gray: np.ndarray, pixels: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    second = moved(gray, 0.4, -0.3)
-    whole = refine_matches(gray, second, pixels, pixels.astype(float))
-    monkeypatch.setattr(subpixel, "MATCHES_OF_BAND", len(pixels) // 5)
-    banded = refine_matches(gray, second, pixels, pixels.astype(float))
-    np.testing.assert_array_equal(banded[1], whole[1])
-    np.testing.assert_allclose(banded[0], whole[0], atol=1e-3)
-    assert whole[1].mean() > 0.5
 
 
 def test_corners_come_from_all_parts_of_the_image_each_once(

@@ -300,7 +300,10 @@ def _system_memory() -> int:
 def _container_memory() -> int:
     """Return what the control group (version 2) of a container leaves to this process."""
     group = Path("/sys/fs/cgroup")
-    with suppress(OSError, ValueError):  # there is none, or its limit is "max"
-        limit, used = ((group / f"memory.{name}").read_text() for name in ("max", "current"))
-        return max(int(limit) - int(used), 0)
+    with suppress(OSError, ValueError, KeyError):  # there is none, or its limit is "max"
+        limit, used, stat = (
+            (group / f"memory.{name}").read_text() for name in ("max", "current", "stat")
+        )
+        cached = dict(line.split() for line in stat.splitlines())["inactive_file"]  # can be dropped
+        return max(int(limit) - int(used) + int(cached), 0)
     return 2**62

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 from .errors import MissingExtraError, first_line, require_packages
 from .signals import sigterm_kept
 
-LOWEST_VERSION = "4.10"
-"""The first one that works with NumPy 2."""
+LOWEST_VERSION = "4.12"
+"""The first one that writes the EXIF of a picture."""
 
 DISTRIBUTIONS = (
     "opencv-python",

@@ -174,13 +174,13 @@ def run_reconstruct(images: Images, options: Options, folder: Path, report: Repo
     done = itertools.count(1)
     report("starting", 0, MODEL_STAGES)
     left, right = (one.path for one in images)
-    height, width = load_image(left).shape[:2]
+    sizes = [load_image(path).shape[1::-1] for path in (left, right)]
     focal_px, assumed = options.get("focal_px"), False
     if focal_px is None:
         try:
-            calibration_from_exif(left, right, (width, height), (width, height))
+            calibration_from_exif(left, right, *sizes)
         except ReconstructionError:
-            focal_px, assumed = ASSUMED_FOCAL * max(height, width), True
+            focal_px, assumed = ASSUMED_FOCAL * max(sizes[0]), True
     found = reconstruct(
         left,
         right,

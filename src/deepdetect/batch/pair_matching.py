@@ -66,7 +66,10 @@ class PairMatchingOptions:
 
     def __post_init__(self) -> None:
         check_ranges(
-            self, positive=("inlier_threshold",), not_negative=("seed",), fractions=("ratio",)
+            self,
+            positive=("inlier_threshold", "ratio"),
+            not_negative=("seed",),
+            fractions=("ratio",),
         )
         look_up("matcher", self.matcher, MATCHERS_OF_FLOATS)
         if self.verify == "essential":
@@ -158,7 +161,7 @@ def _find_pairs(
     taken: dict[str, Pair] = {}
     with open_hdf5(features) as file:
         settings = key(str(file.attrs.get(SETTINGS)))
-        states = {name: _state(file, name) for pair in pairs for name in pair}
+        states = {name: _state(file, name) for name in {name for pair in pairs for name in pair}}
         for pair in pairs:
             state0, state1 = states[pair[0]], states[pair[1]]
             name, reversed_name = pair_name(*pair), pair_name(*pair[::-1])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import os
 import re
 import sys
 import warnings
@@ -173,7 +174,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _failed("stopped; what was written stays", 130)
     except OSError as error:
         if not fails(sys.stdout):
-            raise
+            if error.filename is None:
+                raise
+            name = os.fsdecode(error.filename)
+            return _failed(f"{name} cannot be used ({error.strerror}): check the path", 2)
         if isinstance(error, BrokenPipeError):
             return 1
         text = f"cannot write to standard output ({error.strerror}): what is in files stays"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
@@ -26,6 +27,9 @@ NETWORK = From(
     defaults={"threads": "the backend's choice"},
 )
 POINTS = From(PointDetector, more="spread ranker")
+ONE_THREAD = replace(NETWORK, defaults={"threads": "1"})
+"""Of commands that run a detector in each process."""
+
 DESCRIBED_POINTS = From(PointDetector, more="spread ranker descriptor")
 SELECTION = From(
     SelectionOptions,

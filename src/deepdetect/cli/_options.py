@@ -34,8 +34,6 @@ CELL_WIDTH = 18
 TEXT_WIDTH = 100
 """Characters of a line of a wrapped table, at most; only words may be longer."""
 
-ALIASES = {"max_keypoints": ("--num-keypoints", "--top-k", "--max-num-keypoints")}
-
 
 @dataclass(frozen=True)
 class From:
@@ -72,7 +70,7 @@ class From:
         for name in self.names():
             hint = self.types.get(name) or eval(str(parameters[name].annotation), scope)
             flag, _, negative = self.flags.get(name, "").partition("/")
-            settings: dict[str, Any] = {"name": flag or None, "alias": ALIASES.get(name)}
+            settings: dict[str, Any] = {"name": flag or None}
             settings |= {"negative": negative.split()} if negative else {}
             if name in self.defaults:
                 settings["show_default"] = lambda _, text=self.defaults[name]: text

@@ -55,13 +55,8 @@ SHARED_CAMERA = replace(MANY, more="single_camera")
 ONNX = cli.From(
     OnnxOptions,
     "size",
-    types={
-        "size": Annotated[
-            tuple[int, int] | None,
-            Parameter(converter=lambda _, tokens: size_of(tokens[0].value), n_tokens=1),
-        ]
-    },
-    defaults={"size": "any"},
+    types={"size": str | None},
+    defaults={"size": "any; else as 480x640"},
 )
 Sources = Annotated[
     Path,
@@ -206,7 +201,7 @@ def size_of(text: str) -> tuple[int, int]:
     """Read height and width, as 480x640."""
     match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", text)
     if match is None:
-        raise ValueError(f"{text!r} is no height and width, as 480x640")
+        raise OptionError(f"{text!r} is no height and width, as 480x640")
     return int(match[1]), int(match[2])
 
 
@@ -239,6 +234,8 @@ def onnx(
         licence: What the file says of the licence of the weights.
     """
     file = cli.output_file(output, "deepdetect.onnx")
+    if "size" in values:
+        values["size"] = size_of(values["size"])
     options = OnnxOptions(**values)
     cli.check_outputs([file], [resolve_weights(weights)])
     metadata = write_onnx(weights, file, options, licence=licence)

@@ -11,7 +11,7 @@ from ..batch.extraction import extract_features
 from ..batch.hdf5 import BatchReport
 from ..batch.pair_matching import MATCHERS_OF_FLOATS, PairMatchingOptions, match_pairs
 from . import _options as cli
-from ._detection import DESCRIBED_POINTS, NETWORK, SELECTION, Detector, chosen_detector
+from ._detection import DESCRIBED_POINTS, ONE_THREAD, SELECTION, Detector, chosen_detector
 
 EXTRACTION = cli.From(extract_features, "overwrite", more="engine workers")
 PAIRS = cli.From(match_pairs, "overwrite", more="engine workers")
@@ -25,7 +25,7 @@ MATCHING = cli.From(
 )
 
 
-@cli.command(EXTRACTION, SELECTION, DESCRIBED_POINTS, NETWORK, cli.READING)
+@cli.command(EXTRACTION, SELECTION, DESCRIBED_POINTS, ONE_THREAD, cli.READING)
 def extract(
     folder: Annotated[Path, Parameter(help="Folder of the images.")],
     /,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -51,11 +52,25 @@ MANY = cli.From(
 WORKERS = cli.From(reconstruct_many, more="workers")
 """Options that two images do not have."""
 
+CHOSEN = replace(
+    SELECTION,
+    defaults={
+        "max_keypoints": f"{MAX_KEYPOINTS} of points; of two images 2048, of the network all"
+    },
+)
+DETECTOR = replace(
+    NETWORK,
+    defaults={
+        "weights": "default; of two images dense",
+        "threads": "1; of two images the backend's choice",
+    },
+)
+
 MAX_UNREGISTERED = 4
 """Images that are named with a reason on the terminal; model.json names all."""
 
 
-@cli.command(CAMERAS, SELECTION, MANY, WORKERS, DESCRIBED_POINTS, NETWORK, cli.READING)
+@cli.command(CAMERAS, CHOSEN, MANY, WORKERS, DESCRIBED_POINTS, DETECTOR, cli.READING)
 def reconstruct(
     *images: cli.Images,
     output: cli.Output = Path("deepdetect-output"),

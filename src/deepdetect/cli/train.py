@@ -95,7 +95,7 @@ def chosen_label_settings(
     if detectors is None:
         return settings
     names = tuple(name.strip() for name in detectors.split(",") if name.strip())
-    return replace(settings, detectors=names)
+    return settings.with_detectors(names)
 
 
 def chosen_recipe(

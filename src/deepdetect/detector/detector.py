@@ -400,7 +400,7 @@ def find_keypoints(
         raise OptionError(f"the detector {detector!r} has no method detect: give a DeepDetect")
     if hasattr(detector, "detect") and not hasattr(detector, "heatmap"):
         found = detector.detect(rgb, ignore=ignore)
-        if not ((found.xy >= -0.5) & (found.xy <= np.array(rgb.shape[1::-1]) - 0.5)).all():
+        if not ((found.xy >= -0.5) & (found.xy < np.array(rgb.shape[1::-1]) - 0.5)).all():
             raise OptionError(
                 "the detector has found keypoints outside of the image: correct its method detect"
             )

@@ -134,7 +134,8 @@ def checked_image(image: Any, size: tuple[int, int], channels: Channels) -> np.n
     if isinstance(image, (str, bytes)) or hasattr(image, "__fspath__"):
         raise ImageError("a picture needs the image itself, not a path: give load_image(path)")
     if hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
-        image, channels = np.asarray(image.convert("RGB")), "rgb"
+        deep = image.mode.startswith(("I", "F"))  # which Pillow would clip
+        image, channels = np.asarray(image if deep else image.convert("RGB")), "rgb"
     rgb = array_to_rgb(image, channels)
     if rgb.shape[1::-1] != size:
         raise ImageError(

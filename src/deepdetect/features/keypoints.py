@@ -52,7 +52,7 @@ class Keypoints:
     `len`, iteration over (x, y) rows and indexing by slices, masks and index arrays work.
 
     Raises:
-        OptionError: the shapes do not fit together, or a position or score is not finite.
+        OptionError: the shapes do not fit together, or a number other than a logit is not finite.
 
     Example:
         >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))
@@ -91,6 +91,8 @@ class Keypoints:
                     raise OptionError(
                         f"{len(scores)} keypoints need (N,) {name}, not {values.shape}"
                     )
+                if name != "logits" and not np.isfinite(values).all():
+                    raise OptionError(f"keypoints need finite {name}")
         if self.descriptors is not None:
             whole = getattr(self.descriptors, "dtype", None) == np.uint8
             kind = np.uint8 if whole else np.float32
@@ -99,6 +101,8 @@ class Keypoints:
                 raise OptionError(
                     f"{len(scores)} keypoints need (N, D) descriptors, not {descriptors.shape}"
                 )
+            if not whole and not np.isfinite(descriptors).all():
+                raise OptionError("keypoints need finite descriptors")
             fields["descriptors"] = descriptors
         for name, values in fields.items():
             object.__setattr__(self, name, values)

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from .._shared.errors import OptionError
+from .._shared.errors import ImageError, OptionError
 from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
 from .._shared.options import look_up
@@ -178,6 +178,7 @@ def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
         keypoints: of any detector; angles of -1 are unset.
 
     Raises:
+        ImageError: the image has another type or size than the keypoints' own.
         OptionError: a size is not above 0.
 
     Example:
@@ -186,16 +187,32 @@ def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
         >>> describe_keypoints(gray, points).descriptors.shape
         (1, 128)
     """
-    xy, sizes, angles = keypoints.xy, keypoints.sizes, keypoints.angles
-    if sizes is None:
-        descriptors = sift_descriptors(gray, xy)
+    if gray.dtype != np.uint8 or gray.shape[::-1] != keypoints.image_size:
+        width, height = keypoints.image_size
+        raise ImageError(
+            f"keypoints of {width}x{height} pixels need the uint8 luma of their image, of shape "
+            f"{(height, width)}, not {gray.dtype} of shape {gray.shape}"
+        )
+    if keypoints.sizes is None:
+        described = replace(keypoints, descriptors=sift_descriptors(gray, keypoints.xy))
     else:
-        if not (sizes > 0).all():
-            raise OptionError("keypoints need sizes above 0 to be described: give them some")
-        angles = set_angles(gray, xy, sizes, angles)
-        descriptors = scaled_sift_descriptors(gray, xy, sizes, angles)
-    root = to_root_sift(descriptors, overwrite=True)
-    return replace(keypoints, angles=angles, descriptors=root, descriptor_type=ROOT_SIFT)
+        described = describe_scaled(gray, keypoints)
+    root = to_root_sift(described.descriptors, overwrite=True)
+    return replace(described, descriptors=root, descriptor_type=ROOT_SIFT)
+
+
+def describe_scaled(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
+    """Return keypoints that have sizes with SIFT descriptors at these and at their angles.
+
+    Unset angles become the dominant ones; a size that is not above 0 is an OptionError.
+    """
+    xy, sizes = keypoints.xy, keypoints.sizes
+    assert sizes is not None
+    if not (sizes > 0).all():
+        raise OptionError("keypoints need sizes above 0 to be described: give them some")
+    angles = set_angles(gray, xy, sizes, keypoints.angles)
+    descriptors = scaled_sift_descriptors(gray, xy, sizes, angles)
+    return replace(keypoints, angles=angles, descriptors=descriptors, descriptor_type="sift")
 
 
 def root_sift_descriptors(
@@ -254,7 +271,6 @@ Descriptor = Callable[[np.ndarray, np.ndarray, float, float], np.ndarray]
 DESCRIPTORS: dict[str, Descriptor] = {
     "sift": sift_descriptors,
     "rootsift": root_sift_descriptors,
-    "sift-opencv": opencv_sift_descriptors,
 }
 
 

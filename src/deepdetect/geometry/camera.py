@@ -190,11 +190,7 @@ class Calibration:
         place = Path(path)
         try:
             values = read_camera_file(place, views)
-            if size0 is None:
-                if not {"width", "height"} <= {*values}:
-                    raise ReconstructionError("it does not name the images' size: give `size0`")
-                size0 = values["width"], values["height"]
-            return _calibration(values, size0, size1 or size0, str(path))
+            return _calibration(values, size0, size1, str(path))
         except ReconstructionError as error:
             raise ReconstructionError(f"{path}: {error}") from None
         except OSError as error:
@@ -217,7 +213,9 @@ class Calibration:
                 )
 
 
-def _calibration(values: dict[str, Any], size0: Size, size1: Size, source: str) -> Calibration:
+def _calibration(
+    values: dict[str, Any], size0: Size | None, size1: Size | None, source: str
+) -> Calibration:
     views = []
     for name in ("left", "right"):
         of_view = values.get(name, {})
@@ -226,6 +224,8 @@ def _calibration(values: dict[str, Any], size0: Size, size1: Size, source: str) 
         together = {**values, **of_view}
         views.append({key: value for key, value in together.items() if value is not None})
     left, right = views
+    size0 = size0 or _size_of(left)
+    size1 = size1 or (_size_of(right) if {"width", "height"} <= {*right} else size0)
     camera0 = _camera(left, size0)
     offset = values.get("disparity_offset_px")
     if offset is not None:
@@ -241,6 +241,12 @@ def _calibration(values: dict[str, Any], size0: Size, size1: Size, source: str) 
         )
     calibration.check_sizes(size0, size1)
     return calibration
+
+
+def _size_of(view: dict[str, Any]) -> Size:
+    if not {"width", "height"} <= {*view}:
+        raise ReconstructionError("it does not name the images' size: give `size0`")
+    return view["width"], view["height"]
 
 
 def _camera(view: dict[str, Any], size: Size) -> Camera:

@@ -253,19 +253,27 @@ def equalise(gray: np.ndarray) -> np.ndarray:
     return cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply(gray)
 
 
+WINDOWS_AT_ONCE = 4096
+"""Of `zncc_at_points`: `cv2.remap` takes up to 32,766, and many would fill the memory."""
+
+
 def zncc_at_points(
     images: tuple[np.ndarray, np.ndarray], points: tuple[np.ndarray, np.ndarray], side: int
 ) -> np.ndarray:
     """Return the ZNCC of the windows around (M, 2) points in both images, (M,) float64."""
-    patches = []
-    for image, at in zip(images, points, strict=True):
-        offsets = np.indices((side, side))[::-1].reshape(2, -1) - (side - 1) / 2
-        x, y = (at.T[:, :, None] + offsets[:, None]).astype(np.float32)
-        values = cv2.remap(gaussian_blur(image, BLUR_SIGMA_PX), x, y, cv2.INTER_LINEAR)
-        values = values - values.mean(axis=1, keepdims=True, dtype=np.float64)
-        norms = np.linalg.norm(values, axis=1, keepdims=True)
-        patches.append(values / np.maximum(norms, 1e-9))
-    return np.asarray((patches[0] * patches[1]).sum(axis=1))
+    blurred = [gaussian_blur(image, BLUR_SIGMA_PX) for image in images]
+    offsets = np.indices((side, side))[::-1].reshape(2, -1) - (side - 1) / 2
+    correlations = np.empty(len(points[0]))
+    for start in range(0, len(correlations), WINDOWS_AT_ONCE):
+        part, patches = slice(start, start + WINDOWS_AT_ONCE), []
+        for image, at in zip(blurred, points, strict=True):
+            x, y = (at[part].T[:, :, None] + offsets[:, None]).astype(np.float32)
+            values = cv2.remap(image, x, y, cv2.INTER_LINEAR)
+            values = values - values.mean(axis=1, keepdims=True, dtype=np.float64)
+            norms = np.linalg.norm(values, axis=1, keepdims=True)
+            patches.append(values / np.maximum(norms, 1e-9))
+        correlations[part] = (patches[0] * patches[1]).sum(axis=1)
+    return correlations
 
 
 EDGE_SIGMA_PX, EDGE_QUANTILE = 1.0, 0.99

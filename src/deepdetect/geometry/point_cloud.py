@@ -73,6 +73,11 @@ class PointCloud:
             if colors.dtype.kind not in "iu" or colors.min() < 0 or colors.max() > 255:
                 raise OptionError(f"colors must be whole numbers from 0 to 255, not {colors.dtype}")
             colors = colors.astype(np.uint8)
+        if self.normals is not None:
+            normals = np.asarray(self.normals, np.float32)
+            if normals.shape != points.shape:
+                raise OptionError(f"normals must be {points.shape} as points, not {normals.shape}")
+            object.__setattr__(self, "normals", normals)
         # Written so that NaN fails too.
         if not (np.abs(points) < np.finfo(np.float32).max).all():
             raise OptionError("every coordinate of a point cloud must be finite: remove the others")

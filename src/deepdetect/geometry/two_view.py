@@ -192,10 +192,7 @@ def is_pure_rotation(points0: np.ndarray, points1: np.ndarray, calibration: Cali
 def is_usual_rotation(points0: np.ndarray, points1: np.ndarray, sizes: tuple[Size, Size]) -> bool:
     """Return whether a turn of one camera of a usual focal length explains (M, 2) matches."""
     for focal in START_FOCAL_LENGTHS:
-        cameras = [
-            Camera(size, focal * max(size), ((size[0] - 1) / 2, (size[1] - 1) / 2))
-            for size in sizes
-        ]
+        cameras = [Camera(size, focal * max(size)) for size in sizes]
         if is_pure_rotation(points0, points1, Calibration(cameras[0], cameras[1])):
             return True
     return False

@@ -77,10 +77,9 @@ class DeepDetectExtractor(BaseModel):
     def _init(self, conf: dict[str, Any]) -> None:
         _check_names(conf, self.default_conf)
         check_name("angle unit", conf["angle_unit"], ("degrees", "radians"))
-        if conf["max_keypoints"] > MAX_KEYPOINTS:
-            raise OptionError(
-                f"hloc takes `max_keypoints` up to {MAX_KEYPOINTS}, not {conf['max_keypoints']}"
-            )
+        count = conf["max_keypoints"]
+        if count is None or count > MAX_KEYPOINTS:
+            raise OptionError(f"hloc takes `max_keypoints` up to {MAX_KEYPOINTS}, not {count}")
         self._detector = PointDetector(
             conf["max_keypoints"], spread=conf["spread"], descriptor=conf["descriptor"]
         )

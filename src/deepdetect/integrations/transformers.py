@@ -182,7 +182,7 @@ class DeepDetectForKeypointDetection(transformers.PreTrainedModel):
         output = DeepDetectKeypointOutput(
             loss=loss,
             logits=logits,
-            keypoints=padded(relative, logits.device).to(logits.dtype),
+            keypoints=padded(relative, logits.device),  # half precision has multiples of pixels
             scores=padded([points.scores for points in found], logits.device).to(logits.dtype),
             mask=padded([np.ones(len(points), np.int32) for points in found], logits.device),
         )

@@ -27,7 +27,7 @@ class DeepDetectMatcher(BaseMatcher):
     Args:
         device: where the images are; the matching itself runs on the processor.
         max_num_keypoints: at most this many, the best of all scales; None: dense keypoints.
-        weights: as of `DeepDetect`.
+        weights: of dense keypoints, as of `DeepDetect`.
         **keywords: of vismatch: `ransac_iters`, `ransac_conf`, `ransac_reproj_thresh`.
 
     Raises:

@@ -309,7 +309,8 @@ def _from_pil(
         values = np.asarray(image)
         if image.mode == "I" and image.format in ("PNG", "PPM"):  # Pillow's form of their 16 bits
             values = values.astype(np.uint16)
-        return array_to_rgb(values, name=name, value_range=value_range, deep=deep)
+        white = 65535 if image.format == "PPM" else None  # Pillow has scaled them to it
+        return array_to_rgb(values, name=name, value_range=value_range, white=white, deep=deep)
     width, height = image.size
     rgb = np.empty((height, width, 3), np.uint8)
     rows = max(1, STRIP_PIXELS // max(1, width))

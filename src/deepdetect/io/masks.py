@@ -7,9 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageOps
 
 from .._shared.atomic import atomic_path
 from .image_file import open_image, reading_options
+
+WHITES = (1, 255, 65535, 2**32)
+"""Of masks of 1, 8, 16 and more bits, whatever the file has room for."""
 
 
 def save_mask(mask: np.ndarray, path: str | Path) -> None:
@@ -20,8 +24,6 @@ def save_mask(mask: np.ndarray, path: str | Path) -> None:
 
 def encode_mask(mask: np.ndarray) -> bytes:
     """Encode a (H, W) bool mask as the content of a 1-bit PNG file."""
-    from PIL import Image
-
     content = io.BytesIO()
     Image.fromarray(mask).save(content, format="PNG")
     return content.getvalue()
@@ -30,10 +32,13 @@ def encode_mask(mask: np.ndarray) -> bytes:
 def load_mask(source: Any, *, max_megapixels: float | None = None) -> np.ndarray:
     """Read a mask of any bit depth as (H, W) bool: True where a pixel is brighter than half.
 
-    In a file of zeros and ones alone, the ones are True. Arguments and errors: see `open_image`.
+    White is the least of `WHITES` that no pixel is above. The mask is turned upright, as by
+    `load_image`. Arguments and errors: see `open_image`.
     """
     options = reading_options(max_megapixels=max_megapixels)
     with open_image(source, what="mask", options=options) as opened:
-        deep = opened.mode.startswith("I")  # 16 bits per pixel
-        values = np.asarray(opened if deep else opened.convert("L"))
-    return values > (0 if values.max() <= 1 else 32767 if deep else 127)
+        upright = ImageOps.exif_transpose(opened)
+        deep = upright.mode.startswith("I")  # 16 or 32 bits per pixel
+        values = np.asarray(upright if deep else upright.convert("L"))
+    white = next(white for white in WHITES if values.max() <= white)
+    return values > white // 2

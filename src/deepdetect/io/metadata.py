@@ -88,8 +88,10 @@ class Metadata:
             parts[cv2.IMAGE_METADATA_EXIF] = exif.tobytes().removeprefix(b"Exif\0\0")
         kept = {kind: np.frombuffer(part, np.uint8) for kind, part in parts.items() if part}
         bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-        _, data = cv2.imencodeWithMetadata(suffix, bgr, [*kept], [*kept.values()], settings)
-        return data.tobytes()
+        done, data = cv2.imencodeWithMetadata(suffix, bgr, [*kept], [*kept.values()], settings)
+        if not done:  # more than the format can hold
+            data = cv2.imencode(suffix, bgr, settings)[1]
+        return bytes(data)
 
     def _exif_of(self, picture: np.ndarray) -> Any:
         """Return the EXIF of an upright picture of another size; or None."""
@@ -102,6 +104,9 @@ class Metadata:
             fine.pop(Base.FocalLengthIn35mmFilm, None)
         fine |= {Base.ExifImageWidth: width, Base.ExifImageHeight: height}
         self.exif[Base.Orientation] = 1
+        for code in EXIF_TEXTS:  # of any encoding, which Pillow reads as Latin-1
+            if isinstance(text := self.exif.get(code), str):
+                self.exif[code] = text.encode("latin-1", "replace")
         return self.exif
 
     def write_tiff(self, bands: np.ndarray, path: Path) -> None:
@@ -122,7 +127,7 @@ class Metadata:
             tags.append((NO_DATA, "s", 0, f"{self.no_data:.17g}", True))
         exif = self._exif_of(bands)
         texts = {code: exif[code] for code in EXIF_TEXTS if code in exif} if exif else {}
-        tags += [(code, "s", 0, str(text), True) for code, text in texts.items()]
+        tags += [(code, "s", 0, text, True) for code, text in texts.items()]
         directories = {code: exif.get_ifd(code) for code in EXIF_DIRECTORIES} if exif else {}
         directories = {code: values for code, values in directories.items() if values}
         # Pointers, which tifffile does not write: they are made of the tags of the codes before.
@@ -173,7 +178,8 @@ def read_metadata(source: Any) -> Metadata:
         if file.read(4) in TIFF_STARTS:
             found = _of_tiff(file)
     with suppress(Exception), open_image(source) as image:  # raw photographs and others have none
-        found = replace(found, profile=found.profile or image.info.get("icc_profile"))
+        profile = found.profile or image.info.get("icc_profile")
+        found = replace(found, profile=profile if _is_of_rgb(profile) else None)
         exif = image.getexif()
         kept = _kept_exif(exif) if image.format == "TIFF" else exif
         found = replace(found, exif=kept if len(kept) else None)
@@ -188,6 +194,13 @@ def read_metadata(source: Any) -> Metadata:
         with suppress(OSError):
             found = replace(found, projection=path.with_suffix(".prj").read_bytes())
     return found
+
+
+def _is_of_rgb(profile: bytes | None) -> bool:
+    """Whether an ICC profile is whole, and of the colours that pictures are written in."""
+    return bool(
+        profile and int.from_bytes(profile[:4]) == len(profile) and profile[16:20] == b"RGB "
+    )
 
 
 def _kept_exif(exif: Any) -> Any:

@@ -23,7 +23,13 @@ from ..features.match_filter import filter_matches, suits_filter
 from ..features.matchers import DescriptorMatches, get_matcher, match_descriptors
 from ..features.matches import Matches, TwoViewGeometry, lazy
 from ..features.selection import SelectionOptions
-from ..features.sift import DESCRIPTORS, get_descriptor, scaled_sift_descriptors, to_root_sift
+from ..features.sift import (
+    DESCRIPTORS,
+    ROOT_SIFT,
+    describe_keypoints,
+    describe_scaled,
+    get_descriptor,
+)
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
 from ..geometry.transforms import epipolar_errors, transfer_errors
@@ -57,8 +63,7 @@ class MatchingOptions:
     Attributes:
         two_view_model: the geometry that guides if `model` leaves it open: "homography",
             "fundamental", or "auto": the one that fits the images.
-        descriptor: "sift", "rootsift", or "sift-opencv" for OpenCV's own in any case. None: what a
-            `PointDetector` extracts; of others "sift".
+        descriptor: "sift" or "rootsift". None: what a `PointDetector` extracts; of others "sift".
         keypoint_size: diameter of a keypoint for its descriptor, in pixels (paper: 3). Keypoints
             with sizes and angles of their own are described at these.
         angle: direction of all keypoints in degrees; -1 is OpenCV's "unset".
@@ -245,6 +250,7 @@ def match_features(
             f"descriptors of the types {features0.descriptor_type} ({length0} numbers) and "
             f"{features1.descriptor_type} ({length1}) cannot be compared: extract both alike"
         )
+    check_model("none", seed, GeometryOptions())
     learned = is_learned(features0.descriptor_type)
     check_name("filter_by", filter_by, ("ratio", "neighbours"))
     by_neighbours = filter_by == "neighbours"
@@ -410,12 +416,8 @@ def _describe(
     if keypoints.sizes is None or keypoints.angles is None:
         of_pixels = get_descriptor(kind)
         descriptors = of_pixels(gray, keypoints.xy, options.keypoint_size, options.angle)
-    else:
-        scaled = keypoints.xy, keypoints.sizes, keypoints.angles
-        descriptors = scaled_sift_descriptors(gray, *scaled)
-        if kind == "rootsift":
-            descriptors = to_root_sift(descriptors, True)
-    return replace(keypoints, descriptors=descriptors, descriptor_type=kind)
+        return replace(keypoints, descriptors=descriptors, descriptor_type=kind)
+    return (describe_keypoints if kind == ROOT_SIFT else describe_scaled)(gray, keypoints)
 
 
 def check_memory(keypoints: Sequence[int]) -> None:

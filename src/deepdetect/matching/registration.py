@@ -193,7 +193,9 @@ def _union(
     low = np.minimum(0, np.ceil(ends.min(axis=0)))
     high = np.maximum([shape0[1], shape0[0]], np.floor(ends.max(axis=0)) + 1)
     pixels = float(np.prod(high - low))
-    if depths.min() * depths.max() <= 0 or pixels > MAX_UNION * (width * height + np.prod(shape0)):
+    if depths.min() * depths.max() <= 0 or pixels > MAX_UNION * (
+        width * height + np.prod(shape0[:2])
+    ):
         raise RegistrationError(
             "the second image is seen too much from the side for a union: leave `extent` out"
         )

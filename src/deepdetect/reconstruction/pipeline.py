@@ -38,8 +38,7 @@ from .rectification import (
     find_rectification,
 )
 from .result import Reconstruction
-from .subpixel import refine_matches, spread_corners
-from .two_view import POSE_CELLS, checked_pose, reconstruct_two_view
+from .two_view import checked_pose, reconstruct_two_view, refined_corners
 
 SOR_WINDOW_PX = 9
 """Side of the window of pixels that SOR compares with in rectified pairs."""
@@ -219,10 +218,8 @@ def estimate_pose(
             seed=seed,
         )
     with timer.stage("sub-pixel"):
-        points0 = matches.points0.astype(np.float64)
-        rows = spread_corners(grays[0], points0, POSE_CELLS)
-        refined, converged = refine_matches(*grays, points0[rows], matches.points1[rows])
-    return checked_pose(points0[rows][converged], refined[converged], known, seed, timer)
+        corners = refined_corners(grays, matches.points0, matches.points1)
+    return checked_pose(*corners, known, seed, timer)
 
 
 def _from_disparities(

@@ -7,8 +7,6 @@ matches together (a similarity), then as the refined matches around it (an affin
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
 from .._shared.machine import parallel_for
@@ -30,9 +28,6 @@ MIN_CORRELATION = 0.8
 CONVERGENCE_PX, COARSE_CONVERGENCE_PX = 0.01, 0.05
 """A smaller step ends the alignment; the first one only serves the second."""
 
-MIN_MATCHES_OF_LATTICE = 1_000_000
-"""With more matches than this only those in every second row and column are aligned before."""
-
 AFFINITY_WINDOW_PX = 15
 """Side of the window whose matches give a patch its affinity."""
 
@@ -42,12 +37,6 @@ those on one line, give no affinity of their own."""
 
 MAX_SIMILARITY_SAMPLES = 5000
 """Matches that the similarity is estimated from."""
-
-MATCHES_OF_BAND = 500_000
-"""At a time, to bound the memory."""
-
-COARSE_STEP_PX = 2
-"""Between the rows and columns of the matches that are aligned before the others."""
 
 CORNER_WINDOW_PX = 7
 """Side of the window whose gradients make a corner: about the patch that is aligned."""
@@ -71,40 +60,10 @@ def refine_matches(
         return start, inside
     images = gray0.astype(np.float32), gray1.astype(np.float32)
     overall = similarity(pixels0, start)
-    refined, converged = start.copy(), np.zeros(len(start), bool)
-    step = COARSE_STEP_PX if len(pixels0) > MIN_MATCHES_OF_LATTICE else 1
-    # In bands of rows, for which the memory is small; neighbours beyond their edges are seen, too.
-    rows = pixels0[:, 1]
-    edges = np.quantile(rows, np.linspace(0, 1, -(-len(rows) // MATCHES_OF_BAND) + 1))
-    edges[-1] += 1
-    for top, bottom in pairwise(np.ceil(edges).astype(np.int64).tolist()):
-        reach = AFFINITY_WINDOW_PX // 2
-        near = np.flatnonzero((rows >= top - reach) & (rows < bottom + reach))
-        own = (rows[near] >= top) & (rows[near] < bottom)
-        found = _refine_band(images, pixels0[near], start[near], own, overall, step)
-        refined[near[own]], converged[near[own]] = found
-    return refined, converged
-
-
-def _refine_band(
-    images: tuple[np.ndarray, np.ndarray],
-    pixels0: np.ndarray,
-    start: np.ndarray,
-    own: np.ndarray,
-    overall: np.ndarray,
-    step_px: int,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Refine those of the matches, (N,) bool, that a band of the image owns."""
-    # How patches are deformed can be seen on some of them, where they are many.
-    some = np.flatnonzero((pixels0 % step_px == 0).all(axis=1))
-    affinities = np.broadcast_to(overall, (len(some), 2, 2))
-    start, converged = start.copy(), np.zeros(len(start), bool)
-    start[some], converged[some] = align_patches(
-        images, pixels0[some], start[some], affinities, COARSE_CONVERGENCE_PX
-    )
-    shape = images[0].shape
-    affinities = local_affinities(pixels0, start, converged, shape, overall)[own]
-    return align_patches(images, pixels0[own], start[own], affinities)
+    affinities = np.broadcast_to(overall, (len(start), 2, 2))
+    start, converged = align_patches(images, pixels0, start, affinities, COARSE_CONVERGENCE_PX)
+    affinities = local_affinities(pixels0, start, converged, gray0.shape, overall)
+    return align_patches(images, pixels0, start, affinities)
 
 
 def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:

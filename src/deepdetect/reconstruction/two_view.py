@@ -64,6 +64,19 @@ NO_DEPTH = {
 """What is said of the kinds of scenes without depth."""
 
 
+def refined_corners(
+    images: tuple[np.ndarray, np.ndarray], points0: np.ndarray, points1: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the matches at corners, which a pose is estimated from, to sub-pixel accuracy.
+
+    From whole pixels of the first image; those that do not converge are left out.
+    """
+    pixels0 = np.rint(points0)
+    rows = spread_corners(images[0], pixels0, POSE_CELLS)
+    refined, converged = refine_matches(*images, pixels0[rows], points1[rows])
+    return pixels0[rows][converged], refined[converged]
+
+
 def reconstruct_two_view(
     matches: Matches,
     images: tuple[np.ndarray, np.ndarray],
@@ -74,28 +87,21 @@ def reconstruct_two_view(
 ) -> dict[str, Any]:
     """Reconstruct the points of a pair; return what `Reconstruction` says of them.
 
-    Matches not sub-pixel are refined from whole pixels of the left image; `images` are uint8 luma.
+    The matches are sub-pixel; `images` are uint8 luma.
     """
     points0, points1 = matches.points0.astype(np.float64), matches.points1.astype(np.float64)
-    indices = pose_indices = np.arange(len(points0))
     dropped: dict[str, int] = {}
     with timer.stage("sub-pixel"):
-        if matches.subpixel:
-            pose_indices = spread_corners(images[0], points0, POSE_CELLS)
-        aligned, converged = refine_matches(*images, points0[pose_indices], points1[pose_indices])
-    pose_indices = pose_indices[converged]
-    if not matches.subpixel:
-        indices, points1 = pose_indices, aligned
-        dropped["not refined"] = len(points0) - len(indices)
-    pose = checked_pose(points0[pose_indices], aligned[converged], calibration, seed, timer)
+        corners = refined_corners(images, points0, points1)
+    pose = checked_pose(*corners, calibration, seed, timer)
     baseline = 1.0 if calibration.baseline_mm is None else calibration.baseline_mm
-    used = points0[indices], points1[indices]
     with timer.stage("triangulation"):
-        made = triangulate(*used, calibration, pose.rotation, pose.translation * baseline)
+        shift = pose.translation * baseline
+        made = triangulate(points0, points1, calibration, pose.rotation, shift)
     fundamental = fundamental_matrix(calibration, pose.rotation, pose.translation)
-    near_line = epipolar_errors(*used, fundamental) < MAX_EPIPOLAR_DISTANCE_PX
+    near_line = epipolar_errors(points0, points1, fundamental) < MAX_EPIPOLAR_DISTANCE_PX
     focal = calibration.camera0.focal_px[0]
-    kept = np.ones(len(indices), bool)
+    kept = np.ones(len(points0), bool)
     for reason, passed in (
         ("far from its epipolar line", near_line),
         ("behind a camera", made.cheirality),
@@ -118,7 +124,7 @@ def reconstruct_two_view(
         )
     return {
         "points": made.points[kept].astype(np.float32),
-        "pixels": matches.points0[indices[kept]],
+        "pixels": matches.points0[kept],
         "disparity": None,
         "matched": np.ones(np.count_nonzero(kept), bool),
         "pose": pose,

@@ -103,7 +103,9 @@ def reconstruct_many(
     if calibration is not None and focal_px is not None:
         raise ReconstructionError("give `calibration` or `focal_px`, not both")
     if overwrite:
-        shutil.rmtree(target / WORK, ignore_errors=True)
+        work = target / WORK
+        if any(work.glob("features.h5*")):  # another folder of this name is not ours
+            shutil.rmtree(work, ignore_errors=True)
     stages = Stages(target, options, workers, quiet, seed)
     folder = stages.folder_of(images)
     if control is None and (placed := [n for n in options.formats if FORMATS[n].placed]):
@@ -234,8 +236,14 @@ def _write(
     values = {**found.summary(), "files": [str(path) for path in found.files]}
     with atomic_path(output / "model.json") as path:
         path.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
+    failed = []
     for name in formats:
-        FORMATS[name].write(found, folder, output)
+        try:
+            FORMATS[name].write(found, folder, output)
+        except ReconstructionError as error:  # what one lacks, another may not need
+            failed.append(str(error))
+    if failed:
+        raise ReconstructionError("; ".join(failed))
 
 
 def _seen_from(

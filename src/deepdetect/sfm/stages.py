@@ -25,7 +25,7 @@ from .._shared.options import check_ranges, suggest_keywords
 from .._shared.progress import progress
 from .._shared.records import file_state, key, load_arrays, save_arrays
 from ..batch.extraction import extract_features
-from ..batch.hdf5 import open_hdf5
+from ..batch.hdf5 import feature_names, open_hdf5
 from ..batch.pair_list import Pair, following, list_pairs, pair_name
 from ..batch.pair_matching import PairMatchingOptions, match_pairs
 from ..detector.detector import DeepDetect
@@ -130,7 +130,14 @@ class MultiViewOptions:
             )
         check_name("matches", self.matches, ("sparse", "dense"))
         check_name("mapper", self.mapper, ("incremental", "global"))
-        check_ranges(self, counts=("stride_px",), fractions=("ratio", "min_motion"))
+        if "mesh" in self.formats and not self.dense:
+            raise OptionError("the format mesh is made of dense points: leave out `dense=False`")
+        check_ranges(
+            self,
+            positive=("ratio",),
+            counts=("stride_px",),
+            fractions=("ratio", "min_motion"),
+        )
 
     def pair_choice(self, count: int) -> str:
         """Return how the pairs of so many images are chosen."""
@@ -176,7 +183,9 @@ class Stages:
         if isinstance(images, (str, Path)):
             if self.output.resolve() == Path(images).resolve():
                 raise OptionError(f"{images} holds the images: give another folder with -o")
-            return Path(images)
+            if not self.output.resolve().is_relative_to(Path(images).resolve()):
+                return Path(images)
+            images = find_images(images, [self.output])  # without pictures among the results
         taken = check_images(images)
         folder = self.work / LINKS
         shutil.rmtree(folder, ignore_errors=True)
@@ -212,8 +221,9 @@ class Stages:
             raise ReconstructionError("no image can be read: " + "; ".join(report.failures))
         sizes, keypoints, failures = {}, {}, {}
         with open_hdf5(self.features) as file:
+            described = {*feature_names(file)}
             for name in check_images(folder):
-                if name in file:
+                if name in described:
                     width, height = file[name]["image_size"][()]
                     sizes[name] = int(width), int(height)
                     keypoints[name] = len(file[name]["keypoints"])
@@ -303,6 +313,7 @@ class Stages:
             [cameras.index(camera) for camera in cameras],
             list(matches.items()),
             (known, refined, options.matches, options.mapper, self.seed),
+            options.stride_px if options.matches == "dense" else None,
             (pycolmap.__version__, __version__),
         )
         record = self.work / f"mapping-{made_of}.json"

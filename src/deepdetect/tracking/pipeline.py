@@ -14,7 +14,7 @@ import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.opencv import cv2
-from .._shared.options import suggest_keywords
+from .._shared.options import is_path, suggest_keywords
 from .._shared.progress import progress
 from .._shared.signals import ENDING, exit_by_signal, handle_signals
 from ..detector.detector import Detector
@@ -138,6 +138,9 @@ def track(
         >>> track("drive.mp4", "tracks.mp4")  # doctest: +SKIP
     """
     video, table = output_files(output)
+    made = [path.resolve() for path in (video, table) if path is not None]
+    if is_path(source) and Path(str(source)).resolve() in made:
+        raise OptionError(f"{source} is the video itself: give another output")
     if tail < 1:
         raise OptionError(f"`tail` must be at least 1, not {tail}")
     frames = tracks = positions = 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,7 +61,7 @@ def load_ranker(path: Path = RANKER) -> Ranker:
                 (file[f"weight{k}"].astype(np.float32), file[f"bias{k}"].astype(np.float32))
                 for k in range(3)
             )
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except Exception as error:  # NumPy's readers raise many kinds
         raise WeightsError(
             f"{path} does not hold weights of the ranker ({first_line(error)})"
         ) from None

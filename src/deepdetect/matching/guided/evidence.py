@@ -277,7 +277,11 @@ def moving_alike(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
     first, second = points0 @ [1, 1j], points1 @ [1, 1j]
     blocks = np.array_split(first, len(first) // 500 + 1)  # all distances of many fill the memory
     distances = (np.abs(block[:, None] - first) for block in blocks)
-    nearest = np.concatenate([np.argsort(each)[:, 1 : neighbours + 1] for each in distances])
+    nearest = np.concatenate(
+        [np.argpartition(each, neighbours)[:, : neighbours + 1] for each in distances]
+    )
+    own = nearest == np.arange(len(first))[:, None]
+    nearest = np.take_along_axis(nearest, np.argsort(own, axis=1, kind="stable"), 1)[:, :-1]
     steps = first[nearest] - first[:, None]
     moves = (second[nearest] - second[:, None]) / steps
     allowed = MAX_MOVE_DIFFERENCE * np.abs(moves)[:, :, None]

@@ -138,13 +138,11 @@ def match_by_rectification(
     xy0: np.ndarray,
     sparse: Pair,
     fundamental: np.ndarray,
-    exact: bool = False,
     plane: np.ndarray | None = None,
 ) -> tuple[np.ndarray, GuidedMatches] | None:
     """Match (N, 2) keypoints of the first image by rectifying the pair.
 
-    The `sparse` matches, (M, 2) in both images, fit the fundamental matrix, x1^T F x0 = 0. An
-    `exact` matrix is known: it is not corrected, and sparse matches that contradict do not matter.
+    The `sparse` matches, (M, 2) in both images, fit the fundamental matrix, x1^T F x0 = 0.
     The homography of a `plane` of the scene brings the second view near to the first.
     Returns the refined matrix and the matches, which fit it exactly; None where the pair cannot be
     rectified, too few corners can be tracked, or the sparse matches contradict.
@@ -162,7 +160,7 @@ def match_by_rectification(
     tracked, on_rows = tracks
     fundamental = _refine(fundamental, sparse, tracked, sizes)
     row_error = np.quantile(epipolar_errors(tracked[0], on_rows, fundamental), ROW_QUANTILE)
-    if not exact and (row_error > MAX_ROW_ERROR_PX or _is_range_too_wide(view)):
+    if row_error > MAX_ROW_ERROR_PX or _is_range_too_wide(view):
         again = rectified_view(grays, tracked, fundamental, plane)
         tracks = None if again is None else _track(again)
         if again is not None and tracks is not None:
@@ -170,7 +168,7 @@ def match_by_rectification(
             if counts[1] >= counts[0]:
                 view, row_error = again, 0.0
                 fundamental = _refine(fundamental, sparse, tracks[0], sizes)
-    if not exact and _agreement(view, sparse) < MIN_AGREEMENT:
+    if _agreement(view, sparse) < MIN_AGREEMENT:
         return None
     # Rows that are off, and could not be corrected, are a reason to doubt low correlation.
     near = row_error * view.scale < MAX_ROW_ERROR_PX

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..._shared.errors import OptionError, check_name
 from ..._shared.image_array import Channels, to_8_bits
-from ..._shared.options import check_ranges, suggest_keywords
+from ..._shared.options import check_ranges, suggest_keywords, whole
 from ..._shared.progress import StageTimer
 from ...detector.detector import AnyDetector, DeepDetect
 from ...geometry.images import downscale
@@ -159,10 +159,12 @@ def stitch(
     several = isinstance(images, Sequence) or getattr(images, "ndim", 0) == 4
     if not several or len(images) < 2:
         raise OptionError("a panorama needs two images or more: give more images")
-    if reference is not None and not 0 <= reference < len(images):
-        raise OptionError(
-            f"`reference` must number an image, 0 to {len(images) - 1}, not {reference}"
-        )
+    if reference is not None:
+        reference = whole("reference", reference)
+        if not 0 <= reference < len(images):
+            raise OptionError(
+                f"`reference` must number an image, 0 to {len(images) - 1}, not {reference}"
+            )
     timer = StageTimer(progress)
     small: dict[int, tuple[np.ndarray, float]] = {}
     sizes: dict[int, tuple[int, int]] = {}
