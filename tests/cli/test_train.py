@@ -88,11 +88,19 @@ def test_a_preset_is_changed_by_options(
 
     monkeypatch.setattr(dense, "initial_network", initial_network)
     words = ["train", str(images), "-o", str(tmp_path), "--preset", "paper", "--stage", "480x64x9"]
-    words += ["--no-interleave", "--flips", "--batch-norm", "--init", "default", "--init", "dense"]
+    words += [
+        "--no-interleave",
+        "--transpositions",
+        "--batch-norm",
+        "--init",
+        "default",
+        "--init",
+        "dense",
+    ]
     assert run_command(words).exit_code == 130
     ((options, init_weights),) = seen
     assert [stage.epochs for stage in options.stages] == [9]
-    assert options.flips
+    assert options.transpositions
     assert options.frozen_batch_norm is False
     assert options.max_images == PRESETS["paper"].max_images
     assert init_weights == ("default", "dense")

@@ -42,7 +42,7 @@ from .conftest import plain_options  # noqa: E402
 OPTIONS = plain_options(
     stages=(Stage(64, 4, 6), Stage(96, 2, 1)),
     short_sides=(96, 64),
-    flips=True,
+    transpositions=True,
     color_jitter=0.0,
     augmentations=1,
     labels=LabelOptions(("fast", "harris", "sobel")),
@@ -139,12 +139,7 @@ def test_crops_and_labels_belong_together(source: FolderSource) -> None:
 
 def _found(image: np.ndarray, mask: np.ndarray, view: np.ndarray, label: np.ndarray) -> bool:
     side = len(image)
-    for flipped, flipped_mask in (
-        (turned[::a, ::b], turned_mask[::a, ::b])
-        for turned, turned_mask in ((image, mask), (image.transpose(1, 0, 2), mask.T))
-        for a in (1, -1)
-        for b in (1, -1)
-    ):
+    for flipped, flipped_mask in ((image, mask), (image.transpose(1, 0, 2), mask.T)):
         corner = (view[: len(view) - side + 1, : view.shape[1] - side + 1] == flipped[0, 0]).all(2)
         for top, left in np.argwhere(corner):
             place = np.s_[top : top + side, left : left + side]
@@ -168,16 +163,13 @@ class Corners:
         return image, image[..., 0] > 0
 
 
-@pytest.mark.parametrize(
-    ("flips", "transpositions", "count"), [(True, True, 8), (True, False, 4), (False, True, 2)]
-)
-def test_all_mirrors_come_when_asked_for(flips: bool, transpositions: bool, count: int) -> None:
-    """Crops of an image that every mirror changes: each of the eight is seen."""
+@pytest.mark.parametrize(("transpositions", "count"), [(False, 1), (True, 2)])
+def test_crops_are_transposed_when_asked_for(transpositions: bool, count: int) -> None:
+    """Crops of an image that every mirror changes."""
     options = plain_options(
         stages=(Stage(64, 4, 60),),
         short_sides=(64,),
         dark_fraction=0.0,
-        flips=flips,
         transpositions=transpositions,
     )
     seen = set()

@@ -91,7 +91,6 @@ def test_bad_device_options_are_refused(bad: dict, hint: str) -> None:
         {"steps": 0},
         {"min_density": 0},
         {"min_density": 0.2, "max_density": 0.1},
-        {"match_weight": -1},
         {"side": 32},
     ],
 )

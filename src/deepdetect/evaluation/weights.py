@@ -21,6 +21,7 @@ from .options import PAPER_RESOLUTION_PX, THRESHOLDS
 from .protocols.masks import (
     LabelDensityDetector,
     MaskScore,
+    check_scale,
     load_sample,
     sample_images,
     score_at_scale,
@@ -155,11 +156,13 @@ def evaluate(
         with_masks = not scales or any(Path(samples).glob("mask_image_*.png"))
         images = sample_images(samples) if with_masks else find_images(samples)
 
-        def loaded(title: str) -> Iterator[tuple[Any, Any]]:
+        def loaded(title: str, scale: float = 1) -> Iterator[tuple[Any, Any]]:
             with progress(len(images), title, "image", quiet) as bar:
                 for path in images:
                     try:
-                        yield load_sample(path) if with_masks else (load_image(path), None)
+                        sample = load_sample(path) if with_masks else (load_image(path), None)
+                        check_scale(sample[0], scale)
+                        yield sample
                     except ImageError as error:
                         failures[str(error)] = None
                     bar.update(1)
@@ -167,7 +170,7 @@ def evaluate(
         if with_masks:
             masks = score_samples(detector.heatmap, loaded("scoring"))
         for scale in scales:
-            shown = (rgb for rgb, _ in loaded(f"scale {scale:g}"))
+            shown = (rgb for rgb, _ in loaded(f"scale {scale:g}", scale))
             for visibility, score in score_at_scale(detector, shown, scale).items():
                 by_scale[scale, visibility] = score
         if not masks and not by_scale:

@@ -69,14 +69,9 @@ def darken(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:
     return np.asarray(ImageEnhance.Contrast(dim).enhance(darkening.contrast))
 
 
-def flip(image: np.ndarray, mask: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mirror a crop and its label left to right (axis 1) or upside down (axis 0)."""
-    # Copies a hundred times faster than a negative stride.
-    return cv2.flip(image, axis), cv2.flip(mask.view(np.uint8), axis).view(bool)
-
-
 def transpose(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mirror a crop and its label along the diagonal: only BRISK labels it differently."""
+    # Copies a hundred times faster than a view.
     return cv2.transpose(image), cv2.transpose(mask.view(np.uint8)).view(bool)
 
 

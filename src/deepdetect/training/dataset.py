@@ -21,7 +21,7 @@ from .._shared.records import key
 from ..io.image import load_image
 from ..io.masks import load_mask, save_mask
 from ..labels import LabelOptions
-from .augmentation import flip, jitter_color, transpose
+from .augmentation import jitter_color, transpose
 from .recipe import Stage, TrainingOptions
 from .sampler import CropIndex
 from .shards import Shards, ShardSource
@@ -167,9 +167,6 @@ class CropDataset(Dataset[tuple[Tensor, Tensor]]):
         left = int(generator.integers(image.shape[1] - side + 1))
         image = image[top : top + side, left : left + side]
         mask = mask[top : top + side, left : left + side]
-        for axis in (1, 0) if options.flips else ():  # left-right, then upside down
-            if generator.random() < 0.5:
-                image, mask = flip(image, mask, axis)
         if options.transpositions and generator.random() < 0.5:
             image, mask = transpose(image, mask)
         if generator.random() < options.color_jitter:
@@ -240,9 +237,10 @@ def prepare_data(
     shards = Shards.open(images, options)
     listed, held_out = [], []
     if shards is None:
-        listed = list_images(images, options, (output, folder), options.max_images)
+        others = (output, folder) if validation is None else (output, folder, Path(validation))
+        listed = list_images(images, options, others, options.max_images)
     if validation is not None:
-        held_out = list_images(Path(validation), options, (output, folder))
+        held_out = list_images(Path(validation), options, (output, folder, images))
     elif shards is None:
         listed, held_out = train_val_split(listed, options.val_fraction)
     memory = available_memory() // 2 // processes

@@ -85,9 +85,8 @@ class TrainingOptions:
         augmentations: augmented views of each image at the first size, in normal and in dark
             light: rotated, relit, blurred, noisy or compressed. Each is used as often as the plain
             view of a size.
-        flips: mirror crops left to right and upside down. The label of a mirrored image
-            is different, though: OpenCV's Shi-Tomasi, SIFT, ORB and BRISK mark other pixels.
-        transpositions: mirror crops along their diagonal, which changes labels of BRISK only.
+        transpositions: mirror crops along their diagonal, which changes labels of BRISK only;
+            flips would change those of Shi-Tomasi, SIFT and ORB, too.
         color_jitter: fraction of the crops whose colours are removed, or rotated with the same
             luma to a grey level, the only thing that labels and `fast` depend on.
         optimizer: "adam", or "soap", which learns more per image (docs/history.md has the
@@ -129,7 +128,6 @@ class TrainingOptions:
     val_fraction: float = 0.05
     dark_fraction: float = 0.5
     augmentations: int = 4
-    flips: bool = False
     transpositions: bool = True
     color_jitter: float = 0.0
     optimizer: str = "soap"
@@ -237,8 +235,6 @@ class PointsTrainingOptions:
         side: side of the square views, in pixels.
         learning_rate: highest learning rate; cosine annealing to 2 % of it.
         min_density, max_density: range of the budgets in keypoints per pixel, log-uniform.
-        match_weight: how much more a keypoint is worth whose upright descriptors match, in
-            multiples of one that is only found again.
         val_count: how many times the weights are measured after the start.
         val_pairs: pairs of each kind that they are measured on: zoom, blur, viewpoint, light.
         seed: seed of the weights and the pairs.
@@ -253,7 +249,6 @@ class PointsTrainingOptions:
     learning_rate: float = 3e-3
     min_density: float = 0.003
     max_density: float = 0.025
-    match_weight: float = 0.0
     val_count: int = 12
     val_pairs: int = 24
     seed: int = 0
@@ -262,7 +257,7 @@ class PointsTrainingOptions:
         check_ranges(
             self,
             positive=("learning_rate", "min_density", "max_density"),
-            not_negative=("match_weight", "seed"),
+            not_negative=("seed",),
             counts=("steps", "pairs", "val_count", "val_pairs"),
             between={"side": (64, math.inf)},
         )

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from .._shared.errors import require_packages
 from .._shared.options import suggest_keywords
 from .._shared.progress import progress
+from ..io.image import find_images
 from .recipe import (
     DescriptorTrainingOptions,
     DeviceOptions,
@@ -120,7 +121,7 @@ def train_points(
     require_packages("training", *TRAINING_PACKAGES)
     from .points.task import RankerTrainer
 
-    trainer = RankerTrainer(Path(images), Path(validation), options, num_workers)
+    trainer = RankerTrainer(*_files(images, validation, output), options, num_workers)
     return trainer.fit(Path(output), log)
 
 
@@ -168,8 +169,16 @@ def train_descriptor(
 
     where = DeviceOptions(device=device, num_workers=num_workers)
     initial = None if init_weights is None else Path(init_weights)
-    trainer = DescriptorTrainer(Path(images), Path(validation), options, initial, where)
+    trainer = DescriptorTrainer(*_files(images, validation, output), options, initial, where)
     return trainer.fit(Path(output), log)
+
+
+def _files(
+    images: str | Path, validation: str | Path, output: str | Path
+) -> tuple[list[Path], list[Path]]:
+    """List the images to train on, and others to choose weights by, without pictures of the run."""
+    images, validation, output = Path(images), Path(validation), Path(output)
+    return find_images(images, [output, validation]), find_images(validation, [output, images])
 
 
 def _dense_trainer(

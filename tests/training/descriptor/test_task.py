@@ -138,7 +138,7 @@ def test_own_weights_describe_points_and_are_of_their_own_type(
 
 def test_a_run_starts_from_weights(whole: TrainingResult, textures: Path, tmp_path: Path) -> None:
     where = DeviceOptions(device="cpu")
-    trainer = DescriptorTrainer(textures, textures, OPTIONS, whole.weights, where)
+    trainer = DescriptorTrainer(*[find_images(textures)] * 2, OPTIONS, whole.weights, where)
     weights = load_file(whole.weights)
     assert all(torch.equal(v, weights[k]) for k, v in trainer.network.state_dict().items())
     with pytest.raises(OptionError, match="initial_weights"):

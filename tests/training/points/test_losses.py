@@ -47,13 +47,12 @@ def known_pair(distance_px: float = 0.3) -> CandidatePair:
         first=rows,
         second=rows,
         distance_px=np.full(REPEATED, distance_px),
-        matchable=np.ones(REPEATED, bool),
     )
     return CandidatePair((view, view), BUDGET)
 
 
-def value(ranker, pair, match_weight=0.0) -> float:
-    return pair_loss(ranker, pair, match_weight).item()
+def value(ranker, pair) -> float:
+    return pair_loss(ranker, pair).item()
 
 
 def test_the_soft_choice_sums_to_the_budget() -> None:
@@ -69,7 +68,7 @@ def test_training_brings_repeated_candidates_to_the_top() -> None:
     before = value(ranker, pair)
     for _ in range(60):
         optimizer.zero_grad()
-        loss = pair_loss(ranker, pair, 0.0)
+        loss = pair_loss(ranker, pair)
         loss.backward()
         optimizer.step()
     assert before > -0.6
@@ -92,14 +91,6 @@ def test_close_partners_are_worth_more() -> None:
     assert near == pytest.approx(close * (1 - losses.CLOSE_SHARE), rel=0.01)
 
 
-def test_matchable_partners_are_worth_more() -> None:
-    ranker, pair = FirstFeature(), known_pair()
-    view = dataclasses.replace(pair.views[0], matchable=np.zeros(REPEATED, bool))
-    other = dataclasses.replace(pair, views=(view, view))
-    first, second = (value(ranker, p, match_weight=1.0) for p in (pair, other))
-    assert second == pytest.approx(first / 2, rel=0.01)
-
-
 def test_mutual_pairs_are_each_others_nearest() -> None:
     view = dataclasses.replace(
         known_pair().views[0],
@@ -114,16 +105,13 @@ def test_mutual_pairs_are_each_others_nearest() -> None:
     assert sorted(mutual_pairs(view, 3.0, *without).tolist()) == [1, 3]
 
 
-@pytest.mark.parametrize("with_descriptors", [False, True])
-def test_candidates_of_the_same_view_see_each_other(
-    photo, with_descriptors, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_candidates_of_the_same_view_see_each_other(photo, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pairs, "MAX_CANDIDATES", 300)
     side = 128
     image, valid = photo[:side, :side], np.ones((side, side), bool)
     valid[:, :20] = False
     images = ViewPair((image, image), (valid, valid), np.eye(3), "light")
-    pair = candidate_pair(images, 0.01, with_descriptors)
+    pair = candidate_pair(images, 0.01)
     assert pair.budget == pytest.approx(0.01 * side**2)
     assert len(pair.views[0].xy) == 300
     assert pair.views[0].xy[:, 0].min() > 19
@@ -133,14 +121,13 @@ def test_candidates_of_the_same_view_see_each_other(
         assert itself.sum() == 300
         assert (view.distance_px[itself] == 0).all()
         assert view.distance_px[~itself].min() > 0
-        assert view.matchable[itself].mean() > 0.9
 
 
 def test_views_of_nothing_have_no_candidates() -> None:
     empty, valid = np.zeros((64, 64), np.uint8), np.ones((64, 64), bool)
-    pair = candidate_pair(ViewPair((empty, empty), (valid, valid), np.eye(3), "blur"), 0.01, True)
+    pair = candidate_pair(ViewPair((empty, empty), (valid, valid), np.eye(3), "blur"), 0.01)
     for view in pair.views:
-        assert len(view.xy) == len(view.visible) == len(view.first) == len(view.matchable) == 0
+        assert len(view.xy) == len(view.visible) == len(view.first) == 0
 
 
 def test_a_shift_is_followed(photo) -> None:
@@ -148,7 +135,7 @@ def test_a_shift_is_followed(photo) -> None:
     images = photo[:side, :side], photo[5 : side + 5, 9 : side + 9]
     valid = np.ones((side, side), bool)
     shift = np.array([[1, 0, -9], [0, 1, -5], [0, 0, 1.0]])
-    view = candidate_pair(ViewPair(images, (valid, valid), shift, "light"), 0.01, False).views[0]
+    view = candidate_pair(ViewPair(images, (valid, valid), shift, "light"), 0.01).views[0]
     seen = view.xy - (9, 5)
     inside = ((seen > -0.5) & (seen < side - 0.5)).all(1)
     np.testing.assert_array_equal(view.visible, inside)

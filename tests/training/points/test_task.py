@@ -14,6 +14,7 @@ from safetensors.torch import load_file
 from deepdetect.detector.points.detection import detect_points
 from deepdetect.detector.points.ranker import load_ranker
 from deepdetect.features.keypoints import Keypoints
+from deepdetect.io.image import find_images
 from deepdetect.training import PointsTrainingOptions, TrainingResult, train_points
 from deepdetect.training.checkpoint import read_checkpoint
 from deepdetect.training.points.measure import MEASURES, measure, validation_pairs
@@ -48,7 +49,7 @@ def untrained(textures: Path) -> RankerTrainer:
     torch.manual_seed(3)
     expected = torch.rand(4)
     torch.manual_seed(3)
-    made = RankerTrainer(textures, textures, OPTIONS)
+    made = RankerTrainer(*[find_images(textures)] * 2, OPTIONS)
     assert torch.equal(torch.rand(4), expected)
     return made
 
@@ -96,7 +97,9 @@ def test_the_best_weights_are_those_of_the_best_measure(
     whole: TrainingResult, textures: Path
 ) -> None:
     ranker = load_ranker(whole.weights)
-    found = measure(partial(detect_points, ranker=ranker), validation_pairs(textures, 1))
+    found = measure(
+        partial(detect_points, ranker=ranker), validation_pairs(find_images(textures), 1)
+    )
     assert found["score"] == pytest.approx(whole.best["score"], abs=1e-6)
     notes = json.loads(ranker.notes)
     assert notes["images"] == "4"
@@ -116,7 +119,7 @@ def test_an_untrained_ranker_ranks_by_the_first_feature(untrained: RankerTrainer
 
 
 def test_the_measure_of_a_blind_detector(textures: Path) -> None:
-    pairs = validation_pairs(textures, 2)
+    pairs = validation_pairs(find_images(textures), 2)
     assert {pair.kind for pair in pairs} == {"zoom", "blur", "viewpoint", "light"}
     generator = np.random.default_rng(0)
 

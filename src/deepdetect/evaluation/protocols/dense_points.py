@@ -27,7 +27,6 @@ from ...sfm.dense import (
     prepared_image,
 )
 from ...sfm.mapping import SparseModel, read_sparse_model
-from ...sfm.pipeline import MAX_KEYPOINTS
 from ...sfm.stages import MultiViewOptions, Stages
 from ..report import Row
 from .stereo_pipelines import sgbm_disparity
@@ -61,7 +60,9 @@ DENSE_NOTE = (
 )
 
 
-def measure_dense_points(images: Sequence[Path], cameras: Mapping[str, Camera]) -> Row:
+def measure_dense_points(
+    images: Sequence[Path], cameras: Mapping[str, Camera], detector: PointDetector
+) -> Row:
     """Make dense points of images; to be called in a process of its own.
 
     Returns the `DENSE_COLUMNS` from "points" on, and those of SGBM after its name and a space; only
@@ -71,7 +72,7 @@ def measure_dense_points(images: Sequence[Path], cameras: Mapping[str, Camera]) 
         options = MultiViewOptions(pairs="exhaustive")
         stages = Stages(Path(scratch) / "model", options, 1, True)
         folder = stages.folder_of(images)
-        sizes = stages.extract(folder, PointDetector(MAX_KEYPOINTS))[0]
+        sizes = stages.extract(folder, detector)[0]
         matches = stages.match(stages.choose_pairs(list(sizes)))
         intrinsics = initial_intrinsics(folder, sizes, cameras)
         try:

@@ -128,6 +128,15 @@ def _by_visibility(images: Iterable[tuple[str, Measured]]) -> dict[str, MaskScor
     return {name: mean_score(listed) for name, listed in measured.items() if listed}
 
 
+def check_scale(image: np.ndarray, scale: float) -> None:
+    """Raise an ImageError where an image is downscaled to under 16 pixels."""
+    if (side := round(scale * min(image.shape[:2]))) < MINIMUM_SIDE:
+        raise ImageError(
+            f"an image scaled by {scale:g} has a side of {side} pixels: "
+            f"it needs at least {MINIMUM_SIDE}, use larger scales"
+        )
+
+
 def score_at_scale(
     detector: DeepDetect, images: Iterable[np.ndarray], scale: float
 ) -> dict[str, MaskScore]:
@@ -143,13 +152,8 @@ def score_at_scale(
 
     def measured() -> Iterator[tuple[str, Measured]]:
         for image in images:
-            short_side = round(scale * min(image.shape[:2]))
-            if short_side < MINIMUM_SIDE:
-                raise ImageError(
-                    f"an image scaled by {scale:g} has a side of {short_side} pixels: "
-                    f"it needs at least {MINIMUM_SIDE}, use larger scales"
-                )
-            rgb = scale_short_side(image, short_side)
+            check_scale(image, scale)
+            rgb = scale_short_side(image, round(scale * min(image.shape[:2])))
             label = fuse(luma(rgb))
             yield label.visibility, measure_heatmap(native.heatmap(rgb), label.mask)
 

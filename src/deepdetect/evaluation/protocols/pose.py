@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -163,7 +164,7 @@ def _match_images(detector: DeepDetect, way: dict[str, Any], images: tuple[Path,
 
 def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
     """Match exactly, with the ratio test; learned descriptors without it."""
-    ratio, test = (1.0, "no ratio test") if feature.learned else (RATIO, f"ratio {RATIO:g}")
+    ratio, test = (math.inf, "no ratio test") if feature.learned else (RATIO, f"ratio {RATIO:g}")
     settings = MatchSettings("exact", ratio, mutual=True, budget=BUDGET)
 
     def match(images: tuple[Path, Path]) -> Found:

@@ -164,8 +164,10 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
     rows = [row for name in chosen for row in where(rows, item=name)]
     costs = [{**row, "scene": row["scene"].name, "keypoints": row["method"]} for row in rows]
     cost_table = Table("sfm_cost", "Seconds and memory", COST_COLUMNS, costs, COST_NOTE)
+    points = PointDetector(MAX_KEYPOINTS, ranker=options.ranker)
     dense = [
-        run.attempt(f"dense points of {name}", dense_rows, run, chosen[name]) for name in chosen
+        run.attempt(f"dense points of {name}", dense_rows, run, chosen[name], points)
+        for name in chosen
     ]
     found = [row for rows in dense for row in rows or ()]
     dense_table = Table("sfm_dense", "Dense points", DENSE_COLUMNS, found, DENSE_NOTE)
@@ -199,16 +201,17 @@ def choose_images(scene: PosedScene, most: int) -> PosedScene:
 def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
     """Return the ranked points, SIFT where it is among the baselines, each twice, and chance."""
     points = PointDetector(MAX_KEYPOINTS, ranker=options.ranker)
-    version, random = (
-        f"{points.settings} {points.descriptor_type}",
-        "baseline: as many random points",
-    )
+    version, random = _version(points), "baseline: as many random points"
     ours = SfmMethod("DeepDetect, points", partial(find_points, points), version=version)
     dense = replace(ours, name="DeepDetect, dense tracks", tracks="dense")
     sift = SfmMethod("SIFT, pycolmap", find_sift, match_sift, refined=False)
     aligned = SfmMethod("SIFT, tracks refined", find_sift, match_sift)
     chance = SfmMethod(random, partial(find_random_points, points), version=version, chance=True)
     return [ours, dense, *([sift, aligned] if "sift" in options.classical else []), chance]
+
+
+def _version(points: PointDetector) -> str:
+    return f"{points.settings} {points.descriptor_type}"
 
 
 def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
@@ -238,13 +241,19 @@ def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
     return row
 
 
-def dense_rows(run: Run, scene: PosedScene) -> Rows:
+def dense_rows(run: Run, scene: PosedScene, detector: PointDetector) -> Rows:
     """Measure the dense points of a scene, or read the result from the cache."""
     images = tuple(image.path for image in scene.images)
     cameras = {name: view.camera for name, view in true_views(scene).items()}
     known = {} if scene.located_only else cameras
-    depends = "dense and SGBM", images, sorted(known.items()), import_pycolmap().__version__
-    row = run.cached("sfm", depends, lambda: run_in_child(measure_dense_points, images, known))
+    depends = (
+        ("dense and SGBM", _version(detector)),
+        (images, sorted(known.items())),
+        import_pycolmap().__version__,
+    )
+    row = run.cached(
+        "sfm", depends, lambda: run_in_child(measure_dense_points, images, known, detector)
+    )
     sgbm = {name.removeprefix(f"{SGBM} "): row[name] for name in row if name.startswith(SGBM)}
     ours = {name: value for name, value in row.items() if not name.startswith(SGBM)}
     named = {"DeepDetect": ours, SGBM: sgbm}

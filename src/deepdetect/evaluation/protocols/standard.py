@@ -101,10 +101,10 @@ def pair_row(
     images = (pair.first, pair.second)
     first, second = (run.keypoints(feature, image)[0] for image in images)
     sizes = first.image_size, second.image_size
-    ratio = 1.0 if feature.learned else RATIO
+    ratio = math.inf if feature.learned else RATIO
     settings = MatchSettings("exact", ratio, mutual=True, budget=MATCHING_BUDGET)
     matches = run.matches(feature, images, settings)
-    unfiltered = run.matches(feature, images, replace(settings, ratio=1.0))
+    unfiltered = run.matches(feature, images, replace(settings, ratio=math.inf))
     accuracy, without_ratio = (
         match_accuracy(
             *(found.points0, found.points1, found.keypoints0, found.keypoints1),

@@ -17,7 +17,6 @@ from ..._shared.records import key
 from ...detector.network.weights import load_network, weights_digest
 from ...evaluation.report import Table
 from ...features.learned import CROSS_MODAL, LEARNED, angles_counted
-from ...io.image import find_images
 from ..checkpoint import Point
 from ..optim import Muon
 from ..recipe import DescriptorTrainingOptions, DeviceOptions
@@ -118,8 +117,8 @@ class DescriptorTrainer(Trainer):
 
     def __init__(
         self,
-        images: Path,
-        validation: Path,
+        images: Sequence[Path],
+        validation: Sequence[Path],
         options: DescriptorTrainingOptions,
         init_weights: str | Path | None,
         device: DeviceOptions,
@@ -127,7 +126,7 @@ class DescriptorTrainer(Trainer):
         self.options, self.num_workers = options, device.worker_count
         self.kind = CROSS_MODAL if options.cross_modal else LEARNED
         self.device = torch.device(device.accelerator)
-        self.files, of_validation = find_images(images), find_images(validation)
+        self.files = images
         if init_weights is None:
             with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
                 torch.default_generator.manual_seed(options.seed)
@@ -136,11 +135,11 @@ class DescriptorTrainer(Trainer):
             network = load_network(init_weights, DescriptorNetwork)
         self.origin = {
             "images_digest": key(self.files)[:16],
-            "validation_digest": key(of_validation)[:16],
+            "validation_digest": key(validation)[:16],
             "initial_weights": weights_digest(network)[:16],
         }
         self.notes = {"images": str(len(self.files)), "run_on": str(self.device)}
-        batches = validation_batches(of_validation, options)
+        batches = validation_batches(validation, options)
         self.batches = [Pair(*(each.to(self.device) for each in batch)) for batch in batches]
         self.network = network.to(self.device).to(memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.network).eval()

@@ -33,7 +33,7 @@ MIN_SPREAD = 1e-3
 BISECTIONS = 40
 
 
-def pair_loss(ranker: torch.nn.Module, pair: CandidatePair, match_weight: float) -> Tensor:
+def pair_loss(ranker: torch.nn.Module, pair: CandidatePair) -> Tensor:
     """Return the loss of a pair of views, seen in both directions.
 
     Its value is what is expected to be found again; its gradient is that at a fixed budget: a
@@ -46,7 +46,7 @@ def pair_loss(ranker: torch.nn.Module, pair: CandidatePair, match_weight: float)
     total = shares[0].sum() * 0
     for k, view in enumerate(pair.views):
         share = shares[k].detach()
-        reward = _rewards(view, share, shares[1 - k].detach(), match_weight)
+        reward = _rewards(view, share, shares[1 - k].detach())
         border = share * (1 - share) * visible[k]
         level = (reward * border).sum() / border.sum().clamp(min=1e-6)
         value = (share * reward * visible[k]).sum() / max(mass, 1.0)
@@ -81,7 +81,7 @@ def soft_top_k(logits: Tensor, budget: float, temperature: float) -> Tensor:
     return torch.sigmoid((logits - low.float()) / temperature)
 
 
-def _rewards(view: ViewCandidates, here: Tensor, there: Tensor, match_weight: float) -> Tensor:
+def _rewards(view: ViewCandidates, here: Tensor, there: Tensor) -> Tensor:
     """Return what a candidate is worth: its partner's choice, by the distances of the measure.
 
     One to one, as it is measured, and among those that may be chosen: with a sum over all near
@@ -90,7 +90,6 @@ def _rewards(view: ViewCandidates, here: Tensor, there: Tensor, match_weight: fl
     pairs = mutual_pairs(view, NEAR_PX, here.numpy() > MIN_CHOICE, there.numpy() > MIN_CHOICE)
     close = view.distance_px[pairs] <= CLOSE_PX
     worth = 1 - CLOSE_SHARE + CLOSE_SHARE * close
-    worth *= (1 + match_weight * view.matchable[pairs]) / (1 + match_weight)
     reward = torch.zeros(len(here))
     partner = torch.from_numpy(view.second[pairs])
     reward[torch.from_numpy(view.first[pairs])] = torch.from_numpy(worth).float() * there[partner]

@@ -16,7 +16,7 @@ from ...evaluation.metrics.repeatability import mutual_nn_repeatability
 from ...features.keypoints import Keypoints
 from ...features.matchers import get_matcher, match_descriptors
 from ...features.sift import root_sift_descriptors
-from ...io.image import find_images, load_image, luma
+from ...io.image import load_image, luma
 from .views import KINDS, ViewPair, draw_pair
 
 IMAGE_PIXELS = 800 * 640
@@ -38,9 +38,8 @@ MEASURES = [f"@{radius:g} px {budget}" for budget in BUDGETS for radius in RADII
 upright RootSIFT of size 4, mutual, ratio .85) over `MATCHING_BUDGET`."""
 
 
-def validation_pairs(folder: Path, pairs_per_kind: int) -> list[ViewPair]:
-    """Draw the fixed set of pairs, each of another image of the folder where they suffice."""
-    files = find_images(folder)
+def validation_pairs(files: Sequence[Path], pairs_per_kind: int) -> list[ViewPair]:
+    """Draw the fixed set of pairs, each of another image where they suffice."""
     order = np.random.default_rng([0, 1]).permutation(len(files))
     pairs = []
     for number in range(pairs_per_kind * len(KINDS)):

@@ -11,8 +11,6 @@ from torch.utils.data import Dataset
 
 from ...detector.points.candidate_features import describe_candidates
 from ...detector.points.hessian_scales import build_scale_space, find_candidates
-from ...features.keypoints import unit_length
-from ...features.sift import root_sift_descriptors
 from ...geometry.transforms import transform_points
 from ...io.image import load_image, luma
 from ..recipe import PointsTrainingOptions
@@ -22,8 +20,6 @@ MAX_CANDIDATES = 2000
 """Of each view; the strongest are ranked."""
 
 REACH_PX = 3.0
-DESCRIPTOR_SIZE_PX = 4.0
-RATIO = 0.85
 
 MIN_OVERLAP = 0.04
 """Of the second view: pairs that share less are drawn again."""
@@ -42,8 +38,6 @@ class ViewCandidates:
         visible: (N,) bool: whether the other view shows the place.
         first, second: (P,) int64 rows of candidates here, and in the other view.
         distance_px: (P,) between the two, in pixels of the other view.
-        matchable: (P,) bool: whether the upright descriptors pass the ratio test against all
-            other candidates of the other view.
     """
 
     xy: np.ndarray
@@ -53,7 +47,6 @@ class ViewCandidates:
     first: np.ndarray
     second: np.ndarray
     distance_px: np.ndarray
-    matchable: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +57,9 @@ class CandidatePair:
     budget: float
 
 
-def candidate_pair(pair: ViewPair, density: float, with_descriptors: bool) -> CandidatePair:
-    """Find the candidates of both views, and which see the same place.
-
-    Without descriptors all of them are said to be matchable.
-    """
-    sides, described = [], []
+def candidate_pair(pair: ViewPair, density: float) -> CandidatePair:
+    """Find the candidates of both views, and which see the same place."""
+    sides = []
     for image, valid in zip(pair.images, pair.valid, strict=True):
         space = build_scale_space(image)
         candidates = find_candidates(space)
@@ -78,24 +68,16 @@ def candidate_pair(pair: ViewPair, density: float, with_descriptors: bool) -> Ca
         strongest = np.argsort(-features[rows, 0], kind="stable")[:MAX_CANDIDATES]
         rows = rows[np.sort(strongest)]
         sides.append((candidates.xy[rows], candidates.sigma_px[rows], features[rows]))
-        if with_descriptors:
-            xy = candidates.xy[rows].astype(np.float32)
-            described.append(unit_length(root_sift_descriptors(image, xy, DESCRIPTOR_SIZE_PX)))
     views = []
     for k, homography in enumerate((pair.homography, np.linalg.inv(pair.homography))):
         here, there = sides[k][0], sides[1 - k][0]
-        similarity = described[k] @ described[1 - k].T if with_descriptors else None
-        close = _correspondences(here, there, homography, pair.valid[1 - k], similarity)
+        close = _correspondences(here, there, homography, pair.valid[1 - k])
         views.append(ViewCandidates(*sides[k], *close))
     return CandidatePair((views[0], views[1]), density * pair.images[0].size)
 
 
 def _correspondences(
-    here: np.ndarray,
-    there: np.ndarray,
-    homography: np.ndarray,
-    valid: np.ndarray,
-    similarity: np.ndarray | None,
+    here: np.ndarray, there: np.ndarray, homography: np.ndarray, valid: np.ndarray
 ) -> tuple[np.ndarray, ...]:
     mapped = np.column_stack([here, np.ones(len(here))]) @ (homography / homography[2, 2]).T
     depth = mapped[:, 2:]
@@ -111,14 +93,7 @@ def _correspondences(
     squared = np.square(mapped[rows, :1] - there[:, 0]) + np.square(mapped[rows, 1:] - there[:, 1])
     near, second = np.nonzero(squared < REACH_PX**2)
     first, distance = rows[near], np.sqrt(squared[near, second])
-    matchable = np.ones(len(first), bool)
-    if similarity is not None:
-        others = similarity.copy()
-        others[first, second] = -1  # several candidates near the place may match as well
-        unlike = np.sqrt(np.maximum(0, 2 - 2 * similarity[first, second]))
-        best_other = others.max(1, initial=-1)
-        matchable = unlike < RATIO * np.sqrt(np.maximum(0, 2 - 2 * best_other))[first]
-    return visible, first, second, distance, matchable
+    return visible, first, second, distance
 
 
 class PairDataset(Dataset[CandidatePair]):
@@ -139,8 +114,7 @@ class PairDataset(Dataset[CandidatePair]):
                 break
         low, high = np.log([options.min_density, options.max_density])
         density = float(np.exp(generator.uniform(low, high)))
-        # Upright descriptors cannot match turned and zoomed views: there all count as matchable.
-        return candidate_pair(pair, density, options.match_weight > 0 and kind != "zoom")
+        return candidate_pair(pair, density)
 
 
 def overlap(pair: ViewPair) -> float:

@@ -20,7 +20,6 @@ from ..._shared.records import key
 from ...detector.points.detection import detect_points
 from ...detector.points.ranker import MAX_DEVIATIONS, Ranker, load_ranker
 from ...evaluation.report import Table
-from ...io.image import find_images
 from ..checkpoint import Point
 from ..recipe import PointsTrainingOptions
 from ..sampler import milestones
@@ -105,10 +104,13 @@ class RankerTrainer(Trainer):
     average: RankerModule
 
     def __init__(
-        self, images: Path, validation: Path, options: PointsTrainingOptions, num_workers: int = 0
+        self,
+        images: Sequence[Path],
+        validation: Sequence[Path],
+        options: PointsTrainingOptions,
+        num_workers: int = 0,
     ) -> None:
-        self.options, self.num_workers = options, num_workers
-        self.files = find_images(images)
+        self.options, self.num_workers, self.files = options, num_workers, images
         self.pairs = validation_pairs(validation, options.val_pairs)
         dataset = PairDataset(self.files, options)
         pairs = (dataset[2**31, number] for number in range(STATISTICS_PAIRS))  # not trained on
@@ -127,7 +129,7 @@ class RankerTrainer(Trainer):
         self.milestones = {0} | milestones(options.steps, options.val_count)
         self.origin = {
             "images_digest": key(self.files)[:16],
-            "validation_digest": key(find_images(validation))[:16],
+            "validation_digest": key(validation)[:16],
         }
         self.notes = {"images": str(len(self.files))}
 
@@ -148,7 +150,7 @@ class RankerTrainer(Trainer):
     def loss(self, batch: Sequence[CandidatePair]) -> Tensor:
         """Return the mean loss of some pairs; those with nothing to see count as 0."""
         losses = [
-            pair_loss(self.network, pair, self.options.match_weight)
+            pair_loss(self.network, pair)
             for pair in batch
             if min(len(view.xy) for view in pair.views) > 1
         ]
