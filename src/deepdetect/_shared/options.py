@@ -173,7 +173,7 @@ def look_up(kind: str, name: str, registry: Mapping[str, Entry]) -> Entry:
     return registry[name]
 
 
-def is_path(value: str | Path) -> bool:
+def names_a_file(value: str | Path) -> bool:
     """Return whether a value is a path, not a name: it has a suffix or a separator."""
     text = str(value)
     return bool(Path(text).suffix) or any(mark in text for mark in (os.sep, os.altsep) if mark)

@@ -11,7 +11,7 @@ import numpy as np
 from .._shared.errors import OptionError, check_name
 from .._shared.image_array import Channels
 from .._shared.opencv import cv2
-from .._shared.options import is_path, suggest_keywords
+from .._shared.options import names_a_file, suggest_keywords
 from .._shared.records import file_digest
 from ..features.keypoints import Keypoints
 from ..features.learned import LEARNED
@@ -77,7 +77,7 @@ class PointDetector:
         self.spread, self.resolution = spread, resolution
         self.ranker = RANKER if ranker is None else Path(ranker).absolute()
         self._ranker = load_ranker(self.ranker)
-        if is_path(descriptor):
+        if names_a_file(descriptor):
             descriptor = Path(descriptor).absolute()
         else:
             check_name("descriptor", descriptor, (*DESCRIPTOR_GRAPHS, ROOT_SIFT))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from .._shared.errors import MissingWeightsError
-from .._shared.options import is_path, look_up
+from .._shared.options import look_up, names_a_file
 
 FOLDER = Path(__file__).parent / "weights"
 
@@ -46,7 +46,7 @@ def pretrained_weights(name: str = "default", suffix: str = ".onnx") -> Path:
 
 def resolve_weights(weights: str | Path, suffix: str = ".onnx") -> Path:
     """Return the path of weights that are named in `PRETRAINED`, or are a file."""
-    path = Path(weights) if is_path(weights) else pretrained_weights(str(weights), suffix)
+    path = Path(weights) if names_a_file(weights) else pretrained_weights(str(weights), suffix)
     if not path.is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")
     return path

@@ -143,6 +143,8 @@ def select_keypoints(
         >>> len(select_keypoints(heatmap, SelectionOptions(threshold=0.95)))
         0
     """
+    if heatmap.dtype.kind != "f":
+        heatmap = heatmap.astype(np.float32)
     ranking = heatmap if logits is None else logits
     if ranking.shape != heatmap.shape:
         raise OptionError(

@@ -197,6 +197,7 @@ def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
         described = replace(keypoints, descriptors=sift_descriptors(gray, keypoints.xy))
     else:
         described = describe_scaled(gray, keypoints)
+    assert described.descriptors is not None
     root = to_root_sift(described.descriptors, overwrite=True)
     return replace(described, descriptors=root, descriptor_type=ROOT_SIFT)
 

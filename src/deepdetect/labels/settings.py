@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from .._shared.errors import OptionError, check_name, unknown_name
-from .._shared.options import is_path, look_up, suggest_keywords
+from .._shared.options import look_up, names_a_file, suggest_keywords
 from .detectors import DETECTOR_NAMES, DETECTORS, Value, select_detectors
 
 Visibility = Literal["normal", "low"]
@@ -132,7 +132,7 @@ def find_label_settings(settings: str | Path) -> LabelOptions:
         >>> find_label_settings("dense").settings
         {'sobel': {'normal': {'relative_threshold': 0.02}}}
     """
-    if not is_path(settings):
+    if not names_a_file(settings):
         return look_up("name or file of label settings", str(settings), LABEL_SETTINGS)
     path = Path(settings)
     try:

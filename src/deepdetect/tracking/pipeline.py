@@ -14,11 +14,12 @@ import numpy as np
 
 from .._shared.errors import OptionError
 from .._shared.opencv import cv2
-from .._shared.options import is_path, suggest_keywords
+from .._shared.options import suggest_keywords
 from .._shared.progress import progress
 from .._shared.signals import ENDING, exit_by_signal, handle_signals
 from ..detector.detector import Detector
 from ..detector.point_detector import PointDetector
+from ..io.image_file import is_path
 from .tracker import CANDIDATES, Detect, Tracker, TrackingOptions
 from .tracks import TrackDrawer, TrackedFrame, write_tracks
 from .video import Frame, FrameSource, check_video_name, write_video

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, relu
 
 from .._shared.atomic import atomic_path
+from .._shared.errors import OptionError
 from .._shared.machine import map_in_processes
 from .._shared.progress import progress
 from ..detector.network.onnx_export import OPSET
@@ -34,6 +35,7 @@ from ..features.match_filter import AROUND, filter_inputs, nearest_rows
 from ..features.matchers import DescriptorMatches, exact_neighbours, match_descriptors
 from ..features.sift import ROOT_SIFT
 from ..io.image import find_images
+from .descriptor.task import ATTEMPTS
 from .descriptor.views import correspond, draw_layers, relight, render_layers
 
 WIDTH, ROUNDS = 32, 3
@@ -134,7 +136,7 @@ def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
     rng = np.random.default_rng([seed, number])
     descriptor = (LEARNED, ROOT_SIFT)[number % 2]
     detector = PointDetector(KEYPOINTS, descriptor=descriptor)
-    while True:
+    for _ in range(ATTEMPTS):
         layers, scales, _ = draw_layers(rng, files, SIDE_PX)
         views, tops = zip(*(render_layers(layers, k, scales[k]) for k in range(2)), strict=True)
         features0, features1 = (detector.extract(relight(rng, view / 255)) for view in views)
@@ -159,6 +161,7 @@ def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
                 beyond = ~((place >= 0) & (place <= last)).all(1)
                 errors[beyond & (tops[0][row, column] == k)] = (RIGHT_PX + WRONG_PX) / 2
         return filter_inputs(features0, features1, matches), errors
+    raise OptionError("the images show too little for pairs of views: use photographs with detail")
 
 
 def mutual_matches(features0: Keypoints, features1: Keypoints) -> DescriptorMatches:
