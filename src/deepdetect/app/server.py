@@ -85,7 +85,7 @@ HEADERS = {
 }
 VIEWER_POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
-    "frame-ancestors 'self'; sandbox allow-scripts"
+    "frame-ancestors 'self'; sandbox allow-scripts allow-downloads"
 )
 """The viewer of a model is one file with its script in it, and cannot reach the page around it."""
 
@@ -172,6 +172,7 @@ class AppServer:
                 HTTPException: lambda _, error: _refusal(error.status_code, error.detail),
                 DeepDetectError: lambda _, error: _refusal(400, str(error)),
                 TimeoutError: lambda *_: _refusal(408, "the request takes too long", CLOSE),
+                MemoryError: lambda *_: _refusal(500, "there is too little memory: use smaller images"),
                 OSError: lambda _, error: _refusal(400, CANNOT_START.format(error.strerror)),
                 ClientDisconnect: lambda *_: _refusal(400, "the connection has ended"),
             },
@@ -218,7 +219,13 @@ class AppServer:
             for kind, task in TASKS.items()
         ]
         limits = {n: getattr(options, f"max_{n}") for n in ("file_mb", "task_mb", "files")}
-        return {"engine": "python", "version": __version__, "tasks": tasks, "limits": limits}
+        return {
+            "engine": "python",
+            "version": __version__,
+            "tasks": tasks,
+            "limits": limits,
+            "suffixes": sorted(IMAGE_SUFFIXES),
+        }
 
     def _check_key(self, request: Request) -> None:
         """Refuse requests without the key of this start, and of other sites."""

@@ -22,22 +22,25 @@ let current = "keypoints";
 /** How often it was started over: what was being read before is not added any more. */
 let restarts = 0;
 
+/** Why pictures cannot be taken, where the network was not asked for. */
+let unready = "The page could not be loaded completely: load it again.";
+
 async function start() {
   const config = await (await fetch("config.json")).json();
-  page.token = takeToken();
   page.server = config.engine === "python" ? config : null;
   const alone = page.server === null;
-  document.body.dataset.engine = config.engine;
+  page.token = alone ? "" : takeToken();
   for (const part of document.querySelectorAll(".with-python")) part.hidden = alone;
   for (const part of document.querySelectorAll(".without-python")) part.hidden = !alone;
   element("tab-python").hidden = alone;
-  element("use-folder").hidden = alone;
+  element("use-folder").hidden = !page.token;
   element("power").textContent = alone ? "In this browser" : "With Python";
   element("promise").textContent = alone
     ? "Your pictures stay on this device: the network runs in this browser."
     : "Your pictures stay on this computer, and are forgotten after each task.";
   if (!alone && !page.token) {
-    showError("Open the address that deepdetect app has printed: it ends in a key.");
+    unready = "Open the address that deepdetect app has printed: it ends in a key.";
+    showError(unready);
     return;
   }
   if (!alone) python.offer(() => showView("wipe"));
@@ -83,7 +86,7 @@ function takeToken() {
 /** Takes the key of a new start, whose address differs from that of the open page in it alone. */
 function takeNewToken() {
   const old = page.token;
-  if (takeToken() !== old) location.reload();
+  if (page.server && takeToken() !== old) location.reload();
 }
 
 async function showExamples() {
@@ -120,7 +123,7 @@ async function guarded(task) {
 /** Reads files; what is found in them is asked for by the view. */
 async function addPictures(files) {
   await starting; // pictures may come before it has asked for the network
-  if (!isOpened()) return;
+  if (!isOpened()) throw new Error(unready);
   const room = MAX_PICTURES - page.pictures.length;
   if (files.length > room) {
     const advice = page.server ? " or use a folder under “3D, panorama, folder”." : ".";
@@ -312,4 +315,4 @@ function setUpDropping() {
 setUp();
 showView("keypoints");
 const starting = start()
-  .catch(() => showError("The page could not be loaded completely: load it again."));
+  .catch(() => showError(unready));

@@ -33,6 +33,9 @@ export function showError(message) {
   box.hidden = !message;
 }
 
+/** Does something; what goes wrong is said in one sentence. */
+export const reported = (task) => task().catch((error) => showError(error.message));
+
 /** Says something to those who hear the page. */
 export function announce(text) {
   element("status").textContent = text;
@@ -59,6 +62,10 @@ export const counted = (number, word) =>
 /** The same position in a picture of another size. */
 export const rescaled = (x, y, from, to) =>
   [(x + 0.5) * to.width / from.width - 0.5, (y + 0.5) * to.height / from.height - 0.5];
+
+/** All of (N, 2) positions, one after the other, in a picture of another size. */
+export const allRescaled = (xy, from, to) => Float32Array.from(xy, (_, k) =>
+  rescaled(xy[k - k % 2], xy[k - k % 2 + 1], from, to)[k % 2]);
 
 /** Positions in the photograph's own pixels, where the network saw it reduced. */
 export const toOriginal = (picture, x, y) => rescaled(x, y, picture, picture.original);

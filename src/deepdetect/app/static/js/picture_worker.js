@@ -46,10 +46,16 @@ async function openedHere(processor) {
 async function browserNetwork(processor) {
   const graphics = processor === "graphics";
   const model = await openModel("default.onnx", graphics);
-  const run = async (rgba, width, height) => {
+  const runOne = async (rgba, width, height) => {
     const planes = toPlanes(rgba, width * height);
     const { logits } = await model({ image: ["float32", planes, [1, 3, height, width]] }, ["logits"]);
     return Float32Array.from(logits);
+  };
+  let last = Promise.resolve();
+  const run = (...picture) => { // one after the other: two at once would wait for ever with WebGPU
+    const own = last.then(() => runOne(...picture));
+    last = own.catch(() => {});
+    return own;
   };
   const words = graphics ? "on the graphics card (WebGPU)" : "on the processor (WebAssembly)";
   return { run, words };

@@ -2,7 +2,7 @@
 import { findHeatMap } from "../detection.js";
 import { drawHeatMap, showPicture } from "../draw.js";
 import { savePng, stem } from "../downloads.js";
-import { activePicture, element, onceAFrame, page, showError } from "../page.js";
+import { activePicture, element, onceAFrame, page, reported } from "../page.js";
 
 const view = element("view-heatmap");
 const form = view.querySelector("form");
@@ -35,7 +35,7 @@ function draw() {
 }
 
 export function setUp() {
-  const later = onceAFrame(() => show().catch((error) => showError(error.message)));
+  const later = onceAFrame(() => reported(show));
   form.addEventListener("input", (event) => {
     if (event.target.name === "which-heatmap") page.active = Number(event.target.value);
     view.querySelector(".layers").classList.toggle("actual", element("actual-heatmap").checked);
@@ -43,6 +43,8 @@ export function setUp() {
   });
   form.querySelector("[data-download]").onclick = () => {
     const picture = activePicture();
-    if (picture?.map) savePng(`${stem(picture.name)}_heatmap.png`, view.querySelector(".overlay"));
+    if (picture?.map) {
+      reported(() => savePng(`${stem(picture.name)}_heatmap.png`, view.querySelector(".overlay")));
+    }
   };
 }

@@ -2,8 +2,8 @@
 import { anglesOf, findHeatMap, findPoints, isRanked } from "../detection.js";
 import { composeKeypoints, drawCircles, drawPixels, showPicture } from "../draw.js";
 import { save, savePng, stem, toCsv, toJson } from "../downloads.js";
-import { activePicture, announce, counted, element, enlargement, onceAFrame, page, rescaled, showError,
-         toOriginal } from "../page.js";
+import { activePicture, allRescaled, announce, counted, element, enlargement, onceAFrame, page, reported,
+         rescaled, toOriginal } from "../page.js";
 import { choosePoints } from "../points/detection.js";
 import { select } from "../selection.js";
 
@@ -99,8 +99,7 @@ function chooseOfAllScales(picture, { maxKeypoints, spread }) {
   const { ranking } = picture;
   const points = choosePoints(ranking, maxKeypoints, spread);
   const { xy, scores, sizes } = points;
-  const drawn = Float32Array.from({ length: xy.length }, (_, k) =>
-    rescaled(xy[k - k % 2], xy[k - k % 2 + 1], ranking, picture)[k % 2]);
+  const drawn = allRescaled(xy, ranking, picture);
   const enlarged = enlargement(ranking, picture.original);
   const [small, large] = [Math.min(...sizes), Math.max(...sizes)].map((size) => (size * enlarged).toFixed(1));
   return {
@@ -182,8 +181,7 @@ const downloads = {
 };
 
 export function setUp() {
-  const guarded = (task) => task().catch((error) => showError(error.message));
-  const later = onceAFrame(() => guarded(show));
+  const later = onceAFrame(() => reported(show));
   form.addEventListener("input", (event) => {
     if (event.target.name === "which-keypoints") page.active = Number(event.target.value);
     for (const layers of view.querySelectorAll(".layers")) {
@@ -196,7 +194,7 @@ export function setUp() {
     later();
   });
   for (const button of form.querySelectorAll("[data-download]")) {
-    button.onclick = () => shown && guarded(async () =>
+    button.onclick = () => shown && reported(async () =>
       downloads[button.dataset.download](stem(shown.picture.name)));
   }
 }

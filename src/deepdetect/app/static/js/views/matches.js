@@ -3,7 +3,7 @@ import { Background } from "../background.js";
 import { describe, findPoints } from "../detection.js";
 import { drawMatches, nearestLine, newCanvas } from "../draw.js";
 import { save, savePng, stem, toCsv, toJson } from "../downloads.js";
-import { announce, counted, during, element, onceAFrame, page, rescaled, showError, toOriginal } from "../page.js";
+import { allRescaled, announce, counted, during, element, onceAFrame, page, reported, toOriginal } from "../page.js";
 import { candidatesFor, choosePoints } from "../points/detection.js";
 
 const NARROW_PX = 640; // below it the pictures stand above each other
@@ -77,13 +77,11 @@ async function matchNew(key, isWanted) {
   }
   const result = await during("Matching…", background.call("match", { pictures }));
   if (!isWanted()) return;
-  const seen = (points, from, to) => Float32Array.from(points, (_, k) =>
-    rescaled(points[k - k % 2], points[k - k % 2 + 1], from, to)[k % 2]);
-  result.points0 = seen(result.points0, pictures[0], first);
-  result.points1 = seen(result.points1, pictures[1], second);
+  result.points0 = allRescaled(result.points0, pictures[0], first);
+  result.points1 = allRescaled(result.points1, pictures[1], second);
   found = { key, ...result };
   await filter();
-  compareWithSift().catch((error) => showError(error.message));
+  reported(compareWithSift);
 }
 
 /** Says how many matches SIFT finds in the same pictures, where that is asked for. */
@@ -244,19 +242,18 @@ function setUpStage() {
 
 export function setUp() {
   setUpStage();
-  const guarded = (task) => () => task().catch((error) => showError(error.message));
-  const refilter = onceAFrame(guarded(filter));
+  const refilter = onceAFrame(() => reported(filter));
   element("ratio").oninput = () => {
     showControls();
     refilter();
   };
   element("match-number").oninput = showControls;
-  element("match-number").onchange = guarded(match);
-  element("sift").onchange = guarded(compareWithSift);
+  element("match-number").onchange = () => reported(match);
+  element("sift").onchange = () => reported(compareWithSift);
   element("agreeing").onchange = element("thickness").oninput = draw;
   addEventListener("resize", onceAFrame(() => !view.hidden && draw()));
   for (const button of form.querySelectorAll("[data-download]")) {
-    button.onclick = () => kept && downloads[button.dataset.download](
-      `${stem(kept.first.name)}_${stem(kept.second.name)}_matches`);
+    button.onclick = () => kept && reported(async () => downloads[button.dataset.download](
+      `${stem(kept.first.name)}_${stem(kept.second.name)}_matches`));
   }
 }

@@ -4,9 +4,8 @@ import { save } from "../downloads.js";
 import { announce, element, page, showError } from "../page.js";
 import { compare } from "./wipe.js";
 
-const IMAGE = /\.(bmp|jpe?g|pgm|png|ppm|tiff?|webp)$/i;
-
 let work = null; // the task that is at work: what was asked, and whether it was cancelled
+let last = null; // the task that was begun last
 let given = ""; // the number that a task takes
 let urls = []; // of files of the result that is shown
 
@@ -51,8 +50,11 @@ function numberInput(name, text) {
 function askForFolder(use) {
   const input = element("folder");
   input.onchange = () => {
-    const files = [...input.files].filter((file) => IMAGE.test(file.name))
-      .sort((a, b) => a.webkitRelativePath.localeCompare(b.webkitRelativePath));
+    const { suffixes } = page.server;
+    const files = [...input.files] // those that Python takes of a folder, in its order
+      .filter(({ name, webkitRelativePath: path }) => !/(^|\/)\./.test(path)
+        && suffixes.some((suffix) => name.toLowerCase().endsWith(suffix)))
+      .sort((a, b) => a.webkitRelativePath.localeCompare(b.webkitRelativePath, "en", { numeric: true }));
     input.value = "";
     if (files.length) use(files);
     else showError("There is no picture in this folder: choose another one.");
@@ -76,7 +78,7 @@ async function run(each, files, showWipe) {
   showError("");
   clear();
   const own = { each, task: null, cancelled: false };
-  work = own;
+  work = last = own;
   const options = Number(given) > 0 && "focal_px" in each.options ? { focal_px: Number(given) } : {};
   const tell = (...told) => own.cancelled || progress(each.title, ...told);
   tell("sending the pictures", 0, 0);
@@ -172,7 +174,7 @@ async function showResult(own, { numbers, shown, files }, showWipe) {
 function modelFrame(address) {
   const frame = document.createElement("iframe");
   frame.title = "3D model";
-  frame.setAttribute("sandbox", "allow-scripts");
+  frame.setAttribute("sandbox", "allow-scripts allow-downloads");
   frame.loaded = new Promise((resolve) => {
     frame.onload = resolve;
   });
@@ -213,7 +215,7 @@ function clear() {
 
 /** Ends the task of pictures that are gone, and forgets its result; folders stay. */
 export function reset() {
-  if (work?.each.folder) return show();
+  if (last?.each.folder) return show();
   cancel();
   clear();
   show();

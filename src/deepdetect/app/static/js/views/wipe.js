@@ -1,7 +1,7 @@
 // Before and after: the second picture in the frame of the first, up to a line that moves.
 import { canvasOf, newCanvas, showPicture } from "../draw.js";
 import { savePng, saveVideo, stem } from "../downloads.js";
-import { during, element, page, showError } from "../page.js";
+import { during, element, page, reported } from "../page.js";
 import { matched, matchingTask } from "./matches.js";
 
 const VIDEO_S = 4; // the line goes there and back
@@ -14,7 +14,7 @@ let shown = null; // the pictures that are compared, and the second one as it is
 export async function prepare() {
   const [first, second] = page.pictures;
   view.querySelector(".empty").hidden = Boolean(second);
-  layers.hidden = !second;
+  layers.hidden = !second || !shown; // of other pictures
   if (!second) return;
   if (shown?.given === first) return draw(); // what Python has registered
   const isCurrent = () => page.pictures[0] === first && page.pictures[1] === second;
@@ -52,6 +52,7 @@ function show(first, warped, hint) {
   [above.width, above.height] = [first.width, first.height];
   above.getContext("2d").drawImage(warped, 0, 0);
   element("wipe-hint").textContent = hint;
+  layers.hidden = false;
   draw();
 }
 
@@ -105,8 +106,8 @@ export function setUp() {
     button.onclick = () => {
       if (!shown) return;
       const { first } = shown;
-      downloads[button.dataset.download](`${stem(first.name)}_wipe`, newCanvas(first.width, first.height), shown)
-        .catch((error) => showError(error.message));
+      reported(() => downloads[button.dataset.download](
+        `${stem(first.name)}_wipe`, newCanvas(first.width, first.height), shown));
     };
   }
 }
