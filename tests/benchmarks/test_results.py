@@ -28,7 +28,7 @@ FIGURE = re.compile(
 
 CONSTANTS = (
     *("(3 GB,", "(19 GB)"),  # of data sets
-    "need 1.1 TB",  # 535 bytes times the number of points
+    "need 0.6 TB",  # 279 bytes times the number of points
     *("8 GB of address space", "over 60 % of the tracks", "over 1 % or", "# 5 % of"),  # of the code
     *("99.95 %", "97 %", "(95 %"),  # what `make test-web` asks for
 )

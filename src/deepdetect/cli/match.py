@@ -19,7 +19,6 @@ from ..batch.pair_matching import MATCHERS_OF_FLOATS
 from ..datasets.planar import read_matrix
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
-from ..features.learned import CROSS_MODAL, LEARNED, LEARNED_FREE
 from ..features.matches import Matches
 from ..features.sift import DESCRIPTORS
 from ..geometry import GeometryOptions
@@ -56,7 +55,7 @@ MATCHING = cli.From(
     more="ratio two_view_model descriptor keypoint_size angle matcher",
     types={
         "two_view_model": Literal[TWO_VIEW_MODELS],
-        "descriptor": Literal[(*DESCRIPTORS, LEARNED, LEARNED_FREE, CROSS_MODAL)],
+        "descriptor": Literal[tuple(DESCRIPTORS)],
         "matcher": Literal[tuple(MATCHERS_OF_FLOATS)],
     },
 )

@@ -62,7 +62,8 @@ def reconstruct_many(
     """Reconstruct the cameras and a dense model from three or more images of a scene.
 
     Writes into the folder `output`: model.ply, model.glb, model.html (a viewer, with the cameras),
-    model.json, sparse/0 and database.db (COLMAP's), and work/ with what each stage made. Where the
+    model.json, transforms.json (nerfstudio's), sparse/0 and database.db (COLMAP's), and work/ with
+    what each stage made. Where the
     images carry GPS, all of it is in metres east, north and up. A call that was interrupted or
     killed goes on when it is made again. A script must call this under
     `if __name__ == "__main__":`, since processes are started.
@@ -71,9 +72,9 @@ def reconstruct_many(
         images: a folder, or image files.
         output: folder for the results.
         detector, selection: as of `extract_features`.
-        calibration: JSON file of the camera (docs/reconstruction.md describes its format), or a
-            `Camera`, which is taken to be exact. Without one the focal length begins with
-            `focal_px`, EXIF, or a guess, and is estimated with the distortion.
+        calibration: file of the cameras, as for `Calibration.load`, a `Calibration` or a `Camera`,
+            which is taken to be exact. Without one the focal length begins with `focal_px`, EXIF,
+            or a guess, and is estimated with the distortion.
         focal_px: focal length in pixels of all images, roughly.
         seed: seed of all random choices; COLMAP's threads may still make a small difference.
         options: of all stages.

@@ -60,8 +60,8 @@ def train(
         options: the recipe.
         validation: folder of other images. None: some of the images are held out.
         labels: folder of the label cache. None: in `output`.
-        init_weights: weights (.safetensors) to start from, or "default", "dense" or "free" for
-            those inside the package; of several, their mean. None: random ones, by the seed.
+        init_weights: weights (.safetensors) to start from, or "default", "dense", "free" or
+            "espnet" inside the package; of several, their mean. None: random ones, by the seed.
         device: how the network is run.
         workers: processes that make labels. None: one per processor.
         log: takes lines of text for the user; without it there is no progress bar either.

@@ -14,7 +14,7 @@ const NUMBERS = [10, 20, 50, 100, 200, 300, 500, 750, 1000, 1500, 2000, 3000, 40
 const KINDS = {
   dense: {
     find: findHeatMap, isFound: (picture) => picture.map, choose: chooseDense,
-    hint: "Every pixel that passes, as DeepDetect gives them.",
+    hint: "Every pixel that passes, of photographs over two megapixels in the reduced picture.",
   },
   points: {
     find: (picture) => findPoints(picture), isFound: (picture) => isRanked(picture), choose: chooseOfAllScales,
@@ -75,7 +75,7 @@ function showControls({ kind, density, threshold, spread }) {
  * @property {(overlay: HTMLCanvasElement, unit: number) => void} draw
  * @property {string[]} columns of its files
  * @property {() => number[][] | Promise<number[][]>} rows in the photograph's own pixels
- * @property {object} options of Python that give the same
+ * @property {object} options of Python that give the same, in the picture as it was seen
  */
 
 /** @returns {Selection} */
