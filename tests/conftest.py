@@ -218,3 +218,21 @@ def run_evaluate(tmp_path: Path) -> Callable[..., str]:
         return result.stdout
 
     return run
+
+
+@pytest.fixture(scope="session")
+def waves() -> Callable[[float, float], np.ndarray]:
+    """Images (320, 320) uint8 of a sum of waves, exact wherever they are moved by (x, y) pixels."""
+    rng = np.random.default_rng(0)
+    frequencies, phases = rng.uniform(-0.9, 0.9, (60, 2)), rng.uniform(0, 2 * np.pi, 60)
+    heights = 1 / (0.3 + np.linalg.norm(frequencies, axis=1))
+    y, x = np.mgrid[:320, :320].astype(float)
+
+    def moved(dx: float, dy: float) -> np.ndarray:
+        parts = zip(frequencies, phases, heights, strict=True)
+        total = sum(h * np.cos(f[0] * (x - dx) + f[1] * (y - dy) + p) for f, p, h in parts)
+        return np.clip(np.rint(128 + 45 / np.sqrt((heights**2).sum() / 2) * total), 0, 255).astype(
+            np.uint8
+        )
+
+    return moved

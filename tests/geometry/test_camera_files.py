@@ -186,8 +186,8 @@ roi:
 ROS2 = "height: 480\nwidth: 640\nd:\n- 0.0\n- 0.0\nk:\n" + "".join(f"- {v}\n" for v in LEFT.ravel())
 SINGLE = {
     "ROS": ros(LEFT, 0),
-    "rostopic echo": ROSTOPIC,
-    "ros2 topic echo": ROS2,
+    "rostopic echo": ROSTOPIC + "---\n",
+    "ros2 topic echo": ROS2 + "---\n",
     "EuRoC": euroc(LEFT, 0.1),
     "K.txt": "500 0 310.5\n0 502 242.25\n0 0 1\n",
     "K.txt with commas": "500.0,0,310.5\n0,502.0,242.25\n0,0,1",
@@ -238,6 +238,9 @@ def test_cameras_of_pycolmap(tmp_path: Path) -> None:
         (kalibr(model="omni"), "its model is omni"),
         (euroc(LEFT, 0, "-0.283, 0.0739, 0.0, 0.0"), "radial-tangential -0.283"),
         ("1 SIMPLE_RADIAL 640 480 500 320 240 -0.02\n", "SIMPLE_RADIAL -0.02"),
+        ("1 SIMPLE_FISHEYE 640 480 500 320 240\n", "its model is SIMPLE_FISHEYE"),
+        ("1 OPENCV_FISHEYE 640 480 500 500 320 240 0 0 0 0\n", "its model is OPENCV_FISHEYE"),
+        (kalibr().replace("radtan", "equidistant"), "its model is equidistant"),
         (COLMAP + "3 PINHOLE 640 480 1 1 1 1\n", "3 cameras"),
         ("fov: 60\nname: camera\n", r"it has fov, name\): give a file of OpenCV, ROS"),
         ("words, and no numbers", "holds no cameras"),

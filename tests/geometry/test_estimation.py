@@ -238,3 +238,16 @@ def test_a_number_of_iterations_may_be_a_float() -> None:
     points = np.random.default_rng(0).uniform(0, 99, (30, 2))
     options = GeometryOptions(iterations=1e4)
     assert estimate_geometry(points, points + 3, "homography", options=options).inliers.all()
+
+
+def test_an_essential_matrix_is_as_accurate_as_its_matches() -> None:
+    """In normalised coordinates OpenCV 5 is five times less accurate."""
+    errors = []
+    for seed in range(6):
+        scene = make_scene("essential", seed, 400, 0.3, 0.4)
+        options = make_options("essential")
+        found = estimate_geometry(scene.points0, scene.points1, **options).matrix
+        assert found is not None
+        fresh = make_scene("essential", 100 + seed, outliers=0, noise=0)
+        errors.append(np.median(errors_of(fresh.points0, fresh.points1, "essential", found)))
+    assert np.median(errors) < 0.1

@@ -141,3 +141,11 @@ def test_wrong_points_pull_less_than_in_least_squares_and_no_more_than_in_magsac
     assert off(plain) > 2
     assert found < 0.2
     assert found < off(magsac) + 0.15
+
+
+@pytest.mark.parametrize("shift", [0.25, 0.3, 0.75])
+def test_a_shift_by_a_fraction_of_a_pixel_is_found(waves, shift: float) -> None:
+    """Known answer: an image that is a sum of waves, where no reading has part in the truth."""
+    true = np.array([[1, 0, shift], [0, 1, -shift], [0, 0, 1.0]])
+    first, second = waves(0, 0), waves(shift, -shift)
+    assert error(refine_homography(first, second, np.eye(3)), true, first.shape) < 0.03

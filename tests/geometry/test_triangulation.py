@@ -135,3 +135,14 @@ def test_blocks_give_what_all_at_once_gives(monkeypatch: pytest.MonkeyPatch) -> 
     for name, values in vars(whole).items():
         np.testing.assert_array_equal(getattr(parts, name), values)
     assert len(triangulate([], [], calibration, *pose).points) == 0
+
+
+@pytest.mark.parametrize("translation", [(-1, 0.2, 0.1), (0.05, 0.02, 1)])
+def test_moved_matches_fulfil_the_constraint(translation: tuple[float, float, float]) -> None:
+    """Sideways and forwards, with errors of eight pixels: the lines of sight meet."""
+    _, seen0, seen1, rotation, moved = scene(translation=translation)
+    random = np.random.default_rng(1)
+    noisy = seen0 + random.normal(0, 8, seen0.shape), seen1 + random.normal(0, 8, seen1.shape)
+    fundamental = fundamental_matrix(BOTH, rotation, moved)
+    left = epipolar_errors(*correct_matches(*noisy, fundamental), fundamental)
+    assert np.quantile(left, 0.99) < 1e-4

@@ -220,7 +220,7 @@ def opencv_pipeline(
 @pytest.mark.parametrize(
     ("selection", "options"),
     [
-        ({"density": 0.02}, {"descriptor": "sift-opencv"}),
+        ({"density": 0.02}, {"ratio": 0.8}),
         ({"threshold": 0.8}, {"ratio": 0.9, "angle": -1.0}),
         ({"max_keypoints": 300}, {"matcher": "exact", "keypoint_size": 5.0}),
         ({"nms_radius": 2}, {"ratio": 0.7, "angle": 30.0, "matcher": "exact"}),

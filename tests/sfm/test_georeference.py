@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -279,3 +280,31 @@ def test_what_is_upright() -> None:
     np.testing.assert_allclose(up, [0, 0, 1], atol=1e-3)
     np.testing.assert_allclose(level @ [0, 0, 1], 0, atol=1e-9)
     assert len(stds) == len(level) == 10
+
+
+def test_a_whole_name_is_that_of_its_image_alone(pycolmap, hidden: Similarity) -> None:
+    centres = np.column_stack([[0, 2.0, 10], np.zeros((3, 2))])
+    sparse = made_model(centres, [NORTH_LEVEL] * 3, np.array([[0.0, 10, 0]]), hidden)
+    named = dict(zip(("x.jpg", "y.jpg", "z/x.jpg"), sparse.images.values(), strict=True))
+    sparse = replace(sparse, images=named)
+    found = georeference(sparse, sparse.points, Path("."), scale_by=(2.0, "x.jpg", "y.jpg"))
+    assert isinstance(found, Georeference)
+    assert found.similarity.scale == pytest.approx(hidden.scale, rel=1e-6)
+    named["w/y.jpg"] = named["y.jpg"]
+    del named["y.jpg"]
+    named["z/y.jpg"] = named["x.jpg"]
+    with pytest.raises(OptionError):  # of two images of this name
+        georeference(sparse, sparse.points, Path("."), scale_by=(2.0, "x.jpg", "y.jpg"))
+
+
+def test_heights_are_measured_where_they_are_known(
+    pycolmap, tmp_path: Path, hidden: Similarity
+) -> None:
+    at = np.linspace(0, 5, 12)
+    centres = np.column_stack([45 * at, 60 * np.sin(at), 3 * np.cos(2 * at)])
+    sparse = made_model(centres, [NORTH_LEVEL] * 12, np.zeros((1, 3)), hidden)
+    write_fixes(tmp_path, centres)
+    found = georeference(sparse, sparse.points, tmp_path)
+    assert isinstance(found, Georeference)
+    found.residuals["03.jpg"][2] = np.nan
+    assert found.summary()["median_residual_up_m"] == pytest.approx(0, abs=0.01)

@@ -167,3 +167,17 @@ def test_wrong_options(values, one_line) -> None:
     with pytest.raises(OptionError) as caught:
         TrackingOptions(**values)
     assert next(iter(values)) in one_line(caught.value)
+
+
+@pytest.mark.parametrize(("start", "shift"), [(0.0, 0.25), (0.25, 0.5), (0.25, 2.3)])
+def test_positions_between_pixels_are_right(waves, start: float, shift: float) -> None:
+    """Known answer: an image that is a sum of waves, moved by a fraction of a pixel."""
+    grid = np.stack(np.meshgrid(range(30, 290, 12), range(30, 290, 12)), -1).reshape(-1, 2) + start
+    points = Keypoints(grid, np.linspace(1, 0.5, len(grid)), (320, 320))
+    tracker = Tracker(lambda rgb: points, TrackingOptions(detect_every=99, min_kept=0))
+    first, second = (np.repeat(waves(k * shift, -k * shift)[..., None], 3, 2) for k in range(2))
+    tracker.update(first)
+    found = tracker.update(second)
+    true = grid[found.tracks] + (shift, -shift)
+    assert len(found) > 0.7 * len(grid)
+    assert np.median(np.linalg.norm(found.xy - true, axis=1)) < 0.02

@@ -52,6 +52,7 @@ BYTES_PER = {
     "pixel_of_level": 16,
     # Dense matching, at its peak.
     "dense_pixel": 250,
+    "fused_pixel": 500,
 }
 """Measured; `needed_memory` adds them up."""
 

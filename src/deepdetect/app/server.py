@@ -172,9 +172,7 @@ class AppServer:
                 HTTPException: lambda _, error: _refusal(error.status_code, error.detail),
                 DeepDetectError: lambda _, error: _refusal(400, str(error)),
                 TimeoutError: lambda *_: _refusal(408, "the request takes too long", CLOSE),
-                MemoryError: lambda *_: _refusal(
-                    500, "too little memory: use smaller images"
-                ),
+                MemoryError: lambda *_: _refusal(500, "too little memory: use smaller images"),
                 OSError: lambda _, error: _refusal(400, CANNOT_START.format(error.strerror)),
                 ClientDisconnect: lambda *_: _refusal(400, "the connection has ended"),
             },

@@ -89,7 +89,8 @@ def reconstruct(
     A folder, or three and more images: also estimates their cameras. Writes model.ply, model.glb,
     model.html (with the cameras), model.json, transforms.json, and COLMAP's sparse/0 and
     database.db. If the images carry GPS, the model is in metres east, north and up. After an
-    interruption the same command continues. Images that cannot be read, or show something else, are left out and listed.
+    interruption the same command continues. Images that cannot be read, or show something else,
+    are left out and listed.
 
         deepdetect reconstruct left.png right.png --calibration calib.json -o model.ply
         deepdetect reconstruct left.jpg right.jpg --focal 1250

@@ -332,6 +332,8 @@ class PosedView:
 
 def camera_spacing(centres: np.ndarray) -> float:
     """Return the median distance from each of (V, 3) centres of cameras to the nearest other."""
-    distances = np.linalg.norm(centres[:, None] - centres, axis=2)
-    np.fill_diagonal(distances, np.inf)
-    return float(np.median(distances.min(axis=1)))
+    blocks = np.array_split(centres, len(centres) // 500 + 1)  # all pairs would fill the memory
+    distances = (np.linalg.norm(block[:, None] - centres, axis=2) for block in blocks)
+    second = min(1, len(centres) - 1)  # the nearest is the camera itself
+    nearest = [np.partition(each, second, axis=1)[:, second] for each in distances]
+    return float(np.median(np.concatenate(nearest)))

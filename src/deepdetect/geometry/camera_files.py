@@ -97,7 +97,8 @@ def _parsed(content: bytes) -> Values:
 
     Loader: Any = type("Loader", (yaml.SafeLoader,), {})  # of our own, for OpenCV's matrices
     Loader.add_multi_constructor("", lambda loader, _, node: loader.construct_mapping(node, True))
-    values = yaml.load(re.sub(r"\A%YAML[^\n]*\n", "", text), Loader)
+    # ROS ends what it prints by the beginning of another document.
+    values = next(yaml.load_all(re.sub(r"\A%YAML[^\n]*\n", "", text), Loader), None)
     if not isinstance(values, dict):
         raise ReconstructionError(f"it holds no cameras: {KNOWN}")
     return values
@@ -127,7 +128,13 @@ def _matrix(values: Values, keys: Iterable[str], *sizes: int) -> np.ndarray | No
     return None
 
 
+NO_PINHOLES = "fisheye", "equidistant", "equirectangular"
+"""In names of models that map angles in another way, even without distortion."""
+
+
 def _check_distortion(value: Any, model: Any) -> None:
+    if any(name in str(model).lower() for name in NO_PINHOLES):
+        raise ReconstructionError(f"its model is {model}: give a pinhole camera")
     data = value.get("data") if isinstance(value, Mapping) else value
     numbers = np.array(0 if data is None else data, np.float64).ravel()
     if numbers.any():
@@ -188,6 +195,7 @@ def _colmap(values: Values, _: Any) -> dict[str, Any] | None:
         raise ReconstructionError(f"it has {len(cameras)} cameras: keep those of left and right")
     made = []
     for model, (width, height, *numbers) in cameras:
+        _check_distortion(0, model)
         if model.startswith(("SIMPLE_", "RADIAL")):  # of one focal length
             numbers.insert(0, numbers[0])
         fx, fy, cx, cy, *distortion = numbers

@@ -68,7 +68,7 @@ class PlanarFrame:
         inverse = np.linalg.inv(matrix) * np.linalg.det(matrix)  # positive before the horizon
         x, y = (np.arange(length) for length in self.size)
         shown &= inverse[2, 0] * x + inverse[2, 1] * y[:, None] + inverse[2, 2] > 0
-        return cv2.warpPerspective(image, matrix, self.size, flags=cv2.INTER_CUBIC), shown
+        return cv2.warpPerspective(image, matrix, self.size, flags=cv2.INTER_LANCZOS4), shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +121,7 @@ class PolarFrame:
         last = np.array(image.shape[1::-1], np.float32) - 0.5
         shown = np.all((places >= -0.5) & (places <= last), axis=2)
         border = cv2.BORDER_REPLICATE
-        return cv2.remap(image, places, None, cv2.INTER_CUBIC, borderMode=border), shown
+        return cv2.remap(image, places, None, cv2.INTER_LANCZOS4, borderMode=border), shown
 
     def _positions(self, column: np.ndarray, row: np.ndarray, view: int) -> np.ndarray:
         """Return where columns and rows, arrays that fit each other, lie in a view, (..., 2)."""

@@ -222,21 +222,36 @@ def _fit(
     if model == "fundamental":
         limits = threshold, confidence, iterations
         return cv2.findFundamentalMat(points0, points1, method, *limits)[0]
-    # Both images in normalised coordinates; the threshold shrinks with the focal length.
     cameras = _cameras(options)
-    first, second = (
-        np.ascontiguousarray(
-            (np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(camera).T)[:, :2]
-        )
+    rays0, rays1 = (
+        np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(camera).T
         for points, camera in zip((points0, points1), cameras, strict=True)
     )
+    focal_px = (cameras[0][0, 0] + cameras[1][0, 0]) / 2
+    return fit_essential(rays0, rays1, focal_px, method, threshold, confidence, iterations)
+
+
+def fit_essential(
+    rays0: np.ndarray,
+    rays1: np.ndarray,
+    focal_px: float,
+    method: int,
+    threshold_px: float,
+    confidence: float,
+    iterations: int,
+) -> np.ndarray | None:
+    """Fit an essential matrix to (N, 3) directions (x, y, 1); None, or an odd one, where it fails.
+
+    As points of one camera in pixels: in normalised coordinates MAGSAC of OpenCV 5 is far less
+    accurate.
+    """
     matrix, _ = cv2.findEssentialMat(
-        first,
-        second,
-        np.eye(3),
+        np.ascontiguousarray(rays0[:, :2] * focal_px),
+        np.ascontiguousarray(rays1[:, :2] * focal_px),
+        np.diag([focal_px, focal_px, 1.0]),
         method=method,
         prob=confidence,
-        threshold=threshold / ((cameras[0][0, 0] + cameras[1][0, 0]) / 2),
+        threshold=threshold_px,
         maxIters=iterations,
     )
     return None if matrix is None else matrix[:3]

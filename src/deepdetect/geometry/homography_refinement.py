@@ -86,12 +86,12 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
         partial(_fit_to_corners, equalised, *settings) for settings in TRACKING_ROUNDS
     ]
     steps.append(partial(_fit_to_pixels, gray0))
-    current = np.asarray(homography, np.float64)
+    current, warp = np.asarray(homography, np.float64), partial(warp_to_reference, smooth=False)
     for step in steps:
-        warped, valid_mask = warp_to_reference(gray1, current, size)
+        warped, valid_mask = warp(gray1, current, size)
         fit = step(warped, valid_mask)
         corrections = fit(half), fit(~half)
-        views = [warp_to_reference(gray1, current @ m, size) for m in corrections if m is not None]
+        views = [warp(gray1, current @ m, size) for m in corrections if m is not None]
         if len(views) < 2:
             continue
         (mixed, mixed_mask), (other, other_mask) = views

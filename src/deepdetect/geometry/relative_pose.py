@@ -106,10 +106,11 @@ def correct_matches(
         a = np.einsum("ij,ij->i", normal1 @ block, normal0)
         b = ((normal0**2).sum(1) + (normal1**2).sum(1)) / 2
         c = np.einsum("ij,ij->i", second @ fundamental, first)
-        step = c / (b + np.sqrt(np.maximum(b * b - a * c, 0)))
+        root = np.sqrt(np.maximum(b * b - a * c, 0))
+        step = c / (b + root)
         next0 = normal0 - step[:, None] * (normal1 @ block)
         next1 = normal1 - step[:, None] * (normal0 @ block.T)
-        step = step * 2 * b / ((next0**2).sum(1) + (next1**2).sum(1))
+        step = step * 2 * root / ((next0**2).sum(1) + (next1**2).sum(1))
         moved0 = points0 - step[:, None] * next0
         moved1 = points1 - step[:, None] * next1
     # On an epipole every line is right: such a match stays where it is.

@@ -17,7 +17,7 @@ import numpy as np
 
 from .._shared.opencv import cv2
 from .camera import Calibration, Camera, Size, cross_matrix
-from .estimation import TwoViewModel, log10_nfa
+from .estimation import TwoViewModel, fit_essential, log10_nfa
 from .relative_pose import Pose, best_of_four, moved_pose
 from .transforms import epipolar_errors, signed_epipolar_errors
 
@@ -214,21 +214,16 @@ def _fit_essential(
     points0: np.ndarray, points1: np.ndarray, cameras: _Cameras, inlier_threshold: float
 ) -> np.ndarray | None:
     calibration = cameras.calibration
-    # Of one camera for both images, in pixels: in normalised coordinates OpenCV 5 is less accurate.
-    focal = (calibration.camera0.focal_px[0] + calibration.camera1.focal_px[0]) / 2
-    first, second = (
-        np.ascontiguousarray(camera.rays(points)[:, :2] * focal)
-        for camera, points in ((calibration.camera0, points0), (calibration.camera1, points1))
-    )
+    camera0, camera1 = calibration.camera0, calibration.camera1
     try:
-        matrix, _ = cv2.findEssentialMat(
-            first,
-            second,
-            np.diag([focal, focal, 1.0]),
-            method=cv2.USAC_MAGSAC,
-            prob=CONFIDENCE,
-            threshold=inlier_threshold,
-            maxIters=ITERATIONS,
+        matrix = fit_essential(
+            camera0.rays(points0),
+            camera1.rays(points1),
+            (camera0.focal_px[0] + camera1.focal_px[0]) / 2,
+            cv2.USAC_MAGSAC,
+            inlier_threshold,
+            CONFIDENCE,
+            ITERATIONS,
         )
     except cv2.error:  # degenerate input, as all points in one place
         return None

@@ -147,7 +147,7 @@ class CameraIntrinsics:
             rays = pinhole.rays(np.column_stack([x.ravel(), y.ravel() + top]))
             places = camera.img_from_cam(rays) * ratio - PIXEL_CENTRE
             column, row = places.T.astype(np.float32).reshape(2, *part.shape[:2])
-            part[:] = cv2.remap(image, column, row, cv2.INTER_CUBIC, borderValue=0)
+            part[:] = cv2.remap(image, column, row, cv2.INTER_LANCZOS4, borderValue=0)
         return made
 
 

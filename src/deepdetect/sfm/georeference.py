@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -106,6 +107,7 @@ class Georeference:
         if self.origin is None or self.fit is None:
             return {"source": self.source}
         good = np.array([r for name, r in self.residuals.items() if name not in self.wrong])
+        up = np.abs(good[:, 2])[np.isfinite(good[:, 2])]
         alone = round(self.fit.axis_std_deg_of_targets, 2)
         return {
             "source": self.source,
@@ -115,7 +117,7 @@ class Georeference:
             "used": len(good),
             "wrong": list(self.wrong),
             "median_residual_across_m": _rounded(np.median(np.linalg.norm(good[:, :2], axis=1))),
-            "median_residual_up_m": _rounded(np.median(np.abs(good[:, 2]))),
+            "median_residual_up_m": _rounded(np.median(up)) if len(up) else None,
             "scale_std_percent": round(100 * self.fit.scale_std, 2),
             "axes_std_deg": self.fit.axes_std_deg.round(2).tolist(),
             "least_certain_axis_std_deg_by_these_alone": alone,
@@ -314,8 +316,10 @@ def georeference_by_control_points(
 
 
 def _by_file_name(sparse: SparseModel) -> dict[str, str]:
-    """Return the names of images by these, and by the names of their files alone."""
-    return {each: name for name in sparse.images for each in (Path(name).name, name)}
+    """Return the names of images by these, and by the names of their files that only one has."""
+    counts = Counter(Path(name).name for name in sparse.images)
+    alone = {Path(name).name: name for name in sparse.images if counts[Path(name).name] == 1}
+    return {**alone, **{name: name for name in sparse.images}}
 
 
 def _triangulated(sparse: SparseModel, rows: Mapping[str, ControlRow]) -> np.ndarray:

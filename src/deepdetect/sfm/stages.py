@@ -146,11 +146,13 @@ class MultiViewOptions:
         return "exhaustive" if count <= MAX_EXHAUSTIVE else "similar"
 
 
-def check_images(images: str | Path | Sequence[str | Path]) -> dict[str, Path]:
+def check_images(
+    images: str | Path | Sequence[str | Path], exclude: Sequence[Path] = ()
+) -> dict[str, Path]:
     """Return the images below a folder, or of a list, as `name_images`."""
     if isinstance(images, (str, Path)):
         folder = Path(images)
-        return {path.relative_to(folder).as_posix(): path for path in find_images(folder)}
+        return {path.relative_to(folder).as_posix(): path for path in find_images(folder, exclude)}
     if not np.iterable(images) or not all(map(is_path, images)):
         raise OptionError("give a folder, or a list of the paths of images")
     paths = [*map(Path, images)]
@@ -185,8 +187,7 @@ class Stages:
                 raise OptionError(f"{images} holds the images: give another folder with -o")
             if not self.output.resolve().is_relative_to(Path(images).resolve()):
                 return Path(images)
-            images = find_images(images, [self.output])  # without pictures among the results
-        taken = check_images(images)
+        taken = check_images(images, [self.output])  # without pictures among the results
         folder = self.work / LINKS
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
@@ -404,7 +405,9 @@ class Stages:
     def _dense_workers(self, sparse: SparseModel) -> int:
         sizes = [limited_view(image.view).camera.size for image in sparse.images.values()]
         pixels = max(width * height for width, height in sizes)
-        fitting = max(1, int(available_memory() // needed_memory(dense_pixel=pixels)))
+        fused = pixels // self.options.stride_px**2
+        needed = max(needed_memory(dense_pixel=pixels), needed_memory(fused_pixel=fused))
+        fitting = max(1, int(available_memory() // needed))
         return min(self.workers or processor_count(), fitting)
 
 

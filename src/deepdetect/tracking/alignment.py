@@ -134,11 +134,14 @@ def find_patches(
 
 
 def _read(image: np.ndarray, xy: np.ndarray, affinities: np.ndarray) -> np.ndarray:
-    """Return the (N, P) values of an image around points, where the affinities put the pixels."""
+    """Return the (N, P) values of an image around points, where the affinities put the pixels.
+
+    By Lanczos' kernel: OpenCV's cubic one moves what it reads by up to .05 px.
+    """
     places = xy.astype(np.float32)[:, :, None] + affinities.astype(np.float32) @ OFFSETS
     parts = np.array_split(places, len(places) // MOST_READ + 1)
     return np.concatenate(
-        [cv2.remap(image, *part.transpose(1, 0, 2), cv2.INTER_CUBIC) for part in parts]
+        [cv2.remap(image, *part.transpose(1, 0, 2), cv2.INTER_LANCZOS4) for part in parts]
     )
 
 
