@@ -212,6 +212,26 @@ def test_there_is_memory_but_not_endlessly() -> None:
     assert 0 < available_memory() < 2**50
 
 
+def test_memory_of_a_container_that_caches_files_is_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a control group of 8 GB, 6 GB used, of which 3 GB are files that can be dropped."""
+    monkeypatch.setattr(machine, "Path", lambda _: tmp_path)
+    monkeypatch.setattr(machine, "_system_memory", lambda: 2**45)
+    without = available_memory()
+    for name, text in (
+        ("max", "8000000000\n"),
+        ("current", "6000000000\n"),
+        ("stat", "anon 2500000000\nfile 3500000000\ninactive_file 3000000000\nslab 5\n"),
+    ):
+        (tmp_path / f"memory.{name}").write_text(text)
+    assert available_memory() == 5_000_000_000
+    (tmp_path / "memory.current").write_text("12000000000\n")
+    assert available_memory() == 0
+    (tmp_path / "memory.max").write_text("max\n")
+    assert available_memory() == without > 2**44
+
+
 def test_a_step_that_does_not_fit_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "available_memory", lambda: 1.5e9)
     require_memory("a million keypoints", "take fewer", matched_keypoint=1e6)

@@ -31,7 +31,7 @@ def test_none(monkeypatch: pytest.MonkeyPatch) -> None:
         assert opencv.cv2.resize
 
 
-@pytest.mark.parametrize("version", ["4.10.0", "4.14.0-pre", "5.0.0"])
+@pytest.mark.parametrize("version", ["4.12.0", "4.14.0-pre", "5.0.0"])
 def test_new_enough(monkeypatch: pytest.MonkeyPatch, version: str) -> None:
     put(monkeypatch, __version__=version, resize=7)
     assert opencv.cv2.resize == 7

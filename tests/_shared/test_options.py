@@ -17,7 +17,7 @@ import deepdetect
 from deepdetect._shared.errors import OptionError
 from deepdetect._shared.options import (
     check_ranges,
-    is_path,
+    names_a_file,
     look_up,
     suggest_keywords,
 )
@@ -149,7 +149,7 @@ def test_a_name_gives_its_entry() -> None:
 
 @pytest.mark.parametrize("value", ["mine.onnx", "./dense", "runs/dense", Path("a/b.onnx")])
 def test_a_path_stays_a_path(value: str | Path) -> None:
-    assert is_path(value)
+    assert names_a_file(value)
 
 
 def test_an_unknown_name_suggests_the_nearest() -> None:

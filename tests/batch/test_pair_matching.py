@@ -301,3 +301,10 @@ def test_damaged_features_do_not_stop_the_others(tmp_path: Path) -> None:
     assert re.fullmatch(
         r"good bad: .*f\.h5, bad is damaged \(.*\): write it again", *report.failures
     )
+
+
+def test_a_ratio_of_nothing_is_refused() -> None:
+    for ratio in (0, -0.1, 1.1):
+        with pytest.raises(OptionError):
+            PairMatchingOptions(ratio=ratio)
+    assert PairMatchingOptions(ratio=None).ratio is None

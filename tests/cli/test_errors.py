@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,8 @@ import pytest
 from PIL import Image
 
 from deepdetect.detector.pretrained import pretrained_weights
+
+from .conftest import one_sentence
 
 
 @pytest.fixture
@@ -57,6 +60,9 @@ CASES = {
     "label settings": "label {bad}/good.png -o {bad}/out --label-settings {bad}/no.toml",
     "evaluate oxford": "dev evaluate {bad} --oxford {bad}/empty",
     "evaluate nothing": "dev evaluate {bad}/empty",
+    "long name of a folder": "detect {bad}/good.png -o {bad}/{long}",
+    "long name of a file": "export onnx dense -o {bad}/{long}.onnx",
+    "long name of pictures": "register {bad}/good.png {bad}/good.png -o {bad}/{long}/out",
 }
 
 
@@ -67,7 +73,7 @@ def test_one_sentence_and_exit_code_2(run, bad: Path, arguments: str) -> None:
     if "weights.safetensors" in arguments:
         pytest.importorskip("torch", reason="needs torch, which is for training only")
     before = {path: path.read_bytes() for path in bad.rglob("*") if path.is_file()}
-    result = run(*arguments.format(bad=bad).split())
+    result = run(*arguments.format(bad=bad, long="x" * 300).split())
     assert result.exit_code == 2, result.output
     message = result.stderr.strip()
     assert message.startswith("deepdetect: ")
@@ -117,3 +123,18 @@ def test_bad_weights_make_no_noise_of_native_code(
     assert done.returncode == 2
     assert done.stderr.startswith("deepdetect: ")
     assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+
+
+def test_a_folder_without_permission_is_one_sentence(run, bad: Path) -> None:
+    closed = bad / "empty"
+    closed.chmod(0)
+    if os.access(closed, os.X_OK):
+        pytest.skip("needs folders that are closed to this user, as they are not to root")
+    try:
+        result = run("detect", bad / "good.png", "-o", closed / "out")
+    finally:
+        closed.chmod(0o700)
+    assert result.exit_code == 2, result.output
+    assert one_sentence(result.stderr)
+    assert str(closed) in result.stderr
+    assert not [*closed.iterdir()]

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -66,3 +67,11 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(
     assert message in result.output.replace("\n", " ")
     assert one_sentence(result.output) or result.output.startswith("Usage:")
     assert [path.name for path in tmp_path.iterdir()] == ["text.onnx"]
+
+
+def test_the_help_shows_size_as_one_word(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    lines = run("export", "onnx", "--help").stdout.splitlines()
+    (line,) = [line for line in lines if re.match(r"\W*--size ", line)]
+    assert re.search(r"--size [A-Z]+ {2,}\S", line), "one word"
+    assert "480x640" in line

@@ -8,7 +8,7 @@ from PIL import Image
 
 from deepdetect import load_image
 from deepdetect.io.image import luma
-from deepdetect.labels import LabelOptions, fuse
+from deepdetect.labels import LabelOptions, find_label_settings, fuse
 
 
 def test_writes_one_bit_masks(run, photos: Path) -> None:
@@ -110,3 +110,13 @@ def test_a_figure_is_never_written_over_a_mask(run, photos: Path) -> None:
     assert result.exit_code == 2
     assert "would both write" in result.stderr
     assert not Path("masks").exists()
+
+
+def test_detectors_leave_out_the_settings_of_others(run, photos: Path) -> None:
+    words = ("label", photos / "cat.jpg", "--label-settings", "dense", "--workers", 1)
+    for names in ("fast", "fast,sobel"):
+        result = run(*words, "-o", names, "--detectors", names)
+        assert result.exit_code == 0, result.output
+        options = find_label_settings("dense").with_detectors(tuple(names.split(",")))
+        expected = fuse(luma(load_image(photos / "cat.jpg")), options).mask
+        np.testing.assert_array_equal(np.asarray(Image.open(f"{names}/cat.png")), expected)

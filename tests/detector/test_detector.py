@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import copy
+import gc
 import multiprocessing
 import os
 import pickle
@@ -390,6 +391,7 @@ def test_copies_detect_the_same(how: Any, image: np.ndarray) -> None:
 @pytest.mark.parametrize("method", multiprocessing.get_all_start_methods())
 def test_pools_map_the_methods_of_detectors(method: str, image: np.ndarray) -> None:
     points = PointDetector(20)
+    gc.collect()  # sessions of earlier tests, which a forked process waits for when it ends them
     context = multiprocessing.get_context(method)
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         found = next(pool.map(points.detect, [image]))
@@ -449,3 +451,26 @@ def test_keypoints_of_another_detector_outside_of_the_image_are_refused() -> Non
     assert find_keypoints(detector, np.zeros((4, 9, 3), np.uint8)) is outside
     with pytest.raises(OptionError, match="outside of the image"):
         find_keypoints(detector, np.zeros((4, 8, 3), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("place", "inside"),
+    [
+        ((-0.5, -0.5), True),
+        ((136.4, 100.4), True),
+        ((136.5, 3), False),
+        ((3, 100.5), False),
+        ((-0.6, 3), False),
+    ],
+)
+def test_keypoints_of_other_detectors_lie_in_pixels_of_the_image(
+    place: tuple[float, float], inside: bool, image: np.ndarray
+) -> None:
+    """A pixel reaches from -0.5 to below 0.5 around its centre."""
+    found = Keypoints([place], [1], (137, 101))
+    other = SimpleNamespace(detect=lambda rgb, ignore=None: found)
+    if inside:
+        assert find_keypoints(other, image) is found
+        return
+    with pytest.raises(OptionError):
+        find_keypoints(other, image)

@@ -297,3 +297,16 @@ def test_probabilities_are_calibrated_against_masks_and_labels(tmp_path: Path, p
     assert told["label_density"] == score.label_density
     refused = run_command(["dev", "evaluate", str(tmp_path)])
     assert "there are no samples in" in refused.output
+
+
+def test_images_too_small_for_a_scale_do_not_end_the_measurement(
+    tmp_path: Path, photo: np.ndarray
+) -> None:
+    for name, side in (("a", 24), ("b", 96), ("c", 30)):
+        Image.fromarray(photo[:side, :96]).save(tmp_path / f"{name}.png")
+    found = evaluate(samples=tmp_path, scales=(0.5, 1))
+    images = {scale: score.images for (scale, _), score in found.scales.items()}
+    assert images == {0.5: 1, 1: 3}
+    assert len(found.failures) == 2
+    for name, failure in zip("ac", found.failures, strict=True):
+        assert f"{name}.png" in failure

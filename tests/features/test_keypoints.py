@@ -84,6 +84,19 @@ def test_numbers_that_are_not_finite_are_an_error(value: float) -> None:
         Keypoints(np.zeros((1, 2)), np.array([value]), SIZE)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_all_numbers_but_logits_must_be_finite(value: float) -> None:
+    columns = {"sizes": (2,), "angles": (2,), "descriptors": (2, 3)}
+    for name, shape in columns.items():
+        values = np.ones(shape, np.float32)
+        assert len(Keypoints(np.zeros((2, 2)), np.zeros(2), SIZE, **{name: values})) == 2
+        values[1] = value
+        with pytest.raises(OptionError):
+            Keypoints(np.zeros((2, 2)), np.zeros(2), SIZE, **{name: values})
+    sure = Keypoints(np.zeros((2, 2)), np.zeros(2), SIZE, logits=[np.inf, -np.inf])
+    assert sure.logits.tolist() == [np.inf, -np.inf]
+
+
 POINTS = Keypoints([[1, 2], [3, 4], [5, 0]], [0.9, 0.6, 0.7], (8, 5))
 
 

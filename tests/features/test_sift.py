@@ -7,12 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from deepdetect import ImageError
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.features.scale_space import nearest_layers
 from deepdetect.features.sift import (
     DESCRIPTORS,
     correlation_distance,
     dense_sift,
+    describe_keypoints,
     opencv_sift_descriptors,
     root_sift_descriptors,
     scaled_sift_descriptors,
@@ -178,3 +180,19 @@ def test_every_descriptor_keeps_the_contract(name: str, count: int) -> None:
     assert len(descriptors) == count
     np.testing.assert_array_equal(gray, before[0])
     np.testing.assert_array_equal(xy, before[1])
+
+
+def test_only_the_keypoints_own_image_describes_them() -> None:
+    gray = make_gray()
+    for sizes in (None, np.full(40, 9.0)):
+        points = Keypoints(make_points(), np.ones(40), (90, 70), sizes=sizes)
+        assert describe_keypoints(gray, points).descriptors.shape == (40, 128)
+        for other in (
+            np.ascontiguousarray(gray[:, :-1]),
+            np.ascontiguousarray(gray.T),
+            np.dstack([gray] * 3),
+            gray.astype(np.float32),
+            gray.astype(np.uint16),
+        ):
+            with pytest.raises(ImageError):
+                describe_keypoints(other, points)

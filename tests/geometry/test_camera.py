@@ -128,3 +128,26 @@ def test_the_size_of_the_images_is_checked() -> None:
     calibration.check_sizes(SIZE, SIZE)
     with pytest.raises(ReconstructionError, match="right image has 320x240"):
         calibration.check_sizes(SIZE, (320, 240))
+
+
+@pytest.mark.parametrize(
+    ("values", "sizes"),
+    [
+        ({"width": 640, "height": 480, "right": {"width": 600, "height": 400}}, (SIZE, (600, 400))),
+        (
+            {"left": {"width": 640, "height": 480}, "right": {"width": 600, "height": 400}},
+            (SIZE, (600, 400)),
+        ),
+        ({"left": {"width": 640, "height": 480}}, (SIZE, SIZE)),
+        ({"width": 640, "height": 480}, (SIZE, SIZE)),
+    ],
+)
+def test_sizes_are_those_of_the_file_where_none_are_given(
+    tmp_path: Path, values: dict[str, Any], sizes: tuple[tuple[int, int], ...]
+) -> None:
+    found = Calibration.load(written(tmp_path, {"focal_px": 900, **values}))
+    assert (found.camera0.size, found.camera1.size) == sizes
+    for camera, (width, height) in zip((found.camera0, found.camera1), sizes, strict=True):
+        assert camera.centre == ((width - 1) / 2, (height - 1) / 2)
+    given = Calibration.load(written(tmp_path, {"focal_px": 900, **values}), *sizes)
+    assert (given.camera0, given.camera1) == (found.camera0, found.camera1)

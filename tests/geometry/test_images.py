@@ -134,3 +134,16 @@ def test_windows_around_points_are_correlated() -> None:
     np.testing.assert_allclose(same, 1, atol=1e-3)
     np.testing.assert_allclose(inverted, -1, atol=1e-3)
     assert np.abs(chance[[0, 2]]).max() < 0.5
+
+
+def test_more_points_than_opencv_takes_at_once_are_correlated() -> None:
+    """`cv2.remap` takes fewer than 32,767 rows."""
+    first, second = noise(0), noise(1) // 2 + noise(0) // 2
+    generator = np.random.default_rng(0)
+    points0, points1 = (generator.uniform(2, (77, 61), (33_001, 2)) for _ in range(2))
+    found = zncc_at_points((first, second), (points0, points1), 3)
+    parts = np.array_split(np.arange(33_001), 7)
+    expected = [zncc_at_points((first, second), (points0[k], points1[k]), 3) for k in parts]
+    assert found.shape == (33_001,)
+    np.testing.assert_array_equal(found, np.concatenate(expected))
+    assert np.abs(found).max() > 0.9

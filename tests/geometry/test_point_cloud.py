@@ -42,6 +42,16 @@ def test_mistakes_are_one_sentence(points, colors, unit: str, word: str, one_lin
     assert word in one_line(caught.value)
 
 
+def test_normals_have_the_shape_of_the_points() -> None:
+    points, colors = np.zeros((3, 3)), np.zeros((3, 3), np.uint8)
+    cloud = PointCloud(points, colors, "mm", normals=[[0, 0, 1], [0, 1, 0], [1, 0, 0]])
+    assert cloud.normals.dtype == np.float32
+    assert cloud[1].normals.tolist() == [[0, 1, 0]]
+    for shape in ((2, 3), (3, 2), (3,), (3, 3, 1)):
+        with pytest.raises(OptionError):
+            PointCloud(points, colors, "mm", normals=np.zeros(shape))
+
+
 def test_a_few_wild_points_hardly_move_the_box() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (1000, 3))

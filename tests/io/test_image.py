@@ -207,6 +207,16 @@ def test_16_bit_grey_that_pillow_may_hold_in_32_bits(kind: str, opened: bool) ->
     np.testing.assert_array_equal(load_image(given), DEEP_GREY)
 
 
+@pytest.mark.parametrize("opened", [True, False])
+@pytest.mark.parametrize(("largest", "bits"), [(1023, 10), (4095, 12), (1000, 16)])
+def test_white_of_a_pgm_file_is_its_largest_value(opened: bool, largest: int, bits: int) -> None:
+    """Although no pixel is near to it."""
+    values = DEEP.astype(int) % (largest // 5)
+    file = io.BytesIO(b"P5 25 18 %d\n" % largest + values.astype(">u2").tobytes())
+    loaded = load_image(Image.open(file) if opened else file.getvalue())
+    np.testing.assert_allclose(loaded, triple(values * 255 / largest), atol=0.51)
+
+
 def encoded(rgb: np.ndarray, kind: str) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(rgb).save(buffer, kind)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from deepdetect._shared.errors import ImageError
+from deepdetect.io.image import load_image
 from deepdetect.io.masks import load_mask, save_mask
 
 MASK = np.random.default_rng(3).random((19, 26)) > 0.6
@@ -73,3 +75,35 @@ def test_masks_of_too_many_pixels_are_not_decoded(
     with pytest.raises(ImageError) as caught:
         load_mask(path)
     assert "20000x20000 pixels" in one_line(caught.value)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_masks_are_turned_as_their_photographs_are(orientation: int, tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(MASK).save(tmp_path / "mask.png", exif=exif)
+    Image.fromarray(np.dstack([MASK.astype(np.uint8) * 255] * 3)).save(
+        tmp_path / "photo.png", exif=exif
+    )
+    upright = load_image(tmp_path / "photo.png")[..., 0] > 127
+    np.testing.assert_array_equal(load_mask(tmp_path / "mask.png"), upright)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_broken_exif_is_no_broken_mask(suffix: str, tmp_path: Path) -> None:
+    """A signed resolution cannot be rewritten by Pillow; the mask can be read all the same."""
+    entries = struct.pack("<HHIHxx", 0x0112, 3, 1, 6) + struct.pack("<HHII", 0x011A, 10, 1, 38)
+    exif = b"Exif\0\0II*\0" + struct.pack("<IH", 8, 2) + entries + struct.pack("<Iii", 0, -1, 0)
+    Image.new("L", (30, 20), 255).save(tmp_path / f"mask{suffix}", exif=exif)
+    mask = load_mask(tmp_path / f"mask{suffix}")
+    assert mask.shape == load_image(tmp_path / f"mask{suffix}").shape[:2]
+    assert mask.all()
+
+
+@pytest.mark.parametrize("white", [1, 255, 65535])
+@pytest.mark.parametrize("kind", [np.uint16, np.int32])
+def test_white_of_8_bits_in_files_of_more(white: int, kind: type, tmp_path: Path) -> None:
+    Image.fromarray((MASK * white).astype(kind)).save(tmp_path / "mask.tif")
+    np.testing.assert_array_equal(load_mask(tmp_path / "mask.tif"), MASK)
+    Image.fromarray(np.zeros(MASK.shape, kind)).save(tmp_path / "mask.tif")
+    assert not load_mask(tmp_path / "mask.tif").any()

@@ -203,3 +203,55 @@ def test_without_anything_there_is_nothing(photo: np.ndarray, tmp_path: Path) ->
     found = read_metadata(tmp_path / "a.tif")
     assert vars(found) == vars(Metadata())
     np.testing.assert_array_equal(load_image(tmp_path / "a.tif"), photo)
+
+
+SRGB = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+
+
+@pytest.mark.parametrize(
+    "profile",
+    [b"no profile", SRGB[:300], *(SRGB[:16] + kind + SRGB[20:] for kind in (b"GRAY", b"CMYK"))],
+    ids=["text", "cut off", "grey", "CMYK"],
+)
+@pytest.mark.parametrize("source", ["a.png", "a.jpg", "a.tif"])
+def test_a_profile_that_fits_no_rgb_picture_is_left_out(
+    source: str, profile: bytes, photo: np.ndarray, tmp_path: Path
+) -> None:
+    Image.fromarray(photo).save(tmp_path / source, icc_profile=profile)
+    for name in ("b.png", "b.jpg", "b.tif"):
+        save_picture(photo, tmp_path / name, read_metadata(tmp_path / source))
+        with Image.open(tmp_path / name) as written:
+            assert written.info.get("icc_profile") is None
+            difference = np.abs(np.asarray(written).astype(int) - photo)
+        assert difference.mean() < (6 if name == "b.jpg" else 1e-9)
+
+
+def test_more_exif_than_a_jpeg_file_holds_does_not_cost_the_picture(
+    photo: np.ndarray, tmp_path: Path
+) -> None:
+    exif = Image.Exif()
+    exif[Base.ImageDescription] = "x" * 70_000
+    Image.fromarray(photo).save(tmp_path / "a.png", exif=exif)
+    metadata = read_metadata(tmp_path / "a.png")
+    save_picture(photo, tmp_path / "b.jpg", metadata)
+    assert np.abs(load_image(tmp_path / "b.jpg").astype(int) - photo).mean() < 6
+    save_picture(photo, tmp_path / "b.png", metadata)
+    np.testing.assert_array_equal(load_image(tmp_path / "b.png"), photo)
+    with Image.open(tmp_path / "b.png") as written:
+        assert written.getexif()[Base.ImageDescription] == "x" * 70_000
+
+
+@pytest.mark.parametrize("source", ["a.png", "a.jpg", "a.tif"])
+def test_texts_that_are_not_ascii_are_kept(source: str, photo: np.ndarray, tmp_path: Path) -> None:
+    """Cameras write UTF-8 and Latin-1 where EXIF has ASCII."""
+    exif = Image.Exif()
+    texts = {Base.Copyright: "© Müller 2024".encode(), Base.Artist: "Jörg Müller".encode("latin-1")}
+    exif.update(texts)
+    Image.fromarray(photo).save(tmp_path / source, exif=exif)
+    for name in ("b.png", "b.jpg", "b.tif"):
+        save_picture(photo, tmp_path / name, read_metadata(tmp_path / source))
+        with Image.open(tmp_path / name) as written:
+            kept = written.getexif()
+        for code, text in texts.items():
+            assert text in (tmp_path / name).read_bytes()
+            assert kept[code].encode("latin-1") == text

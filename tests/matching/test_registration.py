@@ -12,12 +12,13 @@ from deepdetect import (
     DeepDetectError,
     OptionError,
     PointDetector,
+    RegistrationError,
     load_image,
     match_images,
 )
 from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.io.image import luma
-from deepdetect.matching.registration import Registration, agree, register
+from deepdetect.matching.registration import MAX_UNION, Registration, _union, agree, register
 from tests.command_line import run_command
 
 WARP = np.array([[0.92, -0.1, 25.0], [0.08, 0.97, -6.0], [1e-4, 2e-4, 1.0]])
@@ -117,3 +118,12 @@ def test_images_of_one_plane_agree_and_others_do_not(shared: Path) -> None:
         homography = np.loadtxt(folder / name / "H1to4p")
         assert agree(first[name], second[name], homography)
         assert not agree(first[name], second[other], homography)
+
+
+@pytest.mark.parametrize("shape", [(100, 100), (100, 100, 3), (100, 100, 8)])
+def test_a_union_is_limited_by_pixels_however_many_channels(shape: tuple[int, ...]) -> None:
+    """The second image is shown so many times larger; both have 20,000 pixels together."""
+    assert _union(shape, shape, np.diag([1 / 2, 1 / 2, 1])) == (-1, -1, 200, 200)
+    assert MAX_UNION * 20_000 < 299**2
+    with pytest.raises(RegistrationError):
+        _union(shape, shape, np.diag([1 / 3, 1 / 3, 1]))

@@ -15,6 +15,7 @@ from deepdetect import (
     match_features,
     match_images,
 )
+from deepdetect.io.image import luma
 
 
 @pytest.fixture(scope="module")
@@ -78,3 +79,38 @@ def test_the_matrix_has_the_name_of_its_model(pair) -> None:
     lines = dataclasses.replace(plane, model="fundamental")
     assert lines.fundamental is plane.matrix
     assert lines.homography is None
+
+
+class Fast:
+    """OpenCV's FAST: keypoints with sizes, and with no angle of their own."""
+
+    def detect(self, image: np.ndarray, ignore: object = None) -> Keypoints:
+        gray = luma(image)
+        found = cv2.FastFeatureDetector_create().detect(gray, None)
+        return Keypoints.from_opencv(found, gray.shape[::-1])
+
+
+@pytest.mark.parametrize("descriptor", ["sift", "rootsift"])
+def test_keypoints_without_angles_match_in_a_turned_image(
+    photo: np.ndarray, descriptor: str
+) -> None:
+    assert (Fast().detect(photo).angles == -1).all()
+    turned = np.ascontiguousarray(np.rot90(photo))
+    found = match_images(
+        photo,
+        turned,
+        Fast(),
+        guided_matching=False,
+        mutual=True,
+        model="homography",
+        options=MatchingOptions(descriptor=descriptor, ratio=0.85),
+    )
+    x, y = found.points0.T
+    errors = np.linalg.norm(np.column_stack([y, 255 - x]) - found.points1, axis=1)
+    assert np.count_nonzero(errors < 1) > 1000
+    assert found.inliers.mean() > 0.95
+
+
+def test_a_seed_that_is_no_whole_number_is_refused(features: list[Keypoints]) -> None:
+    with pytest.raises(OptionError):
+        match_features(*features, seed=0.5)

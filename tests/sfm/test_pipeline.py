@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,11 +29,14 @@ from deepdetect import (
     load_image,
     reconstruct_many,
 )
+from deepdetect._shared.records import key
 from deepdetect.batch.hdf5 import open_hdf5
 from deepdetect.datasets.posed_images import load_posed_scenes
 from deepdetect.sfm import MultiViewOptions, MultiViewReconstruction, forecast, stages
 from deepdetect.sfm.colmap import CameraIntrinsics, write_database
+from deepdetect.sfm.formats import FORMATS
 from deepdetect.sfm.mapping import read_sparse_model, verify_pairs
+from deepdetect.sfm.pipeline import _write
 from deepdetect.sfm.stages import Stages, check_images
 
 QUICK = {
@@ -438,3 +443,116 @@ def test_frames_that_show_the_same_are_left_out(write_fountain, pycolmap, tmp_pa
         shutil.copy(still / "0004.jpg", still / f"{copy}.jpg")
     with pytest.raises(NoDepthError, match="all images but 1 show nearly the same"):
         reconstruct_many(still, tmp_path / "none", **{**SPARSE, "options": options})
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are text elsewhere")
+def test_a_name_that_is_no_text_is_a_named_failure(
+    tmp_path: Path, photo_path: Path, pycolmap
+) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    odd = os.fsdecode(b"\xff.png")
+    for name in ("good.png", odd):
+        shutil.copy(photo_path, folder / name)
+    made = Stages(tmp_path / "model", MultiViewOptions(), 1, True)
+    sizes, keypoints, failures = made.extract(folder, PointDetector(50))
+    assert (sizes, keypoints) == ({"good.png": (256, 256)}, {"good.png": 50})
+    assert [*failures] == [odd]
+    assert odd in failures[odd]
+
+
+@pytest.fixture
+def nested(tmp_path: Path, photo_path: Path) -> Path:
+    """A folder of images in folders, with pictures of an earlier run's model among them."""
+    folder = tmp_path / "photos"
+    for name in ("3.png", "a/1.png", "b/2.png", "model/splat/images/3.png", "model/height.png"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(photo_path, folder / name)
+    return folder
+
+
+def test_results_among_the_images_are_no_images(nested: Path) -> None:
+    for _ in range(2):
+        made = Stages(nested / "model", MultiViewOptions(), 1, True).folder_of(nested)
+        files = {path.resolve() for path in check_images(made).values()}
+        assert files == {nested / name for name in ("3.png", "a/1.png", "b/2.png")}
+    outside = Stages(nested.parent / "model", MultiViewOptions(), 1, True)
+    assert len(check_images(outside.folder_of(nested))) == 5
+
+
+def test_images_keep_their_names_where_results_are_among_them(nested: Path) -> None:
+    made = Stages(nested / "model", MultiViewOptions(), 1, True).folder_of(nested)
+    assert {*check_images(made)} == {"3.png", "a/1.png", "b/2.png"}
+
+
+def test_formats_after_one_that_fails_are_written(
+    small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, _, found = small
+    written: list[str] = []
+
+    def write(found: object, folder: Path, output: Path, name: str) -> None:
+        assert (output / "model.json").is_file()
+        written.append(name)
+        if name in ("laz", "mesh"):
+            raise ReconstructionError(f"{name} lacks something")
+
+    for name in ("laz", "text", "mesh", "splat"):
+        each = FORMATS[name]._replace(write=partial(write, name=name))
+        monkeypatch.setitem(FORMATS, name, each)
+    with pytest.raises(ReconstructionError) as caught:
+        _write(found, folder, tmp_path, ("laz", "text", "mesh", "splat"))
+    assert written == ["laz", "text", "mesh", "splat"]
+    assert all(name in str(caught.value) for name in ("laz", "mesh"))
+    with pytest.raises(ReconstructionError):
+        _write(found, folder, tmp_path, ("laz",))
+    _write(found, folder, tmp_path, ("text",))
+
+
+class Mapped(Exception):
+    """It would be mapped now."""
+
+
+@pytest.mark.parametrize(("matches", "differ"), [("dense", True), ("sparse", False)])
+def test_dense_matches_of_another_stride_are_mapped_anew(
+    matches: str, differ: bool, small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, output, found = small
+    (tmp_path / "work").mkdir()
+    shutil.copy(output / "work" / "features.h5", tmp_path / "work")
+    keys: list[str] = []
+
+    def noted(*parts: object) -> str:
+        keys.append(key(*parts))
+        raise Mapped
+
+    monkeypatch.setattr(stages, "key", noted)
+    for stride in (2, 4, 2):
+        options = MultiViewOptions(matches=matches, stride_px=stride)
+        with pytest.raises(Mapped):
+            Stages(tmp_path, options, 1, True).map(tmp_path, found.intrinsics, {}, False)
+    assert keys[0] == keys[2]
+    assert (keys[0] != keys[1]) == differ
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"ratio": 0}, {"ratio": 1.2}, {"formats": ("text", "mesh"), "dense": False}],
+    ids=str,
+)
+def test_options_that_can_give_nothing_are_refused(values: dict) -> None:
+    with pytest.raises(OptionError):
+        MultiViewOptions(**values)
+
+
+@pytest.mark.parametrize(("name", "kept"), [("notes.txt", True), ("features.h5", False)])
+def test_only_the_work_of_a_run_is_overwritten(
+    name: str, kept: bool, tmp_path: Path, pycolmap
+) -> None:
+    (tmp_path / "photos").mkdir()
+    work = tmp_path / "model" / "work"
+    work.mkdir(parents=True)
+    (work / name).write_text("anything")
+    with pytest.raises(ImageError):  # there are no images
+        reconstruct_many(tmp_path / "photos", work.parent, workers=1, overwrite=True)
+    assert (work / name).exists() == kept

@@ -184,3 +184,22 @@ def test_wrong_options(name: str, values, word: str, frame_folder, tmp_path: Pat
     with pytest.raises(OptionError, match=word):
         track(frame_folder, tmp_path / name, options=FEW, **values)
     assert [path.name for path in tmp_path.iterdir()] == ["frames"]
+
+
+def test_a_video_is_not_replaced_by_its_tracks(
+    frame_folder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    track(frame_folder, tmp_path / "v.mp4", options=FEW, max_frames=2)
+    content = (tmp_path / "v.mp4").read_bytes()
+    (tmp_path / "v.csv").unlink()
+    (tmp_path / "link.mp4").symlink_to(tmp_path / "v.mp4")
+    monkeypatch.chdir(tmp_path)
+    for source, output in (
+        (tmp_path / "v.mp4", tmp_path / "v.mp4"),
+        ("v.mp4", str(tmp_path / "v.mp4")),
+        ("link.mp4", "v.mp4"),
+    ):
+        with pytest.raises(OptionError):
+            track(source, output, options=FEW)
+    assert (tmp_path / "v.mp4").read_bytes() == content
+    assert sorted(os.listdir(tmp_path)) == ["frames", "link.mp4", "v.mp4"]

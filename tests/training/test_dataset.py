@@ -3,6 +3,7 @@ from __future__ import annotations
 import dataclasses
 import multiprocessing
 import pickle
+import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -291,3 +292,33 @@ def test_preparation_makes_only_the_labels_that_are_needed(
     again = prepare_data(photographs, options, tmp_path, validation=photographs, workers=1)
     assert len(again.validation) == len(again.training) == 12
     assert again.digest != data.digest
+
+
+def test_validation_images_among_the_images_are_not_trained_on(
+    photographs: Path, tmp_path: Path
+) -> None:
+    """Nor are pictures of the run, nor is anything of them validated on."""
+    images, output = tmp_path / "images", tmp_path / "images/run"
+    for name in ("00.png", "a/01.png", "val/02.png", "val/b/03.png", "run/04.png"):
+        (images / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(photographs / f"photo{name[-6:]}", images / name)
+    data = prepare_data(images, OPTIONS, output, validation=images / "val", make_labels=False)
+    trained, held = (
+        {image.path.relative_to(images).as_posix() for image in part.images}
+        for part in (data.training, data.validation)
+    )
+    assert trained == {"00.png", "a/01.png"}
+    assert held == {"val/02.png", "val/b/03.png"}
+
+
+def test_images_among_the_validation_images_are_not_validated_on(
+    photographs: Path, tmp_path: Path
+) -> None:
+    whole = tmp_path / "photographs"
+    for name in ("00.png", "train/01.png"):
+        (whole / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(photographs / f"photo{name[-6:]}", whole / name)
+    how = {"validation": whole, "make_labels": False}
+    data = prepare_data(whole / "train", OPTIONS, tmp_path / "run", **how)
+    assert [image.path for image in data.training.images] == [whole / "train/01.png"]
+    assert [image.path for image in data.validation.images] == [whole / "00.png"]

@@ -161,7 +161,7 @@ def evaluate(
                 for path in images:
                     try:
                         sample = load_sample(path) if with_masks else (load_image(path), None)
-                        check_scale(sample[0], scale)
+                        check_scale(sample[0], scale, path.name)
                         yield sample
                     except ImageError as error:
                         failures[str(error)] = None

@@ -221,7 +221,7 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
         raise ImageError(f"{root} is a file: name the folder that it is in")
     if not root.is_dir():
         raise MissingImageError(f"there is no folder {root}: check the path")
-    left_out = [path.resolve() for path in exclude if path.resolve() != root.resolve()]
+    left_out = [p.resolve() for p in exclude if not root.resolve().is_relative_to(p.resolve())]
     found = natsorted(
         (
             path
@@ -273,7 +273,7 @@ def _read_file(
                     rgb = _deep_png(file, name, options, deep)
                 else:
                     rgb = _from_pil(image, name, value_range=options.value_range, deep=deep)
-                orientation = _orientation(image)
+                orientation = orientation_of(image)
             del image  # its pixels, before they are needed once more
     return UPRIGHT[orientation](rgb) if orientation in UPRIGHT else rgb
 
@@ -287,7 +287,7 @@ def _deep_png(file: BinaryIO, name: str, options: ReadingOptions, deep: bool) ->
     return array_to_rgb(values, "bgr", name, value_range=options.value_range, deep=deep)
 
 
-def _orientation(image: Any) -> Any:
+def orientation_of(image: Any) -> Any:
     """Return the EXIF orientation of a loaded image; a broken tag is ignored."""
     try:
         return image.getexif().get(ORIENTATION_TAG, 1)

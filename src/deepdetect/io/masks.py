@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps
+from PIL import Image
 
 from .._shared.atomic import atomic_path
+from .image import UPRIGHT, orientation_of
 from .image_file import open_image, reading_options
 
 WHITES = (1, 255, 65535, 2**32)
@@ -37,8 +38,8 @@ def load_mask(source: Any, *, max_megapixels: float | None = None) -> np.ndarray
     """
     options = reading_options(max_megapixels=max_megapixels)
     with open_image(source, what="mask", options=options) as opened:
-        upright = ImageOps.exif_transpose(opened)
-        deep = upright.mode.startswith("I")  # 16 or 32 bits per pixel
-        values = np.asarray(upright if deep else upright.convert("L"))
+        deep = opened.mode.startswith("I")  # 16 or 32 bits per pixel
+        values = np.asarray(opened if deep else opened.convert("L"))
+        values = UPRIGHT.get(orientation_of(opened), np.asarray)(values)
     white = next(white for white in WHITES if values.max() <= white)
     return values > white // 2

@@ -84,8 +84,9 @@ class Metadata:
     def encode(self, rgb: np.ndarray, suffix: str, settings: list[int]) -> bytes:
         """Return a PNG or JPEG file of an (H, W, 3) RGB image."""
         parts = {cv2.IMAGE_METADATA_ICCP: self.profile}
-        if exif := self._exif_of(rgb):
-            parts[cv2.IMAGE_METADATA_EXIF] = exif.tobytes().removeprefix(b"Exif\0\0")
+        with suppress(struct.error):  # numbers that Pillow reads and cannot write
+            if exif := self._exif_of(rgb):
+                parts[cv2.IMAGE_METADATA_EXIF] = exif.tobytes().removeprefix(b"Exif\0\0")
         kept = {kind: np.frombuffer(part, np.uint8) for kind, part in parts.items() if part}
         bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
         done, data = cv2.imencodeWithMetadata(suffix, bgr, [*kept], [*kept.values()], settings)

@@ -78,3 +78,17 @@ def test_damaged_and_missing_files_are_reported(tmp_path: Path) -> None:
     np.savez(tmp_path / "pickle.npz", **arrays(notes=np.array([{}], object)))
     with pytest.raises(WeightsError, match="does not hold weights"):
         load_ranker(tmp_path / "pickle.npz")
+
+
+def test_an_array_and_damage_of_any_kind_are_reported(tmp_path: Path) -> None:
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    with pytest.raises(WeightsError):
+        load_ranker(tmp_path / "array.npy")
+    np.savez_compressed(tmp_path / "a.npz", **arrays())
+    load_ranker(tmp_path / "a.npz")
+    whole = (tmp_path / "a.npz").read_bytes()
+    damaged = tmp_path / "damaged.npz"
+    for place in range(60, len(whole) // 2, 40):  # of compressed numbers, mostly
+        damaged.write_bytes(whole[:place] + bytes(20) + whole[place + 20 :])
+        with pytest.raises(WeightsError):
+            load_ranker(damaged)

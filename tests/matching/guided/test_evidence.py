@@ -148,3 +148,30 @@ def test_matches_of_a_pattern_at_random_periods_do_not_move_alike() -> None:
     assert (moving_alike(points, points + periods) >= 0.6).mean() < 0.03
     steps = np.column_stack([80.0 * (points[:, 0] // 250 % 3), np.zeros(130)])  # of depth
     assert (moving_alike(points, points + steps) >= 0.6).mean() > 0.8
+
+
+def test_as_many_move_alike_as_brute_force_finds() -> None:
+    """Of matches of which some begin at one place; each is compared with its eight nearest."""
+    rng = np.random.default_rng(0)
+    points0 = rng.uniform(0, 900, (1100, 2))
+    points1 = points0 @ [[0.6, 0.5], [-0.5, 0.7]] + rng.normal(0, 9, points0.shape)
+    few0, few1 = points0[:9].copy(), points1[:9].copy()  # all the others are the nearest
+    few0[4] = few0[3] = few0[2]
+    same0, same1 = points0[:40].copy(), points1[:40].copy()  # more are at one place than compared
+    same0[:12], same1[:12] = same0[0], same1[0]
+    for start, end in ((points0, points1), (few0, few1), (same0, same1)):
+        expected = []
+        for own in range(len(start)):
+            order = np.argsort(np.linalg.norm(start - start[own], axis=1), kind="stable")
+            nearest = [k for k in order if k != own][:8]
+            steps, ends = (each[nearest] - each[own] for each in (start, end))
+            moved = np.linalg.norm(steps, axis=1) > 0
+            steps, ends = steps[moved] @ [1, 1j], ends[moved] @ [1, 1j]
+            moves = ends / steps
+            allowed = 0.35 * np.abs(moves)[:, None] + 2 / np.abs(steps)
+            alike = np.abs(moves[:, None] - moves) < allowed
+            expected.append(alike.sum(axis=1).max(initial=0) / 8)
+        with np.errstate(all="ignore"):  # of steps of no length
+            found = moving_alike(start, end)
+        np.testing.assert_allclose(found, expected)
+        assert len(set(expected)) > 3

@@ -131,7 +131,13 @@ def test_what_makes_no_panorama_is_refused(views, one_line) -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [{"reference": 2}, {"reference": -1}, {"projection": "cylinder"}, {"seed": -1}],
+    [
+        {"reference": 2},
+        {"reference": -1},
+        {"reference": 0.5},
+        {"projection": "cylinder"},
+        {"seed": -1},
+    ],
     ids=str,
 )
 def test_options_out_of_range_are_refused(views, options: dict, one_line) -> None:

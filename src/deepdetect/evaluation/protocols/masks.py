@@ -128,11 +128,11 @@ def _by_visibility(images: Iterable[tuple[str, Measured]]) -> dict[str, MaskScor
     return {name: mean_score(listed) for name, listed in measured.items() if listed}
 
 
-def check_scale(image: np.ndarray, scale: float) -> None:
+def check_scale(image: np.ndarray, scale: float, name: str = "an image") -> None:
     """Raise an ImageError where an image is downscaled to under 16 pixels."""
     if (side := round(scale * min(image.shape[:2]))) < MINIMUM_SIDE:
         raise ImageError(
-            f"an image scaled by {scale:g} has a side of {side} pixels: "
+            f"{name} scaled by {scale:g} has a side of {side} pixels: "
             f"it needs at least {MINIMUM_SIDE}, use larger scales"
         )
 
