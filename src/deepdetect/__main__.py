@@ -27,7 +27,7 @@ def main() -> None:
     os.close(number)
     for name, value in OPENCV_SETTINGS.items():
         os.environ.setdefault(name, value)
-    if isinstance(sys.stdout, io.TextIOWrapper):
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="surrogateescape")  # names of files may be any bytes
     with noted_interrupts() as interrupts:
         try:

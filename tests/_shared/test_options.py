@@ -17,8 +17,8 @@ import deepdetect
 from deepdetect._shared.errors import OptionError
 from deepdetect._shared.options import (
     check_ranges,
-    names_a_file,
     look_up,
+    names_a_file,
     suggest_keywords,
 )
 

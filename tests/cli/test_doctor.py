@@ -57,7 +57,7 @@ def test_a_working_installation(run: Run) -> None:
     ("imported", "modules", "packages", "status"),
     [
         ("5.0.0", (), {"opencv_python_headless": "5.0.0.93"}, "ok"),
-        ("4.11.0", (), {"opencv_python_headless": "5.0.0.93"}, "problem"),
+        ("4.12.0", (), {"opencv_python_headless": "5.0.0.93"}, "problem"),
         (
             *("5.0.0", ()),
             {"opencv_python_headless": "5.0.0.93", "opencv_contrib_python_headless": "5.0.0.93"},

@@ -255,3 +255,19 @@ def test_texts_that_are_not_ascii_are_kept(source: str, photo: np.ndarray, tmp_p
         for code, text in texts.items():
             assert text in (tmp_path / name).read_bytes()
             assert kept[code].encode("latin-1") == text
+
+
+def test_exif_that_cannot_be_written_does_not_cost_the_picture(
+    photo: np.ndarray, tmp_path: Path
+) -> None:
+    """Pillow reads larger numbers than it writes, and numbers where texts are due."""
+    exif = Image.Exif()
+    exif.get_ifd(IFD.Exif)[Base.ExposureTime] = 0.01
+    exif[Base.Make] = "Maker"
+    Image.fromarray(photo).save(tmp_path / "a.jpg", exif=exif)
+    metadata = read_metadata(tmp_path / "a.jpg")
+    metadata.exif[Base.Software] = 7
+    metadata.exif.get_ifd(IFD.Exif)[Base.FocalLength] = 2**70
+    for name in ("b.png", "b.jpg", "b.tif"):
+        save_picture(photo, tmp_path / name, metadata)
+        assert load_image(tmp_path / name).shape == photo.shape

@@ -83,6 +83,13 @@ def array_to_rgb(
     return np.ascontiguousarray(values[:, :, :3] if channels == "rgb" else values[:, :, 2::-1])
 
 
+def deep_values(image: Any) -> np.ndarray:
+    """Return the numbers of a PIL image of mode I or F, as wide as they are in its file."""
+    values = np.asarray(image)
+    of_16_bits = image.mode == "I" and image.format in ("PNG", "PPM")
+    return values.astype(np.uint16) if of_16_bits else values
+
+
 def to_8_bits(rgb: np.ndarray) -> np.ndarray:
     """Return an image of uint8 or uint16 as uint8."""
     return rgb if rgb.dtype == np.uint8 else _in_range(rgb, (0, 65535), "", False)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import ImageError
-from .._shared.image_array import Channels, array_to_rgb
+from .._shared.image_array import Channels, array_to_rgb, deep_values
 from .._shared.opencv import cv2
 
 MAX_CIRCLES = 5000
@@ -135,7 +135,7 @@ def checked_image(image: Any, size: tuple[int, int], channels: Channels) -> np.n
         raise ImageError("a picture needs the image itself, not a path: give load_image(path)")
     if hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
         deep = image.mode.startswith(("I", "F"))  # which Pillow would clip
-        image, channels = np.asarray(image if deep else image.convert("RGB")), "rgb"
+        image, channels = deep_values(image) if deep else np.asarray(image.convert("RGB")), "rgb"
     rgb = array_to_rgb(image, channels)
     if rgb.shape[1::-1] != size:
         raise ImageError(

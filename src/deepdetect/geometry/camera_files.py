@@ -199,7 +199,7 @@ def _colmap(values: Values, _: Any) -> dict[str, Any] | None:
         if model.startswith(("SIMPLE_", "RADIAL")):  # of one focal length
             numbers.insert(0, numbers[0])
         fx, fy, cx, cy, *distortion = numbers
-        _check_distortion(distortion or 0, model)
+        _check_distortion(distortion, model)
         matrix = np.array([[fx, 0, cx - COLMAP_CENTRE], [0, fy, cy - COLMAP_CENTRE], [0, 0, 1]])
         size = {"width": int(width), "height": int(height)}
         made.append({**_both(matrix, matrix, None, None)["left"], **size})

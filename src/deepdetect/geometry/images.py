@@ -46,8 +46,8 @@ def warp_to_reference(
     """Warp the second image by the homography from the first to it, into the frame of the first.
 
     Returns the (H, W) or (H, W, 3) image, uint8 or uint16, and the (H, W) bool mask of its valid
-    pixels. To be looked at it is `smooth` (cubic); what is measured in it must be read linearly:
-    OpenCV's cubic kernel moves it by up to .05 px.
+    pixels. To be looked at it is `smooth` (cubic); where positions are measured in it, linear:
+    OpenCV's cubic kernel moves them by up to .05 px.
     """
     flags = (cv2.INTER_CUBIC if smooth else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP
     warped = cv2.warpPerspective(image1, homography, size, flags=flags)

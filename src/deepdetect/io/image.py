@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from .._shared.errors import ImageError, MissingImageError, OptionError
-from .._shared.image_array import Channels, array_to_rgb, check_channels
+from .._shared.image_array import Channels, array_to_rgb, check_channels, deep_values
 from .._shared.opencv import cv2
 from .._shared.options import suggest_keywords
 from .._shared.records import was_made
@@ -306,9 +306,7 @@ def _from_pil(
     except Exception as error:  # Pillow's decoders raise many kinds
         raise damaged_image(name, error) from None
     if image.mode.startswith(("I", "F")):
-        values = np.asarray(image)
-        if image.mode == "I" and image.format in ("PNG", "PPM"):  # Pillow's form of their 16 bits
-            values = values.astype(np.uint16)
+        values = deep_values(image)
         white = 65535 if image.format == "PPM" else None  # Pillow has scaled them to it
         return array_to_rgb(values, name=name, value_range=value_range, white=white, deep=deep)
     width, height = image.size

@@ -83,16 +83,24 @@ class Metadata:
 
     def encode(self, rgb: np.ndarray, suffix: str, settings: list[int]) -> bytes:
         """Return a PNG or JPEG file of an (H, W, 3) RGB image."""
-        parts = {cv2.IMAGE_METADATA_ICCP: self.profile}
+        parts = {cv2.IMAGE_METADATA_ICCP: self._profile_of(b"RGB ")}
         with suppress(struct.error):  # numbers that Pillow reads and cannot write
             if exif := self._exif_of(rgb):
                 parts[cv2.IMAGE_METADATA_EXIF] = exif.tobytes().removeprefix(b"Exif\0\0")
         kept = {kind: np.frombuffer(part, np.uint8) for kind, part in parts.items() if part}
         bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-        done, data = cv2.imencodeWithMetadata(suffix, bgr, [*kept], [*kept.values()], settings)
-        if not done:  # more than the format can hold
-            data = cv2.imencode(suffix, bgr, settings)[1]
-        return bytes(data)
+        for count in range(len(kept), 0, -1):  # EXIF is left out first, if it is too large
+            kinds, values = [*kept][:count], [*kept.values()][:count]
+            done, data = cv2.imencodeWithMetadata(suffix, bgr, kinds, values, settings)
+            if done:
+                return bytes(data)
+        return bytes(cv2.imencode(suffix, bgr, settings)[1])
+
+    def _profile_of(self, space: bytes) -> bytes | None:
+        """Return the ICC profile where it is whole, and of the colours that are written."""
+        profile = self.profile or b""
+        length = int.from_bytes(profile[:4], "big")
+        return profile[:length] if length <= len(profile) and profile[16:20] == space else None
 
     def _exif_of(self, picture: np.ndarray) -> Any:
         """Return the EXIF of an upright picture of another size; or None."""
@@ -106,8 +114,8 @@ class Metadata:
         fine |= {Base.ExifImageWidth: width, Base.ExifImageHeight: height}
         self.exif[Base.Orientation] = 1
         for code in EXIF_TEXTS:  # of any encoding, which Pillow reads as Latin-1
-            if isinstance(text := self.exif.get(code), str):
-                self.exif[code] = text.encode("latin-1", "replace")
+            if not isinstance(text := self.exif.get(code, b""), bytes):
+                self.exif[code] = str(text).encode("latin-1", "replace")
         return self.exif
 
     def write_tiff(self, bands: np.ndarray, path: Path) -> None:
@@ -130,7 +138,7 @@ class Metadata:
         texts = {code: exif[code] for code in EXIF_TEXTS if code in exif} if exif else {}
         tags += [(code, "s", 0, text, True) for code, text in texts.items()]
         directories = {code: exif.get_ifd(code) for code in EXIF_DIRECTORIES} if exif else {}
-        directories = {code: values for code, values in directories.items() if values}
+        directories = {code: each for code, each in directories.items() if _can_be_written(each)}
         # Pointers, which tifffile does not write: they are made of the tags of the codes before.
         tags += [(code - 1, "I", 1, 0, True) for code in directories]
         bands = bands[:, :, 0] if bands.shape[2:] == (1,) else bands
@@ -142,13 +150,24 @@ class Metadata:
                 photometric="rgb" if colour else "minisblack",
                 planarconfig="contig" if bands.ndim == 3 else None,
                 compression="zlib",
-                iccprofile=self.profile,
+                iccprofile=self._profile_of(b"RGB " if colour else b"GRAY"),
                 metadata=None,
                 software=False,
                 extratags=tags,
             )
             for code, values in directories.items():
                 _append_directory(temporary, code, values)
+
+
+def _can_be_written(values: dict[int, Any]) -> bool:
+    """Whether there are values of EXIF, and Pillow can write them: it reads larger numbers."""
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+    directory = ImageFileDirectory_v2()
+    directory.update(values)
+    with suppress(struct.error):
+        return bool(values and directory.tobytes())
+    return False
 
 
 def _append_directory(path: Path, code: int, values: dict[int, Any]) -> None:
@@ -179,8 +198,7 @@ def read_metadata(source: Any) -> Metadata:
         if file.read(4) in TIFF_STARTS:
             found = _of_tiff(file)
     with suppress(Exception), open_image(source) as image:  # raw photographs and others have none
-        profile = found.profile or image.info.get("icc_profile")
-        found = replace(found, profile=profile if _is_of_rgb(profile) else None)
+        found = replace(found, profile=found.profile or image.info.get("icc_profile"))
         exif = image.getexif()
         kept = _kept_exif(exif) if image.format == "TIFF" else exif
         found = replace(found, exif=kept if len(kept) else None)
@@ -195,13 +213,6 @@ def read_metadata(source: Any) -> Metadata:
         with suppress(OSError):
             found = replace(found, projection=path.with_suffix(".prj").read_bytes())
     return found
-
-
-def _is_of_rgb(profile: bytes | None) -> bool:
-    """Whether an ICC profile is whole, and of the colours that pictures are written in."""
-    return bool(
-        profile and int.from_bytes(profile[:4]) == len(profile) and profile[16:20] == b"RGB "
-    )
 
 
 def _kept_exif(exif: Any) -> Any:

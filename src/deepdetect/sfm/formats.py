@@ -98,8 +98,8 @@ def _in_utm(found: MultiViewReconstruction, what: str) -> tuple[np.ndarray, int]
     place = found.georeference
     if not isinstance(place, Georeference) or place.origin is None:
         raise ReconstructionError(
-            f"{what} needs a place on the Earth, the other files are written: take photographs "
-            "with GPS, or give ground control points"
+            f"{what} needs a place on the Earth: take photographs with GPS, or give ground "
+            "control points"
         )
     return place.origin.to_utm(found.cloud.points)
 
@@ -118,7 +118,7 @@ def write_mesh(found: MultiViewReconstruction, folder: Path, output: Path) -> No
     """
     cloud = found.dense
     if not len(cloud):
-        raise ReconstructionError("a mesh needs dense points, the other files are written")
+        raise ReconstructionError("a mesh needs dense points")
     box = robust_box(cloud)
     margin = MESH_MARGIN * (box.high - box.low)
     inside = (cloud.points >= box.low - margin) & (cloud.points <= box.high + margin)

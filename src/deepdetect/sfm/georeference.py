@@ -308,7 +308,8 @@ def georeference_by_control_points(
     if len(seen) < MIN_FIXES:
         raise OptionError(
             f"{len(seen)} ground control points are in two or more images of the model, "
-            f"{MIN_FIXES} are needed: name more, and the images as their files are called"
+            f"{MIN_FIXES} are needed: name more, and the images as their files are called, with "
+            "their folders where two have one name"
         )
     points = {name: _triangulated(sparse, rows) for name, rows in seen.items()}
     places = np.array([next(iter(rows.values())).place for rows in seen.values()])

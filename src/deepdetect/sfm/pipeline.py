@@ -244,7 +244,7 @@ def _write(
         except ReconstructionError as error:  # what one lacks, another may not need
             failed.append(str(error))
     if failed:
-        raise ReconstructionError("; ".join(failed))
+        raise ReconstructionError("; ".join(failed) + " (the other files are written)")
 
 
 def _seen_from(

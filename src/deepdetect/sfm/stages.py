@@ -181,7 +181,7 @@ class Stages:
         self.features = self.work / "features.h5"
 
     def folder_of(self, images: str | Path | Sequence[str | Path]) -> Path:
-        """Return the folder of the images: for a list, one with links to them."""
+        """Return the folder of the images: for a list, or around the results, one of links."""
         if isinstance(images, (str, Path)):
             if self.output.resolve() == Path(images).resolve():
                 raise OptionError(f"{images} holds the images: give another folder with -o")

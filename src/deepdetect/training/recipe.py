@@ -86,7 +86,7 @@ class TrainingOptions:
             light: rotated, relit, blurred, noisy or compressed. Each is used as often as the plain
             view of a size.
         transpositions: mirror crops along their diagonal, which changes labels of BRISK only;
-            flips would change those of Shi-Tomasi, SIFT and ORB, too.
+            flips also change those of Shi-Tomasi, SIFT and ORB.
         color_jitter: fraction of the crops whose colours are removed, or rotated with the same
             luma to a grey level, the only thing that labels and `fast` depend on.
         optimizer: "adam", or "soap", which learns more per image (docs/history.md has the

@@ -52,7 +52,7 @@ function askForFolder(use) {
   input.onchange = () => {
     const { suffixes } = page.server;
     const files = [...input.files] // those that Python takes of a folder, in its order
-      .filter(({ name, webkitRelativePath: path }) => !/(^|\/)\./.test(path)
+      .filter(({ name, webkitRelativePath: path }) => !/\/\./.test(path)
         && suffixes.some((suffix) => name.toLowerCase().endsWith(suffix)))
       .sort((a, b) => a.webkitRelativePath.localeCompare(b.webkitRelativePath, "en", { numeric: true }));
     input.value = "";
