@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -10,7 +12,15 @@ import importlib.util
 
 from deepdetect import MissingExtraError
 from deepdetect.labels import LabelOptions
-from deepdetect.training import DeviceOptions, Stage, TrainingOptions, profile, train
+from deepdetect.training import (
+    DeviceOptions,
+    Stage,
+    TrainingOptions,
+    profile,
+    train,
+    train_descriptor,
+    train_points,
+)
 
 
 @pytest.mark.slow
@@ -52,3 +62,31 @@ def test_a_missing_package_is_named_before_any_work(
             function(photographs, tmp_path / "run")
         one_line(caught.value)
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("validation", ["images/val", "other"])
+@pytest.mark.parametrize(
+    ("train_one", "trainer"),
+    [
+        (train_points, "points.task.RankerTrainer"),
+        (train_descriptor, "descriptor.task.DescriptorTrainer"),
+    ],
+)
+def test_pictures_of_validation_and_of_the_run_are_not_trained_on(
+    train_one: Any, trainer: str, validation: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images, output = tmp_path / "images", tmp_path / "images/run"
+    for path in (
+        images / "0.png",
+        images / "a/1.png",
+        output / "2.png",
+        tmp_path / validation / "3.png",
+    ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    made = Mock()
+    monkeypatch.setattr(f"deepdetect.training.{trainer}", made)
+    train_one(images, tmp_path / validation, output)
+    listed, held_out = made.call_args.args[:2]
+    assert listed == [images / "0.png", images / "a/1.png"]
+    assert held_out == [tmp_path / validation / "3.png"]

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -181,26 +180,3 @@ def test_cross_modal_weights_are_told_from_others(textures: Path, tmp_path: Path
     # Half a turn of a keypoint is none.
     again = points.describe(textures / "0.png", replace(first, angles=(first.angles + 180) % 360))
     np.testing.assert_allclose(again.descriptors, first.descriptors, atol=1e-5)
-
-
-@pytest.mark.parametrize("validation", ["images/val", "other"])
-def test_pictures_of_validation_and_of_the_run_are_not_trained_on(
-    validation: str, textures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    images, output = tmp_path / "images", tmp_path / "images/run"
-    for place in (images / "a/0.png", output / "1.png"):
-        place.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(textures / place.name, place)
-    (tmp_path / validation).mkdir()
-    shutil.copy(textures / "2.png", tmp_path / validation)
-    measured: list[Path] = []
-
-    def batches(files: list[Path], options: DescriptorTrainingOptions) -> list[Any]:
-        measured.extend(files)
-        return []
-
-    monkeypatch.setattr("deepdetect.training.descriptor.task.validation_batches", batches)
-    monkeypatch.setattr(DescriptorTrainer, "fit", lambda trainer, *_: trainer)
-    trainer = train_descriptor(images, tmp_path / validation, output, OPTIONS, device="cpu")
-    assert trainer.files == [images / "a/0.png"]
-    assert measured == [tmp_path / validation / "2.png"]

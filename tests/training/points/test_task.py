@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -132,26 +131,3 @@ def test_the_measure_of_a_blind_detector(textures: Path) -> None:
     assert found["score"] < 0.3
     assert max(found[name] for name in found if name.endswith("correct")) < 0.1
     assert found["blur @3 px 2048"] >= found["blur @1 px 2048"]
-
-
-@pytest.mark.parametrize("validation", ["images/val", "other"])
-def test_pictures_of_validation_and_of_the_run_are_not_trained_on(
-    validation: str, textures: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    images, output = tmp_path / "images", tmp_path / "images/run"
-    for place in (images / "0.png", images / "a/1.png", output / "2.png"):
-        place.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(textures / place.name, place)
-    (tmp_path / validation).mkdir()
-    shutil.copy(textures / "3.png", tmp_path / validation)
-    measured: list[Path] = []
-
-    def pairs(files: list[Path], count: int) -> list[Any]:
-        measured.extend(files)
-        return []
-
-    monkeypatch.setattr("deepdetect.training.points.task.validation_pairs", pairs)
-    monkeypatch.setattr(RankerTrainer, "fit", lambda trainer, *_: trainer)
-    trainer = train_points(images, tmp_path / validation, output, OPTIONS)
-    assert trainer.files == [images / "0.png", images / "a/1.png"]
-    assert measured == [tmp_path / validation / "3.png"]
