@@ -86,7 +86,7 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
         partial(_fit_to_corners, equalised, *settings) for settings in TRACKING_ROUNDS
     ]
     steps.append(partial(_fit_to_pixels, gray0))
-    current, warp = np.asarray(homography, np.float64), partial(warp_to_reference, smooth=False)
+    current, warp = np.asarray(homography, np.float64), partial(warp_to_reference, exact=True)
     for step in steps:
         warped, valid_mask = warp(gray1, current, size)
         fit = step(warped, valid_mask)

@@ -41,15 +41,15 @@ def downscale(gray: np.ndarray, max_side: int) -> tuple[np.ndarray, float]:
 
 
 def warp_to_reference(
-    image1: np.ndarray, homography: np.ndarray, size: tuple[int, int], *, smooth: bool = True
+    image1: np.ndarray, homography: np.ndarray, size: tuple[int, int], *, exact: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """Warp the second image by the homography from the first to it, into the frame of the first.
 
     Returns the (H, W) or (H, W, 3) image, uint8 or uint16, and the (H, W) bool mask of its valid
-    pixels. To be looked at it is `smooth` (cubic); where positions are measured in it, linear:
-    OpenCV's cubic kernel moves them by up to .05 px.
+    pixels. Where positions are measured in it, it must be `exact`, by Lanczos' kernel: OpenCV's
+    cubic one moves them by up to .05 px.
     """
-    flags = (cv2.INTER_CUBIC if smooth else cv2.INTER_LINEAR) | cv2.WARP_INVERSE_MAP
+    flags = (cv2.INTER_LANCZOS4 if exact else cv2.INTER_CUBIC) | cv2.WARP_INVERSE_MAP
     warped = cv2.warpPerspective(image1, homography, size, flags=flags)
     whole = np.full(image1.shape[:2], 255, np.uint8)
     nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
