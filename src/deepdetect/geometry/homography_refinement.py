@@ -86,8 +86,10 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
         partial(_fit_to_corners, equalised, *settings) for settings in TRACKING_ROUNDS
     ]
     steps.append(partial(_fit_to_pixels, gray0))
-    current, warp = np.asarray(homography, np.float64), partial(warp_to_reference, exact=True)
+    current = np.asarray(homography, np.float64)
     for step in steps:
+        # Corners need detail, which is lost by linear reading where scales differ.
+        warp = partial(warp_to_reference, exact=step is steps[-1])
         warped, valid_mask = warp(gray1, current, size)
         fit = step(warped, valid_mask)
         corrections = fit(half), fit(~half)

@@ -46,10 +46,10 @@ def warp_to_reference(
     """Warp the second image by the homography from the first to it, into the frame of the first.
 
     Returns the (H, W) or (H, W, 3) image, uint8 or uint16, and the (H, W) bool mask of its valid
-    pixels. Where positions are measured in it, it must be `exact`, by Lanczos' kernel: OpenCV's
-    cubic one moves them by up to .05 px.
+    pixels. OpenCV's cubic kernel keeps detail and moves it by up to .05 px; where it must be in
+    its `exact` place, the image is read linearly.
     """
-    flags = (cv2.INTER_LANCZOS4 if exact else cv2.INTER_CUBIC) | cv2.WARP_INVERSE_MAP
+    flags = (cv2.INTER_LINEAR if exact else cv2.INTER_CUBIC) | cv2.WARP_INVERSE_MAP
     warped = cv2.warpPerspective(image1, homography, size, flags=flags)
     whole = np.full(image1.shape[:2], 255, np.uint8)
     nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
