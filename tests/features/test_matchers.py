@@ -124,8 +124,6 @@ def test_mutual_matches_are_the_same_both_ways(seed: int, count0: int, count1: i
 @pytest.mark.parametrize("name", MATCHERS)
 @pytest.mark.parametrize("count", [1, 2])
 def test_every_matcher_keeps_the_contract(name: str, count: int) -> None:
-    if name == "faiss":
-        pytest.importorskip("faiss", reason="needs faiss-cpu")
     rng = np.random.default_rng(0)
     queries = rng.random((20, 32), np.float32)
     base = rng.random((30, 32), np.float32)

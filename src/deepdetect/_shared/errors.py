@@ -122,7 +122,6 @@ WITHOUT_GPU = (
 
 DISTRIBUTIONS = {
     "cv2": "opencv-python-headless",
-    "faiss": "faiss-cpu",
     "hloc": "git+https://github.com/cvg/Hierarchical-Localization",
     "lightning_fabric": "lightning-fabric",
     "ray": "'ray[data]'",

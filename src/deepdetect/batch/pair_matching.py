@@ -47,7 +47,7 @@ class PairMatchingOptions:
         ratio: limit of the ratio test: the best distance must be below this share of the
             second-best. None: as of `match_features`.
         mutual: keep only mutual nearest neighbours.
-        matcher: name of the matcher: "auto", "exact", "patchmatch", "flann" or "faiss".
+        matcher: name of the matcher: "auto", "exact", "patchmatch" or "flann".
         verify: keep only the matches that agree with a geometry that is estimated from them:
             "fundamental", "homography" or "auto"; "none" keeps all.
         inlier_threshold: largest error under this geometry, in pixels.

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import OptionError, require_packages
+from .._shared.errors import OptionError
 from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
 from .._shared.options import look_up
@@ -46,13 +46,6 @@ MAX_EXACT_PRODUCT = 4e8
 
 FLANN_INDEX_KDTREE, TREES, CHECKS = 1, 5, 50
 """Of FLANN, as in the paper's code."""
-
-LISTS_PER_ROOT, PROBES, TRAINING_PER_LIST = 4, 16, 40
-"""Of faiss: lists of the inverted file, in units of the square root of the descriptors; lists that
-are searched for each query; descriptors that the centre of each list is trained on."""
-
-MIN_INDEXED = 4096
-"""With fewer descriptors faiss compares all: an inverted file would save nothing."""
 
 SWEEPS = 4
 """Of PatchMatch over all queries, down and up in turn."""
@@ -214,38 +207,6 @@ def flann_neighbours(
     return rows, np.sqrt(squared)
 
 
-def faiss_neighbours(
-    queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: Positions = None
-) -> Neighbours:
-    """Find approximate nearest neighbours in an inverted file; otherwise as `Matcher`.
-
-    The file holds quantised descriptors (Johnson, Douze and Jégou, "Billion-scale similarity search
-    with GPUs", 2017); bytes lose nothing. About one neighbour in fifty is missed.
-    """
-    require_packages("the matcher faiss", "faiss")
-    import faiss
-
-    quantizer = faiss.ScalarQuantizer
-    kind = quantizer.QT_8bit_direct if base.dtype == np.uint8 else quantizer.QT_8bit
-    queries, base = (np.ascontiguousarray(part, np.float32) for part in (queries, base))
-    width = base.shape[1]
-    centres = faiss.IndexFlatL2(width)
-    index: Any = centres
-    if len(base) >= MIN_INDEXED:
-        lists = min(int(LISTS_PER_ROOT * np.sqrt(len(base))), len(base) // TRAINING_PER_LIST)
-        index = faiss.IndexIVFScalarQuantizer(centres, width, lists, kind, faiss.METRIC_L2, False)
-        index.cp.seed = seed
-        index.cp.niter = 5
-        index.nprobe = PROBES
-        order = np.random.default_rng(seed).permutation(len(base))
-        index.train(base[np.sort(order[: lists * TRAINING_PER_LIST])])
-    index.add(base)
-    squared, rows = index.search(queries, count)
-    missing = rows < 0  # the lists that were searched held too few
-    rows, squared = np.where(missing, 0, rows), np.where(missing, np.inf, squared)
-    return rows.astype(np.int32), np.sqrt(np.maximum(squared, 0)).astype(np.float32)
-
-
 def patchmatch_neighbours(
     queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: Positions = None
 ) -> Neighbours:
@@ -261,9 +222,7 @@ def patchmatch_neighbours(
             "patchmatch needs dense keypoints of one scale and angle, on whole pixels: use auto"
         )
     if queries.dtype != np.uint8 or base.dtype != np.uint8:
-        raise OptionError(
-            "the matcher patchmatch needs descriptors of bytes: use flann, faiss or exact"
-        )
+        raise OptionError("the matcher patchmatch needs descriptors of bytes: use flann or exact")
     from . import kernels
 
     xy0, xy1 = (np.asarray(xy).astype(np.int32) for xy in positions)
@@ -316,7 +275,6 @@ MATCHERS: dict[str, Matcher] = {
     "auto": automatic_neighbours,
     "flann": flann_neighbours,
     "exact": exact_neighbours,
-    "faiss": faiss_neighbours,
     "patchmatch": patchmatch_neighbours,
     "hamming": hamming_neighbours,
 }
@@ -372,7 +330,6 @@ def match_descriptors(
     best, second = distances[:, 0], distances[:, 1]
     # Two neighbours at distance 0 are equally good: their ratio is 1.
     ratios = np.divide(best, second, out=np.ones_like(best), where=second > 0)
-    ratios[~np.isfinite(second)] = 1  # no second-best was found
     kept = ratios < ratio
     if mutual:
         kept &= nearest[rows[:, 0]] == np.arange(len(rows))

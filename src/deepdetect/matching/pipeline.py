@@ -68,7 +68,7 @@ class MatchingOptions:
             with sizes and angles of their own are described at these.
         angle: direction of all keypoints in degrees; -1 is OpenCV's "unset".
         matcher: "auto" ("exact" for few keypoints, else "patchmatch" for dense ones and "flann" for
-            others), "flann", "exact", "faiss" or "patchmatch" ("hamming" is for binary
+            others), "flann", "exact" or "patchmatch" ("hamming" is for binary
             descriptors).
         ratio: the ratio test keeps matches strictly under it (paper's code: 0.99).
         geometry: how the geometry is estimated in the end.
@@ -214,7 +214,7 @@ def match_features(
     Args:
         features0, features1: keypoints with descriptors of one type.
         matcher: "auto" ("exact" for few keypoints, else "patchmatch" for dense ones and "flann" for
-            others), "flann", "exact", "faiss", "patchmatch", or "hamming" for binary descriptors.
+            others), "flann", "exact", "patchmatch", or "hamming" for binary descriptors.
         filter_by: which nearest neighbours are matches: "ratio" (Lowe's test), or "neighbours":
             those that move, turn and grow as the matches around them do, by a small network: more
             right ones, and fewer wrong. It needs nine mutual neighbours at least, of learned
