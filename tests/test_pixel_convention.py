@@ -18,7 +18,7 @@ from deepdetect.labels.detectors import pixels_mask
 
 
 def compute_heatmap(rgb: np.ndarray, *arguments: Any) -> np.ndarray:
-    return compute_maps([rgb], *arguments)[0].both()[0]
+    return compute_maps(rgb, *arguments).both()[0]
 
 
 def to_logits(probability: np.ndarray) -> np.ndarray:

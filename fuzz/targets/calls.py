@@ -77,7 +77,6 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
         "Calibration": (Calibration, {"camera0": camera, "camera1": camera}),
         "Calibration.load": (Calibration.load, {"path": "missing.json"}),
         "load_keypoints": (deepdetect.load_keypoints, {"path": "missing.npz"}),
-        "heatmap_batch": (network.heatmap_batch, {"images": [scene]}),
         "heatmap_and_logits": (network.heatmap_and_logits, {"image": scene}),
         "configured": (network.configured, {"heatmap_options": network.heatmap_options}),
         "with_weights": (network.with_weights, {"weights": "default"}),

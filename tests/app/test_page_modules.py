@@ -112,7 +112,7 @@ def test_large_photographs_are_reduced_to_the_size_that_the_package_takes(
 
     rgb = np.zeros((size[1], size[0], 3), np.uint8)
     rgb[0, 0] = 1
-    compute_maps([rgb], network)
+    compute_maps(rgb, network)
     imports = 'import { networkSize } from "@/pixels.js";\n'
     script = (
         "writeFileSync(made, new Uint8Array(Float64Array.from(networkSize(width, height)).buffer));"

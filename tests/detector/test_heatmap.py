@@ -14,11 +14,11 @@ from deepdetect.detector.heatmap import HeatmapOptions, compute_maps
 
 
 def compute_heatmap_and_logits(rgb: np.ndarray, *arguments: Any) -> tuple[np.ndarray, np.ndarray]:
-    return compute_maps([rgb], *arguments)[0].both()
+    return compute_maps(rgb, *arguments).both()
 
 
 def compute_heatmap(rgb: np.ndarray, *arguments: Any) -> np.ndarray:
-    return compute_maps([rgb], *arguments)[0].both()[0]
+    return compute_maps(rgb, *arguments).both()[0]
 
 
 RGB = np.random.default_rng(11).integers(0, 256, (61, 90, 3), dtype=np.uint8)

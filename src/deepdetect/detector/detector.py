@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import itertools
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, Protocol, Self
 
@@ -15,11 +13,11 @@ from .._shared.image_array import Channels
 from .._shared.options import suggest_keywords
 from .._shared.records import file_digest
 from ..features.keypoints import Keypoints
-from ..features.selection import Maps, SelectionOptions, select_from_maps, select_keypoints
+from ..features.selection import SelectionOptions, select_from_maps, select_keypoints
 from ..features.sift import describe_keypoints
 from ..io.image import Images, batch_length, ignore_masks, image_named, load_each, load_image, luma
 from .backends import RuntimeOptions, open_network
-from .heatmap import HeatmapOptions, compute_maps, memory_named, seen_size
+from .heatmap import HeatmapOptions, compute_maps, memory_named
 from .pretrained import PRETRAINED, resolve_weights
 
 CHANNELS_OF_IMAGES = (
@@ -138,10 +136,6 @@ class DeepDetect:
         self._network, self.backend = open_network(self.weights, self._runtime)
 
     @property
-    def _keywords(self) -> dict[str, Any]:
-        return {**vars(self._runtime), **vars(self.heatmap_options)}
-
-    @property
     def runtime(self) -> str:
         """What runs the network, as "openvino" or "openvino, bfloat16": results depend on it."""
         precision = self._runtime.precision
@@ -167,7 +161,7 @@ class DeepDetect:
     @suggest_keywords
     def with_weights(self, weights: str | Path) -> DeepDetect:
         """Return a detector with other weights, and all other options as they are."""
-        return DeepDetect(weights, **self._keywords)
+        return DeepDetect(weights, **vars(self._runtime), **vars(self.heatmap_options))
 
     @suggest_keywords
     def heatmap(self, image: Any, *, channels: Channels = "rgb") -> np.ndarray:
@@ -207,32 +201,7 @@ class DeepDetect:
         """
         rgb = load_image(image, channels=channels)
         with memory_named(rgb.shape):
-            (maps,) = compute_maps([rgb], self._network, self.heatmap_options)
-            return maps.both()
-
-    @suggest_keywords
-    def heatmap_batch(
-        self, images: Images, *, channels: Channels = "rgb", batch_size: int = 1
-    ) -> list[np.ndarray]:
-        """Compute the heat maps of several images.
-
-        Args:
-            images: in a list, a tuple or an array of four dimensions, each as of `heatmap`; their
-                sizes may differ.
-            channels: as of `heatmap`.
-            batch_size: at most this many consecutive images, which the network sees at one size,
-                are run at once. On a processor that pays for small images only: larger ones take
-                as long, and the memory of all of them.
-
-        Returns:
-            The map of each, in their order: the same as one by one, but for the last bits of those
-            that were run together.
-
-        Raises:
-            ImageError: an image cannot be read or is not fit.
-            OptionError: the batch size is out of its range.
-        """
-        return self._map_batches(images, channels, batch_size, lambda _, maps: maps.both()[0])
+            return compute_maps(rgb, self._network, self.heatmap_options).both()
 
     @suggest_keywords
     def detect(
@@ -284,12 +253,11 @@ class DeepDetect:
         subpixel: bool = False,
         ignore: np.ndarray | Images | None = None,
         channels: Channels = "rgb",
-        batch_size: int = 1,
     ) -> list[Keypoints]:
         """Detect the dense keypoints of several images.
 
         Args:
-            images, batch_size: as of `heatmap_batch`.
+            images: in a list, a tuple or an array of four dimensions; their sizes may differ.
             threshold, density, max_keypoints, nms_radius, subpixel, channels: as of `detect`.
             ignore: a mask for each image, or None, in a list or a tuple; or one array for all.
 
@@ -301,12 +269,11 @@ class DeepDetect:
             OptionError: an option is out of its range, or a mask has another size.
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
-        masks = ignore_masks(ignore, batch_length(images))
-
-        def select(number: int, maps: Maps) -> Keypoints:
-            return select_from_maps(maps, options, masks[number])
-
-        return self._map_batches(images, channels, batch_size, select)
+        masks, found = ignore_masks(ignore, batch_length(images)), []
+        for number, rgb in load_each(images, channels):
+            with image_named(number):
+                found.append(self._select(rgb, options, masks[number]))
+        return found
 
     @suggest_keywords
     def extract(
@@ -342,7 +309,7 @@ class DeepDetect:
         self, rgb: np.ndarray, options: SelectionOptions, ignore: np.ndarray | None
     ) -> Keypoints:
         with memory_named(rgb.shape):
-            (maps,) = compute_maps([rgb], self._network, self.heatmap_options)
+            maps = compute_maps(rgb, self._network, self.heatmap_options)
             del rgb  # the keypoints need the room
             return select_from_maps(maps, options, ignore)
 
@@ -352,28 +319,6 @@ class DeepDetect:
             f"DeepDetect({self.weights.name}, resolution={shown.resolution!r}, "
             f"network_channels={shown.network_channels!r}, backend={self.runtime!r})"
         )
-
-    def _map_batches(
-        self, images: Images, channels: Channels, batch_size: int, make: Callable[[int, Maps], Any]
-    ) -> list[Any]:
-        if not isinstance(batch_size, (int, np.integer)) or batch_size < 1:
-            raise OptionError(f"`batch_size` must be a whole number from 1 on, not {batch_size!r}")
-
-        def size(loaded: tuple[int, np.ndarray]) -> tuple[int, int]:
-            return seen_size(loaded[1].shape, self.heatmap_options)
-
-        made = []
-        for _, group in itertools.groupby(load_each(images, channels), size):
-            while batch := list(itertools.islice(group, min(batch_size, len(images)))):
-                places = [(number, rgb.shape) for number, rgb in batch]
-                loaded = [rgb for _, rgb in batch]
-                with image_named(places[0][0]), memory_named(places[0][1], len(batch)):
-                    maps = compute_maps(loaded, self._network, self.heatmap_options)
-                del batch, loaded  # the keypoints need the room
-                for number, shape in places:
-                    with image_named(number), memory_named(shape):
-                        made.append(make(number, maps.pop(0)))
-        return made
 
 
 def check_selection(detector: AnyDetector, selection: SelectionOptions | None) -> None:
@@ -408,14 +353,10 @@ def find_keypoints(
     options = selection or SelectionOptions()
     if isinstance(detector, DeepDetect):
         return detector._select(rgb, options, ignore)
-    logits = None
-    if hasattr(detector, "heatmap_and_logits"):
-        heatmap, logits = detector.heatmap_and_logits(rgb)
-    else:
-        heatmap = detector.heatmap(rgb)
+    heatmap = detector.heatmap(rgb)
     if np.shape(heatmap) != rgb.shape[:2] or not np.isfinite(heatmap).all():
         raise OptionError(
             f"the detector's heat map must be {rgb.shape[:2]} finite probabilities, one per "
             f"pixel, and has shape {np.shape(heatmap)}: correct its method heatmap"
         )
-    return select_keypoints(np.asarray(heatmap), options, logits, ignore=ignore)
+    return select_keypoints(np.asarray(heatmap), options, ignore=ignore)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -30,8 +30,8 @@ RELEASE_PIXELS = 20_000_000
 MIN_TILE_MEGAPIXELS = 1.5
 """Smaller tiles would be mostly overlap."""
 
-Run = Callable[[list[np.ndarray]], list[np.ndarray]]
-"""Maps images of one size, (H, W, 3) uint8, to their (H, W) logits."""
+Run = Callable[[np.ndarray], np.ndarray]
+"""Maps an image, (H, W, 3) uint8, to its (H, W) logits."""
 
 
 @suggest_keywords
@@ -92,54 +92,35 @@ def seen_size(shape: tuple[int, ...], options: HeatmapOptions) -> tuple[int, int
 
 
 def compute_maps(
-    images: Sequence[np.ndarray], network: Network, options: HeatmapOptions = HeatmapOptions()
-) -> list[Maps]:
-    """Run the network once on (H, W, 3) uint8 RGB images that it sees at one size.
+    rgb: np.ndarray, network: Network, options: HeatmapOptions = HeatmapOptions()
+) -> Maps:
+    """Run the network on a (H, W, 3) uint8 RGB image.
 
-    The maps are at the images' own pixels: scaled ones are enlarged when a map is asked for. A
-    constant image holds nothing to detect: its map is 0. The last bits of images that are run
-    together may be others.
+    The maps are at the image's own pixels: a scaled one is enlarged when a map is asked for. A
+    constant image holds nothing to detect: its map is 0.
     """
-    logits: dict[int, np.ndarray] = {}
-    together = []
-    for number, rgb in enumerate(images):
-        if all((rgb[rows] == rgb[0, 0]).all() for rows in bands(rgb.shape)):
-            logits[number] = np.full(rgb.shape[:2], -np.inf, np.float32)
-        elif tiled := _tiled(network, rgb.shape, options):
-            (logits[number],) = _mean_of_flips(tiled, [_seen(rgb, options)], options)
-        else:
-            together.append(number)
-    if together:
-        seen = [_seen(images[number], options) for number in together]
-        found = _mean_of_flips(partial(_run, network), seen, options)
-        logits.update(zip(together, found, strict=True))
-        shapes = [images[number].shape for number in together]
-        large = max(height * width for height, width, _ in shapes) > RELEASE_PIXELS
-        if large and not is_native(shapes[0], options) and hasattr(network, "release_memory"):
-            network.release_memory()
-            release_freed_memory()
-    return [
-        Maps.of_logits(logits[number])
-        if logits[number].shape == rgb.shape[:2]
-        else _enlarged(logits[number], rgb.shape[:2])
-        for number, rgb in enumerate(images)
-    ]
+    shape = rgb.shape[:2]
+    if all((rgb[rows] == rgb[0, 0]).all() for rows in bands(rgb.shape)):
+        return Maps.of_logits(np.full(shape, -np.inf, np.float32))
+    tiled = _tiled(network, shape, options)
+    logits = _mean_of_flips(tiled or partial(_run, network), _seen(rgb, options), options)
+    large = shape[0] * shape[1] > RELEASE_PIXELS
+    if large and not is_native(shape, options) and hasattr(network, "release_memory"):
+        network.release_memory()
+        release_freed_memory()
+    return Maps.of_logits(logits) if logits.shape == shape else _enlarged(logits, shape)
 
 
 @contextmanager
-def memory_named(shape: tuple[int, ...], images: int = 1) -> Iterator[None]:
-    """Make lack of memory, in work on images of this shape, an error of one sentence."""
+def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
+    """Make lack of memory, in work on an image of this shape, an error of one sentence."""
     try:
         yield
     except Exception as error:
         if not (isinstance(error, MemoryError) or is_lack_of_memory(error)):
             raise
-        size = f"{shape[1]}x{shape[0]} pixels"
         raise DeepDetectError(
-            f"there is not enough memory for {images} images of {size} at once: "
-            "use a smaller `batch_size`"
-            if images > 1
-            else f"there is not enough memory for an image of {size}: "
+            f"there is not enough memory for an image of {shape[1]}x{shape[0]} pixels: "
             "use `resolution='auto'`, fewer keypoints, or a smaller image"
         ) from None
 
@@ -177,7 +158,7 @@ def _tiled(network: Network, shape: tuple[int, ...], options: HeatmapOptions) ->
         return None
     tiled = None if path is None else open_tiled(path, network.threads)  # type: ignore[attr-defined]
     if tiled is not None:
-        return lambda images: [tiled(rgb, area) for rgb in images]
+        return lambda rgb: tiled(rgb, area)
     if area is None:
         return None
     raise OptionError(
@@ -186,24 +167,20 @@ def _tiled(network: Network, shape: tuple[int, ...], options: HeatmapOptions) ->
     )
 
 
-def _run(network: Network, images: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return the (H, W) logits of images of one size, padded to multiples of 8."""
-    height, width = images[0].shape[:2]
-    full = (height + -height % STRIDE, width + -width % STRIDE)
-    planes = np.empty((len(images), 3, *full), np.float32)
-    for rgb, into in zip(images, planes, strict=True):
-        fill_planes(rgb, into)
-    return [np.ascontiguousarray(logits[0, :height, :width]) for logits in network(planes)]
+def _run(network: Network, rgb: np.ndarray) -> np.ndarray:
+    """Return the (H, W) logits of an image, which is padded to multiples of 8."""
+    height, width = rgb.shape[:2]
+    planes = np.empty((1, 3, height + -height % STRIDE, width + -width % STRIDE), np.float32)
+    fill_planes(rgb, planes[0])
+    return np.ascontiguousarray(network(planes)[0, 0, :height, :width])
 
 
-def _mean_of_flips(run: Run, images: list[np.ndarray], options: HeatmapOptions) -> list[np.ndarray]:
+def _mean_of_flips(run: Run, rgb: np.ndarray, options: HeatmapOptions) -> np.ndarray:
     if options.tta == "none":
-        return run(images)
-    means = [np.zeros(rgb.shape[:2], np.float32) for rgb in images]
+        return run(rgb)
+    mean = np.zeros(rgb.shape[:2], np.float32)
     for turns in range(4):
-        turned = [np.rot90(rgb, turns) for rgb in images]
+        turned = np.rot90(rgb, turns)
         for step in (1, -1):
-            found = run([each[:, ::step] for each in turned])
-            for mean, logits in zip(means, found, strict=True):
-                mean += np.rot90(logits[:, ::step], -turns)
-    return [mean / np.float32(8) for mean in means]
+            mean += np.rot90(run(turned[:, ::step])[:, ::step], -turns)
+    return mean / np.float32(8)

@@ -84,11 +84,10 @@ def failed_run(error: Exception, image_shape: tuple[int, ...]) -> Exception:
     """Return the error of a run on (N, 3, H, W) that failed, a MemoryError for lack of memory."""
     if any(word in f"{type(error).__name__} {error}" for word in ("MemoryError", "alloc")):
         return MemoryError(str(error))
-    number, _, height, width = image_shape
-    images = "an image" if number == 1 else f"{number} images"
-    remedy = "use another backend or device" if number == 1 else "use `batch_size=1`"
+    height, width = image_shape[2:]
     return DeepDetectError(
-        f"the network failed on {images} of {width}x{height} pixels ({_reason(error)}): {remedy}"
+        f"the network failed on an image of {width}x{height} pixels ({_reason(error)}): "
+        "use another backend or device"
     )
 
 

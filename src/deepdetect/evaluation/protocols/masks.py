@@ -177,7 +177,7 @@ class LabelDetector:
         """Return the label as (H, W) float32, 0 or 1."""
         rgb = load_image(image)
         if self.heatmap_options is not None:
-            (maps,) = compute_maps([rgb], self._network, self.heatmap_options)
+            maps = compute_maps(rgb, self._network, self.heatmap_options)
             return maps.both()[0]
         return fuse(luma(rgb), self.options).mask.astype(np.float32)
 
