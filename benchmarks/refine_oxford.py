@@ -26,13 +26,9 @@ from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.geometry import GeometryOptions, estimate_geometry, transform_points
 from deepdetect.geometry.homography_refinement import refine_homography
 from deepdetect.geometry.images import (
-    BLUR_SIGMA_PX,
     WINDOW_PX,
-    erode_mask,
-    gaussian_blur,
-    local_zncc,
     median_local_zncc,
-    warp_to_reference,
+    warped_zncc,
 )
 from deepdetect.io.image import load_image, luma
 
@@ -149,10 +145,7 @@ def risen_fraction(
     """
     values = []
     for homography in (before, after):
-        size = (gray0.shape[1], gray0.shape[0])
-        warped, valid_mask = warp_to_reference(gray1, homography, size)
-        first, second = (gaussian_blur(gray, BLUR_SIGMA_PX) for gray in (gray0, warped))
-        every = local_zncc(first, second, erode_mask(valid_mask, BLUR_SIGMA_PX))
+        every = warped_zncc(gray0, gray1, homography)
         values.append(every[WINDOW_PX // 2 :: WINDOW_PX, WINDOW_PX // 2 :: WINDOW_PX])
     risen, fallen = (int(np.count_nonzero(one > other)) for one, other in (values[::-1], values))
     return risen / (risen + fallen) if risen + fallen else 0.0

@@ -35,7 +35,12 @@ from deepdetect.detector.points.detection import (
     SIZE_PER_SIGMA,
     least_distances,
 )
-from deepdetect.detector.points.hessian_scales import LEAST_RESPONSE, NMS_RADIUS, SIGMAS_PX
+from deepdetect.detector.points.hessian_scales import (
+    LEAST_RESPONSE,
+    NMS_RADIUS,
+    SIGMAS_PX,
+    VARIANCES,
+)
 from deepdetect.detector.points.ranker import MAX_DEVIATIONS, load_ranker
 from deepdetect.detector.pretrained import POINTS, POINTS_GRAPH
 from deepdetect.features.kernels import ATAN, BINS, RADIUS_PER_WINDOW
@@ -57,8 +62,6 @@ LUMA, LUMA_UNIT = (9798.0, 19235.0, 3735.0), 32768.0
 
 REACH_PER_SIGMA = 4
 """Of OpenCV's Gaussian filters of float32."""
-
-VARIANCES = (SIGMAS_PX**2).astype(np.float32)
 
 FIRST, LAST = 1, len(SIGMAS_PX) - 3
 """Levels that have candidates."""

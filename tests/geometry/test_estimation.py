@@ -20,10 +20,7 @@ SHIFT = np.array([0.8, 0.1, 0.3]) / np.linalg.norm([0.8, 0.1, 0.3])
 TURN = cv2.Rodrigues(np.array([0.05, -0.15, 0.1]))[0]
 
 MODELS = ("homography", "fundamental", "essential")
-ESTIMATORS = ("magsac", "ransac")
-every_way = pytest.mark.parametrize(
-    ("model", "estimator"), [(model, name) for model in MODELS for name in ESTIMATORS]
-)
+every_way = pytest.mark.parametrize("model", MODELS)
 
 
 @dataclass
@@ -57,11 +54,11 @@ def make_scene(
     return Scene(points0[order], points1[order], true[order])
 
 
-def make_options(model: str, estimator: str = "magsac", **changes: Any) -> dict[str, Any]:
+def make_options(model: str, **changes: Any) -> dict[str, Any]:
     """Return keywords of `estimate_geometry`."""
     cameras = {"camera0": CAMERA0, "camera1": CAMERA1} if model == "essential" else {}
     seed = changes.pop("seed", 0)
-    options = GeometryOptions(estimator=estimator, **(cameras | changes))
+    options = GeometryOptions(**(cameras | changes))
     return {"model": model, "seed": seed, "options": options}
 
 
@@ -98,9 +95,9 @@ def assert_consistent(geometry: Geometry, count: int) -> None:
 
 
 @every_way
-def test_finds_the_model_among_outliers(model: str, estimator: str) -> None:
+def test_finds_the_model_among_outliers(model: str) -> None:
     scene = make_scene(model)
-    geometry = estimate_geometry(scene.points0, scene.points1, **make_options(model, estimator))
+    geometry = estimate_geometry(scene.points0, scene.points1, **make_options(model))
     assert geometry.model == model
     assert_consistent(geometry, len(scene.true))
     assert geometry.inliers[scene.true].mean() > 0.9
@@ -112,9 +109,9 @@ def test_finds_the_model_among_outliers(model: str, estimator: str) -> None:
 
 
 @every_way
-def test_the_same_seed_gives_the_same_result(model: str, estimator: str) -> None:
+def test_the_same_seed_gives_the_same_result(model: str) -> None:
     scene = make_scene(model)
-    options = make_options(model, estimator, seed=4)
+    options = make_options(model, seed=4)
     first = estimate_geometry(scene.points0, scene.points1, **options)
     cv2.setRNGSeed(12345)  # whatever ran before
     again = estimate_geometry(scene.points0, scene.points1, **options)
@@ -123,12 +120,12 @@ def test_the_same_seed_gives_the_same_result(model: str, estimator: str) -> None
 
 
 @every_way
-def test_the_seed_decides_the_samples(model: str, estimator: str) -> None:
+def test_the_seed_decides_the_samples(model: str) -> None:
     """Among many outliers few iterations end at whatever was drawn."""
     scene = make_scene(model, outliers=0.6, noise=1.0)
     found = {
         estimate_geometry(
-            scene.points0, scene.points1, **make_options(model, estimator, iterations=20, seed=seed)
+            scene.points0, scene.points1, **make_options(model, iterations=20, seed=seed)
         ).inliers.tobytes()
         for seed in range(6)
     }
@@ -136,18 +133,17 @@ def test_the_seed_decides_the_samples(model: str, estimator: str) -> None:
 
 
 @given(
-    way=st.sampled_from([(model, name) for model in MODELS for name in ESTIMATORS]),
+    model=st.sampled_from(MODELS),
     seed=st.integers(0, 1000),
     threshold=st.floats(0.2, 5.0),
     noise=st.floats(0.0, 1.0),
     outliers=st.floats(0.0, 0.5),
 )
 def test_inliers_are_exactly_the_matches_under_the_threshold(
-    way: tuple[str, str], seed: int, threshold: float, noise: float, outliers: float
+    model: str, seed: int, threshold: float, noise: float, outliers: float
 ) -> None:
-    model, estimator = way
     scene = make_scene(model, seed, 60, outliers, noise)
-    options = make_options(model, estimator, inlier_threshold=threshold, iterations=200)
+    options = make_options(model, inlier_threshold=threshold, iterations=200)
     geometry = estimate_geometry(scene.points0, scene.points1, **options)
     assert_consistent(geometry, 60)
     if geometry.matrix is not None:
@@ -180,8 +176,8 @@ def degenerate(count: int = 40) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 @every_way
-def test_few_and_degenerate_matches_do_no_harm(model: str, estimator: str) -> None:
-    options = make_options(model, estimator, iterations=500)
+def test_few_and_degenerate_matches_do_no_harm(model: str) -> None:
+    options = make_options(model, iterations=500)
     few = [make_scene(model, count, count) for count in (0, 1, 3, 4, 5, 7, 8, 14, 15)]
     pairs = [(scene.points0, scene.points1) for scene in few]
     for points0, points1 in (*pairs, *degenerate().values()):
@@ -207,7 +203,6 @@ def test_a_given_homography_is_judged_and_not_estimated(model: str) -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"estimator": "ransack"}, "unknown estimator 'ransack': did you mean 'ransac'?"),
         ({"inlier_threshold": 0}, "`inlier_threshold` must be above 0, not 0"),
         ({"iterations": 0.5}, "`iterations` must be a whole number from 1 on, not 0.5"),
         ({"confidence": 0.0}, "confidence must lie between 0 and 1, not 0.0"),

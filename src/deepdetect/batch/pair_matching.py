@@ -12,11 +12,11 @@ import numpy as np
 from natsort import natsorted, ns
 
 from .. import __version__
-from .._shared.errors import InvalidFileError, OptionError, noted_failures
-from .._shared.options import check_ranges, look_up, suggest_keywords
+from .._shared.errors import InvalidFileError, OptionError, check_name, noted_failures
+from .._shared.options import check_ranges, suggest_keywords
 from .._shared.records import key
 from ..features.keypoints import Keypoints
-from ..features.matchers import MATCHERS
+from ..features.matchers import MATCHERS_OF_NUMBERS
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
 from ..matching.pipeline import match_features
@@ -33,9 +33,6 @@ from .hdf5 import (
     state_of,
 )
 from .pair_list import Pair, list_pairs, pair_name
-
-MATCHERS_OF_FLOATS = {name: MATCHERS[name] for name in MATCHERS if name != "hamming"}
-"""Features in files are no bits."""
 
 
 @suggest_keywords
@@ -71,7 +68,7 @@ class PairMatchingOptions:
             not_negative=("seed",),
             fractions=("ratio",),
         )
-        look_up("matcher", self.matcher, MATCHERS_OF_FLOATS)
+        check_name("matcher", self.matcher, MATCHERS_OF_NUMBERS)
         if self.verify == "essential":
             raise OptionError("`verify` knows no cameras: use fundamental, homography or auto")
         check_model(self.verify, self.seed, GeometryOptions())

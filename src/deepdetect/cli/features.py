@@ -9,7 +9,8 @@ from cyclopts import Parameter
 
 from ..batch.extraction import extract_features
 from ..batch.hdf5 import BatchReport
-from ..batch.pair_matching import MATCHERS_OF_FLOATS, PairMatchingOptions, match_pairs
+from ..batch.pair_matching import PairMatchingOptions, match_pairs
+from ..features.matchers import MATCHERS_OF_NUMBERS
 from . import _options as cli
 from ._detection import DESCRIBED_POINTS, ONE_THREAD, SELECTION, Detector, chosen_detector
 
@@ -19,7 +20,7 @@ MATCHING = cli.From(
     PairMatchingOptions,
     "ratio mutual verify",
     types={
-        "matcher": Literal[tuple(MATCHERS_OF_FLOATS)],
+        "matcher": Literal[MATCHERS_OF_NUMBERS],
         "verify": Literal["none", "fundamental", "homography", "auto"],
     },
 )

@@ -15,14 +15,14 @@ from .._shared.errors import ImageError, OptionError, RegistrationError, noted_f
 from .._shared.image_array import array_to_rgb
 from .._shared.progress import progress, stage_progress
 from ..batch.pair_list import list_pairs
-from ..batch.pair_matching import MATCHERS_OF_FLOATS
 from ..datasets.planar import read_matrix
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
+from ..features.matchers import MATCHERS_OF_NUMBERS
 from ..features.matches import Matches
 from ..features.sift import DESCRIPTORS
 from ..geometry import GeometryOptions
-from ..geometry.estimation import ESTIMATORS, MODEL_NAMES
+from ..geometry.estimation import MODEL_NAMES
 from ..geometry.transforms import translation_matrix
 from ..io.image import load_image
 from ..io.metadata import read_metadata
@@ -56,13 +56,12 @@ MATCHING = cli.From(
     types={
         "two_view_model": Literal[TWO_VIEW_MODELS],
         "descriptor": Literal[tuple(DESCRIPTORS)],
-        "matcher": Literal[tuple(MATCHERS_OF_FLOATS)],
+        "matcher": Literal[MATCHERS_OF_NUMBERS],
     },
 )
 GEOMETRY = cli.From(
     GeometryOptions,
-    more="estimator inlier_threshold confidence iterations",
-    types={"estimator": Literal[ESTIMATORS]},
+    more="inlier_threshold confidence iterations",
 )
 REGISTRATION = cli.From(register_images, "extent", more="mutual seed")
 PANORAMA = cli.From(stitch_images, "projection crop", more="seed")

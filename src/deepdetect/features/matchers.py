@@ -279,6 +279,9 @@ MATCHERS: dict[str, Matcher] = {
     "hamming": hamming_neighbours,
 }
 
+MATCHERS_OF_NUMBERS = tuple(name for name in MATCHERS if name != "hamming")
+"""All but that of binary descriptors, as ORB's."""
+
 
 def get_matcher(name: str) -> Matcher:
     """Return the matcher of this name; an unknown one is an OptionError."""

@@ -14,7 +14,6 @@ import numpy as np
 from .._shared.errors import ImageError, OptionError
 from .._shared.machine import parallel_for
 from .._shared.opencv import cv2
-from .._shared.options import look_up
 from .keypoints import Keypoints, on_pixels
 from .scale_space import BASE_SIGMA_PX, CAMERA_SIGMA_PX, LAYERS, packed_octaves, set_angles
 from .selection import spread_over_grid
@@ -198,7 +197,7 @@ def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
     else:
         described = describe_scaled(gray, keypoints)
     assert described.descriptors is not None
-    root = to_root_sift(described.descriptors, overwrite=True)
+    root = to_root_sift(described.descriptors)
     return replace(described, descriptors=root, descriptor_type=ROOT_SIFT)
 
 
@@ -220,18 +219,17 @@ def root_sift_descriptors(
     gray: np.ndarray, xy: np.ndarray, size: float = 3.0, angle: float = 0.0
 ) -> np.ndarray:
     """Compute RootSIFT descriptors (`to_root_sift`); arguments as of `sift_descriptors`."""
-    return to_root_sift(sift_descriptors(gray, xy, size, angle), overwrite=True)
+    return to_root_sift(sift_descriptors(gray, xy, size, angle))
 
 
-def to_root_sift(descriptors: np.ndarray, overwrite: bool = False) -> np.ndarray:
-    """Convert (N, 128) uint8 SIFT descriptors to RootSIFT (Arandjelovic and Zisserman, 2012).
+def to_root_sift(descriptors: np.ndarray) -> np.ndarray:
+    """Convert (N, 128) uint8 SIFT descriptors to RootSIFT, in place.
 
-    They are the square roots of the L1-normalised ones times 512, at most 255: their Euclidean
-    distance is the Hellinger distance of SIFT. To overwrite them saves a copy.
+    They (Arandjelovic and Zisserman, 2012) are the square roots of the L1-normalised ones times
+    512, at most 255: their Euclidean distance is the Hellinger distance of SIFT.
     """
-    converted = descriptors if overwrite else descriptors.copy()
-    parallel_for(len(converted), _square_root, converted)
-    return converted
+    parallel_for(len(descriptors), _square_root, descriptors)
+    return descriptors
 
 
 def _square_root(start: int, stop: int, descriptors: np.ndarray) -> None:
@@ -273,11 +271,6 @@ DESCRIPTORS: dict[str, Descriptor] = {
     "sift": sift_descriptors,
     "rootsift": root_sift_descriptors,
 }
-
-
-def get_descriptor(name: str) -> Descriptor:
-    """Return the descriptor of this name; an unknown one is an OptionError."""
-    return look_up("descriptor", name, DESCRIPTORS)
 
 
 def detect_sift(gray: np.ndarray, max_keypoints: int = 4000) -> Keypoints:

@@ -25,6 +25,7 @@ import numpy as np
 from .._shared.errors import MissingCalibrationError, ReconstructionError, first_line
 from .._shared.options import numbers_of, shown, suggest_keywords
 from .camera_files import read_camera_file
+from .transforms import outer_corners
 
 Size = tuple[int, int]
 
@@ -312,11 +313,6 @@ class PosedView:
         """(3,) float64, where the camera stands."""
         return np.asarray(-self.rotation.T @ self.translation)
 
-    @property
-    def projection(self) -> np.ndarray:
-        """(3, 4) float64 projection matrix, from the world to pixels."""
-        return self.camera.matrix @ np.column_stack([self.rotation, self.translation])
-
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return positions (N, 2) in pixels, and depths (N,), of points (N, 3) of the world."""
         seen = np.asarray(points, np.float64) @ self.rotation.T + self.translation
@@ -324,9 +320,7 @@ class PosedView:
 
     def corners(self, depth: float) -> np.ndarray:
         """Return the (4, 3) corners of what it sees at a depth, around the image."""
-        width, height = self.camera.size
-        pixels = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
-        rays = self.camera.rays(pixels) * depth
+        rays = self.camera.rays(outer_corners(self.camera.size)) * depth
         return np.asarray((rays - self.translation) @ self.rotation)
 
 

@@ -19,7 +19,6 @@ from .._shared.opencv import cv2
 from .._shared.options import check_ranges, numbers_of, suggest_keywords
 from .transforms import epipolar_errors, transfer_errors, transform_points
 
-ESTIMATORS = ("magsac", "ransac")
 MODEL_NAMES = ("auto", "homography", "fundamental", "essential", "none")
 
 MIN_MATCHES = {"homography": 4, "fundamental": 15, "essential": 6}
@@ -57,7 +56,6 @@ class GeometryOptions:
     """How a geometry is estimated.
 
     Attributes:
-        estimator: "magsac" or "ransac".
         inlier_threshold: a match is an inlier when its error is below this, in pixels: the
             transfer error of a homography, else the Sampson distance (in a rectified pair an
             error of d rows counts as d / sqrt(2)).
@@ -71,7 +69,6 @@ class GeometryOptions:
         OptionError: a value is unknown, missing or out of its range.
     """
 
-    estimator: str = "magsac"
     inlier_threshold: float = 1.0
     homography: np.ndarray | None = field(default=None, repr=False)
     camera0: np.ndarray | None = field(default=None, repr=False)
@@ -80,7 +77,6 @@ class GeometryOptions:
     iterations: int = 10_000
 
     def __post_init__(self) -> None:
-        check_name("estimator", self.estimator, ESTIMATORS)
         if not 0 < self.confidence < 1:
             raise OptionError(f"the confidence must lie between 0 and 1, not {self.confidence}")
         check_ranges(self, positive=("inlier_threshold",), counts=("iterations",))
@@ -211,31 +207,34 @@ def check_model(model: str, seed: int, options: GeometryOptions) -> None:
 def _fit(
     points0: np.ndarray, points1: np.ndarray, model: str, options: GeometryOptions
 ) -> np.ndarray | None:
-    """Fit a model by OpenCV's estimator; None, or an odd matrix, where that fails."""
-    method = cv2.USAC_MAGSAC if options.estimator == "magsac" else cv2.RANSAC
+    """Fit a model by MAGSAC; None, or an odd matrix, where that fails."""
     threshold, confidence = options.inlier_threshold, options.confidence
     iterations = int(options.iterations)
     if model == "homography":
         return cv2.findHomography(
-            points0, points1, method, threshold, maxIters=iterations, confidence=confidence
+            points0,
+            points1,
+            cv2.USAC_MAGSAC,
+            threshold,
+            maxIters=iterations,
+            confidence=confidence,
         )[0]
     if model == "fundamental":
         limits = threshold, confidence, iterations
-        return cv2.findFundamentalMat(points0, points1, method, *limits)[0]
+        return cv2.findFundamentalMat(points0, points1, cv2.USAC_MAGSAC, *limits)[0]
     cameras = _cameras(options)
     rays0, rays1 = (
         np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(camera).T
         for points, camera in zip((points0, points1), cameras, strict=True)
     )
     focal_px = (cameras[0][0, 0] + cameras[1][0, 0]) / 2
-    return fit_essential(rays0, rays1, focal_px, method, threshold, confidence, iterations)
+    return fit_essential(rays0, rays1, focal_px, threshold, confidence, iterations)
 
 
 def fit_essential(
     rays0: np.ndarray,
     rays1: np.ndarray,
     focal_px: float,
-    method: int,
     threshold_px: float,
     confidence: float,
     iterations: int,
@@ -249,7 +248,7 @@ def fit_essential(
         np.ascontiguousarray(rays0[:, :2] * focal_px),
         np.ascontiguousarray(rays1[:, :2] * focal_px),
         np.diag([focal_px, focal_px, 1.0]),
-        method=method,
+        method=cv2.USAC_MAGSAC,
         prob=confidence,
         threshold=threshold_px,
         maxIters=iterations,

@@ -126,12 +126,16 @@ def local_zncc(
     return result
 
 
+def warped_zncc(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    """Return `local_zncc` of an image and of one that a homography warps to it."""
+    warped, valid = warp_to_reference(gray1, homography, gray0.shape[::-1])
+    first, second = (gaussian_blur(gray, BLUR_SIGMA_PX) for gray in (gray0, warped))
+    return local_zncc(first, second, erode_mask(valid, BLUR_SIGMA_PX))
+
+
 def median_local_zncc(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> float:
     """Return the median local ZNCC of two images over their overlap, -1 without any."""
-    size = (gray0.shape[1], gray0.shape[0])
-    warped, valid_mask = warp_to_reference(gray1, homography, size)
-    first, second = (gaussian_blur(gray, BLUR_SIGMA_PX) for gray in (gray0, warped))
-    values = local_zncc(first, second, erode_mask(valid_mask, BLUR_SIGMA_PX))
+    values = warped_zncc(gray0, gray1, homography)
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else -1.0
 

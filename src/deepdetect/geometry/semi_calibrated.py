@@ -220,7 +220,6 @@ def _fit_essential(
             camera0.rays(points0),
             camera1.rays(points1),
             (camera0.focal_px[0] + camera1.focal_px[0]) / 2,
-            cv2.USAC_MAGSAC,
             inlier_threshold,
             CONFIDENCE,
             ITERATIONS,

@@ -178,7 +178,9 @@ def _search(
     best: dict[bool, tuple[float, Similarity | None]] = dict.fromkeys((True, False), (np.inf, None))
     for size in [3] * MAX_SAMPLES + [2] * (0 if up is None else MAX_SAMPLES):
         rows = random.choice(len(points), size, replace=False)
-        found = _of_sample(points[rows], targets[rows], up if size == 2 else None, scale)
+        found = least_squares_similarity(
+            points[rows], targets[rows], up if size == 2 else None, scale
+        )
         if found is None:
             continue
         median = float(np.median(np.linalg.norm((targets - found.apply(points)) * known, axis=1)))
@@ -191,10 +193,16 @@ def _search(
     return best[not (sure and best[False][0] < MUCH_BETTER * best[True][0])][1]
 
 
-def _of_sample(
-    points: np.ndarray, targets: np.ndarray, up: np.ndarray | None, scale: float | None
+def least_squares_similarity(
+    points: np.ndarray,
+    targets: np.ndarray,
+    up: np.ndarray | None = None,
+    scale: float | None = None,
 ) -> Similarity | None:
-    """Return the similarity of a few points (Umeyama, 1991), about the vertical alone with `up`."""
+    """Fit a similarity by least squares (Umeyama, 1991), about the vertical alone with `up`.
+
+    None where all points are in one place.
+    """
     middle, middle_of_targets = points.mean(axis=0), targets.mean(axis=0)
     own, other = points - middle, targets - middle_of_targets
     if up is not None:

@@ -110,6 +110,12 @@ def translation_matrix(x: float, y: float) -> np.ndarray:
     return np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])
 
 
+def outer_corners(size: tuple[int, int]) -> np.ndarray:
+    """Return the corners of an image, half a pixel beyond the outermost centres; (4, 2)."""
+    width, height = size
+    return np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+
+
 def scaling_matrix(scale: float) -> np.ndarray:
     """Return the (3, 3) map from an image to the same image at another scale."""
     shift = 0.5 * scale - 0.5

@@ -20,7 +20,12 @@ from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints, nearest_keypoints
 from ..features.learned import LEARNED_RATIO, RATIO, is_learned, match_learned
 from ..features.match_filter import filter_matches, suits_filter
-from ..features.matchers import DescriptorMatches, get_matcher, match_descriptors
+from ..features.matchers import (
+    MATCHERS_OF_NUMBERS,
+    DescriptorMatches,
+    get_matcher,
+    match_descriptors,
+)
 from ..features.matches import Matches, TwoViewGeometry, lazy
 from ..features.selection import SelectionOptions
 from ..features.sift import (
@@ -28,7 +33,6 @@ from ..features.sift import (
     ROOT_SIFT,
     describe_keypoints,
     describe_scaled,
-    get_descriptor,
 )
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
@@ -68,8 +72,7 @@ class MatchingOptions:
             with sizes and angles of their own are described at these.
         angle: direction of all keypoints in degrees; -1 is OpenCV's "unset".
         matcher: "auto" ("exact" for few keypoints, else "patchmatch" for dense ones and "flann" for
-            others), "flann", "exact" or "patchmatch" ("hamming" is for binary
-            descriptors).
+            others), "flann", "exact" or "patchmatch".
         ratio: the ratio test keeps matches strictly under it (paper's code: 0.99).
         geometry: how the geometry is estimated in the end.
 
@@ -87,11 +90,7 @@ class MatchingOptions:
 
     def __post_init__(self) -> None:
         check_name("descriptor", self.descriptor, (None, *DESCRIPTORS))
-        get_matcher(self.matcher)
-        if self.matcher == "hamming":
-            raise OptionError(
-                "the matcher hamming compares binary descriptors, as ORB's: take exact or flann"
-            )
+        check_name("matcher", self.matcher, MATCHERS_OF_NUMBERS)
         check_name("two-view model", self.two_view_model, TWO_VIEW_MODELS)
         if self.angle != -1 and not 0 <= self.angle < 360:
             raise OptionError(f"the angle must lie in [0, 360) or be -1, not {self.angle}")
@@ -414,7 +413,7 @@ def _describe(
     if options.descriptor is None and isinstance(detector, PointDetector):
         return detector.describe(gray, keypoints)
     if keypoints.sizes is None or keypoints.angles is None:
-        of_pixels = get_descriptor(kind)
+        of_pixels = DESCRIPTORS[kind]
         descriptors = of_pixels(gray, keypoints.xy, options.keypoint_size, options.angle)
         return replace(keypoints, descriptors=descriptors, descriptor_type=kind)
     return (describe_keypoints if kind == ROOT_SIFT else describe_scaled)(gray, keypoints)

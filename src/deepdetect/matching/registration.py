@@ -15,7 +15,12 @@ from .._shared.options import suggest_keywords
 from ..detector.detector import AnyDetector
 from ..features.selection import SelectionOptions
 from ..geometry.images import downscale, median_local_zncc, warp_bands, warp_to_reference
-from ..geometry.transforms import scaled_homography, transform_points, translation_matrix
+from ..geometry.transforms import (
+    outer_corners,
+    scaled_homography,
+    transform_points,
+    translation_matrix,
+)
 from ..io.image import Images, load_deep, load_image, luma
 from ..io.image_file import file_name, is_file
 from ..io.metadata import read_metadata
@@ -186,7 +191,7 @@ def _union(
 ) -> tuple[int, int, int, int]:
     """Return left, top, right and bottom of what two images show, in pixels of the first."""
     height, width = shape1[:2]
-    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+    corners = outer_corners((width, height))
     back = np.linalg.inv(homography)
     ends, depths = transform_points(corners, back), corners @ back[2, :2] + back[2, 2]
     # A pixel belongs to an image when its centre does.
@@ -210,8 +215,8 @@ def agree(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> bool:
     shifted = []
     for radius in SHIFTS:
         for angle in np.arange(8) * np.pi / 4:
-            move = np.eye(3)
-            move[:2, 2] = radius * min(first.shape) * np.array([np.cos(angle), np.sin(angle)])
+            length = radius * min(first.shape)
+            move = translation_matrix(length * np.cos(angle), length * np.sin(angle))
             shifted.append(median_local_zncc(first, second, matrix @ move))
     known = [value for value in shifted if value > -1]  # where both are seen
     least = np.mean(known) + MIN_DEVIATIONS * np.std(known) if known else 1.0

@@ -14,11 +14,9 @@ import numpy as np
 from .._shared.atomic import atomic_path
 from .._shared.errors import InvalidFileError, MissingFileError, OptionError, first_line
 from .._shared.opencv import cv2
+from ..features.display import line_scale
 
 HEADER = "frame,track,x,y,score"
-
-READABLE_WIDTH_PX = 800
-"""Lines and letters grow with frames that are wider than this."""
 
 HUE_STEP = 0.61803
 """Of the colours of following tracks: neighbours are far apart (the golden ratio)."""
@@ -135,7 +133,7 @@ class TrackDrawer:
         """Return a copy of a frame, (H, W, 3) uint8, with its tracks and a caption."""
         self._frames.append(frame)
         canvas = np.ascontiguousarray(rgb.copy())
-        unit = max(1.0, rgb.shape[1] / READABLE_WIDTH_PX)
+        unit = line_scale(rgb)
         colors = {track: track_color(track) for track in frame.tracks.tolist()}
         tails: dict[int, list[list[float]]] = {}
         for past in self._frames:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 
 from deepdetect.detector.points.candidate_features import FEATURES, describe_candidates
-from deepdetect.detector.points.hessian_scales import build_scale_space, find_candidates
+from deepdetect.detector.points.hessian_scales import SIGMAS_PX, build_scale_space, find_candidates
 
 
 def textured(seed: int = 0, side: int = 160) -> np.ndarray:
@@ -50,7 +50,7 @@ def test_measurements_are_those_of_maps() -> None:
         values += [np.sign(space.determinant[level, row, column])]
         slopes = []
         for k in range(level - 1, level + 3):
-            image, variance = space.smooth[k].astype(np.float64), space.sigmas_px[k] ** 2
+            image, variance = space.smooth[k].astype(np.float64), SIGMAS_PX[k] ** 2
             laplacian = cv2.filter2D(image, -1, second) + cv2.filter2D(image, -1, second.T)
             bent = np.arctan(laplacian[row, column] * variance / strength / 2)
             values += [bent, abs(bent)]
@@ -63,7 +63,7 @@ def test_measurements_are_those_of_maps() -> None:
             values += [np.log((window.max() + 1e-7) / (response[k, row, column] + 1e-7)) / 2]
         angle = np.arange(8) * np.pi / 4
         for radius in (1, 2, 3.5, 6):
-            reach = radius * space.sigmas_px[level]
+            reach = radius * SIGMAS_PX[level]
             x = np.clip(np.rint(column + reach * np.cos(angle)), 0, 95).astype(int)
             y = np.clip(np.rint(row + reach * np.sin(angle)), 0, 95).astype(int)
             ring = np.log(response[level, y, x] + 1e-7) - own

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.detector.points.hessian_scales import build_scale_space, find_candidates
+from deepdetect.detector.points.hessian_scales import SIGMAS_PX, build_scale_space, find_candidates
 from deepdetect.features.selection import peak_offset
 
 
@@ -17,7 +17,7 @@ def blob(sigma: float, center=(40.3, 32.6), shape=(64, 80)) -> np.ndarray:
 def test_the_levels_are_gaussians_of_the_image() -> None:
     gray = np.random.default_rng(0).integers(0, 256, (90, 120), np.uint8)
     space = build_scale_space(gray)
-    for sigma, smooth in zip(space.sigmas_px, space.smooth, strict=True):
+    for sigma, smooth in zip(SIGMAS_PX, space.smooth, strict=True):
         wanted = cv2.GaussianBlur(gray.astype(np.float64) / 255, (0, 0), float(sigma))
         # Smoothing twice cuts the tails off twice.
         found = smooth + space.gray
@@ -27,7 +27,7 @@ def test_the_levels_are_gaussians_of_the_image() -> None:
 def test_derivatives_are_those_of_opencv() -> None:
     gray = np.random.default_rng(1).integers(0, 256, (50, 70), np.uint8)
     space = build_scale_space(gray)
-    for k, sigma in enumerate(space.sigmas_px):
+    for k, sigma in enumerate(SIGMAS_PX):
         xx, yy = (
             cv2.filter2D(space.smooth[k], -1, kernel)
             for kernel in (np.array([[1.0, -2, 1]]), np.array([[1.0], [-2], [1]]))

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetectError, OptionError
+from deepdetect import Camera, DeepDetectError, OptionError
 from deepdetect._shared import machine
 from deepdetect.matching.stitching.bundle_adjustment import RotatingCamera
 from deepdetect.matching.stitching.canvas import (
@@ -119,7 +119,7 @@ def test_a_curved_canvas_shows_directions(projection, height) -> None:
         assert canvas.boxes[number] == (left, top, left + shape[1], top + shape[0])
         for row, column in np.argwhere(drawn.mask)[::3001]:
             x, y = 2 * drawn.image[row, column, :2].astype(float) + 0.5
-            ray = camera.rotation @ np.linalg.inv(camera.intrinsics(SIZE)) @ [x, y, 1]
+            ray = camera.rotation @ np.linalg.inv(Camera(SIZE, camera.focal_px).matrix) @ [x, y, 1]
             seen.append([left + column, top + row])
             true.append(270 * np.array([np.arctan2(ray[0], ray[2]), height(*ray)]))
     offsets = np.array(seen) - true  # of the canvas, the same for all

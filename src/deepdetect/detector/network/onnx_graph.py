@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 IMAGE, PROBABILITY, PADDED_LOGITS = "image", "probability", "padded_logits"
 """Names of tensors: the network itself maps `PADDED_IMAGE` to `PADDED_LOGITS`."""
 
-_PADDING = {"shape", "sides", "minus_sides", "missing", "padding", PADDED_IMAGE}
-_ENDING = {"sigmoid", PROBABILITY}
+_OUTSIDE = {"shape", "sides", "minus_sides", "missing", "padding", PADDED_IMAGE}
+_OUTSIDE |= {"sigmoid", PROBABILITY, LOGITS}
 """Names of tensors that are made outside of the network itself."""
 
 METADATA = {
@@ -74,7 +74,7 @@ def fix_size(model: ModelProto, height: int, width: int, batch: int) -> None:
 
     graph = model.graph
     below, right = -height % STRIDE, -width % STRIDE
-    inner, before = split_nodes(graph)[1], []
+    inner, before = [node for node in graph.node if _OUTSIDE.isdisjoint(node.output)], []
     if below or right:
         add_constants(graph, {"padding": [0] * 6 + [below, right], "sides": [height, width]})
         before = [helper.make_node("Pad", [IMAGE, "padding"], [PADDED_IMAGE], mode="edge")]
@@ -100,20 +100,6 @@ def write_metadata(model: ModelProto, values: Mapping[str, str]) -> None:
 def read_metadata(model: ModelProto) -> dict[str, str]:
     """Return a file's metadata."""
     return {one.key: one.value for one in model.metadata_props}
-
-
-def split_nodes(graph: GraphProto) -> tuple[list[NodeProto], list[NodeProto], list[NodeProto]]:
-    """Return the nodes that pad, those of the network itself, and those behind its logits."""
-    before, inner, behind = [], [], []
-    for node in graph.node:
-        cropping = LOGITS in node.output and node.op_type == "Slice"
-        if not _PADDING.isdisjoint(node.output):
-            before.append(node)
-        elif cropping or not _ENDING.isdisjoint(node.output):
-            behind.append(node)
-        else:
-            inner.append(node)
-    return before, inner, behind
 
 
 def _ending(graph: GraphProto, crop: bool = True) -> list[NodeProto]:

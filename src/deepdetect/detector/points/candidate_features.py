@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..._shared.machine import parallel_for
-from .hessian_scales import SIGMAS_PX, Candidates, ScaleSpace
+from .hessian_scales import SIGMAS_PX, VARIANCES, Candidates, ScaleSpace
 
 RING_RADII = (1.0, 2.0, 3.5, 6.0)
 """Of the rings around a candidate that are looked at, in sigmas."""
@@ -53,7 +53,7 @@ def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray
         measure_candidates,
         space.smooth.shape,
         *(maps.reshape(-1) for maps in (space.smooth, space.determinant)),
-        space.variances,
+        VARIANCES,
         *(ring_offsets(), pixels, floors, features),
     )
     features[:, 17] += 2 * space.gray - 1

@@ -16,6 +16,9 @@ SIGMAS_PX = 1.5 * 1.35 ** np.arange(-1.0, 9)
 """Of the Gaussians of all levels, in pixels: seven that have candidates, and one finer and two
 coarser ones, which only the ranking looks at."""
 
+VARIANCES = (SIGMAS_PX**2).astype(np.float32)
+"""Of these Gaussians, by which derivatives are normalised."""
+
 LEAST_RESPONSE = 1e-8
 """Of a candidate, in an image with values in [0, 1]: less is rounding."""
 
@@ -28,15 +31,9 @@ class ScaleSpace:
     whole levels, is taken off.
     """
 
-    sigmas_px: np.ndarray
     gray: np.float32
     smooth: np.ndarray
     determinant: np.ndarray
-
-    @property
-    def variances(self) -> np.ndarray:
-        """(L,) float32 variances of the Gaussians, by which derivatives are normalised."""
-        return (self.sigmas_px**2).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +44,7 @@ class Candidates:
         level, row, column: (N,) int64 pixels.
         xy: (N, 2) float64 sub-pixel positions.
         sigma_px: (N,) float64 of their levels.
-        strength: (N,) float32 |det Hessian| sigma^4.
-        rank: (N,) int64 places in the order of strength, from 0, among all of the image.
+        rank: (N,) int64 places in the order of |det Hessian| sigma^4, from 0, of the whole image.
     """
 
     level: np.ndarray
@@ -56,7 +52,6 @@ class Candidates:
     column: np.ndarray
     xy: np.ndarray
     sigma_px: np.ndarray
-    strength: np.ndarray
     rank: np.ndarray
 
     def __len__(self) -> int:
@@ -74,13 +69,13 @@ def build_scale_space(gray: np.ndarray) -> ScaleSpace:
     smooth, determinant = (np.empty((len(SIGMAS_PX), *gray.shape), np.float32) for _ in range(2))
     # Around 0 the least is rounded away: other implementations of the filters find the same maxima.
     mean = np.float32(np.rint(gray.mean()))
-    space = ScaleSpace(SIGMAS_PX, mean / np.float32(255), smooth, determinant)
+    space = ScaleSpace(mean / np.float32(255), smooth, determinant)
     current, reached = (gray - mean) / np.float32(255), 0.0
     for k, sigma in enumerate(SIGMAS_PX):
         # Gaussians add up by their variances: each level smooths the one before.
         step = float(np.sqrt(sigma**2 - reached**2))
         current, reached = cv2.GaussianBlur(current, (0, 0), step, dst=smooth[k]), sigma
-        differentiate(smooth[k], space.variances[k], determinant[k])
+        differentiate(smooth[k], VARIANCES[k], determinant[k])
     return space
 
 
@@ -92,7 +87,7 @@ def find_candidates(space: ScaleSpace) -> Candidates:
     """
     pixels, positions, strengths = [], [], []
     window = np.ones((2 * NMS_RADIUS + 1,) * 2, np.uint8)
-    for k in range(1, len(space.sigmas_px) - 2):
+    for k in range(1, len(SIGMAS_PX) - 2):
         response = np.abs(space.determinant[k])
         peak = (response == cv2.dilate(response, window)) & (response > LEAST_RESPONSE)
         row, column = np.add(np.divmod(np.flatnonzero(peak[1:-1, 1:-1]), response.shape[1] - 2), 1)
@@ -106,4 +101,4 @@ def find_candidates(space: ScaleSpace) -> Candidates:
     rank = np.empty(len(level), np.int64)
     rank[descending_order(strength)] = np.arange(len(level))
     xy = np.concatenate(positions)
-    return Candidates(level, row, column, xy, space.sigmas_px[level], strength, rank)
+    return Candidates(level, row, column, xy, SIGMAS_PX[level], rank)

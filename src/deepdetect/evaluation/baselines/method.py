@@ -16,7 +16,7 @@ from ...detector.point_detector import PointDetector
 from ...features.keypoints import Keypoints
 from ...features.scale_space import dominant_angles
 from ...features.selection import SelectionOptions
-from ...features.sift import get_descriptor, scaled_sift_descriptors, to_root_sift
+from ...features.sift import DESCRIPTORS, scaled_sift_descriptors, to_root_sift
 from ...io.image import luma
 
 
@@ -71,7 +71,7 @@ class PointDescriptor:
 
     def describe(self, rgb: np.ndarray, features: Keypoints) -> np.ndarray:
         """Return (N, D) float32 descriptors."""
-        return get_descriptor(self.name)(luma(rgb), features.xy, self.size_px, self.angle_deg)
+        return DESCRIPTORS[self.name](luma(rgb), features.xy, self.size_px, self.angle_deg)
 
 
 PAPER_DESCRIPTOR = PointDescriptor()
@@ -98,7 +98,7 @@ class OwnScaleDescriptor:
         angles = features.angles
         if angles is None:
             angles = dominant_angles(gray, features.xy, sizes)
-        return to_root_sift(scaled_sift_descriptors(gray, features.xy, sizes, angles), True)
+        return to_root_sift(scaled_sift_descriptors(gray, features.xy, sizes, angles))
 
 
 def with_own_scale(feature: LocalFeature) -> LocalFeature:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...geometry.camera import PosedView
 from ...geometry.relative_pose import rotation_angle
+from ...geometry.similarity import least_squares_similarity
 from ...geometry.transforms import epipolar_errors
 
 POSE_THRESHOLDS_DEG = (5.0, 10.0, 20.0)
@@ -76,22 +77,19 @@ def camera_errors(
     """
     own = np.array([view.centre for view in views])
     true = np.array([view.centre for view in truth])
-    means = own.mean(axis=0), true.mean(axis=0)
-    left, values, right = np.linalg.svd((true - means[1]).T @ (own - means[0]))
-    signs = np.array([1, 1, np.sign(np.linalg.det(left @ right))])
-    turn = left * signs @ right
-    scale = float((values * signs).sum() / ((own - means[0]) ** 2).sum())
-    placed = scale * (own - means[0]) @ turn.T + means[1]
+    moved = least_squares_similarity(own, true)
+    if moved is None:
+        return np.full(len(own), np.nan), np.full(len(own), np.nan), np.nan
     angles = np.array(
         [
-            rotation_error(view.rotation @ turn.T, other.rotation)
+            rotation_error(view.rotation @ moved.rotation.T, other.rotation)
             for view, other in zip(views, truth, strict=True)
         ]
     )
-    along, across, _ = np.linalg.svd(true - means[1], compute_uv=False)
+    along, across, _ = np.linalg.svd(true - true.mean(axis=0), compute_uv=False)
     if across <= LINE_WIDTH * along:
         angles[:] = np.nan
-    return np.linalg.norm(placed - true, axis=1), angles, scale
+    return np.linalg.norm(moved.apply(own) - true, axis=1), angles, moved.scale
 
 
 def relative_pose_errors(

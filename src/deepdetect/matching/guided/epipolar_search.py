@@ -12,6 +12,7 @@ import numpy as np
 
 from ..._shared.kernels import compiled
 from ...features.keypoints import Keypoints
+from ...geometry.transforms import translation_matrix
 
 MAX_DISTANCE_PX = 3.0
 """Of each keypoint from the other's line."""
@@ -143,8 +144,7 @@ def log10_p_value(
     by_chance = []
     for share in NULL_SHIFTS:
         for right, down in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            back = np.eye(3)
-            back[:2, 2] = -side * share * np.array([right, down])
+            back = translation_matrix(-side * share * right, -side * share * down)
             by_chance.append(further(back.T @ fundamental))
     expected = max(float(np.mean(by_chance)), 1.0)
     return math.log10(max(_poisson_tail(further(fundamental), expected), 1e-300))

@@ -22,11 +22,11 @@ from ...geometry.homography_refinement import refine_homography
 from ...geometry.images import (
     BLUR_SIGMA_PX,
     downscale,
-    erode_mask,
     gaussian_blur,
     local_zncc,
     normalise_local_contrast,
     warp_to_reference,
+    warped_zncc,
     zncc_at_points,
 )
 from ...geometry.transforms import (
@@ -34,6 +34,7 @@ from ...geometry.transforms import (
     scaled_points,
     transfer_errors,
     transform_points,
+    translation_matrix,
 )
 from .tentative_matches import Pair
 
@@ -112,19 +113,17 @@ def is_repeated(
     x, y = np.rint(scaled_points(points0, scale0)).clip(0, last).astype(np.int64).T
     places = np.zeros(first.shape, bool)
     places[y, x] = True
-    own = _correlation(first, second, matrix)[places]
+    own = warped_zncc(first, second, matrix)[places]
     for shift in _similar_shifts(first, *warp_to_reference(second, matrix, first.shape[::-1])):
-        shifted = np.eye(3)
-        shifted[:2, 2] = shift
-        other = refine_homography(first, second, matrix @ shifted)
-        others = _correlation(first, second, other)[places]
+        other = refine_homography(first, second, matrix @ translation_matrix(*shift))
+        others = warped_zncc(first, second, other)[places]
         step = np.linalg.inv(matrix) @ other
         middle = np.array([last / 2])
         if transfer_errors(middle, middle, step)[0] < MIN_SHIFT_PX:
             continue  # it is the first one again
         # Where the pattern ends in both images, the rest of it may be hidden: only what does not
         # recur in the first image tells both places apart.
-        recurring = [_correlation(first, first, move) for move in (step, np.linalg.inv(step))]
+        recurring = [warped_zncc(first, first, move) for move in (step, np.linalg.inv(step))]
         recurs = np.fmax(*recurring)[places] > MIN_ZNCC
         explained = np.fmax(own, others) > MIN_ZNCC  # not for NaN in both
         known = explained & np.isfinite(own) & np.isfinite(others)
@@ -164,13 +163,6 @@ def _parallax_decides(
         measure_parallax(points0[off], points1[off], each, seed).log10_nfa for each in (plane, copy)
     )
     return own < min(other, 0) + MAX_LOG10_NFA
-
-
-def _correlation(first: np.ndarray, second: np.ndarray, homography: np.ndarray) -> np.ndarray:
-    """Return the local ZNCC of two images in the frame of the first, (H, W)."""
-    warped, valid = warp_to_reference(second, homography, first.shape[::-1])
-    first, warped = (gaussian_blur(gray, BLUR_SIGMA_PX) for gray in (first, warped))
-    return local_zncc(first, warped, erode_mask(valid, BLUR_SIGMA_PX))
 
 
 def _similar_shifts(first: np.ndarray, warped: np.ndarray, valid: np.ndarray) -> np.ndarray:

@@ -17,8 +17,10 @@ from ..._shared.opencv import cv2
 from ...features.matches import GuidedMatches
 from ...geometry.camera import Size
 from ...geometry.epipolar_rectification import PolarFrame, RectifiedFrame, rectified_frame
+from ...geometry.homography_refinement import MAX_ROUND_TRIP_PX
 from ...geometry.images import downscale, equalise, gaussian_blur, local_zncc, track_round_trip
 from ...geometry.semi_calibrated import refine_fundamental
+from ...geometry.similarity import MAD_STD
 from ...geometry.transforms import (
     epipolar_errors,
     scaled_fundamental,
@@ -78,9 +80,6 @@ MIN_SIGMA_PX = 0.1
 
 TRACKED_CORNERS, TRACKED_WINDOW_PX = 2000, 15
 """Corners that are tracked, and the side of the windows."""
-
-MAX_ROUND_TRIP_PX = 0.3
-"""A track counts when it ends this near to its start, forth and back."""
 
 MAX_TRACK_PX = 4.0
 """A track that moves further than this from its match is wrong."""
@@ -331,7 +330,7 @@ def _refine(
     sigmas = []
     for points0, points1 in (sparse, tracked):
         errors = epipolar_errors(points0, points1, fundamental)
-        sigma = max(1.4826 * float(np.median(errors)), MIN_SIGMA_PX)
+        sigma = max(MAD_STD * float(np.median(errors)), MIN_SIGMA_PX)
         sigmas.append(np.full(len(points0), sigma))
     points0, points1 = (np.concatenate([sparse[side], tracked[side]]) for side in (0, 1))
     return refine_fundamental(points0, points1, fundamental, sizes, np.concatenate(sigmas))

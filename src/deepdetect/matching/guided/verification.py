@@ -163,12 +163,12 @@ def _distances(
     shifted = [sift_gradient(null.shifted) for null in null_pairs]
     for size in KEYPOINT_SIZES_PX:
         described = dense_sift(gray0, points, size, LATTICE_PX, gradients[0])
-        first = to_root_sift(described, overwrite=True)
+        first = to_root_sift(described)
         total = first.sum(axis=0, dtype=np.int64)  # exact: the order of the points does not matter
         enough = len(first) >= MIN_POINTS_OF_MEAN
         mean = (total / len(first) if enough else 0 * total).astype(np.float32)
         described = dense_sift(warped, pixels, size, LATTICE_PX, gradients[1])
-        second = to_root_sift(described, overwrite=True)
+        second = to_root_sift(described)
         distances += correlation_distance(
             first, np.arange(len(first)), second, rows_of_points, mean
         )
@@ -177,7 +177,7 @@ def _distances(
             inner, outer = null.rows[null.interior], null.rows[~null.interior]
             values[null.interior] += correlation_distance(first, inner, second, index[y, x], mean)
             described = dense_sift(null.shifted, points[outer], size, LATTICE_PX, gradient)
-            others = to_root_sift(described, overwrite=True)
+            others = to_root_sift(described)
             rows = np.arange(len(outer))
             values[~null.interior] += correlation_distance(first, outer, others, rows, mean)
     return distances, null_distances

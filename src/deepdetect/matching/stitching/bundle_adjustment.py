@@ -63,11 +63,6 @@ class RotatingCamera:
     focal_px: float
     rotation: np.ndarray
 
-    def intrinsics(self, size: tuple[int, int]) -> np.ndarray:
-        """Return the (3, 3) intrinsics of an image of (width, height)."""
-        x, y = (np.array(size) - 1) / 2
-        return np.array([[self.focal_px, 0, x], [0, self.focal_px, y], [0, 0, 1]])
-
 
 Cameras = Mapping[int, RotatingCamera]
 

@@ -14,8 +14,14 @@ import numpy as np
 from ..._shared.errors import OptionError, RegistrationError
 from ..._shared.machine import require_memory
 from ..._shared.opencv import cv2
+from ...geometry.camera import Camera
 from ...geometry.images import downscale
-from ...geometry.transforms import scaled_homography, transform_points, translation_matrix
+from ...geometry.transforms import (
+    outer_corners,
+    scaled_homography,
+    transform_points,
+    translation_matrix,
+)
 from .bundle_adjustment import Cameras, Matrices, Sizes
 
 Box = tuple[int, int, int, int]
@@ -107,7 +113,7 @@ def plan_plane(
             )
     placed = {number: scaled_homography(matrix, 1, scale) for number, matrix in placed.items()}
     # A pixel belongs to an image when its centre does.
-    edges = {n: transform_points(_edges(sizes[n]), matrix) for n, matrix in placed.items()}
+    edges = {n: transform_points(outer_corners(sizes[n]), matrix) for n, matrix in placed.items()}
     low = np.ceil(np.min([edge.min(0) for edge in edges.values()], axis=0))
     boxes = {}
     for number, edge in edges.items():
@@ -159,7 +165,8 @@ def plan_curved(
         radius = turn * canvas_scale / (2 * np.pi)
         middle = round((angles[number] - start) % (2 * np.pi) * radius)
         ahead = cv2.Rodrigues(np.array([0, -middle / radius - start, 0]))[0]
-        matrices = cameras[number].intrinsics(sizes[number]), ahead @ cameras[number].rotation
+        camera = cameras[number]
+        matrices = Camera(sizes[number], camera.focal_px).matrix, ahead @ camera.rotation
         arguments = sizes[number], *(matrix.astype(np.float32) for matrix in matrices)
         return cv2.PyRotationWarper(projection, radius), arguments, middle
 
@@ -231,12 +238,6 @@ def _downscaled(rgb: np.ndarray, shown: float) -> tuple[np.ndarray, float]:
     return downscale(rgb, max(16, int(np.ceil(shown * max(rgb.shape[:2])))))
 
 
-def _edges(size: tuple[int, int]) -> np.ndarray:
-    """Return the outer corners of an image, half a pixel beyond the outermost centres; (4, 2)."""
-    right, bottom = size[0] - 0.5, size[1] - 0.5
-    return np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]])
-
-
 def _depths(size: tuple[int, int], homography: np.ndarray) -> np.ndarray:
     """Return how far before the camera of the frame the corners of an image lie, (4,).
 
@@ -245,4 +246,4 @@ def _depths(size: tuple[int, int], homography: np.ndarray) -> np.ndarray:
     """
     # Matrices are known but for a factor; rotations do not mirror.
     matrix = homography / np.cbrt(np.linalg.det(homography))
-    return _edges(size) @ matrix[2, :2] + matrix[2, 2]
+    return outer_corners(size) @ matrix[2, :2] + matrix[2, 2]

@@ -13,6 +13,7 @@ from ..._shared.image_array import Channels, to_8_bits
 from ..._shared.options import check_ranges, suggest_keywords, whole
 from ..._shared.progress import StageTimer
 from ...detector.detector import AnyDetector, DeepDetect
+from ...geometry.camera import Camera
 from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography, translation_matrix
 from ...io.image import load_deep
@@ -243,7 +244,7 @@ def _plan(
         for number, one in level_cameras(registration.cameras, reference).items()
     }
     rays = {
-        number: one.rotation @ np.linalg.inv(one.intrinsics(sizes[number]))
+        number: one.rotation @ np.linalg.inv(Camera(sizes[number], one.focal_px).matrix)
         for number, one in cameras.items()
     }
     homographies = {n: np.linalg.inv(rays[reference]) @ ray for n, ray in rays.items()}
