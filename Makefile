@@ -1,11 +1,7 @@
 # Set-up, demonstration, tests. All of it happens in .venv, with the versions of requirements/lock.txt.
 PYTHON ?= python3
 VENV ?= .venv
-VENV_OPENCV4 ?= .venv-opencv4
-VENV_LOWEST ?= .venv-lowest
-VENV_RAY ?= .venv-ray
-VENV_INTEGRATIONS ?= .venv-integrations
-VENV_DOCS ?= .venv-docs
+OTHER_VENVS := $(patsubst %,.venv-%,opencv4 lowest ray integrations docs)
 DEMO_OUTPUT ?= demo-output
 DATA ?= data
 # What installs the lock files: uv is eight times as fast as pip, which does the same.
@@ -47,7 +43,7 @@ install_torch = $(1)/bin/python -m pip install $(PIP_FLAGS) --no-compile -r requ
 install_package = $(call install,$(1)) --no-deps --no-build-isolation --editable .
 
 .PHONY: demo test test-all fuzz onnxruntime test-opencv4 test-ray test-integrations test-lowest web test-web coverage hub lint spelling types contracts check \
-	format lock upgrade check-lock audit sbom docs test-docs notebooks figures results dist release-check clean
+	format lock upgrade check-lock audit sbom docs test-docs notebooks figures results release-check clean
 
 demo: $(VENV)/.demo
 	$(VENV)/bin/deepdetect demo -o $(DEMO_OUTPUT)
@@ -71,20 +67,20 @@ onnxruntime: $(VENV)/.test
 	bash examples/onnx_cpp/get_onnxruntime.sh $(VENV)/onnxruntime $(VENV)/bin/python || \
 		echo "ONNX Runtime's headers cannot be fetched: the C++ example is not tested"
 
-test-opencv4: $(VENV_OPENCV4)/.test
-	$(VENV_OPENCV4)/bin/python $(PYTEST) -p no:cacheprovider $(TESTS_OPENCV4)
+test-opencv4: .venv-opencv4/.test
+	.venv-opencv4/bin/python $(PYTEST) -p no:cacheprovider $(TESTS_OPENCV4)
 
 # Collections on a cluster of this machine.
-test-ray: $(VENV_RAY)/.test
-	$(VENV_RAY)/bin/python -m pytest -p no:cacheprovider --runslow tests/batch tests/detector/test_detector.py
+test-ray: .venv-ray/.test
+	.venv-ray/bin/python -m pytest -p no:cacheprovider --runslow tests/batch tests/detector/test_detector.py
 
 # Drop-ins for other programs, with these installed.
-test-integrations: $(VENV_INTEGRATIONS)/.test
-	$(VENV_INTEGRATIONS)/bin/python $(PYTEST) -p no:cacheprovider tests/integrations
+test-integrations: .venv-integrations/.test
+	.venv-integrations/bin/python $(PYTEST) -p no:cacheprovider tests/integrations
 
 # The lowest versions that pyproject.toml allows, but for torch.
-test-lowest: $(VENV_LOWEST)/.test
-	$(VENV_LOWEST)/bin/python $(PYTEST) -p no:cacheprovider $(TESTS_LOWEST)
+test-lowest: .venv-lowest/.test
+	.venv-lowest/bin/python $(PYTEST) -p no:cacheprovider $(TESTS_LOWEST)
 
 # The page for any web server, with ONNX Runtime, the network and the graph of the points, in web/dist.
 web: web/node_modules/.package-lock.json $(VENV)/.test
@@ -139,16 +135,16 @@ sbom: $(VENV)/bin/uv
 		--pyproject pyproject.toml --output-format JSON --output-reproducible --output-file sbom.json
 
 # The site, in build/site; what is wrong with a link or a docstring ends it.
-docs: $(VENV_DOCS)/.test
-	NO_MKDOCS_2_WARNING=1 $(VENV_DOCS)/bin/mkdocs build
+docs: .venv-docs/.test
+	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build
 
 # The site asks for nothing on other servers, and the notebooks run: five minutes on two cores.
-test-docs: $(VENV_DOCS)/.notebooks
-	$(VENV_DOCS)/bin/python -m pytest -p no:cacheprovider --runslow tests/docs
+test-docs: .venv-docs/.notebooks
+	.venv-docs/bin/python -m pytest -p no:cacheprovider --runslow tests/docs
 
 # Runs the notebooks and keeps their output.
-notebooks: $(VENV_DOCS)/.notebooks
-	$(VENV_DOCS)/bin/python docs/notebooks/run.py
+notebooks: .venv-docs/.notebooks
+	.venv-docs/bin/python docs/notebooks/run.py
 
 # Draws the pictures of the README, of docs/method.md and of docs/points.md again.
 figures: $(VENV)/.test
@@ -169,17 +165,13 @@ hub: $(VENV)/.test
 	rm -rf dist/hub
 	$(VENV)/bin/python tools/hub.py dist/hub
 
-dist: $(VENV)/.test
-	rm -rf dist
-	$(VENV)/bin/python -m build --no-isolation
-
 # The wheel and the source archive are made, looked at, and installed without a network into empty
 # environments of each Python that is here. With VERSION=0.2.0 all files must name this version.
-release-check: $(VENV_DOCS)/.test
-	$(VENV_DOCS)/bin/python .ci/check_release.py $(if $(VERSION),--version $(VERSION))
+release-check: .venv-docs/.test
+	.venv-docs/bin/python .ci/check_release.py $(if $(VERSION),--version $(VERSION))
 
 clean:
-	rm -rf $(VENV) $(VENV_OPENCV4) $(VENV_LOWEST) $(VENV_RAY) $(VENV_INTEGRATIONS) $(VENV_DOCS) $(DEMO_OUTPUT)
+	rm -rf $(VENV) $(OTHER_VENVS) $(DEMO_OUTPUT)
 	rm -rf web/dist web/node_modules web/points.onnx web/test-results
 	rm -rf build dist sbom.json htmlcov .coverage .coverage.* .pytest_cache .ruff_cache .mypy_cache .import_linter_cache
 
@@ -203,36 +195,16 @@ $(VENV)/.test: $(VENV)/bin/uv requirements/lock.txt requirements/torch.txt pypro
 	$(call install_package,$(VENV))
 	@touch $(VENV)/.demo $@
 
-$(VENV_OPENCV4)/.test: $(VENV_OPENCV4)/bin/uv requirements/opencv4.txt pyproject.toml
-	$(call install_locked,$(VENV_OPENCV4),requirements/opencv4.txt)
-	$(call install_package,$(VENV_OPENCV4))
-	@touch $@
-
-$(VENV_LOWEST)/.test: $(VENV_LOWEST)/bin/uv requirements/lowest.txt requirements/torch.txt pyproject.toml
-	$(call install_locked,$(VENV_LOWEST),requirements/lowest.txt)
-	$(call install_torch,$(VENV_LOWEST))
-	$(call install_package,$(VENV_LOWEST))
-	@touch $@
-
-$(VENV_RAY)/.test: $(VENV_RAY)/bin/uv requirements/ray.txt pyproject.toml
-	$(call install_locked,$(VENV_RAY),requirements/ray.txt)
-	$(call install_package,$(VENV_RAY))
-	@touch $@
-
-$(VENV_INTEGRATIONS)/.test: $(VENV_INTEGRATIONS)/bin/uv requirements/integrations.txt requirements/torch.txt pyproject.toml
-	$(call install_locked,$(VENV_INTEGRATIONS),requirements/integrations.txt)
-	$(call install_torch,$(VENV_INTEGRATIONS))
-	$(call install_package,$(VENV_INTEGRATIONS))
-	@touch $@
-
-$(VENV_DOCS)/.test: $(VENV_DOCS)/bin/uv requirements/docs.txt pyproject.toml
-	$(call install_locked,$(VENV_DOCS),requirements/docs.txt)
-	$(call install_package,$(VENV_DOCS))
+# An environment for each of the other lock files.
+$(OTHER_VENVS:%=%/.test): .venv-%/.test: .venv-%/bin/uv requirements/%.txt requirements/torch.txt pyproject.toml
+	$(call install_locked,.venv-$*,requirements/$*.txt)
+	$(if $(filter lowest integrations,$*),$(call install_torch,.venv-$*))
+	$(call install_package,.venv-$*)
 	@touch $@
 
 # The notebooks also map and train.
-$(VENV_DOCS)/.notebooks: $(VENV_DOCS)/.test requirements/lock.txt requirements/torch.txt
-	$(call install_locked,$(VENV_DOCS),requirements/lock.txt)
-	$(call install_torch,$(VENV_DOCS))
-	$(call install_package,$(VENV_DOCS))
+.venv-docs/.notebooks: .venv-docs/.test requirements/lock.txt requirements/torch.txt
+	$(call install_locked,.venv-docs,requirements/lock.txt)
+	$(call install_torch,.venv-docs)
+	$(call install_package,.venv-docs)
 	@touch $@

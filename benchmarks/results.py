@@ -35,7 +35,8 @@ CELL = re.compile(r"(<!-- result:(.*?) -->)[^<]*(<!-- /result -->)")
 
 BENCHMARK = "-m deepdetect dev benchmark {} --data {{data}} -o {{output}}"
 PEERS = ("xfeat_2048_600x800", "edgepoint2_t32", "edgepoint2_e64")
-XFEAT, _, E64 = (f" --method {{published}}/peers/{name}.onnx" for name in PEERS)
+METHODS = [f" --method {{published}}/peers/{name}.onnx" for name in PEERS]
+XFEAT, _, E64 = METHODS
 PAGES = [
     page
     for folder in (".", "docs", "src/deepdetect/detector/weights")
@@ -72,11 +73,9 @@ STAGES = {
     "disparity": "benchmarks/row_matching.py {data}/middlebury",
     "motorcycle": "benchmarks/motorcycle_matching.py",
     "costs": "benchmarks/costs.py {data}/fountain/0004.jpg {data}/fountain/0005.jpg",
-    "times": "benchmarks/times.py {data} --cache {output}/cache"
-    + "".join(f" --method {{published}}/peers/{name}.onnx" for name in PEERS),
+    "times": "benchmarks/times.py {data} --cache {output}/cache" + "".join(METHODS),
     "published-pipeline": "benchmarks/published_pipeline.py {data}",
-    "descriptors": "benchmarks/descriptors.py {data}"
-    + "".join(f" --method {{published}}/peers/{name}.onnx" for name in PEERS),
+    "descriptors": "benchmarks/descriptors.py {data}" + "".join(METHODS),
     "fuzz": "-m fuzz",
     "mappers": "benchmarks/mappers.py",
     "match-filter": "benchmarks/match_filter.py {data}",

@@ -11,7 +11,6 @@ Exit code 1 where anything but "right" and "refused" came of an input.
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from pathlib import Path
 
@@ -33,7 +32,6 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--show", type=int, default=5, help="defects to print of each target")
     parser.add_argument("--input", type=int, help="number of one input to repeat here")
-    parser.add_argument("--json", type=Path, help="write all findings")
     arguments = parser.parse_args()
     names = arguments.only or [*TARGETS, "kills"]
     if arguments.input is not None:
@@ -62,9 +60,6 @@ def main() -> None:
             row = rows[name]
             print(f"| {name} | " + " | ".join(str(row[column]) for column in KILL_COLUMNS) + " |")
             bad += row["unreadable"] + row["rerun differs"]
-    if arguments.json:
-        values = {name: {"counts": f.counts, "defects": f.defects} for name, f in findings.items()}
-        arguments.json.write_text(json.dumps(values, indent=1) + "\n")
     raise SystemExit(bool(bad))
 
 

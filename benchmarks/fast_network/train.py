@@ -7,8 +7,8 @@ weights are an exponential average: the recipe of `deepdetect train` without fil
 prints steps, images' worth of 480x480, seconds, rate, loss, BCE and IoU of every fourth
 photograph of the validation in normal light and darkened, and the views made so far.
 
-The weights `default` are those of two runs on 2,705 photographs (29,703 views), `fast.csv` is their
-curve. (Their first kernels were trained as 3x3 of the four pixels of each 2x2, which is the same,
+The weights `default` are those of two runs on 2,705 photographs (29,703 views).
+(Their first kernels were trained as 3x3 of the four pixels of each 2x2, which is the same,
 and their thresholds with the other sign.) The first, 5,400 s of one thread (AMD EPYC with bfloat16,
 beside other work), began with weights of the network before, which had a convolution at a quarter
 of the size in place of one at half of it (60c01c10, 465 s of a third of an NVIDIA H100, from random

@@ -66,7 +66,6 @@ class VisualOdometry:
         self._before: list[tuple[np.ndarray, np.ndarray]] = []  # paths that were lost
         self._points = np.empty((0, 3))  # by the number of the track, NaN where it has none
         self._strikes = np.empty(0, np.int64)
-        self._pose = self._motion = pycolmap.Rigid3d()
 
     def update(self, frame: TrackedFrame) -> bool:
         """Estimate the pose of the next frame; return whether it has one.

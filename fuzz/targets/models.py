@@ -20,12 +20,6 @@ from ..mutations import mutate
 from .images import scene
 
 
-@prepared
-def expected_map() -> np.ndarray:
-    """Return the heat map of the weights as they are."""
-    return DeepDetect(backend="onnxruntime").heatmap(scene())
-
-
 def onnx(generator: np.random.Generator, folder: Path) -> None:
     """Run a damaged ONNX file."""
     path = folder / "weights.onnx"

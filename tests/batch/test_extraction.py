@@ -18,6 +18,7 @@ from deepdetect.batch import extract_features
 from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.features.sift import root_sift_descriptors
 from deepdetect.io.image import luma
+from deepdetect.viz.draw import save_picture
 
 FEW, PIXELS = PointDetector(50), SelectionOptions(max_keypoints=50)
 
@@ -216,3 +217,18 @@ def test_a_killed_run_goes_on(
     assert not parts.exists()
     extract_features(folder, tmp_path / "whole.h5", PointDetector(500), workers=2)
     assert same_content(tmp_path / "f.h5", tmp_path / "whole.h5")
+
+
+def test_positions_are_as_uncertain_as_the_network_sees_them(
+    tmp_path: Path, photo: np.ndarray
+) -> None:
+    """hloc's `uncertainty` is the larger side of a pixel of the image that a model was given."""
+    import h5py
+
+    (tmp_path / "photos").mkdir()
+    save_picture(photo[:96, :160], tmp_path / "photos" / "a.png")
+    for resolution, expected in ((64, 2.5), ("auto", 1), ("native", 1)):
+        detector, file = DeepDetect(resolution=resolution), tmp_path / f"{resolution}.h5"
+        extract_features(tmp_path / "photos", file, detector, workers=1)
+        with h5py.File(file, "r", libver="latest") as opened:
+            assert opened["a.png"]["keypoints"].attrs["uncertainty"] == expected

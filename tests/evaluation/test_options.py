@@ -26,7 +26,6 @@ def options(edge_detector: DeepDetect) -> BenchmarkOptions:
         ({"classical": ("fast", "fast_low")}, "'fast-low'"),
         ({"channels": "bgrr"}, "'bgr'"),
         ({"protocols": ("paper", "standart")}, "'standard'"),
-        ({"degraded_images": "seconds"}, "'second'"),
         ({"max_images": 2}, "max_images"),
         ({"geometry_weights": ("a/model.onnx", "b/model.onnx")}, "rename"),
     ],

@@ -72,22 +72,3 @@ def test_scales_and_angles_are_as_kornia_makes_them_of_frames(views: Views) -> N
     assert torch.allclose(features["scales"], feature.get_laf_scale(lafs)[..., 0, 0] / 6)
     turned = torch.deg2rad(feature.get_laf_orientation(lafs)[..., 0]) + features["oris"]
     assert torch.allclose(torch.cos(turned), torch.ones(1), atol=1e-5)
-
-
-def test_lightglue_runs_on_our_points(views: Views) -> None:
-    """Wiring only: without its weights, which are not ours, the matches mean nothing."""
-    feature = pytest.importorskip("kornia.feature", reason="needs kornia")
-    torch.manual_seed(0)
-    matcher = feature.LightGlue(
-        None, input_dim=128, add_scale_ori=True, n_layers=2, filter_threshold=0.0
-    ).eval()
-    extractor = lightglue.DeepDetectExtractor(PointDetector(60, descriptor="rootsift"))
-    features = [extractor.extract(tensor(image)) for image in (views.first, views.second)]
-    with torch.inference_mode():
-        found = matcher({"image0": features[0], "image1": features[1]})
-    assert found["matches0"].shape == (1, 60)
-    assert found["log_assignment"].shape == (1, 61, 61)
-    assert found["log_assignment"].isfinite().all()
-    rows0, rows1 = found["matches"][0].T
-    assert len(rows0) > 0
-    assert int(max(rows0.max(), rows1.max())) < 60

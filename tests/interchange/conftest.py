@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -54,21 +53,3 @@ def fountain_collection(fountain: Path) -> Collection:
     """Their keypoints and matches, all pairs."""
     pytest.importorskip("h5py", reason="needs h5py")
     return match_folder(fountain, PointDetector(1500), workers=1)
-
-
-@pytest.fixture(scope="session")
-def map_database() -> Callable[[Path, Path, Path], object]:
-    """Map a database by COLMAP, and return the largest model."""
-    pytest.importorskip("pycolmap", reason="needs pycolmap")
-    from deepdetect.sfm.colmap import quiet_pycolmap
-
-    def run(database: Path, photographs: Path, folder: Path) -> object:
-        folder.mkdir(parents=True)
-        with quiet_pycolmap() as pycolmap:
-            options = pycolmap.IncrementalPipelineOptions()
-            options.random_seed = 0
-            options.min_model_size = 3
-            models = pycolmap.incremental_mapping(database, photographs, folder, options)
-        return max(models.values(), key=lambda model: model.num_reg_images())
-
-    return run

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.ExifTags import Base
 
 from deepdetect import ImageError, Keypoints, OptionError, PointDetector
 from deepdetect.features.sift import describe_keypoints
@@ -12,7 +13,7 @@ from deepdetect.interchange import Collection, PairMatches, describe_collection
 from deepdetect.interchange.collection import check_upright
 from deepdetect.interchange.colmap import write_colmap_text
 from deepdetect.interchange.hloc import write_hloc
-from deepdetect.io.image import ORIENTATION_TAG, luma
+from deepdetect.io.image import luma
 from deepdetect.sfm.colmap import sift_bytes
 
 
@@ -88,11 +89,13 @@ def test_the_file_of_the_matches_replaces_no_other(small_collection, tmp_path) -
 def test_photographs_that_exif_turns(tmp_path: Path, one_line) -> None:
     """They are refused where a reader would take their size from the file, as it is stored."""
     exif = Image.Exif()
-    exif[ORIENTATION_TAG] = 8
+    exif[Base.Orientation] = 8
     Image.new("RGB", (20, 10)).save(tmp_path / "turned.jpg", exif=exif)
     Image.new("RGB", (20, 10)).save(tmp_path / "upright.jpg")
     (tmp_path / "broken.jpg").write_bytes(b"no image")
-    others = [tmp_path / "upright.jpg", tmp_path / "broken.jpg"]
+    exif[Base.Orientation] = 0  # what some cameras write, and turns nothing
+    Image.new("RGB", (20, 10)).save(tmp_path / "unset.jpg", exif=exif)
+    others = [tmp_path / f"{name}.jpg" for name in ("upright", "broken", "unset")]
     check_upright(others)
     with pytest.raises(OptionError) as caught:
         check_upright([*others, tmp_path / "turned.jpg"])

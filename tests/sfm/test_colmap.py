@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -26,21 +25,17 @@ def test_what_pycolmap_logs_is_not_seen(pycolmap, capfd: pytest.CaptureFixture[s
     with quiet_pycolmap() as found:
         assert found is pycolmap
         found.logging.warning("quiet")
-        print("a bar", file=sys.stderr)
     pycolmap.logging.warning("loud again")
     shown = capfd.readouterr().err
     assert "quiet" not in shown
-    assert "a bar" in shown
     assert "loud again" in shown
 
 
-def test_errors_leave_standard_error_as_it_was(pycolmap, capfd: pytest.CaptureFixture[str]) -> None:
-    before = sys.stderr
+def test_after_an_error_it_logs_again(pycolmap) -> None:
+    before = pycolmap.logging.minloglevel
     with pytest.raises(ZeroDivisionError), quiet_pycolmap():
         raise ZeroDivisionError
-    assert sys.stderr is before
-    print("still there", file=sys.stderr)
-    assert "still there" in capfd.readouterr().err
+    assert pycolmap.logging.minloglevel == before
 
 
 def write(folder: Path, name: str, focal_35mm: int | None) -> None:
@@ -102,7 +97,6 @@ def test_a_known_camera_keeps_its_numbers(pycolmap) -> None:
     assert (theirs.principal_point_x, theirs.principal_point_y) == (310.5, 250.5)
     assert theirs.has_prior_focal_length
     xy = np.array([[3.0, 4.0]])
-    assert own.to_pinhole(xy) is not None
     np.testing.assert_array_equal(own.from_pinhole(own.to_pinhole(xy)), xy)
 
 

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect._shared.errors import OptionError
 from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.geometry.point_cloud import PointCloud
 from deepdetect.viz.draw import CAPTION_HEIGHT
@@ -149,11 +148,3 @@ def test_all_clouds_are_seen_by_one_camera(photo: np.ndarray, flat_cloud: PointC
     assert columns.min() > 100
     inside = (slice(rows.min() + 5, rows.max() - 5), slice(columns.min() + 5, columns.max() - 5))
     assert np.abs(few[inside].astype(int) - full[inside]).mean() < 3
-
-
-def test_nothing_to_draw_is_an_error(photo: np.ndarray, flat_cloud: PointCloud) -> None:
-    with pytest.raises(OptionError, match="no cloud has a point"):
-        draw_clouds(photo, {"ours": flat_cloud[:0]})
-    other = PointCloud(flat_cloud.points, flat_cloud.colors, "baseline")
-    with pytest.raises(OptionError, match="one unit"):
-        draw_clouds(photo, {"ours": flat_cloud, "theirs": other})

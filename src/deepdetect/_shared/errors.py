@@ -121,7 +121,6 @@ WITHOUT_GPU = (
 """How pip takes the build of torch for processors; on Linux it takes that for CUDA otherwise."""
 
 DISTRIBUTIONS = {
-    "cv2": "opencv-python-headless",
     "hloc": "git+https://github.com/cvg/Hierarchical-Localization",
     "lightning_fabric": "lightning-fabric",
     "ray": "'ray[data]'",

@@ -27,8 +27,6 @@ FOLDER = ".deepdetect"
 
 ADVICE = "choose another place with -o, or replace it with --overwrite"
 
-Arrays = Mapping[str, np.ndarray]
-
 
 def key(*values: Any) -> str:
     """Return 32 hexadecimal digits of values, the same in every process and on every machine.

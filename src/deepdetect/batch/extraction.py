@@ -6,7 +6,6 @@ https://github.com/cvg/Hierarchical-Localization stores them so; its pixels are 
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -20,7 +19,7 @@ from .._shared.errors import noted_failures
 from .._shared.options import suggest_keywords
 from .._shared.records import file_state
 from ..detector.detector import DeepDetect, check_selection, find_keypoints
-from ..detector.heatmap import MAX_AUTO_PIXELS
+from ..detector.heatmap import HeatmapOptions, seen_size
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import UNSET_ANGLE, Keypoints, unit_length
 from ..features.selection import SelectionOptions
@@ -140,8 +139,8 @@ def _extract(
             else:
                 keypoints = describe_keypoints(gray, keypoints)
             # Of a pixel of the image that they were found on.
-            scaled = detector.settings["resolution"] != "native" and gray.size > MAX_AUTO_PIXELS
-            uncertainty = math.sqrt(gray.size / MAX_AUTO_PIXELS) if scaled else 1.0
+            seen = seen_size(gray.shape, HeatmapOptions(detector.settings["resolution"]))
+            uncertainty = max(gray.shape[1] / seen[0], gray.shape[0] / seen[1])
             column, row = np.rint(keypoints.xy).astype(np.int64).T
             group = feature_group(name, keypoints, state, uncertainty)
             counts[name] = len(keypoints)

@@ -20,7 +20,7 @@ from cyclopts import Parameter
 
 from .._shared.atomic import atomic_path
 from .._shared.errors import BatchError, DeepDetectError, OptionError
-from .._shared.progress import STDERR
+from .._shared.progress import say as say
 from .._shared.records import Outputs, inputs_of
 from .._shared.signals import exit_by_signal, handle_signals
 from ..io.image import load_image, name_images
@@ -221,7 +221,7 @@ def expand_images(paths: Sequence[Path], output: Path) -> dict[str, Path]:
     kept = []
     for path in paths:
         if given & {*inputs_of(path)}:  # as where all *.jpg are named
-            note(f"{path} was made of others of the images, and is left out")
+            say(f"{path} was made of others of the images, and is left out")
         else:
             kept.append(path)
     return name_images(kept, [output])
@@ -274,11 +274,6 @@ def writing(
     check_outputs(files.values(), inputs)
     with claimed(Outputs([*files.values()], inputs, overwrite=overwrite)), whole(files) as made:
         yield made
-
-
-def note(text: str) -> None:
-    """Print a line to standard error."""
-    print(text, file=STDERR)
 
 
 def headed(sentence: str, values: Mapping[str, Any], names: str) -> str:

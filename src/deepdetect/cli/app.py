@@ -8,9 +8,10 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from .._shared.errors import require_packages
+from .._shared.progress import say
 from .._shared.signals import endings_interrupt
 from ..app.jobs import AppOptions
-from ._options import From, command, note
+from ._options import From, command
 
 
 @command(From(AppOptions, "port"), prints=False)
@@ -35,9 +36,9 @@ def app(
     with endings_interrupt(), AppServer(AppOptions(**values)) as server:
         try:
             print(f"DeepDetect is at {server.address}", flush=True)
-            note("Ctrl+C ends it.")
+            say("Ctrl+C ends it.")
             if open_browser:
                 webbrowser.open(server.address)
             server.serve_forever()
         except KeyboardInterrupt:
-            note("deepdetect: ended; nothing was kept")
+            say("deepdetect: ended; nothing was kept")

@@ -66,7 +66,7 @@ def detect(
     cli.check_outputs([file for files in outputs.values() for file in files.values()], paths)
     mask = None if ignore is None else load_mask(ignore)
     if detector == "network" and "max_keypoints" in values:
-        cli.note("these are the best pixels of the heat map: --detector points finds better points")
+        cli.say("these are the best pixels of the heat map: --detector points finds better points")
     work = _Work(*chosen_detector(detector, values), mask, overwrite)
     work.say_what_is_replaced(outputs)
     results: list[dict[str, Any]] = []
@@ -78,7 +78,7 @@ def detect(
             bar.update(1)
     nothing = not failures and not any(result["keypoints"] for result in results)
     if nothing:
-        cli.note("no keypoint was found: the image is uniform, or the options leave none")
+        cli.say("no keypoint was found: the image is uniform, or the options leave none")
     backend = getattr(work.detector, "runtime", None)
     return cli.Result(
         {"backend": backend, "images": results, "failures": failures},
@@ -125,7 +125,7 @@ class _Work:
             names = {"detector"} if "detector" in names else names
             flags = ", ".join("--" + name.replace("_", "-") for name in sorted(names))
             whose = str(changed[0]) if len(changed) == 1 else f"{len(changed)} images"
-            cli.note(f"replacing the results of {whose} with other options ({flags})")
+            cli.say(f"replacing the results of {whose} with other options ({flags})")
 
     def detect(self, path: Path, files: dict[str, Path]) -> dict[str, Any]:
         shown = {"file": files["file"], "pictures": {n: files[n] for n in files if n != "file"}}

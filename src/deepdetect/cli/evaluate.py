@@ -160,7 +160,7 @@ def evaluate_stereo(
     return cli.Result(rows, table.to_markdown(), failures, len(scenes), "scenes")
 
 
-OPTIONS = cli.From(BenchmarkOptions, "degraded_images max_pairs max_images", more="ranker")
+OPTIONS = cli.From(BenchmarkOptions, "max_pairs max_images", more="ranker")
 
 
 @cli.command(OPTIONS, NETWORK)

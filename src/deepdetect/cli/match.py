@@ -132,7 +132,7 @@ def match(
     guided = values.get("guided_matching", True)
     if guided and (unused := [name for name in UNGUIDED_ONLY if name in changes]):
         flags = " and ".join("--" + name.replace("_", "-") for name in unused)
-        cli.note(f"only unguided matching uses {flags}: add --unguided")
+        cli.say(f"only unguided matching uses {flags}: add --unguided")
     stages = _guided_stages(detector) if guided else UNGUIDED_STAGES
     load = functools.lru_cache(2)(load_image)  # pairs that follow each other share one
     found: list[dict[str, Any]] = []
@@ -149,7 +149,7 @@ def match(
                     if pictures:
                         _draw(rgb0, rgb1, matches, made["picture"])
                 if reason := _why_none(matches):
-                    cli.note(f"{name}: {reason}" if many else reason)
+                    cli.say(f"{name}: {reason}" if many else reason)
                 numbers = _numbers(pair, matches, files)
                 found.append(numbers | {"backend": getattr(chosen, "runtime", None)})
             bar.update(1)
@@ -388,10 +388,10 @@ def stitch(
         save_picture(panorama.image, made["file"], kept)
         kept.write_beside(file)
     for number, reason in panorama.unregistered.items():
-        cli.note(f"not in the panorama: {images[number]}, as {reason}")
+        cli.say(f"not in the panorama: {images[number]}, as {reason}")
     if panorama.parallax:
         (first, second), distance = max(panorama.parallax.items(), key=lambda item: item[1])
-        cli.note(
+        cli.say(
             f"{images[first]} and {images[second]} differ by {distance:.0f} pixels along their "
             "seam, since the camera moved: turn it about its lens, or keep away from near things"
         )

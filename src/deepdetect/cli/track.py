@@ -66,7 +66,7 @@ def track(
         report = track_points(source, file, options=options, quiet=False, **frames)
     total = report.frames + len(report.failures)
     if report.expected is not None and total < report.expected:
-        cli.note(f"the file states {report.expected:,} frames, and may be cut off")
+        cli.say(f"the file states {report.expected:,} frames, and may be cut off")
     code = 0 if report.tracks or live else cli.NOTHING_FOUND
     sentence = f"{report.tracks:,} tracks in {report.frames:,} frames"
     names = "tracks_per_frame frames_per_track fps seconds files"

@@ -151,7 +151,7 @@ def train(
     run = RUN.take(values)
     if given := run.pop("init_weights", None):
         run["init_weights"] = given[0] if len(given) == 1 else tuple(given)
-    run |= {"device": DeviceOptions(**DEVICE.take(values)), "log": cli.note}
+    run |= {"device": DeviceOptions(**DEVICE.take(values)), "log": cli.say}
     recipe = chosen_recipe(**values)
     if profiling:
         profiles = [asdict(each) for each in profile(images, output, recipe, **run)]
@@ -184,7 +184,7 @@ def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli
     Args:
         output: Folder of the run.
     """
-    run = {**POINTS_RUN.take(values), "output": output, "log": cli.note}
+    run = {**POINTS_RUN.take(values), "output": output, "log": cli.say}
     result = train_ranker(images, options=PointsTrainingOptions(**values), **run)
     return cli.Result({"weights": result.weights, "best": result.best, "points": result.points})
 
@@ -203,7 +203,7 @@ def train_descriptor(images: Folder, /, *, output: cli.Output, **values: Any) ->
     Args:
         output: Folder of the run.
     """
-    run = {**DESCRIPTOR_RUN.take(values), "output": output, "log": cli.note}
+    run = {**DESCRIPTOR_RUN.take(values), "output": output, "log": cli.say}
     result = train_descriptor_network(images, options=DescriptorTrainingOptions(**values), **run)
     files = {"weights": result.weights, "onnx": result.onnx}
     return cli.Result({**files, "best": result.best, "points": result.points})

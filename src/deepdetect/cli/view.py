@@ -55,5 +55,5 @@ def view(
             )
         shown = found[0]
     if not webbrowser.open(shown.absolute().as_uri()):
-        cli.note(f"no browser was found: open {shown} in one")
+        cli.say(f"no browser was found: open {shown} in one")
     return cli.Result({**numbers, "shown": shown})

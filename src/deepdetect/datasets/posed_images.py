@@ -22,7 +22,7 @@ from .._shared.errors import ImageError, first_line
 from .._shared.opencv import import_pycolmap
 from ..geometry.camera import cross_matrix
 from ..io.gps import read_gps
-from ..io.image import ORIENTATION_TAG
+from ..io.image import UPRIGHT, orientation_of
 from ..io.image_file import open_image
 from .pair_selection import FRAME_DISTANCES, sequence_pairs, unordered_pairs
 
@@ -306,7 +306,7 @@ def _scaled(
 def _image_size(path: Path) -> tuple[int, int]:
     with open_image(path) as opened:
         size: tuple[int, int] = opened.size
-        turned = opened.getexif().get(ORIENTATION_TAG, 1) != 1
+        turned = orientation_of(opened) in UPRIGHT
     if turned:
         raise ImageError(
             f"{path} is to be turned by its EXIF orientation: save it upright without that tag"

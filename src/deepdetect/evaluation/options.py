@@ -48,7 +48,6 @@ class BenchmarkOptions:
         channels: order of the colours in the paper's protocol; "bgr" in the paper's code.
         geometry_weights: the weights for stereo pairs, one or more.
         max_pairs: at most this many pairs of each scene, evenly spaced; the last one if it is one.
-        degraded_images: which images of a pair the protocol "degraded" degrades.
         max_images: at most this many of a scene: of a sequence the first, else evenly spaced.
         ranker: ranker of the points, as for `PointDetector`.
 
@@ -63,7 +62,6 @@ class BenchmarkOptions:
     channels: Literal["rgb", "bgr"] = "rgb"
     geometry_weights: tuple[str | Path, ...] = ("dense",)
     max_pairs: int = 60
-    degraded_images: Literal["second", "both"] = "second"
     max_images: int = 20
     ranker: str | Path | None = None
 
@@ -71,7 +69,6 @@ class BenchmarkOptions:
         check_ranges(self, counts=("max_pairs",), between={"max_images": (3, float("inf"))})
         for name in self.protocols:
             check_name("protocol", name, PROTOCOLS)
-        check_name("choice of images", self.degraded_images, ("second", "both"))
         for name in self.classical:
             check_name("classical baseline", name, BASELINES)
         stems = [Path(weights).stem for weights in self.geometry_weights]

@@ -17,7 +17,7 @@ import numpy as np
 from .._shared.errors import DeepDetectError, OptionError, first_line
 from .._shared.opencv import cv2
 from .._shared.progress import progress
-from .._shared.records import Arrays, file_digest, key, load_arrays, save_arrays
+from .._shared.records import file_digest, key, load_arrays, save_arrays
 from ..features.keypoints import Keypoints
 from ..features.matchers import get_matcher, match_descriptors
 from ..io.image import load_image
@@ -168,7 +168,7 @@ class Run:
         It depends on the values of `depends`, as for `records.key`: of a path on its content.
         """
         path = None
-        kept: Arrays | None = None
+        kept: Mapping[str, np.ndarray] | None = None
         if self.cache is not None:
             path = self.cache / stage / f"{key(stage_versions(stage), depends)}.npz"
             kept = load_arrays(path)

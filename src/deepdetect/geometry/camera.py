@@ -313,6 +313,13 @@ class PosedView:
         """(3,) float64, where the camera stands."""
         return np.asarray(-self.rotation.T @ self.translation)
 
+    def relative_to(self, first: PosedView) -> PosedView:
+        """Return it in the frame of another view: its pose maps from that camera to its own."""
+        rotation = self.rotation @ first.rotation.T
+        return replace(
+            self, rotation=rotation, translation=self.translation - rotation @ first.translation
+        )
+
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return positions (N, 2) in pixels, and depths (N,), of points (N, 3) of the world."""
         seen = np.asarray(points, np.float64) @ self.rotation.T + self.translation

@@ -13,7 +13,7 @@ from .._shared.progress import progress
 from ..batch.pair_list import Pair
 from ..features.keypoints import Keypoints
 from ..features.sift import describe_keypoints
-from ..io.image import ORIENTATION_TAG, load_image, luma
+from ..io.image import UPRIGHT, load_image, luma, orientation_of
 from ..io.image_file import open_image
 
 
@@ -136,7 +136,7 @@ def check_upright(paths: Iterable[Path]) -> None:
     for path in paths:
         try:
             with open_image(path) as image:
-                turned = image.getexif().get(ORIENTATION_TAG, 1) != 1
+                turned = orientation_of(image) in UPRIGHT
         except ImageError:
             continue
         if turned:

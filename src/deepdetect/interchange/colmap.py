@@ -33,7 +33,6 @@ def write_colmap(
     *,
     intrinsics: Mapping[str, CameraIntrinsics],
     verify: bool = True,
-    seed: int = 0,
 ) -> tuple[Path, ...]:
     """Write COLMAP's database, whole or not at all; it is replaced where it exists.
 
@@ -42,7 +41,6 @@ def write_colmap(
         output: ending in .db.
         intrinsics: of the camera of each image; those with the same object share one.
         verify: estimate the two-view geometry of each pair, without which COLMAP maps nothing.
-        seed: seed of this verification.
 
     Returns:
         The file.
@@ -64,7 +62,7 @@ def write_colmap(
         rows = {pair: found.rows for pair, found in collection.matches.items()}
         write_database(temporary, images, rows)
         if verify and rows:
-            verify_pairs(temporary, seed)
+            verify_pairs(temporary)
     return (path,)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -99,7 +98,7 @@ def _tags(image: Any) -> tuple[dict[int, Any], int]:
 
 def _number(value: Any) -> float:
     try:
-        number = float(value) if not isinstance(value, tuple) else float(Fraction(*value))
+        number = float(value)
     except (TypeError, ValueError, ZeroDivisionError):
         return 0.0
     return number if np.isfinite(number) and number > 0 else 0.0

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from ..geometry.camera import PosedView, camera_spacing
-from ..geometry.point_cloud import UNITS, PointCloud, angular_spacing, robust_box
+from ..geometry.point_cloud import UNITS, PointCloud, RobustBox, angular_spacing, robust_box
 
 DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
 """Tangent of half the field of view, and its range."""
@@ -139,14 +139,15 @@ def _description(
         "reach": float(reach),
         "spacing": angular_spacing(cloud),
         "slope": slope,
-        "view": _overview(cloud, lines, slope) if len(lines) else None,
+        "view": _overview(cloud, box, lines, slope) if len(lines) else None,
         "lines": lines.round(6).ravel().tolist(),
     }
 
 
-def _overview(cloud: PointCloud, lines: np.ndarray, slope: float) -> dict[str, object]:
+def _overview(
+    cloud: PointCloud, box: RobustBox, lines: np.ndarray, slope: float
+) -> dict[str, object]:
     """Return the nearest view from behind and above that shows the cloud and all cameras."""
-    box = robust_box(cloud)
     inside = ((cloud.points >= box.low) & (cloud.points <= box.high)).all(axis=1)
     near = cloud.points[inside][:: max(1, int(inside.sum()) // OVERVIEW_POINTS)]
     shown = np.concatenate([near.astype(np.float64), lines])

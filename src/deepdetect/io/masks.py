@@ -11,7 +11,7 @@ from PIL import Image
 
 from .._shared.atomic import atomic_path
 from .image import UPRIGHT, orientation_of
-from .image_file import open_image, reading_options
+from .image_file import open_image
 
 WHITES = (1, 255, 65535)
 """Of masks of 1, 8 and 16 bits, whatever the file has room for."""
@@ -30,14 +30,13 @@ def encode_mask(mask: np.ndarray) -> bytes:
     return content.getvalue()
 
 
-def load_mask(source: Any, *, max_megapixels: float | None = None) -> np.ndarray:
+def load_mask(source: Any) -> np.ndarray:
     """Read a mask of any bit depth as (H, W) bool: True where a pixel is brighter than half.
 
     White is the least of `WHITES` that no pixel is above, else the brightest pixel. The mask is
     turned upright, as by `load_image`. Arguments and errors: see `open_image`.
     """
-    options = reading_options(max_megapixels=max_megapixels)
-    with open_image(source, what="mask", options=options) as opened:
+    with open_image(source, what="mask") as opened:
         deep = opened.mode.startswith("I")  # 16 or 32 bits per pixel
         values = np.asarray(opened if deep else opened.convert("L"))
         values = UPRIGHT.get(orientation_of(opened), np.asarray)(values)

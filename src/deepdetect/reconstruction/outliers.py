@@ -50,13 +50,12 @@ class PointFilterOptions:
 def sor_inliers(
     points: np.ndarray, point_filter: PointFilterOptions = PointFilterOptions()
 ) -> np.ndarray:
-    """Return which points (N, 3) have others around them; those that are not finite have not."""
-    inliers = np.isfinite(points).all(1)
-    if np.count_nonzero(inliers) > 1:
-        distances = mean_neighbor_distances(points[inliers], point_filter.sor_neighbors)
-        limit = distances.mean() + point_filter.sor_std_ratio * distances.std()
-        inliers[inliers] = distances <= limit
-    return inliers
+    """Return which points (N, 3) have others around them."""
+    if len(points) < 2:
+        return np.ones(len(points), bool)
+    distances = mean_neighbor_distances(points, point_filter.sor_neighbors)
+    limit = distances.mean() + point_filter.sor_std_ratio * distances.std()
+    return np.asarray(distances <= limit)
 
 
 def mean_neighbor_distances(points: np.ndarray, neighbors: int) -> np.ndarray:
@@ -79,7 +78,6 @@ def mean_neighbor_distances(points: np.ndarray, neighbors: int) -> np.ndarray:
 
 def disparity_space(points: np.ndarray, focal_px: float, baseline: float = 1.0) -> np.ndarray:
     """Return (N, 3) points as (x, y, weight * disparity) in pixels of the first camera."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        across = points[:, :2] / points[:, 2:] * focal_px
-        disparity = focal_px * baseline / points[:, 2]
+    across = points[:, :2] / points[:, 2:] * focal_px
+    disparity = focal_px * baseline / points[:, 2]
     return np.column_stack([across, SOR_DISPARITY_WEIGHT * disparity])

@@ -10,7 +10,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -64,7 +64,6 @@ def reconstruct(
     selection: SelectionOptions | None = None,
     ignore: np.ndarray | Images | None = None,
     seed: int = 0,
-    disparity: DisparityOptions | Literal["auto"] = "auto",
     point_filter: PointFilterOptions = PointFilterOptions(),
     progress: Callable[[str], object] | None = None,
 ) -> Reconstruction:
@@ -86,7 +85,6 @@ def reconstruct(
             takes every pixel, and `DENSE` disparities; `subpixel` does not apply.
         ignore: as of `match_images`; of a rectified pair only the mask of the left image counts.
         seed: seed of all random choices.
-        disparity: of rectified pairs; "auto": `DENSE` for every pixel, else the strict default.
         point_filter: which points are kept.
         progress: called with the name of each stage when it ends.
 
@@ -132,9 +130,8 @@ def reconstruct(
     if rectified:
         with timer.stage("keypoints"):
             keypoints = find_keypoints(detector, rgb[0], whole, masks[0])
-        if disparity == "auto":
-            every_pixel = selection is not None and selection.density == 1
-            disparity = DENSE if every_pixel else DisparityOptions()
+        every_pixel = selection is not None and selection.density == 1
+        disparity = DENSE if every_pixel else DisparityOptions()
         made = _from_disparities(keypoints, grays, known, disparity, point_filter, timer)
     else:
         with timer.stage("keypoints and matching"):

@@ -209,7 +209,7 @@ def detect_rectification(
     elif on_rows_count < MIN_INLIER_RATIO * best:
         reason = (
             f"only {on_rows_count:,} of {best:,} matches that agree are on the same row in both "
-            f"images (median offset {vertical_offset:+.1f} px)"
+            "images"
         )
     elif spread[2] - spread[0] < MIN_DISPARITY_SPREAD_PX:
         reason = f"all matches on rows have about the same disparity ({spread[1]:.3g} px)"

@@ -334,10 +334,8 @@ def _refine(
 
 def relative_projection(first: PosedView, second: PosedView) -> tuple[np.ndarray, np.ndarray]:
     """Return A (3, 3) and b (3,): the pixel q of inverse depth w is seen at A (q, 1) + w b."""
-    rotation = second.rotation @ first.rotation.T
-    translation = second.translation - rotation @ first.translation
-    matrix = second.camera.matrix
-    return matrix @ rotation @ np.linalg.inv(first.camera.matrix), matrix @ translation
+    moved, matrix = second.relative_to(first), second.camera.matrix
+    return matrix @ moved.rotation @ np.linalg.inv(first.camera.matrix), matrix @ moved.translation
 
 
 def _projections(first: PosedView, others: Sequence[PosedView], back: bool = False) -> np.ndarray:

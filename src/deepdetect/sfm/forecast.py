@@ -19,7 +19,7 @@ from .dense import MAX_SIDE_PX
 from .pair_selection import SIMILAR
 from .stages import MultiViewOptions, Stages, check_images
 
-MIN_IMAGES, MEASURED = 10, 3
+MIN_IMAGES, MEASURED = 30, 3
 """Least images of which it is told, and how many of them are extracted and matched to tell it."""
 
 UNIQUE_SHARE = 0.6

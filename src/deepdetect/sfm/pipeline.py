@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 
@@ -122,12 +121,6 @@ def reconstruct_many(
                 f"it has {count} keypoints: it is black, blurred, or shows nothing with texture"
             )
             del sizes[name]
-    if len(sizes) < MIN_VIEWS:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in [*unregistered.items()][:3])
-        raise ReconstructionError(
-            f"{len(sizes)} of {len(sizes) + len(unregistered)} images can be used, "
-            f"{MIN_VIEWS} are needed: {reasons or 'take more images'}"
-        )
     known: Mapping[str, Camera] = {}
     if calibration is not None:
         known = known_cameras(calibration, sizes)
@@ -137,6 +130,12 @@ def reconstruct_many(
                     f"it is {width}x{height} pixels, and the calibration is for another size"
                 )
         sizes = {name: sizes[name] for name in known}
+    if len(sizes) < MIN_VIEWS:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in [*unregistered.items()][:3])
+        raise ReconstructionError(
+            f"{len(sizes)} of {len(sizes) + len(unregistered)} images can be used, "
+            f"{MIN_VIEWS} are needed: {reasons or 'take more images'}"
+        )
     with timer.stage("matching"):
         matches, alike = stages.match_images(sizes)
     for stage in timer.expected.keys() - timer.seconds:
@@ -253,11 +252,7 @@ def _seen_from(
     """Return the points and cameras in the frame of one of these, as the page shows them."""
     frame = f"camera of {view.name}"
     points = found.cloud.points @ view.rotation.T + view.translation
-    cameras = []
-    for each in found.views.values():
-        rotation = each.rotation @ view.rotation.T
-        moved = each.translation - rotation @ view.translation
-        cameras.append(replace(each, rotation=rotation, translation=moved))
+    cameras = [each.relative_to(view) for each in found.views.values()]
     return PointCloud(points, found.cloud.colors, found.cloud.unit, frame), cameras
 
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from .._shared.errors import OptionError
 from .._shared.opencv import cv2
 from ..geometry.camera import Camera, PosedView
 from ..geometry.point_cloud import (
@@ -80,12 +79,8 @@ def draw_clouds(left: np.ndarray, clouds: Mapping[str, PointCloud], width: int =
 
     All are seen by one camera, which the one with the most points places.
     """
-    if not any(map(len, clouds.values())):
-        raise OptionError("no cloud has a point: there is nothing to draw")
-    if len({cloud.unit for cloud in clouds.values()}) > 1:
-        raise OptionError("clouds in one figure must have one unit: make them with one calibration")
     size = (width, max(1, round(width * left.shape[0] / left.shape[1])))
-    shrinks = width < left.shape[1]
+    shrinks = left.shape[1] > width
     image = cv2.resize(left, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
     panels = [add_caption(image, "left image")]
     camera = orbit_camera(max(clouds.values(), key=len), size=size)

@@ -13,7 +13,12 @@ import pytest
 from scipy.ndimage import map_coordinates
 
 from deepdetect import OptionError, WeightsError
-from deepdetect.evaluation.baselines.external import find_feature, onnx_feature, plugin_feature
+from deepdetect.evaluation.baselines.external import (
+    _maxima,
+    find_feature,
+    onnx_feature,
+    plugin_feature,
+)
 from deepdetect.evaluation.baselines.method import BaselineError
 from deepdetect.evaluation.run import MatchSettings, Run
 from deepdetect.features.sift import root_sift_descriptors
@@ -336,3 +341,13 @@ def test_what_is_no_network_is_said(make: Make, tmp_path: Path, one_line) -> Non
         with pytest.raises(WeightsError) as caught:
             onnx_feature(path)
         assert str(path) in one_line(caught.value)
+
+
+def test_descriptors_are_read_up_to_the_border_of_a_coarse_map() -> None:
+    logits = np.full((64, 96), -9.0, np.float32)
+    logits[59, 91] = 9.0  # beyond the middle of the last cell of 32 pixels
+    values = np.arange(1.0, 13).reshape(2, 2, 3).astype(np.float32)
+    found = _maxima(logits, values)
+    assert found["keypoints"].tolist() == [[91, 59]]
+    corner = values[:, -1, -1]
+    np.testing.assert_allclose(found["descriptors"], [corner / np.linalg.norm(corner)], rtol=1e-6)

@@ -53,9 +53,9 @@ def test_a_copy_is_made_once_and_outside_the_data(pairs: list[PlanarPair], tmp_p
     assert path.stat().st_mtime_ns == made
     newer = degraded_copy(image, dataclasses.replace(one, version=2), tmp_path)
     assert newer != path
-    both = degraded_pair(pairs[0], one, tmp_path, "both")
-    assert (both.first != pairs[0].first, both.second) == (True, path)
-    assert both.homography is pairs[0].homography
+    pair = degraded_pair(pairs[0], one, tmp_path)
+    assert (pair.first, pair.second) == (pairs[0].first, path)
+    assert pair.homography is pairs[0].homography
 
 
 def test_tables_have_scores_and_their_fraction_of_daylight(

@@ -172,8 +172,9 @@ def _maxima(logits: np.ndarray, descriptors: np.ndarray) -> dict[str, np.ndarray
     inner = slice(MAP_BORDER_PX, -MAP_BORDER_PX)
     xy = np.argwhere(peaks[inner, inner])[:, ::-1] + MAP_BORDER_PX
     scale = np.divide(descriptors.shape[:0:-1], logits.shape[::-1])
-    place = (xy + 0.5) * scale - 0.5
-    column, row = np.maximum(np.floor(place), 0).astype(int).T
+    last = np.array(descriptors.shape[:0:-1]) - 1
+    place = np.clip((xy + 0.5) * scale - 0.5, 0, last)
+    column, row = np.floor(np.minimum(place, last - 1)).astype(int).T
     right, below = place.T - (column, row)
     values = sum(
         descriptors[:, row + down, column + aside]

@@ -105,14 +105,7 @@ def relative_pose_errors(
         if not set(pair) <= set(views):
             errors.append(float("inf"))
             continue
-        (rotation, translation), (true_rotation, true_translation) = (
-            _relative_pose(cameras[pair[0]], cameras[pair[1]]) for cameras in (views, truth)
-        )
-        angle = rotation_error(rotation, true_rotation)
-        errors.append(max(angle, translation_error(translation, true_translation)))
+        moved, true = (each[pair[1]].relative_to(each[pair[0]]) for each in (views, truth))
+        angle = rotation_error(moved.rotation, true.rotation)
+        errors.append(max(angle, translation_error(moved.translation, true.translation)))
     return errors
-
-
-def _relative_pose(first: PosedView, second: PosedView) -> tuple[np.ndarray, np.ndarray]:
-    rotation = second.rotation @ first.rotation.T
-    return rotation, np.asarray(second.translation - rotation @ first.translation)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 from ..._shared.records import file_digest
 from ...datasets.degradation import DEGRADATIONS, Degradation, degrade
@@ -40,13 +39,9 @@ TEXT = (
     "Dark and blurred copies of the same images, made in linear light with the same random numbers "
     "every time. In 1/4 or 1/8 of the light white gives 2,500 or 1,250 electrons instead of "
     "10,000; shot noise is Poisson's, reading adds 3 electrons (standard deviation), the result "
-    "has 8 bits. Motion blur has a direction drawn for each image."
+    "has 8 bits. Motion blur has a direction drawn for each image. The second image of each pair "
+    "is degraded, the first is not."
 )
-
-WHICH_TEXT = {
-    "second": "The second image of each pair is degraded, the first is not.",
-    "both": "Both images of each pair are degraded alike, with different noise.",
-}
 
 OVERVIEW_NOTE = (
     f"Score over that of the same pairs in daylight, at {MATCHING_BUDGET:,} keypoints: mutual-NN "
@@ -78,18 +73,12 @@ def degraded_sections(
     if "degraded" not in options.protocols:
         return []
     features = options.standard_features()
-    rows = degraded_rows(run, features, pairs, options.degraded_images)
-    text = (TEXT, WHICH_TEXT[options.degraded_images])
+    rows = degraded_rows(run, features, pairs)
     tables = degraded_tables(features, rows, f"{key}_degraded", f"{title} ({len(pairs)} pairs)")
-    return [Section(f"{title}, dark and blurred", text, tables)]
+    return [Section(f"{title}, dark and blurred", (TEXT,), tables)]
 
 
-def degraded_rows(
-    run: Run,
-    features: Sequence[LocalFeature],
-    pairs: Sequence[PlanarPair],
-    images: Literal["second", "both"] = "second",
-) -> Rows:
+def degraded_rows(run: Run, features: Sequence[LocalFeature], pairs: Sequence[PlanarPair]) -> Rows:
     """Measure all features on all pairs, in daylight and with each degradation.
 
     Returns the rows of `standard.pair_row` with "light" and "daylight", the row of the same pair in
@@ -101,7 +90,7 @@ def degraded_rows(
     def measure(feature: LocalFeature, item: tuple[str, PlanarPair]) -> Row:
         light, pair = item
         if light != DAYLIGHT:
-            pair = degraded_pair(pair, DEGRADATIONS[light], run.files_folder, images)
+            pair = degraded_pair(pair, DEGRADATIONS[light], run.files_folder)
         return {"light": light, "pair": pair.name, **pair_row(run, feature, pair, BUDGETS)}
 
     rows = run.rows("", features, items, measure)
@@ -113,15 +102,9 @@ def degraded_rows(
     ]
 
 
-def degraded_pair(
-    pair: PlanarPair,
-    degradation: Degradation,
-    folder: Path,
-    images: Literal["second", "both"] = "second",
-) -> PlanarPair:
-    """Return a pair whose second image, or both, are degraded copies in a folder."""
-    first = degraded_copy(pair.first, degradation, folder) if images == "both" else pair.first
-    return replace(pair, first=first, second=degraded_copy(pair.second, degradation, folder))
+def degraded_pair(pair: PlanarPair, degradation: Degradation, folder: Path) -> PlanarPair:
+    """Return a pair whose second image is a degraded copy in a folder."""
+    return replace(pair, second=degraded_copy(pair.second, degradation, folder))
 
 
 def degraded_copy(image: Path, degradation: Degradation, folder: Path) -> Path:

@@ -141,11 +141,18 @@ def _sgbm_points(
     Disparities are sought among those of sparse points.
     """
     (rgb0, view0), (rgb1, view1) = one, other
-    rotation = view1.rotation @ view0.rotation.T
-    moved = (view1.translation - rotation @ view0.translation)[:, None]
+    moved = view1.relative_to(view0)
     size, matrices = view0.camera.size, [view.camera.matrix for view in (view0, view1)]
     turn0, turn1, first, second, *_ = cv2.stereoRectify(
-        matrices[0], None, matrices[1], None, size, rotation, moved, flags=0, alpha=-1
+        matrices[0],
+        None,
+        matrices[1],
+        None,
+        size,
+        moved.rotation,
+        moved.translation,
+        flags=0,
+        alpha=-1,
     )
     views = [
         cv2.remap(rgb, *cv2.initUndistortRectifyMap(matrix, None, turn, projection, size, 5), 1)

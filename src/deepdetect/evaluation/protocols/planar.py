@@ -73,7 +73,7 @@ def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
     if len(unrefined) == len(pairs):
         unrefined = ["all pairs"]
         del by_truth["refined"]
-    if unrefined and "standard" in options.protocols:
+    if unrefined and {*options.protocols} - {"paper"}:
         run.skipped.append(
             f"refined homographies of {', '.join(unrefined)}: there is no file H1toKp.refined "
             "(benchmarks/refine_oxford.py makes them); these are evaluated by the published one"
