@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from PIL.ExifTags import Base
 
 from .._shared.errors import ImageError, MissingImageError, OptionError
 from .._shared.image_array import Channels, array_to_rgb, check_channels, deep_values
@@ -38,6 +37,7 @@ Images = list[Any] | tuple[Any, ...] | np.ndarray
 MINIMUM_SIDE = 16
 """Smallest width and height of an image, in pixels."""
 
+ORIENTATION_TAG = 0x0112
 HEADER_BYTES = 26
 """Of a PNG file up to its bits and the type of its colours; `GREY_PNG` is one without alpha."""
 GREY_PNG = 0
@@ -292,7 +292,7 @@ def _deep_png(file: BinaryIO, name: str, options: ReadingOptions, deep: bool) ->
 def orientation_of(image: Any) -> Any:
     """Return the EXIF orientation of a loaded image; a broken tag is ignored."""
     try:
-        return image.getexif().get(Base.Orientation, 1)
+        return image.getexif().get(ORIENTATION_TAG, 1)
     except Exception:  # Pillow's readers raise many kinds
         return 1
 

@@ -11,7 +11,6 @@ import os
 from typing import Any, BinaryIO
 
 import numpy as np
-from PIL.ExifTags import Base
 
 from .._shared.errors import ImageError, MissingExtraError
 from .._shared.image_array import array_to_rgb
@@ -31,7 +30,7 @@ JPEG = (6, 7)
 ALPHA = (1, 2)
 """Extra samples that are no band."""
 
-MAX_SAMPLE_VALUE, NO_DATA = 281, 42113
+ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
 """Tags; the last is of GDAL."""
 
 MAX_BYTES_PER_PIXEL = 256
@@ -80,7 +79,7 @@ def read_tiff(
             return _read_by_pillow(file, stored, page, name, options), 1
         # (separate bands, depth, height, width, bands) to (height, width, bands).
         bands = np.moveaxis(array[:, 0], 0, -1).reshape(*array.shape[2:4], -1)
-        orientation = int(page.tags.valueof(Base.Orientation, 1))
+        orientation = int(page.tags.valueof(ORIENTATION, 1))
         if raw and photometric in (MIN_IS_BLACK, RGB):
             return bands, orientation
         return _to_rgb(bands, page, name, options, deep), orientation

@@ -30,15 +30,19 @@ def test_most_of_what_can_be_matched_is(shared: Path, scene: str, number: int) -
     scenes = load_oxford(shared / "data" / "oxford", "refined")
     pair = next(one for one in scenes if one.name == scene).pairs[number - 2]
     rgb = [load_image(image) for image in (pair.first, pair.second)]
-    found = match_images(*rgb, DeepDetect().configured(HeatmapOptions(480)))
-    assert found.guided
-    places = transform_points(found.keypoints0.xy, pair.homography)
-    size = (rgb[1].shape[1], rgb[1].shape[0])
-    ceiling = np.count_nonzero(nearest_keypoints(places, found.keypoints1.xy, size)[1] < 1)
-    errors = np.linalg.norm(
-        transform_points(found.points0, pair.homography) - found.points1, axis=1
-    )
+    shares, precisions = [], []
+    for seed in range(3):  # of graf they differ by .02
+        found = match_images(*rgb, DeepDetect().configured(HeatmapOptions(480)), seed=seed)
+        assert found.guided
+        places = transform_points(found.keypoints0.xy, pair.homography)
+        size = (rgb[1].shape[1], rgb[1].shape[0])
+        ceiling = np.count_nonzero(nearest_keypoints(places, found.keypoints1.xy, size)[1] < 1)
+        errors = np.linalg.norm(
+            transform_points(found.points0, pair.homography) - found.points1, axis=1
+        )
+        shares.append(np.count_nonzero(errors < 1) / ceiling)
+        precisions.append((errors < 1).mean())
+        assert corner_error(found.matrix, pair.homography, rgb[0].shape[1::-1]) <= 1.5
     share, precision = BARS[scene, number]
-    assert np.count_nonzero(errors < 1) >= share * ceiling
-    assert (errors < 1).mean() >= precision
-    assert corner_error(found.matrix, pair.homography, rgb[0].shape[1::-1]) <= 1.5
+    assert np.median(shares) >= share
+    assert np.median(precisions) >= precision
