@@ -39,8 +39,7 @@ from deepdetect import Keypoints, Matches, PointDetector, match_features
 from deepdetect.datasets.planar import load_hpatches, load_oxford
 from deepdetect.datasets.posed_images import PosedPair, load_posed_scenes
 from deepdetect.evaluation.baselines.external import onnx_feature
-from deepdetect.evaluation.metrics.homography import corner_error
-from deepdetect.evaluation.metrics.pose import pose_auc
+from deepdetect.evaluation.metrics.homography import area_under_curve, corner_error
 from deepdetect.evaluation.protocols.planar import pairs_of
 from deepdetect.evaluation.protocols.pose import ERROR, estimate_pose, pose_errors
 from deepdetect.evaluation.report import Row, Table
@@ -172,7 +171,7 @@ def relative_time(extract: Extract, rgb: np.ndarray) -> float:
 def auc(by_pair: dict[str, list[float]]) -> float:
     """Return the area under the curve of pose errors, a mean over orders of the matches."""
     orders = zip(*by_pair.values(), strict=True)
-    return float(np.mean([pose_auc(list(errors), AUC_DEG) for errors in orders]))
+    return float(np.mean([area_under_curve(list(errors), AUC_DEG) for errors in orders]))
 
 
 def _pose_errors(

@@ -40,21 +40,51 @@ def test_agrees_with_opencv() -> None:
     assert corner_error(homography, np.eye(3), (640, 480)) == pytest.approx(expected)
 
 
-def test_shares_and_areas_of_known_errors() -> None:
+def test_shares_of_known_errors() -> None:
     errors = [0.5, 1.0, 2.0, math.inf]
     assert accuracy_at(errors, 1) == 0.5
-    assert area_under_curve(errors, 1) == pytest.approx(0.5 / 4)
-    assert area_under_curve(errors, 4) == pytest.approx((3.5 + 3 + 2) / 16)
-    assert accuracy_at([], 1) == area_under_curve([], 1) == 0
+    assert accuracy_at([], 1) == 0
+
+
+@pytest.mark.parametrize(
+    ("errors", "threshold", "expected"),
+    [
+        # Under the line from (0, 0) to (2, 1), then at 1 up to 5: 1 + 3 of 5.
+        ([2.0], 5.0, 0.8),
+        # (0, 0), (1, 1/4), (3, 2/4), then level to 4: .125 + .75 + .5 of 4.
+        ([1.0, 3.0, math.inf, math.inf], 4.0, 0.34375),
+        # Level at 0 to 4, as the next point is beyond: the curve is cut, not interpolated.
+        ([6.0, 8.0], 4.0, 0.0),
+        ([0.0, 0.0], 5.0, 1.0),
+        ([math.inf, math.inf], 5.0, 0.0),
+        ([], 5.0, 0.0),
+        # The order is of no importance: (0, 0), (0, 1/3), (10, 2/3), level to 20.
+        ([10.0, math.inf, 0.0], 20.0, (10 * 0.5 + 10 * 2 / 3) / 20),
+    ],
+)
+def test_the_auc_is_that_of_superglue(errors: list[float], threshold: float, expected) -> None:
+    assert area_under_curve(errors, threshold) == pytest.approx(expected)
+
+
+def superglue_auc(errors: np.ndarray, threshold: float) -> float:
+    """The published procedure, written again."""
+    ordered = [0.0, *sorted(errors)]
+    recall = [k / len(errors) for k in range(len(ordered))]
+    last = sum(error < threshold for error in ordered)
+    x, y = [*ordered[:last], threshold], [*recall[:last], recall[last - 1]]
+    steps = zip(x, x[1:], y, y[1:], strict=False)
+    return sum((b - a) * (low + high) / 2 for a, b, low, high in steps) / threshold
 
 
 @given(errors=ERRORS, threshold=st.floats(0.5, 10))
-def test_the_area_is_the_mean_of_the_shares_up_to_the_threshold(
+def test_the_auc_of_many_errors_is_near_the_mean_of_the_shares(
     errors: list[float], threshold: float
 ) -> None:
+    found = area_under_curve(errors, threshold)
+    assert found == pytest.approx(superglue_auc(errors, threshold))
     steps = (np.arange(4000) + 0.5) / 4000 * threshold
     mean = np.mean([accuracy_at(errors, step) for step in steps])
-    assert area_under_curve(errors, threshold) == pytest.approx(mean, abs=1e-3)
+    assert mean - 1e-3 < found < mean + 1 / len(errors) + 1e-3
 
 
 HOMOGRAPHIES = st.builds(

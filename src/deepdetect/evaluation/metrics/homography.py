@@ -95,11 +95,16 @@ def accuracy_at(errors: Sequence[float], threshold: float) -> float:
 
 
 def area_under_curve(errors: Sequence[float], threshold: float) -> float:
-    """Return the mean, over all thresholds up to this one, of the accuracy.
+    """Return the area under the cumulative curve of the errors up to a threshold, over it.
 
-    Each error e under the threshold T adds (T - e) / T: the exact area under the cumulative
-    curve, with no interpolation between errors.
+    As SuperGlue and glue-factory compute it: the curve is drawn with straight lines from (0, 0), so
+    it lies a little higher than the mean of `accuracy_at` up to the threshold.
     """
     if not len(errors):
         return 0.0
-    return float(np.clip(1 - np.asarray(errors) / threshold, 0, None).mean())
+    curve = np.concatenate([[0.0], np.sort(np.asarray(errors, np.float64))])
+    recall = np.arange(len(curve)) / len(errors)
+    under = int(np.searchsorted(curve, threshold))
+    x = np.append(curve[:under], threshold)
+    y = np.append(recall[:under], recall[under - 1])
+    return float(np.trapezoid(y, x) / threshold)

@@ -37,22 +37,6 @@ def translation_error(estimated: np.ndarray, true: np.ndarray) -> float:
     return float(np.degrees(np.arctan2(across, np.dot(estimated, true))))
 
 
-def pose_auc(errors: Sequence[float], threshold: float) -> float:
-    """Return the area under the cumulative curve of the errors up to a threshold, over it.
-
-    As SuperGlue and glue-factory compute it: the curve is drawn with straight lines from (0, 0), so
-    it lies a little higher than `homography.area_under_curve`, whose curve has steps.
-    """
-    if not len(errors):
-        return 0.0
-    curve = np.concatenate([[0.0], np.sort(np.asarray(errors, np.float64))])
-    recall = np.arange(len(curve)) / len(errors)
-    under = int(np.searchsorted(curve, threshold))
-    x = np.append(curve[:under], threshold)
-    y = np.append(recall[:under], recall[under - 1])
-    return float(np.trapezoid(y, x) / threshold)
-
-
 def epipolar_inlier_ratio(
     points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
 ) -> float:
@@ -95,7 +79,7 @@ def camera_errors(
 def relative_pose_errors(
     views: Mapping[str, PosedView], truth: Mapping[str, PosedView]
 ) -> list[float]:
-    """Return the error of each pair's relative pose in degrees, for `pose_auc`.
+    """Return the error of each pair's relative pose in degrees, for `area_under_curve`.
 
     The larger of the angles of the rotation and between the directions of the translation; infinite
     where one of both cameras is missing. It needs no alignment.

@@ -18,11 +18,11 @@ from ...detector.detector import DeepDetect
 from ...matching.pipeline import MatchingOptions, match_images
 from ..baselines.method import LocalFeature
 from ..baselines.opencv import CLASSICAL, STANDARD
+from ..metrics.homography import area_under_curve
 from ..metrics.pose import (
     EPIPOLAR_THRESHOLD_PX,
     POSE_THRESHOLDS_DEG,
     epipolar_inlier_ratio,
-    pose_auc,
     rotation_error,
     translation_error,
 )
@@ -254,7 +254,7 @@ def _of_camera(points: np.ndarray, intrinsics: np.ndarray, camera: np.ndarray) -
 
 
 def _auc(own: Rows, threshold: float) -> float | None:
-    return pose_auc([row[ERROR] for row in own], threshold) if own else None
+    return area_under_curve([row[ERROR] for row in own], threshold) if own else None
 
 
 SUMMARY: Columns = {

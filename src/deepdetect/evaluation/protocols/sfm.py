@@ -31,7 +31,8 @@ from ...sfm.colmap import PIXEL_CENTRE, import_pycolmap, initial_intrinsics, qui
 from ...sfm.mapping import read_sparse_model
 from ...sfm.pipeline import MAX_KEYPOINTS
 from ...sfm.stages import MultiViewOptions, Stages
-from ..metrics.pose import camera_errors, pose_auc, relative_pose_errors
+from ..metrics.homography import area_under_curve
+from ..metrics.pose import camera_errors, relative_pose_errors
 from ..options import BenchmarkOptions
 from ..profiling import peak_memory, run_in_child
 from ..report import Figure, Row, Rows, Section, Table, where
@@ -279,7 +280,7 @@ def camera_table(rows: Rows) -> Table:
             if not scene.located_only:
                 errors = relative_pose_errors(views, truth)
                 for each in POSE_THRESHOLDS_DEG:
-                    line[f"AUC at {each:g}°"] = pose_auc(errors, each)
+                    line[f"AUC at {each:g}°"] = area_under_curve(errors, each)
             if len(views) >= MIN_IMAGES:
                 true = [truth[name] for name in views]
                 centres, rotations, _ = camera_errors(list(views.values()), true)

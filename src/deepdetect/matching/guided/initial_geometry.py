@@ -62,13 +62,18 @@ SIMULATED_SIDE_PX, SIMULATED_KEYPOINTS = 320, 1000
 WINDOW_PX = 16
 """Side of the windows around matches that are correlated."""
 
-MIN_INVERTED = 0.1
-"""Share of the matches with a negative correlation: of visible and infrared light one to nine of
-ten have one, of facades and photographs in other light none of a hundred."""
+MIN_GAIN = 1.2
+"""Tentative matches of cross-modal descriptors per one of the others, for images of two sensors: of
+visible and infrared light 1.5 to 30, of photographs in any light, and of wide pairs, up to 1.17."""
 
-MAX_CROSS_MODAL_LOG10_NFA = -20.0
-"""Of what cross-modal descriptors show: they see the edges of small images, too, which lie in the
-same places, so that noise of 160x120 has -7; visible and infrared light have -33 and less."""
+MIN_INVERTED = 0.05
+"""Fraction of what agrees with their geometry that is dark in one image and bright in the other,
+which says the same; of wide pairs of the clips up to .04 are, by wrong matches."""
+
+MAX_LEARNED_LOG10_NFA, MAX_CROSS_MODAL_LOG10_NFA = -10.0, -22.0
+"""Of what descriptors of a network show: they see the borders of an image, too, which lie in the
+same places. Unrelated photographs have down to -8; by cross-modal descriptors noise of 320x240 has
+down to -20, visible and infrared light -24 and less."""
 
 MAX_MATCHES_TO_SEARCH = 200
 """With fewer that agree with a fundamental matrix, more are searched for along its lines."""
@@ -125,6 +130,10 @@ class InitialGeometry(TwoViewModel):
         nowhere = np.empty((0, 2))
         return replace(self, model="none", matrix=None, points0=nowhere, points1=nowhere)
 
+    def only_below(self, max_log10_nfa: float) -> InitialGeometry:
+        """Return it, or that there is none that can be trusted."""
+        return self if self.log10_nfa < max_log10_nfa else self.untrusted()
+
     def rescaled(self, scale0: float, scale1: float) -> InitialGeometry:
         """Return a geometry of images at other scales as one of the images themselves."""
         assert self.matrix is not None
@@ -170,7 +179,7 @@ def guiding_geometry(
     geometry = estimate_initial_geometry(
         tentative, model, seed, semi_calibrated=False, view_keypoints=SIMULATED_KEYPOINTS // 2
     )
-    return replace(geometry, source=source)
+    return replace(geometry.only_below(MAX_LEARNED_LOG10_NFA), source=source)
 
 
 def _geometry_of_keypoints(
@@ -213,22 +222,22 @@ def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
         first, second = pool.map(describe_learned, *seen, 2 * (CROSS_MODAL,))
     across = find_tentative_matches(*grays, (first, second), max_side_px=COARSE_SIDE_PX)
     tentative, geometry = as_it_is, estimate_initial_geometry(as_it_is, model, seed)
-    cross_modal = len(across.ratios) > len(as_it_is.ratios) and _is_inverted(across)
+    other = estimate_initial_geometry(across, model, seed)
+    cross_modal = other.log10_nfa < min(geometry.log10_nfa, MAX_CROSS_MODAL_LOG10_NFA) and (
+        len(across.ratios) >= MIN_GAIN * len(as_it_is.ratios) or _is_inverted(across, other)
+    )
     if cross_modal:
-        # Wrong matches, as of the clips 25 frames on, have negative correlations, too.
-        other = estimate_initial_geometry(across, model, seed)
-        cross_modal = other.log10_nfa < geometry.log10_nfa
-        if cross_modal:
-            tentative, geometry = across, other
-        if geometry.log10_nfa > MAX_CROSS_MODAL_LOG10_NFA:
-            geometry = geometry.untrusted()
+        tentative, geometry = across, other
+    geometry = geometry.only_below(MAX_LEARNED_LOG10_NFA)
     return replace(geometry, source=tentative, learned=True, cross_modal=cross_modal)
 
 
-def _is_inverted(tentative: TentativeMatches) -> bool:
-    """Whether some of what is bright in one image is dark in the other."""
-    correlations = zncc_at_points(tentative.views, tentative.matched, WINDOW_PX)
-    return bool(np.mean(correlations < 0) > MIN_INVERTED)
+def _is_inverted(tentative: TentativeMatches, geometry: InitialGeometry) -> bool:
+    """Whether some of what agrees with a geometry is dark in one image and bright in the other."""
+    scale0, scale1 = tentative.scales
+    agreeing = scaled_points(geometry.points0, scale0), scaled_points(geometry.points1, scale1)
+    correlations = zncc_at_points(tentative.views, agreeing, WINDOW_PX)
+    return bool(np.mean(correlations < 0) >= MIN_INVERTED)
 
 
 def _learned_matches(grays: Pair, side_px: int, keypoints: int) -> TentativeMatches:

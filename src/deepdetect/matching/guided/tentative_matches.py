@@ -16,7 +16,8 @@ from ...features.learned import is_learned, match_learned
 from ...features.matchers import exact_neighbours, match_descriptors
 from ...features.sift import detect_sift
 from ...geometry.images import downscale
-from ...geometry.transforms import scaled_points
+from ...geometry.transforms import scaled_points, transfer_errors
+from ...geometry.two_view import GUIDING_THRESHOLDS_PX
 
 Pair = tuple[np.ndarray, np.ndarray]
 """Something of both images: themselves, (H, W) uint8 luma, or (M, 2) matched positions."""
@@ -71,6 +72,13 @@ class TentativeMatches:
         """Return the matches from the second image to the first."""
         views, scales, features = self.views[::-1], self.scales[::-1], self.features[::-1]
         return TentativeMatches(views, scales, features, self.matched[::-1], self.ratios)
+
+    def apart_from(self, homography: np.ndarray) -> TentativeMatches:
+        """Return those that do not agree with a homography of the whole images."""
+        errors = transfer_errors(self.points0, self.points1, homography)
+        left = errors > GUIDING_THRESHOLDS_PX["homography"] / self.scales[1]
+        matched = self.matched[0][left], self.matched[1][left]
+        return replace(self, matched=matched, ratios=self.ratios[left])
 
 
 def find_tentative_matches(

@@ -2,11 +2,14 @@
 
 Which images overlap is found with few keypoints. The pairs that do are registered by guided
 matching, whose test by dense keypoints they must pass. The pairs with the most matches make a
-spanning tree; homographies composed along it are the start of a fit to all pairs at once.
+spanning tree; homographies composed along it are the start of a fit to all pairs at once. Pairs
+that overlap by this fit, but not by their keypoints, or disagree with it, are tried again from
+where it puts them, and all are fitted once more.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -20,8 +23,11 @@ from ...detector.point_detector import PointDetector
 from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
 from ...features.sift import describe_keypoints, detect_sift
+from ...geometry.camera import Camera
+from ...geometry.estimation import TwoViewModel
+from ...geometry.transforms import transfer_errors, transform_points
 from ...io.image import luma
-from ..guided import find_tentative_matches, guided_matches
+from ..guided import TentativeMatches, find_tentative_matches, guided_matches
 from ..guided.initial_geometry import InitialGeometry, estimate_initial_geometry
 from .bundle_adjustment import RegisteredPair, RotatingCamera, adjust_cameras, adjust_homographies
 
@@ -33,6 +39,13 @@ MAX_KEYPOINTS = 30_000
 
 MIN_PARTNERS = 3
 """Pairs that each image takes part in, where it has that many, beyond those that connect all."""
+
+MIN_OVERLAP = 0.1
+"""Fraction of the keypoints of either image that the other shows by the fit, for a pair to be tried
+again."""
+
+MAX_DISAGREEMENT_PX = 2.0
+"""Root mean square of what the fit leaves of a pair, above which it is tried again."""
 
 MAX_CORRESPONDENCES = 400
 """Evenly spread matches per pair that the fit of all uses."""
@@ -107,19 +120,37 @@ def register_images(
         for number in other
     }
     pairs = [pair for pair in pairs if pair.first in group]
-    start = _compose(group, pairs)
     sizes = {number: views[number].gray.shape[::-1] for number in group}
-    homographies, residual_px = adjust_homographies(start, pairs, sizes)
+    homographies, cameras, _ = _adjust(group, pairs, sizes, turning)
+    to_common = homographies
+    if cameras is not None:
+        to_common = {
+            n: one.rotation @ np.linalg.inv(Camera(sizes[n], one.focal_px).matrix)
+            for n, one in cameras.items()
+        }
+    pairs = _registered_again(views, to_common, pairs, seed)
+    homographies, cameras, residual_px = _adjust(group, pairs, sizes, turning)
+    if turning and residual_px > MAX_CAMERA_RESIDUAL_PX:
+        raise RegistrationError(
+            f"the cameras of these images did more than turn ({residual_px:.1f} px remain): "
+            "take all from one place, or choose the projection 'plane'"
+        )
+    counts = {(pair.first, pair.second): pair.matches for pair in pairs}
+    return JointRegistration(homographies, cameras, counts, residual_px, unregistered)
+
+
+def _adjust(
+    group: Sequence[int],
+    pairs: Sequence[RegisteredPair],
+    sizes: dict[int, tuple[int, int]],
+    turning: bool,
+) -> tuple[dict[int, np.ndarray], dict[int, RotatingCamera] | None, float]:
+    """Fit all images of a group to their pairs; returns what remains, in pixels, too."""
+    homographies, residual_px = adjust_homographies(_compose(group, pairs), pairs, sizes)
     cameras = None
     if turning:
         cameras, residual_px = adjust_cameras(homographies, pairs, sizes)
-        if residual_px > MAX_CAMERA_RESIDUAL_PX:
-            raise RegistrationError(
-                f"the cameras of these images did more than turn ({residual_px:.1f} px remain): "
-                "take all from one place, or choose the projection 'plane'"
-            )
-    counts = {(pair.first, pair.second): pair.matches for pair in pairs}
-    return JointRegistration(homographies, cameras, counts, residual_px, unregistered)
+    return homographies, cameras, residual_px
 
 
 def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
@@ -138,32 +169,93 @@ def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
 def _registered_pairs(
     views: Sequence[_Image], seed: int, done: Callable[[str], object]
 ) -> list[RegisteredPair]:
-    overlaps: list[tuple[InitialGeometry, int, int]] = []
+    overlaps: list[tuple[InitialGeometry, TentativeMatches, int, int]] = []
     for first, second in combinations(range(len(views)), 2):
         a, b = views[first], views[second]
         tentative = find_tentative_matches(a.gray, b.gray, (a.features, b.features))
         geometry = estimate_initial_geometry(tentative, "homography", seed)
         if geometry.model != "none":
-            overlaps.append((geometry, first, second))
+            overlaps.append((geometry, tentative, first, second))
         done("overlaps")
     overlaps.sort(key=lambda overlap: -len(overlap[0].points0))
     pairs: list[RegisteredPair] = []
     partners = [0] * len(views)
-    for geometry, first, second in overlaps:
+    for geometry, tentative, first, second in overlaps:
         enough = min(partners[first], partners[second]) >= MIN_PARTNERS
         if enough and second in _connected(first, pairs):
             continue
-        a, b = views[first], views[second]
-        keypoints = a.keypoints, b.keypoints
-        guide, matches = guided_matches((a.gray, b.gray), keypoints, geometry, seed)
-        if guide.matrix is not None and matches is not None:
-            points = a.keypoints[matches.indices0]
-            order = np.argsort(bayer_order(points, a.gray.shape[::-1]), kind="stable")
-            spread = points[order[:MAX_CORRESPONDENCES]]
-            pairs.append(RegisteredPair(first, second, guide.matrix, spread, len(points)))
+        pair = None
+        while pair is None and geometry.matrix is not None:
+            pair = _register(views, first, second, geometry, seed)
+            # Where towers or windows look alike, most keypoints can agree on what is wrong.
+            tentative = tentative.apart_from(geometry.matrix)
+            geometry = estimate_initial_geometry(tentative, "homography", seed)
+        if pair is not None:
+            pairs.append(pair)
             partners[first] += 1
             partners[second] += 1
     return pairs
+
+
+def _register(
+    views: Sequence[_Image], first: int, second: int, geometry: InitialGeometry, seed: int
+) -> RegisteredPair | None:
+    a, b = views[first], views[second]
+    keypoints = a.keypoints, b.keypoints
+    guide, matches = guided_matches((a.gray, b.gray), keypoints, geometry, seed)
+    if guide.matrix is None or matches is None:
+        return None
+    points = a.keypoints[matches.indices0]
+    order = np.argsort(bayer_order(points, a.gray.shape[::-1]), kind="stable")
+    spread = points[order[:MAX_CORRESPONDENCES]]
+    return RegisteredPair(first, second, guide.matrix, spread, len(points))
+
+
+def _registered_again(
+    views: Sequence[_Image],
+    to_common: dict[int, np.ndarray],
+    pairs: Sequence[RegisteredPair],
+    seed: int,
+) -> list[RegisteredPair]:
+    """Register pairs that disagree with a fit, or are missing in it, from where it puts them.
+
+    Where towers or windows look alike, or lie along one line, keypoints show wrong homographies,
+    which dense matches refute, or confirm in part; the fit knows them from all other pairs. Of both
+    the one with more matches is returned. Without the pair that closes a turn its ends drift apart.
+    """
+    known = {(pair.first, pair.second): pair for pair in pairs}
+    partners = Counter(number for ends in known for number in ends)
+    result = []
+    for first, second in combinations(sorted(to_common), 2):
+        matrix = np.linalg.inv(to_common[second]) @ to_common[first]
+        pair = known.get((first, second))
+        if pair is None:
+            enough = min(partners[first], partners[second]) >= MIN_PARTNERS
+            ends = (first, second, matrix), (second, first, np.linalg.inv(matrix))
+            shown = [_shown(views[a], views[b], between) for a, b, between in ends]
+            good = enough or min(shown) < MIN_OVERLAP
+        else:
+            expected = transform_points(pair.points, pair.homography)
+            off_px = transfer_errors(pair.points, expected, matrix)
+            good = bool(np.sqrt(np.mean(off_px**2)) < MAX_DISAGREEMENT_PX)
+        if not good:
+            nowhere = np.empty((0, 2))
+            model = TwoViewModel("homography", matrix, np.zeros(0, bool), 0.0)
+            geometry = InitialGeometry.of(model, nowhere, nowhere, "homography")
+            again = _register(views, first, second, geometry, seed)
+            if again is not None and (pair is None or again.matches > pair.matches):
+                pair = again
+        if pair is not None:
+            result.append(pair)
+    return result
+
+
+def _shown(first: _Image, second: _Image, homography: np.ndarray) -> float:
+    """Return the fraction of the keypoints of one image that another shows, by a homography."""
+    x, y, depth = homography @ np.vstack([first.keypoints.T, np.ones(len(first.keypoints))])
+    height, width = second.gray.shape
+    inside = (x > 0) & (x < depth * (width - 1)) & (y > 0) & (y < depth * (height - 1))
+    return float(inside.mean())
 
 
 def _connected(number: int, pairs: Sequence[RegisteredPair]) -> set[int]:
