@@ -13,8 +13,6 @@ from deepdetect.evaluation.metrics.pose import (
 )
 from deepdetect.geometry.camera import Camera, PosedView
 
-INF = float("inf")
-
 
 @pytest.mark.parametrize("degrees", [0, 1e-4, 0.5, 30, 90, 179, 180])
 def test_rotations_differ_by_the_angle_that_was_turned(degrees: float) -> None:

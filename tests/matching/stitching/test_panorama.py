@@ -303,6 +303,8 @@ def test_a_full_turn_is_closed(projection, seed, surroundings: np.ndarray) -> No
         if between[2, 2] > 0.5:  # the others are behind the reference
             assert corner_error(homography, expected, (320, 240)) < 1
     assert not found.parallax
+    beside = {tuple(sorted((order.index(k), order.index((k + 1) % 10)))) for k in range(10)}
+    assert beside <= set(found.matches)
 
 
 def test_less_than_a_turn_is_not_cut(surroundings: np.ndarray) -> None:

@@ -98,7 +98,7 @@ def area_under_curve(errors: Sequence[float], threshold: float) -> float:
     """Return the area under the cumulative curve of the errors up to a threshold, over it.
 
     As SuperGlue and glue-factory compute it: the curve is drawn with straight lines from (0, 0), so
-    it lies a little higher than the mean of `accuracy_at` up to the threshold.
+    it lies up to half an error's share above the mean of `accuracy_at` up to the threshold.
     """
     if not len(errors):
         return 0.0

@@ -150,7 +150,7 @@ def _sgbm_points(
         None,
         size,
         moved.rotation,
-        moved.translation,
+        moved.translation[:, None],  # a (3,) vector is none to OpenCV 5
         flags=0,
         alpha=-1,
     )

@@ -300,7 +300,7 @@ HOMOGRAPHY_NOTE = (
     f"{MATCHING_NOTE} MAGSAC at {INLIER_THRESHOLD_PX:g} px. Error: mean distance of the first "
     "image's corners from where the true homography takes them, at the images' own size; a "
     "pair without a homography counts as wrong. Accuracy: fraction of the pairs within a "
-    "threshold; AUC: exact area under it, up to the threshold. Mean and standard deviation (±) "
+    "threshold; AUC: area under it, as SuperGlue computes it. Mean and standard deviation (±) "
     f"over {SEEDS} seeds of MAGSAC."
 )
 

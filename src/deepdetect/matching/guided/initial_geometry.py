@@ -71,9 +71,9 @@ MIN_INVERTED = 0.05
 which says the same; of wide pairs of the clips up to .04 are, by wrong matches."""
 
 MAX_LEARNED_LOG10_NFA, MAX_CROSS_MODAL_LOG10_NFA = -10.0, -22.0
-"""Of what descriptors of a network show: they see the borders of an image, too, which lie in the
-same places. Unrelated photographs have down to -8; by cross-modal descriptors noise of 320x240 has
-down to -20, visible and infrared light -24 and less."""
+"""Of what nothing but descriptors of a network shows: they see the borders of an image, too, which
+lie in the same places. Unrelated photographs have down to -8; by cross-modal descriptors noise of
+320x240 has down to -20, visible and infrared light -24 and less."""
 
 MAX_MATCHES_TO_SEARCH = 200
 """With fewer that agree with a fundamental matrix, more are searched for along its lines."""
@@ -95,8 +95,7 @@ class InitialGeometry(TwoViewModel):
 
     `points0` and `points1` are the matches that agree with it, `others` those that do not, None
     where the model was asked for; `num_views` were simulated for them. Another model would be found
-    from the `source`. A `learned` one is of points; a `cross_modal` one of images in which the same
-    thing is dark and bright.
+    from the `source`. A `learned` one is of points; a `cross_modal` one of images of two sensors.
     """
 
     points0: np.ndarray
@@ -221,15 +220,12 @@ def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
     with ThreadPoolExecutor(2) as pool:
         first, second = pool.map(describe_learned, *seen, 2 * (CROSS_MODAL,))
     across = find_tentative_matches(*grays, (first, second), max_side_px=COARSE_SIDE_PX)
-    tentative, geometry = as_it_is, estimate_initial_geometry(as_it_is, model, seed)
-    other = estimate_initial_geometry(across, model, seed)
-    cross_modal = other.log10_nfa < min(geometry.log10_nfa, MAX_CROSS_MODAL_LOG10_NFA) and (
-        len(across.ratios) >= MIN_GAIN * len(as_it_is.ratios) or _is_inverted(across, other)
-    )
-    if cross_modal:
-        tentative, geometry = across, other
-    geometry = geometry.only_below(MAX_LEARNED_LOG10_NFA)
-    return replace(geometry, source=tentative, learned=True, cross_modal=cross_modal)
+    geometry, other = (estimate_initial_geometry(each, model, seed) for each in (as_it_is, across))
+    better = other.log10_nfa < min(geometry.log10_nfa, MAX_CROSS_MODAL_LOG10_NFA)
+    gain = len(across.ratios) >= MIN_GAIN * len(as_it_is.ratios)
+    if better and (gain or _is_inverted(across, other)):
+        return replace(other, source=across, learned=True, cross_modal=True)
+    return replace(geometry.only_below(MAX_LEARNED_LOG10_NFA), source=as_it_is, learned=True)
 
 
 def _is_inverted(tentative: TentativeMatches, geometry: InitialGeometry) -> bool:

@@ -24,7 +24,6 @@ from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
 from ...features.sift import describe_keypoints, detect_sift
 from ...geometry.camera import Camera
-from ...geometry.estimation import TwoViewModel
 from ...geometry.transforms import transfer_errors, transform_points
 from ...io.image import luma
 from ..guided import TentativeMatches, find_tentative_matches, guided_matches
@@ -41,8 +40,11 @@ MIN_PARTNERS = 3
 """Pairs that each image takes part in, where it has that many, beyond those that connect all."""
 
 MIN_OVERLAP = 0.1
-"""Fraction of the keypoints of either image that the other shows by the fit, for a pair to be tried
+"""Fraction of the keypoints of one image that the other shows by the fit, for a pair to be tried
 again."""
+
+MAX_FURTHER_TRIALS = 2
+"""Of the geometries that keypoints show, where dense matches refute the first."""
 
 MAX_DISAGREEMENT_PX = 2.0
 """Root mean square of what the fit leaves of a pair, above which it is tried again."""
@@ -121,15 +123,17 @@ def register_images(
     }
     pairs = [pair for pair in pairs if pair.first in group]
     sizes = {number: views[number].gray.shape[::-1] for number in group}
-    homographies, cameras, _ = _adjust(group, pairs, sizes, turning)
+    homographies, cameras, residual_px = _adjust(group, pairs, sizes, turning)
     to_common = homographies
     if cameras is not None:
         to_common = {
             n: one.rotation @ np.linalg.inv(Camera(sizes[n], one.focal_px).matrix)
             for n, one in cameras.items()
         }
-    pairs = _registered_again(views, to_common, pairs, seed)
-    homographies, cameras, residual_px = _adjust(group, pairs, sizes, turning)
+    again = _registered_again(views, to_common, pairs, seed)
+    if set(again) != set(pairs):
+        pairs = again
+        homographies, cameras, residual_px = _adjust(group, pairs, sizes, turning)
     if turning and residual_px > MAX_CAMERA_RESIDUAL_PX:
         raise RegistrationError(
             f"the cameras of these images did more than turn ({residual_px:.1f} px remain): "
@@ -184,12 +188,14 @@ def _registered_pairs(
         enough = min(partners[first], partners[second]) >= MIN_PARTNERS
         if enough and second in _connected(first, pairs):
             continue
-        pair = None
-        while pair is None and geometry.matrix is not None:
-            pair = _register(views, first, second, geometry, seed)
+        pair = _register(views, first, second, geometry, seed)
+        for _ in range(MAX_FURTHER_TRIALS):
+            if pair is not None or geometry.matrix is None:
+                break
             # Where towers or windows look alike, most keypoints can agree on what is wrong.
             tentative = tentative.apart_from(geometry.matrix)
             geometry = estimate_initial_geometry(tentative, "homography", seed)
+            pair = _register(views, first, second, geometry, seed)
         if pair is not None:
             pairs.append(pair)
             partners[first] += 1
@@ -200,6 +206,9 @@ def _registered_pairs(
 def _register(
     views: Sequence[_Image], first: int, second: int, geometry: InitialGeometry, seed: int
 ) -> RegisteredPair | None:
+    """Match densely by a geometry; None where it is refuted, or none."""
+    if geometry.matrix is None:
+        return None
     a, b = views[first], views[second]
     keypoints = a.keypoints, b.keypoints
     guide, matches = guided_matches((a.gray, b.gray), keypoints, geometry, seed)
@@ -230,19 +239,31 @@ def _registered_again(
         matrix = np.linalg.inv(to_common[second]) @ to_common[first]
         pair = known.get((first, second))
         if pair is None:
-            enough = min(partners[first], partners[second]) >= MIN_PARTNERS
-            ends = (first, second, matrix), (second, first, np.linalg.inv(matrix))
-            shown = [_shown(views[a], views[b], between) for a, b, between in ends]
-            good = enough or min(shown) < MIN_OVERLAP
+            good = min(partners[first], partners[second]) >= MIN_PARTNERS or not any(
+                _shown(views[a], views[b], between) >= MIN_OVERLAP
+                for a, b, between in (
+                    (first, second, matrix),
+                    (second, first, np.linalg.inv(matrix)),
+                )
+            )
         else:
             expected = transform_points(pair.points, pair.homography)
             off_px = transfer_errors(pair.points, expected, matrix)
             good = bool(np.sqrt(np.mean(off_px**2)) < MAX_DISAGREEMENT_PX)
         if not good:
             nowhere = np.empty((0, 2))
-            model = TwoViewModel("homography", matrix, np.zeros(0, bool), 0.0)
-            geometry = InitialGeometry.of(model, nowhere, nowhere, "homography")
+            geometry = InitialGeometry(
+                "homography",
+                matrix,
+                np.zeros(0, bool),
+                0.0,
+                points0=nowhere,
+                points1=nowhere,
+                others=None,
+            )
             again = _register(views, first, second, geometry, seed)
+            if again is not None and pair is None:
+                partners.update((first, second))
             if again is not None and (pair is None or again.matches > pair.matches):
                 pair = again
         if pair is not None:
