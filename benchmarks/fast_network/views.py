@@ -1,9 +1,9 @@
 """Make labelled views for ever, beside the training that takes them: chunks of (N, 2, S, S) uint8.
 
-    views.py PHOTOS VALIDATION OUTPUT WORKERS [--labels dense] [--free]
+    views.py PHOTOS VALIDATION OUTPUT WORKERS [--labels dense]
 
 Luma and label of whole views of four sizes, since the thresholds of a label depend on the whole
-image. `dense` labels are of normal light only; --free takes photographs of free licences alone.
+image. `dense` labels are of normal light only. `free` is of the data set `photographs-free`.
 """
 
 from __future__ import annotations
@@ -30,9 +30,6 @@ SMALL = (0.2, 0.1, 0.4, 0.3)
 KINDS = {"S": SMALL, "T": SMALL, "M": (0, 0.3, 0.42, 0.28), "L": (0.45, 0.25, 0.18, 0.12)}
 NORMAL_KINDS = (0.4, 0, 0.6, 0)
 """Shares of: as it is, darkened, augmented, augmented and darkened."""
-
-FREE = ("boofcv", "cid22", "clic2025", "gb82", "budgie", "cutefish", "ukui", "elementary")
-"""Beginnings of the names of photographs under CC0, CC BY, CC BY-SA or Unsplash's licence."""
 
 
 def labelled(rgb: np.ndarray, dense: bool) -> np.ndarray:
@@ -66,10 +63,7 @@ def work(given: argparse.Namespace, worker: int) -> None:
     """Label one worker's part of the validation photographs, then views of its others for ever."""
     cv2.setNumThreads(1)
     dense = given.labels == "dense"
-    photos, held_out = (
-        [p for p in sorted(folder.iterdir()) if not given.free or p.name.startswith(FREE)]
-        for folder in (given.photos, given.validation)
-    )
+    photos, held_out = (sorted(folder.iterdir()) for folder in (given.photos, given.validation))
     for light in range(1 if dense else 2):
         views = []
         for path in held_out[worker :: given.workers]:
@@ -99,7 +93,6 @@ if __name__ == "__main__":
         parser.add_argument(name, type=Path)
     parser.add_argument("workers", type=int)
     parser.add_argument("--labels", choices=["paper", "dense"], default="paper")
-    parser.add_argument("--free", action="store_true")
     arguments = parser.parse_args()
     arguments.output.mkdir(parents=True, exist_ok=True)
     for process in range(arguments.workers):
