@@ -79,6 +79,7 @@ STAGES = {
     "fuzz": "-m fuzz",
     "mappers": "benchmarks/mappers.py",
     "match-filter": "benchmarks/match_filter.py {data}",
+    "modalities": f"benchmarks/modalities.py {{data}}/multimodal{XFEAT}{E64}",
     "made-scenes": "benchmarks/made_scenes.py {data} --scenes {output}/scenes",
 }
 """Arguments of Python by the stage's name. What writes no report prints its tables, or JSON."""
@@ -291,6 +292,7 @@ RESULTS = {
     "fuzz": Result("fuzz", "0"),
     "mappers": Result("mappers", "0"),
     "match-filter": Result("match-filter", "0"),
+    "modalities": Result("modalities", "0"),
     "made-scenes": Result("made-scenes", "0"),
     "foreground": Result(
         "foreground",

@@ -1,0 +1,102 @@
+"""Pairs of different sensors, seasons and maps: what is answered, and how often rightly.
+
+    python benchmarks/modalities.py FOLDER [--method xfeat_2048_600x800.onnx ...]
+
+FOLDER is Multimodal_Image_Matching_Datasets of the repository StaRainJ/Multi-modality-image-
+matching-database-metrics-methods on GitHub: both images, their homography, and landmarks marked by
+hand in each of its `*/*/*.mat`. A match is right within 5 px, or three times what the homography
+leaves of the landmarks where that is more. Answered: pairs that `match_images` matches; wrong:
+those of which fewer than half of the matches are right. The other columns are right matches of a
+pair, means, of 2,048 keypoints, mutual nearest neighbours without a ratio test.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from descriptors import methods
+from scipy.io import loadmat
+
+from deepdetect import DeepDetect, Matches, match_features, match_images
+from deepdetect.evaluation.report import Row, Table
+from deepdetect.geometry.transforms import transfer_errors, transform_points, translation_matrix
+
+RIGHT_PX, LANDMARK_ERRORS = 5.0, 3.0
+OWN = "learned", "cross-modal"
+
+
+class ModalPair:
+    """Two (H, W, 3) uint8 images, the homography from the first to the second, what is right."""
+
+    def __init__(self, path: Path) -> None:
+        found = loadmat(path)
+        self.images = to_bytes(found["I_fix"]), to_bytes(found["I_move"])
+        landmarks = [found["Landmarks"][name][0, 0] - 1.0 for name in ("LMfix", "LMmov")]
+        # Of MATLAB: from the second to the first, rows in place of columns, counted from 1.
+        matrix = np.linalg.inv(found["T"].astype(np.float64).T)
+        self.homography = translation_matrix(-1, -1) @ matrix @ translation_matrix(1, 1)
+        off = np.median(
+            np.linalg.norm(transform_points(landmarks[0], self.homography) - landmarks[1], axis=1)
+        )
+        self.right_px = max(RIGHT_PX, LANDMARK_ERRORS * float(off))
+
+    def right(self, matches: Matches) -> int:
+        """Count right matches."""
+        if not len(matches):
+            return 0
+        errors = transfer_errors(matches.points0, matches.points1, self.homography)
+        return int(np.count_nonzero(errors < self.right_px))
+
+
+def to_bytes(image: np.ndarray) -> np.ndarray:
+    """Return an image as uint8; some are fractions."""
+    if image.dtype != np.uint8:
+        image = np.rint(image * (255 if image.max() <= 1 else 1)).clip(0, 255)
+    return np.ascontiguousarray(image.astype(np.uint8))
+
+
+def measure(paths: Sequence[Path], files: Sequence[str]) -> Row:
+    """Return the columns of pairs of one kind."""
+    others = {Path(file).stem for file in files}
+    extractors = {n: e for n, e in methods([*files]).items() if n in {*OWN, *others}}
+    detector, answers, right = DeepDetect(), [], dict.fromkeys(extractors, 0)
+    for pair in map(ModalPair, paths):
+        matches = match_images(*pair.images, detector)
+        good = 2 * pair.right(matches) >= len(matches)
+        answers.append((len(matches) > 0, matches.confidence == "high", good))
+        for name, extract in extractors.items():
+            first, second = (extract(image) for image in pair.images)
+            right[name] += pair.right(match_features(first, second, ratio=1))
+    answered, high, good = np.array(answers).T
+    return {
+        "pairs": len(paths),
+        "answered": int(np.count_nonzero(answered)),
+        "wrong": int(np.count_nonzero(answered & ~good)),
+        "wrong, high confidence": int(np.count_nonzero(high & ~good)),
+        **{name: count / len(paths) for name, count in right.items()},
+    }
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--method", action="append", default=[], help="an ONNX file")
+    given = parser.parse_args()
+    kinds = sorted({path.parent for path in given.folder.glob("*/*/*.mat")})
+    rows: list[Row] = [
+        {
+            "images": f"{kind.parent.name}, {kind.name.replace('_', ' ')}",
+            **measure(sorted(kind.glob("*.mat")), given.method),
+        }
+        for kind in kinds
+    ]
+    styles = dict.fromkeys(rows[0], ".0f") | {"images": ""}
+    print(Table("modalities", "modalities", styles, rows).to_markdown())
+
+
+if __name__ == "__main__":
+    main()
