@@ -68,6 +68,16 @@ print(json.dumps(sorted(sys.modules)))
     assert not {"cv2", "numba", "PIL", "numpy.random", "multiprocessing", "tqdm"} & {*loaded}
 
 
+def test_no_command_imports_opencv_before_it_is_used() -> None:
+    code = """
+import json, sys
+from deepdetect.cli import detect, features, match, reconstruct, train
+from deepdetect import matching, reconstruction, sfm
+print(json.dumps(sorted(sys.modules)))
+"""
+    assert "cv2" not in in_a_fresh_interpreter(code)
+
+
 def test_messages_name_no_package_that_cannot_be_had() -> None:
     """There is no release on PyPI, and anybody could take the name."""
     for path in ROOT.rglob("*.py"):

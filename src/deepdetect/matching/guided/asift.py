@@ -29,7 +29,7 @@ BLUR = 0.8
 ROUNDING = 1e-9
 """Pixels: more is no further row or column of a view."""
 
-OUTSIDE: dict[str, Any] = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": 128}
+OUTSIDE: dict[str, Any] = {"borderValue": 128}
 
 TILT, DIRECTIONS = 4.0, 8
 """How many times shorter one direction is seen in the simulated views, and of how many of them.
