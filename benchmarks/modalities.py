@@ -6,8 +6,8 @@ FOLDER is Multimodal_Image_Matching_Datasets of the repository StaRainJ/Multi-mo
 matching-database-metrics-methods on GitHub: both images, their homography, and landmarks marked by
 hand in each of its `*/*/*.mat`. A match is right within 5 px, or three times what the homography
 leaves of the landmarks where that is more. Answered: pairs that `match_images` matches; wrong:
-those of which fewer than half of the matches are right. The other columns are right matches of a
-pair, means, of 2,048 keypoints, mutual nearest neighbours without a ratio test.
+those of which fewer than half of the matches are right. The other columns are the right matches of
+all pairs, of 2,048 keypoints, mutual nearest neighbours without a ratio test.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def measure(paths: Sequence[Path], files: Sequence[str]) -> Row:
         "answered": int(np.count_nonzero(answered)),
         "wrong": int(np.count_nonzero(answered & ~good)),
         "wrong, high confidence": int(np.count_nonzero(high & ~good)),
-        **{name: count / len(paths) for name, count in right.items()},
+        **right,
     }
 
 
@@ -94,7 +94,8 @@ def main() -> None:
         }
         for kind in kinds
     ]
-    styles = dict.fromkeys(rows[0], ".0f") | {"images": ""}
+    rows.append({"images": "all", **{n: sum(row[n] for row in rows) for n in [*rows[0]][1:]}})
+    styles = dict.fromkeys(rows[0], ",d") | {"images": ""}
     print(Table("modalities", "modalities", styles, rows).to_markdown())
 
 

@@ -397,7 +397,8 @@ def write_result(name: str, work: Path) -> None:
     start, several, _ = result.table.partition("*")
     keys = [key for key in tables if key.startswith(start)] if several else [result.table]
     first = next(iter(tables[keys[0]][0]))
-    columns = result.columns or {title: (title, "") for title in list(tables[keys[0]][0])[1:]}
+    titles = list(tables[keys[0]][0])[1:]
+    columns = result.columns or {TITLES.get(title, title): (title, "") for title in titles}
     by_name = {(key, row.get(first)): row for key in tables for row in tables[key]}
     lines = [[*(["scene"] if several else []), first, *columns]]
     for key in keys:
