@@ -35,7 +35,7 @@ class ModalPair:
         found = loadmat(path)
         self.images = to_bytes(found["I_fix"]), to_bytes(found["I_move"])
         landmarks = [found["Landmarks"][name][0, 0] - 1.0 for name in ("LMfix", "LMmov")]
-        # Of MATLAB: from the second to the first, rows in place of columns, counted from 1.
+        # MATLAB's: from the second to the first, for row vectors, pixels counted from 1.
         matrix = np.linalg.inv(found["T"].astype(np.float64).T)
         self.homography = translation_matrix(-1, -1) @ matrix @ translation_matrix(1, 1)
         off = np.median(

@@ -68,10 +68,10 @@ print(json.dumps(sorted(sys.modules)))
     assert not {"cv2", "numba", "PIL", "numpy.random", "multiprocessing", "tqdm"} & {*loaded}
 
 
-def test_no_command_imports_opencv_before_it_is_used() -> None:
+def test_commands_and_matching_import_opencv_when_they_use_it() -> None:
     code = """
 import json, sys
-from deepdetect.cli import detect, features, match, reconstruct, train
+from deepdetect.cli import detect, evaluate, export, features, match, reconstruct, train
 from deepdetect import matching, reconstruction, sfm
 print(json.dumps(sorted(sys.modules)))
 """

@@ -3,7 +3,7 @@
     views.py PHOTOS VALIDATION OUTPUT WORKERS [--labels dense]
 
 Luma and label of whole views of four sizes, since the thresholds of a label depend on the whole
-image. `dense` labels are of normal light only. `free` is of the data set `photographs-free`.
+image. `dense` labels are of normal light only. `free` learns `photographs-free`.
 """
 
 from __future__ import annotations

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,6 @@ from deepdetect.geometry import transform_points
 from deepdetect.geometry.transforms import epipolar_errors, transfer_errors
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import guided_matches, guiding_geometry
-from deepdetect.matching.guided.initial_geometry import InitialGeometry
 from deepdetect.matching.guided.pipeline import match_by_homography
 
 from ..conftest import match
@@ -143,26 +141,6 @@ def test_a_dominant_plane_does_not_hide_the_depth_beside_it(
     pose = estimate_pose(matches.points0, matches.points1, first.intrinsics, second.intrinsics)
     assert pose is not None
     assert translation_error(pose[1], pair.translation) < 1
-
-
-def test_edges_are_compared_where_brightness_refutes_what_learned_points_show(
-    photo: np.ndarray,
-) -> None:
-    """A negative, with a geometry that no cross-modal descriptor has found."""
-    gray = luma(photo)
-    negative = 255 - cv2.warpPerspective(gray, WARP, (256, 256), flags=cv2.INTER_CUBIC)
-    points = np.random.default_rng(0).uniform(30, 220, (60, 2))
-    ends = transform_points(points, WARP)
-    first = InitialGeometry(
-        "homography", WARP, np.ones(60, bool), -200.0, points0=points, points1=ends, others=None
-    )
-    pixels = np.argwhere(Everywhere().heatmap(gray))[:, ::-1].astype(np.float64)
-    assert guided_matches((gray, negative), (pixels, pixels), first)[1] is None
-    found = guided_matches((gray, negative), (pixels, pixels), replace(first, learned=True))[1]
-    assert found is not None
-    errors = transfer_errors(found.starts(pixels), found.points1, WARP)
-    assert (errors < 1).mean() > 0.99
-    assert len(found) > 0.3 * len(pixels)
 
 
 def test_of_few_keypoints_those_without_a_partner_are_verified_too(

@@ -150,7 +150,7 @@ def _sgbm_points(
         None,
         size,
         moved.rotation,
-        moved.translation[:, None],  # a (3,) vector is none to OpenCV 5
+        moved.translation[:, None],  # OpenCV 5 wants a column
         flags=0,
         alpha=-1,
     )

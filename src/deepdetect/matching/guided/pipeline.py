@@ -123,17 +123,10 @@ def guided_matches(
     Returns the geometry that guided, and the matches; None when no geometry could be trusted.
     """
     enough = MIN_MATCHED_FRACTION * min(len(xy) for xy in pixels)
-    given = grays
     if first.cross_modal:
         grays = edge_strength(grays[0]), edge_strength(grays[1])
     if first.model == "homography":
         geometry, matches = _plane_or_depth(grays, pixels, first, enough, seed)
-        sparse = matches is None or matches.points0 is not None
-        if sparse and first.learned and not first.cross_modal:
-            # Brightness may differ more between two sensors, or at night, than edges do.
-            again = guided_matches(given, pixels, replace(first, cross_modal=True), seed)
-            if again[1] is not None and again[1].points0 is None:
-                return again
     else:
         apart = _apart_from_plane(grays, first, first, seed)
         ways = ((way, None) for way in (apart, first) if way is not None)
@@ -141,9 +134,9 @@ def guided_matches(
     if matches is None:
         return geometry, None
     geometry, plane = _with_scene(grays, pixels[0], geometry, matches, seed)
-    tentative = None if first.others is None else first.all_points
+    sparse = None if first.others is None else first.all_points
     distinct = matches.points0 is not None
-    if plane is not None and is_repeated(grays, *plane, tentative, seed, distinct):
+    if plane is not None and is_repeated(grays, *plane, sparse, seed, distinct):
         return replace(geometry, model="none", matrix=None, scene="none"), None
     own = len(matches)
     matches = _with_further_planes(grays, pixels, geometry, matches, first, enough, seed)

@@ -9,7 +9,6 @@ where it puts them, and all are fitted once more.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -233,13 +232,18 @@ def _registered_again(
     the one with more matches is returned. Without the pair that closes a turn its ends drift apart.
     """
     known = {(pair.first, pair.second): pair for pair in pairs}
-    partners = Counter(number for ends in known for number in ends)
+    partners: dict[int, set[int]] = {number: set() for number in to_common}
+    for one, other in known:
+        partners[one].add(other)
+        partners[other].add(one)
     result = []
     for first, second in combinations(sorted(to_common), 2):
         matrix = np.linalg.inv(to_common[second]) @ to_common[first]
         pair = known.get((first, second))
         if pair is None:
-            good = min(partners[first], partners[second]) >= MIN_PARTNERS or not any(
+            near = bool(partners[first] & partners[second])
+            enough = min(len(partners[first]), len(partners[second])) >= MIN_PARTNERS
+            good = (near and enough) or not any(
                 _shown(views[a], views[b], between) >= MIN_OVERLAP
                 for a, b, between in (
                     (first, second, matrix),
@@ -262,8 +266,9 @@ def _registered_again(
                 others=None,
             )
             again = _register(views, first, second, geometry, seed)
-            if again is not None and pair is None:
-                partners.update((first, second))
+            if again is not None:
+                partners[first].add(second)
+                partners[second].add(first)
             if again is not None and (pair is None or again.matches > pair.matches):
                 pair = again
         if pair is not None:
