@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..._shared.opencv import cv2
+from ...geometry.camera import Camera, Size
 from ...geometry.transforms import transform_points
 
 MAX_ITERATIONS, MIN_STEP = 20, 1e-7
@@ -62,6 +63,10 @@ class RotatingCamera:
 
     focal_px: float
     rotation: np.ndarray
+
+    def to_common(self, size: Size) -> np.ndarray:
+        """Return the (3, 3) map from pixels of its image to directions in the common frame."""
+        return np.asarray(self.rotation @ np.linalg.inv(Camera(size, self.focal_px).matrix))
 
 
 Cameras = Mapping[int, RotatingCamera]

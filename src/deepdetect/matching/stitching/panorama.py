@@ -13,7 +13,6 @@ from ..._shared.image_array import Channels, to_8_bits
 from ..._shared.options import check_ranges, suggest_keywords, whole
 from ..._shared.progress import StageTimer
 from ...detector.detector import AnyDetector, DeepDetect
-from ...geometry.camera import Camera
 from ...geometry.images import downscale
 from ...geometry.transforms import scaled_homography, translation_matrix
 from ...io.image import load_deep
@@ -243,9 +242,6 @@ def _plan(
         number: RotatingCamera(one.focal_px / scales[number], one.rotation)
         for number, one in level_cameras(registration.cameras, reference).items()
     }
-    rays = {
-        number: one.rotation @ np.linalg.inv(Camera(sizes[number], one.focal_px).matrix)
-        for number, one in cameras.items()
-    }
+    rays = {number: one.to_common(sizes[number]) for number, one in cameras.items()}
     homographies = {n: np.linalg.inv(rays[reference]) @ ray for n, ray in rays.items()}
     return plan_curved(projection, sizes, cameras, reference, scale), homographies, reference

@@ -22,7 +22,6 @@ from ...detector.point_detector import PointDetector
 from ...features.keypoints import Keypoints, bayer_order
 from ...features.selection import SelectionOptions
 from ...features.sift import describe_keypoints, detect_sift
-from ...geometry.camera import Camera
 from ...geometry.transforms import transfer_errors, transform_points
 from ...io.image import luma
 from ..guided import TentativeMatches, find_tentative_matches, guided_matches
@@ -125,10 +124,7 @@ def register_images(
     homographies, cameras, residual_px = _adjust(group, pairs, sizes, turning)
     to_common = homographies
     if cameras is not None:
-        to_common = {
-            n: one.rotation @ np.linalg.inv(Camera(sizes[n], one.focal_px).matrix)
-            for n, one in cameras.items()
-        }
+        to_common = {n: one.to_common(sizes[n]) for n, one in cameras.items()}
     again = _registered_again(views, to_common, pairs, seed)
     if set(again) != set(pairs):
         pairs = again
