@@ -325,11 +325,39 @@ def _refine(
         made = refined, errors, certainty
         limits = tolerance, MIN_CORRELATION, MIN_VIEWS - 1
         parallel_for(len(planes), refine_rows, planes, *compared, *limits, *made)
-        weights = certainty / (certainty + max(np.median(certainty), 1e-9)) + np.float32(MIN_WEIGHT)
+        sure = certainty > 0
+        usual = np.median(certainty[sure]) if sure.any() else 1
+        weights = certainty / (certainty + usual) + np.float32(MIN_WEIGHT)
         # Slopes are per pixel of the depth map while it is fitted.
         planes = _fit(np.dstack([refined, planes[..., 1:] * stride_px]), weights, radius, tolerance)
         planes[..., 1:] /= stride_px
+    planes[~_enclosed(planes, sure, stride_px, tolerance)] = np.nan
     return planes, errors
+
+
+def _enclosed(planes: np.ndarray, sure: np.ndarray, stride_px: int, tolerance: float) -> np.ndarray:
+    """Return which pixels of a depth map are `sure`, or on one surface between two that are.
+
+    These are to the left and right, or above and below. Beside others a depth is only continued: of
+    the roof into the sky.
+    """
+    found = sure.copy()
+    for axis in (0, 1):
+        surface, known = (np.moveaxis(each, axis, 0) for each in (planes, sure))
+        slope = stride_px * surface[..., 2 - axis]
+        jump = np.diff(surface[..., 0], axis=0) - (slope[1:] + slope[:-1]) / 2
+        begins = np.pad(~(np.abs(jump) <= tolerance), ((1, 1), (0, 0)), constant_values=True)
+        before = _reached(known, begins[:-1])
+        after = _reached(known[::-1], begins[:0:-1])[::-1]
+        found |= np.moveaxis(before & after, 0, axis)
+    return found
+
+
+def _reached(known: np.ndarray, begins: np.ndarray) -> np.ndarray:
+    """Return where a row is known, or one before it since the last that begins a surface."""
+    rows = np.arange(len(known))[:, None]
+    last, first = (np.maximum.accumulate(np.where(each, rows, -1)) for each in (known, begins))
+    return last >= first
 
 
 def relative_projection(first: PosedView, second: PosedView) -> tuple[np.ndarray, np.ndarray]:

@@ -17,6 +17,10 @@ from ..matching.stereo.kernels import count_bits
 HIDDEN = np.uint64(1) << np.uint64(63)
 """Bit of a census of 62 bits: the neighbour does not show this place."""
 
+MIN_STEEPNESS = np.float32(1.25)
+"""Of a window with texture, relative to the noise: 1 is that of the noise, which is added to all,
+and the rest is of gradients half as strong."""
+
 
 @compiled(nogil=True)
 def _two_best(y, census, neighbours, columns, rows, hidden_cost, line):  # type: ignore[no-untyped-def]
@@ -202,7 +206,7 @@ def _compare(gray, y, x, plane, same, m, other, size, radius, spacing, noise):  
     gain = (covariance * steep - moved * mixed) / area
     shift = (moved * spread - covariance * mixed) / (area * max(gain, np.float32(0.2)))
     shift = min(max(shift, np.float32(-1)), np.float32(1))
-    weight = (steep - mixed * mixed / spread) / own
+    weight = max(steep - MIN_STEEPNESS * floor - mixed * mixed / spread, np.float32(0)) / own
     return covariance / np.float32(math.sqrt(own * spread)), shift, parallax, weight
 
 
@@ -272,7 +276,8 @@ def refine_rows(  # type: ignore[no-untyped-def]
     `planes` (H, W, 3), as of `fit_rows`, are at every `stride` pixels of `gray`, slopes per pixel
     of `gray`. `neighbours` (K, H', W') float32 have (width, height) `sizes`, `maps` (K, 3, 4) are A
     and b. Every `spacing`-th pixel of the window counts that is on the same surface. `errors` are
-    the distances in pixels to the matches of each neighbour alone, as root mean squares.
+    the distances in pixels to the matches of each neighbour alone, as root mean squares;
+    `certainty` is 0 without texture, where the depth stays.
     """
     height, width = gray.shape
     side = 2 * radius + 1
@@ -309,9 +314,9 @@ def refine_rows(  # type: ignore[no-untyped-def]
                     shifts[number], parallaxes[number] = shift, parallax
                     number += 1
             out[row, column] = np.nan
-            if number >= min_number and information > 0:
+            if number >= min_number:
                 certainty[row, column] = information
-                step /= information
+                step /= max(information, 1e-12)
                 out[row, column] = w + step
                 squares = ((shifts[:number] - parallaxes[:number] * step) ** 2).sum()
                 errors[row, column] = math.sqrt(squares / number)
