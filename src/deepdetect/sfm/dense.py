@@ -331,7 +331,10 @@ def _refine(
         # Slopes are per pixel of the depth map while it is fitted.
         planes = _fit(np.dstack([refined, planes[..., 1:] * stride_px]), weights, radius, tolerance)
         planes[..., 1:] /= stride_px
-    planes[~_enclosed(planes, sure, stride_px, tolerance)] = np.nan
+    # The window of a pixel beside a texture reaches into it.
+    reach = np.ones((2 * (WINDOW_RADIUS_PX // stride_px) + 1,) * 2, np.uint8)
+    textured = cv2.erode((sure | np.isnan(planes[..., 0])).astype(np.uint8), reach) > 0
+    planes[~_enclosed(planes, textured & sure, stride_px, tolerance)] = np.nan
     return planes, errors
 
 

@@ -17,9 +17,9 @@ from ..matching.stereo.kernels import count_bits
 HIDDEN = np.uint64(1) << np.uint64(63)
 """Bit of a census of 62 bits: the neighbour does not show this place."""
 
-MIN_STEEPNESS = np.float32(1.25)
+MIN_STEEPNESS = np.float32(1.18)
 """Of a window with texture, relative to the noise: 1 is that of the noise, which is added to all,
-and the rest is of gradients half as strong."""
+and the rest is of gradients 0.4 times as strong."""
 
 
 @compiled(nogil=True)
