@@ -3,8 +3,9 @@
 Each image in turn gets a depth map. A small copy is matched with its best neighbours together, by
 semi-global matching; pixels that correlate badly take planes of others; and inverse depths are
 fitted to the grey values at full size. A surface near a pixel is a plane throughout, so that
-slanted ones are matched as well as others. A pixel becomes a point where the depth maps of enough
-neighbours agree.
+slanted ones are matched as well as others. What has no texture, and does not lie between textures
+of one surface, has no depth. A pixel becomes a point where the depth maps of enough neighbours
+agree.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ BLUR_SIGMA_PX = 1.0
 """Of both images before, so that these pixels stand for all."""
 
 NOISE_LEVELS = 1.0
-"""Grey levels; where the images have no stronger gradients, the depth stays."""
+"""Grey levels a pixel, which are added to all gradients."""
 
 JUMPS = (16, 8, 4, 2, 1)
 """Distances over which planes spread, in pixels of the depth map."""
@@ -331,33 +332,33 @@ def _refine(
         # Slopes are per pixel of the depth map while it is fitted.
         planes = _fit(np.dstack([refined, planes[..., 1:] * stride_px]), weights, radius, tolerance)
         planes[..., 1:] /= stride_px
-    # The window of a pixel beside a texture reaches into it.
-    reach = np.ones((2 * (WINDOW_RADIUS_PX // stride_px) + 1,) * 2, np.uint8)
+    # Windows reach into a texture beside their pixel.
+    reach = np.ones((2 * -(-WINDOW_RADIUS_PX // stride_px) + 1,) * 2, np.uint8)
     textured = cv2.erode((sure | np.isnan(planes[..., 0])).astype(np.uint8), reach) > 0
-    planes[~_enclosed(planes, textured & sure, stride_px, tolerance)] = np.nan
+    planes[~_enclosed(planes, textured, stride_px, tolerance)] = np.nan
     return planes, errors
 
 
 def _enclosed(planes: np.ndarray, sure: np.ndarray, stride_px: int, tolerance: float) -> np.ndarray:
     """Return which pixels of a depth map are `sure`, or on one surface between two that are.
 
-    These are to the left and right, or above and below. Beside others a depth is only continued: of
-    the roof into the sky.
+    The two are to the left and right, or above and below. Elsewhere the depth is only continued
+    from one side, such as that of a roof into the sky.
     """
     found = sure.copy()
     for axis in (0, 1):
         surface, known = (np.moveaxis(each, axis, 0) for each in (planes, sure))
         slope = stride_px * surface[..., 2 - axis]
         jump = np.diff(surface[..., 0], axis=0) - (slope[1:] + slope[:-1]) / 2
-        begins = np.pad(~(np.abs(jump) <= tolerance), ((1, 1), (0, 0)), constant_values=True)
-        before = _reached(known, begins[:-1])
-        after = _reached(known[::-1], begins[:0:-1])[::-1]
+        edges = np.pad(~(np.abs(jump) <= tolerance), ((1, 1), (0, 0)), constant_values=True)
+        before = _reached(known, edges[:-1])
+        after = _reached(known[::-1], edges[1:][::-1])[::-1]
         found |= np.moveaxis(before & after, 0, axis)
     return found
 
 
 def _reached(known: np.ndarray, begins: np.ndarray) -> np.ndarray:
-    """Return where a row is known, or one before it since the last that begins a surface."""
+    """Return where a pixel or one above it is known, and no surface begins in between."""
     rows = np.arange(len(known))[:, None]
     last, first = (np.maximum.accumulate(np.where(each, rows, -1)) for each in (known, begins))
     return last >= first

@@ -17,9 +17,9 @@ from ..matching.stereo.kernels import count_bits
 HIDDEN = np.uint64(1) << np.uint64(63)
 """Bit of a census of 62 bits: the neighbour does not show this place."""
 
-MIN_STEEPNESS = np.float32(1.18)
-"""Of a window with texture, relative to the noise: 1 is that of the noise, which is added to all,
-and the rest is of gradients 0.4 times as strong."""
+MIN_TEXTURE = np.float32(0.18)
+"""Variance of the gradients along the epipolar line, over that of the noise, in a window with
+texture: plain skies have less, with their JPEG, and weathered stone has more."""
 
 
 @compiled(nogil=True)
@@ -148,7 +148,8 @@ def _compare(gray, y, x, plane, same, m, other, size, radius, spacing, noise):  
 
     Returns their correlation, by how many pixels the match should move along its line (one step of
     Lucas-Kanade; contrast and brightness may differ), how far it moves for a change of the inverse
-    depth, and the weight of that: the correlation is -1 where the neighbour does not show it.
+    depth, and the weight of that, 0 without texture. The correlation is -1 where the neighbour does
+    not show it.
     """
     nothing = np.float32(-1), np.float32(0), 0.0, np.float32(0)
     w, right, down = plane
@@ -206,7 +207,8 @@ def _compare(gray, y, x, plane, same, m, other, size, radius, spacing, noise):  
     gain = (covariance * steep - moved * mixed) / area
     shift = (moved * spread - covariance * mixed) / (area * max(gain, np.float32(0.2)))
     shift = min(max(shift, np.float32(-1)), np.float32(1))
-    weight = max(steep - MIN_STEEPNESS * floor - mixed * mixed / spread, np.float32(0)) / own
+    textured = steep - (1 + MIN_TEXTURE) * floor - mixed * mixed / spread
+    weight = max(textured, np.float32(0)) / own
     return covariance / np.float32(math.sqrt(own * spread)), shift, parallax, weight
 
 
@@ -277,7 +279,7 @@ def refine_rows(  # type: ignore[no-untyped-def]
     of `gray`. `neighbours` (K, H', W') float32 have (width, height) `sizes`, `maps` (K, 3, 4) are A
     and b. Every `spacing`-th pixel of the window counts that is on the same surface. `errors` are
     the distances in pixels to the matches of each neighbour alone, as root mean squares;
-    `certainty` is 0 without texture, where the depth stays.
+    `certainty` is 0 where no neighbour has texture along its line, and the depth stays.
     """
     height, width = gray.shape
     side = 2 * radius + 1
