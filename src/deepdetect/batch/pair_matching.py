@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from natsort import natsorted, ns
@@ -44,6 +44,8 @@ class PairMatchingOptions:
         ratio: limit of the ratio test: the best distance must be below this share of the
             second-best. None: as of `match_features`.
         mutual: keep only mutual nearest neighbours.
+        filter_by: which nearest neighbours are matches: "ratio" or "neighbours", as of
+            `match_features`.
         matcher: name of the matcher: "auto", "exact", "patchmatch" or "flann".
         verify: keep only the matches that agree with a geometry that is estimated from them:
             "fundamental", "homography" or "auto"; "none" keeps all.
@@ -56,6 +58,7 @@ class PairMatchingOptions:
 
     ratio: float | None = None
     mutual: bool = True
+    filter_by: Literal["ratio", "neighbours"] = "ratio"
     matcher: str = "auto"
     verify: str = "none"
     inlier_threshold: float = GeometryOptions.inlier_threshold
@@ -221,8 +224,8 @@ def match_group(
 def _match(
     features0: Keypoints, features1: Keypoints, options: PairMatchingOptions
 ) -> tuple[np.ndarray, np.ndarray]:
-    how = {name: getattr(options, name) for name in ("matcher", "ratio", "mutual", "seed")}
-    found = match_features(features0, features1, **how)
+    taken = "matcher", "filter_by", "ratio", "mutual", "seed"
+    found = match_features(features0, features1, **{name: getattr(options, name) for name in taken})
     kept = found.inliers
     if options.verify != "none":
         geometry = GeometryOptions(inlier_threshold=options.inlier_threshold)

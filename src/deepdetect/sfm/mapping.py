@@ -162,7 +162,8 @@ def map_images(
                     initial_image_pair_callback=lambda: registered(2),
                     next_image_callback=lambda: registered(1),
                 )
-            attempt = sorted(models.values(), key=_size, reverse=True)
+            sound = (model for model in models.values() if not _is_bogus(model, how))
+            attempt = sorted(sound, key=_size, reverse=True)
             if not found or (attempt and _size(attempt[0]) > _size(found[0])):
                 found = attempt
             # What is left may be more than the model: a drive beside some images of a house.
@@ -195,6 +196,16 @@ def _largest(found: Sequence[Any]) -> tuple[Any, list[frozenset[str]]]:
             "one before shows, from another place"
         )
     return found[0], [_names(model) for model in found[1:]]
+
+
+def _is_bogus(model: Any, how: Any) -> bool:
+    """Return whether most images of a model have cameras that COLMAP triangulates no points of.
+
+    With few points, focal length and distortion may run away together.
+    """
+    limits = how.min_focal_length_ratio, how.max_focal_length_ratio, how.max_extra_param
+    cameras = [model.images[number].camera for number in model.reg_image_ids()]
+    return 2 * sum(camera.has_bogus_params(*limits) for camera in cameras) > len(cameras)
 
 
 def _size(model: Any) -> int:

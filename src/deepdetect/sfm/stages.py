@@ -56,6 +56,7 @@ from .mapping import (
     read_sparse_model,
     verify_pairs,
 )
+from .misplaced import correct_places
 from .pair_selection import (
     COMPARED_KEYPOINTS,
     SIMILAR,
@@ -345,6 +346,7 @@ class Stages:
                     # Those of an attempt that is given up are counted again in the next.
                     lambda count: bar.update(min(count, len(images) - bar.n)),
                 )
+        model = correct_places(model, database, folder, known, self.seed)
         if refined:
             refine_tracks(model, folder, self.quiet)
             adjust_refined(model, known)
