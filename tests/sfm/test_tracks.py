@@ -10,7 +10,7 @@ import pytest
 from deepdetect._shared.opencv import cv2
 from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.sfm.colmap import CameraIntrinsics
-from deepdetect.sfm.dense import DENSE_POINT
+from deepdetect.sfm.fusion import DENSE_POINT
 from deepdetect.sfm.mapping import read_sparse_model
 from deepdetect.sfm.tracks import add_dense_tracks, refine_tracks
 

@@ -15,7 +15,7 @@ from .._shared.errors import DeepDetectError
 from .._shared.machine import map_in_processes, processor_count
 from ..batch.pair_list import following, list_pairs
 from ..detector.heatmap import MAX_AUTO_PIXELS
-from .dense import MAX_SIDE_PX
+from .depth_maps import MAX_SIDE_PX
 from .pair_selection import SIMILAR
 from .stages import MultiViewOptions, Stages, check_images
 

@@ -27,9 +27,9 @@ from ..geometry.point_cloud import EAST_NORTH_UP, PointCloud
 from ..io.html_viewer import write_html_page
 from ..io.point_cloud import save_point_cloud
 from .colmap import import_pycolmap, initial_intrinsics, known_cameras
-from .dense import DENSE_POINT
 from .forecast import expected_seconds
 from .formats import FORMATS, FormatName, check_formats
+from .fusion import DENSE_POINT
 from .georeference import Georeference, georeference, read_control_points, require_fixes
 from .mapping import MIN_VIEWS, read_sparse_model, transform_model
 from .result import MultiViewReconstruction

@@ -36,15 +36,9 @@ from ..geometry.camera import PosedView
 from ..io.image import find_images, name_images
 from ..io.image_file import IMAGE_SUFFIXES, ReadingOptions, is_path, read_with, reading_options
 from .colmap import CameraIntrinsics, import_pycolmap, write_database
-from .dense import (
-    MATCHED_NEIGHBOURS,
-    depth_map,
-    find_references,
-    fuse_depth_maps,
-    limited_view,
-    merge_dense_points,
-)
+from .depth_maps import MATCHED_NEIGHBOURS, depth_map, find_references, limited_view
 from .formats import FormatName
+from .fusion import fuse_depth_maps, merge_dense_points
 from .mapping import (
     RegisteredImage,
     SparseModel,

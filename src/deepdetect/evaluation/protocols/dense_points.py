@@ -19,13 +19,8 @@ from ..._shared.opencv import cv2
 from ...detector.point_detector import PointDetector
 from ...geometry.camera import Camera, PosedView
 from ...sfm.colmap import initial_intrinsics
-from ...sfm.dense import (
-    find_references,
-    limited_view,
-    merge_dense_points,
-    nearest_depths,
-    prepared_image,
-)
+from ...sfm.depth_maps import find_references, limited_view, prepared_image
+from ...sfm.fusion import merge_dense_points, nearest_depths
 from ...sfm.mapping import SparseModel, read_sparse_model
 from ...sfm.stages import MultiViewOptions, Stages
 from ..report import Row
