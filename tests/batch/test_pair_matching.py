@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetectError, Keypoints, OptionError, PointDetector
+from deepdetect import DeepDetectError, Keypoints, OptionError, PointDetector, match_features
 from deepdetect.batch import PairMatchingOptions, extract_features, match_pairs
+from deepdetect.batch.extraction import read_keypoints
 from deepdetect.batch.hdf5 import open_hdf5
 from deepdetect.batch.pair_list import pair_name, read_pairs
 from deepdetect.batch.pair_matching import _match, match_group
@@ -154,6 +155,24 @@ def test_verification_keeps_what_agrees(features: Path, tmp_path: Path) -> None:
     assert (np.linalg.norm(moved, axis=1) < 2).all()
 
 
+@pytest.mark.parametrize("filter_by", ["ratio", "neighbours"])
+def test_matches_are_filtered_as_those_of_two_images(
+    features: Path, tmp_path: Path, filter_by: str
+) -> None:
+    import h5py
+
+    how = PairMatchingOptions(filter_by=filter_by)
+    match_pairs(features, [PAIR], tmp_path / "m.h5", options=how, workers=1)
+    with open_hdf5(features) as file:
+        both = [read_keypoints(file, name) for name in PAIR]
+    expected = match_features(*both, filter_by=filter_by)
+    with h5py.File(tmp_path / "m.h5") as file:
+        found = file[pair_name(*PAIR)]["matches0"][()]
+    np.testing.assert_array_equal(np.flatnonzero(found >= 0), np.sort(expected.indices0))
+    np.testing.assert_array_equal(found[expected.indices0], expected.indices1)
+    assert len(expected) > 200
+
+
 def test_more_keypoints_than_int16_holds() -> None:
     """hloc's own int16 would end at 32,767."""
     generator = np.random.default_rng(0)
@@ -255,6 +274,8 @@ def test_wrong_lists_of_pairs(text: str | None, message: str, tmp_path: Path) ->
         ({"ratio": 1.5}, "`ratio` must lie in"),
         ({"matcher": "exakt"}, "did you mean 'exact'"),
         ({"matcher": "hamming"}, r"unknown matcher 'hamming' .*\(known: auto, flann"),
+        ({"filter_by": "neighbors"}, "did you mean 'neighbours'"),
+        ({"filter_by": "neighbours", "ratio": 0.8}, "no `ratio`"),
         ({"verify": "fundamentle"}, "did you mean 'fundamental'"),
         ({"verify": "essential"}, "knows no cameras"),
     ],

@@ -16,6 +16,7 @@ from .._shared.errors import InvalidFileError, OptionError, check_name, noted_fa
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.records import key
 from ..features.keypoints import Keypoints
+from ..features.match_filter import check_filter
 from ..features.matchers import MATCHERS_OF_NUMBERS
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
@@ -44,8 +45,8 @@ class PairMatchingOptions:
         ratio: limit of the ratio test: the best distance must be below this share of the
             second-best. None: as of `match_features`.
         mutual: keep only mutual nearest neighbours.
-        filter_by: which nearest neighbours are matches: "ratio" or "neighbours", as of
-            `match_features`.
+        filter_by: which nearest neighbours are matches: "ratio" (Lowe's test), or "neighbours":
+            those that move as the matches around them do, as of `match_features`.
         matcher: name of the matcher: "auto", "exact", "patchmatch" or "flann".
         verify: keep only the matches that agree with a geometry that is estimated from them:
             "fundamental", "homography" or "auto"; "none" keeps all.
@@ -71,6 +72,7 @@ class PairMatchingOptions:
             not_negative=("seed",),
             fractions=("ratio",),
         )
+        check_filter(self.filter_by, self.ratio, self.mutual)
         check_name("matcher", self.matcher, MATCHERS_OF_NUMBERS)
         if self.verify == "essential":
             raise OptionError("`verify` knows no cameras: use fundamental, homography or auto")
@@ -93,7 +95,8 @@ def match_pairs(
 
     Each pair has a group NAME0/NAME1, with "-" for each "/" in the names. In it are
     `matches0` (N0,) int32, for each keypoint of the first image its match in the second, -1 where
-    it has none; and `matching_scores0` (N0,) float32 in [0, 1], 1 - Lowe's ratio.
+    it has none; and `matching_scores0` (N0,) float32 in [0, 1], 1 - Lowe's ratio, or by neighbours
+    how likely the match is right.
 
     A call that is interrupted or killed goes on when it is made again; pairs that are done and
     whose features have not changed are skipped, new ones are added. A script must call this under

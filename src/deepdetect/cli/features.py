@@ -18,7 +18,7 @@ EXTRACTION = cli.From(extract_features, "overwrite", more="engine workers")
 PAIRS = cli.From(match_pairs, "overwrite", more="engine workers")
 MATCHING = cli.From(
     PairMatchingOptions,
-    "ratio mutual verify",
+    "filter_by ratio mutual verify",
     types={
         "matcher": Literal[MATCHERS_OF_NUMBERS],
         "verify": Literal["none", "fundamental", "homography", "auto"],

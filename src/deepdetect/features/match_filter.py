@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from .._shared.errors import OptionError, check_name
 from .._shared.runtimes import start_session
 from .keypoints import Keypoints
 from .learned import CROSS_MODAL, UPRIGHT_DEGREES, common_turn, is_learned
@@ -27,6 +28,13 @@ AROUND = 8
 
 MOST_DISTINCT = 512
 """Matches of the lowest ratios, which tell by how much one image is turned."""
+
+
+def check_filter(filter_by: str, ratio: float | None, mutual: bool) -> None:
+    """Raise an OptionError where the name is unknown, or the other options are not of this one."""
+    check_name("filter_by", filter_by, ("ratio", "neighbours"))
+    if filter_by == "neighbours" and (ratio is not None or not mutual):
+        raise OptionError("`filter_by='neighbours'` needs `mutual=True` and no `ratio`")
 
 
 def suits_filter(features: Keypoints) -> bool:

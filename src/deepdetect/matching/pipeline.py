@@ -19,7 +19,7 @@ from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_k
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints, nearest_keypoints
 from ..features.learned import LEARNED_RATIO, RATIO, is_learned, match_learned
-from ..features.match_filter import filter_matches, suits_filter
+from ..features.match_filter import check_filter, filter_matches, suits_filter
 from ..features.matchers import (
     MATCHERS_OF_NUMBERS,
     DescriptorMatches,
@@ -251,10 +251,8 @@ def match_features(
         )
     check_model("none", seed, GeometryOptions())
     learned = is_learned(features0.descriptor_type)
-    check_name("filter_by", filter_by, ("ratio", "neighbours"))
+    check_filter(filter_by, ratio, mutual)
     by_neighbours = filter_by == "neighbours"
-    if by_neighbours and (ratio is not None or not mutual):
-        raise OptionError("`filter_by='neighbours'` needs `mutual=True` and no `ratio`")
     if by_neighbours and not (suits_filter(features0) and suits_filter(features1)):
         raise OptionError(
             "`filter_by='neighbours'` needs keypoints with sizes and angles, and learned "

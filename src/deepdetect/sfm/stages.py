@@ -10,7 +10,7 @@ import contextlib
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -24,13 +24,14 @@ from .._shared.machine import available_memory, map_in_processes, needed_memory,
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.progress import progress
 from .._shared.records import file_state, key, load_arrays, save_arrays
-from ..batch.extraction import extract_features
+from ..batch.extraction import extract_features, read_keypoints
 from ..batch.hdf5 import feature_names, open_hdf5
 from ..batch.pair_list import Pair, following, list_pairs, pair_name
 from ..batch.pair_matching import PairMatchingOptions, match_pairs
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
+from ..features.match_filter import suits_filter
 from ..features.selection import SelectionOptions
 from ..geometry.camera import PosedView
 from ..io.image import find_images, name_images
@@ -84,8 +85,6 @@ class MultiViewOptions:
         min_motion: leave out images that show nearly the same as one before them, such as most
             frames of a video: those in which half of the matched keypoints moved by less than this
             share of the longer side. None: use all.
-        ratio: limit of the ratio test: the best distance must be below this share of the
-            second-best. None: as of `match_features`.
         matches: "sparse": of keypoints; "dense": points of the depth maps also become points
             of the model, and cameras are adjusted to all.
         mapper: how COLMAP finds the poses: "incremental": one image after the other; "global": of
@@ -106,7 +105,6 @@ class MultiViewOptions:
 
     pairs: str = "auto"
     min_motion: float | None = None
-    ratio: float | None = None
     matches: Literal["sparse", "dense"] = "sparse"
     mapper: Literal["incremental", "global"] = "incremental"
     dense: bool = True
@@ -129,9 +127,8 @@ class MultiViewOptions:
             raise OptionError("the format mesh is made of dense points: leave out `dense=False`")
         check_ranges(
             self,
-            positive=("ratio",),
             counts=("stride_px",),
-            fractions=("ratio", "min_motion"),
+            fractions=("min_motion",),
         )
 
     def pair_choice(self, count: int) -> str:
@@ -172,7 +169,7 @@ class Stages:
     ) -> None:
         self.output, self.work = output, output / WORK
         self.options, self.workers, self.quiet, self.seed = options, workers, quiet, seed
-        self.matching = PairMatchingOptions(ratio=options.ratio, seed=seed)
+        self.matching = PairMatchingOptions(seed=seed)
         self.features = self.work / "features.h5"
 
     def folder_of(self, images: str | Path | Sequence[str | Path]) -> Path:
@@ -269,11 +266,16 @@ class Stages:
             names = [name for name in names if name not in further]
 
     def match(self, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
-        """Match pairs; return (K, 2) rows of keypoints of each."""
+        """Match pairs; return (K, 2) rows of keypoints of each.
+
+        Keypoints without sizes, or of other descriptors, are matched by the ratio test.
+        """
         path = self.work / "matches.h5"
-        matching, workers = self.matching, self.workers
+        with open_hdf5(self.features) as file:
+            suited = suits_filter(read_keypoints(file, feature_names(file)[0]))
+        how = replace(self.matching, filter_by="neighbours" if suited else "ratio")
         match_pairs(
-            self.features, pairs, path, options=matching, workers=workers, quiet=self.quiet
+            self.features, pairs, path, options=how, workers=self.workers, quiet=self.quiet
         ).check()
         found = {}
         with open_hdf5(path) as file:
