@@ -173,6 +173,16 @@ def test_matches_are_filtered_as_those_of_two_images(
     assert len(expected) > 200
 
 
+def test_keypoints_that_neighbours_do_not_suit_are_refused_at_once(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    whole = generator.uniform(0, 99, (40, 2)), generator.normal(size=(8, 40))
+    write_foreign(tmp_path / "f.h5", a=whole, b=whole)
+    how = PairMatchingOptions(filter_by="neighbours")
+    with pytest.raises(OptionError, match="take 'ratio'"):
+        match_pairs(tmp_path / "f.h5", "exhaustive", tmp_path / "m.h5", options=how, workers=1)
+    assert not (tmp_path / "m.h5").exists()
+
+
 def test_more_keypoints_than_int16_holds() -> None:
     """hloc's own int16 would end at 32,767."""
     generator = np.random.default_rng(0)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from deepdetect import Camera
+from deepdetect import Camera, Keypoints, NoDepthError
 from deepdetect.geometry.camera import camera_spacing
 from deepdetect.sfm import mapping
-from deepdetect.sfm.colmap import CameraIntrinsics
+from deepdetect.sfm.colmap import CameraIntrinsics, write_database
 from deepdetect.sfm.mapping import (
     adjust,
     map_globally,
@@ -98,12 +99,34 @@ def attempts(pycolmap, monkeypatch: pytest.MonkeyPatch) -> list[dict]:
     return made
 
 
+def write_scenes(path: Path, steps: dict[str, tuple[np.ndarray, int]]) -> None:
+    """Write a database of cameras that pass random points, by name: step and number of cameras."""
+    rng = np.random.default_rng(0)
+    intrinsics = CameraIntrinsics.of_camera(Camera((640, 480), 500.0))
+    images = {}
+    matches = {}
+    for scene, (step, count) in steps.items():
+        points = rng.uniform((-5, -3, 7), (5, 3, 13), (400, 3))
+        own: list[tuple[str, np.ndarray]] = []
+        for number in range(count):
+            seen = points - number * step
+            xy = seen[:, :2] / seen[:, 2:] * 500 + (319.5, 239.5)
+            inside = ((xy > 0) & (xy < (639, 479))).all(axis=1)
+            own.append((f"{scene}{number}.jpg", np.flatnonzero(inside)))
+            noisy = xy[inside] + rng.normal(0, 0.2, (inside.sum(), 2))
+            noisy = noisy.clip(0, (639, 479))
+            points_seen = Keypoints(noisy, np.ones(len(noisy)), (640, 480))
+            images[own[-1][0]] = points_seen, intrinsics
+        for (name0, rows0), (name1, rows1) in itertools.combinations(own, 2):
+            rows = np.intersect1d(rows0, rows1, return_indices=True)[1:]
+            matches[name0, name1] = np.column_stack(rows)
+    write_database(path, images, matches)
+
+
 AHEAD, ASIDE = np.array([0, 0, 0.4]), np.array([0.8, 0, 0])
 
 
-def test_cameras_that_move_straight_ahead_are_mapped(
-    attempts, write_scenes, tmp_path: Path
-) -> None:
+def test_cameras_that_move_straight_ahead_are_mapped(attempts, tmp_path: Path) -> None:
     """COLMAP's defaults find no pair to begin with: the second attempt does."""
     write_scenes(tmp_path / "database.db", {"ahead": (AHEAD, 5)})
     verified = verify_pairs(tmp_path / "database.db")
@@ -118,32 +141,53 @@ def test_cameras_that_move_straight_ahead_are_mapped(
     assert ((steps @ steps[0]) / (lengths * lengths[0]) > 0.99).all()
 
 
-def test_a_model_whose_camera_ran_away_is_made_again(
-    pycolmap, write_scenes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    original, calls = pycolmap.incremental_mapping, []
+@pytest.fixture
+def run_away(pycolmap, monkeypatch: pytest.MonkeyPatch):
+    """Let the focal length run away in the first models that a mapper of COLMAP makes."""
 
-    def runs_away_once(*arguments, **keywords):
-        models = original(*arguments, **keywords)
-        calls.append(len(models))
-        if len(calls) == 1:
-            models[0].cameras[1].params = np.array([20_000.0, 20_000, 320, 240])
-        return models
+    def patch(name: str, times: int) -> list[int]:
+        original, calls = getattr(pycolmap, name), []
 
-    monkeypatch.setattr(pycolmap, "incremental_mapping", runs_away_once)
+        def mapper(*arguments, **keywords):
+            models = original(*arguments, **keywords)
+            calls.append(len(models))
+            if len(calls) <= times:
+                models[0].cameras[1].params = np.array([20_000.0, 20_000, 320, 240])
+            return models
+
+        monkeypatch.setattr(pycolmap, name, mapper)
+        return calls
+
+    return patch
+
+
+def test_a_model_whose_camera_ran_away_is_made_again(run_away, tmp_path: Path) -> None:
+    calls = run_away("incremental_mapping", 1)
     write_scenes(tmp_path / "database.db", {"aside": (ASIDE, 4)})
     verified = verify_pairs(tmp_path / "database.db")
     model, _ = map_images(tmp_path / "database.db", tmp_path, verified, True)
     assert calls == [1, 1]
-    assert {view.camera.focal_px for view in read_sparse_model(model).views.values()} == {
-        (500, 500)
-    }
+    views = read_sparse_model(model).views.values()
+    assert {view.camera.focal_px for view in views} == {(500, 500)}
+
+
+@pytest.mark.parametrize(
+    ("mapper", "name"),
+    [(map_images, "incremental_mapping"), (map_globally, "global_mapping")],
+)
+def test_cameras_that_cannot_be_told_are_no_model(
+    run_away, mapper, name: str, tmp_path: Path
+) -> None:
+    run_away(name, 2)
+    write_scenes(tmp_path / "database.db", {"aside": (ASIDE, 4)})
+    verified = verify_pairs(tmp_path / "database.db")
+    others = (True,) if name == "global_mapping" else (verified, True)
+    with pytest.raises(NoDepthError, match="focal length"):
+        mapper(tmp_path / "database.db", tmp_path, *others)
 
 
 @pytest.mark.parametrize(("ahead", "calls"), [(5, 2), (3, 1)])
-def test_a_drive_beside_a_smaller_scene(
-    attempts, write_scenes, ahead: int, calls: int, tmp_path: Path
-) -> None:
+def test_a_drive_beside_a_smaller_scene(attempts, ahead: int, calls: int, tmp_path: Path) -> None:
     """A second attempt is made where more photographs are left than the first has mapped."""
     write_scenes(tmp_path / "database.db", {"ahead": (AHEAD, ahead), "aside": (ASIDE, 4)})
     verified = verify_pairs(tmp_path / "database.db")
@@ -158,7 +202,7 @@ def test_a_drive_beside_a_smaller_scene(
         assert others == [aside]
 
 
-def test_all_poses_at_once_and_the_smaller_scene_apart(write_scenes, tmp_path: Path) -> None:
+def test_all_poses_at_once_and_the_smaller_scene_apart(tmp_path: Path) -> None:
     write_scenes(tmp_path / "database.db", {"aside": (ASIDE, 6), "up": (ASIDE[[1, 0, 2]], 4)})
     verify_pairs(tmp_path / "database.db")
     model, others = map_globally(tmp_path / "database.db", tmp_path, True)

@@ -30,7 +30,7 @@ from deepdetect import (
     reconstruct_many,
 )
 from deepdetect._shared.records import key
-from deepdetect.batch.hdf5 import open_hdf5
+from deepdetect.batch.hdf5 import SETTINGS, open_hdf5
 from deepdetect.datasets.posed_images import load_posed_scenes
 from deepdetect.evaluation.metrics.pose import camera_errors, rotation_error
 from deepdetect.geometry.camera import PosedView
@@ -260,11 +260,17 @@ def test_photographs_of_another_size_do_not_stop_a_calibrated_run(
         reconstruct_many(folder, tmp_path / "model", seed=-1, **arguments)
 
 
-def test_other_descriptors_make_a_model(write_fountain, tmp_path: Path, pycolmap) -> None:
-    """Their matches are filtered by the ratio test."""
+@pytest.mark.parametrize(
+    ("descriptor", "filter_by"), [("rootsift", "neighbours"), ("cross-modal", "ratio")]
+)
+def test_matches_are_filtered_as_their_descriptors_allow(
+    write_fountain, tmp_path: Path, pycolmap, descriptor: str, filter_by: str
+) -> None:
     folder = write_fountain(tmp_path / "photos", ("0004", "0005", "0006"))
-    detector = PointDetector(1000, descriptor="cross-modal")
+    detector = PointDetector(1000, descriptor=descriptor)
     found = reconstruct_many(folder, tmp_path / "model", **{**SPARSE, "detector": detector})
+    with open_hdf5(tmp_path / "model" / "work" / "matches.h5") as file:
+        assert json.loads(file.attrs[SETTINGS])["filter_by"] == filter_by
     assert len(found.views) == 3
     assert len(found.sparse) > 200
     assert np.median(found.sparse_errors) < 0.5

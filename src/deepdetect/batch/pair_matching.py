@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,7 +17,7 @@ from .._shared.errors import InvalidFileError, OptionError, check_name, noted_fa
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.records import key
 from ..features.keypoints import Keypoints
-from ..features.match_filter import check_filter
+from ..features.match_filter import check_filter, require_suited
 from ..features.matchers import MATCHERS_OF_NUMBERS
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import check_model
@@ -133,6 +134,8 @@ def match_pairs(
         listed = list_pairs(pairs, natsorted(feature_names(file), alg=ns.PATH))
     if source == Path(path).absolute():
         raise OptionError(f"{path} holds the features: give the matches another file with -o")
+    if options.filter_by == "neighbours" and (first := first_keypoints(source)):
+        require_suited(first)
     wanted, failures, gone, made_with = _find_pairs(source, listed)
     report = fill_file(
         path,
@@ -147,6 +150,15 @@ def match_pairs(
         quiet=quiet,
     )
     return replace(report, failures=(*failures, *report.failures))
+
+
+def first_keypoints(features: Path) -> Keypoints | None:
+    """Return those of the first image in a file that are not damaged: the others are alike."""
+    with open_hdf5(features) as file:
+        for name in feature_names(file):
+            with suppress(InvalidFileError):
+                return read_keypoints(file, name)
+    return None
 
 
 def _find_pairs(

@@ -49,6 +49,15 @@ def suits_filter(features: Keypoints) -> bool:
     return bool((sizes > 0).all() and (angles >= 0).all())
 
 
+def require_suited(*features: Keypoints) -> None:
+    """Raise an OptionError where keypoints do not suit the filter."""
+    if not all(map(suits_filter, features)):
+        raise OptionError(
+            "`filter_by='neighbours'` needs keypoints with sizes and angles, and learned "
+            "descriptors or RootSIFT, as `PointDetector.extract` returns them: take 'ratio'"
+        )
+
+
 def filter_matches(
     features0: Keypoints, features1: Keypoints, matches: DescriptorMatches
 ) -> DescriptorMatches:

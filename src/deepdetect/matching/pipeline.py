@@ -19,7 +19,7 @@ from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_k
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints, nearest_keypoints
 from ..features.learned import LEARNED_RATIO, RATIO, is_learned, match_learned
-from ..features.match_filter import check_filter, filter_matches, suits_filter
+from ..features.match_filter import check_filter, filter_matches, require_suited
 from ..features.matchers import (
     MATCHERS_OF_NUMBERS,
     DescriptorMatches,
@@ -253,11 +253,8 @@ def match_features(
     learned = is_learned(features0.descriptor_type)
     check_filter(filter_by, ratio, mutual)
     by_neighbours = filter_by == "neighbours"
-    if by_neighbours and not (suits_filter(features0) and suits_filter(features1)):
-        raise OptionError(
-            "`filter_by='neighbours'` needs keypoints with sizes and angles, and learned "
-            "descriptors or RootSIFT, as `PointDetector.extract` returns them: take 'ratio'"
-        )
+    if by_neighbours:
+        require_suited(features0, features1)
     if ratio is None:
         ratio = LEARNED_RATIO if learned else RATIO
     if not 0 < ratio <= 1:

@@ -61,6 +61,9 @@ their error, and it takes four times as long."""
 MIN_ANGLE_DEG = 1.0
 """Between two lines of sight of a point."""
 
+MIN_FOCAL_RATIO, MAX_FOCAL_RATIO, MAX_DISTORTION = 0.1, 10.0, 1.0
+"""Focal lengths over the longer side, and the largest parameter of distortion: COLMAP's limits."""
+
 MIN_VIEWS_OF_PRINCIPAL_POINT = 8
 """From so many images of a camera its principal point is estimated, too; else it is the middle."""
 
@@ -148,7 +151,7 @@ def map_images(
         if known_cameras:
             how.ba_refine_focal_length = False
             how.ba_refine_extra_params = False
-        found: list[Any] = []
+        found, tried = list[Any](), list[Any]()
         for forward in (False, True):
             if forward:
                 how.mapper.init_max_forward_motion = 1.0
@@ -162,8 +165,8 @@ def map_images(
                     initial_image_pair_callback=lambda: registered(2),
                     next_image_callback=lambda: registered(1),
                 )
-            sound = (model for model in models.values() if not _is_bogus(model, how))
-            attempt = sorted(sound, key=_size, reverse=True)
+            tried.extend(models.values())
+            attempt = _sound(models)
             if not found or (attempt and _size(attempt[0]) > _size(found[0])):
                 found = attempt
             # What is left may be more than the model: a drive beside some images of a house.
@@ -171,7 +174,7 @@ def map_images(
             left = [pair for pair in verified if mapped.isdisjoint(pair)]
             if found and largest_component(left) <= _size(found[0]):
                 break
-    return _largest(found)
+    return _largest(found, tried)
 
 
 def map_globally(
@@ -185,27 +188,37 @@ def map_globally(
             how.mapper.bundle_adjustment.refine_focal_length = False
             how.mapper.bundle_adjustment.refine_extra_params = False
         models = pycolmap.global_mapping(database, folder, space, how)
-    return _largest(sorted(models.values(), key=_size, reverse=True))
+    return _largest(_sound(models), [*models.values()])
 
 
-def _largest(found: Sequence[Any]) -> tuple[Any, list[frozenset[str]]]:
-    """Return the first of several models, and the names in the others."""
+def _sound(models: Mapping[int, Any]) -> list[Any]:
+    """Return the models, the largest first, without those whose cameras ran away.
+
+    With few points, focal length and distortion may become such that COLMAP triangulates no points
+    of most images.
+    """
+    limits = MIN_FOCAL_RATIO, MAX_FOCAL_RATIO, MAX_DISTORTION
+    found = []
+    for model in models.values():
+        cameras = [model.images[number].camera for number in model.reg_image_ids()]
+        if 2 * sum(camera.has_bogus_params(*limits) for camera in cameras) <= len(cameras):
+            found.append(model)
+    return sorted(found, key=_size, reverse=True)
+
+
+def _largest(found: Sequence[Any], tried: Sequence[Any]) -> tuple[Any, list[frozenset[str]]]:
+    """Return the first of several models, and the names in the others; none may be sound."""
+    if not found and any(_size(model) >= MIN_VIEWS for model in tried):
+        raise NoDepthError(
+            "focal length and distortion cannot be told from these images: give `calibration` or "
+            "`focal_px`, or take more images, from the side, too"
+        )
     if not found or _size(found[0]) < MIN_VIEWS:
         raise NoDepthError(
             "the images do not hang together: take them so that each shows most of what the "
             "one before shows, from another place"
         )
     return found[0], [_names(model) for model in found[1:]]
-
-
-def _is_bogus(model: Any, how: Any) -> bool:
-    """Return whether most images of a model have cameras that COLMAP triangulates no points of.
-
-    With few points, focal length and distortion may run away together.
-    """
-    limits = how.min_focal_length_ratio, how.max_focal_length_ratio, how.max_extra_param
-    cameras = [model.images[number].camera for number in model.reg_image_ids()]
-    return 2 * sum(camera.has_bogus_params(*limits) for camera in cameras) > len(cameras)
 
 
 def _size(model: Any) -> int:

@@ -2,24 +2,27 @@
 
 An image that comes early is placed by few points. Where a camera moves straight ahead, matches that
 are wrong along the line of motion agree with many places on it, and a wrong one stays: the points
-that the image itself gave their depth agree with it. Those that others see without it do not.
+that the image itself gave their depth agree with it. Those that others see well without it do not.
 """
 
 from __future__ import annotations
 
 import tempfile
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Container, Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .._shared.progress import progress
 from .colmap import quiet_pycolmap
-from .mapping import MAX_VERIFICATION_ERROR_PX, MIN_VERIFIED, adjust
+from .mapping import MAX_VERIFICATION_ERROR_PX, MIN_ANGLE_DEG, MIN_VERIFIED, adjust
 
-MIN_OTHERS = 2
-"""Images that see a point beside the one that is checked: its place rests on them alone."""
+MIN_SPREAD_DEG = MIN_ANGLE_DEG / 2
+"""Of the lines of sight of the other images about their mean (root mean square); of two images it
+is half of the angle between them. With less, the image that is checked gave a point its depth."""
 
 MIN_GAIN = 1.5
 """Points that agree with another place, in those that agree with the one of the model. Of images
@@ -29,72 +32,122 @@ MAX_ROUNDS = 3
 """Of checks: with each image that is put right, the points by which others are checked get
 better."""
 
+MIN_KEPT = 0.9
+"""Observations of the points that are made anew, in those of before: it was .99 where it helped."""
 
-def correct_places(model: Any, database: Path, folder: Path, known_cameras: bool, seed: int) -> Any:
+
+def correct_places(
+    model: Any,
+    database: Path,
+    folder: Path,
+    known_cameras: bool,
+    seed: int = 0,
+    quiet: bool = True,
+) -> Any:
     """Return a model of pycolmap in which all images are where the points of the others say.
 
     The database is that of the mapping. If an image is put elsewhere, all points are made anew, and
-    cameras and points adjusted.
+    cameras and points adjusted. `quiet` shows no bar.
     """
     for _ in range(MAX_ROUNDS):
         with quiet_pycolmap() as pycolmap:
-            places = _better_places(pycolmap, model, database, seed)
+            places = _better_places(pycolmap, model, database, seed, quiet)
             if not places:
                 break
+            moved = pycolmap.Reconstruction(model)
             for number, place in places.items():
-                image = model.images[number]
+                image = moved.images[number]
                 image.frame.set_cam_from_world(image.camera_id, place)
             with tempfile.TemporaryDirectory(prefix="deepdetect-") as space:
                 how = pycolmap.IncrementalPipelineOptions(extract_colors=False, random_seed=seed)
-                model = pycolmap.triangulate_points(model, database, folder, space, options=how)
-        adjust(model, known_cameras)
+                moved = pycolmap.triangulate_points(moved, database, folder, space, options=how)
+        if moved.compute_num_observations() < MIN_KEPT * model.compute_num_observations():
+            break
+        adjust(moved, known_cameras)
+        model = moved
     return model
 
 
-def _better_places(pycolmap: Any, model: Any, database: Path, seed: int) -> dict[int, Any]:
+def _better_places(
+    pycolmap: Any, model: Any, database: Path, seed: int, quiet: bool
+) -> dict[int, Any]:
     """Return the poses of those images that more points of others agree with, by their numbers."""
     how = pycolmap.AbsolutePoseEstimationOptions()
     how.ransac.max_error, how.ransac.random_seed = MAX_VERIFICATION_ERROR_PX, seed
-    row_of = {number: row for row, number in enumerate(model.points3D)}
-    points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-    lengths = np.array([point.track.length() for point in model.points3D.values()], np.int64)
-    seen = {
-        number: np.array([row_of.get(p.point3D_id, -1) for p in model.images[number].points2D])
-        for number in model.reg_image_ids()
-    }
-    found = {}
-    with pycolmap.Database.open(database) as opened:
-        partners = _partners(pycolmap, opened, seen)
-        for number, own in seen.items():
-            matched = np.concatenate(
-                [np.empty((0, 2), np.int64)]
-                + [_matched(opened, number, other, seen[other]) for other in partners[number]]
-            )
-            keypoints, rows = np.unique(matched, axis=0).T
-            others = lengths[rows] - np.isin(rows, own[own >= 0])
-            keypoints, rows = (each[others >= MIN_OTHERS] for each in (keypoints, rows))
-            if len(rows) < MIN_VERIFIED:
+    points, found = _Points(model), {}
+    with (
+        pycolmap.Database.open(database) as opened,
+        progress(len(points.seen), "checking places", "image", quiet) as bar,
+    ):
+        partners = _partners(pycolmap, opened, points.seen)
+        for number in points.seen:
+            bar.update()
+            matches = [(other, _matches(opened, number, other)) for other in partners[number]]
+            keypoints, rows = points.matched(number, matches)
+            image, places = model.images[number], points.xyz[rows]
+            xy = points.keypoints[number][keypoints]
+            agreeing = partial(_agreeing, image.camera, xy, places)
+            needed = max(MIN_VERIFIED, MIN_GAIN * agreeing(image.cam_from_world()))
+            if len(rows) < needed:
                 continue
-            image = model.images[number]
-            xy = np.array([point.xy for point in image.points2D])[keypoints]
-            estimate = pycolmap.estimate_and_refine_absolute_pose(
-                xy, points[rows], image.camera, how
-            )
-            if estimate is None:
-                continue
-            place = estimate["cam_from_world"]
-            before, after = (
-                _agreeing(image.camera, pose, xy, points[rows])
-                for pose in (image.cam_from_world(), place)
-            )
-            if after >= max(MIN_VERIFIED, MIN_GAIN * before):
-                found[number] = place
+            estimate = pycolmap.estimate_and_refine_absolute_pose(xy, places, image.camera, how)
+            if estimate and agreeing(estimate["cam_from_world"]) >= needed:
+                found[number] = estimate["cam_from_world"]
     return found
 
 
-def _partners(
-    pycolmap: Any, database: Any, images: Mapping[int, np.ndarray]
-) -> dict[int, list[int]]:
+class _Points:
+    """The points of a model, and which images see them.
+
+    Attributes:
+        xyz: (P, 3) places.
+        keypoints: (K, 2) pixels of all keypoints of each image.
+        seen: (K,) rows of the points that they are of, or -1.
+    """
+
+    def __init__(self, model: Any) -> None:
+        row_of = {number: row for row, number in enumerate(model.points3D)}
+        places = [point.xyz for point in model.points3D.values()]
+        self.xyz = np.array(places).reshape(-1, 3)
+        self.keypoints, self.seen, self._sights = {}, {}, {}
+        # Of the lines of sight of all images that see a point.
+        self._counts, self._sums = np.zeros(len(self.xyz)), np.zeros_like(self.xyz)
+        for number in model.reg_image_ids():
+            image = model.images[number]
+            self.keypoints[number] = np.array([k.xy for k in image.points2D]).reshape(-1, 2)
+            rows = [row_of.get(k.point3D_id, -1) for k in image.points2D]
+            self.seen[number] = np.array(rows, np.int64)
+            own = np.unique(self.seen[number][self.seen[number] >= 0])
+            sights = self.xyz[own] - image.projection_center()
+            sights /= np.linalg.norm(sights, axis=1, keepdims=True)
+            self._sights[number] = own, sights
+            self._counts[own] += 1
+            self._sums[own] += sights
+
+    def matched(
+        self, number: int, matches: Iterable[tuple[int, np.ndarray]]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return which keypoints of an image are matched to which points that others see well.
+
+        `matches` are (M, 2) rows of keypoints of the image and of each other one.
+        """
+        own, sights = self._sights[number]
+        counts, sums = self._counts.copy(), self._sums.copy()
+        counts[own] -= 1
+        sums[own] -= sights
+        # The mean of unit vectors is the shorter, the farther they lie apart.
+        lengths = np.linalg.norm(sums, axis=1) / np.maximum(counts, 1)
+        well = (counts > 1) & (lengths < np.cos(np.radians(MIN_SPREAD_DEG)))
+        found = [np.empty(0, np.int64)]
+        for other, pairs in matches:
+            rows = self.seen[other][pairs[:, 1]]
+            kept = (rows >= 0) & well[rows]
+            found.append(pairs[kept, 0] * len(self.xyz) + rows[kept])
+        keypoints, rows = np.divmod(np.unique(np.concatenate(found)), max(len(self.xyz), 1))
+        return keypoints, rows
+
+
+def _partners(pycolmap: Any, database: Any, images: Container[int]) -> dict[int, list[int]]:
     """Return with which of the images each has verified matches."""
     partners = defaultdict[int, list[int]](list)
     for pair, count in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
@@ -105,17 +158,13 @@ def _partners(
     return partners
 
 
-def _matched(database: Any, number: int, other: int, seen: np.ndarray) -> np.ndarray:
-    """Return (K, 2) keypoints of an image, and the rows of the points another has them matched to.
-
-    `seen` has the row of the point at each keypoint of the other image, or -1.
-    """
-    matches = np.asarray(database.read_two_view_geometry(number, other).inlier_matches, np.int64)
-    found = np.column_stack([matches[:, 0], seen[matches[:, 1]]])
-    return found[found[:, 1] >= 0]
+def _matches(database: Any, number: int, other: int) -> np.ndarray:
+    """Return (M, 2) rows of keypoints of two images that agree with their geometry."""
+    matches = database.read_two_view_geometry(number, other).inlier_matches
+    return np.asarray(matches, np.int64).reshape(-1, 2)
 
 
-def _agreeing(camera: Any, pose: Any, xy: np.ndarray, points: np.ndarray) -> int:
+def _agreeing(camera: Any, xy: np.ndarray, points: np.ndarray, pose: Any) -> int:
     """Count points that a camera at a pose sees where (K, 2) keypoints are."""
     local = points @ pose.rotation.matrix().T + pose.translation
     errors = np.linalg.norm(camera.img_from_cam(local) - xy, axis=1)

@@ -24,10 +24,10 @@ from .._shared.machine import available_memory, map_in_processes, needed_memory,
 from .._shared.options import check_ranges, suggest_keywords
 from .._shared.progress import progress
 from .._shared.records import file_state, key, load_arrays, save_arrays
-from ..batch.extraction import extract_features, read_keypoints
+from ..batch.extraction import extract_features
 from ..batch.hdf5 import feature_names, open_hdf5
 from ..batch.pair_list import Pair, following, list_pairs, pair_name
-from ..batch.pair_matching import PairMatchingOptions, match_pairs
+from ..batch.pair_matching import PairMatchingOptions, first_keypoints, match_pairs
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
@@ -271,8 +271,8 @@ class Stages:
         Keypoints without sizes, or of other descriptors, are matched by the ratio test.
         """
         path = self.work / "matches.h5"
-        with open_hdf5(self.features) as file:
-            suited = suits_filter(read_keypoints(file, feature_names(file)[0]))
+        first = first_keypoints(self.features)
+        suited = first is not None and suits_filter(first)
         how = replace(self.matching, filter_by="neighbours" if suited else "ratio")
         match_pairs(
             self.features, pairs, path, options=how, workers=self.workers, quiet=self.quiet
@@ -342,7 +342,7 @@ class Stages:
                     # Those of an attempt that is given up are counted again in the next.
                     lambda count: bar.update(min(count, len(images) - bar.n)),
                 )
-        model = correct_places(model, database, folder, known, self.seed)
+        model = correct_places(model, database, folder, known, self.seed, self.quiet)
         if refined:
             refine_tracks(model, folder, self.quiet)
             adjust_refined(model, known)
