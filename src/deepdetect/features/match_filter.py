@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 
 from .._shared.errors import OptionError, check_name
+from .._shared.opencv import cv2
 from .._shared.runtimes import start_session
 from .keypoints import Keypoints
 from .learned import CROSS_MODAL, UPRIGHT_DEGREES, common_turn, is_learned
-from .matchers import DescriptorMatches, automatic_neighbours
+from .matchers import DescriptorMatches
 from .sift import ROOT_SIFT
 
 MATCH_FILTER = Path(__file__).with_name("match_filter.onnx")
@@ -28,6 +29,9 @@ AROUND = 8
 
 MOST_DISTINCT = 512
 """Matches of the lowest ratios, which tell by how much one image is turned."""
+
+FLANN_KDTREE_SINGLE, ALL_LEAVES = 4, -1
+"""FLANN's tree for few dimensions, and the search that is exact."""
 
 
 def check_filter(filter_by: str, ratio: float | None, mutual: bool) -> None:
@@ -106,7 +110,8 @@ def filter_inputs(
 def nearest_rows(xy: np.ndarray) -> np.ndarray:
     """Return the (N, `AROUND`) rows of the nearest others of more than so many positions."""
     own = np.arange(len(xy))[:, None]
-    near = automatic_neighbours(xy, xy, AROUND + 1, 0)[0].astype(np.int64)
+    tree = cv2.flann_Index(xy, {"algorithm": FLANN_KDTREE_SINGLE, "leaf_max_size": 10})
+    near = tree.knnSearch(xy, AROUND + 1, params={"checks": ALL_LEAVES})[0].astype(np.int64)
     # The own one comes last then; it is not among them where many are at one place.
     return np.take_along_axis(near, np.argsort(near == own, axis=1, kind="stable"), 1)[:, :-1]
 
