@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import ast
 import os
 import stat
 import subprocess
@@ -123,3 +124,21 @@ def test_the_first_compilation_is_announced_once(sealed: Path) -> None:
     cache = sealed.parent / "cache"
     assert run(code, sealed, NUMBA_CACHE_DIR=cache).split() == ["imported", "compiling", "3", "3.5"]
     assert run(code, sealed, NUMBA_CACHE_DIR=cache).split() == ["imported", "3", "3.5"]
+
+
+def test_kernels_do_without_linear_algebra() -> None:
+    """Numba takes it from scipy, which a plain installation has not."""
+    counted = 0
+    for path in PACKAGE.rglob("*.py"):
+        if "@compiled(" not in (source := path.read_text(encoding="utf-8")):
+            continue
+        functions = [each for each in ast.parse(source).body if isinstance(each, ast.FunctionDef)]
+        for function in functions:
+            if not any("compiled(" in ast.unparse(each) for each in function.decorator_list):
+                continue
+            counted += 1
+            for node in ast.walk(function):
+                assert not isinstance(node, ast.MatMult), function.name
+                name = getattr(node, "attr", None)
+                assert name not in ("dot", "vdot", "linalg", "outer", "kron"), function.name
+    assert counted > 20

@@ -345,7 +345,7 @@ def fuse_rows(  # type: ignore[no-untyped-def]
             if not w > 0:
                 continue
             x, y = float(column * stride), float(row * stride)
-            line = rays @ np.array([x, y, 1.0])
+            line = rays[:, 0] * x + rays[:, 1] * y + rays[:, 2]
             total, count, widest = float(w), 1, 0.0
             for k in range(len(neighbours)):
                 m, n = there[k], back[k]
