@@ -76,7 +76,9 @@ def test_a_wrong_depth_map_is_outvoted() -> None:
     found = fuse_depth_maps(views, maps, 2)
     points = found["points"]
     np.testing.assert_allclose(points[:, 2], 6 + points[:, 0] / 2, atol=1e-4)
-    assert (found["views"] == 3).all()
+    # Two at the borders, which some images do not show.
+    assert found["views"].max() == 3
+    assert (found["views"] == 3).mean() > 0.8
     assert len(found) > 5000
 
 
@@ -86,6 +88,46 @@ def test_two_depth_maps_are_not_enough() -> None:
     maps[1]["plane"][:, :80, 0] *= 1.1
     maps[2]["plane"][...] = np.nan
     assert not len(fuse_depth_maps(views, maps, 2))
+
+
+def cells(found: np.ndarray) -> np.ndarray:
+    """Return which pixels of the depth map of the reference are points."""
+    shown = np.zeros((SIZE[1] // 2, SIZE[0] // 2), bool)
+    column, row = np.rint(REFERENCE.project(found["points"])[0] / 2).astype(int).T
+    shown[row, column] = True
+    return shown
+
+
+def agreed_by(*counts: tuple[int, slice, slice]) -> np.ndarray:
+    """Return the pixels that become points if so many depth maps agree there, elsewhere none."""
+    views = [REFERENCE, *OTHERS]
+    known = np.zeros((len(views), SIZE[1] // 2, SIZE[0] // 2), bool)
+    for count, rows, columns in counts:
+        known[:, rows, columns] = np.arange(len(views))[:, None, None] < count
+    # The cameras do not turn: surfaces parallel to the image are shifted along rows alone.
+    ahead = [PosedView("", each.camera, np.eye(3), -each.centre) for each in views]
+    maps = []
+    for each, own in zip(ahead, known, strict=True):
+        made = np.zeros(own.shape, DEPTH_PIXEL)
+        shift = round(300.0 * each.centre[0] / 6 / 2)
+        made["plane"][..., 0] = np.where(np.roll(own, -shift, axis=1), 1 / 6, np.nan)
+        maps.append(made)
+    return cells(fuse_depth_maps(ahead, maps, 2))
+
+
+def test_holes_of_a_surface_are_filled_by_two_depth_maps() -> None:
+    rows, whole = slice(20, 100), slice(60, 120)
+    found = agreed_by((3, rows, whole), (2, rows, slice(80, 84)))
+    assert found[30:90, 65:115].all()
+    wide = agreed_by((3, rows, whole), (2, rows, slice(75, 95)))
+    assert wide[30:90, 65:75].all()
+    assert not wide[30:90, 81:89].any()
+
+
+def test_small_patches_apart_need_five_depth_maps() -> None:
+    patch = slice(50, 60), slice(80, 90)
+    assert not agreed_by((4, *patch)).any()
+    assert agreed_by((5, *patch))[51:59, 82:88].all()
 
 
 def test_points_without_parallax_or_behind_the_cameras_are_left_out() -> None:

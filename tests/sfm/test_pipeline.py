@@ -115,7 +115,8 @@ def test_points_agree_with_the_photographs(small) -> None:
     assert len(found.dense) > 1500
     assert np.median(found.sparse_errors) < 0.5
     assert np.median(found.dense_errors) < 0.3
-    assert found.dense_views.min() >= 3
+    assert found.dense_views.min() == 2  # holes of a surface that three agree on
+    assert (found.dense_views >= 3).mean() > 0.8
     # The world is the frame of the reference, and 1 the spacing of the cameras.
     reference = found.views[found.reference]
     np.testing.assert_allclose(reference.rotation, np.eye(3), atol=1e-9)

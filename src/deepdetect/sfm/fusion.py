@@ -19,12 +19,17 @@ MAX_ERROR_PX = 1.0
 MAX_DEPTH_DIFFERENCE = 0.01
 """Of two depth maps that agree, relative."""
 
-EDGE_RADIUS, MIN_VIEWS_AT_EDGES = 4, 5
-"""Pixels of a depth map from a farther surface within which so many images must agree."""
+EDGE_RADIUS, ENOUGH_VIEWS = 4, 5
+"""Pixels of a depth map from a farther surface within which so many images must agree; they are
+enough everywhere."""
 
-SUPPORT_SIDE, MIN_SUPPORT = 9, 0.4
-"""Side of the square of pixels of a depth map around one, and the share of them that must be agreed
-on, too, or one image more must agree: small patches apart are where most wrong points are."""
+SUPPORT_SIDE, MIN_SUPPORT = 21, 0.6
+"""Side of the square of pixels of a depth map around one, and the share of them that `MIN_VIEWS` or
+more must agree on, too: small patches apart are where most wrong points are."""
+
+SUPPORTED_RADIUS, MIN_SUPPORTED_VIEWS = 4, 2
+"""Pixels of a depth map from such a one within which so many images are enough: holes of a surface
+are where others show through."""
 
 MIN_TRIANGULATION_DEG = 1.0
 """Smallest angle between two of the lines of sight."""
@@ -69,9 +74,12 @@ def fuse_depth_maps(
     farthest = cv2.erode(known, np.ones((2 * EDGE_RADIUS + 1,) * 2, np.uint8))
     slanted = EDGE_RADIUS * stride_px * np.abs(planes[..., 1:]).sum(axis=2)
     edge = planes[..., 0] - farthest > MAX_DEPTH_DIFFERENCE * planes[..., 0] + slanted
-    agreed = count >= np.where(edge, MIN_VIEWS_AT_EDGES, MIN_VIEWS)
+    agreed = count >= np.where(edge, ENOUGH_VIEWS, MIN_VIEWS)
     support = cv2.boxFilter(agreed.astype(np.float32), -1, (SUPPORT_SIDE, SUPPORT_SIDE))
-    row, column = np.nonzero(agreed & ((count > MIN_VIEWS) | (support >= MIN_SUPPORT)))
+    sure = (agreed & (support >= MIN_SUPPORT)).astype(np.uint8)
+    supported = cv2.dilate(sure, np.ones((2 * SUPPORTED_RADIUS + 1,) * 2, np.uint8)) > 0
+    some = supported & ~edge & (count >= MIN_SUPPORTED_VIEWS)
+    row, column = np.nonzero(some | (count >= ENOUGH_VIEWS))
     found, plane = maps[0][row, column], planes[row, column].astype(np.float64)
     xy, near = np.column_stack([column, row]) * float(stride_px), inverse[row, column]
     made = np.empty(len(row), DENSE_POINT)
