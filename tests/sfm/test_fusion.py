@@ -98,8 +98,11 @@ def cells(found: np.ndarray) -> np.ndarray:
     return shown
 
 
-def agreed_by(*counts: tuple[int, slice, slice]) -> np.ndarray:
-    """Return the pixels that become points if so many depth maps agree there, elsewhere none."""
+def agreed_by(*counts: tuple[int, slice, slice], behind: float = np.nan) -> np.ndarray:
+    """Return the pixels that become points if so many depth maps agree there.
+
+    Elsewhere all have the inverse depth `behind`, if any.
+    """
     views = [REFERENCE, *OTHERS]
     known = np.zeros((len(views), SIZE[1] // 2, SIZE[0] // 2), bool)
     for count, rows, columns in counts:
@@ -110,7 +113,7 @@ def agreed_by(*counts: tuple[int, slice, slice]) -> np.ndarray:
     for each, own in zip(ahead, known, strict=True):
         made = np.zeros(own.shape, DEPTH_PIXEL)
         shift = round(300.0 * each.centre[0] / 6 / 2)
-        made["plane"][..., 0] = np.where(np.roll(own, -shift, axis=1), 1 / 6, np.nan)
+        made["plane"][..., 0] = np.where(np.roll(own, -shift, axis=1), 1 / 6, behind)
         maps.append(made)
     return cells(fuse_depth_maps(ahead, maps, 2))
 
@@ -122,6 +125,15 @@ def test_holes_of_a_surface_are_filled_by_two_depth_maps() -> None:
     wide = agreed_by((3, rows, whole), (2, rows, slice(75, 95)))
     assert wide[30:90, 65:75].all()
     assert not wide[30:90, 81:89].any()
+
+
+def test_edges_of_a_nearer_surface_need_five_depth_maps() -> None:
+    rows, whole = slice(20, 100), slice(60, 120)
+    four = agreed_by((4, rows, whole), behind=1 / 12)
+    assert four[30:90, 66:114].all()
+    assert not four[30:90, 60:63].any()
+    assert not four[30:90, 117:120].any()
+    assert agreed_by((5, rows, whole), behind=1 / 12)[30:90, 61:119].all()
 
 
 def test_small_patches_apart_need_five_depth_maps() -> None:
