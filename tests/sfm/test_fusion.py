@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+import pytest
 
 from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.sfm.depth_maps import DEPTH_PIXEL
@@ -20,12 +23,12 @@ def view(x: float, name: str = "") -> PosedView:
     return PosedView(name, Camera(SIZE, 300.0), rotation, -rotation @ [x, 0, 0])
 
 
-def tilted(own: PosedView, stride: int = 2) -> np.ndarray:
-    """Return the exact depth map of the plane z = 6 + x / 2."""
+def tilted(own: PosedView, stride: int = 2, slope: float = 0.5) -> np.ndarray:
+    """Return the exact depth map of the plane z = 6 + slope x."""
     y, x = np.mgrid[0 : SIZE[1] : stride, 0 : SIZE[0] : stride]
     rays = own.camera.rays(np.column_stack([x.ravel(), y.ravel()]))
-    # Of a point X = centre + t ray: its z - x / 2 - 6 is 0, and t is its depth.
-    plane = np.array([-0.5, 0, 1])
+    # Of a point X = centre + t ray: its z - slope x - 6 is 0, and t is its depth.
+    plane = np.array([-slope, 0, 1])
     inverse = (rays @ own.rotation @ plane) / (6 - own.centre @ plane)
     made = np.zeros(x.shape, DEPTH_PIXEL)
     made["plane"][..., 0] = inverse.reshape(x.shape)
@@ -82,6 +85,14 @@ def test_a_wrong_depth_map_is_outvoted() -> None:
     assert len(found) > 5000
 
 
+@pytest.mark.parametrize(("factor", "agree"), [(1.008, True), (1.03, False)])
+def test_depths_may_differ_by_a_hundredth(factor: float, agree: bool) -> None:
+    views = [view(x) for x in (0, -0.15, 0.15)]
+    maps = [tilted(each) for each in views]
+    maps[0]["plane"] *= factor  # less than a pixel away
+    assert bool(len(fuse_depth_maps(views, maps, 2))) == agree
+
+
 def test_two_depth_maps_are_not_enough() -> None:
     views = [REFERENCE, *OTHERS[:2]]
     maps = [tilted(each) for each in views]
@@ -90,56 +101,107 @@ def test_two_depth_maps_are_not_enough() -> None:
     assert not len(fuse_depth_maps(views, maps, 2))
 
 
-def cells(found: np.ndarray) -> np.ndarray:
-    """Return which pixels of the depth map of the reference are points."""
-    shown = np.zeros((SIZE[1] // 2, SIZE[0] // 2), bool)
-    column, row = np.rint(REFERENCE.project(found["points"])[0] / 2).astype(int).T
-    shown[row, column] = True
-    return shown
+Layer = tuple[int, slice, slice, float]
+ROWS, COLUMNS, NEAR, FAR = slice(20, 100), slice(60, 120), 1 / 6, 1 / 12
 
 
-def agreed_by(*counts: tuple[int, slice, slice], behind: float = np.nan) -> np.ndarray:
-    """Return the pixels that become points if so many depth maps agree there.
+def agreed_by(
+    *layers: Layer, others: Sequence[float] = (-0.8, -0.4, 0.4, 0.8), behind: float = np.nan
+) -> np.ndarray:
+    """Return which pixels of the depth map of the reference become points.
 
-    Elsewhere all have the inverse depth `behind`, if any.
+    The cameras are at 0 and `others` and do not turn. A layer is how many depth maps have a surface
+    parallel to the image, its pixels in the reference, and its inverse depth; the others have the
+    inverse depth `behind` there, if any, as all have where no layer is.
     """
-    views = [REFERENCE, *OTHERS]
-    known = np.zeros((len(views), SIZE[1] // 2, SIZE[0] // 2), bool)
-    for count, rows, columns in counts:
-        known[:, rows, columns] = np.arange(len(views))[:, None, None] < count
-    # The cameras do not turn: surfaces parallel to the image are shifted along rows alone.
-    ahead = [PosedView("", each.camera, np.eye(3), -each.centre) for each in views]
-    maps = []
-    for each, own in zip(ahead, known, strict=True):
-        made = np.zeros(own.shape, DEPTH_PIXEL)
-        shift = round(300.0 * each.centre[0] / 6 / 2)
-        made["plane"][..., 0] = np.where(np.roll(own, -shift, axis=1), 1 / 6, behind)
-        maps.append(made)
-    return cells(fuse_depth_maps(ahead, maps, 2))
+    views = [
+        PosedView("", Camera(SIZE, 300.0), np.eye(3), np.array([-x, 0.0, 0.0]))
+        for x in (0.0, *others)
+    ]
+    maps = [np.zeros((SIZE[1] // 2, SIZE[0] // 2), DEPTH_PIXEL) for _ in views]
+    for number, (own, made) in enumerate(zip(views, maps, strict=True)):
+        made["plane"][..., 0] = behind
+        for count, rows, columns, inverse in layers:
+            shown = np.zeros(made.shape, bool)
+            shown[rows, columns] = True
+            shown = np.roll(shown, -round(300.0 * own.centre[0] * inverse / 2), axis=1)
+            made["plane"][shown, 0] = inverse if number < count else behind
+    found = np.zeros(maps[0].shape, bool)
+    projected, _ = views[0].project(fuse_depth_maps(views, maps, 2)["points"])
+    column, row = np.rint(projected / 2).astype(int).T
+    found[row, column] = True
+    return found
 
 
-def test_holes_of_a_surface_are_filled_by_two_depth_maps() -> None:
-    rows, whole = slice(20, 100), slice(60, 120)
-    found = agreed_by((3, rows, whole), (2, rows, slice(80, 84)))
-    assert found[30:90, 65:115].all()
-    wide = agreed_by((3, rows, whole), (2, rows, slice(75, 95)))
-    assert wide[30:90, 65:75].all()
-    assert not wide[30:90, 81:89].any()
+def test_two_depth_maps_fill_four_pixels_around_the_middle_of_a_surface() -> None:
+    found = agreed_by((3, ROWS, COLUMNS, NEAR), (2, ROWS, slice(75, 95), NEAR))
+    assert found[40:80, 60:79].all()
+    assert not found[40:80, 79:91].any()
+    assert found[40:80, 91:120].all()
 
 
-def test_edges_of_a_nearer_surface_need_five_depth_maps() -> None:
-    rows, whole = slice(20, 100), slice(60, 120)
-    four = agreed_by((4, rows, whole), behind=1 / 12)
-    assert four[30:90, 66:114].all()
-    assert not four[30:90, 60:63].any()
-    assert not four[30:90, 117:120].any()
-    assert agreed_by((5, rows, whole), behind=1 / 12)[30:90, 61:119].all()
+def test_small_patches_need_five_depth_maps() -> None:
+    """Of 25 pixels, five apart, a patch must have 15 around its middle."""
+    strip, narrower = slice(80, 91), slice(80, 90)
+    assert agreed_by((3, ROWS, strip, NEAR))[40:80, strip].all()
+    assert not agreed_by((4, ROWS, narrower, NEAR)).any()
+    assert agreed_by((5, ROWS, narrower, NEAR), others=(-0.8, -0.4, 0.4, 0.8, 0.2))[
+        40:80, narrower
+    ].all()
+    assert not agreed_by((4, slice(40, 60), strip, NEAR)).any()
+    assert agreed_by((4, slice(40, 61), strip, NEAR))[50, strip].all()
 
 
-def test_small_patches_apart_need_five_depth_maps() -> None:
-    patch = slice(50, 60), slice(80, 90)
-    assert not agreed_by((4, *patch)).any()
-    assert agreed_by((5, *patch))[51:59, 82:88].all()
+def test_all_four_depth_maps_that_show_a_place_are_enough() -> None:
+    patch = ROWS, slice(80, 84), NEAR
+    three = -0.8, -0.4, 0.4
+    assert agreed_by((4, *patch), others=three)[40:80, 80:84].all()
+    assert agreed_by((4, *patch), others=(*three, 8.0))[40:80, 80:84].all()
+    assert not agreed_by((4, *patch), others=(*three, 0.8)).any()
+    assert not agreed_by((3, *patch), others=three).any()
+    assert not agreed_by((3, *patch), others=three[:2]).any()
+
+
+def test_what_lies_at_another_depth_is_no_part_of_a_surface() -> None:
+    speck = slice(55, 60), slice(85, 90)
+    found = agreed_by((5, ROWS, COLUMNS, NEAR), (2, *speck, FAR))
+    assert not found[speck].any()
+    assert found[30:50, 66:114].all()
+    # Every third row is another surface: neither is one that three depth maps make.
+    rows = [(3, slice(row, row + 1), COLUMNS, FAR) for row in range(20, 100, 3)]
+    assert not agreed_by((3, ROWS, COLUMNS, NEAR), *rows)[30:90, 66:114].any()
+
+
+def test_fewer_than_five_depth_maps_make_no_points_beside_a_farther_surface() -> None:
+    found = agreed_by((4, ROWS, COLUMNS, NEAR), behind=FAR)
+    assert found[40:80, 64:116].all()
+    assert not found[40:80, 60:64].any()
+    assert not found[40:80, 116:120].any()
+    assert agreed_by((5, ROWS, COLUMNS, NEAR), behind=FAR)[40:80, 61:119].all()
+
+
+def test_a_wrong_depth_of_one_map_makes_no_edge() -> None:
+    wrong = slice(60, 61), slice(90, 91)
+    found = agreed_by((4, ROWS, COLUMNS, NEAR), (1, *wrong, FAR))
+    assert found[wrong].sum() == 0
+    assert found[55:66, 85:96].sum() == 11 * 11 - 1
+
+
+def test_surfaces_reach_the_corners_of_the_image() -> None:
+    everywhere = slice(0, 120), slice(0, 160)
+    found = agreed_by((3, *everywhere, NEAR), others=(-0.8, -0.4, -0.6, -0.2))
+    assert found[:, :100].all()
+
+
+@pytest.mark.parametrize("stride", [1, 2, 4])
+def test_steep_surfaces_have_no_edges(stride: int) -> None:
+    views = [REFERENCE, *(view(x) for x in (0.4, -0.4, 0.2, -0.2))]
+    maps = [tilted(each, stride, 2.0) for each in views]
+    known = fuse_depth_maps(views, maps, stride)
+    for each in maps[3:]:
+        each["plane"] = np.nan
+    found = fuse_depth_maps(views, maps, stride)
+    assert len(found) > 0.9 * len(known) > 0.6 * SIZE[0] * SIZE[1] / stride**2
 
 
 def test_points_without_parallax_or_behind_the_cameras_are_left_out() -> None:

@@ -327,7 +327,7 @@ def refine_rows(  # type: ignore[no-untyped-def]
 @compiled(nogil=True)
 def fuse_rows(  # type: ignore[no-untyped-def]
     first, last, planes, neighbours, stride, there, back, rays, centres, max_error, max_difference,
-    min_angle, fused, views,
+    min_angle, fused, views, shown,
 ):  # fmt: skip
     """Write the mean inverse depth of the depth maps that agree on each pixel of the first.
 
@@ -335,18 +335,18 @@ def fuse_rows(  # type: ignore[no-untyped-def]
     pixels. `there` and `back` (K, 3, 4) are A and b to the neighbours and from them. `rays` (3, 3)
     makes lines of sight of pixels, `centres` (K, 3) are those of the neighbours in the same frame.
     A neighbour agrees where its own surface is seen within `max_error` pixels. `views` (H, W) is
-    how many do, with the first one, or 0.
+    how many do, with the first one, or 0; `shown` (H, W), how many have the pixel in their image.
     """
     across, down = neighbours.shape[2], neighbours.shape[1]
     for row in range(first, last):
         for column in range(planes.shape[1]):
             w, right, below = planes[row, column]
-            views[row, column] = 0
+            views[row, column] = shown[row, column] = 0
             if not w > 0:
                 continue
             x, y = float(column * stride), float(row * stride)
             line = rays[:, 0] * x + rays[:, 1] * y + rays[:, 2]
-            total, count, widest = float(w), 1, 0.0
+            total, count, inside, widest = float(w), 1, 1, 0.0
             for k in range(len(neighbours)):
                 m, n = there[k], back[k]
                 px, py, pz = _project(m, x, y, w)
@@ -355,6 +355,7 @@ def fuse_rows(  # type: ignore[no-untyped-def]
                 c, r = math.floor(px / stride + 0.5), math.floor(py / stride + 0.5)
                 if not (0 <= c < across and 0 <= r < down):
                     continue
+                inside += 1
                 its, its_right, its_down = neighbours[k, r, c]
                 its += its_right * (px - c * stride) + its_down * (py - r * stride)
                 if not its > 0:
@@ -372,6 +373,31 @@ def fuse_rows(  # type: ignore[no-untyped-def]
                 product = (line * other).sum()
                 product /= math.sqrt((line * line).sum() * (other * other).sum())
                 widest = max(widest, math.acos(min(max(product, -1.0), 1.0)))
+            shown[row, column] = inside
             if widest >= min_angle:
                 fused[row, column] = total / count
                 views[row, column] = count
+
+
+@compiled(nogil=True)
+def support_rows(first, last, planes, stride, chosen, reach, spacing, tolerance, support):  # type: ignore[no-untyped-def]
+    """Write how many of the pixels around each one are `chosen` (H, W) and on its surface, a share.
+
+    They are every `spacing`-th of a square up to `reach` pixels away, as far as it is inside.
+    `planes` are as of `fuse_rows`; inverse depths may differ from the own plane by `tolerance`,
+    relative.
+    """
+    height, width = chosen.shape
+    for row in range(first, last):
+        for column in range(width):
+            w, right, down = planes[row, column]
+            inside = number = 0
+            for j in range(-reach, reach + 1, spacing):
+                for i in range(-reach, reach + 1, spacing):
+                    r, c = row + j, column + i
+                    if not (0 <= r < height and 0 <= c < width):
+                        continue
+                    inside += 1
+                    rest = planes[r, c, 0] - w - stride * (i * right + j * down)
+                    number += chosen[r, c] and abs(rest) <= tolerance * w
+            support[row, column] = number / inside

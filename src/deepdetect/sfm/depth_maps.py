@@ -102,7 +102,7 @@ MIN_WEIGHT = 0.02
 """Of a pixel without texture in these fits; half of the others have more than 0.5."""
 
 MIN_VIEWS = 3
-"""Images that must agree, the reference among them; beside such points two do for `fusion`."""
+"""Images that must agree, the reference among them; `fusion` asks some places for others."""
 
 DEPTH_PIXEL = np.dtype(
     [("plane", np.float32, 3), ("error", np.float32), ("color", np.uint8, 3)], align=True

@@ -17,19 +17,23 @@ MAX_ERROR_PX = 1.0
 """Between a pixel and where the surface of another depth map is seen."""
 
 MAX_DEPTH_DIFFERENCE = 0.01
-"""Of two depth maps that agree, relative."""
+"""Of two depth maps that agree, and of pixels on one surface, relative."""
 
-EDGE_RADIUS, ENOUGH_VIEWS = 4, 5
-"""Pixels of a depth map from a farther surface within which so many images must agree; they are
-enough everywhere."""
+MIN_ALL_VIEWS, ENOUGH_VIEWS = 4, 5
+"""So many images that agree make a point anywhere: the second, or all that show it if these are
+fewer, but not below the first."""
 
-SUPPORT_SIDE, MIN_SUPPORT = 21, 0.6
-"""Side of the square of pixels of a depth map around one, and the share of them that `MIN_VIEWS` or
-more must agree on, too: small patches apart are where most wrong points are."""
+EDGE_RADIUS = 4
+"""Pixels of a depth map: as near as that to a farther surface, fewer images make no point."""
 
-SUPPORTED_RADIUS, MIN_SUPPORTED_VIEWS = 4, 2
-"""Pixels of a depth map from such a one within which so many images are enough: holes of a surface
-are where others show through."""
+MIDDLE_REACH, MIDDLE_SPACING, MIN_MIDDLE_SHARE = 10, 5, 0.6
+"""Elsewhere `MIN_VIEWS` do in the middle of a surface: of every so many-th pixel of a depth map, up
+to so many away each way, this share is on the same surface and agreed on, too. Most wrong points
+are on small patches apart."""
+
+FILLED_REACH, MIN_FILLED_VIEWS = 4, 2
+"""As many pixels from the middle of the same surface so many images are enough, but at edges:
+something may hide it from the others, or they show less of it."""
 
 MIN_TRIANGULATION_DEG = 1.0
 """Smallest angle between two of the lines of sight."""
@@ -55,7 +59,7 @@ def fuse_depth_maps(
     views: Sequence[PosedView], maps: Sequence[np.ndarray], stride_px: int
 ) -> np.ndarray:
     """Return what enough depth maps (`DEPTH_PIXEL`) agree on with the first one (`DENSE_POINT`)."""
-    from .dense_kernels import fuse_rows
+    from .dense_kernels import fuse_rows, support_rows
 
     planes = np.ascontiguousarray(maps[0]["plane"])
     shape = np.max([each.shape for each in maps], axis=0)
@@ -65,21 +69,28 @@ def fuse_depth_maps(
     there, back = (relative_projections(views[0], views[1:], back) for back in (False, True))
     camera = views[0].camera
     centres = [views[0].rotation @ view.centre + views[0].translation for view in views[1:]]
-    inverse, count = np.empty(planes.shape[:2], np.float32), np.empty(planes.shape[:2], np.uint8)
+    shape = planes.shape[:2]
+    inverse, (count, shown) = np.empty(shape, np.float32), np.empty((2, *shape), np.uint8)
     geometry = stride_px, there, back, np.linalg.inv(camera.matrix), np.array(centres)
     limits = MAX_ERROR_PX, MAX_DEPTH_DIFFERENCE, math.radians(MIN_TRIANGULATION_DEG)
-    parallel_for(len(planes), fuse_rows, planes, others, *geometry, *limits, inverse, count)
+    parallel_for(len(planes), fuse_rows, planes, others, *geometry, *limits, inverse, count, shown)
+
+    def supported(chosen: np.ndarray, reach: int, spacing: int) -> np.ndarray:
+        support = np.empty(shape, np.float32)
+        square = reach, spacing, MAX_DEPTH_DIFFERENCE
+        parallel_for(len(planes), support_rows, planes, stride_px, chosen, *square, support)
+        return support
+
     # Windows there give pixels beside a nearer surface its depth, in all views alike.
-    known = np.nan_to_num(planes[..., 0], nan=np.inf)
+    known = np.where(count >= MIN_FILLED_VIEWS, planes[..., 0], np.inf)
     farthest = cv2.erode(known, np.ones((2 * EDGE_RADIUS + 1,) * 2, np.uint8))
     slanted = EDGE_RADIUS * stride_px * np.abs(planes[..., 1:]).sum(axis=2)
     edge = planes[..., 0] - farthest > MAX_DEPTH_DIFFERENCE * planes[..., 0] + slanted
-    agreed = count >= np.where(edge, ENOUGH_VIEWS, MIN_VIEWS)
-    support = cv2.boxFilter(agreed.astype(np.float32), -1, (SUPPORT_SIDE, SUPPORT_SIDE))
-    sure = (agreed & (support >= MIN_SUPPORT)).astype(np.uint8)
-    supported = cv2.dilate(sure, np.ones((2 * SUPPORTED_RADIUS + 1,) * 2, np.uint8)) > 0
-    some = supported & ~edge & (count >= MIN_SUPPORTED_VIEWS)
-    row, column = np.nonzero(some | (count >= ENOUGH_VIEWS))
+    enough = shown.clip(MIN_ALL_VIEWS, ENOUGH_VIEWS)
+    agreed = count >= np.where(edge, enough, MIN_VIEWS)
+    middle = agreed & (supported(agreed, MIDDLE_REACH, MIDDLE_SPACING) >= MIN_MIDDLE_SHARE)
+    filled = (count >= MIN_FILLED_VIEWS) & ~edge & (supported(middle, FILLED_REACH, 1) > 0)
+    row, column = np.nonzero(filled | (count >= enough))
     found, plane = maps[0][row, column], planes[row, column].astype(np.float64)
     xy, near = np.column_stack([column, row]) * float(stride_px), inverse[row, column]
     made = np.empty(len(row), DENSE_POINT)

@@ -38,7 +38,7 @@ class MultiViewReconstruction:
         sparse_errors: (N,) float32 their mean reprojection errors in pixels.
         sparse_views: (N,) int32 number of images that each of them is seen in.
         dense: the dense points; empty where none were asked for.
-        dense_errors: (M,) float32 reprojection errors in pixels: RMS of the images that agree.
+        dense_errors: (M,) float32 distances in pixels to the matches in other images, their RMS.
         dense_views: (M,) uint8 number of images that agree on each of them.
         keypoints: number of keypoints of each image.
         matched: number of verified matches of each pair that has some.
