@@ -93,6 +93,10 @@ def test_depths_may_differ_by_a_hundredth(factor: float, agree: bool) -> None:
     assert bool(len(fuse_depth_maps(views, maps, 2))) == agree
 
 
+def test_no_other_depth_map_gives_no_points() -> None:
+    assert not len(fuse_depth_maps([REFERENCE], [tilted(REFERENCE)], 2))
+
+
 def test_two_depth_maps_are_not_enough() -> None:
     views = [REFERENCE, *OTHERS[:2]]
     maps = [tilted(each) for each in views]
@@ -106,38 +110,51 @@ ROWS, COLUMNS, NEAR, FAR = slice(20, 100), slice(60, 120), 1 / 6, 1 / 12
 
 
 def agreed_by(
-    *layers: Layer, others: Sequence[float] = (-0.8, -0.4, 0.4, 0.8), behind: float = np.nan
+    *layers: Layer,
+    others: Sequence[float] = (-0.8, -0.4, 0.4, 0.8),
+    behind: float = np.nan,
+    stride: int = 2,
+    last_columns: int = 160,
 ) -> np.ndarray:
-    """Return which pixels of the depth map of the reference become points.
+    """Return which of 120 x 160 pixels of the depth map of the reference become points.
 
-    The cameras are at 0 and `others` and do not turn. A layer is how many depth maps have a surface
-    parallel to the image, its pixels in the reference, and its inverse depth; the others have the
-    inverse depth `behind` there, if any, as all have where no layer is.
+    The cameras are at 0 and `others` and do not turn; the map of the last one has fewer columns. A
+    layer is how many depth maps have a surface parallel to the image, its pixels in the reference,
+    and its inverse depth; the others have the inverse depth `behind` there, if any, as all have
+    where no layer is.
     """
-    views = [
-        PosedView("", Camera(SIZE, 300.0), np.eye(3), np.array([-x, 0.0, 0.0]))
-        for x in (0.0, *others)
-    ]
-    maps = [np.zeros((SIZE[1] // 2, SIZE[0] // 2), DEPTH_PIXEL) for _ in views]
-    for number, (own, made) in enumerate(zip(views, maps, strict=True)):
+    views, maps = [], []
+    for number, x in enumerate((0.0, *others)):
+        made = np.zeros((120, 160), DEPTH_PIXEL)
         made["plane"][..., 0] = behind
         for count, rows, columns, inverse in layers:
             shown = np.zeros(made.shape, bool)
             shown[rows, columns] = True
-            shown = np.roll(shown, -round(300.0 * own.centre[0] * inverse / 2), axis=1)
+            shown = np.roll(shown, -round(150.0 * x * inverse), axis=1)
             made["plane"][shown, 0] = inverse if number < count else behind
-    found = np.zeros(maps[0].shape, bool)
-    projected, _ = views[0].project(fuse_depth_maps(views, maps, 2)["points"])
-    column, row = np.rint(projected / 2).astype(int).T
+        if number == len(others):
+            made = made[:, :last_columns]
+        camera = Camera(
+            (made.shape[1] * stride, 120 * stride), 150.0 * stride, (80.0 * stride, 60.0 * stride)
+        )
+        views.append(PosedView("", camera, np.eye(3), np.array([-x, 0.0, 0.0])))
+        maps.append(made)
+    found = np.zeros((120, 160), bool)
+    projected, _ = views[0].project(fuse_depth_maps(views, maps, stride)["points"])
+    column, row = np.rint(projected / stride).astype(int).T
     found[row, column] = True
     return found
 
 
-def test_two_depth_maps_fill_four_pixels_around_the_middle_of_a_surface() -> None:
-    found = agreed_by((3, ROWS, COLUMNS, NEAR), (2, ROWS, slice(75, 95), NEAR))
-    assert found[40:80, 60:79].all()
-    assert not found[40:80, 79:91].any()
-    assert found[40:80, 91:120].all()
+@pytest.mark.parametrize("stride", [1, 2, 4])
+def test_two_depth_maps_fill_eight_pixels_around_the_middle_of_a_surface(stride: int) -> None:
+    # As many pixels of an image: the middle of the surface reaches to its end.
+    hole, filled = slice(75, 101), 8 // stride
+    layers = (3, ROWS, slice(20, 160), NEAR), (2, ROWS, hole, NEAR)
+    found = agreed_by(*layers, others=(-0.8, -0.4, -0.2, -0.1), stride=stride)
+    assert found[50:70, 30 : 75 + filled].all()
+    assert not found[50:70, 75 + filled : 101 - filled].any()
+    assert found[50:70, 101 - filled : 120].all()
 
 
 def test_small_patches_need_five_depth_maps() -> None:
@@ -162,14 +179,21 @@ def test_all_four_depth_maps_that_show_a_place_are_enough() -> None:
     assert not agreed_by((3, *patch), others=three[:2]).any()
 
 
+def test_an_image_shows_no_more_than_its_own_pixels() -> None:
+    patch = 4, ROWS, slice(100, 104), NEAR
+    assert not agreed_by(patch).any()
+    assert agreed_by(patch, last_columns=60)[40:80, 100:104].all()
+
+
 def test_what_lies_at_another_depth_is_no_part_of_a_surface() -> None:
     speck = slice(55, 60), slice(85, 90)
     found = agreed_by((5, ROWS, COLUMNS, NEAR), (2, *speck, FAR))
     assert not found[speck].any()
     assert found[30:50, 66:114].all()
-    # Every third row is another surface: neither is one that three depth maps make.
-    rows = [(3, slice(row, row + 1), COLUMNS, FAR) for row in range(20, 100, 3)]
-    assert not agreed_by((3, ROWS, COLUMNS, NEAR), *rows)[30:90, 66:114].any()
+    rows = [(3, slice(row, row + 3), COLUMNS, FAR) for row in range(20, 100, 8)]
+    found = agreed_by((5, ROWS, COLUMNS, NEAR), *rows)[:, 66:114]
+    assert not found[44:47].any()
+    assert found[47:52].all()
 
 
 def test_fewer_than_five_depth_maps_make_no_points_beside_a_farther_surface() -> None:
@@ -185,6 +209,16 @@ def test_a_wrong_depth_of_one_map_makes_no_edge() -> None:
     found = agreed_by((4, ROWS, COLUMNS, NEAR), (1, *wrong, FAR))
     assert found[wrong].sum() == 0
     assert found[55:66, 85:96].sum() == 11 * 11 - 1
+
+
+def test_a_farther_surface_that_no_other_image_sees_makes_an_edge() -> None:
+    """So does what is too far for an angle."""
+    wall = 4, ROWS, COLUMNS, NEAR
+    far = agreed_by(wall, behind=1 / 1200)
+    beside = agreed_by(wall, (1, ROWS, slice(40, 60), FAR))
+    for found in (far, beside):
+        assert not found[40:80, 60:64].any()
+        assert found[40:80, 64:110].all()
 
 
 def test_surfaces_reach_the_corners_of_the_image() -> None:

@@ -326,18 +326,18 @@ def refine_rows(  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True)
 def fuse_rows(  # type: ignore[no-untyped-def]
-    first, last, planes, neighbours, stride, there, back, rays, centres, max_error, max_difference,
-    min_angle, fused, views, shown,
+    first, last, planes, neighbours, sizes, stride, there, back, rays, centres, max_error,
+    max_difference, min_angle, fused, views, shown,
 ):  # fmt: skip
     """Write the mean inverse depth of the depth maps that agree on each pixel of the first.
 
     `planes` (H, W, 3) and `neighbours` (K, H', W', 3), NaN where unknown, are at every `stride`
-    pixels. `there` and `back` (K, 3, 4) are A and b to the neighbours and from them. `rays` (3, 3)
-    makes lines of sight of pixels, `centres` (K, 3) are those of the neighbours in the same frame.
-    A neighbour agrees where its own surface is seen within `max_error` pixels. `views` (H, W) is
-    how many do, with the first one, or 0; `shown` (H, W), how many have the pixel in their image.
+    pixels; `sizes` (K, 2) are the rows and columns of the latter. `there` and `back` (K, 3, 4) are
+    A and b to the neighbours and from them. `rays` (3, 3) makes lines of sight of pixels, `centres`
+    (K, 3) are those of the neighbours in the same frame. A neighbour agrees where its own surface
+    is seen within `max_error` pixels. `views` (H, W) is how many do, with the first one, or 0;
+    `shown` (H, W), how many have the place in their image, hidden or not.
     """
-    across, down = neighbours.shape[2], neighbours.shape[1]
     for row in range(first, last):
         for column in range(planes.shape[1]):
             w, right, below = planes[row, column]
@@ -353,7 +353,7 @@ def fuse_rows(  # type: ignore[no-untyped-def]
                 if not pz > 0:
                     continue
                 c, r = math.floor(px / stride + 0.5), math.floor(py / stride + 0.5)
-                if not (0 <= c < across and 0 <= r < down):
+                if not (0 <= r < sizes[k, 0] and 0 <= c < sizes[k, 1]):
                     continue
                 inside += 1
                 its, its_right, its_down = neighbours[k, r, c]

@@ -17,23 +17,23 @@ MAX_ERROR_PX = 1.0
 """Between a pixel and where the surface of another depth map is seen."""
 
 MAX_DEPTH_DIFFERENCE = 0.01
-"""Of two depth maps that agree, and of pixels on one surface, relative."""
+"""Of two depth maps that agree, and of two pixels on one surface, relative."""
 
 MIN_ALL_VIEWS, ENOUGH_VIEWS = 4, 5
-"""So many images that agree make a point anywhere: the second, or all that show it if these are
-fewer, but not below the first."""
+"""A pixel is a point anywhere if the second number of images agree, or all whose frame contains it
+if these are fewer, but not fewer than the first."""
 
-EDGE_RADIUS = 4
-"""Pixels of a depth map: as near as that to a farther surface, fewer images make no point."""
+EDGE_RADIUS_PX = 8
+"""As near as that to a farther surface fewer images make no point."""
 
-MIDDLE_REACH, MIDDLE_SPACING, MIN_MIDDLE_SHARE = 10, 5, 0.6
-"""Elsewhere `MIN_VIEWS` do in the middle of a surface: of every so many-th pixel of a depth map, up
-to so many away each way, this share is on the same surface and agreed on, too. Most wrong points
-are on small patches apart."""
+MIDDLE_SPACING_PX, MIN_MIDDLE_SHARE = 10, 0.6
+"""Elsewhere `MIN_VIEWS` are enough in the middle of a surface: where of 5 x 5 pixels around, so far
+from each other, this share is agreed on, too, and on the same surface. Most wrong points are on
+small patches."""
 
-FILLED_REACH, MIN_FILLED_VIEWS = 4, 2
-"""As many pixels from the middle of the same surface so many images are enough, but at edges:
-something may hide it from the others, or they show less of it."""
+FILLED_RADIUS_PX, MIN_FILLED_VIEWS = 8, 2
+"""As near as that to such a middle of the same surface so few images are enough: the others may
+have something before it, or not show its rim."""
 
 MIN_TRIANGULATION_DEG = 1.0
 """Smallest angle between two of the lines of sight."""
@@ -59,11 +59,13 @@ def fuse_depth_maps(
     views: Sequence[PosedView], maps: Sequence[np.ndarray], stride_px: int
 ) -> np.ndarray:
     """Return what enough depth maps (`DEPTH_PIXEL`) agree on with the first one (`DENSE_POINT`)."""
-    from .dense_kernels import fuse_rows, support_rows
+    from .dense_kernels import fuse_rows
 
+    if len(maps) < MIN_FILLED_VIEWS:  # none of the neighbours has one
+        return np.empty(0, DENSE_POINT)
     planes = np.ascontiguousarray(maps[0]["plane"])
-    shape = np.max([each.shape for each in maps], axis=0)
-    others = np.full((len(maps) - 1, *shape, 3), np.nan, np.float32)
+    sizes = np.array([each.shape for each in maps])
+    others = np.full((len(maps) - 1, *sizes.max(axis=0), 3), np.nan, np.float32)
     for page, each in zip(others, maps[1:], strict=True):
         page[: each.shape[0], : each.shape[1]] = each["plane"]
     there, back = (relative_projections(views[0], views[1:], back) for back in (False, True))
@@ -73,35 +75,49 @@ def fuse_depth_maps(
     inverse, (count, shown) = np.empty(shape, np.float32), np.empty((2, *shape), np.uint8)
     geometry = stride_px, there, back, np.linalg.inv(camera.matrix), np.array(centres)
     limits = MAX_ERROR_PX, MAX_DEPTH_DIFFERENCE, math.radians(MIN_TRIANGULATION_DEG)
-    parallel_for(len(planes), fuse_rows, planes, others, *geometry, *limits, inverse, count, shown)
+    made = inverse, count, shown
+    parallel_for(len(planes), fuse_rows, planes, others, sizes[1:], *geometry, *limits, *made)
 
-    def supported(chosen: np.ndarray, reach: int, spacing: int) -> np.ndarray:
-        support = np.empty(shape, np.float32)
-        square = reach, spacing, MAX_DEPTH_DIFFERENCE
-        parallel_for(len(planes), support_rows, planes, stride_px, chosen, *square, support)
-        return support
-
-    # Windows there give pixels beside a nearer surface its depth, in all views alike.
-    known = np.where(count >= MIN_FILLED_VIEWS, planes[..., 0], np.inf)
-    farthest = cv2.erode(known, np.ones((2 * EDGE_RADIUS + 1,) * 2, np.uint8))
-    slanted = EDGE_RADIUS * stride_px * np.abs(planes[..., 1:]).sum(axis=2)
-    edge = planes[..., 0] - farthest > MAX_DEPTH_DIFFERENCE * planes[..., 0] + slanted
-    enough = shown.clip(MIN_ALL_VIEWS, ENOUGH_VIEWS)
-    agreed = count >= np.where(edge, enough, MIN_VIEWS)
-    middle = agreed & (supported(agreed, MIDDLE_REACH, MIDDLE_SPACING) >= MIN_MIDDLE_SHARE)
-    filled = (count >= MIN_FILLED_VIEWS) & ~edge & (supported(middle, FILLED_REACH, 1) > 0)
-    row, column = np.nonzero(filled | (count >= enough))
+    row, column = np.nonzero(_agreed(planes, count, shown, stride_px))
     found, plane = maps[0][row, column], planes[row, column].astype(np.float64)
     xy, near = np.column_stack([column, row]) * float(stride_px), inverse[row, column]
-    made = np.empty(len(row), DENSE_POINT)
-    made["points"] = (camera.rays(xy) / near[:, None] - views[0].translation) @ views[0].rotation
+    fused = np.empty(len(row), DENSE_POINT)
+    fused["points"] = (camera.rays(xy) / near[:, None] - views[0].translation) @ views[0].rotation
     # The inverse depth of a plane is its normal times the line of sight, over its distance.
     ahead = near - (plane[:, 1:] * (xy - camera.centre)).sum(axis=1)
     away = np.column_stack([plane[:, 1:] * camera.focal_px, ahead]) @ views[0].rotation
-    made["normals"] = -away / np.linalg.norm(away, axis=1, keepdims=True)
-    made["errors"], made["colors"] = found["error"], found["color"]
-    made["views"] = count[row, column]
-    return made
+    fused["normals"] = -away / np.linalg.norm(away, axis=1, keepdims=True)
+    fused["errors"], fused["colors"] = found["error"], found["color"]
+    fused["views"] = count[row, column]
+    return fused
+
+
+def _agreed(planes: np.ndarray, count: np.ndarray, shown: np.ndarray, stride_px: int) -> np.ndarray:
+    """Return on which pixels of a depth map enough images agree: `count` of those that show it."""
+    from .dense_kernels import support_rows
+
+    def support(chosen: np.ndarray, reach: int, spacing: int) -> np.ndarray:
+        found = np.empty(chosen.shape, np.float32)
+        square = reach, spacing, MAX_DEPTH_DIFFERENCE
+        parallel_for(len(planes), support_rows, planes, stride_px, chosen, *square, found)
+        return found
+
+    def pixels(length_px: int) -> int:
+        return max(1, length_px // stride_px)
+
+    # Windows give pixels beside a nearer surface its depth, in all views alike. Single pixels are
+    # no surface.
+    inverse, radius = planes[..., 0], pixels(EDGE_RADIUS_PX)
+    known = cv2.dilate(np.where(inverse > 0, inverse, np.inf), np.ones((3, 3), np.uint8))
+    farthest = cv2.erode(known, np.ones((2 * radius + 3,) * 2, np.uint8))
+    slanted = radius * stride_px * np.abs(planes[..., 1:]).sum(axis=2)
+    edge = inverse - farthest > MAX_DEPTH_DIFFERENCE * inverse + slanted
+    sure = count >= shown.clip(MIN_ALL_VIEWS, ENOUGH_VIEWS)
+    agreed = sure | ((count >= MIN_VIEWS) & ~edge)
+    spacing = pixels(MIDDLE_SPACING_PX)
+    middle = agreed & (support(agreed, 2 * spacing, spacing) >= MIN_MIDDLE_SHARE)
+    near = support(middle, pixels(FILLED_RADIUS_PX), 1) > 0
+    return sure | ((count >= MIN_FILLED_VIEWS) & ~edge & near)
 
 
 def merge_dense_points(parts: Iterable[tuple[PosedView, np.ndarray]], stride_px: int) -> np.ndarray:
