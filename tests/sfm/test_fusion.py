@@ -180,9 +180,11 @@ def test_all_four_depth_maps_that_show_a_place_are_enough() -> None:
 
 
 def test_an_image_shows_no_more_than_its_own_pixels() -> None:
-    patch = 4, ROWS, slice(100, 104), NEAR
-    assert not agreed_by(patch).any()
-    assert agreed_by(patch, last_columns=60)[40:80, 100:104].all()
+    left, right = (4, ROWS, slice(20, 24), NEAR), (4, ROWS, slice(100, 104), NEAR)
+    assert not agreed_by(left, right).any()
+    found = agreed_by(left, right, last_columns=60)
+    assert not found[:, :50].any()
+    assert found[40:80, 100:104].all()
 
 
 def test_what_lies_at_another_depth_is_no_part_of_a_surface() -> None:

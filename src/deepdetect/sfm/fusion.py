@@ -112,12 +112,10 @@ def _agreed(planes: np.ndarray, count: np.ndarray, shown: np.ndarray, stride_px:
     farthest = cv2.erode(known, np.ones((2 * radius + 3,) * 2, np.uint8))
     slanted = radius * stride_px * np.abs(planes[..., 1:]).sum(axis=2)
     edge = inverse - farthest > MAX_DEPTH_DIFFERENCE * inverse + slanted
-    sure = count >= shown.clip(MIN_ALL_VIEWS, ENOUGH_VIEWS)
-    agreed = sure | ((count >= MIN_VIEWS) & ~edge)
-    spacing = pixels(MIDDLE_SPACING_PX)
+    agreed, spacing = count >= MIN_VIEWS, pixels(MIDDLE_SPACING_PX)
     middle = agreed & (support(agreed, 2 * spacing, spacing) >= MIN_MIDDLE_SHARE)
-    near = support(middle, pixels(FILLED_RADIUS_PX), 1) > 0
-    return sure | ((count >= MIN_FILLED_VIEWS) & ~edge & near)
+    filled = (count >= MIN_FILLED_VIEWS) & (support(middle, pixels(FILLED_RADIUS_PX), 1) > 0)
+    return (filled & ~edge) | (count >= shown.clip(MIN_ALL_VIEWS, ENOUGH_VIEWS))
 
 
 def merge_dense_points(parts: Iterable[tuple[PosedView, np.ndarray]], stride_px: int) -> np.ndarray:
