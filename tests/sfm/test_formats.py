@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,13 +13,22 @@ import pytest
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
-from deepdetect import Camera, MissingExtraError, OptionError, PointDetector, reconstruct_many
+from deepdetect import (
+    Camera,
+    MissingExtraError,
+    OptionError,
+    PointDetector,
+    ReconstructionError,
+    reconstruct_many,
+)
 from deepdetect.datasets.posed_images import load_posed_scenes
+from deepdetect.geometry.camera import PosedView
 from deepdetect.geometry.point_cloud import EAST_NORTH_UP, PointCloud
 from deepdetect.sfm import MultiViewOptions, MultiViewReconstruction
+from deepdetect.sfm.colmap import CameraIntrinsics
 from deepdetect.sfm.formats import FORMATS, write_mesh
 from deepdetect.sfm.georeference import Georeference
-from deepdetect.sfm.splat import seen_depths, thinned
+from deepdetect.sfm.splat import seen_depths, thinned, write_transforms
 
 from ..io.test_gps import place_tags
 
@@ -272,6 +282,32 @@ def test_a_mesh_is_read_by_trimesh(tmp_path: Path, pycolmap) -> None:
     assert plain.volume == pytest.approx(4 / 3 * np.pi * 8, rel=0.01)
     expected = (plain.vertices - [10, 20, 30] + 2) / 2 * 127
     assert np.abs(plain.visual.vertex_colors[:, :3] - expected).mean() < 4
+
+
+def test_too_few_points_make_no_mesh(tmp_path: Path, pycolmap) -> None:
+    points = np.eye(3, dtype=np.float32)
+    few = PointCloud(points, np.zeros((3, 3), np.uint8), "m", EAST_NORTH_UP, points)
+    with pytest.raises(ReconstructionError, match="there are 3"):
+        write_mesh(SimpleNamespace(dense=few), tmp_path, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_transforms_name_files_from_where_they_lie(tmp_path: Path) -> None:
+    """Also if the folder is a link to one elsewhere."""
+    (tmp_path / "far" / "away").mkdir(parents=True)
+    (tmp_path / "link").symlink_to(tmp_path / "far" / "away")
+    (tmp_path / "a.jpg").touch()
+    path, camera = tmp_path / "link" / "transforms.json", Camera((640, 480), 600.0)
+    write_transforms(
+        path,
+        {"a.jpg": PosedView("a.jpg", camera, np.eye(3), np.zeros(3))},
+        {"a.jpg": CameraIntrinsics.of_camera(camera)},
+        {"file_path": {"a.jpg": tmp_path / "a.jpg"}},
+        tmp_path / "link" / "model.ply",
+    )
+    values = json.loads(path.read_text())
+    assert os.path.exists(tmp_path / "link" / values["frames"][0]["file_path"])
+    assert values["ply_file_path"] == "model.ply"
 
 
 def test_formats_are_checked_before_the_work(

@@ -221,6 +221,34 @@ def test_ground_control_points(pycolmap, tmp_path: Path, hidden: Similarity) -> 
         georeference(sparse, sparse.points, tmp_path, read_control_points(path))
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_control_points_along_a_line(
+    pycolmap, tmp_path: Path, hidden: Similarity, seed: int
+) -> None:
+    """On a kerb of 100 m: the cameras know up."""
+    pytest.importorskip("pyproj", reason="needs pyproj")
+    random = np.random.default_rng(seed)
+    centres = np.column_stack([np.arange(6) * 15.0, random.normal(0, 3, 6), np.full(6, 3.0)])
+    marks = np.column_stack(
+        [np.linspace(0, 100, 5), 30 + random.normal(0, 0.1, 5), random.normal(0, 0.1, 5)]
+    )
+    rotations = [NORTH_LEVEL @ turn("z", heading) for heading in (-40, 25, -10, 35, -30, 15)]
+    sparse = made_model(centres, rotations, marks, hidden)
+    utm, epsg = ORIGIN.to_utm(marks + random.normal(0, 0.05, marks.shape))
+    lines = [
+        f"{x:.3f} {y:.3f} {z:.3f} {xy[0]:.2f} {xy[1]:.2f} {name} mark{k}"
+        for name, image in sparse.images.items()
+        for k, ((x, y, z), xy) in enumerate(zip(utm, image.xy, strict=True))
+    ]
+    path = tmp_path / "gcp_list.txt"
+    path.write_text("\n".join([f"EPSG:{epsg}", *lines]))
+    found = georeference(sparse, sparse.points, tmp_path, read_control_points(path))
+    assert isinstance(found, Georeference)
+    assert tilt_error_deg(found.similarity, hidden) < 3
+    assert heading_error_deg(found.similarity, hidden) < 1
+    assert "line" in found.summary()["note"]
+
+
 def test_a_known_distance_gives_the_scale(pycolmap, tmp_path: Path, hidden: Similarity) -> None:
     centres = np.column_stack([np.arange(4) * 2.0, np.zeros((4, 2))])
     points = np.array([[0.0, 10, 0], [3, 10, 1], [3.1, 30, 1]])

@@ -259,6 +259,9 @@ def test_photographs_of_another_size_do_not_stop_a_calibrated_run(
         reconstruct_many(folder, tmp_path / "model", focal_px=300, **arguments)
     with pytest.raises(OptionError, match="`seed`"):
         reconstruct_many(folder, tmp_path / "model", seed=-1, **arguments)
+    with pytest.raises(ReconstructionError, match="-5"):
+        reconstruct_many(folder, tmp_path / "another", focal_px=-5, **SPARSE)
+    assert not (tmp_path / "another").exists()
 
 
 @pytest.mark.parametrize(

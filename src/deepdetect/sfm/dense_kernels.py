@@ -279,7 +279,8 @@ def refine_rows(  # type: ignore[no-untyped-def]
     of `gray`. `neighbours` (K, H', W') float32 have (width, height) `sizes`, `maps` (K, 3, 4) are A
     and b. Every `spacing`-th pixel of the window counts that is on the same surface. `errors` are
     the distances in pixels to the matches of each neighbour alone, as root mean squares;
-    `certainty` is 0 where no neighbour has texture along its line, and the depth stays.
+    `certainty` is 0 where no neighbour has texture along its line, and the depth stays, and where
+    fewer than `min_number` correlate, and the depth becomes NaN.
     """
     height, width = gray.shape
     side = 2 * radius + 1

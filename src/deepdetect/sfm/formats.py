@@ -33,6 +33,9 @@ MESH_MARGIN = 0.5
 MESH_DEPTHS, MESH_TRIM = (6, 12), 3
 """Levels of the octree, and how many coarser the surface may be than the finest one."""
 
+MIN_MESH_POINTS = 100
+"""COLMAP's meshing ends the process where there are a handful."""
+
 COLORS = ("red", "green", "blue")
 
 POINTS_PER_CELL = 4.0
@@ -117,12 +120,16 @@ def write_mesh(found: MultiViewReconstruction, folder: Path, output: Path) -> No
     By screened Poisson reconstruction (Kazhdan and Hoppe, 2013), which COLMAP brings.
     """
     cloud = found.dense
-    if not len(cloud):
-        raise ReconstructionError("a mesh needs dense points")
-    box = robust_box(cloud)
-    margin = MESH_MARGIN * (box.high - box.low)
-    inside = (cloud.points >= box.low - margin) & (cloud.points <= box.high + margin)
-    cloud = cloud[inside.all(axis=1)]
+    if len(cloud):
+        box = robust_box(cloud)
+        margin = MESH_MARGIN * (box.high - box.low)
+        inside = (cloud.points >= box.low - margin) & (cloud.points <= box.high + margin)
+        cloud = cloud[inside.all(axis=1)]
+    if len(cloud) < MIN_MESH_POINTS:
+        raise ReconstructionError(
+            f"a mesh needs {MIN_MESH_POINTS} dense points or more, there are {len(cloud)}: take "
+            "more images, closer together, or leave out the format mesh"
+        )
     # Points lie on surfaces, so that their number grows with the square of cells across.
     depth = round(float(np.clip(np.log2(np.sqrt(len(cloud))), *MESH_DEPTHS)))
     with tempfile.TemporaryDirectory(prefix="deepdetect-") as space:

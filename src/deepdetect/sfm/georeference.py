@@ -168,8 +168,8 @@ def require_fixes(folder: Path, what: str) -> None:
     found = sum(read_gps(path) is not None for path in find_images(folder))
     if found < MIN_FIXES:
         raise OptionError(
-            f"{what} needs a place on the Earth, and {found} images carry a satellite fix: leave "
-            "it out, or give ground control points"
+            f"{what} needs a place on the Earth, and {found} images carry a satellite fix, where "
+            f"{MIN_FIXES} are needed: leave it out, or give ground control points"
         )
 
 
@@ -313,7 +313,9 @@ def georeference_by_control_points(
         )
     points = {name: _triangulated(sparse, rows) for name, rows in seen.items()}
     places = np.array([next(iter(rows.values())).place for rows in seen.values()])
-    return _place("ground control points", points, places, CONTROL_ACCURACY_M, scale)
+    up, level, stds = upright(sparse.views)
+    known = {"up": up, "level": level, "level_stds": stds}
+    return _place("ground control points", points, places, CONTROL_ACCURACY_M, scale, **known)
 
 
 def _by_file_name(sparse: SparseModel) -> dict[str, str]:

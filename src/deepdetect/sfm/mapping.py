@@ -65,7 +65,7 @@ MIN_FOCAL_RATIO, MAX_FOCAL_RATIO, MAX_DISTORTION = 0.1, 10.0, 1.0
 """Focal lengths over the longer side, and the largest parameter of distortion: COLMAP's limits."""
 
 MIN_VIEWS_OF_PRINCIPAL_POINT = 8
-"""From so many images of a camera its principal point is estimated, too; else it is the middle."""
+"""If each camera took so many images, principal points are estimated, else they are the middle."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -100,8 +100,10 @@ def reconstruct_many(
     control = read_control_points(options.control_points) if options.control_points else None
     target = Path(output)
     check_output_folder(target)
-    if calibration is not None and focal_px is not None:
-        raise ReconstructionError("give `calibration` or `focal_px`, not both")
+    if focal_px is not None:
+        Camera((1, 1), focal_px)  # which says what is wrong with it
+        if calibration is not None:
+            raise ReconstructionError("give `calibration` or `focal_px`, not both")
     if overwrite:
         work = target / WORK
         if any(work.glob("features.h5*")):  # another folder of this name is not ours
@@ -127,7 +129,8 @@ def reconstruct_many(
         for name, (width, height) in sizes.items():
             if name not in known:
                 unregistered[name] = (
-                    f"it is {width}x{height} pixels, and the calibration is for another size"
+                    f"it is {width}x{height} pixels, and the calibration is for another size: "
+                    "give images of one size"
                 )
         sizes = {name: sizes[name] for name in known}
     if len(sizes) < MIN_VIEWS:

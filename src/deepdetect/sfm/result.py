@@ -23,8 +23,8 @@ class MultiViewReconstruction:
     """Cameras and points of many images.
 
     The world is the frame of the camera of `reference`: x right, y down, z forward. 1 is the median
-    distance from a camera to the nearest other one; the true scale is not known. Where satellite
-    fixes or ground control points place the model, the world goes east, north and up in metres.
+    distance from a camera to the nearest other one, or a metre if `scale_by` told a distance. Where
+    satellite fixes or ground control points place the model, it goes east, north and up in metres.
 
     Attributes:
         views: of the images that are part of it, by name; their cameras are pinhole cameras.

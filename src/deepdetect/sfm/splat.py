@@ -31,7 +31,7 @@ MAX_DEPTH_STEP = 0.1
 """A point so much, relatively, behind one beside it in a depth map is seen through a gap."""
 
 DEPTH_PERCENT = 95.0
-"""Of the sparse points of each view, whose depths fit into its map at least."""
+"""Of all sparse points, whose depths from each view fit into its map at least."""
 
 MAX_VALUE_PER_UNIT = 1000.0
 """Millimetres, which nearly all readers of depth maps expect, where they reach far enough."""
@@ -51,7 +51,12 @@ def write_transforms(
     """Write nerfstudio's transforms.json: cameras, points, and `files` by their key and image."""
 
     def relative(file: Path) -> str:
-        return Path(os.path.relpath(file, path.parent)).as_posix()
+        # A folder that is a link has another parent than its name says.
+        file = file.resolve()
+        try:
+            return Path(os.path.relpath(file, path.parent.resolve())).as_posix()
+        except ValueError:  # on another drive of Windows
+            return file.as_posix()
 
     frames = []
     for name, view in views.items():
