@@ -18,12 +18,12 @@ import numpy as np
 from numpy.random import Generator
 
 from deepdetect._shared.opencv import cv2
+from deepdetect.batch.pair_list import SIMILAR
 from deepdetect.evaluation.metrics.pose import camera_errors
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.sfm.colmap import CameraIntrinsics, write_database
 from deepdetect.sfm.mapping import adjust, map_globally, map_images, read_sparse_model, verify_pairs
-from deepdetect.sfm.pair_selection import SIMILAR
 
 COUNTS = (60, 120, 250, 500, 1000)
 SIZE, FOCAL_PX, WRONG_FOCAL = (640, 480), 600.0, 1.03

@@ -280,12 +280,11 @@ def test_matches_are_filtered_as_their_descriptors_allow(
     assert np.median(found.sparse_errors) < 0.5
 
 
-def test_pairs_are_chosen(small, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pairs_are_chosen(small) -> None:
     _, output, found = small
     names = ["0004.jpg", "0005.jpg", "0006.jpg", "other.jpg"]
     assert (found.pairs, found.pair_choice) == (6, "exhaustive")
-    monkeypatch.setattr(stages, "SIMILAR", 1)
-    for options in (MultiViewOptions("similar"), MultiViewOptions("sequential:1")):
+    for options in (MultiViewOptions("similar:1"), MultiViewOptions("sequential:1")):
         pairs = Stages(output, options, 1, True).choose_pairs(names)
         assert 2 <= len(pairs) < 6
         assert ("0005.jpg", "0006.jpg") in pairs

@@ -34,7 +34,7 @@ def read_pairs(path: str | Path) -> list[Pair]:
         text = Path(path).read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise MissingFileError(
-            f"there is no file {path}: give one, or exhaustive, or sequential:10"
+            f"there is no file {path}: give one, or exhaustive, sequential:10 or similar"
         ) from None
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is no text in UTF-8"
@@ -43,6 +43,16 @@ def read_pairs(path: str | Path) -> list[Pair]:
     if not lines:
         raise DeepDetectError(f"{path} has no pairs: give the names of two images on each line")
     return check_pairs([line.split("\t" if "\t" in line else None) for line in lines], str(path))
+
+
+SIMILAR = 20
+"""Most similar images that each one is matched with, where no number is told."""
+
+
+def similar(pairs: object) -> int | None:
+    """Return with how many of the most similar each image is matched; None where not by these."""
+    match = re.fullmatch("similar(?::([1-9][0-9]{0,8}))?", str(pairs))
+    return int(match[1] or SIMILAR) if match else None
 
 
 def following(pairs: object) -> int | None:

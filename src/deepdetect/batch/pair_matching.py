@@ -34,7 +34,8 @@ from .hdf5 import (
     open_hdf5,
     state_of,
 )
-from .pair_list import Pair, list_pairs, pair_name
+from .pair_list import Pair, list_pairs, pair_name, similar
+from .similar_pairs import similar_pairs
 
 
 @suggest_keywords
@@ -106,6 +107,8 @@ def match_pairs(
     Args:
         features: file of `extract_features`, or of hloc.
         pairs: "exhaustive": all; "sequential:10": each image with the 10 that follow it by name;
+            "similar:20" or "similar": with the 20 that are most like it (VLAD of the best 512
+            keypoints);
             or a list of pairs of names, or a text file with a pair on each line. A pair that is
             listed twice, in either order, is taken once.
         path: the file.
@@ -129,13 +132,19 @@ def match_pairs(
         ...     match_pairs("features.h5", "pairs.txt", "matches.h5").check()
     """
     source = Path(features).absolute()
-    list_pairs(pairs, ())  # what is wrong with them is said first
-    with open_hdf5(source) as file:
-        listed = list_pairs(pairs, natsorted(feature_names(file), alg=ns.PATH))
+    alike = similar(pairs)
+    if alike is None:
+        list_pairs(pairs, ())  # what is wrong with them is said first
     if source == Path(path).absolute():
         raise OptionError(f"{path} holds the features: give the matches another file with -o")
     if options.filter_by == "neighbours" and (first := first_keypoints(source)):
         require_suited(first)
+    with open_hdf5(source) as file:
+        names = natsorted(feature_names(file), alg=ns.PATH)
+    if alike is None:
+        listed = list_pairs(pairs, names)
+    else:
+        listed = similar_pairs(source, names, alike, options.seed, quiet)
     wanted, failures, gone, made_with = _find_pairs(source, listed)
     report = fill_file(
         path,

@@ -73,12 +73,13 @@ def match_many(
     interrupted or killed, the same command continues; new pairs are added later.
 
         deepdetect match-many features.h5 --pairs exhaustive
-        deepdetect match-many features.h5 --pairs sequential:10 --verify fundamental
+        deepdetect match-many features.h5 --pairs similar --verify fundamental
         deepdetect match-many features.h5 --pairs pairs.txt -o matches.h5
 
     Args:
-        pairs: exhaustive (all), sequential:10 (each image with the 10 that follow it by name), or
-            a text file with the names of two images on each line, as hloc writes it.
+        pairs: exhaustive (all), sequential:10 (each image with the 10 that follow it by name),
+            similar:20 (with the 20 most like it), or a text file with the names of two images on
+            each line, as hloc writes it.
         output: File for the matches, or a folder for it.
     """
     file = cli.output_file(output, "matches.h5")

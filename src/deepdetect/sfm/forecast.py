@@ -13,17 +13,16 @@ import numpy as np
 
 from .._shared.errors import DeepDetectError
 from .._shared.machine import map_in_processes, processor_count
-from ..batch.pair_list import following, list_pairs
+from ..batch.pair_list import following, list_pairs, similar
 from ..detector.heatmap import MAX_AUTO_PIXELS
 from .depth_maps import MAX_SIDE_PX
-from .pair_selection import SIMILAR
 from .stages import MultiViewOptions, Stages, check_images
 
 MIN_IMAGES, MEASURED = 30, 3
 """Least images of which it is told, and how many of them are extracted and matched to tell it."""
 
 UNIQUE_SHARE = 0.6
-"""Pairs over `SIMILAR` an image: often both are among the most similar images of the other."""
+"""Pairs an image, of those with its most similar ones: often each is among those of the other."""
 
 MEGAPIXEL_S, KEYPOINT_S = 0.14, 9.5e-6
 MAPPED_IMAGE_S, PAIRED_KEYPOINT_S, DENSE_MEGAPIXEL_S = 0.75, 2.5e-6, 3.1
@@ -49,7 +48,8 @@ def expected_seconds(stages: Stages, folder: Path, *how: Any) -> dict[str, float
     image_s, pair_s, megapixels, keypoints = map(float, np.mean(measured, axis=0))
     if not pair_s:
         return {}
-    partners = following(options.pair_choice(count)) or UNIQUE_SHARE * SIMILAR
+    choice = options.pair_choice(count)
+    partners = following(choice) or UNIQUE_SHARE * (similar(choice) or 0)
     pairs = count * min(partners, (count - 1) / 2)
     scaled = min(megapixels, MAX_AUTO_PIXELS / 1e6)
     pace = image_s / (scaled * MEGAPIXEL_S + keypoints * KEYPOINT_S)

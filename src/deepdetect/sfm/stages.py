@@ -26,8 +26,9 @@ from .._shared.progress import progress
 from .._shared.records import file_state, key, load_arrays, save_arrays
 from ..batch.extraction import extract_features
 from ..batch.hdf5 import feature_names, open_hdf5
-from ..batch.pair_list import Pair, following, list_pairs, pair_name
+from ..batch.pair_list import Pair, following, list_pairs, pair_name, similar
 from ..batch.pair_matching import PairMatchingOptions, first_keypoints, match_pairs
+from ..batch.similar_pairs import similar_pairs
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints
@@ -52,14 +53,7 @@ from .mapping import (
     verify_pairs,
 )
 from .misplaced import correct_places
-from .pair_selection import (
-    COMPARED_KEYPOINTS,
-    SIMILAR,
-    motion,
-    similar_pairs,
-    thin_out,
-    vlad_vectors,
-)
+from .pair_selection import motion, thin_out
 from .tracks import add_dense_tracks, refine_tracks
 
 MAX_EXHAUSTIVE = 50
@@ -80,8 +74,8 @@ class MultiViewOptions:
 
     Attributes:
         pairs: which images are matched: "exhaustive": all; "sequential:10": each with the 10 that
-            follow it by name; "similar": the most alike; "auto": all of up to 50, else the most
-            alike.
+            follow it by name; "similar:20": with the 20 that are most like it; "auto": all of up
+            to 50, else "similar:20".
         min_motion: leave out images that show nearly the same as one before them, such as most
             frames of a video: those in which half of the matched keypoints moved by less than this
             share of the longer side. None: use all.
@@ -117,9 +111,9 @@ class MultiViewOptions:
     def __post_init__(self) -> None:
         if self.scale_by is not None and not 0 < self.scale_by[0] < np.inf:
             raise OptionError(f"`scale_by` must be a distance in metres, not {self.scale_by[0]}")
-        if self.pairs not in ("auto", "similar") and following(self.pairs) is None:
+        if self.pairs != "auto" and not (following(self.pairs) or similar(self.pairs)):
             raise OptionError(
-                f"`pairs` must be auto, exhaustive, sequential:10 or similar, not {self.pairs}"
+                f"`pairs` must be auto, exhaustive, sequential:10 or similar:20, not {self.pairs}"
             )
         check_name("matches", self.matches, ("sparse", "dense"))
         check_name("mapper", self.mapper, ("incremental", "global"))
@@ -230,14 +224,9 @@ class Stages:
     def choose_pairs(self, names: Sequence[str]) -> list[Pair]:
         """Choose which images are matched with each other."""
         choice = self.options.pair_choice(len(names))
-        if choice != "similar":
+        if (alike := similar(choice)) is None:
             return list_pairs(choice, names)
-        descriptors = []
-        with open_hdf5(self.features) as file:
-            for name in names:
-                best = np.argsort(-file[name]["scores"][()], kind="stable")[:COMPARED_KEYPOINTS]
-                descriptors.append(file[name]["descriptors"][()].T[best])
-        return similar_pairs(names, vlad_vectors(descriptors, seed=self.seed), SIMILAR)
+        return similar_pairs(self.features, names, alike, self.seed, self.quiet)
 
     def match_images(
         self, sizes: Mapping[str, tuple[int, int]]

@@ -1,0 +1,254 @@
+"""Features, pairs and matches of made collections of more and more images, on a Ray cluster.
+
+    python benchmarks/scale.py PHOTOGRAPHS [COUNT ...] [--work FOLDER]
+
+Each photograph below a folder is a place that 34 images show: it is seen through random
+perspectives, brighter or darker. These are small and have few keypoints, so that 100,000 of them
+take an hour on two cores. Then `extract_features`, the most similar pairs, and `match_pairs`. CPU
+time and memory are of all processes, Ray's own too.
+
+A second table tells what usual photographs will take, on paper: CPU hours, by these rates, by the
+costs of larger images and by the mappers' times, both of docs/results, and gigabytes of files.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import shutil
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from deepdetect import PointDetector, load_image
+from deepdetect._shared.machine import map_in_processes
+from deepdetect._shared.opencv import cv2
+from deepdetect.batch import extract_features, match_pairs
+from deepdetect.batch.hdf5 import feature_names, open_hdf5
+from deepdetect.batch.pair_list import SIMILAR
+from deepdetect.batch.similar_pairs import WORDS, similar_pairs
+from deepdetect.evaluation.profiling import peak_memory, run_in_child
+from deepdetect.evaluation.report import Table
+
+COUNTS = (1000, 10_000, 100_000)
+VIEWS = 34
+"""Images of one place: more than the similar ones that each is matched with."""
+
+SIZE = (320, 240)
+POINTS = 256
+SHRUNK, SHIFTED = 0.8, 0.1
+"""A view's frame, of the photograph's smaller side, and how far each of its corners is moved."""
+
+COLUMNS = {
+    "images": ",d",
+    "features, CPU s an image": ".4f",
+    "similar pairs, CPU s an image": ".4f",
+    "pairs": ",d",
+    "of one place": ".3f",
+    "matching, CPU s a pair": ".4f",
+    **{f"{stage}, MB": ",.0f" for stage in ("features", "similar pairs", "matching")},
+    "a worker, MB": ",.0f",
+    "files, MB": ",.0f",
+}
+
+
+RESULTS = Path(__file__).parents[1] / "docs" / "results"
+
+USUAL, USUAL_POINTS = "1600x1067", 2048
+POINT_BYTES = 279
+"""In a file of features: position, score, size, angle, colour, and a learned descriptor."""
+
+DESCRIPTOR_LENGTH = 64
+MIN_MAPPED = 120
+"""Images from which on the time of the mapping tells how it grows."""
+
+FORECAST = (1000, 10_000, 100_000, 1_000_000)
+FORECAST_COLUMNS = {
+    "images": ",d",
+    "features": ",.1f",
+    "similar pairs": ",.1f",
+    "matching": ",.1f",
+    "files, GB": ",.0f",
+    "vectors, GB": ".2f",
+    "incremental mapper": ",.0f",
+    "global mapper": ",.0f",
+}
+
+
+def make_images(task: tuple[Path, Path, int]) -> None:
+    """Write so many views of a photograph into a folder."""
+    photograph, folder, count = task
+    rng = np.random.default_rng(int(folder.name))
+    image = load_image(photograph)[..., ::-1]
+    height, width = image.shape[:2]
+    frame = np.array([(0, 0), (1, 0), (1, 1), (0, 1)]) * SIZE
+    frame = frame / max(SIZE) * SHRUNK * min(width, height)
+    folder.mkdir(parents=True)
+    for k in range(count):
+        corners = frame + rng.uniform(0, np.array([width, height]) - frame.max(axis=0))
+        corners += rng.uniform(-SHIFTED, SHIFTED, (4, 2)) * frame.max()
+        to = np.array([(0, 0), (SIZE[0], 0), SIZE, (0, SIZE[1])], np.float32)
+        seen = cv2.getPerspectiveTransform(corners.astype(np.float32), to)
+        view = cv2.warpPerspective(image, seen, SIZE, borderMode=cv2.BORDER_REFLECT)
+        view = cv2.convertScaleAbs(view, alpha=rng.uniform(0.6, 1.2))
+        cv2.imwrite(str(folder / f"{k:02}.jpg"), view)
+
+
+class Watch(threading.Thread):
+    """Sums the CPU seconds of this process and of those that it starts; the most memory of one."""
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.seconds: dict[int, float] = {}
+        self.worker_bytes = 0
+        self.ended = threading.Event()
+
+    def run(self) -> None:
+        """Look at all processes, until it is over."""
+        own = psutil.Process()
+        while True:
+            over = self.ended.wait(0.5)
+            for process in (own, *own.children(recursive=True)):
+                try:
+                    used, memory = process.cpu_times(), process.memory_info().rss
+                except psutil.Error:
+                    continue
+                self.seconds[process.pid] = used.user + used.system
+                if process is not own:
+                    self.worker_bytes = max(self.worker_bytes, memory)
+            if over:
+                return
+
+
+def watched(work: Callable[..., Any], *arguments: Any) -> dict[str, Any]:
+    """Run something; to be called in a process of its own."""
+    watch, before = Watch(), time.process_time()
+    watch.start()
+    found = work(*arguments)
+    watch.ended.set()
+    watch.join()
+    return {
+        "found": found,
+        "CPU s": sum(watch.seconds.values()) - before,
+        "own bytes": peak_memory(),
+        "worker bytes": watch.worker_bytes,
+    }
+
+
+def find_features(folder: Path, path: Path) -> None:
+    """Extract the features of all images below a folder."""
+    extract_features(folder, path, PointDetector(POINTS), engine="ray", quiet=False).check()
+
+
+def find_pairs(path: Path) -> list[tuple[str, str]]:
+    """Return the pairs of images that are alike."""
+    with open_hdf5(path) as file:
+        names = sorted(feature_names(file))
+    return similar_pairs(path, names, SIMILAR, quiet=False)
+
+
+def find_matches(features: Path, pairs: list[tuple[str, str]], path: Path) -> None:
+    """Match pairs of images."""
+    match_pairs(features, pairs, path, engine="ray", quiet=False).check()
+
+
+def measure(photographs: list[Path], count: int, work: Path) -> dict[str, Any]:
+    """Make so many images and return the row of the table."""
+    tasks = [
+        (photographs[k], work / "images" / f"{k:05}", min(VIEWS, count - VIEWS * k))
+        for k in range(-(-count // VIEWS))
+    ]
+    for _ in map_in_processes(make_images, tasks):
+        pass
+    features, matches = work / "features.h5", work / "matches.h5"
+    first = run_in_child(watched, find_features, work / "images", features)
+    chosen = run_in_child(watched, find_pairs, features)
+    pairs = chosen.pop("found")
+    last = run_in_child(watched, find_matches, features, pairs, matches)
+    stages = {"features": first, "similar pairs": chosen, "matching": last}
+    return {
+        "images": count,
+        "pairs": len(pairs),
+        "features, CPU s an image": first["CPU s"] / count,
+        "similar pairs, CPU s an image": chosen["CPU s"] / count,
+        "of one place": np.mean([Path(a).parent == Path(b).parent for a, b in pairs]),
+        "matching, CPU s a pair": last["CPU s"] / len(pairs),
+        **{f"{name}, MB": stage["own bytes"] / 1e6 for name, stage in stages.items()},
+        "a worker, MB": max(first["worker bytes"], last["worker bytes"]) / 1e6,
+        "files, MB": sum(path.stat().st_size for path in (features, matches)) / 1e6,
+    }
+
+
+def read_result(name: str) -> list[dict[str, str]]:
+    """Read a table of docs/results."""
+    with (RESULTS / f"{name}.csv").open(newline="", encoding="utf-8") as file:
+        return [*csv.DictReader(file)]
+
+
+def forecast(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return what collections of usual photographs will take.
+
+    Comparing an image takes longer by as much as there are others; mapping grows by a power of
+    their number.
+    """
+    large = np.array([(r["images"], r["similar pairs, CPU s an image"]) for r in rows[-2:]])
+    slope, constant = np.polyfit(*large.T, 1)
+    costs = next(row for row in read_result("costs") if row["image, px"] == USUAL)
+    pair_s = float(costs["matching these, s"]) + rows[-1]["matching, CPU s a pair"]
+    pairs_an_image = rows[-1]["pairs"] / rows[-1]["images"]
+    powers = {}
+    for mapper in ("incremental", "global"):
+        known = [r for r in read_result("mappers") if r["mapper"] == mapper]
+        times = np.array([(float(r["images"]), float(r["CPU s"])) for r in known])
+        powers[mapper] = np.polyfit(*np.log(times[times[:, 0] >= MIN_MAPPED]).T, 1)
+    found = []
+    for count in FORECAST:
+        pairs = count * pairs_an_image
+        file_bytes = count * USUAL_POINTS * POINT_BYTES + pairs * USUAL_POINTS * 8
+        found.append(
+            {
+                "images": count,
+                "features": count * float(costs[f"{USUAL_POINTS} points, s"]) / 3600,
+                "similar pairs": count * (constant + slope * count) / 3600,
+                "matching": pairs * pair_s / 3600,
+                "files, GB": file_bytes / 1e9,
+                "vectors, GB": count * 4 * WORDS * DESCRIPTOR_LENGTH / 1e9,
+                **{
+                    f"{name} mapper": float(np.exp(np.polyval(power, np.log(count)))) / 3600
+                    for name, power in powers.items()
+                },
+            }
+        )
+    return found
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("photographs", type=Path)
+    parser.add_argument("counts", type=int, nargs="*", default=COUNTS)
+    parser.add_argument("--work", type=Path, help="where there is space for the files")
+    arguments = parser.parse_args()
+    photographs = sorted(arguments.photographs.rglob("*.jpg"))
+    rows = []
+    if arguments.work is not None:
+        arguments.work.mkdir(parents=True, exist_ok=True)
+    for count in arguments.counts:
+        work = Path(tempfile.mkdtemp(dir=arguments.work))
+        try:
+            rows.append(measure(photographs, count, work))
+        finally:
+            shutil.rmtree(work)
+        print(rows[-1], flush=True)
+    print(Table("scale", "", COLUMNS, rows).to_markdown())
+    print(Table("forecast", "", FORECAST_COLUMNS, forecast(rows)).to_markdown())
+
+
+if __name__ == "__main__":
+    main()
