@@ -68,6 +68,7 @@ DEVELOPMENT = {
         "datasets": ("datasets", "download data sets"),
         "benchmark": ("evaluate", "the tables and figures of the paper, with baselines"),
         "evaluate": ("evaluate", "how good weights are"),
+        "compare-clouds": ("evaluate", "dense points beside those of OpenMVS or COLMAP"),
         "evaluate-stereo": ("evaluate", "correct stereo matches of weights and of label settings"),
     },
     "Weights": {

@@ -21,6 +21,8 @@ from ..evaluation.baselines.external import find_feature
 from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
 from ..evaluation.metrics.stereo import TOLERANCE_PX, score_errors
 from ..evaluation.options import PAPER_RESOLUTION_PX, BenchmarkOptions
+from ..evaluation.protocols.dense_points import CLOUD_COLUMNS, CLOUD_NOTE
+from ..evaluation.protocols.dense_points import compare_clouds as compare
 from ..evaluation.protocols.masks import LabelDetector
 from ..evaluation.protocols.stereo_matches import match_random_points, score_stereo_matches
 from ..evaluation.report import Table
@@ -158,6 +160,24 @@ def evaluate_stereo(
     rows = score_stereo_matches(sources, pairs, quiet=False)
     table = Table("stereo", "", STEREO_COLUMNS, rows)
     return cli.Result(rows, table.to_markdown(), failures, len(scenes), "scenes")
+
+
+@cli.command()
+def compare_clouds(
+    model: Annotated[Path, Parameter(help="Folder of `deepdetect reconstruct`.")],
+    /,
+    *clouds: Annotated[Path, Parameter(help="PLY files in its frame.", required=True)],
+) -> cli.Result:
+    """Compare the dense points of a model with the clouds of other programs.
+
+    Prints how much of the images each cloud covers, and how far its depths are from those of
+    model.ply. The clouds must be in the frame of the model: give OpenMVS or COLMAP its sparse/0.
+
+        deepdetect dev compare-clouds model/ openmvs/scene_dense.ply colmap/fused.ply
+    """
+    rows = compare(model, [model / "model.ply", *clouds])
+    table = Table("clouds", "", CLOUD_COLUMNS, rows, CLOUD_NOTE)
+    return cli.Result(rows, f"{table.to_markdown()}\n\n{CLOUD_NOTE}")
 
 
 OPTIONS = cli.From(BenchmarkOptions, "max_pairs max_images", more="ranker")

@@ -1,6 +1,7 @@
 """Dense points of many images: how much of the images they cover, and whether halves agree.
 
-Beside them OpenCV's semi-global matching of pairs, rectified by the same cameras.
+Beside them OpenCV's semi-global matching of pairs, rectified by the same cameras; or the clouds
+that other programs, as OpenMVS or COLMAP, have made of the same model.
 """
 
 from __future__ import annotations
@@ -14,16 +15,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ..._shared.errors import NoDepthError
+from ..._shared.errors import MissingFileError, NoDepthError
 from ..._shared.opencv import cv2
 from ...detector.point_detector import PointDetector
 from ...geometry.camera import Camera, PosedView
-from ...sfm.colmap import initial_intrinsics
+from ...io.point_cloud import read_ply_points
+from ...sfm.colmap import import_pycolmap, initial_intrinsics
 from ...sfm.depth_maps import find_references, limited_view, prepared_image
 from ...sfm.fusion import merge_dense_points, nearest_depths
 from ...sfm.mapping import SparseModel, read_sparse_model
 from ...sfm.stages import MultiViewOptions, Stages
-from ..report import Row
+from ..report import Row, Rows
 from .stereo_pipelines import sgbm_disparity
 
 SGBM = "SGBM, OpenCV"
@@ -53,6 +55,49 @@ DENSE_NOTE = (
     "cameras, as far as they overlap then; in place of halves, its maps by the best and by the "
     "second-best neighbour."
 )
+
+
+CELL_PX = 4
+"""Clouds are compared in cells of so many pixels: other programs make a point of every second."""
+
+CLOUD_COLUMNS = {
+    "cloud": "",
+    "points": ",d",
+    "share": ".3f",
+    "from the first: median difference": ".5f",
+    "from the first: share apart": ".4f",
+}
+
+CLOUD_NOTE = (
+    "Share: of the cells of 4 x 4 pixels of an image, those in which any point is seen; mean over "
+    "the images. From the first: where both have a point, the relative difference of the depths, "
+    "and the share of cells in which it is over 1 %."
+)
+
+
+def compare_clouds(model: Path, clouds: Sequence[Path]) -> Rows:
+    """Compare clouds in PLY files, all in the frame of the cameras in `model`/sparse/0.
+
+    Returns the `CLOUD_COLUMNS` of each. A DeepDetectError says what cannot be read.
+    """
+    sparse = model / "sparse" / "0"
+    if not (sparse / "images.bin").is_file():
+        raise MissingFileError(f"there is no {sparse}: name the folder of a reconstruction")
+    views = read_sparse_model(import_pycolmap().Reconstruction(sparse)).views.values()
+    limited = [limited_view(view) for view in views]
+    rows: Rows = []
+    first: list[np.ndarray] = []
+    for path in clouds:
+        points = read_ply_points(path)
+        depths = [nearest_depths(view, [points], CELL_PX) for view in limited]
+        share = np.mean([np.isfinite(depth).mean() for depth in depths])
+        row = {"cloud": str(path), "points": len(points), "share": float(share)}
+        if first:
+            apart = _agreement([*zip(depths, first, strict=True)])
+            row |= {name.replace("halves", "from the first"): x for name, x in apart.items()}
+        first = first or depths
+        rows.append(row)
+    return rows
 
 
 def measure_dense_points(
