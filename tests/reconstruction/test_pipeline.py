@@ -346,8 +346,9 @@ def test_what_is_wrong_is_said(level: Any, one_line: Any, tmp_path: Path) -> Non
     assert "taken from one place" in refusal(one_line, left, again, rectified=True)
     assert "left and right exchanged" in refusal(one_line, right, left)
     assert "no focal length (EXIF)" in refusal(one_line, *pair, focal_px=None)
-    assert "not both" in refusal(one_line, *pair, calibration=level.calibration)
     assert "must be above 0" in refusal(one_line, *pair, focal_px=-3)
+    with pytest.raises(OptionError, match="not both"):
+        reconstruct(*pair, AllPixels(), focal_px=500, calibration=level.calibration)
     with pytest.raises(OptionError, match="the seed must lie"):
         reconstruct(*pair, AllPixels(), focal_px=500, seed=-1)
     path = tmp_path / "calib.json"

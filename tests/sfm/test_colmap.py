@@ -60,6 +60,9 @@ def test_images_of_one_size_and_focal_length_share_a_camera(tmp_path: Path) -> N
     assert zoomed["b.jpg"].params[0] > zoomed["a.jpg"].params[0]
     one = initial_intrinsics(tmp_path, SIZES, single_camera=True)
     assert one["a.jpg"] is one["b.jpg"]
+    write(tmp_path, "a.jpg", None)  # what another image tells of the camera is taken
+    one = initial_intrinsics(tmp_path, SIZES, single_camera=True)
+    assert one["a.jpg"] is one["b.jpg"] == zoomed["b.jpg"]
     each = initial_intrinsics(tmp_path, SIZES, single_camera=False)
     assert len({id(own) for own in each.values()}) == 3
 

@@ -19,6 +19,7 @@ from PIL import Image, ImageOps
 
 from deepdetect import (
     Camera,
+    DeepDetectError,
     ImageError,
     Keypoints,
     MissingExtraError,
@@ -236,6 +237,32 @@ def test_dense_matches_give_more_and_longer_tracks(small, tmp_path: Path, shared
     assert errors[0] < errors[1] + 0.2
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"calibration": "none.json"}, "none.json cannot be read"),
+        ({"calibration": "damaged.json"}, "damaged.json"),
+        ({"scale_by": (0.5, "0004.jpg", "none.jpg")}, "none.jpg is no image"),
+        ({"scale_by": (0.5, "0004.jpg", "none.jpg:3,4")}, "none.jpg is no image"),
+        ({"control_points": "gcp_list.txt"}, "0 ground control points are in two or more images"),
+    ],
+)
+def test_what_is_named_wrongly_is_said_before_the_work(
+    write_fountain, tmp_path: Path, monkeypatch, pycolmap, wrong: dict, message: str
+) -> None:
+    pytest.importorskip("pyproj", reason="needs pyproj")
+    folder = write_fountain(tmp_path / "photos", ("0004", "0005", "0006"))
+    monkeypatch.chdir(tmp_path)
+    Path("damaged.json").write_text("{")
+    rows = [f"{k} 2 3 4 5 00{name}.jpg {k}" for k in range(3) for name in ("14", "15")]
+    Path("gcp_list.txt").write_text("\n".join(["EPSG:32633", *rows]))
+    given = {k: v for k, v in wrong.items() if k == "calibration"}
+    options = MultiViewOptions(**{k: v for k, v in wrong.items() if k != "calibration"})
+    with pytest.raises(DeepDetectError, match=message):
+        reconstruct_many(folder, "model", options=options, **given)
+    assert not Path("model").exists()
+
+
 def test_photographs_of_another_size_do_not_stop_a_calibrated_run(
     write_fountain, tmp_path: Path, photo: np.ndarray, pycolmap
 ) -> None:
@@ -255,7 +282,7 @@ def test_photographs_of_another_size_do_not_stop_a_calibrated_run(
     (tmp_path / "calib.json").write_text(json.dumps(of_one))
     with pytest.raises(ReconstructionError, match=r"^1 of 4 images can be used"):
         reconstruct_many(folder, tmp_path / "model", **arguments)
-    with pytest.raises(ReconstructionError, match="not both"):
+    with pytest.raises(OptionError, match="not both"):
         reconstruct_many(folder, tmp_path / "model", focal_px=300, **arguments)
     with pytest.raises(OptionError, match="`seed`"):
         reconstruct_many(folder, tmp_path / "model", seed=-1, **arguments)

@@ -15,7 +15,8 @@ Other keys are ignored. The names follow Middlebury 2014, where the offset is `d
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -188,20 +189,8 @@ class Calibration:
             ReconstructionError: it is missing, damaged, contradictory, of no known format, of
                 cameras that distort, or for images of another size.
         """
-        place = Path(path)
-        try:
-            values = read_camera_file(place, views)
-            return _calibration(values, size0, size1, str(path))
-        except ReconstructionError as error:
-            raise ReconstructionError(f"{path}: {error}") from None
-        except OSError as error:
-            missing = isinstance(error, FileNotFoundError)
-            kind = MissingCalibrationError if missing else ReconstructionError
-            raise kind(f"{path} cannot be read ({error.strerror}): check the path") from None
-        except Exception as error:  # readers of so many formats raise many kinds
-            raise ReconstructionError(
-                f"{path} is damaged ({first_line(error)}): correct it, or give the focal length"
-            ) from None
+        with _reading(path):
+            return _calibration(read_camera_file(Path(path), views), size0, size1, str(path))
 
     def check_sizes(self, size0: Size, size1: Size) -> None:
         """Raise `ReconstructionError` unless it is for images of these (width, height)."""
@@ -212,6 +201,28 @@ class Calibration:
                     f"the calibration is for images of {wanted} pixels, the {name} image has "
                     f"{actual}: give the calibration of this size"
                 )
+
+
+def check_camera_file(path: str | Path) -> None:
+    """Raise a ReconstructionError where `Calibration.load` cannot read a file, for any image."""
+    with _reading(path):
+        read_camera_file(Path(path), None)
+
+
+@contextmanager
+def _reading(path: str | Path) -> Iterator[None]:
+    try:
+        yield
+    except ReconstructionError as error:
+        raise ReconstructionError(f"{path}: {error}") from None
+    except OSError as error:
+        missing = isinstance(error, FileNotFoundError)
+        kind = MissingCalibrationError if missing else ReconstructionError
+        raise kind(f"{path} cannot be read ({error.strerror}): check the path") from None
+    except Exception as error:  # readers of so many formats raise many kinds
+        raise ReconstructionError(
+            f"{path} is damaged ({first_line(error)}): correct it, or give the focal length"
+        ) from None
 
 
 def _calibration(

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from .._shared.errors import NoDepthError, ReconstructionError
+from .._shared.errors import NoDepthError, OptionError, ReconstructionError
 from .._shared.image_array import Channels
 from .._shared.options import suggest_keywords
 from .._shared.progress import StageTimer
@@ -333,7 +333,7 @@ def _calibration(
 ) -> Calibration:
     """Return the calibration that is given, or the one the images carry."""
     if given is not None and focal_px is not None:
-        raise ReconstructionError("give `calibration` or `focal_px`, not both")
+        raise OptionError("give `calibration` or `focal_px`, not both")
     if isinstance(given, Calibration):
         given.check_sizes(*sizes)
         return given

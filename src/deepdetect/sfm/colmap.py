@@ -187,23 +187,28 @@ def initial_intrinsics(
     `focal_px` is of the images whose camera is not known; None: of their EXIF, or a guess. Images
     that share a camera, by `MultiViewOptions.single_camera`, get the same object.
     """
-    shared: dict[Any, CameraIntrinsics] = {}
-    intrinsics = {}
+    begins = {}
     for name, size in sizes.items():
         if name in known:
-            begin = CameraIntrinsics.of_camera(known[name])
+            begins[name] = CameraIntrinsics.of_camera(known[name])
         elif focal_px is not None:
             focal = Camera(size, focal_px).focal_px[0]
-            begin = CameraIntrinsics.initial(size, focal, "focal_px")
+            begins[name] = CameraIntrinsics.initial(size, focal, "focal_px")
         else:
             try:
                 exif = camera_from_exif(folder / name, size)
-                begin = CameraIntrinsics.initial(size, float(np.mean(exif.focal_px)))
+                begins[name] = CameraIntrinsics.initial(size, float(np.mean(exif.focal_px)))
             except ReconstructionError:
-                begin = CameraIntrinsics.initial(size)
-        key = {None: begin, True: size, False: name}[single_camera]
-        intrinsics[name] = shared.setdefault(key, begin)
-    return intrinsics
+                begins[name] = CameraIntrinsics.initial(size)
+    shared: dict[Any, CameraIntrinsics] = {}
+    keys = {
+        name: {None: begin, True: begin.size, False: name}[single_camera]
+        for name, begin in begins.items()
+    }
+    # Of a camera's images those without EXIF do not tell its focal length.
+    for name in sorted(begins, key=lambda name: begins[name].source == "estimated"):
+        shared.setdefault(keys[name], begins[name])
+    return {name: shared[keys[name]] for name in sizes}
 
 
 def write_database(

@@ -74,7 +74,7 @@ def write_map(found: MultiViewReconstruction, folder: Path, output: Path) -> Non
     xyz, colors = xyz[inside], found.cloud.colors[inside]
     size = xyz[:, :2].max(axis=0) - xyz[:, :2].min(axis=0)
     cell = max(float(np.sqrt(size.prod() * POINTS_PER_CELL / len(xyz))), size.max() / MAX_MAP_SIDE)
-    cell = float(f"{cell:.1g}") or 1.0
+    cell = float(f"{cell:.2g}") or 1.0
     west, north = np.floor(xyz[:, 0].min() / cell), np.ceil(xyz[:, 1].max() / cell)
     column = np.floor(xyz[:, 0] / cell - west).astype(np.int64)
     row = np.floor(north - xyz[:, 1] / cell).astype(np.int64)

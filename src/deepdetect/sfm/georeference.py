@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -173,6 +173,20 @@ def require_fixes(folder: Path, what: str) -> None:
         )
 
 
+def require_images(
+    names: Iterable[str],
+    control: Sequence[ControlRow] | None,
+    scale_by: tuple[float, str, str] | None,
+) -> None:
+    """Raise an OptionError where control points, or the ends of a distance, name other images."""
+    named = _by_file_name(names)
+    if control is not None:
+        _seen_by_several(control, named)
+    if scale_by is not None:
+        for end in scale_by[1:]:
+            _image_and_pixel(end, named)
+
+
 def georeference_by_gps(
     views: Mapping[str, PosedView], folder: Path, scale: float | None = None
 ) -> Georeference:
@@ -299,7 +313,18 @@ def georeference_by_control_points(
     sparse: SparseModel, control: Sequence[ControlRow], scale: float | None = None
 ) -> Georeference:
     """Find the place of a model by points that two or more of its images show."""
-    names = _by_file_name(sparse)
+    seen = _seen_by_several(control, _by_file_name(sparse.images))
+    points = {name: _triangulated(sparse, rows) for name, rows in seen.items()}
+    places = np.array([next(iter(rows.values())).place for rows in seen.values()])
+    up, level, stds = upright(sparse.views)
+    known = {"up": up, "level": level, "level_stds": stds}
+    return _place("ground control points", points, places, CONTROL_ACCURACY_M, scale, **known)
+
+
+def _seen_by_several(
+    control: Sequence[ControlRow], names: Mapping[str, str]
+) -> dict[str, dict[str, ControlRow]]:
+    """Return the rows by point and image, of points in two or more images of these names."""
     seen: dict[str, dict[str, ControlRow]] = {}
     for row in control:
         if row.image in names:
@@ -311,18 +336,15 @@ def georeference_by_control_points(
             f"{MIN_FIXES} are needed: name more, and the images as their files are called, with "
             "their folders where two have one name"
         )
-    points = {name: _triangulated(sparse, rows) for name, rows in seen.items()}
-    places = np.array([next(iter(rows.values())).place for rows in seen.values()])
-    up, level, stds = upright(sparse.views)
-    known = {"up": up, "level": level, "level_stds": stds}
-    return _place("ground control points", points, places, CONTROL_ACCURACY_M, scale, **known)
+    return seen
 
 
-def _by_file_name(sparse: SparseModel) -> dict[str, str]:
+def _by_file_name(names: Iterable[str]) -> dict[str, str]:
     """Return the names of images by these, and by the names of their files that only one has."""
-    counts = Counter(Path(name).name for name in sparse.images)
-    alone = {Path(name).name: name for name in sparse.images if counts[Path(name).name] == 1}
-    return {**alone, **{name: name for name in sparse.images}}
+    names = [*names]
+    counts = Counter(Path(name).name for name in names)
+    alone = {Path(name).name: name for name in names if counts[Path(name).name] == 1}
+    return {**alone, **{name: name for name in names}}
 
 
 def _triangulated(sparse: SparseModel, rows: Mapping[str, ControlRow]) -> np.ndarray:
@@ -354,17 +376,11 @@ def scale_by_distance(
 
 
 def _end(end: str, sparse: SparseModel, points: np.ndarray) -> np.ndarray:
-    pixel = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", end)
-    name = pixel[1] if pixel else end
-    names = _by_file_name(sparse)
-    if name not in names:
-        raise OptionError(
-            f"{name} is no image of the model: name two of its images, or pixels as NAME:X,Y"
-        )
-    image = sparse.images[names[name]]
-    if not pixel:
+    name, pixel = _image_and_pixel(end, _by_file_name(sparse.images))
+    image = sparse.images[name]
+    if pixel is None:
         return image.view.centre
-    xy = image.intrinsics.to_pinhole(np.array([[float(pixel[2]), float(pixel[3])]]))
+    xy = image.intrinsics.to_pinhole(pixel[None])
     projected, depth = image.view.project(points)
     distances = np.where(depth > 0, np.linalg.norm(projected - xy, axis=1), np.inf)
     if not (len(points) and distances.min() < MAX_DISTANCE_PX):
@@ -375,3 +391,14 @@ def _end(end: str, sparse: SparseModel, points: np.ndarray) -> np.ndarray:
     # Of several as near, the nearest to the camera hides the others.
     near = np.flatnonzero(distances < distances.min() + 2)
     return np.asarray(points[near[depth[near].argmin()]], np.float64)
+
+
+def _image_and_pixel(end: str, names: Mapping[str, str]) -> tuple[str, np.ndarray | None]:
+    """Return the image that an end of a distance names, and its pixel, if it is one."""
+    pixel = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", end)
+    name = pixel[1] if pixel else end
+    if name not in names:
+        raise OptionError(
+            f"{name} is no image of the model: name two of its images, or pixels as NAME:X,Y"
+        )
+    return names[name], np.array([float(pixel[2]), float(pixel[3])]) if pixel else None

@@ -151,6 +151,7 @@ def map_images(
         if known_cameras:
             how.ba_refine_focal_length = False
             how.ba_refine_extra_params = False
+            how.max_focal_length_ratio = np.inf  # a telescope's
         found, tried = list[Any](), list[Any]()
         for forward in (False, True):
             if forward:
@@ -166,7 +167,7 @@ def map_images(
                     next_image_callback=lambda: registered(1),
                 )
             tried.extend(models.values())
-            attempt = _sound(models)
+            attempt = _sound(models, known_cameras)
             if not found or (attempt and _size(attempt[0]) > _size(found[0])):
                 found = attempt
             # What is left may be more than the model: a drive beside some images of a house.
@@ -188,20 +189,22 @@ def map_globally(
             how.mapper.bundle_adjustment.refine_focal_length = False
             how.mapper.bundle_adjustment.refine_extra_params = False
         models = pycolmap.global_mapping(database, folder, space, how)
-    return _largest(_sound(models), [*models.values()])
+    return _largest(_sound(models, known_cameras), [*models.values()])
 
 
-def _sound(models: Mapping[int, Any]) -> list[Any]:
+def _sound(models: Mapping[int, Any], known_cameras: bool) -> list[Any]:
     """Return the models, the largest first, without those whose cameras ran away.
 
     With few points, focal length and distortion may become such that COLMAP triangulates no points
-    of most images.
+    of most images. Known ones stay.
     """
     limits = MIN_FOCAL_RATIO, MAX_FOCAL_RATIO, MAX_DISTORTION
     found = []
     for model in models.values():
         cameras = [model.images[number].camera for number in model.reg_image_ids()]
-        if 2 * sum(camera.has_bogus_params(*limits) for camera in cameras) <= len(cameras):
+        if known_cameras or 2 * sum(camera.has_bogus_params(*limits) for camera in cameras) <= len(
+            cameras
+        ):
             found.append(model)
     return sorted(found, key=_size, reverse=True)
 

@@ -22,7 +22,7 @@ from ..batch.pair_list import Pair
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.selection import SelectionOptions
-from ..geometry.camera import Calibration, Camera, PosedView
+from ..geometry.camera import Calibration, Camera, PosedView, check_camera_file
 from ..geometry.point_cloud import EAST_NORTH_UP, PointCloud
 from ..io.html_viewer import write_html_page
 from ..io.point_cloud import save_point_cloud
@@ -30,11 +30,17 @@ from .colmap import import_pycolmap, initial_intrinsics, known_cameras
 from .forecast import expected_seconds
 from .formats import FORMATS, FormatName, check_formats
 from .fusion import DENSE_POINT
-from .georeference import Georeference, georeference, read_control_points, require_fixes
+from .georeference import (
+    Georeference,
+    georeference,
+    read_control_points,
+    require_fixes,
+    require_images,
+)
 from .mapping import MIN_VIEWS, read_sparse_model, transform_model
 from .result import MultiViewReconstruction
 from .splat import write_transforms
-from .stages import WORK, MultiViewOptions, Stages
+from .stages import WORK, MultiViewOptions, Stages, check_images
 
 MAX_KEYPOINTS = 8192
 """Of an image, where nothing else is asked for."""
@@ -103,13 +109,16 @@ def reconstruct_many(
     if focal_px is not None:
         Camera((1, 1), focal_px)  # which says what is wrong with it
         if calibration is not None:
-            raise ReconstructionError("give `calibration` or `focal_px`, not both")
+            raise OptionError("give `calibration` or `focal_px`, not both")
+    if isinstance(calibration, (str, Path)):
+        check_camera_file(calibration)
     if overwrite:
         work = target / WORK
         if any(work.glob("features.h5*")):  # another folder of this name is not ours
             shutil.rmtree(work, ignore_errors=True)
     stages = Stages(target, options, workers, quiet, seed)
     folder = stages.folder_of(images)
+    require_images(check_images(folder), control, options.scale_by)
     if control is None and (placed := [n for n in options.formats if FORMATS[n].placed]):
         require_fixes(folder, f"the format {placed[0]}")
     timer = StageTimer(None if quiet else lambda _: _say_left(timer))

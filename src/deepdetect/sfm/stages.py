@@ -218,7 +218,7 @@ class Stages:
                 path = folder.absolute() / name
                 begins, within = (f"{path} ", f"{name}: "), f" {path}:"
                 found = [one for one in report.failures if one.startswith(begins) or within in one]
-                failures[name] = [*found, "it could not be read"][0]
+                failures[name] = [*found, "it cannot be read: check the file"][0]
         return sizes, keypoints, failures
 
     def choose_pairs(self, names: Sequence[str]) -> list[Pair]:
