@@ -5,6 +5,7 @@
 Each flight passes a relief in lines, as a drone does, overlapping by 70 and 60 %. Keypoints are the
 relief's points seen with noise; matches are those of the 20 images nearest to each, some of them
 lost and others wrong. Both mappers get the same verified pairs, and the last adjustment follows.
+Memory is all that a process held, with Python.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ import numpy as np
 from numpy.random import Generator
 
 from deepdetect._shared.opencv import cv2
-from deepdetect.batch.pair_list import SIMILAR
+from deepdetect.batch.pair_list import SIMILAR, Pair
 from deepdetect.evaluation.metrics.pose import camera_errors
+from deepdetect.evaluation.profiling import peak_memory, run_in_child
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.sfm.colmap import CameraIntrinsics, write_database
@@ -85,28 +87,40 @@ def write_flight(path: Path, count: int, rng: Generator) -> list[PosedView]:
     return views
 
 
+def measure(
+    name: str, database: Path, truth: list[PosedView], verified: dict[Pair, int]
+) -> tuple[object, ...]:
+    """Map a flight; to be called in a process of its own.
+
+    Returns how many images were registered, the mean and the largest error of their centres in
+    pixels on the ground, CPU seconds, and the megabytes that the process held at most.
+    """
+    start = time.process_time()
+    if name == "global":
+        model = map_globally(database, database.parent, False)[0]
+    else:
+        model = map_images(database, database.parent, verified, False)[0]
+    adjust(model, False)
+    seconds, memory = time.process_time() - start, peak_memory() / 1e6
+    views = read_sparse_model(model).views
+    true = [view for view in truth if view.name in views]
+    errors = camera_errors([views[view.name] for view in true], true)[0]
+    return len(views), errors.mean(), errors.max(), seconds, memory
+
+
 def main() -> None:
     """Print a row for each number of images and mapper."""
-    print("| images | mapper | registered | centres, px on the ground | largest | CPU s |")
-    print("|---|---|---:|---:|---:|---:|")
+    print("| images | mapper | registered | centres, px on the ground | largest | CPU s | MB |")
+    print("|---|---|---:|---:|---:|---:|---:|")
     for count in map(int, sys.argv[1:] or COUNTS):
         with tempfile.TemporaryDirectory() as scratch:
-            database, folder = Path(scratch, "database.db"), Path(scratch)
+            database = Path(scratch, "database.db")
             truth = write_flight(database, count, np.random.default_rng(count))
             verified = verify_pairs(database)
-            for name, mapper, pairs in (
-                ("incremental", map_images, [verified]),
-                ("global", map_globally, []),
-            ):
-                start = time.process_time()
-                model = mapper(database, folder, *pairs, False)[0]
-                adjust(model, False)
-                seconds = time.process_time() - start
-                views = read_sparse_model(model).views
-                true = [view for view in truth if view.name in views]
-                errors = camera_errors([views[view.name] for view in true], true)[0]
-                row = count, name, len(views), errors.mean(), errors.max(), seconds
-                print("| {} | {} | {} | {:.2f} | {:.2f} | {:.0f} |".format(*row), flush=True)
+            for name in ("incremental", "global"):
+                row = run_in_child(measure, name, database, truth, verified)
+                cells = "| {} | {} | {} | {:.2f} | {:.2f} | {:.0f} | {:.0f} |"
+                print(cells.format(count, name, *row), flush=True)
 
 
 if __name__ == "__main__":
