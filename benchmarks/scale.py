@@ -4,17 +4,15 @@
 
 Each photograph below a folder is a place that 34 images show: it is seen through random
 perspectives, brighter or darker. These are small and have few keypoints, so that 100,000 of them
-take an hour on two cores. Then `extract_features`, the most similar pairs, and `match_pairs`. CPU
-time and memory are of all processes, Ray's own too.
-
-A second table tells what usual photographs will take, on paper: CPU hours, by these rates, by the
-costs of larger images and by the mappers' times, both of docs/results, and gigabytes of files.
+take two hours on two cores. Then `extract_features`, the most similar pairs, and `match_pairs`, on
+a cluster that is started here. CPU time is of all processes, Ray's own too; memory of the one that
+asks, and of the largest other one, a worker. Needs the group `ray`.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
+import os
 import shutil
 import tempfile
 import threading
@@ -32,7 +30,7 @@ from deepdetect._shared.opencv import cv2
 from deepdetect.batch import extract_features, match_pairs
 from deepdetect.batch.hdf5 import feature_names, open_hdf5
 from deepdetect.batch.pair_list import SIMILAR
-from deepdetect.batch.similar_pairs import WORDS, similar_pairs
+from deepdetect.batch.similar_pairs import similar_pairs
 from deepdetect.evaluation.profiling import peak_memory, run_in_child
 from deepdetect.evaluation.report import Table
 
@@ -55,29 +53,6 @@ COLUMNS = {
     **{f"{stage}, MB": ",.0f" for stage in ("features", "similar pairs", "matching")},
     "a worker, MB": ",.0f",
     "files, MB": ",.0f",
-}
-
-
-RESULTS = Path(__file__).parents[1] / "docs" / "results"
-
-USUAL, USUAL_POINTS = "1600x1067", 2048
-POINT_BYTES = 279
-"""In a file of features: position, score, size, angle, colour, and a learned descriptor."""
-
-DESCRIPTOR_LENGTH = 64
-MIN_MAPPED = 120
-"""Images from which on the time of the mapping tells how it grows."""
-
-FORECAST = (1000, 10_000, 100_000, 1_000_000)
-FORECAST_COLUMNS = {
-    "images": ",d",
-    "features": ",.1f",
-    "similar pairs": ",.1f",
-    "matching": ",.1f",
-    "files, GB": ",.0f",
-    "vectors, GB": ".2f",
-    "incremental mapper": ",.0f",
-    "global mapper": ",.0f",
 }
 
 
@@ -150,7 +125,7 @@ def find_pairs(path: Path) -> list[tuple[str, str]]:
     """Return the pairs of images that are alike."""
     with open_hdf5(path) as file:
         names = sorted(feature_names(file))
-    return similar_pairs(path, names, SIMILAR, quiet=False)
+    return similar_pairs(path, names, SIMILAR, quiet=False)[0]
 
 
 def find_matches(features: Path, pairs: list[tuple[str, str]], path: Path) -> None:
@@ -185,57 +160,17 @@ def measure(photographs: list[Path], count: int, work: Path) -> dict[str, Any]:
     }
 
 
-def read_result(name: str) -> list[dict[str, str]]:
-    """Read a table of docs/results."""
-    with (RESULTS / f"{name}.csv").open(newline="", encoding="utf-8") as file:
-        return [*csv.DictReader(file)]
-
-
-def forecast(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return what collections of usual photographs will take.
-
-    Comparing an image takes longer by as much as there are others; mapping grows by a power of
-    their number.
-    """
-    large = np.array([(r["images"], r["similar pairs, CPU s an image"]) for r in rows[-2:]])
-    slope, constant = np.polyfit(*large.T, 1)
-    costs = next(row for row in read_result("costs") if row["image, px"] == USUAL)
-    pair_s = float(costs["matching these, s"]) + rows[-1]["matching, CPU s a pair"]
-    pairs_an_image = rows[-1]["pairs"] / rows[-1]["images"]
-    powers = {}
-    for mapper in ("incremental", "global"):
-        known = [r for r in read_result("mappers") if r["mapper"] == mapper]
-        times = np.array([(float(r["images"]), float(r["CPU s"])) for r in known])
-        powers[mapper] = np.polyfit(*np.log(times[times[:, 0] >= MIN_MAPPED]).T, 1)
-    found = []
-    for count in FORECAST:
-        pairs = count * pairs_an_image
-        file_bytes = count * USUAL_POINTS * POINT_BYTES + pairs * USUAL_POINTS * 8
-        found.append(
-            {
-                "images": count,
-                "features": count * float(costs[f"{USUAL_POINTS} points, s"]) / 3600,
-                "similar pairs": count * (constant + slope * count) / 3600,
-                "matching": pairs * pair_s / 3600,
-                "files, GB": file_bytes / 1e9,
-                "vectors, GB": count * 4 * WORDS * DESCRIPTOR_LENGTH / 1e9,
-                **{
-                    f"{name} mapper": float(np.exp(np.polyval(power, np.log(count)))) / 3600
-                    for name, power in powers.items()
-                },
-            }
-        )
-    return found
-
-
 def main() -> None:
-    """Print the tables."""
+    """Print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("photographs", type=Path)
     parser.add_argument("counts", type=int, nargs="*", default=COUNTS)
     parser.add_argument("--work", type=Path, help="where there is space for the files")
     arguments = parser.parse_args()
     photographs = sorted(arguments.photographs.rglob("*.jpg"))
+    if len(photographs) * VIEWS < max(arguments.counts):
+        raise SystemExit(f"{max(arguments.counts) // VIEWS + 1} photographs are needed")
+    os.environ["RAY_ADDRESS"] = "local"  # processes of another cluster would not be seen
     rows = []
     if arguments.work is not None:
         arguments.work.mkdir(parents=True, exist_ok=True)
@@ -247,7 +182,6 @@ def main() -> None:
             shutil.rmtree(work)
         print(rows[-1], flush=True)
     print(Table("scale", "", COLUMNS, rows).to_markdown())
-    print(Table("forecast", "", FORECAST_COLUMNS, forecast(rows)).to_markdown())
 
 
 if __name__ == "__main__":

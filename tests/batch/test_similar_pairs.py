@@ -38,24 +38,42 @@ def test_views_of_one_thing_are_more_alike_than_others(tmp_path: Path) -> None:
     for picture in (data.camera(), *(cv2.cvtColor(each, cv2.COLOR_RGB2GRAY) for each in color)):
         crops += [picture[:200, :260], picture[20:220, 40:300]]
     found = [described(np.ascontiguousarray(crop)) for crop in crops]
-    vectors = vlad_vectors(len(found), found.__getitem__)
+    vectors, rows = vlad_vectors(len(found), found.__getitem__)
+    assert rows.tolist() == [*range(8)]
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1, atol=1e-5)
     write_groups(tmp_path / "f.h5", [group(str(k), each) for k, each in enumerate(found)])
-    pairs = similar_pairs(tmp_path / "f.h5", [str(k) for k in range(8)], 1)
+    pairs = similar_pairs(tmp_path / "f.h5", [str(k) for k in range(8)], 1)[0]
     assert pairs == [("0", "1"), ("2", "3"), ("4", "5"), ("6", "7")]
 
 
-def test_photographs_without_descriptors_are_in_no_pair(tmp_path: Path) -> None:
+def test_photographs_that_cannot_be_compared_are_named(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py", reason="needs h5py")
     rng = np.random.default_rng(0)
-    given = {name: rng.normal(size=(30, 64)).astype(np.float32) for name in "abcd"}
-    given["b"] = given["b"][:0]
+    given = {name: rng.normal(size=(30, 64)).astype(np.float32) for name in "abcdef"}
+    given["b"] = given["b"][:0]  # black: nothing is wrong with it
+    given["e"] = rng.normal(size=(30, 128)).astype(np.float32)
     path = tmp_path / "f.h5"
     write_groups(path, [group(name, each) for name, each in given.items()])
     with h5py.File(path, "r+") as file:
         file["d/descriptors"][:, 3] = np.nan  # damaged
-    assert similar_pairs(path, "abcd", 3) == [("a", "c")]
-    assert similar_pairs(path, "bd", 3) == similar_pairs(path, "b", 3) == []
+        del file["f/descriptors"]
+    pairs, failures = similar_pairs(path, "acbdfe", 3)
+    assert pairs == [("a", "c")]
+    assert ["d" in failures[0], "e: its" in failures[1], "f: it has no" in failures[2]] == [
+        True
+    ] * 3
+    assert len(failures) == 3
+    report = match_pairs(path, "similar", tmp_path / "m.h5", workers=1)
+    assert ([*report.counts], len(report.failures)) == ([("a", "c")], 3)
+    assert similar_pairs(path, "b", 3) == ([], [])
+    assert similar_pairs(path, "bd", 3)[0] == []
+
+
+def test_the_vocabulary_is_of_photographs_with_descriptors(monkeypatch) -> None:
+    monkeypatch.setattr("deepdetect.batch.similar_pairs.TRAINING_IMAGES", 1)
+    few = [np.empty((0, 8), np.float32)] * 30 + [np.eye(8, dtype=np.float32)] * 2
+    vectors, rows = vlad_vectors(len(few), few.__getitem__)
+    assert (len(vectors), rows.tolist()) == (2, [30, 31])
 
 
 def test_of_a_large_set_those_that_see_the_same_are_matched(tmp_path: Path) -> None:
@@ -70,7 +88,7 @@ def test_of_a_large_set_those_that_see_the_same_are_matched(tmp_path: Path) -> N
         strange = rng.normal(size=(80, 128))  # leaves, and what moves
         seen[f"{k:03}"] = np.concatenate([own, strange]).astype(np.float32)
     write_groups(tmp_path / "f.h5", [group(*each) for each in seen.items()])
-    pairs = similar_pairs(tmp_path / "f.h5", [*seen], 6)
+    pairs = similar_pairs(tmp_path / "f.h5", [*seen], 6)[0]
     assert len(pairs) <= 6 * count < count * (count - 1) / 2
     found = {tuple(sorted(map(int, pair))) for pair in pairs}
     assert len(found) == len(pairs)

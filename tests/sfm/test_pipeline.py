@@ -258,9 +258,13 @@ def test_what_is_named_wrongly_is_said_before_the_work(
     Path("gcp_list.txt").write_text("\n".join(["EPSG:32633", *rows]))
     given = {k: v for k, v in wrong.items() if k == "calibration"}
     options = MultiViewOptions(**{k: v for k, v in wrong.items() if k != "calibration"})
-    with pytest.raises(DeepDetectError, match=message):
-        reconstruct_many(folder, "model", options=options, **given)
-    assert not Path("model").exists()
+    kept = Path("model", "work", "features.h5")
+    kept.parent.mkdir(parents=True)
+    kept.touch()
+    for images in (folder, [*folder.iterdir()]):
+        with pytest.raises(DeepDetectError, match=message):
+            reconstruct_many(images, "model", options=options, overwrite=True, **given)
+    assert kept.exists()
 
 
 def test_photographs_of_another_size_do_not_stop_a_calibrated_run(

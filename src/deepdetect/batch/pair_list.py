@@ -51,13 +51,13 @@ SIMILAR = 20
 
 def similar(pairs: object) -> int | None:
     """Return with how many of the most similar each image is matched; None where not by these."""
-    match = re.fullmatch("similar(?::([1-9][0-9]{0,8}))?", str(pairs))
+    match = isinstance(pairs, str) and re.fullmatch("similar(?::([1-9][0-9]{0,8}))?", pairs)
     return int(match[1] or SIMILAR) if match else None
 
 
 def following(pairs: object) -> int | None:
     """Return with how many that follow each image is matched; None where it is told otherwise."""
-    match = re.fullmatch("sequential:([1-9][0-9]{0,8})", str(pairs))
+    match = isinstance(pairs, str) and re.fullmatch("sequential:([1-9][0-9]{0,8})", pairs)
     return sys.maxsize if pairs == "exhaustive" else int(match[1]) if match else None
 
 

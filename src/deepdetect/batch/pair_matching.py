@@ -108,9 +108,9 @@ def match_pairs(
         features: file of `extract_features`, or of hloc.
         pairs: "exhaustive": all; "sequential:10": each image with the 10 that follow it by name;
             "similar:20" or "similar": with the 20 that are most like it (VLAD of the best 512
-            keypoints);
-            or a list of pairs of names, or a text file with a pair on each line. A pair that is
-            listed twice, in either order, is taken once.
+            keypoints), which new images may change: pairs of before stay; or a list of pairs of
+            names, or a text file with a pair on each line. A pair that is listed twice, in either
+            order, is taken once.
         path: the file.
         options: how they are matched.
         engine: "processes" of this machine, or "ray" for a cluster.
@@ -132,8 +132,7 @@ def match_pairs(
         ...     match_pairs("features.h5", "pairs.txt", "matches.h5").check()
     """
     source = Path(features).absolute()
-    alike = similar(pairs)
-    if alike is None:
+    if not (alike := similar(pairs)):
         list_pairs(pairs, ())  # what is wrong with them is said first
     if source == Path(path).absolute():
         raise OptionError(f"{path} holds the features: give the matches another file with -o")
@@ -141,10 +140,11 @@ def match_pairs(
         require_suited(first)
     with open_hdf5(source) as file:
         names = natsorted(feature_names(file), alg=ns.PATH)
-    if alike is None:
-        listed = list_pairs(pairs, names)
-    else:
-        listed = similar_pairs(source, names, alike, options.seed, quiet)
+    listed, unlike = (
+        similar_pairs(source, names, alike, options.seed, quiet)
+        if alike
+        else (list_pairs(pairs, names), [])
+    )
     wanted, failures, gone, made_with = _find_pairs(source, listed)
     report = fill_file(
         path,
@@ -158,7 +158,7 @@ def match_pairs(
         overwrite=overwrite,
         quiet=quiet,
     )
-    return replace(report, failures=(*failures, *report.failures))
+    return replace(report, failures=(*unlike, *failures, *report.failures))
 
 
 def first_keypoints(features: Path) -> Keypoints | None:

@@ -6,13 +6,14 @@ the best keypoints, with a vocabulary of the collection itself.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from .._shared.errors import InvalidFileError
+from .._shared.errors import noted_failures
 from .._shared.opencv import cv2
 from .._shared.progress import progress
 from ..features.keypoints import unit_length
@@ -31,40 +32,45 @@ TRAINING_IMAGES, TRAINING_DESCRIPTORS = 500, 50_000
 """At most so many tell the vocabulary."""
 
 COMPARED_ROWS = 256
-"""Images that are compared with all others at once: of 100,000 these are 100 MB."""
+"""Images that are compared with all others at once: of 100,000 these are 300 MB."""
 
 
 def similar_pairs(
     features: Path, names: Sequence[str], count: int, seed: int = 0, quiet: bool = True
-) -> list[Pair]:
-    """Return each image with the `count` that are most like it, every pair once.
+) -> tuple[list[Pair], list[str]]:
+    """Find for each image the `count` that are most like it.
 
-    Images without descriptors, or with damaged ones, are in no pair.
+    Returns every pair once; and a sentence on each image that is in none, since its descriptors are
+    missing, damaged, or not those of the others. Images without keypoints are in none either.
     """
-    with open_hdf5(features) as file, progress(len(names), "comparing", "image", quiet) as bar:
-        vectors = vlad_vectors(
-            len(names), lambda k: _best_descriptors(file, names[k]), seed, bar.update
-        )
-    described = np.flatnonzero(vectors.any(axis=1))
-    if len(described) < len(names):
-        vectors = vectors[described]
-    pairs = {
-        (min(k, other), max(k, other))
-        for k, alike in enumerate(most_alike(vectors, count))
-        for other in alike.tolist()
-    }
-    return [(names[described[a]], names[described[b]]) for a, b in sorted(pairs)]
+    failures: dict[str, str] = {}
+    blank: set[str] = set()
+    with open_hdf5(features) as file, progress(len(names), "describing", "image", quiet) as bar:
 
+        def descriptors(row: int) -> np.ndarray:
+            name = names[row]
+            with noted_failures(name, reasons := list[str]()):
+                keypoints = read_keypoints(file, name)
+                if not len(keypoints):
+                    blank.add(name)
+                elif keypoints.descriptors is None:
+                    reasons.append(f"{name}: it has no descriptors: extract it again")
+                else:
+                    best = np.argsort(-keypoints.scores, kind="stable")[:COMPARED_KEYPOINTS]
+                    return unit_length(keypoints.descriptors[best])
+            if reasons:
+                failures[name] = reasons[0]
+            return np.empty((0, 0), np.float32)
 
-def _best_descriptors(file: Any, name: str) -> np.ndarray:
-    try:
-        keypoints = read_keypoints(file, name)
-    except InvalidFileError:  # who matches it is told
-        return np.empty((0, 0), np.float32)
-    if keypoints.descriptors is None:
-        return np.empty((0, 0), np.float32)
-    best = np.argsort(-keypoints.scores, kind="stable")[:COMPARED_KEYPOINTS]
-    return unit_length(keypoints.descriptors[best])
+        vectors, rows = vlad_vectors(len(names), descriptors, seed, bar.update)
+    for name in {*names} - blank - {names[row] for row in rows}:
+        failures.setdefault(name, f"{name}: its descriptors differ from others: extract all alike")
+    pairs: set[tuple[int, int]] = set()
+    with progress(len(rows), "comparing", "image", quiet) as bar:
+        for k, alike in enumerate(most_alike(vectors, count)):
+            pairs |= {(min(k, other), max(k, other)) for other in alike.tolist()}
+            bar.update()
+    return [(names[rows[a]], names[rows[b]]) for a, b in sorted(pairs)], sorted(failures.values())
 
 
 def vlad_vectors(
@@ -72,29 +78,33 @@ def vlad_vectors(
     descriptors: Callable[[int], np.ndarray],
     seed: int = 0,
     done: Callable[[], object] = lambda: None,
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Describe each image by one vector: VLAD with the sum of each word at length 1.
 
-    `descriptors` returns those of an image, (N_i, D) float32 of length 1; vectors are (images,
-    WORDS * D) of length 1, or 0 if it has none.
+    `descriptors` returns those of an image, (N_i, D) float32 of length 1. Returns the vectors (M,
+    WORDS * D), of length 1, and the rows (M,) of their images: those that have some, with the D
+    that most have.
     """
     rng = np.random.default_rng(seed)
-    chosen = rng.permutation(count)[:TRAINING_IMAGES].tolist()
-    found = [own for k in chosen for own in [descriptors(k)] if len(own)]
+    described = (own for k in rng.permutation(count).tolist() if len(own := descriptors(k)))
+    found = [*islice(described, TRAINING_IMAGES)]
     if not found:
-        return np.zeros((count, 1), np.float32)
-    centres = _vocabulary(np.concatenate(found), rng)
-    vectors = np.zeros((count, centres.size), np.float32)
+        return np.empty((0, 0), np.float32), np.empty(0, np.int64)
+    numbers = Counter(own.shape[1] for own in found).most_common(1)[0][0]
+    alike = [own for own in found if own.shape[1] == numbers]
+    centres = _vocabulary(np.concatenate(alike), rng)
+    vectors, rows = np.empty((count, centres.size), np.float32), list[int]()
     for row in range(count):
         own = descriptors(row)
-        if len(own):
+        if len(own) and own.shape[1] == numbers:
             nearest = _nearest(own, centres)
             sums = np.zeros_like(centres)
             np.add.at(sums, nearest, own - centres[nearest])
             sums /= np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-12)
-            vectors[row] = sums.ravel() / max(float(np.linalg.norm(sums)), 1e-12)
+            vectors[len(rows)] = sums.ravel() / max(float(np.linalg.norm(sums)), 1e-12)
+            rows.append(row)
         done()
-    return vectors
+    return vectors[: len(rows)], np.array(rows, np.int64)
 
 
 def most_alike(vectors: np.ndarray, count: int) -> Iterator[np.ndarray]:

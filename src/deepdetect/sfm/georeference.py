@@ -179,7 +179,8 @@ def require_images(
     scale_by: tuple[float, str, str] | None,
 ) -> None:
     """Raise an OptionError where control points, or the ends of a distance, name other images."""
-    named = _by_file_name(names)
+    names = [*names]
+    named = {Path(name).name: name for name in names} | {name: name for name in names}
     if control is not None:
         _seen_by_several(control, named)
     if scale_by is not None:

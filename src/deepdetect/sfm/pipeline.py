@@ -112,13 +112,14 @@ def reconstruct_many(
             raise OptionError("give `calibration` or `focal_px`, not both")
     if isinstance(calibration, (str, Path)):
         check_camera_file(calibration)
+    if control is not None or options.scale_by is not None:
+        require_images(check_images(images, [target]), control, options.scale_by)
     if overwrite:
         work = target / WORK
         if any(work.glob("features.h5*")):  # another folder of this name is not ours
             shutil.rmtree(work, ignore_errors=True)
     stages = Stages(target, options, workers, quiet, seed)
     folder = stages.folder_of(images)
-    require_images(check_images(folder), control, options.scale_by)
     if control is None and (placed := [n for n in options.formats if FORMATS[n].placed]):
         require_fixes(folder, f"the format {placed[0]}")
     timer = StageTimer(None if quiet else lambda _: _say_left(timer))

@@ -75,7 +75,7 @@ class MultiViewOptions:
     Attributes:
         pairs: which images are matched: "exhaustive": all; "sequential:10": each with the 10 that
             follow it by name; "similar:20": with the 20 that are most like it; "auto": all of up
-            to 50, else "similar:20".
+            to 50, else "similar", as "similar:20".
         min_motion: leave out images that show nearly the same as one before them, such as most
             frames of a video: those in which half of the matched keypoints moved by less than this
             share of the longer side. None: use all.
@@ -224,9 +224,9 @@ class Stages:
     def choose_pairs(self, names: Sequence[str]) -> list[Pair]:
         """Choose which images are matched with each other."""
         choice = self.options.pair_choice(len(names))
-        if (alike := similar(choice)) is None:
+        if not (alike := similar(choice)):
             return list_pairs(choice, names)
-        return similar_pairs(self.features, names, alike, self.seed, self.quiet)
+        return similar_pairs(self.features, names, alike, self.seed, self.quiet)[0]
 
     def match_images(
         self, sizes: Mapping[str, tuple[int, int]]

@@ -124,6 +124,35 @@ def test_what_is_no_cloud(model: Path, text: bytes | None, message: str, one_lin
     one_line(caught.value)
 
 
-def test_a_folder_without_a_model(tmp_path: Path) -> None:
+@pytest.mark.parametrize("text_format", ["ascii", "binary_big_endian"])
+def test_clouds_of_other_kinds(model: Path, text_format: str) -> None:
+    points = wall(DEPTH, 320)
+    save(points, model / "model.ply")
+    points = np.append(points, [(np.nan, 0, 1)], axis=0)
+    head = f"ply\nformat {text_format} 1.0\ncomment TextureFile möbel.png\n"
+    head += f"element vertex {len(points)}\n"
+    head += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n"
+    body = points.astype(">f8").tobytes()
+    if text_format == "ascii":
+        body = "\n".join(" ".join(map(str, point)) for point in points.tolist()).encode() + b"\n"
+    (model / "other.ply").write_bytes(head.encode() + body)
+    row = compare_clouds(model, [model / "model.ply", model / "other.ply"])[1]
+    assert row["points"] == len(points) - 1
+    assert row["from the first: median difference"] == pytest.approx(0, abs=1e-6)
+
+
+def test_models_of_other_kinds(model: Path, one_line) -> None:
+    pycolmap = pytest.importorskip("pycolmap", reason="needs pycolmap")
+    save(wall(DEPTH, 320), model / "model.ply")
+    sparse = model / "sparse" / "0"
+    made = pycolmap.Reconstruction(sparse)
+    (sparse / "images.bin").write_bytes((sparse / "images.bin").read_bytes()[:30])
+    with pytest.raises(DeepDetectError, match="no model of COLMAP") as caught:
+        compare_clouds(model, [])
+    one_line(caught.value)
+    for file in sparse.iterdir():
+        file.unlink()
+    made.write_text(sparse)
+    assert compare_clouds(model, [model / "model.ply"])[0]["share"] > 0.4
     with pytest.raises(DeepDetectError, match="name the folder of a reconstruction"):
-        compare_clouds(tmp_path, [])
+        compare_clouds(model / "gone", [])

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..._shared.errors import MissingFileError, NoDepthError
+from ..._shared.errors import InvalidFileError, MissingFileError, NoDepthError, first_line
 from ..._shared.opencv import cv2
 from ...detector.point_detector import PointDetector
 from ...geometry.camera import Camera, PosedView
@@ -69,9 +69,9 @@ CLOUD_COLUMNS = {
 }
 
 CLOUD_NOTE = (
-    "Share: of the cells of 4 x 4 pixels of an image, those in which any point is seen; mean over "
-    "the images. From the first: where both have a point, the relative difference of the depths, "
-    "and the share of cells in which it is over 1 %."
+    "Share: of the cells of 4 x 4 pixels of an image, at most 2,000 pixels a side, those in which "
+    "any point is seen; mean over the images. From the first: where both have a point, the "
+    "relative difference of the depths, and the share of cells in which it is over 1 %."
 )
 
 
@@ -81,9 +81,15 @@ def compare_clouds(model: Path, clouds: Sequence[Path]) -> Rows:
     Returns the `CLOUD_COLUMNS` of each. A DeepDetectError says what cannot be read.
     """
     sparse = model / "sparse" / "0"
-    if not (sparse / "images.bin").is_file():
+    if not sparse.is_dir():
         raise MissingFileError(f"there is no {sparse}: name the folder of a reconstruction")
-    views = read_sparse_model(import_pycolmap().Reconstruction(sparse)).views.values()
+    pycolmap = import_pycolmap()
+    try:
+        views = read_sparse_model(pycolmap.Reconstruction(sparse)).views.values()
+    except (ValueError, IndexError, RuntimeError) as error:
+        raise InvalidFileError(
+            f"{sparse} is no model of COLMAP ({first_line(error)}): check it"
+        ) from error
     limited = [limited_view(view) for view in views]
     rows: Rows = []
     first: list[np.ndarray] = []
@@ -93,8 +99,7 @@ def compare_clouds(model: Path, clouds: Sequence[Path]) -> Rows:
         share = np.mean([np.isfinite(depth).mean() for depth in depths])
         row = {"cloud": str(path), "points": len(points), "share": float(share)}
         if first:
-            apart = _agreement([*zip(depths, first, strict=True)])
-            row |= {name.replace("halves", "from the first"): x for name, x in apart.items()}
+            row |= _agreement([*zip(depths, first, strict=True)], "from the first")
         first = first or depths
         rows.append(row)
     return rows
@@ -155,7 +160,7 @@ def measure_dense_points(
         return row | {f"{SGBM} {name}": value for name, value in sgbm.items()}
 
 
-def _agreement(pairs: Sequence[Sequence[np.ndarray]]) -> Row:
+def _agreement(pairs: Sequence[Sequence[np.ndarray]], name: str = "halves") -> Row:
     """Compare two depth maps of each of some views, infinite where they have none.
 
     Returns nothing where no pixel has two depths.
@@ -168,8 +173,8 @@ def _agreement(pairs: Sequence[Sequence[np.ndarray]]) -> Row:
     if not len(difference):
         return {}
     return {
-        "halves: median difference": float(np.median(difference)),
-        "halves: share apart": float((difference > APART).mean()),
+        f"{name}: median difference": float(np.median(difference)),
+        f"{name}: share apart": float((difference > APART).mean()),
     }
 
 
