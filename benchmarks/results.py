@@ -357,9 +357,10 @@ def run_stage(stage: str, data: Path, published: Path | None, work: Path) -> Non
         subprocess.run([sys.executable, *words], check=True)
         return
     made = subprocess.run([sys.executable, *words], check=True, stdout=subprocess.PIPE, text=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "printed.txt").write_text(made.stdout)  # what took hours, whatever follows
     found = [evaluated(made.stdout)] if "--json" in words else printed_tables(made.stdout)
     tables = {str(k): {"rows": rows} for k, rows in enumerate(found)}
-    folder.mkdir(parents=True, exist_ok=True)
     (folder / "report.json").write_text(json.dumps({"metadata": {}, "tables": tables}))
 
 
