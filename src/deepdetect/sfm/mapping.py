@@ -202,9 +202,8 @@ def _sound(models: Mapping[int, Any], known_cameras: bool) -> list[Any]:
     found = []
     for model in models.values():
         cameras = [model.images[number].camera for number in model.reg_image_ids()]
-        if known_cameras or 2 * sum(camera.has_bogus_params(*limits) for camera in cameras) <= len(
-            cameras
-        ):
+        bogus = sum(camera.has_bogus_params(*limits) for camera in cameras)
+        if known_cameras or 2 * bogus <= len(cameras):
             found.append(model)
     return sorted(found, key=_size, reverse=True)
 
