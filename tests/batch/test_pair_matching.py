@@ -12,7 +12,7 @@ from deepdetect import DeepDetectError, Keypoints, OptionError, PointDetector, m
 from deepdetect.batch import PairMatchingOptions, extract_features, match_pairs
 from deepdetect.batch.extraction import read_keypoints
 from deepdetect.batch.hdf5 import open_hdf5
-from deepdetect.batch.pair_list import pair_name, read_pairs
+from deepdetect.batch.pair_list import pair_name, read_pairs, write_pairs
 from deepdetect.batch.pair_matching import _match, match_group
 
 PAIR = ("a/00.png", "b/01.png")
@@ -257,7 +257,12 @@ def test_wrong_pairs_from_python(pairs: object, tmp_path: Path) -> None:
 def test_lists_of_pairs(tmp_path: Path) -> None:
     path = tmp_path / "pairs.txt"
     path.write_text("a.jpg b.jpg\n\nb.jpg a.jpg\na.jpg b.jpg\nwith blank.jpg\tc d.jpg\n")
-    assert read_pairs(path) == [("a.jpg", "b.jpg"), ("with blank.jpg", "c d.jpg")]
+    pairs = [("a.jpg", "b.jpg"), ("with blank.jpg", "c d.jpg")]
+    assert read_pairs(path) == pairs
+    write_pairs(path, pairs)
+    assert read_pairs(path) == pairs
+    write_pairs(path, pairs[:1])
+    assert path.read_text() == "a.jpg b.jpg\n"
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from deepdetect import Keypoints
-from deepdetect.batch import extract_features, match_pairs
+from deepdetect.batch import extract_features, match_pairs, read_pairs
 from deepdetect.batch.extraction import feature_group
 from deepdetect.batch.hdf5 import Group, write_groups
 from deepdetect.batch.similar_pairs import COMPARED_ROWS, most_alike, similar_pairs, vlad_vectors
@@ -116,5 +116,6 @@ def test_a_collection_is_matched_by_likeness(collection: Callable[..., Path], tm
     numbers = [[int(Path(name).stem) for name in pair] for pair in report.counts]
     assert 3 <= len(numbers) <= 5
     assert all(abs(first - second) == 1 for first, second in numbers)
+    assert sorted(read_pairs(tmp_path / "m.h5.pairs.txt")) == [*report.counts]
     whole = match_pairs(path, "similar", tmp_path / "all.h5", workers=1)
     assert len(whole.counts) == 10

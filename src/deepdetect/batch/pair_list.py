@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from .._shared.atomic import atomic_path
 from .._shared.errors import DeepDetectError, MissingFileError, OptionError
 
 Pair = tuple[str, str]
@@ -34,7 +35,7 @@ def read_pairs(path: str | Path) -> list[Pair]:
         text = Path(path).read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise MissingFileError(
-            f"there is no file {path}: give one, or exhaustive, sequential:10 or similar"
+            f"there is no file {path}: give one, or exhaustive, or sequential:10"
         ) from None
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is no text in UTF-8"
@@ -43,6 +44,14 @@ def read_pairs(path: str | Path) -> list[Pair]:
     if not lines:
         raise DeepDetectError(f"{path} has no pairs: give the names of two images on each line")
     return check_pairs([line.split("\t" if "\t" in line else None) for line in lines], str(path))
+
+
+def write_pairs(path: Path, pairs: Sequence[Pair]) -> None:
+    """Write a list of pairs as `read_pairs` and hloc read it."""
+    blanks = any(" " in name for pair in pairs for name in pair)
+    lines = [("\t" if blanks else " ").join(pair) + "\n" for pair in pairs]
+    with atomic_path(path) as temporary:
+        temporary.write_text("".join(lines), encoding="utf-8")
 
 
 SIMILAR = 20

@@ -34,7 +34,7 @@ from .hdf5 import (
     open_hdf5,
     state_of,
 )
-from .pair_list import Pair, list_pairs, pair_name, similar
+from .pair_list import Pair, following, list_pairs, pair_name, similar, write_pairs
 from .similar_pairs import similar_pairs
 
 
@@ -98,7 +98,8 @@ def match_pairs(
     Each pair has a group NAME0/NAME1, with "-" for each "/" in the names. In it are
     `matches0` (N0,) int32, for each keypoint of the first image its match in the second, -1 where
     it has none; and `matching_scores0` (N0,) float32 in [0, 1], 1 - Lowe's ratio, or by neighbours
-    how likely the match is right.
+    how likely the match is right. Where pairs are told by a word, PATH.pairs.txt lists them, as
+    hloc wants it.
 
     A call that is interrupted or killed goes on when it is made again; pairs that are done and
     whose features have not changed are skipped, new ones are added. A script must call this under
@@ -158,6 +159,8 @@ def match_pairs(
         overwrite=overwrite,
         quiet=quiet,
     )
+    if alike or following(pairs):
+        write_pairs(Path(f"{path}.pairs.txt"), listed)
     return replace(report, failures=(*unlike, *failures, *report.failures))
 
 
