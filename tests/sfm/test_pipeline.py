@@ -224,6 +224,34 @@ def test_a_known_camera_stays_as_it_is(write_fountain, shared: Path, tmp_path: P
     assert relative_rotation_error(found.views, true_views(shared)) < 0.4
 
 
+def test_several_cameras_upright_and_on_their_side(
+    write_fountain, shared: Path, tmp_path: Path, pycolmap
+) -> None:
+    """Two photographs were taken with the camera turned, two by a camera with fewer pixels."""
+    names = ("0003", "0004", "0005", "0006", "0007", "0008")
+    folder = write_fountain(tmp_path / "photos", names, 480)
+    write_fountain(folder, ("0005", "0007"), 320)
+    for name in ("0004", "0006"):
+        with Image.open(folder / f"{name}.jpg") as image:
+            image.transpose(Image.Transpose.ROTATE_90).save(folder / f"{name}.jpg", quality=95)
+    found = reconstruct_many(folder, tmp_path / "model", **SPARSE)
+    assert (len(found.views), found.unregistered) == (6, {})
+    # The top of the turned ones is what was on the right: x was down, and y is left.
+    turn = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    truth = true_views(shared)
+    for name in ("0004.jpg", "0006.jpg"):
+        truth[name] = replace(
+            truth[name],
+            rotation=turn @ truth[name].rotation,
+            translation=turn @ truth[name].translation,
+        )
+    assert pose_errors(found.views, truth)[0] < 25
+    assert relative_rotation_error(found.views, truth) < 0.5
+    for name, width in (("0003", 480), ("0004", 480), ("0005", 320)):
+        focal = found.views[f"{name}.jpg"].camera.focal_px[0]
+        assert focal == pytest.approx(1380.9 * width / 1536, rel=0.04)
+
+
 def test_dense_matches_give_more_and_longer_tracks(small, tmp_path: Path, shared: Path) -> None:
     folder, output, found = small
     shutil.copytree(output / "work", tmp_path / "work")
