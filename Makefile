@@ -1,60 +1,44 @@
-# Set-up, demonstration, tests. All of it happens in .venv, with the versions of requirements/lock.txt.
+# Set-up, demonstration, tests. Everything is installed into .venv, in the versions of uv.lock.
 PYTHON ?= python3
 VENV ?= .venv
 OTHER_VENVS := $(patsubst %,.venv-%,opencv4 lowest ray integrations docs)
 DEMO_OUTPUT ?= demo-output
 DATA ?= data
-# What installs the lock files: uv is eight times as fast as pip, which does the same.
-INSTALLER ?= uv
+TORCH := torch==2.13.0
 # Two processes, each with whole files (what a file sets up is set up once), on one thread each. One
 # that crashes ends the run: with a new one in its place pytest-xdist may wait for ever.
-PYTEST := -m pytest -n 2 --dist loadfile --max-worker-restart 0
-# Parts of the package with their tests; those that take long come first, those not named together.
-LONG := matching detector evaluation app reconstruction training
-MEDIUM := features+labels benchmarks+integrations _shared+viz
-OTHERS := $(filter-out cli $(subst +, ,$(LONG) $(MEDIUM)),$(notdir $(patsubst %/,%,$(wildcard tests/[!_]*/))))
-parts = $(foreach part,$(1),tests/$(part) $(wildcard src/deepdetect/$(part)))
-TESTS := "$(call parts,$(OTHERS))" $(foreach part,$(LONG),"$(call parts,$(part))") \
-	"tests/test_*.py src/deepdetect/*.py" "tests/cli/test_[a-e]*.py" "tests/cli/test_[f-s]*.py" \
-	$(foreach both,$(MEDIUM),"$(call parts,$(subst +, ,$(both)))") \
-	"tests/cli/test_[t-z]*.py src/deepdetect/cli"
-# Each part in a process of its own, two at a time: what it has loaded goes with it.
-run_parts = printf '"%s"\n' $(TESTS) | xargs -P 2 -n 1 sh -c \
-	'output=$$($(VENV)/bin/python -m pytest -q $(1) $$0 2>&1); status=$$?; echo "$$output"; exit $$status'
+PYTEST := -m pytest -q -n 2 --dist loadfile --max-worker-restart 0
 export OMP_NUM_THREADS ?= 1
+export UV_PYTHON_DOWNLOADS ?= never
 # The tests start many interpreters: what one has compiled, the next should find.
 unexport PYTHONDONTWRITEBYTECODE
 
 # What calls the parts of OpenCV that moved between its versions 4 and 5.
-TESTS_OPENCV4 ?= tests/labels tests/features tests/geometry tests/evaluation/baselines \
+TESTS_OPENCV4 ?= lab/tests/labels tests/features tests/geometry lab/tests/evaluation/baselines \
 	tests/detector/network/test_onnx_export.py
-# A quick part that touches most of the packages that this one depends on.
-TESTS_LOWEST ?= tests/io tests/detector tests/labels tests/features
+# A quick part that touches most of the packages that these distributions depend on.
+TESTS_LOWEST ?= tests/io tests/detector lab/tests/labels tests/features
 
 PIP_FLAGS := --quiet --disable-pip-version-check
-ifeq ($(INSTALLER),uv)
-install = $(1)/bin/uv pip install --quiet --python $(1)/bin/python
-else
-install = $(1)/bin/python -m pip install $(PIP_FLAGS)
-endif
-# The lock files are complete, so that nothing is resolved anew.
-install_locked = $(call install,$(1)) --no-deps --require-hashes -r $(2)
-install_torch = $(1)/bin/python -m pip install $(PIP_FLAGS) --no-compile -r requirements/torch.txt
-install_package = $(call install,$(1)) --no-deps --no-build-isolation --editable .
+# Into an environment, from the lock file; what pip has put there stays.
+sync = UV_PROJECT_ENVIRONMENT=$(1) $(VENV)/bin/uv sync --quiet --locked --inexact --python $(PYTHON) \
+	--no-install-package torch
+EVERYTHING := --all-packages --all-extras
+export = $(VENV)/bin/uv export --quiet --locked --all-packages --all-extras --no-emit-workspace --format $(1)
+install_torch = $(VENV)/bin/python -m pip --python $(1)/bin/python install $(PIP_FLAGS) --no-compile --no-deps $(TORCH)
 
 .PHONY: demo test test-all fuzz onnxruntime test-opencv4 test-ray test-integrations test-lowest web test-web coverage hub lint spelling types contracts check \
 	format lock upgrade check-lock audit sbom docs test-docs notebooks figures results release-check clean
-
 demo: $(VENV)/.demo
 	$(VENV)/bin/deepdetect demo -o $(DEMO_OUTPUT)
 
 # The fast tests. Those marked as slow run with `make test-all`.
 test: $(VENV)/.test
-	@$(call run_parts,)
+	$(VENV)/bin/python $(PYTEST)
 
 # All tests, and ten minutes of wrong input and kills.
 test-all: $(VENV)/.test test-opencv4 test-ray test-integrations onnxruntime
-	@$(call run_parts,--runslow)
+	$(VENV)/bin/python $(PYTEST) --runslow
 	$(VENV)/bin/python -m fuzz --seconds 540 --kills 8
 
 # All wrong input and all kills of docs/limits.md: a quarter of an hour on two cores.
@@ -116,23 +100,23 @@ format: $(VENV)/.test
 	$(VENV)/bin/ruff check --fix .
 	$(VENV)/bin/ruff format .
 
-lock: $(VENV)/bin/uv
-	$(VENV)/bin/python requirements/lock.py
-
-upgrade: $(VENV)/bin/uv
-	$(VENV)/bin/python requirements/lock.py --upgrade
+# Only what the files pyproject.toml ask for changes; `make upgrade` takes the newest versions.
+lock upgrade: $(VENV)/bin/uv
+	$(VENV)/bin/uv lock $(if $(filter upgrade,$@),--upgrade)
+	$(VENV)/bin/uv pip compile --quiet --generate-hashes --resolution lowest-direct --no-emit-package torch \
+		--python-version 3.11 --custom-compile-command "make lock" --extra all --group build --group test \
+		--no-emit-package deepdetect --output-file requirements/lowest.txt pyproject.toml lab/pyproject.toml
 
 check-lock: $(VENV)/bin/uv
-	$(VENV)/bin/python requirements/lock.py --check
+	$(VENV)/bin/uv lock --check
 
 # Known vulnerabilities of the locked packages, where data can be reached.
 audit: $(VENV)/bin/uv
-	$(VENV)/bin/python requirements/audit.py
+	$(call export,requirements.txt) | $(VENV)/bin/python requirements/audit.py
 
 # A bill of materials of the locked packages, as CycloneDX JSON.
 sbom: $(VENV)/bin/uv
-	$(VENV)/bin/uvx --from cyclonedx-bom==7.5.0 cyclonedx-py requirements requirements/lock.txt \
-		--pyproject pyproject.toml --output-format JSON --output-reproducible --output-file sbom.json
+	$(call export,cyclonedx1.5) > sbom.json
 
 # The site, in build/site; what is wrong with a link or a docstring ends it.
 docs: .venv-docs/.test
@@ -178,33 +162,41 @@ clean:
 web/node_modules/.package-lock.json: web/package-lock.json
 	cd web && npm ci --ignore-scripts --no-audit --no-fund
 
-%/bin/uv: requirements/uv.txt
-	$(PYTHON) -m venv $*
-	$*/bin/python -m pip install $(PIP_FLAGS) --require-hashes -r requirements/uv.txt
+$(VENV)/bin/uv: requirements/uv.txt
+	$(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/python -m pip install $(PIP_FLAGS) --require-hashes -r requirements/uv.txt
 	@touch $@
 
-$(VENV)/.demo: $(VENV)/bin/uv requirements/demo.txt pyproject.toml
-	$(call install_locked,$(VENV),requirements/demo.txt)
-	$(call install_package,$(VENV))
+$(VENV)/.demo: $(VENV)/bin/uv uv.lock
+	$(call sync,$(VENV)) --group demo
 	@touch $@
 
 # It holds what the demonstration needs, too.
-$(VENV)/.test: $(VENV)/bin/uv requirements/lock.txt requirements/torch.txt pyproject.toml
-	$(call install_locked,$(VENV),requirements/lock.txt)
+$(VENV)/.test: $(VENV)/bin/uv uv.lock
+	$(call sync,$(VENV)) $(EVERYTHING) --group dev --group opencv5
 	$(call install_torch,$(VENV))
-	$(call install_package,$(VENV))
 	@touch $(VENV)/.demo $@
 
-# An environment for each of the other lock files.
-$(OTHER_VENVS:%=%/.test): .venv-%/.test: .venv-%/bin/uv requirements/%.txt requirements/torch.txt pyproject.toml
-	$(call install_locked,.venv-$*,requirements/$*.txt)
-	$(if $(filter lowest integrations,$*),$(call install_torch,.venv-$*))
-	$(call install_package,.venv-$*)
+# An environment for each of the other targets.
+.venv-opencv4/.test: GROUPS := $(EVERYTHING) --group test --group opencv4
+.venv-ray/.test: GROUPS := --group test --group ray
+.venv-integrations/.test: GROUPS := $(EVERYTHING) --group test --group opencv5 --group integrations
+.venv-docs/.test: GROUPS := --group docs --group test --group release --group build
+.venv-opencv4/.test .venv-ray/.test .venv-integrations/.test .venv-docs/.test: .venv-%/.test: $(VENV)/bin/uv uv.lock
+	$(call sync,.venv-$*) $(GROUPS)
+	$(if $(filter opencv4 integrations,$*),$(call install_torch,.venv-$*))
+	@touch $@
+
+.venv-lowest/.test: $(VENV)/bin/uv requirements/lowest.txt
+	$(VENV)/bin/uv venv --quiet --clear --python $(PYTHON) .venv-lowest
+	$(VENV)/bin/uv pip install --quiet --python .venv-lowest/bin/python --no-deps --require-hashes -r requirements/lowest.txt
+	$(call install_torch,.venv-lowest)
+	$(VENV)/bin/uv pip install --quiet --python .venv-lowest/bin/python --no-deps --editable . --editable lab
 	@touch $@
 
 # The notebooks also map and train.
-.venv-docs/.notebooks: .venv-docs/.test requirements/lock.txt requirements/torch.txt
-	$(call install_locked,.venv-docs,requirements/lock.txt)
+.venv-docs/.notebooks: .venv-docs/.test
+	$(call sync,.venv-docs) $(GROUPS) $(EVERYTHING) --group opencv5
 	$(call install_torch,.venv-docs)
-	$(call install_package,.venv-docs)
 	@touch $@
+.venv-docs/.notebooks: GROUPS := --group docs --group test

@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 
 from deepdetect import DeepDetect, PointDetector, load_image, match_features, match_images
-from deepdetect.evaluation.profiling import peak_memory, run_in_child
-from deepdetect.evaluation.report import Table
+from deepdetect_lab.evaluation.profiling import peak_memory, run_in_child
+from deepdetect_lab.evaluation.report import Table
 
 SIDES_PX = (640, 1600, 6000)
 """Of the longer side: a frame of a video, near the two megapixels of the network, a camera's."""

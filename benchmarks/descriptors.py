@@ -36,17 +36,17 @@ import cv2
 import numpy as np
 
 from deepdetect import Keypoints, Matches, PointDetector, match_features
-from deepdetect.datasets.planar import load_hpatches, load_oxford
-from deepdetect.datasets.posed_images import PosedPair, load_posed_scenes
-from deepdetect.evaluation.baselines.external import onnx_feature
-from deepdetect.evaluation.metrics.homography import area_under_curve, corner_error
-from deepdetect.evaluation.protocols.planar import pairs_of
-from deepdetect.evaluation.protocols.pose import ERROR, estimate_pose, pose_errors
-from deepdetect.evaluation.report import Row, Table
 from deepdetect.features.sift import detect_sift
 from deepdetect.geometry import GeometryOptions, estimate_geometry
 from deepdetect.geometry.transforms import transfer_errors
 from deepdetect.io.image import load_image, luma
+from deepdetect_lab.datasets.planar import load_hpatches, load_oxford
+from deepdetect_lab.datasets.posed_images import PosedPair, load_posed_scenes
+from deepdetect_lab.evaluation.baselines.external import onnx_feature
+from deepdetect_lab.evaluation.metrics.homography import area_under_curve, corner_error
+from deepdetect_lab.evaluation.protocols.planar import pairs_of
+from deepdetect_lab.evaluation.protocols.pose import ERROR, estimate_pose, pose_errors
+from deepdetect_lab.evaluation.report import Row, Table
 
 KEYPOINTS, FEW, RIGHT_PX, RIGHT_DARK_PX, ORDERS, AUC_DEG = 2048, 512, 3.0, 2.0, 5, 5.0
 RIGHT_INFRARED_PX = 5.0

@@ -25,11 +25,11 @@ import numpy as np
 
 from deepdetect import DeepDetect, match_images
 from deepdetect._shared.opencv import cv2
-from deepdetect.datasets.planar import load_oxford
-from deepdetect.datasets.posed_images import PosedPair, load_posed_scenes
-from deepdetect.evaluation.protocols.pose import ERROR, GOOD_DEG, estimate_pose, pose_errors
 from deepdetect.geometry.transforms import epipolar_errors, transfer_errors
 from deepdetect.io.image import load_image
+from deepdetect_lab.datasets.planar import load_oxford
+from deepdetect_lab.datasets.posed_images import PosedPair, load_posed_scenes
+from deepdetect_lab.evaluation.protocols.pose import ERROR, GOOD_DEG, estimate_pose, pose_errors
 
 PAIRS = 60
 """Made pairs of planes, and of facades; the number of a pair is its seed."""

@@ -20,8 +20,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from deepdetect.evaluation.report import Row, Table
 from deepdetect.io.image import find_images
+from deepdetect_lab.evaluation.report import Row, Table
 
 SCENES, PLACES, ARC_DEG, DISTANCE_M = 3, 11, 56, 8.0
 WALL_M, TILE_PX, PIXELS_PER_M, CELLS_PER_M = (14, 9), 480, 240, 60

@@ -20,12 +20,12 @@ from numpy.random import Generator
 
 from deepdetect._shared.opencv import cv2
 from deepdetect.batch.pair_list import SIMILAR, Pair
-from deepdetect.evaluation.metrics.pose import camera_errors
-from deepdetect.evaluation.profiling import peak_memory, run_in_child
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.sfm.colmap import CameraIntrinsics, write_database
 from deepdetect.sfm.mapping import adjust, map_globally, map_images, read_sparse_model, verify_pairs
+from deepdetect_lab.evaluation.metrics.pose import camera_errors
+from deepdetect_lab.evaluation.profiling import peak_memory, run_in_child
 
 COUNTS = (60, 120, 250, 500, 1000)
 SIZE, FOCAL_PX, WRONG_FOCAL = (640, 480), 600.0, 1.03

@@ -28,12 +28,12 @@ import numpy as np
 from descriptors import CLIP_PAIRS, CLIPS, KEYPOINTS, RIGHT_PX, ROUNDS, auc, errors_in_orders
 
 from deepdetect import Keypoints, PointDetector, match_features
-from deepdetect.datasets.planar import load_hpatches, load_oxford
-from deepdetect.datasets.posed_images import load_posed_scenes
-from deepdetect.evaluation.protocols.planar import pairs_of
-from deepdetect.evaluation.report import Row, Table
 from deepdetect.geometry.transforms import epipolar_errors, transfer_errors
 from deepdetect.io.image import load_image
+from deepdetect_lab.datasets.planar import load_hpatches, load_oxford
+from deepdetect_lab.datasets.posed_images import load_posed_scenes
+from deepdetect_lab.evaluation.protocols.planar import pairs_of
+from deepdetect_lab.evaluation.report import Row, Table
 
 NEAR_LINE_PX = 1.5
 RATIOS = np.arange(0.4, 0.99, 0.02)

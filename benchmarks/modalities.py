@@ -21,8 +21,8 @@ from descriptors import methods
 from scipy.io import loadmat
 
 from deepdetect import DeepDetect, Matches, match_features, match_images
-from deepdetect.evaluation.report import Row, Table
 from deepdetect.geometry.transforms import transfer_errors, transform_points, translation_matrix
+from deepdetect_lab.evaluation.report import Row, Table
 
 RIGHT_PX, LANDMARK_ERRORS = 5.0, 3.0
 OWN = "learned", "cross-modal"

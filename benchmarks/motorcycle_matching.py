@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from deepdetect import DeepDetect, MatchingOptions, match_images
-from deepdetect.datasets.middlebury import load_motorcycle
-from deepdetect.evaluation.metrics.stereo import stereo_score
-from deepdetect.evaluation.protocols.stereo_matches import match_random_points
+from deepdetect_lab.datasets.middlebury import load_motorcycle
+from deepdetect_lab.evaluation.metrics.stereo import stereo_score
+from deepdetect_lab.evaluation.protocols.stereo_matches import match_random_points
 
 
 def _unguided(mutual: bool = False, **options: Any) -> dict[str, Any]:

@@ -28,15 +28,15 @@ from deepdetect import (
     load_image,
     match_images,
 )
-from deepdetect.datasets.middlebury import StereoPair, load_middlebury
-from deepdetect.datasets.planar import PlanarPair, load_oxford
 from deepdetect.detector import HeatmapOptions
 from deepdetect.detector.pretrained import PRETRAINED
-from deepdetect.evaluation.profiling import profiled
-from deepdetect.evaluation.protocols.paper import CORRECT_PX
-from deepdetect.evaluation.protocols.planar import select_pairs
-from deepdetect.evaluation.report import Row, Table
 from deepdetect.geometry import disparity_errors, transform_points
+from deepdetect_lab.datasets.middlebury import StereoPair, load_middlebury
+from deepdetect_lab.datasets.planar import PlanarPair, load_oxford
+from deepdetect_lab.evaluation.profiling import profiled
+from deepdetect_lab.evaluation.protocols.paper import CORRECT_PX
+from deepdetect_lab.evaluation.protocols.planar import select_pairs
+from deepdetect_lab.evaluation.report import Row, Table
 
 PLANAR = (("wall", 6), ("graf", 3))
 STEREO = "cones"

@@ -19,9 +19,6 @@ import numpy as np
 
 from deepdetect._shared.atomic import atomic_path
 from deepdetect._shared.progress import progress
-from deepdetect.datasets.planar import PlanarPair, load_oxford
-from deepdetect.evaluation.metrics.homography import project_visible
-from deepdetect.evaluation.report import Row, Table
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.geometry import GeometryOptions, estimate_geometry, transform_points
 from deepdetect.geometry.homography_refinement import refine_homography
@@ -31,6 +28,9 @@ from deepdetect.geometry.images import (
     warped_zncc,
 )
 from deepdetect.io.image import load_image, luma
+from deepdetect_lab.datasets.planar import PlanarPair, load_oxford
+from deepdetect_lab.evaluation.metrics.homography import project_visible
+from deepdetect_lab.evaluation.report import Row, Table
 
 CLEAR_GAIN = 0.01
 """Gain in the median correlation that is clear by itself."""

@@ -37,13 +37,13 @@ import numpy as np
 
 from deepdetect import DeepDetect, disparity_map
 from deepdetect._shared.errors import ImageError
-from deepdetect.datasets.middlebury import load_motorcycle
-from deepdetect.evaluation.protocols.stereo import ground_truths
-from deepdetect.evaluation.protocols.stereo_pipelines import sgbm_disparity
-from deepdetect.evaluation.report import Row, Table
 from deepdetect.io.image import load_image, luma
 from deepdetect.matching.stereo import DENSE, DisparityOptions
 from deepdetect.matching.stereo.sgm import semi_global_matching
+from deepdetect_lab.datasets.middlebury import load_motorcycle
+from deepdetect_lab.evaluation.protocols.stereo import ground_truths
+from deepdetect_lab.evaluation.protocols.stereo_pipelines import sgbm_disparity
+from deepdetect_lab.evaluation.report import Row, Table
 
 TOLERANCES = (0.25, 0.5, 1.0, 2.0, 4.0)
 AT_EDGES = DisparityOptions(uniqueness_ratio=1.0, discontinuity_margin_px=0)

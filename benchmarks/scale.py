@@ -31,8 +31,8 @@ from deepdetect.batch import extract_features, match_pairs
 from deepdetect.batch.hdf5 import feature_names, open_hdf5
 from deepdetect.batch.pair_list import SIMILAR
 from deepdetect.batch.similar_pairs import similar_pairs
-from deepdetect.evaluation.profiling import peak_memory, run_in_child
-from deepdetect.evaluation.report import Table
+from deepdetect_lab.evaluation.profiling import peak_memory, run_in_child
+from deepdetect_lab.evaluation.report import Table
 
 COUNTS = (1000, 10_000, 100_000)
 VIEWS = 34

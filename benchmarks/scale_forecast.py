@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deepdetect.evaluation.report import Table
+from deepdetect_lab.evaluation.report import Table
 
 RESULTS = Path(__file__).parents[1] / "docs" / "results"
 

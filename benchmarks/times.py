@@ -25,22 +25,22 @@ import numpy as np
 
 from deepdetect import DeepDetect, PointDetector, SelectionOptions
 from deepdetect._shared.opencv import opencv_factory
-from deepdetect.datasets.planar import load_oxford
-from deepdetect.evaluation.baselines.external import onnx_feature
-from deepdetect.evaluation.baselines.hessian import HESSIAN
-from deepdetect.evaluation.baselines.method import (
+from deepdetect.io.image import load_image, luma
+from deepdetect_lab.datasets.planar import load_oxford
+from deepdetect_lab.evaluation.baselines.external import onnx_feature
+from deepdetect_lab.evaluation.baselines.hessian import HESSIAN
+from deepdetect_lab.evaluation.baselines.method import (
     LocalFeature,
     deepdetect_feature,
     points_feature,
     with_common_descriptor,
     with_own_scale,
 )
-from deepdetect.evaluation.baselines.opencv import STANDARD
-from deepdetect.evaluation.protocols.planar import pairs_of
-from deepdetect.evaluation.protocols.standard import MATCHING_BUDGET, pair_row
-from deepdetect.evaluation.report import Row, Table, mean, where
-from deepdetect.evaluation.run import Run
-from deepdetect.io.image import load_image, luma
+from deepdetect_lab.evaluation.baselines.opencv import STANDARD
+from deepdetect_lab.evaluation.protocols.planar import pairs_of
+from deepdetect_lab.evaluation.protocols.standard import MATCHING_BUDGET, pair_row
+from deepdetect_lab.evaluation.report import Row, Table, mean, where
+from deepdetect_lab.evaluation.run import Run
 
 SIZE_PX = (800, 600)
 ROUNDS = 15

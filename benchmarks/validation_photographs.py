@@ -16,11 +16,11 @@ from pathlib import Path
 
 from deepdetect import DeepDetect
 from deepdetect._shared.machine import processor_count
-from deepdetect.evaluation.protocols.masks import Measured, mean_score, measure_heatmap
 from deepdetect.io.image import load_image
-from deepdetect.labels import LabelOptions
-from deepdetect.training.recipe import Stage, TrainingOptions
-from deepdetect.training.views import SourceImage, label_view, list_images, render
+from deepdetect_lab.evaluation.protocols.masks import Measured, mean_score, measure_heatmap
+from deepdetect_lab.labels import LabelOptions
+from deepdetect_lab.training.recipe import Stage, TrainingOptions
+from deepdetect_lab.training.views import SourceImage, label_view, list_images, render
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """Look up the locked packages in the database of known vulnerabilities, by pip-audit.
 
-python requirements/audit.py    # `make audit`: exit code 1 where one is known
+`make audit` gives it what `uv export` makes of uv.lock; it ends with 1 where one is known.
 
 Without network, or where no data on the packages can be had, it says so and does not fail.
 """
@@ -12,8 +12,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-FOLDER = Path(__file__).resolve().parent
-LOCK_FILE = FOLDER / "lock.txt"
 PIP_AUDIT = "pip-audit==2.10.1"
 
 
@@ -22,7 +20,7 @@ def main() -> None:
     uvx = Path(sys.executable).with_name("uvx")
     options = ("--disable-pip", "--require-hashes", "--format", "json", "--progress-spinner", "off")
     run = subprocess.run(
-        [str(uvx), PIP_AUDIT, "--requirement", str(LOCK_FILE), *options],
+        [str(uvx), PIP_AUDIT, "--requirement", "/dev/stdin", *options],
         capture_output=True,
         text=True,
     )

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import deepdetect
-import deepdetect.labels
+import deepdetect_lab.labels
 from deepdetect import OptionError
-from deepdetect.evaluation.baselines.random import RandomDetector
+from deepdetect_lab.evaluation.baselines.random import RandomDetector
 
 EVERY = deepdetect.SelectionOptions(density=1)
 
@@ -38,7 +38,7 @@ def calls() -> dict[str, Any]:
         "stitch": lambda a, b, **o: deepdetect.stitch([a, b], detector=RandomDetector(), **o).image,
         "reconstruct": calibrated,
         "disparity_map": lambda a, b, **o: deepdetect.disparity_map(a, b, **o).disparity,
-        "fuse": lambda a, b, **o: deepdetect.labels.fuse(a, **o).mask,
+        "fuse": lambda a, b, **o: deepdetect_lab.labels.fuse(a, **o).mask,
         "points": lambda a, b, **o: deepdetect.PointDetector(50).detect(a, **o).xy,
     }
 
@@ -72,7 +72,7 @@ def test_files_say_their_order_themselves(photo: np.ndarray, photo_path: Any) ->
 
 def test_luma_is_taken_as_it_is(photo: np.ndarray) -> None:
     gray = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
-    fuse = deepdetect.labels.fuse
+    fuse = deepdetect_lab.labels.fuse
     np.testing.assert_array_equal(fuse(gray).mask, fuse(photo).mask)
     assert fuse(gray[:10, :12]).mask.shape == (10, 12)
 

@@ -39,7 +39,7 @@ import contextlib
 from deepdetect import (
     DeepDetect, DeepDetectError, PointDetector, load_image, match_images, reconstruct, register
 )
-from deepdetect.labels import LabelOptions, fuse
+from deepdetect_lab.labels import LabelOptions, fuse
 from deepdetect.io.image import luma
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ import pytest
 
 from deepdetect.detector.heatmap import HeatmapOptions, compute_maps
 from deepdetect.features.selection import select_keypoints
-from deepdetect.labels import DETECTORS
-from deepdetect.labels.detectors import pixels_mask
+from deepdetect_lab.labels import DETECTORS
+from deepdetect_lab.labels.detectors import pixels_mask
 
 
 def compute_heatmap(rgb: np.ndarray, *arguments: Any) -> np.ndarray:

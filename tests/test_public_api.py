@@ -45,7 +45,7 @@ def test_every_name_of_a_namespace_can_be_imported(package: str) -> None:
 
 def test_every_name_of_training_can_be_imported() -> None:
     pytest.importorskip("torch")
-    import deepdetect.training as names
+    import deepdetect_lab.training as names
 
     assert set(names.__all__) <= {name for name in names.__all__ if getattr(names, name)}
 
@@ -105,7 +105,7 @@ def test_importing_does_no_work() -> None:
     "module",
     [
         "deepdetect.cli",
-        "deepdetect.labels",
+        "deepdetect_lab.labels",
         "deepdetect.detector.detector",
         "deepdetect.io.image",
     ],

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 from skimage import data
+from tests.command_line import run_command
 
 from deepdetect.detector.pretrained import PRETRAINED
-from tests.command_line import run_command
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

@@ -32,8 +32,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits as bce
 
-from deepdetect.detector.network.fast import FastNetwork
-from deepdetect.training.optim import Soap
+from deepdetect_lab.networks.fast import FastNetwork
+from deepdetect_lab.training.optim import Soap
 
 BATCHES = {"S": 64, "T": 30, "M": 16, "L": 4}
 SHARES = {"S": 0.14, "T": 0.12, "M": 0.62, "L": 0.12}

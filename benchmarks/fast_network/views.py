@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 
 from deepdetect.io.image import load_image, luma, scale_short_side
-from deepdetect.labels import LABEL_SETTINGS, LabelOptions, fuse
-from deepdetect.training.augmentation import augment, darken, draw_darkening
+from deepdetect_lab.labels import LABEL_SETTINGS, LabelOptions, fuse
+from deepdetect_lab.training.augmentation import augment, darken, draw_darkening
 
 SIDES_PX = {"S": 240, "T": 352, "M": 480, "L": 960}
 SHARES = {"S": 0.16, "T": 0.14, "M": 0.64, "L": 0.06}

@@ -19,9 +19,9 @@ from PIL import Image
 
 from deepdetect import DeepDetect, match_images
 from deepdetect._shared.opencv import cv2
-from deepdetect.datasets import StereoPair, load_motorcycle
-from deepdetect.datasets.degradation import Degradation, darken, degrade
 from deepdetect.geometry import disparity_errors
+from deepdetect_lab.datasets import StereoPair, load_motorcycle
+from deepdetect_lab.datasets.degradation import Degradation, darken, degrade
 
 OUTPUT = Path(__file__).parents[1] / "images" / "day-to-dark.webp"
 STEPS, DARKEST = 7, 1 / 8

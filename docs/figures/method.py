@@ -15,11 +15,11 @@ from day_dark_blurred import POINTS, draw_points
 from layout import caption, write_jpeg
 
 from deepdetect import DeepDetect, Matches, PointDetector, match_images
-from deepdetect.datasets import StereoPair, load_motorcycle
 from deepdetect.features.display import draw_matches
 from deepdetect.geometry import disparity_errors
-from deepdetect.labels import LabelOptions, fuse
 from deepdetect.viz.draw import draw_heatmap
+from deepdetect_lab.datasets import StereoPair, load_motorcycle
+from deepdetect_lab.labels import LabelOptions, fuse
 
 FOLDER = Path(__file__).parents[1] / "images"
 DETECTORS = {"sift": "SIFT", "fast": "FAST", "harris": "Harris", "canny": "Canny", "sobel": "Sobel"}

@@ -32,10 +32,10 @@ from deepdetect import (
     stitch,
 )
 from deepdetect._shared.opencv import cv2
-from deepdetect.datasets import load_motorcycle
 from deepdetect.reconstruction import Reconstruction
 from deepdetect.tracking import Tracker, TrackingOptions, point_candidates
 from deepdetect.tracking.tracks import TrackDrawer
+from deepdetect_lab.datasets import load_motorcycle
 
 FOLDER = Path(__file__).parents[1] / "images"
 SIZE = (240, 160)

@@ -32,12 +32,12 @@ from deepdetect import (
     load_image,
     match_features,
 )
-from deepdetect.datasets.posed_images import load_posed_scenes
 from deepdetect.features.sift import describe_keypoints
 from deepdetect.geometry.relative_pose import rotation_angle
 from deepdetect.io.image import luma
 from deepdetect.tracking import TrackedFrame, Tracker, TrackingOptions, point_candidates
 from deepdetect.tracking.tracker import CANDIDATES
+from deepdetect_lab.datasets.posed_images import load_posed_scenes
 
 NUMBERS = (250, 500, 1000)  # of keypoints, without others
 SEGMENTS_M = (10.0, 20.0, 30.0, 40.0, 50.0)  # KITTI's own, 100 to 800 m, are longer than a clip

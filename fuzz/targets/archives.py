@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from deepdetect.datasets.download import RemoteFile, _unpack
+from deepdetect_lab.datasets.download import RemoteFile, _unpack
 
 from ..case import Target, expect, prepared
 from ..mutations import mutate
@@ -88,8 +88,8 @@ def tar_file(generator: np.random.Generator, compressed: bool) -> bytes:
 
 def shard_options() -> Any:
     """Return the recipe of the shards."""
-    from deepdetect.labels import LabelOptions
-    from deepdetect.training.recipe import Stage, TrainingOptions
+    from deepdetect_lab.labels import LabelOptions
+    from deepdetect_lab.training.recipe import Stage, TrainingOptions
 
     labels = LabelOptions(("fast", "sobel"))
     return TrainingOptions(
@@ -100,7 +100,7 @@ def shard_options() -> Any:
 @prepared
 def shard_files() -> dict[str, bytes]:
     """Return the files of a folder of shards of three images."""
-    from deepdetect.training.shards import write_shards
+    from deepdetect_lab.training.shards import write_shards
 
     with tempfile.TemporaryDirectory() as folder:
         images, output = Path(folder) / "images", Path(folder) / "shards"
@@ -113,7 +113,7 @@ def shard_files() -> dict[str, bytes]:
 
 def shards(generator: np.random.Generator, folder: Path) -> None:
     """Read all images of shards of which one file is damaged."""
-    from deepdetect.training.shards import Shards, ShardSource
+    from deepdetect_lab.training.shards import Shards, ShardSource
 
     options = shard_options()
     files = dict(shard_files())

@@ -14,8 +14,8 @@ from hypothesis import strategies
 from deepdetect import Keypoints, load_keypoints, load_matches, save_keypoints
 from deepdetect.geometry.camera import Calibration
 from deepdetect.io.masks import encode_mask, load_mask
-from deepdetect.labels import find_label_settings
-from deepdetect.labels.detectors import DETECTORS
+from deepdetect_lab.labels import find_label_settings
+from deepdetect_lab.labels.detectors import DETECTORS
 
 from ..case import Target, expect, prepared
 from ..mutations import mutate

@@ -39,7 +39,7 @@ def safetensors_file() -> bytes:
     """Return weights of the network as a safetensors file."""
     from safetensors.torch import save
 
-    from deepdetect.detector.network.espnet import ESPNet
+    from deepdetect_lab.networks.espnet import ESPNet
 
     return bytes(save(ESPNet().state_dict()))
 
@@ -77,7 +77,7 @@ def checkpoint_content() -> bytes:
     """Return a checkpoint of a small network after a step."""
     import torch
 
-    from deepdetect.training.checkpoint import save_checkpoint
+    from deepdetect_lab.training.checkpoint import save_checkpoint
 
     network, optimizers = small_training()
     network(torch.ones(2, 3)).sum().backward()
@@ -93,7 +93,7 @@ def small_training() -> tuple[Any, list[Any]]:
     """Return a small network and its optimisers, as a training has them."""
     import torch
 
-    from deepdetect.training.optim import make_optimizers
+    from deepdetect_lab.training.optim import make_optimizers
 
     torch.manual_seed(0)
     network = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.PReLU(4), torch.nn.Linear(4, 1))
@@ -105,7 +105,7 @@ def checkpoints(generator: np.random.Generator, folder: Path) -> None:
     import torch
     from safetensors.numpy import load, save
 
-    from deepdetect.training.checkpoint import read_checkpoint, restore
+    from deepdetect_lab.training.checkpoint import read_checkpoint, restore
 
     content = checkpoint_content()
     if generator.random() < 0.5:

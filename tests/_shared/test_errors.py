@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import deepdetect
-import deepdetect.labels
 from deepdetect._shared.errors import (
     DeepDetectError,
     ImageError,
@@ -88,12 +87,10 @@ def missing_files() -> dict[str, Callable[[Path], object]]:
     return {
         "image": deepdetect.load_image,
         "weights": deepdetect.DeepDetect,
-        "torch weights": lambda path: deepdetect.DeepDetect(path.with_suffix(".safetensors")),
         "ranker": lambda path: deepdetect.PointDetector(ranker=path),
         "keypoints": deepdetect.load_keypoints,
         "matches": deepdetect.load_matches,
         "match_images": lambda path: deepdetect.match_images(path, path),
-        "fuse": deepdetect.labels.fuse,
         "disparity_map": lambda path: deepdetect.disparity_map(path, path),
         "stitch": lambda path: deepdetect.stitch([path, path]),
         "calibration": lambda path: deepdetect.reconstruct(image, image, calibration=path),

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.datasets.planar import OXFORD_KINDS, read_matrix
 from deepdetect.io.image import luma
+from deepdetect_lab.datasets.planar import OXFORD_KINDS, read_matrix
 
 MOVE = np.array([[1.01, 0.02, 3.0], [-0.02, 0.99, 2.0], [1e-4, 0, 1.0]])
 WRONG = np.array([[1.0, 0, 1.6], [0, 1, -1.2], [0, 0, 1]])

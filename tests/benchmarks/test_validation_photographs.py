@@ -9,10 +9,10 @@ import pytest
 
 from deepdetect import DeepDetect
 from deepdetect.io.image import load_image, luma
-from deepdetect.labels import fuse
-from deepdetect.training.augmentation import darken
-from deepdetect.training.recipe import Stage, TrainingOptions
-from deepdetect.training.views import list_images, render
+from deepdetect_lab.labels import fuse
+from deepdetect_lab.training.augmentation import darken
+from deepdetect_lab.training.recipe import Stage, TrainingOptions
+from deepdetect_lab.training.views import list_images, render
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "validation_photographs.py"
 

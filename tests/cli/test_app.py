@@ -10,10 +10,10 @@ import urllib.request
 from pathlib import Path
 
 import pytest
+from tests.command_line import run_command
 
 from deepdetect.app.jobs import AppOptions
 from deepdetect.app.server import AppServer
-from tests.command_line import run_command
 
 
 def started(temporary: Path) -> tuple[subprocess.Popen[str], str]:

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from deepdetect.cli.evaluate import run_demo
-from deepdetect.datasets import StereoPair
+from deepdetect_lab.cli.evaluate import run_demo
+from deepdetect_lab.datasets import StereoPair
 
 
 class FakeDetector:

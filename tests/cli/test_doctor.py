@@ -10,11 +10,11 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from tests.command_line import Result
 
 from deepdetect import DeepDetect
 from deepdetect._shared import opencv
 from deepdetect.cli import doctor
-from tests.command_line import Result
 
 Run = Callable[..., Result]
 ROOT = Path(__file__).parents[2]

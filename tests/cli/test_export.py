@@ -8,8 +8,9 @@ import pytest
 
 onnx = pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
 
-from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
 from tests.cli.conftest import one_sentence  # noqa: E402
+
+from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
 
 
 def test_without_points_it_is_the_shipped_file(run, tmp_path: Path) -> None:

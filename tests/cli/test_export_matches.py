@@ -8,9 +8,10 @@ import pytest
 
 pytest.importorskip("h5py", reason="needs h5py")
 
-from deepdetect.sfm.colmap import import_pycolmap
 from tests.cli.conftest import one_sentence
 from tests.command_line import run_command
+
+from deepdetect.sfm.colmap import import_pycolmap
 
 
 @pytest.fixture(scope="module")

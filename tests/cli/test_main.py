@@ -6,9 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from tests.command_line import run_command
 
 from deepdetect.cli._app import COMMANDS, DEVELOPMENT, make_app, with_flags
-from tests.command_line import run_command
 
 PARTS = {"export": ("colmap", "hloc", "onnx"), "datasets": ("list", "get"), "dev": ()}
 WORDS = [

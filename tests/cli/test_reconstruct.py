@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from tests.command_line import run_command
 
 from deepdetect import DeepDetect
-from deepdetect.datasets import load_motorcycle
-from tests.command_line import run_command
+from deepdetect_lab.datasets import load_motorcycle
 
 FOCAL, OFFSET, BASELINE = 994.978, 31.086, 193.001
 """In pixels and mm, of the page of skimage.data.stereo_motorcycle."""

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from tests.cli.conftest import one_sentence
 
 from deepdetect.tracking import FrameSource, load_tracks
 from deepdetect.tracking.video import write_video
-from tests.cli.conftest import one_sentence
 
 
 @pytest.fixture

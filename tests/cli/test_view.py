@@ -6,9 +6,9 @@ from urllib.request import url2pathname
 
 import numpy as np
 import pytest
+from tests.command_line import run_command
 
 from deepdetect import Keypoints, load_image, match_features, save_keypoints, save_matches
-from tests.command_line import run_command
 
 
 @pytest.fixture

@@ -56,7 +56,7 @@ def onnx_file(tmp_path: Path) -> Callable[..., Path]:
 def fast_network(photo: np.ndarray) -> Any:
     """A random `FastNetwork` in evaluation mode that has seen photographs: all of its parts act."""
     torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
-    from deepdetect.detector.network.fast import FastNetwork
+    from deepdetect_lab.networks.fast import FastNetwork
 
     with torch.random.fork_rng(devices=()), torch.no_grad():
         torch.manual_seed(2)
@@ -72,8 +72,8 @@ def fast_network(photo: np.ndarray) -> Any:
 def fast_files(fast_network: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Weights of the fast network as ONNX and safetensors."""
     pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
-    from deepdetect.detector.network.onnx_export import export_onnx
-    from deepdetect.detector.network.weights import save_tensors
+    from deepdetect_lab.networks.export import export_onnx
+    from deepdetect_lab.networks.weights import save_tensors
 
     folder = tmp_path_factory.mktemp("fast")
     files = folder / "fast.onnx", folder / "fast.safetensors"

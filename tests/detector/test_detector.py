@@ -31,7 +31,6 @@ from deepdetect.io import image as io_image
 OneLine = Callable[[BaseException], str]
 MakeOnnx = Callable[..., Path]
 FREE_MAP = ("n", 1, "h", "w")
-TORCH_WEIGHTS = pretrained_weights().with_suffix(".safetensors")
 
 
 @pytest.fixture(scope="module")
@@ -117,20 +116,16 @@ def test_detection_is_selection_from_the_map(
 # Backends.
 
 
-@pytest.mark.parametrize("other", ["onnxruntime", "openvino", "torch"])
+@pytest.mark.parametrize("other", ["onnxruntime", "openvino"])
 def test_backends_agree(other: str, detector: DeepDetect, image: np.ndarray) -> None:
-    library = pytest.importorskip(other)
-    threads = library.get_num_threads() if other == "torch" else None
-    weights = TORCH_WEIGHTS if other == "torch" else "default"
-    second = DeepDetect(weights, backend=other, threads=1)
+    pytest.importorskip(other)
+    second = DeepDetect(backend=other, threads=1)
     assert second.backend == other
     pieces = (image, image[8:, :], image[:17, :23])
     # All first: a map is not to be overwritten by the next.
     for piece, heatmap in zip(pieces, [second.heatmap(piece) for piece in pieces], strict=True):
         assert heatmap.dtype == np.float32
         assert np.abs(heatmap - detector.heatmap(piece)).max() < 1e-3
-    if threads is not None:
-        library.set_num_threads(threads)  # the detector sets it for the whole process
 
 
 def test_the_automatic_backend() -> None:
@@ -143,14 +138,11 @@ def test_the_automatic_backend() -> None:
     "arguments",
     [
         {"backend": "onnx"},
-        {"backend": "torch"},
-        {"backend": "onnxruntime", "weights": TORCH_WEIGHTS},
         {"threads": 1.5},
         {"device": "CUDAExecutionProvidr"},
         {"device": "cuda", "backend": "openvino"},
         {"precision": "bfloat16", "backend": "onnxruntime"},
         {"precision": "bfloat16", "device": "cuda"},
-        {"device": "cuda", "weights": TORCH_WEIGHTS},
     ],
 )
 def test_wrong_options(arguments: dict[str, Any], one_line: OneLine) -> None:
@@ -163,17 +155,8 @@ def test_wrong_options(arguments: dict[str, Any], one_line: OneLine) -> None:
 
 
 def write_half(path: Path) -> None:
-    content = pretrained_weights().with_suffix(path.suffix).read_bytes()
+    content = pretrained_weights().read_bytes()
     path.write_bytes(content[: len(content) // 2])
-
-
-def write_too_wide(path: Path) -> None:
-    """Write the bundled tensors, one of them one channel too wide."""
-    numpy = pytest.importorskip("safetensors.numpy")
-    tensors = numpy.load_file(TORCH_WEIGHTS)
-    name = sorted(name for name, value in tensors.items() if value.ndim == 4)[0]
-    tensors[name] = np.concatenate([tensors[name], tensors[name][:1]])
-    numpy.save_file(tensors, path)
 
 
 def write_words(path: Path) -> None:
@@ -183,17 +166,14 @@ def write_words(path: Path) -> None:
 BAD_WEIGHTS = {
     "none.onnx": (None, "there is no weights file"),
     "half.onnx": (write_half, "is not an ONNX file that can be read"),
-    "half.safetensors": (write_half, "does not fit the network"),
-    "wide.safetensors": (write_too_wide, "does not fit the network"),
     "words.onnx": (write_words, "is not an ONNX file that can be read"),
-    "words.pth": (write_words, "must end in .onnx or .safetensors"),
+    "words.safetensors": (write_words, "is no ONNX file"),
 }
 
 
 @pytest.mark.parametrize(
     ("name", "backend"),
-    [(name, "torch" if name.endswith(".safetensors") else "auto") for name in BAD_WEIGHTS]
-    + [(name, "onnxruntime") for name in BAD_WEIGHTS if name.endswith(".onnx")],
+    [(name, backend) for name in BAD_WEIGHTS for backend in ("auto", "onnxruntime")],
 )
 def test_wrong_weights(
     name: str,
@@ -202,8 +182,6 @@ def test_wrong_weights(
     one_line: OneLine,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    if backend == "torch":
-        pytest.importorskip("torch")
     write, words = BAD_WEIGHTS[name]
     if write is not None:
         write(tmp_path / name)
@@ -298,12 +276,11 @@ for megabytes in (10, 80):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs a limit on memory that holds")
-@pytest.mark.parametrize("backend", ["onnxruntime", "openvino", "torch"])
+@pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
 def test_too_little_memory_is_one_sentence(backend: str) -> None:
     pytest.importorskip(backend)
-    weights = str(TORCH_WEIGHTS) if backend == "torch" else "default"
     environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    words = [sys.executable, "-c", SHORT_OF_MEMORY, weights, backend]
+    words = [sys.executable, "-c", SHORT_OF_MEMORY, "default", backend]
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
@@ -321,8 +298,6 @@ def test_bfloat16_moves_few_keypoints(image: np.ndarray) -> None:
     assert (exact.runtime, quick.runtime) == ("openvino", "openvino, bfloat16")
     assert repr(quick).endswith("backend='openvino, bfloat16')")
     assert quick.with_weights("dense").runtime == quick.configured(HeatmapOptions(480)).runtime
-    with pytest.raises(OptionError, match="needs the backend openvino, not torch"):
-        quick.with_weights(TORCH_WEIGHTS)
     expected, found = exact.heatmap(image), quick.heatmap(image)
     difference = np.abs(found - expected)
     assert 1e-5 < difference.max() < 0.2

@@ -94,12 +94,8 @@ def test_a_size_of_tiles_is_never_ignored(photo: np.ndarray) -> None:
     large = np.tile(photo, (6, 6, 1))
     with pytest.raises(OptionError, match="resolution='native'"):
         DeepDetect(tile_megapixels=2.0)
-    pytest.importorskip("torch", reason="needs torch, which is for training only")
-    torch_weights = pretrained_weights("espnet", ".safetensors")
     with pytest.raises(OptionError, match="cannot be run in tiles"):
-        DeepDetect(
-            torch_weights, backend="torch", resolution="native", tile_megapixels=2.0
-        ).heatmap(large)
+        DeepDetect("espnet", resolution="native", tile_megapixels=2.0).heatmap(large)
 
 
 def test_images_in_bfloat16_are_run_whole(

@@ -11,9 +11,10 @@ from PIL import Image
 
 pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
 
+from tests.docs.test_pages import blocks
+
 from deepdetect import PointDetector
 from deepdetect.detector.network.onnx_export import write_onnx
-from tests.docs.test_pages import blocks
 
 
 def test_points_in_the_file(

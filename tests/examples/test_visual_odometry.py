@@ -16,9 +16,10 @@ pytest.importorskip("pycolmap", reason="needs pycolmap")
 pytest.importorskip("h5py", reason="needs h5py")
 pytest.importorskip("matplotlib", reason="needs matplotlib")
 
+from tests.cli.conftest import one_sentence
+
 from deepdetect import Camera
 from deepdetect.tracking import TrackedFrame
-from tests.cli.conftest import one_sentence
 
 FOLDER = Path(__file__).parents[2] / "examples/visual_odometry"
 CAMERA = Camera((640, 480), 500.0)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from fuzz import campaign
 from fuzz.campaign import Findings, as_table, run_batch, run_campaign
 from fuzz.case import DEFECTS, Target

@@ -15,7 +15,7 @@ import pytest
 from deepdetect import DeepDetectError, load_image, load_keypoints
 from deepdetect.geometry.camera import Calibration
 from deepdetect.io.masks import load_mask
-from deepdetect.labels import find_label_settings
+from deepdetect_lab.labels import find_label_settings
 
 CORPUS = Path(__file__).parents[2] / "fuzz" / "corpus"
 READERS: dict[str, Callable[[Path], Any]] = {

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect.datasets.planar import read_matrix
-from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.geometry import transform_points
 from deepdetect.geometry.homography_refinement import fit_homography_irls, refine_homography
 from deepdetect.io.image import load_image, luma
+from deepdetect_lab.datasets.planar import read_matrix
+from deepdetect_lab.evaluation.metrics.homography import corner_error
 
 TRUE = np.array([[0.97, 0.05, 8.3], [-0.04, 1.02, -5.6], [4e-5, -3e-5, 1.0]])
 OFF = np.array([[1.0, 0.004, 2.4], [-0.003, 1.0, -1.7], [0, 0, 1.0]])

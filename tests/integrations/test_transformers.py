@@ -20,7 +20,7 @@ torch = pytest.importorskip("torch", reason="needs torch")
 transformers = pytest.importorskip("transformers", reason="needs transformers")
 drop_in = pytest.importorskip("deepdetect.integrations.transformers")
 
-from deepdetect.detector.network.weights import NETWORKS, save_tensors  # noqa: E402
+from deepdetect_lab.networks.weights import NETWORKS, save_tensors  # noqa: E402
 
 
 @pytest.fixture(scope="module")

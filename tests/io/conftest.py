@@ -13,7 +13,7 @@ from deepdetect.geometry.point_cloud import PointCloud
 @pytest.fixture(scope="session")
 def cones(shared: Path) -> PointCloud:
     """About 160,000 points of cones, in baselines."""
-    from deepdetect.datasets.middlebury import load_middlebury
+    from deepdetect_lab.datasets.middlebury import load_middlebury
 
     scene = load_middlebury(shared / "data/middlebury/cones")
     known = np.isfinite(scene.disparity) & (scene.disparity > 0)

@@ -10,13 +10,13 @@ import pytest
 import tifffile
 from PIL import Image, ImageCms
 from PIL.ExifTags import IFD, Base
+from tests.command_line import run_command
 
 from deepdetect import RegistrationError, load_image, register
 from deepdetect.geometry import transform_points
 from deepdetect.io.exif import camera_from_exif
 from deepdetect.io.metadata import Metadata, read_metadata
 from deepdetect.viz.draw import save_picture
-from tests.command_line import run_command
 
 SPACING_M, EAST, NORTH = 0.5, 500_000.0, 5_400_000.0
 UTM = 32632

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
+from fuzz.targets.tiff import expected_rgb, tiff_files
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -15,7 +16,6 @@ from PIL import Image
 import deepdetect
 from deepdetect import DeepDetectError, load_image
 from deepdetect._shared.errors import ImageError, MissingExtraError
-from fuzz.targets.tiff import expected_rgb, tiff_files
 
 OneLine = Callable[[BaseException], str]
 RNG = np.random.default_rng(5)

@@ -18,10 +18,10 @@ from deepdetect import (
     SelectionOptions,
 )
 from deepdetect.detector.detector import find_keypoints
-from deepdetect.evaluation.baselines.random import RandomDetector
 from deepdetect.features import select_keypoints
 from deepdetect.geometry import transfer_errors
 from deepdetect.matching import PUBLISHED_MATCHING, pipeline
+from deepdetect_lab.evaluation.baselines.random import RandomDetector
 
 from .conftest import match
 

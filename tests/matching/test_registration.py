@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from tests.command_line import run_command
 
 from deepdetect import (
     DeepDetectError,
@@ -16,10 +17,9 @@ from deepdetect import (
     load_image,
     match_images,
 )
-from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.io.image import luma
 from deepdetect.matching.registration import MAX_UNION, Registration, _union, agree, register
-from tests.command_line import run_command
+from deepdetect_lab.evaluation.metrics.homography import corner_error
 
 WARP = np.array([[0.92, -0.1, 25.0], [0.08, 0.97, -6.0], [1e-4, 2e-4, 1.0]])
 

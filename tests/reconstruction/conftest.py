@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, Matches, match_images
-from deepdetect.datasets import load_motorcycle
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.io.image import luma
+from deepdetect_lab.datasets import load_motorcycle
 
 FOCAL, OFFSET, BASELINE = 994.978 / 2, 31.086 / 2, 193.001
 """In pixels and mm, of the page of skimage.data.stereo_motorcycle, at half size."""

@@ -22,14 +22,14 @@ from deepdetect import (
 )
 from deepdetect._shared import machine
 from deepdetect._shared.errors import ImageError
-from deepdetect.datasets.middlebury import load_middlebury
-from deepdetect.evaluation.baselines.random import AllPixels
 from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.geometry.point_cloud import PointCloud
 from deepdetect.matching.stereo import disparity_map
 from deepdetect.reconstruction import estimate_pose
 from deepdetect.reconstruction.outliers import PointFilterOptions
 from deepdetect.reconstruction.result import Reconstruction
+from deepdetect_lab.datasets.middlebury import load_middlebury
+from deepdetect_lab.evaluation.baselines.random import AllPixels
 
 CONES_POINTS = 49_979
 """The paper's count."""

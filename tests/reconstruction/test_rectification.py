@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 from deepdetect._shared.errors import ReconstructionError
-from deepdetect.datasets import load_motorcycle
-from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift import detect_sift
 from deepdetect.geometry.camera import Calibration, Camera
@@ -25,6 +23,8 @@ from deepdetect.reconstruction.rectification import (
     detect_rectification,
     find_rectification,
 )
+from deepdetect_lab.datasets import load_motorcycle
+from deepdetect_lab.datasets.middlebury import load_middlebury
 
 from .conftest import halved
 

@@ -21,7 +21,6 @@ from deepdetect import (
     ReconstructionError,
     reconstruct_many,
 )
-from deepdetect.datasets.posed_images import load_posed_scenes
 from deepdetect.geometry.camera import PosedView
 from deepdetect.geometry.point_cloud import EAST_NORTH_UP, PointCloud
 from deepdetect.sfm import MultiViewOptions, MultiViewReconstruction
@@ -29,6 +28,7 @@ from deepdetect.sfm.colmap import CameraIntrinsics
 from deepdetect.sfm.formats import FORMATS, write_mesh
 from deepdetect.sfm.georeference import Georeference
 from deepdetect.sfm.splat import seen_depths, thinned, write_transforms
+from deepdetect_lab.datasets.posed_images import load_posed_scenes
 
 from ..io.test_gps import place_tags
 

@@ -32,8 +32,6 @@ from deepdetect import (
 )
 from deepdetect._shared.records import key
 from deepdetect.batch.hdf5 import SETTINGS, open_hdf5
-from deepdetect.datasets.posed_images import load_posed_scenes
-from deepdetect.evaluation.metrics.pose import camera_errors, rotation_error
 from deepdetect.geometry.camera import PosedView
 from deepdetect.sfm import MultiViewOptions, MultiViewReconstruction, forecast, stages
 from deepdetect.sfm.colmap import CameraIntrinsics, write_database
@@ -41,6 +39,8 @@ from deepdetect.sfm.formats import FORMATS
 from deepdetect.sfm.mapping import read_sparse_model, verify_pairs
 from deepdetect.sfm.pipeline import _write
 from deepdetect.sfm.stages import Stages, check_images
+from deepdetect_lab.datasets.posed_images import load_posed_scenes
+from deepdetect_lab.evaluation.metrics.pose import camera_errors, rotation_error
 
 QUICK = {
     "workers": 1,

@@ -4,9 +4,9 @@ import shutil
 from pathlib import Path
 
 import pytest
+from tests.command_line import run_section
 
 from deepdetect.tracking.video import write_video
-from tests.command_line import run_section
 
 
 @pytest.mark.slow

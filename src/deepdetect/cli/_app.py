@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import functools
 import importlib
+import importlib.metadata
 import os
 import re
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 from cyclopts import App, CycloptsError, Group, Parameter
 from cyclopts.help import DefaultFormatter
 
 from .. import __version__
-from .._shared.errors import BatchError, DeepDetectError, NoDepthError, RegistrationError
+from .._shared.errors import (
+    BatchError,
+    DeepDetectError,
+    MissingExtraError,
+    NoDepthError,
+    RegistrationError,
+)
 from .._shared.progress import STDERR, fails, say
 
 NOTHING_FOUND = 3
@@ -52,32 +59,23 @@ COMMANDS = {
     },
     "DeepDetect itself": {
         "app": ("app", "a page in the browser, on this computer"),
-        "demo": ("evaluate", "match a real stereo pair, and evaluate the matches"),
+        "demo": ("demo", "match a real stereo pair, and evaluate the matches"),
         "doctor": ("doctor", "check the installation, and say what to do about it"),
         "completion": ("_app", "completion of commands and options by Tab"),
     },
-    "Training": {
-        "label": ("train", "training masks from nine classical detectors"),
-        "train": ("train", "train the network on images"),
-        "train-descriptor": ("train", "train the learned descriptor of keypoints on images"),
-        "dev": ("_app", "commands of development: benchmarks, data sets, weights"),
-    },
 }
-DEVELOPMENT = {
-    "Measuring": {
-        "datasets": ("datasets", "download data sets"),
-        "benchmark": ("evaluate", "the tables and figures of the paper, with baselines"),
-        "evaluate": ("evaluate", "how good weights are"),
-        "compare-clouds": ("evaluate", "dense points beside those of OpenMVS or COLMAP"),
-        "evaluate-stereo": ("evaluate", "correct stereo matches of weights and of label settings"),
-    },
-    "Weights": {
-        "shards": ("train", "pack images for training on large sets"),
-        "train-points": ("train", "train the ranker of keypoints on images"),
-        "average": ("train", "the mean of several weights"),
-    },
-}
-"""All commands, and those after `dev`, by their group: the function's module, and what it does."""
+"""The commands of this package by their group: the function's module, and what it does."""
+
+LAB_ENTRY_POINTS = "deepdetect.commands"
+"""The group of entry points by which deepdetect-lab adds commands: tables such as `COMMANDS`.
+
+One named `dev` holds those after the word `dev`. Their modules are named in full.
+"""
+
+LAB_COMMANDS = ("label", "train", "train-descriptor", "dev")
+"""The names that deepdetect-lab adds, for the sentence that says where it is missing."""
+
+Commands = Mapping[str, Mapping[str, tuple[str, str]]]
 
 
 class HelpFormatter(DefaultFormatter):
@@ -104,6 +102,7 @@ def make_app(summaries: bool = False) -> App:
 
     With summaries it lists them without; else each says itself what it does.
     """
+    commands, development = _all_commands()
     app = App(
         "deepdetect",
         help=INTRODUCTION,
@@ -114,18 +113,49 @@ def make_app(summaries: bool = False) -> App:
         default_parameter=Parameter(allow_repeating=True, negative_iterable=()),
     )
     dev = App("dev", help="Benchmarks, data sets, and what else makes DeepDetect itself.")
-    for parent, groups in ((app, COMMANDS), (dev, DEVELOPMENT)):
-        for title, commands in groups.items():
+    for parent, groups in ((app, commands), (dev, development)):
+        for title, members in groups.items():
             group = Group.create_ordered(title)
-            for number, (name, (module, does)) in enumerate(commands.items()):
-                if name == "dev":
-                    dev.group, dev.sort_key = group, number
-                    app.command(dev)
-                    continue
-                path = f"{__package__}.{module}:{name.replace('-', '_')}"
+            for number, (name, (module, does)) in enumerate(members.items()):
+                path = f"{module}:{name.replace('-', '_')}"
                 shown: dict[str, Any] = {"help": does, "group": group, "sort_key": number}
                 parent.command(path, name=name, **(shown if summaries else {}))
+    if development:
+        dev.group = Group.create_ordered("Development")
+        app.command(dev)
     return app
+
+
+def _all_commands() -> tuple[Commands, Commands]:
+    """Return the commands of this package and of deepdetect-lab, and those after `dev`."""
+    commands = {
+        title: {name: (f"{__package__}.{module}", does) for name, (module, does) in group.items()}
+        for title, group in COMMANDS.items()
+    }
+    added = {p.name: p.load() for p in importlib.metadata.entry_points(group=LAB_ENTRY_POINTS)}
+    development = added.pop("dev", {})
+    for table in added.values():
+        commands |= table
+    return commands, development
+
+
+def _module_of(words: Sequence[str]) -> str | None:
+    """Return the module of the command that is called, if any.
+
+    Entry points are only read where it is no command of this package: that takes time.
+    """
+    name = next((word for word in words if word != "dev"), "")
+    if words[:1] != ["dev"]:
+        own = (group[name][0] for group in COMMANDS.values() if name in group)
+        if module := next(own, None):
+            return f"{__package__}.{module}"
+    commands, development = _all_commands()
+    if words[:1] and words[0] in LAB_COMMANDS and not development:
+        raise MissingExtraError(
+            f"`deepdetect {words[0]}` belongs to deepdetect-lab: run pip install deepdetect-lab"
+        )
+    groups = development if words[:1] == ["dev"] else commands
+    return next((group[name][0] for group in groups.values() if name in group), None)
 
 
 def completion(
@@ -186,11 +216,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _call(words: Sequence[str]) -> int:
-    groups = DEVELOPMENT if words[:1] == ["dev"] else COMMANDS
-    modules = {name: module for group in groups.values() for name, (module, _) in group.items()}
-    module = modules.get(next((word for word in words if word != "dev"), ""))
+    module = _module_of(words)
     if module is not None:
-        importlib.import_module(f".{module}", __package__)  # with its own errors
+        importlib.import_module(module)  # with its own errors
     FORMATTER.shows_all = "--help-all" in words
     meant = {"--help-all": "--help", "-": "/dev/stdin"}
     words = [meant.get(word, word) for word in words]

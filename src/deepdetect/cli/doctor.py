@@ -23,7 +23,6 @@ PURPOSES = {
     "all": "the fast back end, ONNX files, the demo, HEIC, raw and compressed TIFF images",
     "app": "the page in a browser",
     "sfm": "reconstruct of three images and more, extract, match-many, export, control points",
-    "train": "label, train, benchmarks, and weights in .safetensors",
 }
 MAX_BACKEND_DIFFERENCE = 5e-3
 """Between the probabilities of two back ends; five times what is usual."""

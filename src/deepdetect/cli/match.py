@@ -15,7 +15,6 @@ from .._shared.errors import ImageError, OptionError, RegistrationError, noted_f
 from .._shared.image_array import array_to_rgb
 from .._shared.progress import progress, stage_progress
 from ..batch.pair_list import list_pairs
-from ..datasets.planar import read_matrix
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.matchers import MATCHERS_OF_NUMBERS
@@ -26,7 +25,7 @@ from ..geometry.estimation import MODEL_NAMES
 from ..geometry.transforms import translation_matrix
 from ..io.image import load_image
 from ..io.metadata import read_metadata
-from ..io.tables import save_matches
+from ..io.tables import read_matrix, save_matches
 from ..matching.pipeline import (
     GUIDED_STAGES,
     PUBLISHED_MATCHING,

@@ -53,12 +53,11 @@ class DeepDetect:
 
     Args:
         weights: "default", "dense", "free" or "espnet", the weights inside the package; or an ONNX
-            file, or a safetensors file where torch is installed.
+            file.
         resolution: "auto" (the image as it is up to two megapixels, larger ones scaled down to
             that), "native" (always as it is), or a number of pixels: the image is squashed to a
             square of that side, as the paper does with 480.
-        backend: "auto" (ONNX Runtime, OpenVINO for bfloat16, torch for safetensors),
-            "onnxruntime", "openvino" or "torch".
+        backend: "auto" (ONNX Runtime, OpenVINO for bfloat16), "onnxruntime" or "openvino".
         device: "cpu", or "cuda" or the name of any execution provider of ONNX Runtime.
         threads: number of threads. None: the backend's choice.
         precision: what the network computes with, "float32", or "bfloat16" with OpenVINO: faster on

@@ -36,17 +36,17 @@ POINTS = "keypoints", "scores", "sizes", "angles"
 """Outputs of files that give points, too: these are not read by the package."""
 
 
-def pretrained_weights(name: str = "default", suffix: str = ".onnx") -> Path:
-    """Return the path of weights inside the package, for inference or (".safetensors") training.
+def pretrained_weights(name: str = "default") -> Path:
+    """Return the path of weights inside the package.
 
     An OptionError names the nearest name that is known.
     """
-    return (FOLDER / look_up("name or file of weights", name, PRETRAINED)).with_suffix(suffix)
+    return (FOLDER / look_up("name or file of weights", name, PRETRAINED)).with_suffix(".onnx")
 
 
-def resolve_weights(weights: str | Path, suffix: str = ".onnx") -> Path:
+def resolve_weights(weights: str | Path) -> Path:
     """Return the path of weights that are named in `PRETRAINED`, or are a file."""
-    path = Path(weights) if names_a_file(weights) else pretrained_weights(str(weights), suffix)
+    path = Path(weights) if names_a_file(weights) else pretrained_weights(str(weights))
     if not path.is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")
     return path

@@ -86,6 +86,10 @@ def _apply(matrix: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     return coordinates
 
 
+TOLERANCE_PX = 1.0
+"""A match is correct up to this distance from the truth, as Middlebury counts."""
+
+
 def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.ndarray) -> np.ndarray:
     """Return the distances of a rectified pair's matches from the true disparity.
 
@@ -103,6 +107,19 @@ def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.nda
     true = np.where(np.isfinite(disparity), disparity, np.nan)[row, column]
     expected = np.column_stack([points0[:, 0] - true, points0[:, 1]])
     return np.linalg.norm(expected - points1, axis=1)
+
+
+def score_errors(errors: np.ndarray) -> dict[str, float]:
+    """Score the (N,) errors of `disparity_errors`, NaN where the truth is unknown.
+
+    Returns the number of "matches", those of them that can be "evaluated", those of these that are
+    "correct" within `TOLERANCE_PX`, and the fraction that is, the "precision".
+    """
+    evaluated = int(np.isfinite(errors).sum())
+    correct = int((errors <= TOLERANCE_PX).sum())
+    precision = correct / evaluated if evaluated else 0.0
+    counts = {"matches": len(errors), "evaluated": evaluated, "correct": correct}
+    return {**counts, "precision": precision}
 
 
 def translation_matrix(x: float, y: float) -> np.ndarray:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from io import BytesIO
 from numbers import Real
 from pathlib import Path
 
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import InvalidFileError, MissingFileError, first_line, require_packages
 from .._shared.options import look_up, suggest_keywords
 from ..geometry.point_cloud import UNITS, PointCloud, require_points
 from .glb import write_glb
@@ -50,28 +48,6 @@ def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> Non
     with path.open("wb") as file:
         file.write("\n".join(header).encode("ascii", "replace"))
         vertices.tofile(file)
-
-
-def read_ply_points(path: Path) -> np.ndarray:
-    """Read the (N, 3) float64 points of a PLY file of any program, without those at infinity.
-
-    By plyfile: those of OpenMVS have lists, which the readers of OpenCV, COLMAP and trimesh refuse.
-    An InvalidFileError says that it is none.
-    """
-    require_packages("reading a PLY file", "plyfile")
-    import plyfile
-
-    try:
-        head, end, rest = path.read_bytes().partition(b"end_header")
-        head = head.decode("ascii", "replace").encode("ascii", "replace")  # comments are any text
-        vertices = plyfile.PlyData.read(BytesIO(head + end + rest))["vertex"]
-        points = np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
-    except FileNotFoundError:
-        raise MissingFileError(f"there is no file {path}: check the path") from None
-    except (plyfile.PlyParseError, OSError, KeyError, ValueError, MemoryError) as error:
-        reason = first_line(error) or type(error).__name__
-        raise InvalidFileError(f"{path} is no PLY file of points ({reason}): check it") from error
-    return points[np.isfinite(points).all(axis=1)]
 
 
 POINT_CLOUD_WRITERS: dict[str, PointCloudWriter] = {

@@ -11,7 +11,13 @@ from typing import Any
 import numpy as np
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import InvalidFileError, MissingFileError, OptionError, first_line
+from .._shared.errors import (
+    ImageError,
+    InvalidFileError,
+    MissingFileError,
+    OptionError,
+    first_line,
+)
 from .._shared.options import suggest_keywords
 from .._shared.records import save_arrays
 from ..features.keypoints import Keypoints
@@ -182,3 +188,16 @@ def _save_csv(path: str | Path, header: str, columns: list[np.ndarray]) -> None:
         for start in range(0, len(columns[0]), CSV_ROWS):
             table = np.column_stack([values[start : start + CSV_ROWS] for values in columns])
             np.savetxt(file, table, fmt=digits, delimiter=",")
+
+
+def read_matrix(path: Path) -> np.ndarray:
+    """Read nine numbers from a text file as a (3, 3) float64 matrix that can be inverted."""
+    try:
+        matrix = np.array(path.read_text().split(), np.float64).reshape(3, 3)
+    except OSError as error:
+        raise ImageError(f"{path} cannot be read ({error.strerror}): check the folder") from None
+    except ValueError:
+        raise ImageError(f"{path} holds no 3x3 matrix: nine numbers are expected") from None
+    if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
+        raise ImageError(f"{path} holds a matrix that cannot be inverted: get the file again")
+    return matrix

@@ -130,11 +130,11 @@ def register(
             image reaches the horizon of a union.
 
     Example:
-        >>> from deepdetect.evaluation.baselines.random import RandomDetector
+        >>> from deepdetect import PointDetector
         >>> rng = np.random.default_rng(0)
         >>> scene = cv2.GaussianBlur(rng.integers(0, 256, (160, 200)).astype(np.uint8), (0, 0), 2)
         >>> scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
-        >>> registration = register(scene[:, :180], scene[:, 12:], RandomDetector())
+        >>> registration = register(scene[:, :180], scene[:, 12:], PointDetector())
         >>> registration.homography[:2, 2].round(1).tolist()
         [-12.0, 0.0]
     """

@@ -37,7 +37,7 @@ assert sys.modules.get("openvino_telemetry", before) is not None
 ONNX_METHOD = """
 from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect._shared.errors import WeightsError
-from deepdetect.evaluation.baselines.external import onnx_feature
+from deepdetect_lab.evaluation.baselines.external import onnx_feature
 try:
     onnx_feature(pretrained_weights())
 except WeightsError as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +15,7 @@ import onnxruntime  # noqa: E402
 from deepdetect import OptionError, WeightsError  # noqa: E402
 from deepdetect.detector.backends.onnx_parts import cut_onnx  # noqa: E402
 from deepdetect.detector.network.onnx_export import OnnxOptions, write_onnx  # noqa: E402
-from deepdetect.detector.network.onnx_graph import read_metadata  # noqa: E402
-from deepdetect.detector.pretrained import PRETRAINED, pretrained_weights  # noqa: E402
+from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
 
 SIZES = [(64, 96), (123, 157), (80, 41)]
 """Heights and widths: multiples of 8, of 8 in one direction, and of none."""
@@ -113,27 +111,6 @@ def test_opencv_at_one_size(
         net = cv2.dnn.readNetFromONNX(str(path), *engine)
         net.setInput(images)
         check_answers(*net.forward(["logits", "probability"]), expected_logits(network, images))
-
-
-@pytest.mark.parametrize("name", PRETRAINED)
-def test_the_shipped_files_are_those_of_the_safetensors(name: str, tmp_path: Path) -> None:
-    pytest.importorskip("torch", reason="needs torch, which is for training only")
-    shipped = pretrained_weights(name)
-    options = OnnxOptions(max_keypoints=0)
-    write_onnx(shipped.with_suffix(".safetensors"), tmp_path / "made.onnx", options)
-    made, model = onnx.load(tmp_path / "made.onnx"), onnx.load(shipped)
-    for graph in (made.graph, model.graph):  # the exporter counts some of the weights
-        for one in graph.initializer:
-            one.name = re.sub(r"^(onnx::\w+)_\d+$", r"\1", one.name)
-        for node in graph.node:
-            node.input[:] = [re.sub(r"^(onnx::\w+)_\d+$", r"\1", name) for name in node.input]
-    assert made.graph == model.graph
-    metadata = read_metadata(model)
-    assert (metadata["weights"], metadata["licence"]) == (name, "MIT")
-    assert {**read_metadata(made), "weights": name, "licence": "MIT"} == {
-        **metadata,
-        "version": read_metadata(made)["version"],
-    }
 
 
 def test_normalisation_is_folded_and_numbers_for_each_channel_have_four_dimensions() -> None:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, match_images
-from deepdetect.datasets.planar import load_oxford
 from deepdetect.detector import HeatmapOptions
-from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.features.keypoints import nearest_keypoints
 from deepdetect.geometry import transform_points
 from deepdetect.io.image import load_image
+from deepdetect_lab.datasets.planar import load_oxford
+from deepdetect_lab.evaluation.metrics.homography import corner_error
 
 pytestmark = pytest.mark.slow
 

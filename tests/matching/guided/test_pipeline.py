@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, OptionError
-from deepdetect.datasets.middlebury import load_middlebury
-from deepdetect.datasets.posed_images import PosedPair, load_posed_scenes
-from deepdetect.evaluation.metrics.pose import translation_error
-from deepdetect.evaluation.metrics.stereo import stereo_score
-from deepdetect.evaluation.protocols.pose import estimate_pose
 from deepdetect.geometry import transform_points
 from deepdetect.geometry.transforms import epipolar_errors, transfer_errors
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import guided_matches, guiding_geometry
 from deepdetect.matching.guided.pipeline import match_by_homography
+from deepdetect_lab.datasets.middlebury import load_middlebury
+from deepdetect_lab.datasets.posed_images import PosedPair, load_posed_scenes
+from deepdetect_lab.evaluation.metrics.pose import translation_error
+from deepdetect_lab.evaluation.metrics.stereo import stereo_score
+from deepdetect_lab.evaluation.protocols.pose import estimate_pose
 
 from ..conftest import match
 

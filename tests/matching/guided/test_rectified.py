@@ -8,13 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.features.matches import GuidedMatches
 from deepdetect.geometry import epipolar_errors, transform_points
 from deepdetect.io.image import luma
 from deepdetect.matching.guided import rectified
 from deepdetect.matching.guided.initial_geometry import InitialGeometry, guiding_geometry
 from deepdetect.matching.guided.rectified import match_by_rectification
+from deepdetect_lab.datasets.middlebury import load_middlebury
 
 TURNED = cv2.getRotationMatrix2D((225, 190), 30, 1.0)
 

@@ -10,7 +10,6 @@ import pytest
 
 from deepdetect import ImageError, OptionError
 from deepdetect._shared import machine
-from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.matching.stereo import DENSE, DisparityOptions, disparity_map, matching
 from deepdetect.matching.stereo.matching import (
     extrapolate_disparity,
@@ -19,6 +18,7 @@ from deepdetect.matching.stereo.matching import (
     near_discontinuity,
     on_occluding_edge,
 )
+from deepdetect_lab.datasets.middlebury import load_middlebury
 
 SHAPE = (96, 160)
 ROW, COLUMN = np.indices(SHAPE)

@@ -22,7 +22,7 @@ from deepdetect.matching.stereo.sgm import (
 @pytest.fixture(scope="module")
 def motorcycle() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     pytest.importorskip("skimage", reason="needs scikit-image for its stereo pair")
-    from deepdetect.datasets.middlebury import load_motorcycle
+    from deepdetect_lab.datasets.middlebury import load_motorcycle
 
     pair = load_motorcycle()
     part = slice(150, 310)

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.geometry import transform_points
 from deepdetect.matching.stitching.bundle_adjustment import (
     RegisteredPair,
@@ -13,6 +12,7 @@ from deepdetect.matching.stitching.bundle_adjustment import (
     adjust_homographies,
     level_cameras,
 )
+from deepdetect_lab.evaluation.metrics.homography import corner_error
 
 SIZE = (640, 480)
 CAMERA = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect, DeepDetectError, ImageError, OptionError, PointDetector
-from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.geometry import transform_points
 from deepdetect.matching.stitching import Panorama, StitchingOptions, stages_of, stitch
+from deepdetect_lab.evaluation.metrics.homography import corner_error
 
 HALF = StitchingOptions(scale=0.5)
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from deepdetect import DeepDetect, DeepDetectError
-from deepdetect.evaluation.metrics.homography import corner_error
 from deepdetect.matching.stitching.registration import register_images
+from deepdetect_lab.evaluation.metrics.homography import corner_error
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Running the network: ONNX Runtime, OpenVINO or torch."""
+"""Running the network: ONNX Runtime or OpenVINO."""
 
 from .interface import Network, RuntimeOptions
 from .registry import BACKENDS, open_network

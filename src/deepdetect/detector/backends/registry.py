@@ -10,7 +10,6 @@ import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -25,20 +24,13 @@ from ..._shared.options import check_ranges
 from .interface import PROBE_SHAPE, Network, RuntimeOptions
 from .onnxruntime_backend import open_onnxruntime
 from .openvino_backend import open_openvino
-from .torch_backend import open_torch
 
-
-class _Backend(NamedTuple):
-    packages: tuple[str, ...]
-    suffix: str
-    open: Callable[[Path, RuntimeOptions], Network]
-
-
-BACKENDS = {
-    "onnxruntime": _Backend(("onnxruntime",), ".onnx", open_onnxruntime),
-    "openvino": _Backend(("openvino",), ".onnx", open_openvino),
-    "torch": _Backend(("torch", "safetensors"), ".safetensors", open_torch),
+BACKENDS: dict[str, Callable[[Path, RuntimeOptions], Network]] = {
+    "onnxruntime": open_onnxruntime,
+    "openvino": open_openvino,
 }
+"""The function that opens a file, by the backend's name, which is that of its package."""
+
 PRECISIONS = ("float32", "bfloat16")
 
 
@@ -47,13 +39,14 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
     check_name("backend", options.backend, ("auto", *BACKENDS))
     check_name("precision", options.precision, PRECISIONS)
     check_ranges(options, counts=("threads",))
-    name = _choose(path, options) if options.backend == "auto" else options.backend
-    backend = BACKENDS[name]
-    if path.suffix.lower() != backend.suffix:
-        raise OptionError(
-            f"the backend {name} reads {backend.suffix} files, not {path.name}: "
-            "leave the backend out, or give other weights"
+    if path.suffix.lower() != ".onnx":
+        raise WeightsError(
+            f"{path} is no ONNX file: give one; `deepdetect dev average` of deepdetect-lab makes "
+            "one of safetensors"
         )
+    name = options.backend
+    if name == "auto":
+        name = "onnxruntime" if options.precision == "float32" else "openvino"
     for option, usual, needed in (
         ("precision", "float32", "openvino"),
         ("device", "cpu", "onnxruntime"),
@@ -63,7 +56,7 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
             raise OptionError(
                 f'`{option}="{value}"` needs the backend {needed}, not {name}: leave one out'
             )
-    require_packages(f"reading {path.name} with the backend {name}", *backend.packages)
+    require_packages(f"reading {path.name} with the backend {name}", name)
     file = path.stat()
     return _open(name, path, options, (path.absolute(), file.st_mtime_ns, file.st_size)), name
 
@@ -71,7 +64,7 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
 @functools.lru_cache(maxsize=4)
 def _open(backend: str, path: Path, options: RuntimeOptions, state: tuple[object, ...]) -> Network:
     """Load a file; one whose state has changed since is loaded again."""
-    network = BACKENDS[backend].open(path, options)
+    network = BACKENDS[backend](path, options)
     _check_answer(network, path)
     return network
 
@@ -95,12 +88,3 @@ def _check_answer(network: Network, path: Path) -> None:
             f"{path} gives the same value at every pixel of an image of noise: it is damaged, or "
             "was never trained; use other weights"
         )
-
-
-def _choose(path: Path, options: RuntimeOptions) -> str:
-    suffix = path.suffix.lower()
-    if suffix == ".safetensors":
-        return "torch"
-    if suffix != ".onnx":
-        raise WeightsError(f"{path} is no weights file: it must end in .onnx or .safetensors")
-    return "onnxruntime" if options.precision == "float32" else "openvino"

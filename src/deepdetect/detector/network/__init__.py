@@ -1,1 +1,1 @@
-"""The network in torch, its weights, and its export. Needed for training only."""
+"""The network as ONNX files for other programs: of one size, with points, with metadata."""

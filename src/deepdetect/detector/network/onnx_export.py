@@ -5,10 +5,6 @@ Their input is `image`; outputs are `probability`, `logits` and those of `add_po
 
 from __future__ import annotations
 
-import io
-import logging
-import warnings
-from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +18,6 @@ from ..pretrained import LOGITS, resolve_weights
 from .onnx_graph import (
     IMAGE,
     PROBABILITY,
-    add_padding,
     fix_size,
     read_metadata,
     replace_nodes,
@@ -32,10 +27,8 @@ from .onnx_points import add_points, remove_points
 
 if TYPE_CHECKING:
     from onnx import ModelProto
-    from torch import nn
 
 ANY_SIZE = {"size": "any", "batch": "any"}
-OPSET = 17
 
 
 @suggest_keywords
@@ -82,11 +75,6 @@ class OnnxOptions:
         return values
 
 
-def export_onnx(network: nn.Module, path: str | Path) -> None:
-    """Write a network for any size; whole or not at all."""
-    _write(_of_torch(network), path, OnnxOptions(max_keypoints=0), {})
-
-
 def write_onnx(
     weights: str | Path,
     path: str | Path,
@@ -96,8 +84,8 @@ def write_onnx(
 ) -> dict[str, str]:
     """Write weights as an ONNX file for other programs, whole or not at all; return its metadata.
 
-    The weights are named, a safetensors file, or an ONNX file that this package has written for any
-    size. Without a licence the file says that of the given one.
+    The weights are named, or an ONNX file that this package has written for any size. Without a
+    licence the file says that of the given one.
     """
     if Path(path).suffix.lower() != ".onnx":
         raise OptionError(f"the name of an ONNX file ends in .onnx, not {Path(path).name}")
@@ -105,12 +93,13 @@ def write_onnx(
     model, origin = _load(resolve_weights(weights))
     if licence is not None:
         origin["licence"] = licence
-    return _write(model, path, options, origin)
+    return write_model(model, path, options, origin)
 
 
-def _write(
+def write_model(
     model: ModelProto, path: str | Path, options: OnnxOptions, origin: Mapping[str, str]
 ) -> dict[str, str]:
+    """Write a network for any size with options, and notes on its origin; return its metadata."""
     if options.size is not None:
         fix_size(model, *options.size, options.batch)
     if not options.maps:
@@ -128,14 +117,6 @@ def _load(path: Path) -> tuple[ModelProto, dict[str, str]]:
     """Return weights as a network for any size, and where they come from."""
     import onnx
 
-    suffix = path.suffix.lower()
-    if suffix == ".safetensors":
-        require_packages(f"exporting {path.name}", "torch", "safetensors")
-        from .weights import load_network
-
-        return _of_torch(load_network(path)), {"weights": path.name}
-    if suffix != ".onnx":
-        raise WeightsError(f"{path} is no weights file: it must end in .onnx or .safetensors")
     try:
         model = onnx.load_model_from_string(path.read_bytes())
     except Exception as error:  # protobuf's, which onnx hands on
@@ -156,32 +137,3 @@ def _load(path: Path) -> tuple[ModelProto, dict[str, str]]:
         )
     kept = {name: value for name, value in found.items() if name in ("weights", "licence")}
     return model, {"weights": path.name, **kept}
-
-
-def _of_torch(network: nn.Module) -> ModelProto:
-    import onnx
-    import torch
-
-    # Its parts are named after it: `tiling` knows the names that PyTorch's exporter gives.
-    module = torch.nn.Sequential(OrderedDict(network=network.cpu())).eval()
-    axes = {0: "batch", 2: "height", 3: "width"}
-    written = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-        torch.onnx.export(
-            module,
-            (torch.zeros(2, 3, 64, 96),),
-            written,  # type: ignore[arg-type]  # its annotation is of the other exporter
-            input_names=["image"],
-            output_names=["logits"],
-            dynamic_axes={"image": axes, "logits": axes},
-            opset_version=OPSET,
-            dynamo=False,
-            # Keeps batch normalisation as nodes, for `add_padding` to fold in float64. The network
-            # is in evaluation mode already.
-            training=torch.onnx.TrainingMode.PRESERVE,
-        )
-    model = onnx.load_model_from_string(written.getvalue())
-    add_padding(model)
-    return model

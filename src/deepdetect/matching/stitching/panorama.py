@@ -146,12 +146,12 @@ def stitch(
             the cameras of a curved panorama did more than turn.
 
     Example:
-        >>> from deepdetect.evaluation.baselines.random import RandomDetector
+        >>> from deepdetect import PointDetector
         >>> import cv2
         >>> rng = np.random.default_rng(0)
         >>> scene = cv2.GaussianBlur(rng.integers(0, 256, (160, 240)).astype(np.uint8), (0, 0), 2)
         >>> scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
-        >>> panorama = stitch([scene[:, :160], scene[:, 80:]], RandomDetector())
+        >>> panorama = stitch([scene[:, :160], scene[:, 80:]], PointDetector())
         >>> panorama.image.shape
         (160, 240, 3)
     """

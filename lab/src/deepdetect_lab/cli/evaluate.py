@@ -1,0 +1,241 @@
+"""`deepdetect dev evaluate`, `evaluate-stereo`, `benchmark` and `demo`: what weights are worth."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from deepdetect._shared.errors import DeepDetectError, OptionError, noted_failures
+from deepdetect._shared.options import look_up
+from deepdetect.cli import _options as cli
+from deepdetect.cli._detection import NETWORK
+from deepdetect.detector.detector import DeepDetect, HeatmapDetector
+from deepdetect.detector.heatmap import HeatmapOptions
+from deepdetect.detector.pretrained import PRETRAINED
+
+from ..datasets import StereoPair
+from ..datasets.middlebury import load_middlebury
+from ..datasets.planar import load_oxford
+from ..evaluation.baselines.external import find_feature
+from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
+from ..evaluation.options import PAPER_RESOLUTION_PX, BenchmarkOptions
+from ..evaluation.protocols.dense_points import CLOUD_COLUMNS, CLOUD_NOTE
+from ..evaluation.protocols.dense_points import compare_clouds as compare
+from ..evaluation.protocols.masks import LabelDetector
+from ..evaluation.protocols.stereo_matches import score_stereo_matches
+from ..evaluation.report import Table
+from ..evaluation.weights import Evaluation, evaluate_oxford
+from ..evaluation.weights import evaluate as run
+from ..labels import find_label_settings
+
+MEASURES = cli.From(
+    run,
+    "oxford foreground equal_density",
+    more="",
+    types={"oxford": Path | None, "foreground": Path | None},
+)
+
+
+@cli.command(MEASURES, NETWORK)
+def evaluate(
+    samples: Annotated[Path, Parameter(help="Folder of image_NAME.png with mask_image_NAME.png.")],
+    /,
+    *,
+    compare: list[str] | None = None,
+    labels: bool = False,
+    scale: list[float] | None = None,
+    **values: Any,
+) -> cli.Result:
+    """Score the network on a folder of images with known masks.
+
+    Prints the mean binary cross-entropy (BCE) and intersection over union (IoU), the expected
+    calibration error over all pixels, and the density of keypoints at 0.5 and of the masks,
+    separately for normal and for low-visibility images; with --oxford also what the paper's
+    protocol gives. What cannot be read or measured is listed at the end, and in no score.
+
+        deepdetect dev evaluate samples/ --weights run/deepdetect.onnx --compare other.onnx
+        deepdetect dev evaluate photos/ --scale 0.5 --scale 1 --scale 2
+        deepdetect dev evaluate samples/ --oxford oxford/ --equal-density --compare other.onnx
+
+    Args:
+        compare: Evaluate these weights too, beside the first; may be repeated.
+        labels: With --oxford: measure the labels too, which weights without error would give.
+        scale: Score the images scaled by this factor too, on labels of their own; may be repeated.
+            The images then need no masks.
+    """
+    measures = MEASURES.take(values)
+    if labels and "oxford" not in measures:
+        raise OptionError("--labels measures on the Oxford scenes: name their folder with --oxford")
+    # What is missing is said before hours of work.
+    scenes = load_oxford(measures["oxford"]) if "oxford" in measures else []
+    measures |= {"samples": samples, "scales": tuple(scale or ()), "quiet": False}
+    weights = [values.pop("weights", "default"), *(compare or ())]
+    detectors = [DeepDetect(path, **values) for path in weights]
+    found = [run(detector, **measures) for detector in detectors]
+    columns = [
+        {"weights": detector.weights, "backend": detector.runtime, **_values(evaluation)}
+        for detector, evaluation in zip(detectors, found, strict=True)
+    ]
+    report = {**columns[0], **({"compare": columns[1:]} if compare else {})}
+    scores: list[Any] = [found[0], *(each.oxford for each in found)]
+    scores += [each.foreground for each in found]
+    if labels:
+        squashed = LabelDetector(heatmap_options=HeatmapOptions(PAPER_RESOLUTION_PX))
+        scores.append(evaluate_oxford(squashed, scenes, quiet=False))
+        report["labels"] = {"oxford": asdict(scores[-1])}
+        columns.append({"weights": "labels", **report["labels"]})
+    by_scale = [
+        {f"x{row['scale']:g} {row['visibility']}": row for row in column.get("scales", ())}
+        for column in columns
+    ]
+    text = cli.table(*({**c, "scales": s} for c, s in zip(columns, by_scale, strict=True)))
+    failures = [failure for score in scores if score is not None for failure in score.failures]
+    # What all weights lack is listed once.
+    return cli.Result(report, text, list(dict.fromkeys(failures)), what="parts")
+
+
+def _values(evaluation: Evaluation) -> dict[str, Any]:
+    values: dict[str, Any] = {name: asdict(score) for name, score in evaluation.masks.items()}
+    if evaluation.scales:
+        values["scales"] = [
+            {"scale": scale, "visibility": visibility, **asdict(score)}
+            for (scale, visibility), score in evaluation.scales.items()
+        ]
+    for name in ("oxford", "foreground"):
+        if (score := getattr(evaluation, name)) is not None:
+            values[name] = asdict(score)
+    return values
+
+
+STEREO_COLUMNS = {
+    **{"source": "", "pair": "", "density": ".3f"},
+    **{"matches": ",d", "correct": ",d", "precision": ".3f"},
+}
+
+
+@cli.command()
+def evaluate_stereo(
+    *scenes: Annotated[
+        Path,
+        Parameter(
+            help="Folders with left.png, right.png, disparity.png and calib.json.", required=True
+        ),
+    ],
+    weights: list[str] | None = None,
+    label_settings: list[str] | None = None,
+) -> cli.Result:
+    """Match rectified stereo pairs, and evaluate the matches by their true disparity.
+
+    Matching uses neither the rows nor the truth; a match is correct within 1 px. Random points of
+    the same density and all pixels are the baselines.
+
+        deepdetect dev evaluate-stereo cones/ teddy/ --weights default --weights dense
+        deepdetect dev evaluate-stereo cones/ teddy/ --label-settings mine.toml
+
+    Args:
+        weights: default, dense, free or espnet, the pretrained weights, or a file; may be repeated.
+        label_settings: Label settings whose labels are the keypoints, without a network: paper or
+            dense, or a file; may be repeated.
+    """
+    pairs: list[StereoPair] = []
+    failures: list[str] = []
+    for scene in scenes:
+        with noted_failures(str(scene), failures):
+            pairs.append(load_middlebury(scene))
+    if not pairs:
+        raise DeepDetectError("; ".join(failures))
+    sources: dict[str, HeatmapDetector] = {}
+    for name in label_settings or ():
+        sources[f"labels {name}"] = LabelDetector(find_label_settings(name))
+    for name in weights or (() if label_settings else PRETRAINED):
+        sources[f"weights {name}"] = DeepDetect(name)
+    rows = score_stereo_matches(sources, pairs, quiet=False)
+    table = Table("stereo", "", STEREO_COLUMNS, rows)
+    return cli.Result(rows, table.to_markdown(), failures, len(scenes), "scenes")
+
+
+@cli.command()
+def compare_clouds(
+    model: Annotated[Path, Parameter(help="Folder of `deepdetect reconstruct`.")],
+    /,
+    *clouds: Annotated[Path, Parameter(help="PLY files in its frame.", required=True)],
+) -> cli.Result:
+    """Compare the dense points of a model with the clouds of other programs.
+
+    Prints how much of the images each cloud covers, and how far its depths are from those of
+    model.ply. The clouds must be in the frame of the model: give OpenMVS or COLMAP its sparse/0.
+
+        deepdetect dev compare-clouds model/ openmvs/scene_dense.ply colmap/fused.ply
+    """
+    rows = compare(model, [model / "model.ply", *clouds])
+    table = Table("clouds", "", CLOUD_COLUMNS, rows, CLOUD_NOTE)
+    return cli.Result(rows, f"{table.to_markdown()}\n\n{CLOUD_NOTE}")
+
+
+OPTIONS = cli.From(BenchmarkOptions, "max_pairs max_images", more="ranker")
+
+
+@cli.command(OPTIONS, NETWORK)
+def benchmark(
+    name: Annotated[str, Parameter(help=f"One of {', '.join(BENCHMARKS)}, or all.")],
+    /,
+    *,
+    data: Path,
+    output: cli.Output = Path("benchmark"),
+    protocol: list[Literal["paper", "standard", "guided", "degraded"]] | None = None,
+    method: list[str] | None = None,
+    baselines: str | None = None,
+    preset: Literal["default", "published"] = "default",
+    cache: Path | None = None,
+    geometry_weights: list[str] | None = None,
+    **values: Any,
+) -> cli.Result:
+    """Write a report on the detectors: report.md with figures, tables/*.csv, report.json.
+
+    A second run does only what is new. What cannot be measured is listed at the end (exit code 1).
+
+        deepdetect dev benchmark oxford --data data --max-pairs 1 --baselines sift -o quick
+        deepdetect dev benchmark oxford --data data -o report --method xfeat.onnx
+        deepdetect dev benchmark sfm --data data/fountain -o report
+
+    Args:
+        data: Folder of the data sets.
+        output: Folder for the report.
+        protocol: paper, standard, guided or degraded; may be repeated.  [default: all but degraded]
+        method: A further method, NAME, FILE.onnx or MODULE:FUNCTION; may be repeated.
+        baselines: Classical methods, with commas between; none for none. [default: all]
+        preset: published: show the network the channels as the paper's code does (BGR).
+        cache: Folder of the stages' results.  [default: cache in the output]
+        geometry_weights: Weights for stereo pairs, as --weights; may be repeated.  [default: dense]
+    """
+    output = cli.output_folder(output)
+    if values.get("resolution") not in (None, "auto", "native"):
+        raise OptionError("the protocols fix the resolution: leave out --resolution")
+    names = list(BENCHMARKS) if name == "all" else [name]
+    for each in names:
+        look_up("benchmark", each, BENCHMARKS)
+    given = OPTIONS.take(values)
+    if baselines is not None:
+        listed = [word.strip() for word in baselines.split(",")]
+        given["classical"] = tuple(word for word in listed if word not in ("", "none"))
+    given |= {"protocols": tuple(protocol)} if protocol else {}
+    given |= {"geometry_weights": tuple(geometry_weights)} if geometry_weights else {}
+    options = BenchmarkOptions(
+        detector=DeepDetect(**values),
+        others=tuple(find_feature(word) for word in method or ()),
+        channels="bgr" if preset == "published" else "rgb",
+        **given,
+    )
+    report = run_benchmarks(names, data, options, cache=cache or output / "cache", quiet=False)
+    paths = report.save(output)
+    tables = [f"{t.title}\n\n{t.to_markdown()}\n" for t in report.tables() if t.in_text]
+    skipped = [f"skipped: {reason}" for reason in report.skipped if reason not in report.failures]
+    return cli.Result(
+        {**report.values(), "files": paths},
+        "\n".join([*tables, *skipped, f"report: {paths[0]}"]),
+        report.failures,
+        what="parts",
+    )

@@ -1,0 +1,344 @@
+"""`deepdetect train`, `train-points`, `train-descriptor`, `label`, `shards` and `average`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from deepdetect._shared.options import look_up
+from deepdetect._shared.progress import progress
+from deepdetect._shared.provenance import provenance
+from deepdetect.batch.engines import ENGINES
+from deepdetect.cli import _options as cli
+from deepdetect.cli.features import EXTRACTION
+
+from ..labels import LabelOptions, find_label_settings
+from ..labels.fusion import LabelTask, label_file
+from ..training import (
+    PRESETS,
+    DescriptorTrainingOptions,
+    DeviceOptions,
+    PointsTrainingOptions,
+    Stage,
+    TrainingOptions,
+    profile,
+    write_shards,
+)
+from ..training import train as train_network
+from ..training import train_descriptor as train_descriptor_network
+from ..training import train_points as train_ranker
+
+Folder = Annotated[Path, Parameter(help="Folder of images; `train` also takes shards.")]
+RUN = cli.From(
+    train_network,
+    "validation init_weights",
+    more="labels workers",
+    flags={"init_weights": "--init"},
+    types={"init_weights": list[str] | None},
+    defaults={
+        "validation": "one image in twenty is held out",
+        "labels": "in the run's folder",
+        "init_weights": "random ones, by the seed",
+    },
+)
+RECIPE = cli.From(
+    TrainingOptions,
+    "stages max_images learning_rate augmentations seed",
+    more=" ".join(n for n in TrainingOptions.__dataclass_fields__ if n != "labels"),
+    flags={
+        "stages": "--stage",
+        "short_sides": "--short-side",
+        "frozen_batch_norm": "--frozen-batch-norm/--batch-norm",
+    },
+    types={"stages": list[str] | None},
+    defaults={
+        "stages": "480x16x40@480 240x64x36@240 352x30x16@352 960x4x2@960",
+        "short_sides": "480 240 352 960",
+        "max_images": "all",
+        "frozen_batch_norm": "with --init",
+        "low_light_pos_weight": "that of --pos-weight",
+    },
+)
+DEVICE = cli.From(DeviceOptions, "device")
+SHARDS = replace(RECIPE, common="max_images augmentations", more="short_sides square val_fraction")
+"""What of a recipe is fixed once the labels are made."""
+
+SHARD_SIZE = cli.From(write_shards, "shard_size", more="")
+ENGINE = replace(EXTRACTION, common="")
+POINTS_RUN = cli.From(train_ranker, "validation num_workers", more="", types={"validation": Path})
+DESCRIPTOR_RUN = cli.From(
+    train_descriptor_network,
+    "validation init_weights device num_workers",
+    more="",
+    flags={"init_weights": "--init"},
+    types={"validation": Path, "init_weights": Path | None},
+    defaults={"init_weights": "random ones, by the seed", "num_workers": "0 on a CPU"},
+)
+
+
+def chosen_label_settings(
+    detectors: str | None = None, label_settings: str | None = None
+) -> LabelOptions:
+    """Find settings by name or TOML file; detectors replace theirs.
+
+    Args:
+        detectors: Some of sift, orb, brisk, fast, agast, harris, shi-tomasi, canny, sobel, with
+            commas between.  [default: all]
+        label_settings: Detectors and their settings: paper or dense, or a file.  [default: paper]
+    """
+    settings = find_label_settings(label_settings or "paper")
+    if detectors is None:
+        return settings
+    names = tuple(name.strip() for name in detectors.split(",") if name.strip())
+    return settings.with_detectors(names)
+
+
+def chosen_recipe(
+    preset: str = "default",
+    detectors: str | None = None,
+    label_settings: str | None = None,
+    **values: Any,
+) -> TrainingOptions:
+    """Return a preset's training options with the given values changed.
+
+    Args:
+        preset: Recipe that the other options change: default (its values are shown here), dense
+            (normal light only, denser labels), and of ESPNet espnet or paper (the paper's own).
+    """
+    if "stages" in values:
+        values["stages"] = tuple(map(Stage.parse, values["stages"]))
+    recipe = look_up("training preset", preset, PRESETS)
+    labels = chosen_label_settings(detectors, label_settings)
+    if label_settings is not None:
+        values["labels"] = labels
+    elif detectors is not None:  # the preset's settings, for the detectors that are used
+        values["labels"] = recipe.labels.with_detectors(labels.detectors)
+    return replace(recipe, **values)
+
+
+PRESET = cli.From(chosen_recipe, "preset", more="")
+LABELS = cli.From(chosen_label_settings, "detectors label_settings")
+
+
+@cli.command(PRESET, LABELS, RUN, RECIPE, DEVICE)
+def train(
+    images: Folder,
+    /,
+    *,
+    output: cli.Output,
+    profiling: Annotated[bool, Parameter("--profile", negative="")] = False,
+    **values: Any,
+) -> cli.Result:
+    """Train the network on the images, or the shards, in a folder.
+
+    Labels are made first, once, by the detectors of `deepdetect label`. The run's folder gets
+    checkpoint.safetensors, best.safetensors and deepdetect.onnx (the weights of the lowest
+    validation loss) and the loss curves, curves.csv and curves.png. An interrupted run resumes when
+    the same command is given again.
+
+        deepdetect train photos/ -o run
+        deepdetect detect photo.jpg --weights run/deepdetect.onnx
+
+    Args:
+        output: Folder of the run.
+        profiling: Time 30 steps of each stage and report what limits the speed; train nothing.
+    """
+    run = RUN.take(values)
+    if given := run.pop("init_weights", None):
+        run["init_weights"] = given[0] if len(given) == 1 else tuple(given)
+    run |= {"device": DeviceOptions(**DEVICE.take(values)), "log": cli.say}
+    recipe = chosen_recipe(**values)
+    if profiling:
+        profiles = [asdict(each) for each in profile(images, output, recipe, **run)]
+        return cli.Result(profiles, "\n".join(map(cli.table, profiles)))
+    result = train_network(images, output, recipe, **run)
+    best = result.best
+    return cli.Result(
+        {
+            "weights": result.weights,
+            "onnx": result.onnx,
+            "epoch": best["epoch"],
+            "validation_loss": best["validation_loss"],
+            "normal": {"loss": best["normal_loss"], "iou": best["normal_iou"]},
+            "dark": {"loss": best["dark_loss"], "iou": best["dark_iou"]},
+            "images_per_second": round(result.images_per_second, 3),
+        }
+    )
+
+
+@cli.command(POINTS_RUN, cli.From(PointsTrainingOptions, "steps seed"))
+def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
+    """Train the ranker of keypoints on the images in a folder.
+
+    Pairs of views are made of single images, so no labels are needed. The run's folder gets
+    best.npz (the weights of the highest validation score), MODEL_CARD.md, curves.csv, curves.png
+    and checkpoint.safetensors. An interrupted run resumes when the same command is given again.
+
+        deepdetect dev train-points photos/train --validation photos/val -o run
+
+    Args:
+        output: Folder of the run.
+    """
+    run = {**POINTS_RUN.take(values), "output": output, "log": cli.say}
+    result = train_ranker(images, options=PointsTrainingOptions(**values), **run)
+    return cli.Result({"weights": result.weights, "best": result.best, "points": result.points})
+
+
+@cli.command(DESCRIPTOR_RUN, cli.From(DescriptorTrainingOptions, "steps pairs seed"))
+def train_descriptor(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
+    """Train the learned descriptor of keypoints on the images in a folder.
+
+    Pairs of views are made of single images, so no labels are needed. The run's folder gets
+    descriptor.onnx and descriptor.safetensors (the weights of the highest validation score),
+    MODEL_CARD.md, curves.csv, curves.png and checkpoint.safetensors. An interrupted run resumes
+    when the same command is given again.
+
+        deepdetect train-descriptor photos/train --validation photos/val -o run
+
+    Args:
+        output: Folder of the run.
+    """
+    run = {**DESCRIPTOR_RUN.take(values), "output": output, "log": cli.say}
+    result = train_descriptor_network(images, options=DescriptorTrainingOptions(**values), **run)
+    files = {"weights": result.weights, "onnx": result.onnx}
+    return cli.Result({**files, "best": result.best, "points": result.points})
+
+
+@cli.command(PRESET, LABELS, SHARDS, SHARD_SIZE, ENGINE)
+def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
+    """Pack the images in a folder with their labels into tar files.
+
+    They are in WebDataset's layout. Training reads a few of them at a time, so they may be on a
+    slow disk or a network. Give both commands the same options. When it is interrupted, the same
+    command resumes.
+
+        deepdetect dev shards --preset paper data/coco -o data/shards
+        deepdetect train --preset paper data/shards -o run
+
+    Args:
+        output: Folder for the shards.
+    """
+    folder = cli.output_folder(output)
+    how = {**SHARD_SIZE.take(values), **_engine(values)}
+    # Shards are for any stages: one that fits every size stands for them.
+    recipe = chosen_recipe(**{**values, "stages": ["16x1x1"]})
+    made = write_shards(images, folder, recipe, quiet=False, **how)
+    return cli.Result(
+        {
+            "folder": folder,
+            "training": sum(count for _, count in made.training),
+            "validation": sum(count for _, count in made.validation),
+            "shards": len(made.training) + len(made.validation),
+            "bytes": sum(path.stat().st_size for path, _ in made.training + made.validation),
+        }
+    )
+
+
+@cli.command(LABELS, cli.From(LabelOptions, "visibility", more=""), ENGINE)
+def label(
+    *images: cli.Images,
+    output: cli.Output,
+    visualize: bool = False,
+    overwrite: cli.Overwrite = False,
+    **values: Any,
+) -> cli.Result:
+    """Mark the keypoints and edges of images (files or folders) by nine classical detectors.
+
+    Writes a 1-bit PNG mask STEM.png for each image: white where one of the detectors marks the
+    pixel. Masks that exist already are skipped, unless their image has changed; what was made of
+    another image or with other settings is replaced with --overwrite only.
+
+        deepdetect label photos/ -o masks
+        deepdetect label photo.jpg -o masks --detectors fast,sobel --visualize
+
+    Args:
+        output: Folder for the masks.
+        visualize: Also write STEM_labels.png, the paper's Figure 4.
+    """
+    folder = cli.output_folder(output)
+    how = _engine(values)
+    options = replace(chosen_label_settings(**LABELS.take(values)), **values)
+    tasks = []
+    for image, stem in cli.result_stems(cli.expand_images(images, folder)).items():
+        figure = folder / f"{stem}_labels.png" if visualize else None
+        tasks.append(LabelTask(image, folder / f"{stem}.png", options, figure, overwrite))
+    cli.check_outputs(
+        [path for task in tasks for path in task.outputs.paths], [task.image for task in tasks]
+    )
+    left = [task for task in tasks if task.outputs.find() is None]
+    done: list[dict[str, Any]] = []
+    failures: list[str] = []
+    with progress(len(left), "labelling", "image") as bar:
+        for report in how["map_tasks"](label_file, left, how["workers"]):
+            (failures if isinstance(report, str) else done).append(report)
+            bar.update(1)
+    done.sort(key=lambda report: str(report["image"]))
+    skipped = len(tasks) - len(left)
+    found = {
+        "labelled": done,
+        "skipped": skipped,
+        "mean_density": sum(each["density"] for each in done) / len(done) if done else None,
+        "failures": failures,
+    }
+    text = f"{len(done)} labelled, {skipped} already done"
+    if done:
+        low = sum(each["visibility"] == "low" for each in done)
+        text += f"; mean density {found['mean_density']:.3f}, {low} of low visibility"
+    return cli.Result(found, f"{text} -> {folder}", failures, len(tasks))
+
+
+@cli.command()
+def average(
+    *weights: Annotated[
+        str,
+        Parameter(
+            help=".safetensors files, or default, dense, free or espnet; one twice counts double.",
+            required=True,
+        ),
+    ],
+    output: cli.Output,
+    overwrite: cli.Overwrite = False,
+) -> cli.Result:
+    """Average weights (a model soup) into best.safetensors and deepdetect.onnx.
+
+    The mean of runs that continue each other is often better than each of them; one file alone is
+    written as ONNX. Files of another run are replaced with --overwrite only.
+
+        deepdetect dev average first/best.safetensors second/best.safetensors -o mean
+        deepdetect dev evaluate samples/ --weights mean/deepdetect.onnx
+
+    Args:
+        output: Folder for both files.
+    """
+    folder = cli.output_folder(output)
+    files = {"weights": folder / "best.safetensors", "onnx": folder / "deepdetect.onnx"}
+
+    from ..networks.export import export_onnx
+    from ..networks.weights import (
+        average_weights,
+        find_weights,
+        load_network,
+        read_notes,
+        save_tensors,
+        weights_digest,
+    )
+
+    paths = [find_weights(name) for name in weights]
+    with cli.writing(files, paths, overwrite) as made:
+        network = average_weights(paths)
+        parts = [{"sha256": weights_digest(load_network(p)), **read_notes(p)} for p in paths]
+        save_tensors(
+            network.state_dict(), made["weights"], {"parts": json.dumps(parts), **provenance()}
+        )
+        export_onnx(network, made["onnx"])
+    return cli.Result(files)
+
+
+def _engine(values: dict[str, Any]) -> dict[str, Any]:
+    chosen = ENGINE.take(values)
+    map_tasks = look_up("engine", chosen.get("engine", "processes"), ENGINES)
+    return {"map_tasks": map_tasks, "workers": chosen.get("workers")}

@@ -1,0 +1,105 @@
+"""Copies of photographs as a camera would have taken them in little light, or blurred.
+
+To add a degradation, write a function from linear light in [0, 1] and a random generator to the
+8-bit image, and add it to `DEGRADATIONS`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from deepdetect._shared.image_array import srgb_to_linear
+from deepdetect._shared.opencv import cv2
+
+FULL_WELL = 10_000.0
+"""Electrons that white gives in full light, each colour of each pixel by itself; their number is
+Poisson distributed (shot noise)."""
+
+READ_NOISE = 3.0
+"""Standard deviation in electrons of what reading the sensor adds (Gaussian)."""
+
+
+@dataclass(frozen=True)
+class Degradation:
+    """What is done to an image.
+
+    Attributes:
+        name: as "dark-8".
+        title: how tables name it.
+        apply: makes uint8 sRGB of float32 linear light in [0, 1], (H, W, 3), and random numbers.
+        version: raise it when a change of the code changes the result.
+    """
+
+    name: str
+    title: str
+    apply: Callable[[np.ndarray, np.random.Generator], np.ndarray]
+    version: int = 1
+
+
+def degrade(rgb: np.ndarray, degradation: Degradation) -> np.ndarray:
+    """Return a degraded copy of (H, W, 3) uint8 sRGB; the same one for the same image."""
+    own = int.from_bytes(hashlib.sha256(rgb.tobytes()).digest()[:8], "little")
+    return degradation.apply(to_linear(rgb), np.random.default_rng([0, own]))
+
+
+def to_linear(rgb: np.ndarray) -> np.ndarray:
+    """Undo the gamma of sRGB (IEC 61966-2-1): uint8 to float32 in [0, 1]."""
+    return srgb_to_linear().astype(np.float32)[rgb]
+
+
+def to_srgb(linear: np.ndarray) -> np.ndarray:
+    """Apply the gamma of sRGB, and round to uint8."""
+    light = np.clip(linear, 0, 1)
+    value = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.rint(255 * value).astype(np.uint8)
+
+
+def darken(linear: np.ndarray, generator: np.random.Generator, fraction: float) -> np.ndarray:
+    """Photograph a scene in a fraction of the light, with the same exposure and gain."""
+    electrons = generator.poisson(linear * (fraction * FULL_WELL)).astype(np.float32)
+    electrons += generator.normal(0, READ_NOISE, linear.shape).astype(np.float32)
+    return to_srgb(electrons / FULL_WELL)
+
+
+def blur_gaussian(linear: np.ndarray, _: np.random.Generator, sigma_px: float) -> np.ndarray:
+    """Photograph a scene out of focus: a Gaussian blur."""
+    return to_srgb(cv2.GaussianBlur(linear, (0, 0), sigma_px))
+
+
+def blur_motion(linear: np.ndarray, generator: np.random.Generator, length_px: float) -> np.ndarray:
+    """Photograph a scene while the camera moves evenly, in a direction drawn for the image."""
+    return to_srgb(cv2.filter2D(linear, -1, motion_kernel(length_px, generator.uniform(0, np.pi))))
+
+
+def motion_kernel(length_px: float, angle: float) -> np.ndarray:
+    """Return the kernel of an even motion along a line around the pixel; its sum is 1.
+
+    The angle of the line is in radians, from x towards y.
+    """
+    radius = int(np.ceil(length_px / 2))
+    kernel = np.zeros((2 * radius + 1, 2 * radius + 1), np.float64)
+    along = (np.arange(256) + 0.5) / 256 * length_px - length_px / 2
+    x, y = along * np.cos(angle) + radius, along * np.sin(angle) + radius
+    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
+    for right in (0, 1):
+        for below in (0, 1):
+            weight = (1 - abs(x - column - right)) * (1 - abs(y - row - below))
+            place = np.minimum(row + below, 2 * radius), np.minimum(column + right, 2 * radius)
+            np.add.at(kernel, place, weight)
+    return kernel / kernel.sum()
+
+
+DEGRADATIONS: dict[str, Degradation] = {
+    one.name: one
+    for one in (
+        Degradation("dark-4", "1/4 of the light", partial(darken, fraction=1 / 4)),
+        Degradation("dark-8", "1/8 of the light", partial(darken, fraction=1 / 8)),
+        Degradation("blur-2", "Gaussian blur, sigma 2 px", partial(blur_gaussian, sigma_px=2)),
+        Degradation("motion-9", "motion blur, 9 px", partial(blur_motion, length_px=9)),
+    )
+}

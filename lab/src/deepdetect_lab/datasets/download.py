@@ -1,0 +1,330 @@
+"""Data sets on the web: downloaded with resuming and checksums, unpacked, and checked.
+
+It is our own, on `requests`: pooch does not resume a broken download, as COCO's 19 GB need.
+"""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import shutil
+import tarfile
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from deepdetect._shared.errors import DeepDetectError, first_line, require_packages
+from deepdetect._shared.opencv import cv2
+from deepdetect._shared.progress import progress
+from deepdetect._shared.records import file_state
+from deepdetect.io.image import find_images
+from deepdetect.io.image_file import IMAGE_SUFFIXES
+
+CHUNK_BYTES = 1 << 16
+"""At most this much is lost when a download breaks off."""
+
+TIMEOUT_SECONDS = 60.0
+"""A host that sends nothing for this long has failed."""
+
+ARCHIVE_SUFFIXES = (".zip", ".tar.gz", ".tgz", ".tar")
+
+WRITE_ERRORS = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO),
+    *(errno.EMFILE, errno.ENFILE),
+)
+"""What the disk or the system refuses; other errors of unpacking lie in the archive."""
+
+
+@dataclass(frozen=True)
+class RemoteFile:
+    """A file on the web.
+
+    Attributes:
+        urls: its official host first, then mirrors; the next one is tried when one fails.
+        size: in bytes, roughly.
+        checksum: "md5:..." or "sha256:..."; None: the contents of the data set are checked.
+        into: in the data set, the folder that an archive is unpacked into, or a file's path.
+        inside: folder of the archive whose contents are taken.
+        suffixes: endings of the files that are taken from a tar archive; empty for all files.
+    """
+
+    urls: tuple[str, ...]
+    size: int
+    checksum: str | None = None
+    into: str = "."
+    inside: str = ""
+    suffixes: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The file's name on its host."""
+        return Path(urlsplit(self.urls[0]).path).name
+
+
+@dataclass(frozen=True)
+class RemoteDataset:
+    """A data set of images on the web.
+
+    Attributes:
+        name: the name users choose it by.
+        title: what it is.
+        files: archives, which are unpacked, and single files.
+        images: number of images.
+        licence: the terms of use.
+        contents: `content_digest` of files by their path in the data set, which does not depend
+            on the archive or the image format they came in.
+        texts: files that are written, not downloaded, by path in the data set.
+        prepare: turns what was unpacked into the data set, in the folder that it is given; its
+            second argument says whether it shows no progress.
+    """
+
+    name: str
+    title: str
+    files: tuple[RemoteFile, ...]
+    images: int
+    licence: str
+    contents: Mapping[str, str] = field(default_factory=dict, repr=False)
+    texts: Mapping[str, str] = field(default_factory=dict, repr=False)
+    prepare: Callable[[Path, bool], None] | None = field(default=None, repr=False)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the download."""
+        return sum(file.size for file in self.files)
+
+
+def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = True) -> Path:
+    """Download and unpack a data set, unless it is there already.
+
+    A download that broke off is resumed. The folder appears when all images are in it and are
+    the right ones; then the archives are removed.
+
+    Args:
+        dataset: the data set.
+        folder: where its images go.
+        quiet: show no progress bar.
+
+    Returns:
+        The folder.
+
+    Raises:
+        MissingExtraError: requests is not installed.
+        DeepDetectError: the download fails, a checksum is wrong, the disk is full, or the
+            folder holds something else.
+    """
+    require_packages("downloading data sets", "requests")
+    final = Path(folder)
+    if final.is_dir() and any(final.iterdir()):
+        _check(dataset, final, f"{final} exists and")
+        return final
+    store = final.with_name(f"{final.name}.download")
+    try:
+        store.mkdir(parents=True, exist_ok=True)
+        paths = [store / f"{k:02d}-{file.name}" for k, file in enumerate(dataset.files)]
+        every = zip(dataset.files, paths, strict=True)
+        missing = [(file, path) for file, path in every if not path.exists()]
+        # Twice the size: for the archives, and for what is unpacked.
+        done = sum(file_state(_part(path))[0] for _, path in missing)
+        needed = dataset.size + sum(file.size for file, _ in missing) - done
+        free = shutil.disk_usage(store).free
+        if free < needed:
+            raise DeepDetectError(
+                f"{final.parent} has {free / 1e9:.1f} GB free, {needed / 1e9:.1f} GB are needed: "
+                "make room or choose another folder"
+            )
+        for file, path in missing:
+            download(file, path, quiet=quiet)
+        _assemble(dataset, paths, final, quiet)
+        shutil.rmtree(store)
+    except DeepDetectError:
+        if store.is_dir() and not any(store.iterdir()):
+            store.rmdir()
+        raise
+    except OSError as error:
+        raise DeepDetectError(
+            f"cannot write {final} ({error.strerror or error}): make room or choose another folder"
+        ) from None
+    return final
+
+
+def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
+    """Download a file; it appears when it is whole and its checksum is right.
+
+    Until then the bytes are in `path` with ".part" added, where the next call resumes. Where every
+    host fails, the error is that of the last one.
+    """
+    from requests import RequestException
+
+    part = _part(path)
+    for k, url in enumerate(file.urls):
+        if k and file.checksum is None:
+            part.unlink(missing_ok=True)  # another host may have other bytes
+        try:
+            _fetch(url, file, part, quiet)
+            if file.checksum is not None and not has_checksum(part, file.checksum):
+                part.unlink()
+                raise DeepDetectError(
+                    f"{url} does not have the checksum {file.checksum}: try again later"
+                )
+            part.replace(path)
+            return
+        except DeepDetectError as error:
+            failure = error
+        except RequestException as error:
+            what, advice = type(error).__name__, "give the same command again to resume"
+            if error.response is not None:
+                what, advice = f"the server answers {error.response.status_code}", "try again later"
+            failure = DeepDetectError(f"{url} cannot be downloaded ({what}): {advice}")
+    raise failure
+
+
+def has_checksum(path: Path, checksum: str) -> bool:
+    """Whether a file has a checksum such as "sha256:..." or "md5:..."."""
+    algorithm, _, digest = checksum.partition(":")
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, algorithm).hexdigest() == digest
+
+
+def content_digest(folder: Path, name: str) -> str | None:
+    """Return the SHA-256 of a file's content in any format, None when there is no such file.
+
+    Of an image, which is named without its suffix, the pixels with their shape and type are
+    digested, so that a lossless copy in another format has the same digest; of any other file the
+    words, without white space.
+    """
+    path = folder / name
+    if path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES:
+        words = path.read_text(encoding="utf-8", errors="replace").split()
+        return hashlib.sha256(" ".join(words).encode()).hexdigest()
+    for candidate in sorted(path.parent.glob(f"{path.name}.*")):
+        if candidate.suffix.lower() in IMAGE_SUFFIXES:
+            pixels = cv2.imread(str(candidate), cv2.IMREAD_UNCHANGED)
+            if pixels is None:
+                return None
+            head = f"{pixels.shape} {pixels.dtype}".encode()
+            return hashlib.sha256(head + pixels.tobytes()).hexdigest()
+    return None
+
+
+def _part(path: Path) -> Path:
+    return path.with_name(f"{path.name}.part")
+
+
+def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> None:
+    import requests
+
+    have = file_state(part)[0]
+    headers = {"Range": f"bytes={have}-"} if have else {}
+    with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT_SECONDS) as response:
+        if response.status_code == 416:  # nothing is missing, which the checksum confirms
+            if file.checksum is None:
+                part.unlink()
+                raise requests.ConnectionError("the partial file is of another file")
+            return
+        response.raise_for_status()
+        if response.status_code != 206:  # the server sends all of it again
+            have = 0
+        length = response.headers.get("Content-Length")
+        total = have + int(length) if length else max(file.size, have)
+        with (
+            part.open("ab" if have else "wb") as target,
+            progress(total, file.name, "B", quiet, have) as bar,
+        ):
+            bar.unit_scale = True
+            for chunk in response.iter_content(CHUNK_BYTES):
+                target.write(chunk)
+                bar.update(len(chunk))
+    if length and file_state(part)[0] < total:
+        raise requests.ConnectionError("the connection broke off")
+
+
+def _check(dataset: RemoteDataset, folder: Path, subject: str) -> None:
+    count = len(find_images(folder))
+    if count != dataset.images:
+        raise DeepDetectError(
+            f"{subject} holds {count:,} images, not {dataset.images:,}: choose another folder"
+        )
+    for name, digest in dataset.contents.items():
+        found = content_digest(folder, name)
+        if found != digest:
+            state = "is missing" if found is None else "is not the one of the data set"
+            raise DeepDetectError(
+                f"{subject} holds another {dataset.name}, whose {name} {state}: get it again"
+            )
+
+
+def _assemble(dataset: RemoteDataset, paths: Sequence[Path], final: Path, quiet: bool) -> None:
+    """Unpack into a folder beside the final one, and rename it when it is complete and right."""
+    unfinished = final.with_name(f".{final.name}.part")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir(parents=True)
+    try:
+        for file, path in zip(dataset.files, paths, strict=True):
+            target = unfinished / file.into
+            if file.name.endswith(ARCHIVE_SUFFIXES):
+                _unpack(file, path, target, quiet)
+            else:
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(path, target)
+        for name, text in dataset.texts.items():
+            (unfinished / name).parent.mkdir(parents=True, exist_ok=True)
+            (unfinished / name).write_text(text, encoding="utf-8")
+        if dataset.prepare is not None:
+            dataset.prepare(unfinished, quiet)
+        _check(dataset, unfinished, "the download")
+    except DeepDetectError:
+        shutil.rmtree(unfinished)
+        for path in paths:  # or the same wrong files would be used again
+            path.unlink()
+        raise
+    if final.exists():
+        final.rmdir()
+    unfinished.rename(final)
+
+
+def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
+    target.mkdir(parents=True, exist_ok=True)
+    try:
+        if zipfile.is_zipfile(archive):
+            with zipfile.ZipFile(archive) as zipped:
+                _extract(zipped.infolist(), lambda one: zipped.extract(one, target), quiet)
+        else:
+            with tarfile.open(archive) as tar:
+                while tar.fileobj.read(CHUNK_BYTES):
+                    pass  # the checksum of gzip lies behind the last member
+                endings = file.suffixes or ("",)
+                members = [m for m in tar if not m.isdir() and m.name.lower().endswith(endings)]
+                _extract(members, lambda one: _extract_file(tar, one, target), quiet)
+    except Exception as error:  # zip, tar and their compressions raise many kinds
+        if isinstance(error, OSError) and error.errno in WRITE_ERRORS:
+            raise
+        raise DeepDetectError(
+            f"{file.urls[0]} is no archive that can be unpacked ({first_line(error)}): try again"
+        ) from None
+    if file.inside and (target / file.inside).is_dir():
+        for entry in sorted((target / file.inside).iterdir()):
+            entry.rename(target / entry.name)
+        (target / file.inside).rmdir()
+
+
+def _extract_file(tar: tarfile.TarFile, member: tarfile.TarInfo, target: Path) -> None:
+    """Write a file of a tar archive below a folder; a link becomes a copy.
+
+    Python has a filter for it from 3.11.4 on only.
+    """
+    path, content = target / member.name, tar.extractfile(member)
+    if content is None or not path.resolve().is_relative_to(target.resolve()):
+        raise tarfile.TarError(f"{member.name!r} leads outside, or is no file")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with content, path.open("wb") as file:
+        shutil.copyfileobj(content, file)
+
+
+def _extract(members: Sequence[Any], extract: Callable[[Any], object], quiet: bool) -> None:
+    with progress(len(members), "unpacking", "file", quiet) as bar:
+        for member in members:
+            extract(member)
+            bar.update(1)

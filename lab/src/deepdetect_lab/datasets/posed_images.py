@@ -1,0 +1,334 @@
+"""Folders of images with known cameras, in three public layouts, or with satellite fixes.
+
+- Strecha's (Strecha et al., 2008): NNNN.jpg or .png with NNNN.camera (or NNNN.jpg.camera).
+- KITTI odometry (Geiger et al., 2012): NNNNNN.png or .jpg with calib.txt, whose first line is the
+  projection matrix of the images' camera, or K.txt, its camera matrix, and poses.txt, whose line N
+  belongs to image N.
+- COLMAP's model, text or binary (Schönberger and Frahm, 2016): in the folder, or in its sparse/ or
+  sparse/0/; the images in the folder or in its images/. Without distortion. pycolmap reads it.
+
+Intrinsics are of the images as they are: where a file names another size, they are scaled to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from deepdetect._shared.errors import ImageError, first_line
+from deepdetect._shared.opencv import import_pycolmap
+from deepdetect.geometry.camera import cross_matrix
+from deepdetect.io.gps import read_gps
+from deepdetect.io.image import UPRIGHT, orientation_of
+from deepdetect.io.image_file import open_image
+
+from .pair_selection import FRAME_DISTANCES, sequence_pairs, unordered_pairs
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
+
+MAX_ROTATION_ERROR = 1e-3
+"""By which a rotation's columns may fail to be orthonormal: files have few digits."""
+
+MAX_ASPECT_ERROR = 0.01
+"""By which an image may be stretched against the size that its camera is for: sizes are whole."""
+
+COLMAP_FILES = ("images.bin", "images.txt")
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImage:
+    """An image and its camera; centre of the first pixel (0, 0).
+
+    Attributes:
+        path: the image's file.
+        intrinsics: (3, 3) float64 camera matrix in pixels of this file.
+        rotation, translation: (3, 3) and (3,) float64, world to camera: X_camera = rotation @
+            X_world + translation, in the scene's unit of length.
+    """
+
+    path: Path
+    intrinsics: np.ndarray
+    rotation: np.ndarray
+    translation: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class PosedPair:
+    """Two images of a scene, and how many frames lie between them, None for unordered images."""
+
+    scene: str
+    first: PosedImage
+    second: PosedImage
+    frame_distance: int | None = None
+
+    @property
+    def name(self) -> str:
+        """As in "fountain 0000-0005"."""
+        return f"{self.scene} {self.first.path.stem}-{self.second.path.stem}"
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """The (3, 3) relative rotation: X_second = rotation @ X_first + translation."""
+        return self.second.rotation @ self.first.rotation.T
+
+    @property
+    def translation(self) -> np.ndarray:
+        """The (3,) relative translation, in the scene's unit of length."""
+        return self.second.translation - self.rotation @ self.first.translation
+
+    @property
+    def fundamental(self) -> np.ndarray:
+        """The (3, 3) fundamental matrix in pixels, x1^T F x0 = 0."""
+        essential = cross_matrix(self.translation) @ self.rotation
+        inverses = [np.linalg.inv(image.intrinsics) for image in (self.first, self.second)]
+        return inverses[1].T @ essential @ inverses[0]
+
+
+@dataclass(frozen=True, eq=False)
+class PosedScene:
+    """A scene.
+
+    Attributes:
+        name: the folder's.
+        images: all of them, by name.
+        pairs: those that were chosen.
+        located_only: whether only the places of the cameras are known, in metres, as GPS has them;
+            intrinsics and rotations say nothing, and there are no pairs.
+    """
+
+    name: str
+    images: tuple[PosedImage, ...]
+    pairs: tuple[PosedPair, ...]
+    located_only: bool = False
+
+
+def load_posed_scenes(
+    folder: str | Path, max_pairs: int = 60, located: bool = False
+) -> list[PosedScene]:
+    """Read the scene that a folder is, or those that its subfolders are.
+
+    Args:
+        folder: a scene in one of the three layouts, or a folder of scenes.
+        max_pairs: at most this many pairs of a scene. Of images in no order all pairs, where there
+            are more an evenly spaced choice; of a sequence as many at each of `FRAME_DISTANCES`.
+        located: take folders, too, whose first image has a satellite fix.
+
+    Raises:
+        ImageError: there is no scene, or a file of one is missing or damaged.
+        MissingExtraError: pycolmap, which reads COLMAP's layout, is not installed.
+    """
+    root = Path(folder).resolve()
+    below = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
+    folders = [root] if _reader(root, located) else below
+    readers = {path: read for path in folders if (read := _reader(path, located)) is not None}
+    if not readers:
+        raise ImageError(
+            f"there are no images with cameras in {folder}: it, or each of its folders, must hold "
+            "NNNN.camera files (Strecha), calib.txt or K.txt and poses.txt (KITTI), or images.txt "
+            "or images.bin (COLMAP)"
+        )
+    return [_load_scene(path, read, max_pairs) for path, read in readers.items()]
+
+
+def _reader(folder: Path, located: bool) -> Callable[[Path], list[PosedImage]] | None:
+    if any(folder.glob("*.camera")):
+        return _read_strecha
+    if (folder / "poses.txt").is_file() and _kitti_calibration(folder).is_file():
+        return _read_kitti
+    if _colmap_model(folder) is not None:
+        return _read_colmap
+    if located and folder.is_dir():
+        first = min((path for path in folder.iterdir() if path.suffix in SUFFIXES), default=None)
+        if first is not None and read_gps(first) is not None:
+            return _read_located
+    return None
+
+
+def _load_scene(
+    folder: Path, read: Callable[[Path], list[PosedImage]], max_pairs: int
+) -> PosedScene:
+    images, name = read(folder), folder.name
+    if read is _read_located:
+        return PosedScene(name, tuple(images), (), located_only=True)
+    pairs = []
+    distances = ""
+    if read is _read_kitti:
+        distances = f" at the frame distances {FRAME_DISTANCES}"
+        of_frame = {int(image.path.stem): image for image in images}
+        for a, b in sequence_pairs([*of_frame], max_pairs, FRAME_DISTANCES):
+            pairs.append(PosedPair(name, of_frame[a], of_frame[b], b - a))
+    elif len(images) > 1:
+        for a, b in unordered_pairs(len(images), max_pairs):
+            pairs.append(PosedPair(name, images[a], images[b]))
+    if not pairs:
+        raise ImageError(f"there are no two images with cameras{distances} in {folder}: add some")
+    return PosedScene(name, tuple(images), tuple(pairs))
+
+
+def _read_strecha(folder: Path) -> list[PosedImage]:
+    """Read K, a row of zeros, the camera's axes and its centre in the world, and the size."""
+    images = []
+    for file in sorted(folder.glob("*.camera")):
+        numbers = _numbers(_text(file).split(), 26, str(file))
+        size = (numbers[24], numbers[25])
+        stem = folder / file.name.removesuffix(".camera")
+        found = [path for end in ("", *SUFFIXES) if (path := Path(f"{stem}{end}")).is_file()]
+        if not found:
+            raise ImageError(f"there is no image {stem}.jpg or .png for {file}: put it there")
+        intrinsics = _scaled(numbers[:9].reshape(3, 3), size, found[0], file)
+        axes, centre = numbers[12:21].reshape(3, 3), numbers[21:24]
+        images.append(_posed_image(found[0], intrinsics, axes.T, -axes.T @ centre, file))
+    return images
+
+
+def _kitti_calibration(folder: Path) -> Path:
+    calibration = folder / "calib.txt"
+    return calibration if calibration.is_file() else folder / "K.txt"
+
+
+def _read_kitti(folder: Path) -> list[PosedImage]:
+    calibration, poses = _kitti_calibration(folder), folder / "poses.txt"
+    if calibration.name == "K.txt":
+        matrix = _numbers(_text(calibration).split(), 9, str(calibration)).reshape(3, 3)
+        projection = np.column_stack([matrix, np.zeros(3)])
+    else:
+        words = (_text(calibration).splitlines() or [""])[0].split()
+        if words and words[0].endswith(":"):
+            words = words[1:]
+        projection = _numbers(words, 12, f"the first line of {calibration}").reshape(3, 4)
+    lines = [line for line in _text(poses).splitlines() if line.strip()]
+    images = []
+    for path in sorted(folder.iterdir()):
+        if path.suffix not in SUFFIXES or not path.stem.isdecimal():
+            continue
+        frame = int(path.stem)
+        if frame >= len(lines):
+            raise ImageError(
+                f"{poses} has {len(lines)} lines and no pose of {path.name}: line 1 is of 000000"
+            )
+        where = f"line {frame + 1} of {poses}"
+        pose = _numbers(lines[frame].split(), 12, where).reshape(3, 4)
+        axes, centre = pose[:, :3], pose[:, 3]
+        image = _posed_image(path, projection[:, :3], axes.T, -axes.T @ centre, where)
+        _image_size(path)  # damaged images are an error, and those that are to be turned
+        # The poses are of the first camera; the last column leads from it to the images' own.
+        offset = np.linalg.solve(image.intrinsics, projection[:, 3])
+        images.append(replace(image, translation=image.translation + offset))
+    return images
+
+
+def _colmap_model(folder: Path) -> Path | None:
+    """Return where a model of COLMAP lies, or None."""
+    places = [folder, folder / "sparse", folder / "sparse" / "0"]
+    return next((p for p in places if any((p / name).is_file() for name in COLMAP_FILES)), None)
+
+
+def _read_colmap(folder: Path) -> list[PosedImage]:
+    place = _colmap_model(folder) or folder
+    try:
+        model = import_pycolmap("COLMAP's model").Reconstruction(place)
+    except (ValueError, IndexError, RuntimeError) as error:  # by what is wrong with it
+        raise ImageError(
+            f"{place} holds no model that pycolmap can read ({first_line(error)}): write cameras, "
+            "images and points3D with COLMAP"
+        ) from None
+    images = []
+    for image in model.images.values():
+        paths = [path for part in ("", "images") if (path := folder / part / image.name).is_file()]
+        if not paths:
+            raise ImageError(
+                f"there is no image {image.name} in {folder} or its images: put it there"
+            )
+        camera, pose = image.camera, image.cam_from_world()
+        if camera.model_name not in ("SIMPLE_PINHOLE", "PINHOLE"):
+            raise ImageError(
+                f"a camera in {place} is of the model {camera.model_name}, not PINHOLE: undistort "
+                "the images first (colmap image_undistorter)"
+            )
+        # The centre of COLMAP's first pixel is (0.5, 0.5).
+        matrix = camera.calibration_matrix() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        matrix = _scaled(matrix, (camera.width, camera.height), paths[0], place)
+        rotation, translation = pose.rotation.matrix(), np.array(pose.translation)
+        images.append(_posed_image(paths[0], matrix, rotation, translation, place))
+    return sorted(images, key=lambda image: image.path)
+
+
+def _read_located(folder: Path) -> list[PosedImage]:
+    paths = sorted(path for path in folder.iterdir() if path.suffix in SUFFIXES)
+    fixes = [(path, fix) for path in paths if (fix := read_gps(path)) is not None]
+    places = np.nan_to_num([(fix.latitude, fix.longitude, fix.altitude) for _, fix in fixes])
+    pycolmap = import_pycolmap("places of satellite fixes")
+    ellipsoid = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    metres = np.asarray(ellipsoid.ellipsoid_to_enu(places, *places[0]))
+    nothing = np.eye(3)
+    return [
+        PosedImage(path, nothing, nothing, -place)
+        for (path, _), place in zip(fixes, metres, strict=True)
+    ]
+
+
+def _posed_image(
+    path: Path,
+    intrinsics: np.ndarray,
+    rotation: np.ndarray,
+    translation: np.ndarray,
+    where: str | Path,
+) -> PosedImage:
+    """Check the camera of an image."""
+    wrong = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if wrong > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
+        raise ImageError(f"{where} holds no rotation: its columns must be orthonormal")
+    lower = [intrinsics[1, 0], intrinsics[2, 0], intrinsics[2, 1], intrinsics[2, 2] - 1]
+    if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0 or np.any(lower):
+        raise ImageError(
+            f"the camera of {path.name} has no camera matrix with focal lengths above 0 and a last "
+            f"row 0 0 1: correct the file that {where} belongs to"
+        )
+    return PosedImage(path, intrinsics, rotation, translation)
+
+
+def _scaled(
+    intrinsics: np.ndarray, size: tuple[float, float], image: Path, file: Path
+) -> np.ndarray:
+    """Scale intrinsics for a (width, height) to the image: pixels are areas, so edges map."""
+    own = _image_size(image)
+    if min(size) <= 0 or abs(own[0] * size[1] / (own[1] * size[0]) - 1) > MAX_ASPECT_ERROR:
+        raise ImageError(
+            f"{image} is {own[0]}x{own[1]} pixels, but {file} is for {size[0]:g}x{size[1]:g}: take "
+            "images of the same shape"
+        )
+    x, y = (mine / its for mine, its in zip(own, size, strict=True))
+    return np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1]]) @ intrinsics
+
+
+def _image_size(path: Path) -> tuple[int, int]:
+    with open_image(path) as opened:
+        size: tuple[int, int] = opened.size
+        turned = orientation_of(opened) in UPRIGHT
+    if turned:
+        raise ImageError(
+            f"{path} is to be turned by its EXIF orientation: save it upright without that tag"
+        )
+    return size
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ImageError(f"{path} cannot be read ({error.strerror}): check the folder") from None
+    except UnicodeDecodeError:
+        raise ImageError(f"{path} is no text: get it again") from None
+
+
+def _numbers(words: Sequence[str], count: int, where: str) -> np.ndarray:
+    try:
+        numbers = np.array(words, np.float64)
+    except ValueError:
+        numbers = np.empty(0)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise ImageError(f"{where} must hold {count} numbers: get the file again")
+    return numbers

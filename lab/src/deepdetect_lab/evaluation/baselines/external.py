@@ -1,0 +1,217 @@
+"""Detectors from outside by name: a classical one, an ONNX file, or any function Python can import.
+
+A function is named as "package.module:function"; it takes a (H, W, 3) uint8 RGB image and returns a
+dict with `keypoints` (N, 2), `scores` (N,) and optionally `descriptors` (N, D). Attributes of the
+function say more: `learned` (descriptors that need no ratio test), `binary` (compared by Hamming's
+distance), and `version`, to be changed when its results change: of its sources only the module's
+own file is watched.
+
+An ONNX file has one input, 1x3xHxW RGB or 1x1xHxW grey (the mean of the three) in [0, 1], of any or
+of a fixed size, and the outputs of that dict in that frame, like XFeat's; each may have a leading
+dimension of 1. Or it has maps, like EdgePoint2's: `scores` 1x1xHxW, logits of which the maxima are
+keypoints, and `descriptors` 1xDxhxw. An image is resized to a fixed size, or for maps to sides that
+are multiples of 32, and the keypoints are scaled back.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from deepdetect._shared.errors import OptionError, WeightsError, first_line
+from deepdetect._shared.opencv import cv2
+from deepdetect._shared.options import look_up
+from deepdetect._shared.records import file_digest
+from deepdetect._shared.runtimes import import_openvino, start_session
+from deepdetect.features.keypoints import Keypoints
+
+from .hessian import HESSIAN
+from .method import COMMON_DESCRIPTOR, BaselineError, LocalFeature
+from .opencv import CLASSICAL
+
+MAP_SIDE, MAP_BORDER_PX, MAP_LEAST_LOGIT, MAP_WINDOW = 32, 4, -5, np.ones((5, 5), np.uint8)
+"""EdgePoint2's, of files with maps: sides are multiples of it; keypoints are so far from the border
+or farther, have more than such a logit, and are the highest of such a window."""
+
+
+def find_feature(word: str) -> LocalFeature:
+    """Find a local feature by its name, an ONNX file, or "package.module:function".
+
+    Raises:
+        OptionError: there is none.
+        WeightsError: the file cannot be used.
+    """
+    if Path(word).suffix == ".onnx":
+        return onnx_feature(word)
+    if ":" in word:
+        return plugin_feature(word)
+    try:
+        return look_up("method", word, {**CLASSICAL, **HESSIAN})
+    except OptionError as error:
+        raise OptionError(f"{error}; or give an ONNX file, or package.module:function") from None
+
+
+def plugin_feature(target: str) -> LocalFeature:
+    """Make a local feature of a function; modules in the current folder are found too."""
+    module, _, name = target.partition(":")
+    here = str(Path.cwd())
+    sys.path.insert(0, here)
+    try:
+        function = getattr(importlib.import_module(module), name)
+    except Exception as error:  # the module's own code runs here
+        raise OptionError(
+            f"{target} cannot be imported ({first_line(error)}): name it as package.module:function"
+        ) from None
+    finally:
+        sys.path.remove(here)
+    if not callable(function):
+        raise OptionError(f"{target} is no function: it must take an image and return a dict")
+    source = getattr(sys.modules[module], "__file__", None)
+    watched = str(Path(source).stat().st_mtime_ns) if source else "1"
+    version = f"{getattr(function, 'version', '')} {watched}"
+    learned, binary = (bool(getattr(function, kind, False)) for kind in ("learned", "binary"))
+    return _external_feature(target, function, version, learned, binary)
+
+
+def onnx_feature(
+    path: str | Path, backend: str = "onnxruntime", threads: int | None = None
+) -> LocalFeature:
+    """Make a local feature of an ONNX file, run by "onnxruntime" or "openvino".
+
+    Raises:
+        WeightsError: the file cannot be opened, or has other inputs or outputs.
+    """
+    file = Path(path)
+    try:
+        version = file_digest(file)[:16]
+        network = _OPENERS[backend](file, threads)
+    except Exception as error:  # the exceptions of runtimes have no common base
+        raise WeightsError(f"{file} is no ONNX file that runs ({first_line(error)})") from None
+    shapes = network.shapes
+    if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] not in (1, 3):
+        raise WeightsError(f"{file} must have one input 1x3xHxW, RGB, or 1x1xHxW, not {shapes}")
+    if "scores" not in network.outputs or not {"keypoints", "descriptors"} & {*network.outputs}:
+        raise WeightsError(
+            f"{file} must have the outputs scores and keypoints, or maps scores and descriptors, "
+            f"not {network.outputs}"
+        )
+    learned = "descriptors" in network.outputs
+    return _external_feature(file.stem, partial(_run_onnx, network), version, learned)
+
+
+class _Network(NamedTuple):
+    """An ONNX file that is open; sides that are not fixed are no ints."""
+
+    shapes: list[list[Any]]
+    outputs: list[str]
+    run: Callable[[np.ndarray], Iterable[np.ndarray]]
+
+
+def _open_onnxruntime(path: Path, threads: int | None) -> _Network:
+    session = start_session(str(path), threads)
+    shapes, outputs = [x.shape for x in session.get_inputs()], session.get_outputs()
+    name = session.get_inputs()[0].name
+    return _Network(
+        shapes, [x.name for x in outputs], lambda planes: session.run(None, {name: planes})
+    )
+
+
+def _open_openvino(path: Path, threads: int | None) -> _Network:
+    settings: dict[str, object] = {"INFERENCE_PRECISION_HINT": "f32"}
+    if threads is not None:
+        settings["INFERENCE_NUM_THREADS"] = threads
+    model = import_openvino().Core().compile_model(str(path), "CPU", settings)
+    shapes = [
+        [side.get_length() if side.is_static else None for side in x.partial_shape]
+        for x in model.inputs
+    ]
+    outputs = [x.get_any_name() for x in model.outputs]
+    return _Network(shapes, outputs, lambda planes: model([planes]).to_tuple())
+
+
+_OPENERS = {"onnxruntime": _open_onnxruntime, "openvino": _open_openvino}
+
+
+def _run_onnx(network: _Network, rgb: np.ndarray) -> dict[str, np.ndarray]:
+    height, width = rgb.shape[:2]
+    channels, *sides = network.shapes[0][1:]
+    maps = "keypoints" not in network.outputs
+    wanted = [
+        side if isinstance(side, int) else max(1, round(own / MAP_SIDE)) * MAP_SIDE if maps else own
+        for side, own in zip(sides, (height, width), strict=True)
+    ]
+    # Area averaging where pixels fall together; where the image grows, that would repeat pixels.
+    smaller = wanted[0] <= height and wanted[1] <= width
+    method = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+    resized = cv2.resize(rgb, (wanted[1], wanted[0]), interpolation=method)
+    planes = np.ascontiguousarray(resized.transpose(2, 0, 1)[None], np.float32) / 255
+    if channels == 1:
+        planes = planes.mean(axis=1, keepdims=True)
+    found = dict(zip(network.outputs, network.run(planes), strict=True))
+    if maps:
+        parts = _maxima(found["scores"][0, 0], found["descriptors"][0])
+    else:
+        parts = {
+            name: value[0] if value.ndim == rank + 1 else value
+            for name, rank in (("keypoints", 2), ("scores", 1), ("descriptors", 2))
+            if (value := found.get(name)) is not None
+        }
+    # The borders of both frames are the same lines, half a pixel before the first centre.
+    scale = np.array([width / wanted[1], height / wanted[0]])
+    return {**parts, "keypoints": (parts["keypoints"] + 0.5) * scale - 0.5}
+
+
+def _maxima(logits: np.ndarray, descriptors: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the maxima of (H, W) logits, with descriptors of a (D, h, w) map."""
+    peaks = (logits == cv2.dilate(logits, MAP_WINDOW)) & (logits > MAP_LEAST_LOGIT)
+    inner = slice(MAP_BORDER_PX, -MAP_BORDER_PX)
+    xy = np.argwhere(peaks[inner, inner])[:, ::-1] + MAP_BORDER_PX
+    scale = np.divide(descriptors.shape[:0:-1], logits.shape[::-1])
+    last = np.array(descriptors.shape[:0:-1]) - 1
+    place = np.clip((xy + 0.5) * scale - 0.5, 0, last)
+    column, row = np.floor(np.minimum(place, last - 1)).astype(int).T
+    right, below = place.T - (column, row)
+    values = sum(
+        descriptors[:, row + down, column + aside]
+        * (np.abs(1 - down - below) * np.abs(1 - aside - right)).astype(np.float32)
+        for down, aside in np.ndindex(2, 2)
+    )
+    scores = logits[xy[:, 1], xy[:, 0]]
+    return {
+        "keypoints": xy,
+        "scores": scores,
+        "descriptors": (values / np.linalg.norm(values, axis=0)).T,
+    }
+
+
+def _external_feature(
+    name: str,
+    detect: Callable[[np.ndarray], Any],
+    version: str,
+    learned: bool,
+    binary: bool = False,
+) -> LocalFeature:
+    def run(rgb: np.ndarray) -> Keypoints:
+        size = (rgb.shape[1], rgb.shape[0])
+        try:
+            found = detect(rgb)
+            return Keypoints(
+                found["keypoints"], found["scores"], size, descriptors=found.get("descriptors")
+            )
+        except Exception as error:  # anyone's code
+            raise BaselineError(
+                f"{name} made no keypoints and scores: {type(error).__name__}: {first_line(error)}"
+            ) from error
+
+    def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:
+        if features.descriptors is None:
+            return COMMON_DESCRIPTOR.describe(rgb, features)
+        return features.descriptors
+
+    return LocalFeature(name, name, run, describe, binary, learned, version=version)

@@ -1,0 +1,75 @@
+"""The determinant of the Hessian, at one scale and in scale space, ranked by its magnitude.
+
+One line of OpenCV for each scale and no training: what a learned ranking of keypoints has to beat.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from deepdetect._shared.opencv import cv2
+from deepdetect.features.keypoints import Keypoints
+from deepdetect.features.selection import SelectionOptions, select_keypoints, suppress_neighbors
+from deepdetect.io.image import luma
+
+from .method import PAPER_DESCRIPTOR, LocalFeature, OwnScaleDescriptor
+
+SIGMA_PX = 3.0
+
+SIGMAS_PX = tuple(float(sigma) for sigma in np.geomspace(1.5, 9.1, 7))
+"""Of the scale space: a factor of 1.35 from one to the next."""
+
+NMS_RADIUS = 2
+DISTANCE_PX = 2.0
+"""Least distance of two keypoints of the scale space."""
+
+SIZE_PER_SIGMA = 5.0
+"""Diameter of a keypoint: 2.5 sigma around it."""
+
+
+def hessian_response(gray: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Compute |det H| sigma^4, (H, W) float32, of an image in [0, 1]: scales can be compared."""
+    scaled = gray.astype(np.float32) / 255 if gray.dtype == np.uint8 else gray
+    smooth = cv2.GaussianBlur(scaled, (0, 0), sigma_px)
+    second = np.array([[1, -2, 1]], np.float32)
+    diagonal = np.array([[1, 0, -1], [0, 0, 0], [-1, 0, 1]], np.float32) / 4
+    xx, yy, xy = (cv2.filter2D(smooth, -1, kernel) for kernel in (second, second.T, diagonal))
+    return np.abs(xx * yy - xy * xy) * np.float32(sigma_px**4)
+
+
+def detect_hessian(gray: np.ndarray, sigma_px: float = SIGMA_PX) -> Keypoints:
+    """Detect the maxima of `hessian_response` in windows of 5x5, with sub-pixel positions."""
+    response = hessian_response(gray, sigma_px)
+    options = SelectionOptions(threshold=0, nms_radius=NMS_RADIUS, subpixel=True)
+    found = select_keypoints(response, options)
+    sizes = np.full(len(found), SIZE_PER_SIGMA * sigma_px, np.float32)
+    return Keypoints(found.xy, found.scores, found.image_size, sizes=sizes)
+
+
+def detect_hessian_scales(gray: np.ndarray) -> Keypoints:
+    """Detect the maxima at each scale; of neighbours, also of other scales, the best stays."""
+    scales = [detect_hessian(gray, sigma) for sigma in SIGMAS_PX]
+    xy, scores = (np.concatenate([getattr(p, name) for p in scales]) for name in ("xy", "scores"))
+    sizes = np.repeat([SIZE_PER_SIGMA * sigma for sigma in SIGMAS_PX], [len(p) for p in scales])
+    kept = suppress_neighbors(xy, scores, DISTANCE_PX)
+    return Keypoints(xy[kept], scores[kept], scales[0].image_size, sizes=sizes[kept])
+
+
+HESSIAN: dict[str, LocalFeature] = {
+    name: LocalFeature(
+        name,
+        title,
+        detect,
+        PAPER_DESCRIPTOR.describe,
+        own_scale=OwnScaleDescriptor(0.5),  # a size of 2.5 sigma; SIFT has 2
+    )
+    for name, title, detect in (
+        ("hessian", f"|det Hessian|, sigma {SIGMA_PX:g}", lambda rgb: detect_hessian(luma(rgb))),
+        (
+            "hessian-scales",
+            f"|det Hessian|, {len(SIGMAS_PX)} scales",
+            lambda rgb: detect_hessian_scales(luma(rgb)),
+        ),
+    )
+}
+"""By name; rows of the standard protocol, none of the paper's."""

@@ -1,0 +1,163 @@
+"""What a benchmark compares: a detector with the descriptor that is used for its keypoints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deepdetect._shared.errors import DeepDetectError, OptionError
+from deepdetect._shared.records import file_digest
+from deepdetect.detector.detector import find_keypoints
+from deepdetect.detector.point_detector import PointDetector
+from deepdetect.features.keypoints import Keypoints
+from deepdetect.features.scale_space import dominant_angles
+from deepdetect.features.selection import SelectionOptions
+from deepdetect.features.sift import DESCRIPTORS, scaled_sift_descriptors, to_root_sift
+from deepdetect.io.image import luma
+
+
+class BaselineError(DeepDetectError):
+    """A detector or descriptor from outside the package failed, or returned something unusable."""
+
+
+@dataclass(frozen=True)
+class LocalFeature:
+    """A detector and its descriptor, by a name as "sift-low" and a title as tables have it.
+
+    Attributes:
+        detect: function from a (H, W, 3) uint8 RGB image to its keypoints.
+        describe: function from the image and its keypoints to (N, D) descriptors.
+        binary: the descriptors are compared by Hamming's distance, else by Euclid's.
+        learned: the descriptors were learned for their detector and need no ratio test.
+        version: what results depend on besides the name: cached ones of another are not used.
+        detection: what the keypoints depend on, where several features share them.
+        own_scale: how keypoints with sizes of their own are described at these.
+    """
+
+    name: str
+    title: str
+    detect: Callable[[np.ndarray], Keypoints]
+    describe: Callable[[np.ndarray, Keypoints], np.ndarray]
+    binary: bool = False
+    learned: bool = False
+    version: str = "1"
+    detection: str = ""
+    own_scale: OwnScaleDescriptor | None = None
+
+    def __post_init__(self) -> None:
+        if not self.detection:
+            object.__setattr__(self, "detection", f"{self.name} {self.version}")
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """What results depend on besides the images."""
+        return self.name, self.version
+
+
+@dataclass(frozen=True)
+class PointDescriptor:
+    """How keypoints are described by their positions alone; the defaults are the paper's.
+
+    An angle of -1 is OpenCV's "unset".
+    """
+
+    name: str = "sift"
+    size_px: float = 3.0
+    angle_deg: float = -1.0
+
+    def describe(self, rgb: np.ndarray, features: Keypoints) -> np.ndarray:
+        """Return (N, D) float32 descriptors."""
+        return DESCRIPTORS[self.name](luma(rgb), features.xy, self.size_px, self.angle_deg)
+
+
+PAPER_DESCRIPTOR = PointDescriptor()
+
+COMMON_DESCRIPTOR = PointDescriptor("rootsift", 4.0, 0.0)
+"""Of all detectors without descriptors of their own in the standard protocol."""
+
+
+@dataclass(frozen=True)
+class OwnScaleDescriptor:
+    """RootSIFT of keypoints at their own sizes and angles; without angles the dominant gradient's.
+
+    A descriptor covers a square with six times its size as the side; the factor scales the size.
+    """
+
+    size_factor: float = 1.0
+
+    def describe(self, rgb: np.ndarray, features: Keypoints) -> np.ndarray:
+        """Describe keypoints by positions, sizes and angles; (N, 128) uint8."""
+        if features.sizes is None:  # where none was found
+            return np.zeros((0, 128), np.uint8)
+        gray = luma(rgb)
+        sizes = self.size_factor * features.sizes
+        angles = features.angles
+        if angles is None:
+            angles = dominant_angles(gray, features.xy, sizes)
+        return to_root_sift(scaled_sift_descriptors(gray, features.xy, sizes, angles))
+
+
+def with_own_scale(feature: LocalFeature) -> LocalFeature:
+    """Return a feature whose keypoints are described at their own sizes and angles."""
+    if feature.own_scale is None:
+        raise OptionError(f"the keypoints of {feature.title} have no sizes of their own")
+    title = f"{feature.title}, own size and angle"
+    return _described(feature, feature.own_scale, f"{feature.name}-own-scale", title)
+
+
+def with_common_descriptor(feature: LocalFeature) -> LocalFeature:
+    """Return a feature with the descriptor that all detectors get in the standard protocol."""
+    return _described(feature, COMMON_DESCRIPTOR, f"{feature.name}-common", feature.title)
+
+
+def _described(
+    feature: LocalFeature, descriptor: PointDescriptor | OwnScaleDescriptor, name: str, title: str
+) -> LocalFeature:
+    """Describe each position once: SIFT has some for several orientations."""
+    return replace(
+        feature,
+        name=name,
+        title=title,
+        detect=lambda rgb: feature.detect(rgb).distinct(),
+        describe=descriptor.describe,
+        binary=False,
+        version=f"{feature.version} {descriptor}",
+        detection=f"{feature.detection}, distinct",
+    )
+
+
+def deepdetect_feature(
+    detector: Any,
+    selection: SelectionOptions = SelectionOptions(),
+    *,
+    name: str = "deepdetect",
+    title: str = "DeepDetect",
+    descriptor: PointDescriptor = PAPER_DESCRIPTOR,
+    version: str = "",
+) -> LocalFeature:
+    """Make a local feature of a detector; with a version, of anything with a method `heatmap`."""
+    if not version:
+        digest = file_digest(detector.weights)[:16]
+        version = f"{digest} {detector.runtime} {detector.heatmap_options} {selection} {descriptor}"
+
+    def detect(rgb: np.ndarray) -> Keypoints:
+        return find_keypoints(detector, rgb, selection)
+
+    return LocalFeature(name, title, detect, descriptor.describe, version=version)
+
+
+def points_feature(ranker: str | Path | None = None) -> LocalFeature:
+    """Make a local feature of the ranked keypoints of all scales, at the image's own size."""
+    detector = PointDetector(None, resolution="native", ranker=ranker)
+    return LocalFeature(
+        "deepdetect-points",
+        "DeepDetect, points",
+        detector.detect,
+        PAPER_DESCRIPTOR.describe,
+        version=str(detector.settings),
+        own_scale=OwnScaleDescriptor(),
+    )

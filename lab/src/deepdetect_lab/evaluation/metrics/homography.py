@@ -1,0 +1,110 @@
+"""What a true homography says: of points, of matches, and of an estimated homography."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from deepdetect.geometry.transforms import transfer_errors, transform_points
+
+CORNER_THRESHOLDS_PX = (1.0, 3.0, 5.0)
+
+MATCH_THRESHOLDS_PX = tuple(range(1, 11))
+"""Of the mean matching accuracy."""
+
+Sizes = tuple[tuple[int, int], tuple[int, int]]
+"""(width, height) of both images."""
+
+
+def inside(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return which (N, 2) points lie in an image, (N,) bool; false where one is not finite.
+
+    The image reaches half a pixel beyond the centres of its outer pixels.
+    """
+    points = np.asarray(points, np.float64).reshape(-1, 2)
+    return np.all((points >= -0.5) & (points < np.asarray(size) - 0.5), axis=1)
+
+
+def project_visible(
+    points: np.ndarray, homography: np.ndarray, size: tuple[int, int]
+) -> np.ndarray:
+    """Map (N, 2) points into another image; those that it does not show become NaN.
+
+    A homography also maps what lies beyond its horizon, where the plane is not visible, but turns
+    it inside out: the determinant of its Jacobian, det(H) / depth^3, is negative there.
+    """
+    depth = np.asarray(points, np.float64).reshape(-1, 2) @ homography[2, :2] + homography[2, 2]
+    mapped = transform_points(points, homography)
+    visible = inside(mapped, size) & (depth * np.linalg.det(homography) > 0)
+    return np.where(visible[:, None], mapped, np.nan)
+
+
+def match_accuracy(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    keypoints0: np.ndarray,
+    keypoints1: np.ndarray,
+    homography: np.ndarray,
+    sizes: Sizes,
+) -> dict[Any, Any]:
+    """Evaluate (M, 2) matched positions of two images beside all (N, 2) keypoints of both.
+
+    Returns "matches", their number; by distance of 1 to 10 px in the second image ("correct", px),
+    how many are at most that far off, ("precision", px), their fraction (D2-Net's matching
+    accuracy), and ("score", px), those that both images show over the keypoints that could have a
+    match (Mikolajczyk's matching score).
+    """
+    errors = transfer_errors(points0, points1, homography)
+    back = np.linalg.inv(homography)
+
+    def visible(points: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        return np.isfinite(project_visible(points, matrix, size)[:, 0])
+
+    fewest = min(
+        visible(keypoints0, homography, sizes[1]).sum(), visible(keypoints1, back, sizes[0]).sum()
+    )
+    both = visible(points0, homography, sizes[1]) & visible(points1, back, sizes[0])
+    found: dict[Any, Any] = {"matches": len(errors)}
+    for px in MATCH_THRESHOLDS_PX:
+        correct = errors <= px
+        found["correct", px] = int(correct.sum())
+        found["precision", px] = int(correct.sum()) / len(errors) if len(errors) else 0.0
+        found["score", px] = int(correct[both].sum()) / int(fewest) if fewest else 0.0
+    return found
+
+
+def corner_error(estimated: np.ndarray | None, true: np.ndarray, size: tuple[int, int]) -> float:
+    """Return the mean distance of the first image's corners under two homographies, in pixels.
+
+    Of centres of corner pixels (SuperPoint's metric, DeTone 2018). Infinite without an estimate.
+    """
+    if estimated is None:
+        return float("inf")
+    right, bottom = size[0] - 1, size[1] - 1
+    corners = np.array([[0, 0], [right, 0], [right, bottom], [0, bottom]], np.float64)
+    gaps = transform_points(corners, estimated) - transform_points(corners, true)
+    error = float(np.linalg.norm(gaps, axis=1).mean())
+    return error if np.isfinite(error) else float("inf")
+
+
+def accuracy_at(errors: Sequence[float], threshold: float) -> float:
+    """Return the fraction of the errors that are at most the threshold; 0 when there are none."""
+    return float(np.mean(np.asarray(errors) <= threshold)) if len(errors) else 0.0
+
+
+def area_under_curve(errors: Sequence[float], threshold: float) -> float:
+    """Return the area under the cumulative curve of the errors up to a threshold, over it.
+
+    As SuperGlue and glue-factory compute it: the curve is drawn with straight lines from (0, 0), so
+    it lies up to half an error's share above the mean of `accuracy_at` up to the threshold.
+    """
+    if not len(errors):
+        return 0.0
+    curve = np.concatenate([[0.0], np.sort(np.asarray(errors, np.float64))])
+    recall = np.arange(len(curve)) / len(errors)
+    under = int(np.searchsorted(curve, threshold))
+    x = np.append(curve[:under], threshold)
+    y = np.append(recall[:under], recall[under - 1])
+    return float(np.trapezoid(y, x) / threshold)

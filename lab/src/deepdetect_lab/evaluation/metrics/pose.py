@@ -1,0 +1,95 @@
+"""How far estimated cameras are from the true ones: two by two, with the AUC, or all together."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from deepdetect.geometry.camera import PosedView
+from deepdetect.geometry.relative_pose import rotation_angle
+from deepdetect.geometry.similarity import least_squares_similarity
+from deepdetect.geometry.transforms import epipolar_errors
+
+POSE_THRESHOLDS_DEG = (5.0, 10.0, 20.0)
+"""Of the AUC."""
+
+LINE_WIDTH = 0.01
+"""Of the spread of centres along a line: with less across it, they are on it."""
+
+EPIPOLAR_THRESHOLD_PX = 1.0
+"""Within which a match agrees with the true pose."""
+
+
+def rotation_error(estimated: np.ndarray, true: np.ndarray) -> float:
+    """Return the angle between two (3, 3) rotations, in degrees from 0 to 180."""
+    return rotation_angle(estimated @ true.T)
+
+
+def translation_error(estimated: np.ndarray, true: np.ndarray) -> float:
+    """Return the angle between the directions of two translations, in degrees from 0 to 180.
+
+    SuperGlue and glue-factory count an opposite direction as right; here it is wrong, as the points
+    in front of the cameras decide it. A true translation of length 0 has no direction: error 0.
+    """
+    across = float(np.linalg.norm(np.cross(estimated, true)))
+    return float(np.degrees(np.arctan2(across, np.dot(estimated, true))))
+
+
+def epipolar_inlier_ratio(
+    points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
+) -> float:
+    """Return the fraction of the matches whose Sampson distance is under the threshold.
+
+    A match that slid along its line agrees too: an upper bound of the precision. 0 without any.
+    """
+    if not len(points0):
+        return 0.0
+    errors = epipolar_errors(points0, points1, fundamental)
+    return float((errors < EPIPOLAR_THRESHOLD_PX).mean())
+
+
+def camera_errors(
+    views: Sequence[PosedView], truth: Sequence[PosedView]
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Compare three or more cameras with the true ones, after a rotation, a shift and a scale.
+
+    These bring the centres nearest to the true ones (least squares; Umeyama, 1991). Returns the
+    distances of the centres in the unit of the truth, the angles of the rotations in degrees, and
+    the scale. Centres on a line leave the rotation about it open: the angles are NaN.
+    """
+    own = np.array([view.centre for view in views])
+    true = np.array([view.centre for view in truth])
+    moved = least_squares_similarity(own, true)
+    if moved is None:
+        return np.full(len(own), np.nan), np.full(len(own), np.nan), np.nan
+    angles = np.array(
+        [
+            rotation_error(view.rotation @ moved.rotation.T, other.rotation)
+            for view, other in zip(views, truth, strict=True)
+        ]
+    )
+    along, across, _ = np.linalg.svd(true - true.mean(axis=0), compute_uv=False)
+    if across <= LINE_WIDTH * along:
+        angles[:] = np.nan
+    return np.linalg.norm(moved.apply(own) - true, axis=1), angles, moved.scale
+
+
+def relative_pose_errors(
+    views: Mapping[str, PosedView], truth: Mapping[str, PosedView]
+) -> list[float]:
+    """Return the error of each pair's relative pose in degrees, for `area_under_curve`.
+
+    The larger of the angles of the rotation and between the directions of the translation; infinite
+    where one of both cameras is missing. It needs no alignment.
+    """
+    errors = []
+    for pair in itertools.combinations(sorted(truth), 2):
+        if not set(pair) <= set(views):
+            errors.append(float("inf"))
+            continue
+        moved, true = (each[pair[1]].relative_to(each[pair[0]]) for each in (views, truth))
+        angle = rotation_error(moved.rotation, true.rotation)
+        errors.append(max(angle, translation_error(moved.translation, true.translation)))
+    return errors

@@ -1,0 +1,179 @@
+"""Which keypoints of one image are found again in another, and where in the image they lie.
+
+The paper's definition lets several keypoints share a partner and counts over all keypoints, so a
+full grid of pixels scores best. By mutual nearest neighbours a keypoint has one partner at most,
+only what both images show counts, and random points of the same number say what the value is worth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from deepdetect._shared.errors import require_packages
+from deepdetect.geometry.transforms import transform_points
+
+from .homography import Sizes, project_visible
+
+CHANCE_POINTS = 20_000
+"""Random points that the chance level is computed from, drawn several times where they are few."""
+
+MAX_DRAWS = 100
+MIN_POINTS_FOR_THREADS = 20_000
+
+CELL_PX = 32
+"""Side of the square cells of the coverage."""
+
+
+def repeatability_paper(
+    points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, radius_px: float = 1.0
+) -> float:
+    """Return the repeatability as the paper's code computes it, clipped at 1.
+
+    The points of the first image that land strictly closer than the radius to some point of the
+    second, over the smaller of the two total counts: points outside the overlap count in the
+    denominator, several may share one, and nothing is corrected for chance.
+    """
+    fewest = min(len(points0), len(points1))
+    if not fewest:
+        return 0.0
+    mapped = transform_points(points0, homography)
+    mapped = mapped[np.isfinite(mapped).all(axis=1)]
+    distance, _ = _nearest(_kd_tree(points1), mapped, radius_px)
+    return min(np.count_nonzero(distance < radius_px) / fewest, 1.0)
+
+
+def mutual_nn_repeatability(
+    points0: np.ndarray,
+    points1: np.ndarray,
+    homography: np.ndarray,
+    sizes: Sizes,
+    radii_px: Sequence[float] = (1.0, 2.0, 3.0),
+    with_chance: bool = True,
+) -> list[tuple[float, float, float]]:
+    """Measure the repeatability by mutual nearest neighbours in the overlap, beside chance.
+
+    Returns for each radius the fraction of the fewer keypoints in the overlap that are repeated,
+    the one that as many random points reach (pixels, where the keypoints are pixels; NaN where it
+    is not wanted), and the mean distance of the partners in px, NaN without any.
+    """
+    visible = _in_overlap(points0, points1, homography, sizes)
+    distances = _mutual_distances(*visible, max(radii_px))
+    counts = (len(visible[0]), len(visible[1]))
+    chances = [float("nan")] * len(radii_px)
+    if with_chance:
+        on_pixels = all(bool((np.rint(points) == points).all()) for points in (points0, points1))
+        chances = _chance(counts, homography, sizes, radii_px, on_pixels)
+    results = []
+    for radius, chance in zip(radii_px, chances, strict=True):
+        near = distances[distances <= radius]
+        value = len(near) / min(counts) if min(counts) else 0.0
+        results.append((value, chance, float(near.mean()) if len(near) else float("nan")))
+    return results
+
+
+def _in_overlap(
+    points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, sizes: Sizes
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points of both images that the other one shows, in the second image."""
+    mapped = project_visible(points0, homography, sizes[1])
+    back = project_visible(points1, np.linalg.inv(homography), sizes[0])
+    points1 = np.asarray(points1, np.float64).reshape(-1, 2)
+    return mapped[np.isfinite(mapped[:, 0])], points1[np.isfinite(back[:, 0])]
+
+
+def _kd_tree(points: np.ndarray) -> Any:
+    require_packages("repeatability", "scipy")
+    from scipy.spatial import KDTree
+
+    return KDTree(np.asarray(points, np.float64).reshape(-1, 2))
+
+
+def _nearest(tree: Any, points: np.ndarray, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return distances, infinite beyond the radius, and rows of the nearest points of the tree."""
+    # The bound is exclusive in the tree, and keeps it from searching far.
+    bound = np.nextafter(radius_px, np.inf)
+    workers = -1 if min(tree.n, len(points)) > MIN_POINTS_FOR_THREADS else 1
+    distance, rows = tree.query(points, distance_upper_bound=bound, workers=workers)
+    return distance, rows
+
+
+def _mutual_distances(points0: np.ndarray, points1: np.ndarray, radius_px: float) -> np.ndarray:
+    """Return the distances of the pairs of points that are mutual nearest neighbours."""
+    if not len(points0) or not len(points1):
+        return np.empty(0)
+    distance, nearest = _nearest(_kd_tree(points1), points0, radius_px)
+    _, back = _nearest(_kd_tree(points0), points1, radius_px)
+    rows = np.flatnonzero(np.isfinite(distance))
+    return distance[rows[back[nearest[rows]] == rows]]
+
+
+def _chance(
+    counts: tuple[int, int],
+    homography: np.ndarray,
+    sizes: Sizes,
+    radii_px: Sequence[float],
+    on_pixels: bool,
+) -> list[float]:
+    """Return the values of random points of the same number in the overlap of each image.
+
+    Pixels meet more often than points between them where little moves: five lie within 1 px of
+    one, on an area of 3.14. So points that are not on pixels are compared with such ones.
+    """
+    fewest = min(counts)
+    if not fewest:
+        return [0.0] * len(radii_px)
+    grids = _overlapping_grids(np.asarray(homography, np.float64).tobytes(), sizes)
+    generator = np.random.default_rng(0)
+    draws = min(-(-CHANCE_POINTS // fewest), MAX_DRAWS)
+    found = np.zeros(len(radii_px))
+    for _ in range(draws):
+        # Classical detectors may mark a pixel more than once; random points then do so too.
+        drawn = [
+            grid[generator.choice(len(grid), count, replace=count > len(grid))]
+            for grid, count in zip(grids, counts, strict=True)
+        ]
+        if not on_pixels:
+            drawn = [points + generator.uniform(-0.5, 0.5, points.shape) for points in drawn]
+        distances = _mutual_distances(drawn[0], drawn[1], max(radii_px))
+        found += [(distances <= radius).sum() for radius in radii_px]
+    return [float(value) for value in found / (draws * fewest)]
+
+
+@lru_cache(maxsize=2)  # all keypoint budgets of a pair draw from the same
+def _overlapping_grids(homography: bytes, sizes: Sizes) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixels of both images that the other one shows, in the second image."""
+
+    def grid(size: tuple[int, int]) -> np.ndarray:
+        row, column = np.indices((size[1], size[0]))
+        return np.column_stack([column.ravel(), row.ravel()]).astype(np.float64)
+
+    matrix = np.frombuffer(homography).reshape(3, 3)
+    return _in_overlap(grid(sizes[0]), grid(sizes[1]), matrix, sizes)
+
+
+def coverage(xy: np.ndarray, size: tuple[int, int]) -> float:
+    """Return the fraction of the cells of a grid on a (width, height) image that hold a keypoint.
+
+    Cells at the right and lower border may be smaller.
+    """
+    columns, rows = -(-size[0] // CELL_PX), -(-size[1] // CELL_PX)
+    position = np.floor((np.asarray(xy, np.float64).reshape(-1, 2) + 0.5) / CELL_PX).astype(int)
+    position = np.clip(position, 0, (columns - 1, rows - 1))
+    return len(np.unique(position[:, 1] * columns + position[:, 0])) / (columns * rows)
+
+
+def foreground_fraction(xy: np.ndarray, foreground: np.ndarray) -> float:
+    """Return the fraction of (N, 2) keypoints on a (H, W) bool foreground; NaN without any.
+
+    Section IV-A of the paper.
+    """
+    if not len(xy):
+        return float("nan")
+    height, width = foreground.shape
+    column, row = np.rint(np.asarray(xy)).astype(int).T
+    inside = foreground[np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)]
+    return float(inside.mean())

@@ -1,0 +1,150 @@
+"""What a benchmark compares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from deepdetect._shared.errors import OptionError, check_name
+from deepdetect._shared.options import check_ranges, suggest_keywords
+from deepdetect.detector.detector import DeepDetect
+from deepdetect.detector.heatmap import HeatmapOptions
+from deepdetect.features.selection import SelectionOptions
+
+from .baselines.hessian import HESSIAN
+from .baselines.method import (
+    COMMON_DESCRIPTOR,
+    LocalFeature,
+    deepdetect_feature,
+    points_feature,
+    with_common_descriptor,
+    with_own_scale,
+)
+from .baselines.opencv import CLASSICAL, STANDARD
+from .baselines.random import all_pixels_feature, random_feature
+
+PROTOCOLS = ("paper", "standard", "guided", "degraded")
+DEFAULT_PROTOCOLS = PROTOCOLS[:3]
+"""All but "degraded", which measures everything five times."""
+
+THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
+PAPER_RESOLUTION_PX = 480
+
+BASELINES: dict[str, LocalFeature] = {**CLASSICAL, **HESSIAN}
+"""The classical baselines by name: the paper's, and those of the standard protocol only."""
+
+
+@suggest_keywords
+@dataclass(frozen=True, eq=False)
+class BenchmarkOptions:
+    """What is compared, and how.
+
+    Attributes:
+        detector: DeepDetect, with the weights that are evaluated.
+        protocols: of `PROTOCOLS`.
+        classical: names of the classical baselines.
+        others: further local features.
+        channels: order of the colours in the paper's protocol; "bgr" in the paper's code.
+        geometry_weights: the weights for stereo pairs, one or more.
+        max_pairs: at most this many pairs of each scene, evenly spaced; the last one if it is one.
+        max_images: at most this many of a scene: of a sequence the first, else evenly spaced.
+        ranker: ranker of the points, as for `PointDetector`.
+
+    Raises:
+        OptionError: a name is unknown, or a number is out of its range.
+    """
+
+    detector: DeepDetect
+    protocols: tuple[str, ...] = DEFAULT_PROTOCOLS
+    classical: tuple[str, ...] = tuple(BASELINES)
+    others: tuple[LocalFeature, ...] = ()
+    channels: Literal["rgb", "bgr"] = "rgb"
+    geometry_weights: tuple[str | Path, ...] = ("dense",)
+    max_pairs: int = 60
+    max_images: int = 20
+    ranker: str | Path | None = None
+
+    def __post_init__(self) -> None:
+        check_ranges(self, counts=("max_pairs",), between={"max_images": (3, float("inf"))})
+        for name in self.protocols:
+            check_name("protocol", name, PROTOCOLS)
+        for name in self.classical:
+            check_name("classical baseline", name, BASELINES)
+        stems = [Path(weights).stem for weights in self.geometry_weights]
+        if len(set(stems)) < len(stems):
+            raise OptionError(
+                f"two geometry_weights have one name ({', '.join(stems)}): rename a file"
+            )
+
+    def deepdetect_480(self, threshold: float = 0.5) -> LocalFeature:
+        """Return DeepDetect as the paper runs it: images squashed to 480x480, SIFT of size 3."""
+        return deepdetect_feature(
+            self.detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX, self.channels)),
+            SelectionOptions(threshold),
+            name=f"deepdetect-{threshold:g}",
+            title=f"DeepDetect, threshold {threshold:g}",
+        )
+
+    def native_detector(self) -> DeepDetect:
+        """Return the detector at the image's own size."""
+        return self.detector.configured(HeatmapOptions("native", self.channels))
+
+    def deepdetect_native(self) -> LocalFeature:
+        """Return DeepDetect at the image's own size, all pixels over 0.5."""
+        title = "DeepDetect, native resolution, all pixels over 0.5"
+        return deepdetect_feature(self.native_detector(), name="deepdetect-native", title=title)
+
+    def chance_baselines(self) -> tuple[LocalFeature, LocalFeature]:
+        """Return random points of the number that `deepdetect_480` finds, and all pixels."""
+        return random_feature(self.deepdetect_480()), all_pixels_feature()
+
+    def density_features(self) -> list[LocalFeature]:
+        """Return the rows of Table I and of the repeatability, chance baselines last."""
+        classical = [CLASSICAL[name] for name in self.classical if name in CLASSICAL]
+        own = [self.deepdetect_480(threshold) for threshold in THRESHOLDS]
+        return without_repeats([*classical, *self.others, *own, *self.chance_baselines()])
+
+    def matching_features(self) -> list[LocalFeature]:
+        """Return the rows of Table II: the low settings, DeepDetect, chance baselines."""
+        low = [CLASSICAL[name] for name in self.classical if name.endswith("-low")]
+        own = [self.deepdetect_480(), *self.chance_baselines()]
+        return without_repeats([*low, *self.others, *own])
+
+    def standard_features(self) -> list[LocalFeature]:
+        """Return the rows of the standard protocol: default settings, ours sparse, chance."""
+        ranked = {**STANDARD, **HESSIAN}
+        chosen = [name for name in ranked if name in self.classical]
+        # Those with descriptors of their own have a row with these, too.
+        systems = {f.name: f for f in self.others if f.name in BASELINES}
+        systems |= {name: STANDARD[name] for name in ("sift", "orb") if name in chosen}
+        own = deepdetect_feature(
+            self.native_detector(),
+            SelectionOptions(nms_radius=1, subpixel=True),
+            name="deepdetect-sparse",
+            title="DeepDetect, pixels by logits, suppression 3x3, sub-pixel",
+            descriptor=COMMON_DESCRIPTOR,
+        )
+        points = points_feature(self.ranker)
+        native = self.deepdetect_native()
+        chance = [random_feature(native, name="random-native"), all_pixels_feature()]
+        features = [with_common_descriptor(ranked[name]) for name in chosen]
+        features += [
+            replace(f, name=f"{f.name}-own", title=f"{f.title}, own descriptors")
+            for f in systems.values()
+        ]
+        features += [with_own_scale(ranked[name]) for name in chosen if ranked[name].own_scale]
+        features += [feature for feature in self.others if feature.name not in BASELINES]
+        features += [with_common_descriptor(points), with_own_scale(points), own]
+        features += [with_common_descriptor(feature) for feature in (native, *chance)]
+        return without_repeats(features)
+
+
+def without_repeats(features: Sequence[LocalFeature]) -> list[LocalFeature]:
+    """Return the features, each once; two that are not the same must not have one name."""
+    by_name: dict[str, LocalFeature] = {}
+    for feature in features:
+        if by_name.setdefault(feature.name, feature).version != feature.version:
+            raise OptionError(f"two methods are named {feature.name}: rename the file of one")
+    return list(by_name.values())

@@ -1,0 +1,110 @@
+"""Seconds and memory of a piece of work."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+from deepdetect._shared.errors import DeepDetectError
+from deepdetect._shared.machine import start_child
+
+Outcome = TypeVar("Outcome")
+
+
+class Profile(NamedTuple):
+    """What a piece of work took: wall time, and bytes that the process grew by at most."""
+
+    seconds: float = 0.0
+    memory: float = 0.0
+
+
+class StageProfiler:
+    """Measures stages that follow each other: `record` ends one. No two may run at a time.
+
+    The memory is exact on Linux, which is told to forget the peak where a stage begins; elsewhere a
+    peak counts where it is the highest of the process so far.
+
+    Attributes:
+        stages: by name; stages of one name add up their seconds, the largest memory counts.
+        total: of all stages; its memory includes what an earlier stage still holds.
+    """
+
+    def __init__(self) -> None:
+        self.stages: dict[str, Profile] = {}
+        self.total = Profile()
+        self._begin()
+        self._first = self._before
+
+    def record(self, name: str) -> None:
+        """End a stage, and begin the next one."""
+        seconds = time.perf_counter() - self._started
+        peak = max(_memory("VmHWM"), self._before)
+        before = self.stages.get(name, Profile())
+        memory = max(before.memory, peak - self._before)
+        self.stages[name] = Profile(before.seconds + seconds, memory)
+        memory = max(self.total.memory, peak - self._first)
+        self.total = Profile(self.total.seconds + seconds, memory)
+        self._begin()
+
+    def _begin(self) -> None:
+        global _highest
+        _highest = peak_memory()
+        with suppress(OSError):
+            Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM, see man 5 proc
+        self._before = _memory("VmRSS")
+        self._started = time.perf_counter()
+
+
+_highest = 0
+"""Of the peaks that were forgotten."""
+
+
+@contextmanager
+def profiled() -> Iterator[StageProfiler]:
+    """Measure the time and the growth of memory of the block: the `total`, when it has ended."""
+    profiler = StageProfiler()
+    yield profiler
+    profiler.record("block")
+
+
+def peak_memory() -> int:
+    """Return the most memory that the process has held so far, in bytes; 0 where unknown."""
+    return max(_highest, _memory("VmHWM"))
+
+
+def _memory(name: str) -> int:
+    """Return a number of bytes of /proc/self/status; the highest so far on other systems."""
+    # Linux's ru_maxrss counts what the process that started this one held, too; this does not.
+    with suppress(OSError), open("/proc/self/status", encoding="ascii") as status:
+        return next(int(line.split()[1]) * 1024 for line in status if line.startswith(f"{name}:"))
+    try:
+        import resource
+    except ImportError:  # on Windows
+        return 0
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def run_in_child(function: Callable[..., Outcome], *arguments: Any) -> Outcome:
+    """Call a module's function in a process whose `peak_memory` is that of its work alone.
+
+    OpenCV and our kernels have one thread there. Raises a DeepDetectError where the process was
+    ended from outside, else what the function raises.
+    """
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor
+    from concurrent.futures.process import BrokenProcessPool
+
+    # Spawned: a fork would begin with all memory of this process.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context, initializer=start_child) as pool:
+        try:
+            return pool.submit(function, *arguments).result()
+        except BrokenProcessPool:
+            raise DeepDetectError(
+                "its process was ended, probably for lack of memory: take fewer or smaller images"
+            ) from None

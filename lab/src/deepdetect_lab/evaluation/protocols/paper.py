@@ -1,0 +1,279 @@
+"""The paper's protocol: density, foreground, repeatability, correct matches."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from deepdetect._shared.errors import ImageError
+from deepdetect.features.display import draw_matches
+from deepdetect.features.keypoints import Keypoints
+from deepdetect.geometry.transforms import transfer_errors
+from deepdetect.io.image import load_image, luma
+from deepdetect.io.masks import load_mask
+from deepdetect.viz.draw import add_caption, hstack
+
+from ...datasets.foreground import MaskedPhotograph, load_foreground
+from ...datasets.planar import PlanarPair, PlanarScene
+from ..baselines.method import LocalFeature
+from ..metrics.repeatability import foreground_fraction, repeatability_paper
+from ..options import BenchmarkOptions
+from ..report import (
+    Cell,
+    Columns,
+    Figure,
+    Row,
+    Rows,
+    Section,
+    Table,
+    average,
+    mean,
+    mean_of,
+    picture,
+    tabulate,
+    where,
+)
+from ..run import MatchSettings, Run
+from .paper_numbers import DENSITY, FOREGROUND, NOT_IN_DENSITY, with_paper_column
+
+OXFORD_PAIRS = (
+    *(("graf", 6), ("wall", 6), ("bikes", 6), ("leuven", 6), ("trees", 6), ("ubc", 6)),
+    ("boat", 2),
+)
+"""The pairs of the paper's Table II: scene, and number of the second image."""
+
+CORRECT_PX = 1.0
+"""A match is correct strictly under this distance."""
+
+PAPER_MATCHING = MatchSettings(matcher="flann", ratio=0.99)
+
+SEEDS = 3
+"""FLANN's trees are random, and counts of one seed vary by some per cent."""
+
+FEW_MATCHES = 1000
+MANY_SEEDS = 64
+"""Few correct matches (graf's are a hundred) vary by a tenth from seed to seed."""
+
+REPEATABILITY_NOTE = (
+    "Points of the first image that land under 1 px from some point of the second, over the "
+    "smaller of the two counts, clipped at 1. It grows with the density: see the baselines."
+)
+
+MATCHES_NOTE = (
+    "FLANN (5 trees, 50 checks), ratio 0.99; correct: strictly under 1 px by the homography in the "
+    "file. Binary descriptors (ORB, BRISK) are matched exactly by Hamming's distance. The number "
+    "grows with the number of points, whatever they are: see the baselines."
+)
+
+
+def density_table(
+    run: Run,
+    features: Sequence[LocalFeature],
+    scenes: Sequence[PlanarScene],
+    key: str,
+    with_paper: bool = False,
+) -> Table:
+    """Measure the keypoints per pixel of all images: the mean, and that of each scene.
+
+    The paper's numbers are beside the mean that they are of, without one of the scenes.
+    """
+
+    def measure(feature: LocalFeature, item: tuple[str, Path]) -> Row:
+        scene, image = item
+        return {"scene": scene, "density": run.keypoints(feature, image)[0].density}
+
+    def without(own: Rows) -> Cell:
+        return mean_of(row["density"] for row in own if row["scene"] != NOT_IN_DENSITY)
+
+    images = {f"{s.name}/{path.name}": (s.name, path) for s in scenes for path in s.images}
+    rows = run.rows("density of ", features, images, measure)
+    title = f"mean without {NOT_IN_DENSITY}"
+    columns: Columns = {
+        "mean": average(".4f", "density"),
+        **({title: (".4f", without)} if with_paper else {}),
+        **{scene.name: average(".4f", "density", scene=scene.name) for scene in scenes},
+    }
+    note = "The mean is over all images. Several keypoints on one pixel all count."
+    if with_paper:
+        note += f" The paper's means are those without {NOT_IN_DENSITY}."
+    table = tabulate(key, "Keypoints per pixel", features, rows, columns, note)
+    return with_paper_column(table, title, DENSITY) if with_paper else table
+
+
+def repeatability_table(
+    run: Run, features: Sequence[LocalFeature], scenes: Sequence[PlanarScene], key: str
+) -> Table:
+    """Measure the paper's repeatability at 1 px: the mean of the scenes, and that of each."""
+
+    def over_scenes(own: Rows) -> Cell:
+        return mean_of(mean(where(own, scene=s.name), "repeatability") for s in scenes)
+
+    rows = repeatability_rows(run, features, scenes)
+    columns: Columns = {
+        "mean": (".4f", over_scenes),
+        **{scene.name: average(".4f", "repeatability", scene=scene.name) for scene in scenes},
+    }
+    title = "Repeatability as in the paper"
+    return tabulate(key, title, features, rows, columns, REPEATABILITY_NOTE)
+
+
+def repeatability_rows(
+    run: Run, features: Sequence[LocalFeature], scenes: Sequence[PlanarScene]
+) -> Rows:
+    """Measure the "repeatability" of all pairs, with their "scene"."""
+
+    def measure(feature: LocalFeature, pair: PlanarPair) -> Row:
+        return {"scene": pair.scene, "repeatability": pair_repeatability(run, feature, pair)}
+
+    pairs = {pair.name: pair for scene in scenes for pair in scene.pairs}
+    return run.rows("repeatability of ", features, pairs, measure)
+
+
+def matches_table(
+    run: Run,
+    features: Sequence[LocalFeature],
+    pairs: Sequence[PlanarPair],
+    key: str,
+    title: str = "Correct matches",
+) -> Table:
+    """Count correct matches under 1 px, and their fraction of all matches."""
+
+    def measure(feature: LocalFeature, pair: PlanarPair) -> Row:
+        correct, matches = correct_matches(run, feature, pair)
+        return {"correct": correct, "precision": correct / matches if matches else None}
+
+    def value(own: Rows, item: str, name: str) -> Cell:
+        return next((row[name] for row in where(own, item=item)), None)
+
+    rows = run.rows("matches of ", features, {pair.name: pair for pair in pairs}, measure)
+    columns: Columns = {
+        f"{pair.name}{suffix}": (style, partial(value, item=pair.name, name=name))
+        for pair in pairs
+        for suffix, style, name in (("", ",d", "correct"), (", precision", ".2%", "precision"))
+    }
+    return tabulate(key, title, features, rows, columns, MATCHES_NOTE)
+
+
+def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
+    """Table I's second half: which fraction of the keypoints lies on the foreground."""
+    images = load_foreground(run.folder("foreground"))
+    features = options.density_features()
+    rows = foreground_rows(run, features, images)
+    for feature in features:
+        own = where(rows, method=feature.name)
+        if empty := sum(row["fraction"] != row["fraction"] for row in own):  # NaN
+            run.skipped.append(f"foreground of {feature.title}: {empty} images without a keypoint")
+
+    def over_chance(own: Rows) -> Cell:
+        known = [row for row in own if row["fraction"] == row["fraction"]]
+        fraction, chance = mean(known, "fraction"), mean(known, "covered")
+        return None if fraction is None or not chance else fraction / chance
+
+    title = "fraction on the foreground"
+    columns: Columns = {
+        title: average(".4f", "fraction"),
+        "over that of random points": (".2f", over_chance),
+        "keypoints per pixel": average(".4f", "density"),
+    }
+    covered = {row["item"]: row["covered"] for row in rows}
+    note = (
+        f"{len(covered)} images; their foreground is {mean_of(covered.values()) or 0:.1%} of the "
+        "pixels, which is what random points reach. The paper used 18 unpublished images."
+    )
+    table = tabulate("foreground", "Keypoints on the foreground", features, rows, columns, note)
+    table = with_paper_column(table, title, FOREGROUND)
+    return [Section("Foreground (Table I)", (), [table])]
+
+
+def foreground_rows(
+    run: Run, features: Sequence[LocalFeature], images: Sequence[MaskedPhotograph]
+) -> Rows:
+    """Measure the fraction of the keypoints on the foreground, NaN without any, and their density.
+
+    The "covered" fraction of the pixels is what random keypoints reach.
+    """
+
+    def measure(feature: LocalFeature, image: MaskedPhotograph) -> Row:
+        keypoints, _ = run.keypoints(feature, image.image)
+        mask = load_mask(image.mask)
+        if mask.shape[::-1] != keypoints.image_size:
+            raise ImageError(f"{image.mask.name} is not of the photograph's size")
+        fraction = foreground_fraction(keypoints.xy, mask)
+        return {"fraction": fraction, "density": keypoints.density, "covered": float(mask.mean())}
+
+    return run.rows("foreground of ", features, {each.image.name: each for each in images}, measure)
+
+
+def pair_repeatability(run: Run, feature: LocalFeature, pair: PlanarPair) -> float:
+    """Return the paper's repeatability of a pair."""
+    images = (pair.first, pair.second)
+
+    def make() -> Row:
+        first, second = (run.keypoints(feature, image)[0].xy for image in images)
+        return {"value": repeatability_paper(first, second, pair.homography)}
+
+    depends = (feature.detection, images, pair.homography)
+    return float(run.cached("repeatability_paper", depends, make)["value"])
+
+
+def correct_matches(
+    run: Run, feature: LocalFeature, pair: PlanarPair, seed: int = 0
+) -> tuple[int, int]:
+    """Return the number of correct matches of a pair, and of all, by one seed of FLANN."""
+    settings = MatchSettings(PAPER_MATCHING.matcher, PAPER_MATCHING.ratio, seed=seed)
+    found = run.matches(feature, (pair.first, pair.second), settings)
+    errors = transfer_errors(found.points0, found.points1, pair.homography)
+    return int(np.count_nonzero(errors < CORRECT_PX)), len(errors)
+
+
+def mean_correct_matches(run: Run, feature: LocalFeature, pair: PlanarPair) -> tuple[int, int]:
+    """Return both counts as rounded means over `SEEDS`, under `FEW_MATCHES` over `MANY_SEEDS`."""
+    counts: list[tuple[int, int]] = []
+    for seed in range(MANY_SEEDS):
+        if seed == SEEDS and np.mean(counts, axis=0)[0] >= FEW_MATCHES:
+            break
+        counts.append(correct_matches(run, feature, pair, seed))
+    correct, matches = np.rint(np.mean(counts, axis=0)).astype(int).tolist()
+    return correct, matches
+
+
+def keypoint_figure(run: Run, features: Sequence[LocalFeature], scene: PlanarScene) -> Figure:
+    """Draw Figure 2: the keypoints of SIFT, of SIFT with low settings, and ours."""
+    image = scene.images[0]
+    rgb = load_image(image)
+    panels, counts = [], []
+    for feature in features:
+        found, _ = run.keypoints(feature, image)
+        inside = np.clip(np.rint(found.xy), 0, np.array(found.image_size) - 1)
+        drawn = Keypoints(inside, found.scores, found.image_size).draw(rgb)
+        counts.append(f"{feature.title} {len(found):,}")
+        panels.append(add_caption(drawn, f"{feature.title}: {len(found):,}"))
+    title = f"Figure 2: keypoints of {scene.name}: {'; '.join(counts)}"
+    return Figure(f"keypoints_{scene.name}", title, picture(hstack(panels)))
+
+
+def mask_figure(scene: PlanarScene) -> Figure:
+    """Draw Figure 4: the keypoint and the edge mask of an image, and both combined."""
+    from ...labels import draw_label, fuse
+
+    rgb = load_image(scene.images[0])
+    title = f"Figure 4: keypoint and edge masks, and both combined ({scene.name})"
+    return Figure("masks", title, picture(draw_label(rgb, fuse(luma(rgb)))))
+
+
+def match_figure(run: Run, feature: LocalFeature, number: str, pair: PlanarPair) -> Figure:
+    """Draw Figure 6 or 7: a sample of the matches of a pair, the correct ones green."""
+    found = run.matches(feature, (pair.first, pair.second), PAPER_MATCHING)
+    correct = transfer_errors(found.points0, found.points1, pair.homography) < CORRECT_PX
+    drawn = draw_matches(
+        load_image(pair.first), load_image(pair.second), found.points0, found.points1, correct
+    )
+    precision = correct.mean() if len(correct) else 0.0
+    title = (
+        f"{number}: {feature.title}, {pair.name}: {len(correct):,} matches, "
+        f"{int(correct.sum()):,} correct ({precision:.1%}); a random sample drawn"
+    )
+    return Figure(f"matches_{pair.name.replace(' ', '_')}", title, picture(drawn))

@@ -1,0 +1,461 @@
+"""Cameras and points of many images whose cameras are known: ranked points, SIFT, chance.
+
+All methods go through the stages of `reconstruct_many` with the same options; only the keypoints,
+and for SIFT the matches, are others. Each runs in a process of its own, which tells its memory.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from deepdetect._shared.errors import NoDepthError
+from deepdetect.batch.extraction import feature_group
+from deepdetect.batch.hdf5 import Group, import_h5py, open_hdf5, write_groups
+from deepdetect.detector.point_detector import PointDetector
+from deepdetect.features.keypoints import Keypoints
+from deepdetect.features.scale_space import dominant_angles
+from deepdetect.geometry.camera import Camera, PosedView
+from deepdetect.io.image import load_image, luma
+from deepdetect.sfm.colmap import PIXEL_CENTRE, import_pycolmap, initial_intrinsics, quiet_pycolmap
+from deepdetect.sfm.mapping import read_sparse_model
+from deepdetect.sfm.pipeline import MAX_KEYPOINTS
+from deepdetect.sfm.stages import MultiViewOptions, Stages
+
+from ...datasets.pair_selection import evenly_spaced
+from ...datasets.posed_images import PosedScene, load_posed_scenes
+from ..metrics.homography import area_under_curve
+from ..metrics.pose import camera_errors, relative_pose_errors
+from ..options import BenchmarkOptions
+from ..profiling import peak_memory, run_in_child
+from ..report import Figure, Row, Rows, Section, Table, where
+from ..run import Run
+from .dense_points import DENSE_COLUMNS, DENSE_NOTE, SGBM, measure_dense_points
+from .pose import error_chart, file_name
+
+MIN_IMAGES = 3
+
+POSE_THRESHOLDS_DEG = (0.5, 1.0, 5.0)
+"""Of the AUC: adjusted cameras are more accurate than those of two images."""
+
+CURVE_DEG = tuple(0.05 * step for step in range(61))
+"""Errors at which the figure is drawn."""
+
+DATABASE = "sift.db"
+
+OPTIONS = MultiViewOptions(pairs="exhaustive")
+"""Of all methods: those of `reconstruct_many`, but every pair is matched."""
+
+KINDS = ("true", "estimated")
+MODEL_COLUMNS = {"sparse points": ",d", "track length": ".2f", "reprojection error, px": ".3f"}
+
+CAMERA_COLUMNS = {
+    **{"scene": "", "keypoints": "", "intrinsics": "", "images": "d", "registered": "d"},
+    **{f"AUC at {threshold:g}°": ".3f" for threshold in POSE_THRESHOLDS_DEG},
+    "centres, unit of the truth": ".5f",
+    "centres, ‰ of the extent": ".2f",
+    "from the first row's, unit of the truth": ".5f",
+    "rotations, °": ".3f",
+    **MODEL_COLUMNS,
+}
+
+IMAGE_COLUMNS = dict.fromkeys(("scene", "keypoints", "intrinsics", "image"), "")
+IMAGE_COLUMNS |= {"centre, unit of the truth": ".5f", "rotation, °": ".4f"}
+
+MAPPING_CPU = "mapping, {} intrinsics, CPU s"
+
+COST_COLUMNS = {
+    "scene": "",
+    "keypoints": "",
+    "keypoints an image": ",.0f",
+    "matches": ",d",
+    "keypoints and matches, s": ".1f",
+    "keypoints and matches, CPU s": ".1f",
+    **{MAPPING_CPU.format(kind): ".1f" for kind in KINDS},
+    "memory, MB": ",.0f",
+}
+
+TEXT = (
+    "The cameras of all images of a scene and sparse points, as by `reconstruct_many`: every pair "
+    "is matched, COLMAP verifies and maps, tracks are refined, and a last adjustment with a robust "
+    "loss follows. All methods have the same stages and options, once with the true intrinsics and "
+    "once with estimated ones; the true poses only evaluate. What differs are the keypoints: the "
+    "ranked points of DeepDetect; as many random points with their sizes; and pycolmap's own SIFT "
+    "with its own matcher, at as many places at most, some of them at two angles, once with the "
+    "tracks as they are and once with refined ones. Dense tracks are those of `--matches dense`. "
+    "Where only satellite fixes are known, centres are compared with these.",
+)
+
+CAMERA_NOTE = (
+    "AUC: of the relative poses of all pairs of images, the error being the larger of the angle of "
+    "the rotation and that between the directions of translation, infinite where an image is not "
+    "registered. Centres and rotations: mean errors of the registered cameras after the alignment "
+    "of their centres; extent: the largest distance of two true cameras. From the first row's: "
+    "mean distance of the centres from the first method's; where that is much less than the errors "
+    "of both, these are the truth's, or common to both. The alignment leaves the rotation "
+    "about a straight line of cameras open, so these have no rotations: take the AUC. Track "
+    "length: mean number of images that see a point. Reprojection error: mean over the method's "
+    "own points, so no error of the cameras."
+)
+
+COST_NOTE = (
+    "Of one process without other work: keypoints, descriptors and matches on one thread, "
+    "verification and mapping on as many as COLMAP takes. Memory: the most that the process held, "
+    "with Python and all libraries. The ranked points, whose places random ones take, are in the "
+    "memory of these, not in their seconds. On a busy machine compare CPU seconds."
+)
+
+
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class SfmMethod:
+    """A row of the tables; `name` is also the title, and results depend on `version`, too.
+
+    `find` writes the keypoints of the images in a folder, `match` returns the matches of pairs;
+    both are functions of a module. With `chance` the time that finding takes means nothing; tracks
+    are `refined`, or as COLMAP leaves them; `tracks` is the option `matches`.
+    """
+
+    name: str
+    find: Callable[[Stages, Path], None]
+    match: Callable[[Stages, Sequence[Pair]], dict[Pair, np.ndarray]] = Stages.match
+    version: str = ""
+    chance: bool = False
+    refined: bool = True
+    tracks: Literal["sparse", "dense"] = "sparse"
+
+
+@lru_cache
+def true_views(scene: PosedScene) -> dict[str, PosedView]:
+    """Return the true cameras and poses by the names of the files."""
+    views = {}
+    for image in scene.images:
+        name, matrix = image.path.name, image.intrinsics
+        height, width = load_image(image.path).shape[:2]
+        focal, centre = (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2])
+        camera = Camera((width, height), focal, centre)
+        views[name] = PosedView(name, camera, image.rotation, image.translation)
+    return views
+
+
+def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
+    """Reconstruct all scenes by all methods."""
+    import_pycolmap()  # what is missing is said at once
+    folder = run.folder("sfm")
+    scenes = load_posed_scenes(run.folder("pose") if folder == run.data else folder, located=True)
+    chosen = {}
+    for each in scenes:
+        if len(each.images) < MIN_IMAGES:
+            run.fail(f"{each.name}: it has {len(each.images)} images, 3 are needed")
+        else:
+            chosen[each.name] = choose_images(each, options.max_images)
+    for feature in options.others:
+        run.skipped.append(f"sfm: {feature.title}: this benchmark runs no further methods")
+    methods = sfm_methods(options)
+    rows = run.rows("", methods, chosen, partial(measure_scene, run))
+    rows = [row for name in chosen for row in where(rows, item=name)]
+    costs = [{**row, "scene": row["scene"].name, "keypoints": row["method"]} for row in rows]
+    cost_table = Table("sfm_cost", "Seconds and memory", COST_COLUMNS, costs, COST_NOTE)
+    points = PointDetector(MAX_KEYPOINTS, ranker=options.ranker)
+    dense = [
+        run.attempt(f"dense points of {name}", dense_rows, run, chosen[name], points)
+        for name in chosen
+    ]
+    found = [row for rows in dense for row in rows or ()]
+    dense_table = Table("sfm_dense", "Dense points", DENSE_COLUMNS, found, DENSE_NOTE)
+    tables = [camera_table(rows), image_table(rows), cost_table, dense_table]
+    figures = []
+    for name, scene in chosen.items():
+        if scene.located_only:
+            continue
+        errors = {
+            f"{row['method']}, {kind} intrinsics": relative_pose_errors(views, true_views(scene))
+            for row in where(rows, item=name)
+            for kind in KINDS
+            for views in [row[kind]["views"]]
+        }
+        title = f"Relative poses of all pairs of {name}: fraction up to each error"
+        png = error_chart(errors, CURVE_DEG, "error of the relative pose up to, °")
+        figures.append(Figure(f"sfm_{file_name(name)}", title, png))
+    return [Section("Many images", TEXT, tables, figures)]
+
+
+def choose_images(scene: PosedScene, most: int) -> PosedScene:
+    """Return a scene with all of its images, the first of a sequence, or evenly spaced ones.
+
+    Between evenly spaced frames of a long sequence there would be nothing in common.
+    """
+    sequence = bool(scene.pairs) and scene.pairs[0].frame_distance is not None
+    images = scene.images[:most] if sequence else evenly_spaced(scene.images, most)
+    return replace(scene, images=tuple(images))
+
+
+def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
+    """Return the ranked points, SIFT where it is among the baselines, each twice, and chance."""
+    points = PointDetector(MAX_KEYPOINTS, ranker=options.ranker)
+    version, random = _version(points), "baseline: as many random points"
+    ours = SfmMethod("DeepDetect, points", partial(find_points, points), version=version)
+    dense = replace(ours, name="DeepDetect, dense tracks", tracks="dense")
+    sift = SfmMethod("SIFT, pycolmap", find_sift, match_sift, refined=False)
+    aligned = SfmMethod("SIFT, tracks refined", find_sift, match_sift)
+    chance = SfmMethod(random, partial(find_random_points, points), version=version, chance=True)
+    return [ours, dense, *([sift, aligned] if "sift" in options.classical else []), chance]
+
+
+def _version(points: PointDetector) -> str:
+    return f"{points.settings} {points.descriptor_type}"
+
+
+def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
+    """Reconstruct a scene by a method, or read the result from the cache.
+
+    Returns the values of `run_method`, the "scene", and for each kind of intrinsics the registered
+    "views" and the `MODEL_COLUMNS`.
+    """
+    images = tuple(image.path for image in scene.images)
+    cameras = {name: view.camera for name, view in true_views(scene).items()}
+    depends = (
+        (method.name, method.version),
+        [(image.path, image.path.name, image.intrinsics) for image in scene.images],
+        repr(vars(OPTIONS)),
+        import_pycolmap().__version__,
+    )
+    known = {} if scene.located_only else cameras
+    row = run.cached("sfm", depends, lambda: run_in_child(run_method, method, images, known))
+    row["scene"] = scene
+    for kind in KINDS:
+        poses = zip(row[f"{kind} names"].tolist(), row[f"{kind} poses"], strict=True)
+        views = {
+            name: PosedView(name, cameras[name], pose[:9].reshape(3, 3), pose[9:])
+            for name, pose in poses
+        }
+        row[kind] = {"views": views, **{name: row[f"{kind} {name}"] for name in MODEL_COLUMNS}}
+    return row
+
+
+def dense_rows(run: Run, scene: PosedScene, detector: PointDetector) -> Rows:
+    """Measure the dense points of a scene, or read the result from the cache."""
+    images = tuple(image.path for image in scene.images)
+    cameras = {name: view.camera for name, view in true_views(scene).items()}
+    known = {} if scene.located_only else cameras
+    depends = (
+        ("dense and SGBM", _version(detector)),
+        (images, sorted(known.items())),
+        import_pycolmap().__version__,
+    )
+    row = run.cached(
+        "sfm", depends, lambda: run_in_child(measure_dense_points, images, known, detector)
+    )
+    sgbm = {name.removeprefix(f"{SGBM} "): row[name] for name in row if name.startswith(SGBM)}
+    ours = {name: value for name, value in row.items() if not name.startswith(SGBM)}
+    named = {"DeepDetect": ours, SGBM: sgbm}
+    return [{"scene": scene.name, "depth maps": name, **row} for name, row in named.items()]
+
+
+def camera_table(rows: Rows) -> Table:
+    """Tabulate cameras and sparse points of each method on each scene."""
+    lines = []
+    for row in rows:
+        scene: PosedScene = row["scene"]
+        truth = true_views(scene)
+        first = next((each for each in where(rows, scene=scene, method=rows[0]["method"])), row)
+        for kind in KINDS:
+            if scene.located_only and kind == "true":
+                continue
+            views = row[kind]["views"]
+            line = {
+                **{"scene": scene.name, "keypoints": row["method"], "intrinsics": kind},
+                **{"images": len(scene.images), "registered": len(views)},
+                **row[kind],
+            }
+            if not scene.located_only:
+                errors = relative_pose_errors(views, truth)
+                for each in POSE_THRESHOLDS_DEG:
+                    line[f"AUC at {each:g}°"] = area_under_curve(errors, each)
+            if len(views) >= MIN_IMAGES:
+                true = [truth[name] for name in views]
+                centres, rotations, _ = camera_errors(list(views.values()), true)
+                line["centres, unit of the truth"] = float(centres.mean())
+                places = np.array([view.centre for view in truth.values()])
+                extent = np.linalg.norm(places[:, None] - places, axis=2).max()
+                line["centres, ‰ of the extent"] = 1000 * float(centres.mean()) / float(extent)
+                if not scene.located_only:
+                    line["rotations, °"] = float(rotations.mean())
+            if first is not row:
+                apart = _apart(views, first[kind]["views"], truth)
+                line["from the first row's, unit of the truth"] = apart
+            lines.append(line)
+    return Table("sfm", "Cameras and sparse points", CAMERA_COLUMNS, lines, CAMERA_NOTE)
+
+
+def image_table(rows: Rows) -> Table:
+    """Tabulate the errors of each camera."""
+    lines = []
+    for row in rows:
+        truth = true_views(row["scene"])
+        for kind in KINDS:
+            views, errors = row[kind]["views"], {}
+            if len(views) >= MIN_IMAGES:
+                found = camera_errors(list(views.values()), [truth[name] for name in views])
+                turned = [None] * len(views) if row["scene"].located_only else found[1]
+                errors = dict(zip(views, zip(found[0], turned, strict=True), strict=True))
+            for image in truth:
+                cells = row["scene"].name, row["method"], kind, image
+                cells += errors.get(image, (None, None))
+                lines.append(dict(zip(IMAGE_COLUMNS, cells, strict=True)))
+    note = "After the alignment of all centres; a dash: not registered, or not known."
+    return Table("sfm_images", "All images", IMAGE_COLUMNS, lines, note, in_text=False)
+
+
+Views = Mapping[str, PosedView]
+
+
+def _apart(views: Views, others: Views, truth: Views) -> float | None:
+    """Return the mean distance of the centres of two models in the unit of the truth."""
+    names = sorted(set(views) & set(others))
+    if len(names) < MIN_IMAGES:
+        return None
+    own, other, true = ([each[name] for name in names] for each in (views, others, truth))
+    unit = camera_errors(other, true)[2]
+    return unit * float(camera_errors(own, other)[0].mean())
+
+
+def find_points(detector: PointDetector, stages: Stages, folder: Path) -> None:
+    """Find the ranked points of the images in a folder, as `reconstruct_many` does."""
+    stages.extract(folder, detector)
+
+
+def find_random_points(detector: PointDetector, stages: Stages, folder: Path) -> None:
+    """Put as many random points in place of the ranked ones, with their sizes in another order."""
+    find_points(detector, stages, folder)
+    with import_h5py().File(stages.features, "r+") as file:
+        for number, name in enumerate(sorted(path.name for path in folder.iterdir())):
+            rng = np.random.default_rng((0, number))
+            group = file[name]
+            width, height = (int(side) for side in group["image_size"][()])
+            count = len(group["keypoints"])
+            xy = rng.uniform(0, (width - 1, height - 1), (count, 2)).astype(np.float32)
+            gray = luma(load_image(folder / name))
+            sizes = rng.permutation(2 * group["scales"][()])
+            scores, angles = rng.random(count, np.float32), dominant_angles(gray, xy, sizes)
+            points = Keypoints(xy, scores, (width, height), sizes=sizes, angles=angles)
+            made = feature_group(name, detector.describe(gray, points)).arrays
+            for kind in ("keypoints", "descriptors", "scores", "scales", "oris"):
+                group[kind][...] = made[kind]
+
+
+def find_sift(stages: Stages, folder: Path) -> None:
+    """Find keypoints by pycolmap's own SIFT with its defaults, at no more places than ours."""
+    names = sorted(path.name for path in folder.iterdir())
+    with quiet_pycolmap() as pycolmap:
+        how = pycolmap.FeatureExtractionOptions()
+        how.num_threads = 1
+        how.sift.max_num_features = MAX_KEYPOINTS
+        pycolmap.extract_features(
+            stages.work / DATABASE, folder, image_names=names, extraction_options=how
+        )
+        groups = []
+        with pycolmap.Database.open(stages.work / DATABASE) as database:
+            for image in database.read_all_images():
+                camera = database.read_camera(image.camera_id)
+                xy = np.asarray(database.read_keypoints(image.image_id))[:, :2] - PIXEL_CENTRE
+                arrays = {
+                    "keypoints": xy.astype(np.float32),
+                    "image_size": np.array([camera.width, camera.height], np.int32),
+                }
+                groups.append(Group(image.name, arrays))
+    write_groups(stages.features, groups)
+
+
+def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
+    """Match by pycolmap's own matcher with its defaults; the verification is that of all."""
+    with quiet_pycolmap() as pycolmap:
+        how = pycolmap.FeatureMatchingOptions()
+        how.num_threads = 1
+        how.skip_geometric_verification = True
+        pycolmap.match_exhaustive(stages.work / DATABASE, matching_options=how)
+        with pycolmap.Database.open(stages.work / DATABASE) as database:
+            names = {image.image_id: image.name for image in database.read_all_images()}
+            found: dict[Pair, np.ndarray] = {}
+            for identifier, rows in zip(*database.read_all_matches(), strict=True):
+                one, other = (names[k] for k in pycolmap.pair_id_to_image_pair(identifier))
+                found[one, other] = np.asarray(rows, np.int64).reshape(-1, 2)
+    nothing = np.empty((0, 2), np.int64)
+    return {
+        pair: found[pair] if pair in found else found.get(pair[::-1], nothing)[:, ::-1]
+        for pair in pairs
+    }
+
+
+def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, Camera]) -> Row:
+    """Reconstruct images by a method; to be called in a process of its own.
+
+    Returns the `COST_COLUMNS`, and those of `_unpacked` after "true " and "estimated ".
+    """
+    with tempfile.TemporaryDirectory(prefix="deepdetect-sfm-") as scratch:
+        options = replace(OPTIONS, matches=method.tracks)
+        stages = Stages(Path(scratch) / "model", options, 1, True)
+        folder = stages.folder_of(images)
+        start = _times()
+        method.find(stages, folder)
+        took = _times() - start
+        with open_hdf5(stages.features) as file:
+            sides = {name: file[name]["image_size"][()].tolist() for name in sorted(file)}
+            counts = [len(file[name]["keypoints"]) for name in file]
+        sizes = {name: (int(width), int(height)) for name, (width, height) in sides.items()}
+        start = _times()
+        pairs = stages.choose_pairs(list(sizes))
+        matches = method.match(stages, pairs)
+        took = (0 if method.chance else took) + _times() - start
+        row = {
+            "keypoints an image": float(np.mean(counts)),
+            "matches": sum(len(rows) for rows in matches.values()),
+            "keypoints and matches, s": took[0],
+            "keypoints and matches, CPU s": took[1],
+        }
+        for kind, known in zip(KINDS, (cameras, {}), strict=True):
+            intrinsics = initial_intrinsics(folder, sizes, known)
+            model, seconds = None, np.nan
+            if known or kind == "estimated":
+                cpu = time.process_time()
+                with contextlib.suppress(NoDepthError):  # none is a result, too
+                    model = stages.map(folder, intrinsics, matches, bool(known), method.refined)[0]
+                seconds = time.process_time() - cpu
+            row[MAPPING_CPU.format(kind)] = seconds
+            row |= {f"{kind} {name}": value for name, value in _unpacked(model).items()}
+        return row | {"memory, MB": peak_memory() / 1e6}
+
+
+def _times() -> np.ndarray:
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+def _unpacked(model: Any) -> Row:
+    """Return what is kept of a model of pycolmap, or of None.
+
+    The "names" and (N, 12) "poses" (rotation, translation) of its images, and `MODEL_COLUMNS`.
+    """
+    columns: Row = {**dict.fromkeys(MODEL_COLUMNS, np.nan), "sparse points": 0}
+    if model is None:
+        return {"names": np.empty(0, np.str_), "poses": np.empty((0, 12)), **columns}
+    sparse = read_sparse_model(model)
+    views = sorted(sparse.views.values(), key=lambda view: view.name)
+    if len(sparse.points):
+        columns["sparse points"] = len(sparse.points)
+        columns["track length"] = sparse.tracks.mean()
+        columns["reprojection error, px"] = sparse.errors.mean()
+    return {
+        "names": [view.name for view in views],
+        "poses": [[*view.rotation.ravel(), *np.ravel(view.translation)] for view in views],
+        **columns,
+    }

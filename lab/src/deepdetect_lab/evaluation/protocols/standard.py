@@ -1,0 +1,343 @@
+"""The standard metrics on pairs with homographies, at equal budgets and beside chance."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from deepdetect.features.keypoints import Keypoints
+from deepdetect.geometry import GeometryOptions, estimate_geometry
+
+from ...datasets.planar import PlanarPair
+from ..baselines.method import LocalFeature
+from ..metrics.homography import (
+    CORNER_THRESHOLDS_PX,
+    MATCH_THRESHOLDS_PX,
+    accuracy_at,
+    area_under_curve,
+    corner_error,
+    match_accuracy,
+)
+from ..metrics.repeatability import coverage, mutual_nn_repeatability
+from ..options import BenchmarkOptions
+from ..report import (
+    Cell,
+    Columns,
+    Figure,
+    Measure,
+    Row,
+    Rows,
+    Section,
+    Table,
+    average,
+    line_chart,
+    mean,
+    tabulate,
+    where,
+)
+from ..run import MatchSettings, Run
+
+BUDGETS: tuple[int | None, ...] = (512, 1024, 2048, 4096, 8192, None)
+"""Numbers of keypoints; None: all."""
+
+RADII_PX = (1.0, 2.0, 3.0)
+SEEDS = 5
+MATCHING_BUDGET = 2048
+RATIO = 0.85
+INLIER_THRESHOLD_PX = 3.0
+
+MIN_FILLED = 0.9
+"""A budget is shown where a method fills at least this fraction of it, on average."""
+
+MAX_CHANCE = 0.95
+"""Chance beyond which nothing can be distinguished from it."""
+
+MATCHING_NOTE = (
+    f"The best {MATCHING_BUDGET:,} keypoints of each image; the same upright RootSIFT of size "
+    f"4 for all, except in the rows that name others; mutual nearest neighbours, ratio {RATIO} "
+    "(none for learned descriptors). Means over the pairs; no matches count as a precision of 0."
+)
+
+
+def standard_sections(
+    run: Run,
+    options: BenchmarkOptions,
+    pairs: Sequence[PlanarPair],
+    key: str,
+    title: str,
+    text: str,
+) -> list[Section]:
+    """Measure and show all features on all pairs."""
+    if "standard" not in options.protocols:
+        return []
+    features = options.standard_features()
+    rows = standard_rows(run, features, pairs)
+    what = f"{title} ({len(pairs)} pairs)"
+    tables = standard_tables(features, rows, key, what)
+    figures = standard_figures(features, rows, key, what)
+    return [Section(f"{title}, the standard protocol", (text,), tables, figures)]
+
+
+def standard_rows(run: Run, features: Sequence[LocalFeature], pairs: Sequence[PlanarPair]) -> Rows:
+    """Measure all features on all pairs: see `pair_row`."""
+    items = {pair.name: pair for pair in pairs}
+    return run.rows("", features, items, lambda feature, pair: pair_row(run, feature, pair))
+
+
+def pair_row(
+    run: Run, feature: LocalFeature, pair: PlanarPair, budgets: Sequence[int | None] = BUDGETS
+) -> Row:
+    """Measure a feature on a pair.
+
+    Returns:
+        By name: "kind"; ("keypoints", budget) in the image that has fewer; ("repeated", budget,
+        radius), and the same of "chance" and "localization"; ("coverage", budget) of the first
+        image; "matches", and ("correct", px), ("precision", px) and ("score", px); "all matches"
+        and ("accuracy", px) without a ratio test; and "corner errors" by seed.
+    """
+    images = (pair.first, pair.second)
+    first, second = (run.keypoints(feature, image)[0] for image in images)
+    sizes = first.image_size, second.image_size
+    ratio = math.inf if feature.learned else RATIO
+    settings = MatchSettings("exact", ratio, mutual=True, budget=MATCHING_BUDGET)
+    matches = run.matches(feature, images, settings)
+    unfiltered = run.matches(feature, images, replace(settings, ratio=math.inf))
+    accuracy, without_ratio = (
+        match_accuracy(
+            *(found.points0, found.points1, found.keypoints0, found.keypoints1),
+            *(pair.homography, sizes),
+        )
+        for found in (matches, unfiltered)
+    )
+
+    def corner_errors() -> Row:
+        options = GeometryOptions(inlier_threshold=INLIER_THRESHOLD_PX)
+        points = matches.points0, matches.points1
+        estimated = [
+            estimate_geometry(*points, "homography", seed=seed, options=options).matrix
+            for seed in range(SEEDS)
+        ]
+        return {"errors": [corner_error(each, pair.homography, sizes[0]) for each in estimated]}
+
+    depends = (*feature.key, images, pair.homography, settings, (INLIER_THRESHOLD_PX, SEEDS))
+    row: Row = {
+        "kind": pair.kind,
+        **accuracy,
+        "all matches": without_ratio["matches"],
+        **{("accuracy", px): without_ratio["precision", px] for px in MATCH_THRESHOLDS_PX},
+        "corner errors": run.cached("corner_errors", depends, corner_errors)["errors"].tolist(),
+    }
+    # Each position once: another orientation of SIFT's is not another place.
+    places = [first.distinct(), second.distinct()]
+    for budget in budgets:
+        row |= _at_budget(run, feature, pair, places, budget)
+    return row
+
+
+def _at_budget(
+    run: Run,
+    feature: LocalFeature,
+    pair: PlanarPair,
+    places: Sequence[Keypoints],
+    budget: int | None,
+) -> Row:
+    first, second = (each if budget is None else each.best(budget) for each in places)
+    sizes = first.image_size, second.image_size
+
+    def make() -> Row:
+        found = mutual_nn_repeatability(first.xy, second.xy, pair.homography, sizes, RADII_PX)
+        return {"rows": found}
+
+    depends = (feature.detection, (pair.first, pair.second), pair.homography, budget, RADII_PX)
+    rows = run.cached("repeatability_mutual_nn", depends, make)["rows"].tolist()
+    row: Row = {
+        ("keypoints", budget): min(len(first), len(second)),
+        ("coverage", budget): coverage(first.xy, sizes[0]),
+    }
+    for radius, values in zip(RADII_PX, rows, strict=True):
+        for name, value in zip(("repeated", "chance", "localization"), values, strict=True):
+            row[name, budget, radius] = value
+    return row
+
+
+def repeated(rows: Rows, budget: int | None, radius: float, name: str = "repeated") -> float | None:
+    """Return the mean repeatability, or its "chance"; None where the budget is not filled."""
+    filled = mean(rows, ("keypoints", budget))
+    if filled is None or (budget is not None and filled < MIN_FILLED * budget):
+        return None
+    return mean(rows, (name, budget, radius))
+
+
+def correct(rows: Rows) -> float | None:
+    """Return the mean number of correct matches at 1 px."""
+    return mean(rows, ("correct", 1))
+
+
+def budget_name(budget: int | None) -> str:
+    """Return how tables name a budget."""
+    return "all" if budget is None else f"{budget:,}"
+
+
+def standard_tables(
+    features: Sequence[LocalFeature], rows: Rows, key: str, what: str
+) -> list[Table]:
+    """Tabulate the rows; `what` names the data in the titles."""
+    tables: list[tuple[str, str, Columns, str]] = [
+        (
+            f"repeatability_{radius:g}px",
+            f"Mutual-NN repeatability within {radius:g} px, {what}",
+            _repeatability_columns(radius),
+            REPEATABILITY_NOTE,
+        )
+        for radius in RADII_PX
+    ]
+    if kinds := list(dict.fromkeys(row["kind"] for row in rows if row["kind"])):
+        tables.append(("kinds", f"By kind of pair, {what}", _kind_columns(kinds), KIND_NOTE))
+    tables += [
+        ("matching", f"Matches, {what}", MATCHING_COLUMNS, MATCHING_NOTE),
+        ("homography", f"Homographies, {what}", _homography_columns(), HOMOGRAPHY_NOTE),
+        ("accuracy", f"Mean matching accuracy, {what}", ACCURACY_COLUMNS, ACCURACY_NOTE),
+        ("coverage", f"Coverage, {what}", COVERAGE_COLUMNS, COVERAGE_NOTE),
+    ]
+    return [
+        tabulate(f"{key}_{name}", title, features, rows, {**PAIRS, **columns}, note)
+        for name, title, columns, note in tables
+    ]
+
+
+def _repeatability_columns(radius: float) -> Columns:
+    def corrected(own: Rows, budget: int | None) -> Cell:
+        value, chance = (repeated(own, budget, radius, name) for name in ("repeated", "chance"))
+        if value is None or chance is None or chance > MAX_CHANCE:
+            return None
+        return (value - chance) / (1 - chance)
+
+    columns: dict[str, tuple[str, Measure]] = {}
+    for budget in BUDGETS:
+        of, name = partial(repeated, budget=budget, radius=radius), budget_name(budget)
+        columns[name] = ".3f", of
+        columns[f"{name}: chance"] = ".3f", partial(of, name="chance")
+        columns[f"{name}: chance-corrected"] = ".3f", partial(corrected, budget=budget)
+    localization = ("localization", MATCHING_BUDGET, radius)
+    columns["keypoints of all"] = average(",.0f", ("keypoints", None))
+    columns[f"localization at {MATCHING_BUDGET:,}, px"] = average(".2f", localization)
+    return columns
+
+
+def _kind_columns(kinds: Sequence[str]) -> Columns:
+    def of_kind(own: Rows, kind: str, cell: Measure) -> Cell:
+        return cell(where(own, kind=kind))
+
+    values: dict[str, tuple[str, Measure]] = {
+        f"@{radius:g} px": (".3f", partial(repeated, budget=MATCHING_BUDGET, radius=radius))
+        for radius in (RADII_PX[0], RADII_PX[-1])
+    }
+    return {
+        f"{kind}: {title}": (style, partial(of_kind, kind=kind, cell=cell))
+        for kind in kinds
+        for title, (style, cell) in {**values, "correct": (",.0f", correct)}.items()
+    }
+
+
+def _homography_columns() -> Columns:
+    def over_seeds(
+        own: Rows, metric: Callable[[Sequence[float], float], float], px: float, spread: bool
+    ) -> Cell:
+        if not own:
+            return None
+        seeds = zip(*(row["corner errors"] for row in own), strict=True)
+        values = [metric(errors, px) for errors in seeds]
+        return float(np.std(values, ddof=1) if spread else np.mean(values))
+
+    return {
+        title.format(name, px): (".3f", partial(over_seeds, metric=metric, px=px, spread=spread))
+        for name, metric in (("accuracy", accuracy_at), ("AUC", area_under_curve))
+        for px in CORNER_THRESHOLDS_PX
+        for title, spread in (("{} at {:g} px", False), ("± of {} {:g}", True))
+    }
+
+
+PAIRS: Columns = {"pairs": (",d", len)}
+
+MATCHING_COLUMNS: Columns = {
+    "keypoints": average(",.0f", ("keypoints", MATCHING_BUDGET)),
+    "matches": average(",.0f", "matches"),
+    **{
+        f"{title} at {px} px": average(style, (name, px))
+        for title, style, name in (
+            ("correct", ",.0f", "correct"),
+            ("precision", ".3f", "precision"),
+            ("matching score", ".3f", "score"),
+        )
+        for px in (1, 3)
+    },
+}
+
+ACCURACY_COLUMNS: Columns = {
+    "matches": average(",.0f", "all matches"),
+    **{f"{px} px": average(".3f", ("accuracy", px)) for px in MATCH_THRESHOLDS_PX},
+}
+
+COVERAGE_COLUMNS: Columns = {budget_name(b): average(".3f", ("coverage", b)) for b in BUDGETS}
+
+REPEATABILITY_NOTE = (
+    "Keypoints that are mutual nearest neighbours, at most the radius apart, over the fewer of "
+    "the keypoints that both images show, each position once; mean over the pairs. Chance: the "
+    f"same number of random points. Chance-corrected: 0 is chance, 1 is all; a dash where "
+    f"chance is over {MAX_CHANCE:.0%}. A budget that a method does not fill to "
+    f"{MIN_FILLED:.0%} is a dash. Localization: mean distance of the pairs of keypoints."
+)
+
+KIND_NOTE = (
+    f"By what changes between the two images, at {MATCHING_BUDGET:,} keypoints: mutual-NN "
+    "repeatability, and correct matches at 1 px. Means over the pairs of a kind."
+)
+
+HOMOGRAPHY_NOTE = (
+    f"{MATCHING_NOTE} MAGSAC at {INLIER_THRESHOLD_PX:g} px. Error: mean distance of the first "
+    "image's corners from where the true homography takes them, at the images' own size; a "
+    "pair without a homography counts as wrong. Accuracy: fraction of the pairs within a "
+    "threshold; AUC: area under it, as SuperGlue computes it. Mean and standard deviation (±) "
+    f"over {SEEDS} seeds of MAGSAC."
+)
+
+ACCURACY_NOTE = (
+    f"Mutual nearest neighbours of the best {MATCHING_BUDGET:,} keypoints, no ratio test for "
+    "any method: fraction of the matches within each distance, mean over the pairs."
+)
+
+COVERAGE_NOTE = "Fraction of the cells of 32x32 px that hold a keypoint of the first image."
+
+
+def standard_figures(
+    features: Sequence[LocalFeature], rows: Rows, key: str, what: str
+) -> list[Figure]:
+    """Draw accuracy and repeatability; their numbers are in the tables."""
+    measured = [(feature, own) for feature in features if (own := where(rows, method=feature.name))]
+    accuracy = {
+        feature.title: (
+            MATCH_THRESHOLDS_PX,
+            [mean(own, ("accuracy", px)) or 0.0 for px in MATCH_THRESHOLDS_PX],
+        )
+        for feature, own in measured
+    }
+    png = line_chart(accuracy, "error up to, px", "mean matching accuracy")
+    figures = [Figure(f"{key}_accuracy", f"Mean matching accuracy, {what}", png)]
+    budgets = [budget for budget in BUDGETS if budget is not None]
+    # Of rows with the same keypoints, which differ in their descriptors, the first one is drawn.
+    first = {feature.detection: feature for feature in reversed(features)}
+    for radius in (RADII_PX[0], RADII_PX[-1]):
+        lines = {}
+        for feature, own in measured:
+            values = [repeated(own, budget, radius) for budget in budgets]
+            if first[feature.detection] is feature and any(v is not None for v in values):
+                lines[feature.title] = budgets, [math.nan if v is None else v for v in values]
+        label = f"mutual-NN repeatability within {radius:g} px"
+        png = line_chart(lines, "keypoints per image", label, logarithmic=True, ticks=budgets)
+        title = f"Repeatability within {radius:g} px against the number of keypoints, {what}"
+        figures.append(Figure(f"{key}_repeatability_{radius:g}px", title, png))
+    return figures

@@ -1,0 +1,57 @@
+"""Matches of stereo pairs by descriptors alone, evaluated by the true disparity, beside chance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from deepdetect._shared.progress import progress
+from deepdetect.detector.detector import AnyDetector
+from deepdetect.features.matches import Matches
+from deepdetect.features.selection import SelectionOptions
+from deepdetect.matching.pipeline import match_images
+
+from ...datasets.middlebury import StereoPair
+from ..baselines.random import AllPixels, RandomDetector
+from ..metrics.stereo import stereo_score
+
+
+def score_stereo_matches(
+    sources: Mapping[str, AnyDetector], pairs: Sequence[StereoPair], *, quiet: bool = True
+) -> list[dict[str, Any]]:
+    """Match rectified pairs with several sources of keypoints, and evaluate the matches.
+
+    By descriptors alone over the whole image: neither the rows nor the true disparity are used. A
+    source's rows are followed by those of random points at its density, since more keypoints always
+    find more; all pixels come last.
+    """
+    rows: list[dict[str, Any]] = []
+    with progress(len(pairs) * (2 * len(sources) + 1), "matching", "pair", quiet) as bar:
+
+        def evaluate(source: str, pair: StereoPair, found: Matches) -> None:
+            density = (found.keypoints0.density + found.keypoints1.density) / 2
+            score = stereo_score(found.points0, found.points1, pair.disparity)
+            rows.append({"source": source, "pair": pair.name, "density": density, **score})
+            bar.update(1)
+
+        for name, detector in sources.items():
+            for pair in pairs:
+                evaluate(name, pair, match_stereo(pair, detector))
+            for pair, row in zip(pairs, rows[-len(pairs) :], strict=True):
+                evaluate(f"random, as {name}", pair, match_random_points(pair, row["density"]))
+        for pair in pairs:
+            evaluate("all pixels", pair, match_stereo(pair, AllPixels()))
+    return rows
+
+
+def match_stereo(pair: StereoPair, detector: AnyDetector, density: float | None = None) -> Matches:
+    """Match both views by descriptors alone and without estimating their geometry."""
+    selection = SelectionOptions(density=density)
+    return match_images(
+        pair.left, pair.right, detector, selection=selection, guided_matching=False, model="none"
+    )
+
+
+def match_random_points(pair: StereoPair, density: float) -> Matches:
+    """Match random points of a density, in keypoints per pixel: the chance baseline."""
+    return match_stereo(pair, RandomDetector(), max(density, 1e-6))

@@ -1,0 +1,293 @@
+"""A report: rows of values, tables and charts made of them, written as Markdown, CSV and JSON."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deepdetect._shared.atomic import atomic_path
+from deepdetect._shared.errors import require_packages
+from deepdetect._shared.opencv import cv2
+
+Cell = str | int | float | None
+"""What a table holds: None is shown as a dash."""
+
+Row = dict[Any, Any]
+"""What was measured once: values by name."""
+
+Rows = list[Row]
+
+
+def where(rows: Iterable[Row], **wanted: Any) -> Rows:
+    """Return the rows that have these values."""
+    return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
+
+
+def mean(rows: Iterable[Row], name: Any) -> float | None:
+    """Return the mean of the values of this name that are not NaN; None without any."""
+    return mean_of(row[name] for row in rows)
+
+
+def mean_of(values: Iterable[float | None]) -> float | None:
+    """Return the mean of the values that are not None or NaN; None without any."""
+    known = [value for value in values if value is not None and value == value]
+    return float(np.mean(known)) if known else None
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; its key, as "oxford_matches", is the name of its file.
+
+    The columns say how numbers are written, as ".3f", ",d" or ".1%", by title. The rows have cells
+    by title; one that is missing, None or NaN is a dash. report.md only names one not `in_text`.
+    """
+
+    key: str
+    title: str
+    columns: Mapping[str, str]
+    rows: Sequence[Row]
+    note: str = ""
+    in_text: bool = True
+
+    def values(self) -> list[dict[str, Cell]]:
+        """Return each row in the order of the columns; JSON has no NaN: it becomes None."""
+        return [
+            {
+                title: None if isinstance(cell, float) and not math.isfinite(cell) else cell
+                for title in self.columns
+                for cell in [row.get(title)]
+            }
+            for row in self.rows
+        ]
+
+    def to_markdown(self) -> str:
+        """Write the table in Markdown: names to the left, numbers to the right."""
+
+        def line(cells: Iterable[str]) -> str:
+            return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+        rule = "|" + "".join("---:|" if style else "---|" for style in self.columns.values())
+        rows = [
+            [_shown(row.get(t), style) for t, style in self.columns.items()] for row in self.rows
+        ]
+        return "\n".join([line(self.columns), rule, *map(line, rows)])
+
+    def to_csv(self) -> str:
+        """Write all digits; an unknown value is an empty cell."""
+        text = io.StringIO(newline="")
+        writer = csv.writer(text)
+        writer.writerow(self.columns)
+        for row in self.rows:
+            cells = [row.get(title) for title in self.columns]
+            writer.writerow("" if cell is None or cell != cell else cell for cell in cells)
+        return text.getvalue()
+
+
+def _shown(cell: Cell, style: str) -> str:
+    """Write a cell as text; an unknown value, NaN or None, is a dash."""
+    if cell is None or cell != cell:
+        return "–"
+    return cell if isinstance(cell, str) else format(cell, style)
+
+
+Measure = Callable[[Rows], Cell]
+"""What makes a cell of the rows of one method."""
+
+Columns = Mapping[str, tuple[str, Measure]]
+"""The style and the cell of each column, by its title."""
+
+
+def average(style: str, name: Any, **wanted: Any) -> tuple[str, Measure]:
+    """Make the column of the mean of a value, over the rows that have the wanted values."""
+    return style, lambda rows: mean(where(rows, **wanted), name)
+
+
+def median(style: str, name: Any) -> tuple[str, Measure]:
+    """Make the column of the median of a value, over the rows where it is not None."""
+
+    def of_known(rows: Rows) -> Cell:
+        known = [row[name] for row in rows if row[name] is not None]
+        return float(np.median(known)) if known else None
+
+    return style, of_known
+
+
+def tabulate(
+    key: str,
+    title: str,
+    methods: Sequence[Any],
+    rows: Rows,
+    columns: Columns,
+    note: str = "",
+    groups: Sequence[Row] = ({},),
+) -> Table:
+    """Make a table with a line for each method, by its title, of the rows of `Run.rows`.
+
+    In each group of the rows, by values that they have in common: the first columns.
+    """
+    lines = []
+    for group in groups:
+        for method in methods:
+            own = where(rows, method=method.name, **group)
+            cells = {title: cell(own) for title, (_, cell) in columns.items()}
+            lines.append({**group, "method": method.title, **cells})
+    styles = {name: "" if isinstance(value, str) else "d" for name, value in groups[0].items()}
+    styles |= {"method": ""} | {title: style for title, (style, _) in columns.items()}
+    return Table(key, title, styles, lines, note)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture: the name of its file, the line under it, and the PNG file's bytes."""
+
+    key: str
+    title: str
+    png: bytes = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of a report: a heading, paragraphs, tables, then figures."""
+
+    title: str
+    text: tuple[str, ...] = ()
+    tables: Sequence[Table] = ()
+    figures: Sequence[Figure] = ()
+
+
+@dataclass(frozen=True)
+class Report:
+    """All of a benchmark.
+
+    `metadata` says how it was made, `skipped` what was not measured, each with the reason;
+    `failures` are those of them that were wanted and could not be measured.
+    """
+
+    title: str
+    metadata: dict[str, str]
+    sections: Sequence[Section]
+    skipped: Sequence[str] = ()
+    failures: Sequence[str] = ()
+
+    def tables(self) -> list[Table]:
+        """Return the tables of all sections."""
+        return [table for section in self.sections for table in section.tables]
+
+    def values(self) -> dict[str, Any]:
+        """Return the report as plain values: each row a dict by the columns' titles."""
+        return {
+            "title": self.title,
+            "metadata": self.metadata,
+            "tables": {
+                t.key: {"title": t.title, "note": t.note, "rows": t.values()} for t in self.tables()
+            },
+            "figures": {f.key: f.title for section in self.sections for f in section.figures},
+            "skipped": list(self.skipped),
+        }
+
+    def save(self, folder: Path) -> list[Path]:
+        """Write report.md, figures/KEY.png, tables/KEY.csv and report.json; return the files."""
+        files = {"report.md": self._markdown().encode()}
+        files |= {f"figures/{f.key}.png": f.png for s in self.sections for f in s.figures}
+        files |= {f"tables/{table.key}.csv": table.to_csv().encode() for table in self.tables()}
+        files["report.json"] = (json.dumps(self.values(), indent=1) + "\n").encode()
+        for name, content in files.items():
+            with atomic_path(folder / name) as temporary:
+                temporary.write_bytes(content)
+        return [folder / name for name in files]
+
+    def _markdown(self) -> str:
+        parts = [f"# {self.title}"]
+        for section in self.sections:
+            parts += [f"## {section.title}", *section.text]
+            for table in section.tables:
+                shown = table.to_markdown() if table.in_text else f"In `tables/{table.key}.csv`."
+                parts += [f"**{table.title}**", shown, *filter(None, [table.note])]
+            parts += [f"![{f.title}](figures/{f.key}.png)\n\n{f.title}" for f in section.figures]
+        skipped = "\n".join(f"- {reason}" for reason in self.skipped) or "- nothing"
+        made = "\n".join(f"- {name}: {text}" for name, text in self.metadata.items())
+        return "\n\n".join([*parts, "## Skipped", skipped, "## How this was made", made]) + "\n"
+
+
+MARKERS = ("o", "s", "^", "x")
+DASHES = ("-", "--", ":", "-.")
+
+WIDEST = 1600
+"""Pixels; wider pictures are shrunk."""
+
+
+def bar_chart(values: Mapping[str, float], label: str, highlighted: Sequence[str] = ()) -> bytes:
+    """Draw horizontal bars by name, with the value beside each, some in another colour."""
+    figure = _figure(8, 0.32 * len(values) + 1)
+    axes = figure.subplots()
+    colors = ["C1" if name in highlighted else "C0" for name in values]
+    bars = axes.barh(list(values), list(values.values()), color=colors)
+    axes.bar_label(bars, fmt="{:.3f}", padding=3)
+    axes.invert_yaxis()
+    axes.set_xlabel(label)
+    axes.set_xlim(left=0)
+    axes.margins(x=0.12)
+    axes.grid(axis="x", alpha=0.3)
+    return _saved(figure)
+
+
+def line_chart(
+    lines: Mapping[str, tuple[Sequence[float], Sequence[float]]],
+    x_label: str,
+    y_label: str,
+    *,
+    logarithmic: bool = False,
+    ticks: Sequence[float] = (),
+) -> bytes:
+    """Draw lines of (x, y) values, with their names in a legend; one of one value is a point.
+
+    The x axis may be logarithmic, and have ticks of its own.
+    """
+    figure = _figure(11, max(4.5, 0.27 * len(lines) + 0.5))
+    axes = figure.subplots()
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
+    axes.grid(alpha=0.3)
+    for k, (name, (x, y)) in enumerate(lines.items()):
+        # Ten colours, and other marks and lines each time round.
+        marker, dash = MARKERS[k // 10 % len(MARKERS)], DASHES[k // 10 % len(DASHES)]
+        axes.plot(x, y, label=name, color=f"C{k % 10}", marker=marker, linestyle=dash)
+    if logarithmic:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("{x:g}")
+    if ticks:
+        axes.set_xticks(ticks, [f"{tick:,g}" for tick in ticks], minor=False)
+        axes.set_xticks([], minor=True)
+    if lines:
+        axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.01, 0.5))
+    return _saved(figure)
+
+
+def picture(rgb: np.ndarray) -> bytes:
+    """Encode a (H, W, 3) uint8 RGB picture, shrunk where it is very wide."""
+    if rgb.shape[1] > WIDEST:
+        size = (WIDEST, round(rgb.shape[0] * WIDEST / rgb.shape[1]))
+        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    return cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes()
+
+
+def _figure(width: float, height: float) -> Any:
+    require_packages("a chart of the report", "matplotlib")
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _saved(figure: Any) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()

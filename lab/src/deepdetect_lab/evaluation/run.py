@@ -1,0 +1,262 @@
+"""A run of benchmarks: its data, cached results of stages, and what could not be measured."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from deepdetect._shared.errors import DeepDetectError, OptionError, first_line
+from deepdetect._shared.opencv import cv2
+from deepdetect._shared.progress import progress
+from deepdetect._shared.records import file_digest, key, load_arrays, save_arrays
+from deepdetect.features.keypoints import Keypoints
+from deepdetect.features.matchers import get_matcher, match_descriptors
+from deepdetect.io.image import load_image
+from deepdetect.matching.pipeline import check_memory
+
+from .baselines.method import LocalFeature
+from .profiling import Profile, profiled
+from .report import Row, Rows
+
+Result = TypeVar("Result")
+
+STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
+    "keypoints": (1, ()),
+    "matches": (1, ("keypoints",)),
+    "guided": (8, ("keypoints",)),
+    "stereo": (4, ()),
+    "repeatability_paper": (1, ("keypoints",)),
+    "repeatability_mutual_nn": (1, ("keypoints",)),
+    "corner_errors": (1, ("matches",)),
+    "pose": (8, ("matches", "guided")),
+    "sfm": (4, ()),
+}
+"""Version of each stage, and the stages it is made from.
+
+Raise the version when a change of the code changes the stage's results: cached ones of another
+version are not used, nor what was made from them.
+"""
+
+RECENT_IMAGES = 8
+
+
+class CacheError(DeepDetectError):
+    """A result cannot be kept: the folder cannot be written."""
+
+
+@dataclass(frozen=True)
+class MatchSettings:
+    """How the descriptors of a pair are matched.
+
+    The matcher is for Euclid's distances; binary descriptors are matched by Hamming's, exactly.
+    Only the best `budget` keypoints of each image take part.
+    """
+
+    matcher: str = "flann"
+    ratio: float = 0.99
+    mutual: bool = False
+    budget: int | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class PairMatches:
+    """The (M, 2) matched positions of a pair, and those of all keypoints that took part.
+
+    With what describing both images and matching took when it was done.
+    """
+
+    points0: np.ndarray
+    points1: np.ndarray
+    keypoints0: np.ndarray
+    keypoints1: np.ndarray
+    describe: Profile
+    match: Profile
+
+
+class Run:
+    """A run of benchmarks.
+
+    Args:
+        data: folder of the data sets, or of the only one that is needed.
+        cache: folder of the results of stages, each under a digest of all that it depends on; a
+            damaged file is made again, old ones are never removed. None keeps nothing.
+        quiet: show no progress bars.
+
+    Attributes:
+        made: number of results that were computed, not found in the cache.
+        skipped, failures: as of `Report`.
+    """
+
+    def __init__(self, data: Path, cache: Path | None = None, quiet: bool = True) -> None:
+        self.data, self.cache, self.quiet = data, cache, quiet
+        self.made = 0
+        self.skipped: list[str] = []
+        self.failures: list[str] = []
+        self._recent: OrderedDict[str, tuple[Keypoints, Profile]] = OrderedDict()
+        self._described: tuple[str, list[np.ndarray], Profile] | None = None
+
+    def folder(self, name: str) -> Path:
+        """Return the folder of a data set: below `data`, or `data` itself."""
+        below = self.data / name
+        return below if below.is_dir() else self.data
+
+    @cached_property
+    def files_folder(self) -> Path:
+        """Folder for images that are made: the cache's, or a temporary one."""
+        if self.cache is not None:
+            return self.cache
+        folder = Path(tempfile.mkdtemp(prefix="deepdetect-benchmark-"))
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        return folder
+
+    def attempt(self, name: str, work: Callable[..., Result], *arguments: Any) -> Result | None:
+        """Do a piece of work; when it cannot be done, note that it is skipped and why.
+
+        Only errors of data and of detectors from outside are noted. Any other is a bug and passes,
+        an error of options too: those of the user were checked before the run.
+        """
+        try:
+            return work(*arguments)
+        except (CacheError, OptionError):
+            raise
+        except (DeepDetectError, cv2.error) as error:
+            reason = getattr(error, "err", None) or error  # what OpenCV says without its files
+            self.fail(f"{name}: {first_line(reason)}")
+            return None
+
+    def fail(self, reason: str) -> None:
+        """Note what was wanted and cannot be measured."""
+        self.skipped.append(reason)
+        self.failures.append(reason)
+
+    def rows(
+        self,
+        what: str,
+        methods: Sequence[Any],
+        items: Mapping[str, Any],
+        measure: Callable[[Any, Any], Row],
+    ) -> Rows:
+        """Measure each method, which has a name and perhaps a title, on each item by its name.
+
+        `what` is the beginning of what the progress bar shows and of the reason of a failure. The
+        rows have the names as "method" and "item"; those that failed are missing.
+        """
+        rows: Rows = []
+        with progress(len(methods) * len(items), "benchmark", "task", self.quiet) as bar:
+            for method in methods:
+                for name, item in items.items():
+                    task = f"{what}{getattr(method, 'title', method.name)} on {name}"
+                    bar.set_postfix_str(task, refresh=False)
+                    values = self.attempt(task, measure, method, item)
+                    if values is not None:
+                        rows.append({"method": method.name, "item": name, **values})
+                    bar.update(1)
+        return rows
+
+    def cached(self, stage: str, depends: object, make: Callable[[], Row]) -> Row:
+        """Find a result of one of `STAGES`, or make and keep it: arrays, numbers and texts.
+
+        It depends on the values of `depends`, as for `records.key`: of a path on its content.
+        """
+        path = None
+        kept: Mapping[str, np.ndarray] | None = None
+        if self.cache is not None:
+            path = self.cache / stage / f"{key(stage_versions(stage), depends)}.npz"
+            kept = load_arrays(path)
+        if kept is None:
+            kept = {name: np.asarray(value) for name, value in make().items()}
+            self.made += 1
+            if path is not None:
+                try:
+                    save_arrays(path, kept)
+                except DeepDetectError as error:
+                    raise CacheError(str(error)) from None
+        return {name: value if value.ndim else value.item() for name, value in kept.items()}
+
+    def keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, Profile]:
+        """Find the keypoints of an image, or read them and what it took from the cache."""
+        name = f"{feature.detection} {file_digest(image)}"
+        if name not in self._recent:
+            self._recent[name] = self._keypoints(feature, image)
+        self._recent.move_to_end(name)
+        if len(self._recent) > RECENT_IMAGES:
+            self._recent.popitem(last=False)
+        return self._recent[name]
+
+    def _keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, Profile]:
+        def make() -> Row:
+            rgb = load_image(image)
+            with profiled() as profiler:
+                found = feature.detect(rgb)
+            known = {name: value for name, value in vars(found).items() if value is not None}
+            return {**known, "profile": profiler.total}
+
+        kept = self.cached("keypoints", (feature.detection, image), make)
+        profile = Profile(*kept.pop("profile").tolist())
+        width, height = kept.pop("image_size").tolist()
+        return Keypoints(image_size=(width, height), **kept), profile
+
+    def matches(
+        self, feature: LocalFeature, images: tuple[Path, Path], settings: MatchSettings
+    ) -> PairMatches:
+        """Match two images, or read their matches from the cache."""
+        both = [self.keypoints(feature, image)[0] for image in images]
+        if settings.budget is not None:
+            both = [keypoints.best(settings.budget) for keypoints in both]
+
+        def make() -> Row:
+            check_memory([len(keypoints) for keypoints in both])
+            descriptors, describe = self._descriptors(feature, images, both)
+            matcher = get_matcher("hamming" if feature.binary else settings.matcher)
+            with profiled() as profiler:
+                found = match_descriptors(
+                    descriptors[0],
+                    descriptors[1],
+                    matcher,
+                    ratio=settings.ratio,
+                    mutual=settings.mutual,
+                    seed=settings.seed,
+                    positions=(both[0].xy, both[1].xy),
+                )
+            profiles = describe, profiler.total
+            return {"rows0": found.indices0, "rows1": found.indices1, "profiles": profiles}
+
+        kept = self.cached("matches", (*feature.key, images, settings), make)
+        describe, match = (Profile(*profile) for profile in kept["profiles"].tolist())
+        points = both[0].xy[kept["rows0"]], both[1].xy[kept["rows1"]]
+        return PairMatches(*points, both[0].xy, both[1].xy, describe, match)
+
+    def _descriptors(
+        self, feature: LocalFeature, images: tuple[Path, Path], both: Sequence[Keypoints]
+    ) -> tuple[list[np.ndarray], Profile]:
+        """Describe both images; those of the last pair are kept for other settings of matching."""
+        name = key(*feature.key, images, [len(keypoints) for keypoints in both])
+        if self._described is None or self._described[0] != name:
+            self._described = None  # frees its memory before more is needed
+            rgb = [load_image(image) for image in images]
+            with profiled() as profiler:
+                descriptors = [
+                    feature.describe(pixels, keypoints)
+                    for pixels, keypoints in zip(rgb, both, strict=True)
+                ]
+            self._described = name, descriptors, profiler.total
+        return self._described[1:]
+
+
+def stage_versions(stage: str) -> dict[str, Any]:
+    """Return what a stage's results depend on: its version, its sources' and the packages'."""
+    version, sources = STAGES[stage]
+    versions = {"numpy": np.__version__, "opencv": cv2.__version__, stage: version}
+    for source in sources:
+        versions |= stage_versions(source)
+    return versions

@@ -1,0 +1,262 @@
+"""How good weights are: known masks, labels at several scales, and the paper's protocol."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from deepdetect._shared.errors import ImageError, OptionError, require_packages
+from deepdetect._shared.options import suggest_keywords
+from deepdetect._shared.progress import progress
+from deepdetect.detector.detector import DeepDetect
+from deepdetect.features.selection import SelectionOptions
+from deepdetect.io.image import find_images, load_image
+
+from ..datasets.foreground import MaskedPhotograph, load_foreground
+from ..datasets.planar import PlanarPair, PlanarScene, load_oxford
+from .baselines.method import LocalFeature, deepdetect_feature
+from .options import PAPER_RESOLUTION_PX, THRESHOLDS
+from .protocols.masks import (
+    LabelDensityDetector,
+    MaskScore,
+    check_scale,
+    load_sample,
+    sample_images,
+    score_at_scale,
+    score_samples,
+)
+from .protocols.paper import OXFORD_PAIRS, foreground_rows, mean_correct_matches, repeatability_rows
+from .protocols.planar import select_pairs
+from .report import Row, mean, where
+from .run import Run
+
+
+@dataclass(frozen=True)
+class OxfordScore:
+    """What weights give on the Oxford scenes, images squashed to 480x480 and RGB.
+
+    Attributes:
+        density: keypoints per pixel at each of the paper's thresholds, mean over all images; at
+            equal density at the first of them only.
+        repeatability: by scene, mean over its five pairs, as in the paper, clipped.
+        correct: correct matches (FLANN, ratio 0.99, under 1 px by the published
+            homography) by pair, means over several seeds of FLANN.
+        matches: all matches that pass the ratio test, likewise.
+        failures: a sentence on each image and pair that could not be measured: it is in no mean.
+    """
+
+    density: dict[float, float]
+    repeatability: dict[str, float]
+    correct: dict[str, int]
+    matches: dict[str, int]
+    failures: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ForegroundScore:
+    """How many keypoints lie on the foreground of photographs, images squashed to 480x480.
+
+    Attributes:
+        fraction: of the keypoints, mean over the photographs.
+        density: keypoints per pixel, mean over the photographs.
+        covered: of the pixels, which is what random keypoints reach.
+        photographs: how many were measured: those with a keypoint.
+        failures: a sentence on each photograph that could not be measured.
+    """
+
+    fraction: float
+    density: float
+    covered: float
+    photographs: int
+    failures: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How good weights are.
+
+    Attributes:
+        masks: against the known masks of samples, by visibility, "normal" and "low".
+        scales: against the labels of scaled images, by scale and visibility.
+        oxford: by the paper's protocol.
+        foreground: of photographs with a known foreground.
+        failures: a sentence on each sample that cannot be read and is not in the scores; `oxford`
+            and `foreground` have their own.
+    """
+
+    masks: dict[str, MaskScore] = field(default_factory=dict)
+    scales: dict[tuple[float, str], MaskScore] = field(default_factory=dict)
+    oxford: OxfordScore | None = None
+    foreground: ForegroundScore | None = None
+    failures: tuple[str, ...] = ()
+
+
+@suggest_keywords
+def evaluate(
+    detector: DeepDetect | None = None,
+    *,
+    samples: str | Path | None = None,
+    scales: Sequence[float] = (),
+    oxford: str | Path | None = None,
+    foreground: str | Path | None = None,
+    equal_density: bool = False,
+    quiet: bool = True,
+) -> Evaluation:
+    """Evaluate weights.
+
+    Args:
+        detector: with the weights; default `DeepDetect()`. The known masks are compared at the
+            detector's own resolution, the rest at the resolution of the protocol.
+        samples: folder of images `image_NAME.png` with known masks `mask_image_NAME.png`; with
+            `scales` any images, without masks.
+        scales: factors above 0: the samples scaled by each are compared with labels of their own.
+        oxford: folder of the eight Oxford scenes, for `OxfordScore`.
+        foreground: folder of photographs NAME.jpg with their foreground NAME_mask.png: the fraction
+            of the keypoints that lies on it.
+        equal_density: take as many keypoints of each image of `oxford` and `foreground` as its
+            label marks, the most probable ones, instead of all above the threshold 0.5. More
+            keypoints are more repeatable and have more matches whatever they are, so weights are
+            compared in this way.
+        quiet: show no progress bars.
+
+    Raises:
+        ImageError: no sample, scene or photograph can be read, or a file of one is missing.
+        OptionError: a scale is not above 0, or `scales` or `equal_density` has no images.
+        MissingExtraError: `oxford` needs the extra `train`.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> from PIL import Image
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> for name in ("image_1.png", "mask_image_1.png"):
+        ...     Image.fromarray(np.zeros((64, 64), np.uint8)).save(folder / name)
+        >>> list(evaluate(samples=folder).masks)
+        ['low']
+    """
+    if not all(0 < scale < math.inf for scale in scales):
+        raise OptionError(f"scales must be numbers above 0, not {list(scales)}")
+    if scales and samples is None:
+        raise OptionError("scales are of the images in samples: name their folder, too")
+    if equal_density and oxford is None and foreground is None:
+        raise OptionError(
+            "`equal_density` needs keypoints: name a folder as `oxford` or `foreground`, too"
+        )
+    if oxford is not None:  # what is missing is said before hours of work
+        require_packages("the Oxford protocol", "scipy")
+    scenes = None if oxford is None else load_oxford(oxford)
+    masked = None if foreground is None else load_foreground(foreground)
+    detector = DeepDetect() if detector is None else detector
+    masks: dict[str, MaskScore] = {}
+    by_scale: dict[tuple[float, str], MaskScore] = {}
+    failures: dict[str, None] = {}
+    if samples is not None:
+        with_masks = not scales or any(Path(samples).glob("mask_image_*.png"))
+        images = sample_images(samples) if with_masks else find_images(samples)
+
+        def loaded(title: str, scale: float = 1) -> Iterator[tuple[Any, Any]]:
+            with progress(len(images), title, "image", quiet) as bar:
+                for path in images:
+                    try:
+                        sample = load_sample(path) if with_masks else (load_image(path), None)
+                        check_scale(sample[0], scale, path.name)
+                        yield sample
+                    except ImageError as error:
+                        failures[str(error)] = None
+                    bar.update(1)
+
+        if with_masks:
+            masks = score_samples(detector.heatmap, loaded("scoring"))
+        for scale in scales:
+            shown = (rgb for rgb, _ in loaded(f"scale {scale:g}", scale))
+            for visibility, score in score_at_scale(detector, shown, scale).items():
+                by_scale[scale, visibility] = score
+        if not masks and not by_scale:
+            raise ImageError(next(iter(failures)))
+    how = {"equal_density": equal_density, "quiet": quiet}
+    return Evaluation(
+        masks,
+        by_scale,
+        None if scenes is None else evaluate_oxford(detector, scenes, **how),
+        None if masked is None else evaluate_foreground(detector, masked, **how),
+        tuple(failures),
+    )
+
+
+def evaluate_oxford(
+    detector: Any, scenes: list[PlanarScene], *, equal_density: bool = False, quiet: bool = True
+) -> OxfordScore:
+    """Evaluate weights, or anything with a method `heatmap`, on scenes of `load_oxford`.
+
+    A DeepDetect sees images squashed to 480x480, whatever its own resolution; its other options
+    stay. It takes as many keypoints of each image as its label marks where `equal_density` is set.
+    """
+    detector = _of_paper(detector, equal_density)
+    features = [_feature(detector)]
+    thresholds = THRESHOLDS[:1] if equal_density else THRESHOLDS
+    run = Run(Path(), quiet=quiet)
+
+    def densities(_: LocalFeature, image: Path) -> Row:
+        heatmap = detector.heatmap(load_image(image))
+        return {t: float((heatmap > t).mean()) for t in thresholds}
+
+    def matches(feature: LocalFeature, pair: PlanarPair) -> Row:
+        correct, every = mean_correct_matches(run, feature, pair)
+        return {"correct": correct, "all": every}
+
+    images = {f"{scene.name}/{path.name}": path for scene in scenes for path in scene.images}
+    matched = {pair.name: pair for pair in select_pairs(scenes, OXFORD_PAIRS)}
+    density = run.rows("density of ", features, images, densities)
+    repeated = repeatability_rows(run, features, scenes)
+    counts = run.rows("matches of ", features, matched, matches)
+    if run.failures and not density:
+        raise ImageError(run.failures[0])
+    return OxfordScore(
+        {t: mean(density, t) or 0.0 for t in thresholds},
+        {
+            scene: mean(where(repeated, scene=scene), "repeatability") or 0.0
+            for scene in dict.fromkeys(row["scene"] for row in repeated)
+        },
+        {row["item"]: row["correct"] for row in counts},
+        {row["item"]: row["all"] for row in counts},
+        tuple(run.failures),
+    )
+
+
+def evaluate_foreground(
+    detector: Any,
+    images: Sequence[MaskedPhotograph],
+    *,
+    equal_density: bool = False,
+    quiet: bool = True,
+) -> ForegroundScore:
+    """Measure how many keypoints lie on the foreground; arguments as of `evaluate_oxford`."""
+    run = Run(Path(), quiet=quiet)
+    rows = foreground_rows(run, [_feature(_of_paper(detector, equal_density))], images)
+    known = [row for row in rows if row["density"] > 0]
+    if run.failures and not rows:
+        raise ImageError(run.failures[0])
+    if not known:
+        raise ImageError("no photograph with a foreground has a keypoint")
+    fraction, density, covered = (mean(known, n) or 0.0 for n in ("fraction", "density", "covered"))
+    return ForegroundScore(fraction, density, covered, len(known), tuple(run.failures))
+
+
+def _of_paper(detector: Any, equal_density: bool) -> Any:
+    """Return a detector that sees images as in the paper; others than DeepDetect as they are."""
+    if not isinstance(detector, DeepDetect):
+        return detector
+    options = replace(
+        detector.heatmap_options, resolution=PAPER_RESOLUTION_PX, tile_megapixels="auto"
+    )
+    squashing = detector.configured(options)
+    return LabelDensityDetector(squashing) if equal_density else squashing
+
+
+def _feature(detector: Any) -> LocalFeature:
+    selection = SelectionOptions(THRESHOLDS[0])
+    title = "the weights"
+    return deepdetect_feature(detector, selection, name="evaluated", title=title, version="1")

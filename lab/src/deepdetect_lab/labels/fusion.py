@@ -1,0 +1,161 @@
+"""Keypoint-edge fusion: the pixelwise OR of the label detectors (paper, Section III-A).
+
+Of images, and of files, whose labels are 1-bit PNG masks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from deepdetect._shared.errors import DeepDetectError, MissingExtraError
+from deepdetect._shared.image_array import Channels, check_channels
+from deepdetect._shared.options import suggest_keywords
+from deepdetect._shared.records import Outputs
+from deepdetect.io.image import load_image, luma
+from deepdetect.io.masks import save_mask
+from deepdetect.viz.draw import add_caption, hstack, save_picture
+
+from .detectors import DETECTORS
+from .settings import LabelOptions, Visibility
+
+LOW_VISIBILITY_RANGE = 64
+"""An image whose luma spans fewer grey levels than this is of low visibility."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Label:
+    """A fusion label.
+
+    Attributes:
+        keypoints: (H, W) bool, pixels marked by a keypoint detector.
+        edges: (H, W) bool, pixels marked by an edge detector.
+        visibility: the settings that were used, "normal" or "low".
+    """
+
+    keypoints: np.ndarray
+    edges: np.ndarray
+    visibility: Visibility
+
+    @cached_property
+    def mask(self) -> np.ndarray:
+        """(H, W) bool, the pixelwise OR of both."""
+        return self.keypoints | self.edges
+
+    def __repr__(self) -> str:
+        height, width = self.mask.shape
+        return f"Label({width}x{height}, density {self.density:.3f}, {self.visibility} visibility)"
+
+    @property
+    def density(self) -> float:
+        """Fraction of the pixels that are marked."""
+        return float(self.mask.mean())
+
+
+def visibility_of(gray: np.ndarray) -> Visibility:
+    """Decide which detector settings an image gets.
+
+    An image is of low visibility when its luma spans fewer than 64 grey levels between the 1st and
+    the 99th percentile. (The paper's darkened images span at most 32; its normal ones at least
+    146.)
+
+    Args:
+        gray: (H, W) uint8 luma.
+
+    Returns:
+        "normal" or "low".
+
+    Example:
+        >>> visibility_of(np.full((16, 16), 20, np.uint8))
+        'low'
+    """
+    cumulative = np.cumsum(np.bincount(gray.ravel(), minlength=256)) / gray.size
+    darkest, brightest = np.searchsorted(cumulative, [0.01, 0.99])
+    return "low" if brightest - darkest < LOW_VISIBILITY_RANGE else "normal"
+
+
+@suggest_keywords
+def fuse(
+    image: Any, options: LabelOptions = LabelOptions(), *, channels: Channels = "rgb"
+) -> Label:
+    """Run the chosen detectors on the luma of an image and fuse what they mark.
+
+    Args:
+        image: (H, W) uint8 luma; or anything `load_image` takes, whose luma is used.
+        options: which detectors, and which of their settings.
+        channels: order of the colours in an image that is an array, as of `load_image`.
+
+    Returns:
+        The label, whose `mask` is the pixelwise OR.
+
+    Raises:
+        ImageError: the image cannot be read or is not fit.
+
+    Example:
+        >>> square = np.zeros((32, 32), np.uint8)
+        >>> square[8:24, 8:24] = 255
+        >>> label = fuse(square, LabelOptions(detectors=("harris", "sobel")))
+        >>> bool(label.mask[8, 8]), bool(label.mask[0, 0])
+        (True, False)
+    """
+    check_channels(channels)
+    is_gray = isinstance(image, np.ndarray) and image.ndim == 2 and image.dtype == np.uint8
+    gray = image if is_gray else luma(load_image(image, channels=channels))
+    visibility = visibility_of(gray) if options.visibility == "auto" else options.visibility
+    marked = {"keypoint": np.zeros(gray.shape, bool), "edge": np.zeros(gray.shape, bool)}
+    for name in options.detectors:
+        settings = options.parameters(name, visibility)
+        marked[DETECTORS[name].kind] |= DETECTORS[name].mask(gray, **settings)
+    return Label(marked["keypoint"], marked["edge"], visibility)
+
+
+def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
+    """Draw the paper's Figure 4: image, keypoint mask, edge mask, and both combined.
+
+    Returns:
+        Four panels in a row, each mask captioned with its density.
+    """
+    panels = [add_caption(rgb, f"image ({label.visibility} visibility settings)")]
+    masks = {"keypoints": label.keypoints, "edges": label.edges, "combined": label.mask}
+    for name, mask in masks.items():
+        picture = np.repeat((mask * np.uint8(255))[:, :, None], 3, 2)
+        panels.append(add_caption(picture, f"{name}: {mask.mean():.1%} of pixels"))
+    return hstack(panels)
+
+
+@dataclass(frozen=True)
+class LabelTask:
+    """A mask to be made from an image file; `figure` is the paper's Figure 4 of this label."""
+
+    image: Path
+    mask: Path
+    options: LabelOptions
+    figure: Path | None = None
+    overwrite: bool = False
+
+    @property
+    def outputs(self) -> Outputs:
+        """The files, and the records of what they were made from."""
+        paths = [self.mask] if self.figure is None else [self.mask, self.figure]
+        return Outputs(paths, [self.image], {"label": self.options}, self.overwrite)
+
+
+def label_file(task: LabelTask) -> dict[str, Any] | str:
+    """Make the mask of an image file; return its numbers, or what is wrong with the image."""
+    try:
+        rgb = load_image(task.image)
+        label = fuse(luma(rgb), task.options)
+    except MissingExtraError:  # concerns all images
+        raise
+    except DeepDetectError as error:
+        return str(error)
+    with task.outputs.writing():
+        if task.figure is not None:
+            save_picture(draw_label(rgb, label), task.figure)
+        save_mask(label.mask, task.mask)
+    files = {"image": task.image, "mask": task.mask}
+    return {**files, "visibility": label.visibility, "density": label.density}

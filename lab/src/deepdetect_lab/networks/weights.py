@@ -1,0 +1,112 @@
+"""The networks by name, and their weights as safetensors files: state dicts with notes."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from deepdetect._shared.atomic import atomic_path
+from deepdetect._shared.errors import MissingWeightsError, WeightsError
+from deepdetect._shared.options import look_up, names_a_file
+from deepdetect.detector.pretrained import PRETRAINED
+
+from .espnet import ESPNet
+from .fast import FastNetwork
+
+NETWORKS: dict[str, type[nn.Module]] = {"espnet": ESPNet, "fast": FastNetwork}
+"""Made without arguments, they map (B, 3, H, W) float32 RGB in [0, 1] to (B, 1, H, W) logits.
+
+Sides are multiples of `STRIDE`. To add a network, write its module beside this one, and its name
+here.
+"""
+
+
+FOLDER = Path(__file__).parents[1] / "weights"
+"""The trained weights that training can start from; `deepdetect` has them as ONNX files."""
+
+
+def find_weights(weights: str | Path) -> Path:
+    """Return the path of a safetensors file, or of that of weights named in `PRETRAINED`."""
+    if names_a_file(weights):
+        return Path(weights)
+    return FOLDER / f"{look_up('name or file of weights', str(weights), PRETRAINED)}.safetensors"
+
+
+def save_tensors(tensors: Mapping[str, Tensor], path: str | Path, notes: dict[str, str]) -> None:
+    """Write tensors, with notes in the file's header, whole or not at all."""
+    stored = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+    with atomic_path(path) as temporary:
+        try:
+            save_file(stored, temporary, metadata=notes)
+        except SafetensorError as error:  # a full disk
+            raise OSError(str(error)) from None
+
+
+def load_network(path: str | Path, *kinds: type[nn.Module]) -> nn.Module:
+    """Make a network from a weights file, in evaluation mode.
+
+    It is the one of those kinds, by default of `NETWORKS`, that has most of the file's tensors.
+    """
+    if not Path(path).is_file():
+        raise MissingWeightsError(f"there is no weights file {path}: check the path")
+    networks = [make() for make in kinds or NETWORKS.values()]
+    try:
+        with safe_open(path, framework="pt") as file:
+            state = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        network = max(networks, key=lambda each: len(each.state_dict().keys() & state.keys()))
+        network.load_state_dict(state)
+    except (SafetensorError, OSError, RuntimeError) as error:
+        # torch names the first wrong tensor on its second line.
+        reason = " ".join(str(error).split("\n\t")[:2]).strip()
+        reason = reason if len(reason) < 160 else reason[:160] + "..."
+        raise WeightsError(
+            f"{path} does not fit the network ({reason}): "
+            "use weights that deepdetect has trained, or the published ones"
+        ) from None
+    return network.eval()
+
+
+def average_weights(paths: Sequence[str | Path]) -> nn.Module:
+    """Make a network, as `load_network` does, from the mean of several weights files.
+
+    The mean of runs that went on from one another is often better than each of them
+    (Wortsman et al., "Model soups", 2022). Counts, which have no mean, are the first file's.
+    """
+    networks = [load_network(path) for path in paths]
+    for path, network in zip(paths, networks, strict=True):
+        if type(network) is not type(networks[0]):
+            raise WeightsError(
+                f"{path} is of another network than {paths[0]}: give weights of one network"
+            )
+    states = [network.state_dict() for network in networks]
+    mean = {
+        name: sum(state[name] for state in states) / len(states)
+        if value.is_floating_point()
+        else value
+        for name, value in states[0].items()
+    }
+    networks[0].load_state_dict(mean)
+    return networks[0]
+
+
+def read_notes(path: str | Path) -> dict[str, str]:
+    """Read the notes in a weights file's header."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            return dict(file.metadata() or {})
+    except (SafetensorError, OSError) as error:
+        raise WeightsError(f"{path} is not a weights file ({error})") from None
+
+
+def weights_digest(network: nn.Module) -> str:
+    """Return the SHA-256 of a network's state, the same whatever file it came from."""
+    digest = hashlib.sha256()
+    for name, value in sorted(network.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()

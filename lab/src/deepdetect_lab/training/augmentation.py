@@ -1,0 +1,187 @@
+"""Augmentation: darkening, mirrors, colours of the same luma, and augmented views."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image, ImageEnhance
+
+from deepdetect._shared.opencv import cv2
+from deepdetect.io.image import luma
+
+RED, GREEN, BLUE = 0.299, 0.587, 0.114  # of the luma (BT.601)
+
+AUGMENTATION_VERSION = 3
+"""Part of the names of augmented views: when `augment` draws otherwise, old labels do not fit."""
+
+
+@dataclass(frozen=True)
+class Darkening:
+    """Two factors in (0, 1], those of Pillow's `ImageEnhance.Brightness` and `.Contrast`.
+
+    The published dark images fit brightness 0.3 and contrast 0.4.
+    """
+
+    brightness: float
+    contrast: float
+
+
+BRIGHTNESS, CONTRAST = (0.2, 0.45), (0.3, 0.55)
+"""Ranges that the factors of a `Darkening` are drawn from. The product stays under 0.25, so that a
+darkened image spans fewer than the 64 grey levels under which an image is of low visibility."""
+
+# What `augment` draws from.
+TURN_PROBABILITY = 0.5
+"""Of any angle; other views keep the sharpness of the image, which turning blurs."""
+
+CROP_SCALE = (0.7, 1.0)
+"""Side of the cut-out square, as a fraction of the largest that fits."""
+
+INTERPOLATIONS = ("NEAREST", "LINEAR", "CUBIC", "AREA", "LANCZOS4")
+"""What views that are not turned are made smaller by, as OpenCV names it."""
+
+RELIGHT_PROBABILITY = 0.5
+MAX_LOG_GAMMA = 0.5
+RELIGHT_CONTRAST, MAX_BRIGHTNESS_SHIFT = (0.5, 1.2), 0.15
+"""Of values in [0, 1], around 0.5."""
+
+BLUR_PROBABILITY, BLUR_SIGMA_PX = 0.3, (0.5, 2.5)
+NOISE_PROBABILITY, NOISE_SIGMA_LEVELS = 0.25, (1, 8)
+JPEG_PROBABILITY, JPEG_QUALITY = 0.35, (20, 95)
+
+MAX_JITTER_SATURATION = 1.2
+"""Largest factor of the saturation of rotated colours."""
+
+
+def draw_darkening(generator: np.random.Generator) -> Darkening:
+    """Draw both factors, rounded to thousandths so that a file name can hold them."""
+    return Darkening(
+        round(float(generator.uniform(*BRIGHTNESS)), 3),
+        round(float(generator.uniform(*CONTRAST)), 3),
+    )
+
+
+def darken(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:
+    """Reduce the brightness, then the contrast (paper, Section III-B), of (H, W, 3) uint8."""
+    dim = ImageEnhance.Brightness(Image.fromarray(rgb)).enhance(darkening.brightness)
+    return np.asarray(ImageEnhance.Contrast(dim).enhance(darkening.contrast))
+
+
+def transpose(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mirror a crop and its label along the diagonal: only BRISK labels it differently."""
+    # Copies a hundred times faster than a view.
+    return cv2.transpose(image), cv2.transpose(mask.view(np.uint8)).view(bool)
+
+
+def jitter_color(rgb: np.ndarray, generator: np.random.Generator, exact: bool) -> np.ndarray:
+    """Remove the colours or rotate the hue, both with the same luma, of (H, W, 3) uint8 RGB.
+
+    Where it must be exact, colours are removed: rotating them can change the luma by one level,
+    which matters for the keypoints of dark images.
+    """
+    if exact or generator.random() < 0.5:
+        return cv2.cvtColor(luma(rgb), cv2.COLOR_GRAY2RGB)
+    angle = generator.uniform(0, 2 * np.pi)
+    return rotate_hue(rgb, angle, generator.uniform(0, MAX_JITTER_SATURATION))
+
+
+def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
+    """Rotate the colours of (H, W, 3) uint8 RGB by an angle in the plane of Cb and Cr.
+
+    The luma changes by rounding only, by at most one level. Colours that would leave the range of
+    uint8 are desaturated until they fit.
+    """
+    red, green, blue = cv2.split(rgb.astype(np.float32))
+    gray = RED * red + GREEN * green + BLUE * blue
+    # Scaled by their ranges, the two differences are Cb and Cr.
+    blue_range, red_range = 1 - BLUE, 1 - RED
+    blue, red = (blue - gray) / blue_range, (red - gray) / red_range
+    cosine, sine = saturation * math.cos(angle), saturation * math.sin(angle)
+    blue, red = blue_range * (cosine * blue - sine * red), red_range * (sine * blue + cosine * red)
+    green = -(RED * red + BLUE * blue) / GREEN
+    # How far each pixel goes beyond white or black, as a multiple of the available range.
+    above = np.maximum(np.maximum(red, green), blue) / np.maximum(255 - gray, 1e-6)
+    below = np.minimum(np.minimum(red, green), blue) / np.minimum(-gray, -1e-6)
+    scale = 1 / np.maximum(np.maximum(above, below), 1)
+    rotated = cv2.merge([gray + scale * plane for plane in (red, green, blue)])
+    return cv2.convertScaleAbs(rotated)
+
+
+def augment(rgb: np.ndarray, side: int, seed: int) -> np.ndarray:
+    """Make a (side, side, 3) view of a part of an image: turned, relit, blurred, compressed.
+
+    Its label is made from the view itself. Other versions of NumPy and OpenCV may give slightly
+    different views for the same seed.
+    """
+    generator = np.random.default_rng([AUGMENTATION_VERSION, seed])
+    turned = generator.random() < TURN_PROBABILITY
+    view = (_rotated_crop if turned else _upright_crop)(rgb, side, generator)
+    if generator.random() < RELIGHT_PROBABILITY:
+        view = _relight(view, generator)
+    if generator.random() < BLUR_PROBABILITY:
+        view = cv2.GaussianBlur(view, (0, 0), generator.uniform(*BLUR_SIGMA_PX))
+    if generator.random() < NOISE_PROBABILITY:
+        noise = generator.normal(0, generator.uniform(*NOISE_SIGMA_LEVELS), view.shape)
+        view = np.clip(np.rint(view + noise), 0, 255).astype(np.uint8)
+    if generator.random() < JPEG_PROBABILITY:
+        view = _compress(view, int(generator.integers(*JPEG_QUALITY)))
+    return view
+
+
+def _rotated_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) -> np.ndarray:
+    """Cut out a square at any angle, whose corners lie inside the image."""
+    angle = generator.uniform(0, 2 * math.pi)
+    cosine, sine = math.cos(angle), math.sin(angle)
+    extent = abs(cosine) + abs(sine)  # of a rotated square of side 1
+    window = (min(rgb.shape[:2]) - 1) / extent * generator.uniform(*CROP_SCALE)
+    step = window / side
+    if step > 1:  # averaged before it is sampled more coarsely
+        factor = 1 / step
+        size = (max(round(rgb.shape[1] * factor), 1), max(round(rgb.shape[0] * factor), 1))
+        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+        window = min(window * factor, (min(rgb.shape[:2]) - 1) / extent)
+        step = window / side
+    half = window * extent / 2
+    height, width = rgb.shape[:2]
+    centre = (
+        generator.uniform(half, max(width - 1 - half, half)),
+        generator.uniform(half, max(height - 1 - half, half)),
+    )
+    linear = step * np.array([[cosine, -sine], [sine, cosine]])
+    offset = np.array(centre) - linear @ np.full(2, (side - 1) / 2)
+    return cv2.warpAffine(
+        rgb,
+        np.column_stack([linear, offset]),
+        (side, side),
+        flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REFLECT_101,
+    )
+
+
+def _upright_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) -> np.ndarray:
+    largest = min(rgb.shape[:2])
+    window = max(round(largest * generator.uniform(*CROP_SCALE)), min(side, largest))
+    top, left = (int(generator.integers(length - window + 1)) for length in rgb.shape[:2])
+    view = rgb[top : top + window, left : left + window]
+    view = np.rot90(view[:, :: int(generator.choice([-1, 1]))], int(generator.integers(4)))
+    interpolation = cv2.INTER_CUBIC
+    if window > side:
+        name = INTERPOLATIONS[int(generator.integers(len(INTERPOLATIONS)))]
+        interpolation = getattr(cv2, f"INTER_{name}")
+    return cv2.resize(np.ascontiguousarray(view), (side, side), interpolation=interpolation)
+
+
+def _relight(rgb: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    levels = np.arange(256) / 255
+    levels = levels ** math.exp(generator.uniform(-MAX_LOG_GAMMA, MAX_LOG_GAMMA))
+    levels = 0.5 + (levels - 0.5) * generator.uniform(*RELIGHT_CONTRAST)
+    levels = levels + generator.uniform(-MAX_BRIGHTNESS_SHIFT, MAX_BRIGHTNESS_SHIFT)
+    return np.clip(np.rint(255 * levels), 0, 255).astype(np.uint8)[rgb]
+
+
+def _compress(rgb: np.ndarray, quality: int) -> np.ndarray:
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)  # OpenCV's order, so that luma is luma
+    _, stored = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return cv2.cvtColor(cv2.imdecode(stored, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)

@@ -1,0 +1,286 @@
+"""torch datasets: random crops to train on, and whole images for validation."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from deepdetect._shared.errors import BatchError, DeepDetectError, ImageError
+from deepdetect._shared.machine import available_memory, map_in_processes, one_opencv_thread
+from deepdetect._shared.progress import progress
+from deepdetect._shared.records import key
+from deepdetect.io.image import load_image
+from deepdetect.io.masks import load_mask, save_mask
+
+from ..labels import LabelOptions
+from .augmentation import jitter_color, transpose
+from .recipe import Stage, TrainingOptions
+from .sampler import CropIndex
+from .shards import Shards, ShardSource
+from .views import (
+    SourceImage,
+    View,
+    label_key,
+    label_view,
+    list_images,
+    render,
+    train_val_split,
+)
+
+
+class FolderSource:
+    """Images in files, and their labels as 1-bit PNG files, in a subfolder for the label settings.
+
+    A label is named by the content of its image: a replaced image gets a new label. Up to
+    `memory_bytes` of views are kept in memory; those beyond are rendered each time.
+    """
+
+    shard_sizes = None
+
+    def __init__(
+        self,
+        images: Sequence[SourceImage],
+        labels: Path,
+        options: LabelOptions,
+        memory_bytes: int = 0,
+    ) -> None:
+        self.images, self.label_options, self.memory_bytes = images, options, memory_bytes
+        self.label_folder = labels / label_key(options)[:12]
+        self._kept: dict[tuple[int, View], tuple[np.ndarray, np.ndarray]] = {}
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitem__(self, index: int) -> SourceImage:
+        return self.images[index]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_kept": {}}  # a process that is not forked has its own
+
+    def label_path(self, image: SourceImage, view: View) -> Path:
+        """Return the file of a label."""
+        return self.label_folder / f"{image.path.stem}_{image.digest}_{view.name}.png"
+
+    def load(self, index: int, view: View) -> tuple[np.ndarray, np.ndarray]:
+        """Return a view as (H, W, 3) uint8 RGB, and its label as (H, W) bool."""
+        if (index, view) in self._kept:
+            return self._kept[index, view]
+        source = self.images[index]
+        image, mask = render(source.path, view), load_mask(self.label_path(source, view))
+        if mask.shape != image.shape[:2]:
+            raise ImageError(
+                f"the label of {source.path} has another size: delete {self.label_folder}"
+            )
+        self._keep(index, view, image, mask)
+        return image, mask
+
+    def _keep(self, index: int, view: View, image: np.ndarray, mask: np.ndarray) -> None:
+        if image.nbytes + mask.nbytes <= self.memory_bytes:
+            self.memory_bytes -= image.nbytes + mask.nbytes
+            self._kept[index, view] = image, mask
+
+    def make_labels(
+        self, views: Sequence[tuple[View, ...]], workers: int | None = None, quiet: bool = True
+    ) -> int:
+        """Make the missing labels of some views of each image in processes; return their number.
+
+        The views that are rendered for it are kept.
+
+        Raises:
+            BatchError: images cannot be read; the other labels are made all the same.
+        """
+        tasks, memory = [], self.memory_bytes
+        for index, (image, needed) in enumerate(zip(self.images, views, strict=True)):
+            files = {view: self.label_path(image, view) for view in needed}
+            if missing := {view: path for view, path in files.items() if not path.exists()}:
+                memory -= sum(4 * view.short_side**2 for view in missing)  # at least
+                tasks.append((index, image.path, missing, memory > 0))
+        total = sum(len(missing) for _, _, missing, _ in tasks)
+        failures = []
+        work = partial(_make_labels, options=self.label_options)
+        with progress(total, "labels", "label", quiet) as bar:
+            for (index, _, missing, _), made, error in map_in_processes(work, tasks, workers):
+                for view, pair in made.items():
+                    self._keep(index, view, *pair)
+                failures += [error] if error else []
+                bar.update(len(missing))
+        if failures:
+            raise BatchError(
+                f"{len(failures)} of {len(self.images)} images cannot be read, others are kept",
+                failures,
+            )
+        return total
+
+
+LabelTask = tuple[int, Path, dict[View, Path], bool]
+"""An image, by number and file, the labels to be written, and whether its views are sent back."""
+
+
+def _make_labels(
+    task: LabelTask, options: LabelOptions
+) -> tuple[LabelTask, dict[View, tuple[np.ndarray, np.ndarray]], str]:
+    """Write the labels of an image; return the views with their labels, and the error, if any."""
+    _, file, labels, keep = task
+    made = {}
+    try:
+        image = load_image(file)
+        for view, path in labels.items():
+            rgb = render(image, view)
+            mask = label_view(rgb, view, options)
+            save_mask(mask, path)
+            if keep:
+                made[view] = rgb, mask
+    except ImageError as error:
+        return task, made, str(error)
+    return task, made, ""
+
+
+ImageSource = FolderSource | ShardSource
+
+
+class CropDataset(Dataset[tuple[Tensor, Tensor]]):
+    """Random crops of views, augmented. Its indices come from a `CropSampler`.
+
+    A crop is a function of index and seed: (crop, crop, 3) uint8 RGB, (crop, crop) bool label.
+    """
+
+    def __init__(self, source: ImageSource, options: TrainingOptions) -> None:
+        self.source, self.options = source, options
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def __getitem__(self, index: CropIndex) -> tuple[Tensor, Tensor]:
+        options, side = self.options, index.stage.crop
+        generator = np.random.default_rng([options.seed, 2, index.epoch, index.position])
+        view = self._choose_view(self.source[index.image], index.stage, generator)
+        image, mask = self.source.load(index.image, view)
+        top = int(generator.integers(image.shape[0] - side + 1))
+        left = int(generator.integers(image.shape[1] - side + 1))
+        image = image[top : top + side, left : left + side]
+        mask = mask[top : top + side, left : left + side]
+        if options.transpositions and generator.random() < 0.5:
+            image, mask = transpose(image, mask)
+        if generator.random() < options.color_jitter:
+            dark = view.darkening is not None
+            image = jitter_color(image, generator, dark)
+        return torch.tensor(image), torch.tensor(mask)
+
+    def _choose_view(
+        self, image: SourceImage, stage: Stage, generator: np.random.Generator
+    ) -> View:
+        """Choose the light by the dark fraction, then one of the stage's sizes."""
+        dark = generator.random() < self.options.dark_fraction
+        fitting = [
+            view
+            for view in (image.dark if dark else image.normal)
+            if view.short_side >= stage.crop and (not stage.sides or view.short_side in stage.sides)
+        ]
+        return fitting[int(generator.integers(len(fitting)))]
+
+
+class ValidationDataset(Dataset[tuple[Tensor, Tensor]]):
+    """This process's part of the whole images: (H, W, 3) uint8 RGB, and (H, W) bool label.
+
+    Those in normal light come first, then the darkened ones.
+    """
+
+    def __init__(self, source: ImageSource, rank: int = 0, world_size: int = 1) -> None:
+        self.source = source
+        self.indices = range(rank, len(source), world_size)
+
+    def __len__(self) -> int:
+        return 2 * len(self.indices)
+
+    def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
+        light, place = divmod(index, len(self.indices))
+        number = self.indices[place]
+        image, mask = self.source.load(number, self.source[number].validation_views[light])
+        return torch.tensor(image), torch.tensor(mask)
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """The images of a run, and a digest of them."""
+
+    training: ImageSource
+    validation: ImageSource
+    digest: str
+
+
+def prepare_data(
+    images: str | Path,
+    options: TrainingOptions,
+    output: str | Path,
+    *,
+    validation: str | Path | None = None,
+    labels: str | Path | None = None,
+    workers: int | None = None,
+    processes: int = 1,
+    make_labels: bool = True,
+    quiet: bool = True,
+) -> TrainingData:
+    """List the images of a run and make the missing labels of their views; arguments of `train`.
+
+    `processes` of this machine load images, each with views of its own in memory.
+    """
+    images, output = Path(images), Path(output)
+    folder = output / "labels" if labels is None else Path(labels)
+    shards = Shards.open(images, options)
+    listed, held_out = [], []
+    if shards is None:
+        others = (output, folder) if validation is None else (output, folder, Path(validation))
+        listed = list_images(images, options, others, options.max_images)
+    if validation is not None:
+        held_out = list_images(Path(validation), options, (output, folder, images))
+    elif shards is None:
+        listed, held_out = train_val_split(listed, options.val_fraction)
+    memory = available_memory() // 2 // processes
+    training = FolderSource(listed, folder, options.labels, memory)
+    held = FolderSource(held_out, folder, options.labels, memory // 8)
+    if make_labels:
+        views = [i.normal + i.dark if options.dark_fraction > 0 else i.normal for i in listed]
+        training.make_labels(views, workers, quiet)
+        held.make_labels([image.validation_views for image in held_out], workers, quiet)
+    digests = [[image.digest for image in part] for part in (listed, held_out)]
+    if shards is None:
+        return TrainingData(training, held, key(digests)[:16])
+    names = [path.name for path, _ in shards.training + shards.validation]
+    return TrainingData(
+        ShardSource(shards.training, options),
+        ShardSource(shards.validation, options) if validation is None else held,
+        key(names, digests)[:16],
+    )
+
+
+@contextlib.contextmanager
+def loading(loader: DataLoader[Any]) -> Iterator[Iterator[Any]]:
+    """Yield an iterator over a loader; an error in one of its processes comes as raised there.
+
+    OpenCV has one thread meanwhile: a forked process cannot use the threads of its parent.
+    """
+    batches: Any = None
+    try:
+        with one_opencv_thread() if loader.num_workers else contextlib.nullcontext():
+            batches = iter(loader)
+            yield batches
+    except DeepDetectError as error:
+        # torch puts the whole traceback into the message.
+        text = str(error).strip()
+        if not text.startswith("Caught "):
+            raise
+        raise type(error)(text.splitlines()[-1].partition(": ")[2]) from None
+    finally:
+        # torch ends the processes with the iterator, which an error keeps alive; left to the
+        # garbage collector, that takes five seconds (their queues are collected first).
+        if loader.num_workers and batches is not None:
+            batches._shutdown_workers()

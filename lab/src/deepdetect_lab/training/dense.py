@@ -1,0 +1,318 @@
+"""The training of the network: crops with labels, the loss of each pixel, the validation.
+
+Lightning Fabric runs it on several GPUs, whose processes `torchrun` starts.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import datetime
+import logging
+import math
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning_fabric import Fabric
+from lightning_fabric.plugins.environments.lightning import LightningEnvironment
+from lightning_fabric.plugins.environments.torchelastic import TorchElasticEnvironment
+from lightning_fabric.strategies.ddp import DDPStrategy
+from torch import Tensor, nn
+from torch.nn.functional import binary_cross_entropy_with_logits, pad
+from torch.utils.data import DataLoader
+
+from deepdetect._shared.errors import OptionError, first_line
+from deepdetect._shared.machine import disable_malloc_trim
+from deepdetect._shared.options import look_up
+from deepdetect.io.image import luma
+
+from ..evaluation.protocols.masks import score_heatmap
+from ..labels import visibility_of
+from ..networks.export import export_onnx
+from ..networks.weights import (
+    NETWORKS,
+    average_weights,
+    find_weights,
+    load_network,
+    weights_digest,
+)
+from .checkpoint import Point
+from .dataset import CropDataset, TrainingData, ValidationDataset, loading
+from .optim import make_optimizers
+from .recipe import DeviceOptions, InitWeights, TrainingOptions
+from .sampler import CropSampler, Schedule, milestones
+from .trainer import Trainer
+
+ONNX = "deepdetect.onnx"
+
+LABELS_TIMEOUT = datetime.timedelta(hours=24)
+"""While the first process makes the labels, the others wait."""
+
+
+def initial_network(
+    options: TrainingOptions, init_weights: InitWeights | None
+) -> tuple[TrainingOptions, nn.Module]:
+    """Make the network with its initial weights, and resolve the options that depend on them."""
+    make = look_up("network", options.network, NETWORKS)
+    if init_weights is not None:
+        if options.frozen_batch_norm is None:
+            options = dataclasses.replace(options, frozen_batch_norm=True)
+        chosen = [init_weights] if isinstance(init_weights, (str, Path)) else list(init_weights)
+        paths = [find_weights(name) for name in chosen]
+        network = average_weights(paths)
+        if type(network) is not make:
+            raise OptionError(
+                f"the initial weights are not of the network {options.network}: give others, or "
+                "another `network`"
+            )
+        return options, network
+    if options.frozen_batch_norm:
+        raise OptionError(
+            "`frozen_batch_norm` would keep the batch statistics of random weights: "
+            "give trained ones as `init_weights`, or leave it out"
+        )
+    with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
+        torch.default_generator.manual_seed(options.seed)
+        return dataclasses.replace(options, frozen_batch_norm=False), make()
+
+
+def launch(device: DeviceOptions, options: TrainingOptions) -> Any:
+    """Join the processes that `torchrun` has started, or be the only one; return the `Fabric`.
+
+    Raises:
+        OptionError: the processes cannot train by these options.
+    """
+    kind = device.accelerator
+    if kind == "cpu":
+        disable_malloc_trim()
+    alone = "TORCHELASTIC_RUN_ID" not in os.environ
+    local, world = (1 if alone else int(os.environ[f"{n}WORLD_SIZE"]) for n in ("LOCAL_", ""))
+    if kind == "cuda" and local > torch.cuda.device_count():
+        raise OptionError(
+            f"there are {torch.cuda.device_count()} CUDA devices on this machine for {local} "
+            "processes: use `device=cpu`, or lower torchrun's --nproc-per-node"
+        )
+    if world > 1 and kind == "cpu" and not options.frozen_batch_norm:
+        raise OptionError(
+            "several processes need GPUs, or `frozen_batch_norm`: there is no batch normalisation "
+            "over several CPUs"
+        )
+    CropSampler(Schedule(options, images=1), world_size=world)  # which refuses uneven batches
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
+    fabric = Fabric(
+        accelerator=kind,
+        devices=local,
+        num_nodes=world // local,
+        # Buffers are the same everywhere: the batch normalisation sees to it.
+        strategy="auto" if alone else DDPStrategy(broadcast_buffers=False, timeout=LABELS_TIMEOUT),
+        # Named, so that a batch system's variables in the environment change nothing.
+        plugins=[LightningEnvironment() if alone else TorchElasticEnvironment()],
+    )
+    fabric.launch()
+    if device.threads is not None:
+        torch.set_num_threads(int(device.threads))  # launching sets its own
+    return fabric
+
+
+class DenseTrainer(Trainer):
+    """A network that maps images to heat maps, with its initial weights, and labelled images."""
+
+    objective, sign = "validation_loss", 1
+    weights_file = "best.safetensors"
+
+    def __init__(
+        self,
+        network: nn.Module,
+        options: TrainingOptions,
+        data: TrainingData,
+        device: DeviceOptions,
+        fabric: Any,
+    ) -> None:
+        self.options, self.data, self.device_options = options, data, device
+        self.fabric, self.device, self.is_main = fabric, fabric.device, fabric.is_global_zero
+        kind, alone = device.accelerator, fabric.world_size == 1
+        initial_weights = weights_digest(network)
+        self.bfloat16 = device.precision == "bfloat16" or (
+            device.precision == "auto" and _computes_bfloat16(kind)
+        )
+        # channels_last is faster by 40 % on CPUs, and what tensor cores want.
+        self.network = network.to(self.device)
+        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        if not alone and kind == "cuda":
+            nn.SyncBatchNorm.convert_sync_batchnorm(self.network)
+        self.average = copy.deepcopy(self.network).eval()
+        self.average_decay = options.average_decay
+        self.max_gradient_norm = options.max_gradient_norm or math.inf
+        has_compiler = kind == "cuda" or any(map(shutil.which, ("g++", "clang++")))
+        # Sums over processes, inside the batch normalisation, break the graph.
+        self.compiled = has_compiler and alone if device.compile is None else device.compile
+        self._forward = self._set_up()
+        self.optimizers = make_optimizers(options.optimizer, network)
+        self.schedule = Schedule(options, len(data.training))
+        self.steps = self.schedule.steps
+        self.milestones = milestones(self.steps, options.val_count)
+        self.origin = {"images_digest": data.digest, "initial_weights": initial_weights}
+        how = self.describe()
+        self.notes = {"images": str(len(data.training)), "run_on": how}
+        self.introduction = [f"training on {how}"]
+        if self.compiled:
+            self.introduction.append(
+                "the first step of each stage compiles the network, which takes minutes on two "
+                "cores; --no-compile starts at once, and each step takes longer"
+            )
+
+    def _set_up(self) -> nn.Module:
+        network: Any = self.network
+        if self.compiled:
+            # Not dynamic: there are only as many shapes as stages, and each gets its own code.
+            network = torch.compile(network, dynamic=False)
+        return self.fabric.setup_module(network, move_to_device=False)
+
+    def to_device(self, values: Tensor) -> Tensor:
+        """Copy a tensor to the device, without waiting where it is pinned."""
+        return values.to(self.device, non_blocking=True)
+
+    def to_float(self, images: Tensor) -> Tensor:
+        """Turn (B, H, W, 3) uint8 into (B, 3, H, W) float32 in [0, 1] on the device."""
+        return self.to_device(images).permute(0, 3, 1, 2).float().div_(255)
+
+    def logits(self, images: Tensor) -> Tensor:
+        """Run the network for training; logits are float32."""
+        try:
+            # Not Fabric's own precision, which would round the images to bfloat16 as well.
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
+                return self._forward(images).float()
+        except torch._dynamo.exc.TorchDynamoException as error:
+            # A compiler on the path may still lack headers, and CUDA its Triton.
+            if self.device_options.compile:
+                raise OptionError(
+                    f"torch.compile does not work here ({first_line(error)}): set `compile=False`"
+                ) from None
+            self.compiled = False
+            self._forward = self._set_up()
+            return self.logits(images)
+
+    def describe(self) -> str:
+        """Say in words how the network is run."""
+        precision = "bfloat16" if self.bfloat16 else "float32"
+        words = [self.device.type, precision, "compiled" if self.compiled else "eager"]
+        if self.fabric.world_size > 1:
+            words.append(f"{self.fabric.world_size} processes")
+        return ", ".join(words)
+
+    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
+        """Return the loader of the batches of some steps: (images, masks), see `CropDataset`."""
+        rank, world = self.fabric.global_rank, self.fabric.world_size
+        steps = self.schedule, self.data.training.shard_sizes, first, last
+        sampler = CropSampler(*steps, rank=rank, world_size=world)
+        return self._loader(CropDataset(self.data.training, self.options), batch_sampler=sampler)
+
+    def _loader(self, dataset: Any, **batches: Any) -> DataLoader[Any]:
+        return DataLoader(
+            dataset,
+            num_workers=self.device_options.worker_count,
+            pin_memory=self.device.type == "cuda",
+            generator=torch.Generator(),  # not torch's own, whose state is the user's
+            **batches,
+        )
+
+    def pixels(self, batch: tuple[Tensor, Tensor]) -> int:
+        return batch[1].numel() * self.fabric.world_size
+
+    def learning_rate(self, step: int) -> float:
+        return self.schedule.learning_rate(step)
+
+    def loss(self, batch: tuple[Tensor, Tensor]) -> Tensor:
+        """Return the loss of (B, crop, crop, 3) uint8 RGB with (B, crop, crop) bool labels."""
+        images, masks = batch
+        self.network.train()
+        if self.options.frozen_batch_norm:
+            freeze_batch_norm(self.network)
+        truth = self.to_device(masks)[:, None].float()
+        logits = self.logits(self.to_float(images))
+        return binary_cross_entropy_with_logits(logits, truth, pos_weight=self._pos_weight(images))
+
+    def backward(self, loss: Tensor) -> float:
+        self.fabric.backward(loss)
+        return float(self.fabric.all_reduce(loss.detach(), reduce_op="mean").item())
+
+    def _pos_weight(self, images: Tensor) -> Tensor | None:
+        """Return the weights of the images' marked pixels, (B, 1, 1, 1) or (1,); None: all 1."""
+        normal, dark = self.options.pos_weight, self.options.low_light_pos_weight
+        if dark is None or dark == normal:  # the images need not be looked at
+            return None if normal == 1 else self.to_device(torch.tensor([normal]))
+        weights = {"normal": normal, "low": dark}
+        each = [weights[visibility_of(luma(image))] for image in images.numpy()]
+        return self.to_device(torch.tensor(each)[:, None, None, None])
+
+    def validate(self, step: int) -> dict[str, float]:
+        """Return the losses and the intersections over union on the validation images."""
+        rank, world = self.fabric.global_rank, self.fabric.world_size
+        dataset = ValidationDataset(self.data.validation, rank, world)
+        sums = torch.zeros(2, 3, device=self.device, dtype=torch.float64)
+        with loading(self._loader(dataset, batch_size=None)) as pairs:
+            for number, (image, mask) in enumerate(pairs):
+                loss, iou = score_heatmap(self.heatmap(image), mask.numpy())
+                sums[int(number >= len(dataset) // 2)] += torch.tensor(
+                    [loss, iou, 1.0], dtype=torch.float64
+                )
+        sums = self.fabric.all_reduce(sums, reduce_op="sum")
+        (normal_loss, normal_iou), (dark_loss, dark_iou) = (sums[:, :2] / sums[:, 2:]).tolist()
+        fraction, crops = self.options.dark_fraction, self.schedule.crops_until(step)
+        return {
+            "epoch": crops / self.schedule.images,
+            "images": crops,
+            "learning_rate": self.learning_rate(step - 1),
+            "validation_loss": (1 - fraction) * normal_loss + fraction * dark_loss,
+            "normal_loss": normal_loss,
+            "normal_iou": normal_iou,
+            "dark_loss": dark_loss,
+            "dark_iou": dark_iou,
+        }
+
+    @torch.inference_mode()
+    def heatmap(self, image: Tensor) -> np.ndarray:
+        """Run the network, in evaluation mode, in float32 on (H, W, 3) uint8 of any size."""
+        height, width = image.shape[:2]
+        batch = self.to_float(image[None])
+        batch = pad(batch, (0, -width % 8, 0, -height % 8), mode="replicate")
+        batch = batch.contiguous(memory_format=torch.channels_last)
+        logits = self.average(batch)[0, 0, :height, :width]
+        return torch.sigmoid(logits.float()).cpu().numpy()
+
+    def export(self, folder: Path) -> Path:
+        best = load_network(folder / self.weights_file)
+        export_onnx(best, folder / ONNX)
+        return folder / ONNX
+
+    def card(self, best: Point) -> tuple[str, list[str]]:
+        count = sum(parameter.numel() for parameter in self.network.parameters())
+        network = (
+            f"{type(self.network).__name__}, {count:,} parameters. Input: RGB in [0, 1]; output: "
+            "the\nprobability that a pixel is a keypoint or an edge for one of the label detectors."
+        )
+        return network, [
+            "On the validation images, by which these weights were chosen (mean binary",
+            "cross-entropy per pixel / intersection over union at threshold 0.5):",
+            "",
+            f"- normal: {best['normal_loss']:.4f} / {best['normal_iou']:.3f}",
+            f"- darkened: {best['dark_loss']:.4f} / {best['dark_iou']:.3f}",
+        ]
+
+
+def freeze_batch_norm(network: nn.Module) -> None:
+    """Make the batch normalisations use the statistics they have, until `network.train()`."""
+    for module in network.modules():
+        if isinstance(module, nn.modules.batchnorm._BatchNorm):
+            module.eval()
+
+
+def _computes_bfloat16(kind: str) -> bool:
+    if kind == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    capabilities = getattr(torch.cpu, "_is_avx512_bf16_supported", None)
+    return bool(capabilities and capabilities())

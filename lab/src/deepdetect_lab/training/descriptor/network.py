@@ -1,0 +1,202 @@
+"""The network of the learned descriptor: features of the whole image, read at keypoints.
+
+`DescriptorNetwork.maps` makes features at 1/2 to 1/16 of the size, of the image and of it reduced
+to 1/2 and 1/4, by the same kernels; `describe` reads them at each keypoint, those of the image and
+those of the octave of the keypoint's own size, and a perceptron makes 64 numbers of them. These are
+of an upright image: the first 16 do not change where it is turned, the others turn with it
+(`deepdetect.features.learned`).
+"""
+
+from __future__ import annotations
+
+import math
+from functools import reduce
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, batch_norm, interpolate, normalize, relu
+
+from deepdetect.features.learned import CONSTANT, FREQUENCIES
+
+HALF, QUARTER, EIGHTH, SIXTEENTH, COARSEST, HIDDEN = 16, 32, 64, 96, 128, 160
+"""Channels at so much of the size (the coarsest: 1/32), and of the perceptron."""
+
+DIMENSIONS = CONSTANT + 2 * len(FREQUENCIES)
+OCTAVES = 3
+FIRST_OCTAVE_PX = 4.5
+"""Keypoints up to this size are read in the image itself, of twice the size in its half."""
+
+SMALLEST_SIZE_PX = 2.5
+NOISE = 1 / 255
+"""What varies by less than this, one grey level, is not raised to full contrast."""
+
+CELL_PX, CELLS = 8, 5
+"""Local contrast is that of squares of 5 cells of 8 pixels."""
+
+BATCH_MOMENTUM = 0.1
+
+
+class Convolution(nn.Module):
+    """A convolution, batch normalisation, ReLU.
+
+    The statistics of the batch are those of the first octave, for the others, too: as they are once
+    the network is trained, where one normalisation serves all.
+    """
+
+    def __init__(self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> None:
+        super().__init__()
+        padding = (kernel - 1) // 2
+        self.conv = nn.Conv2d(inputs, outputs, kernel, stride, padding, bias=False)
+        self.norm = nn.BatchNorm2d(outputs)
+
+    def forward(self, x: Tensor, octave: int) -> Tensor:
+        x, norm = self.conv(x), self.norm
+        if not self.training:
+            return relu(norm(x))
+        if octave == 0:
+            self.mean, self.variance = (
+                x.new_zeros(x.shape[1]).float(),
+                x.new_ones(x.shape[1]).float(),
+            )
+        batch = self.mean, self.variance
+        first = octave == 0
+        result = relu(batch_norm(x, *batch, norm.weight, norm.bias, training=first, momentum=1))
+        if first:
+            for running, each in zip((norm.running_mean, norm.running_var), batch, strict=True):
+                cast(Tensor, running).lerp_(each, BATCH_MOMENTUM)
+        return result
+
+
+class Halving(nn.Module):
+    """Two convolutions, of which the first halves the size."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.first, self.second = (
+            Convolution(inputs, outputs, 2, 2),
+            Convolution(outputs, outputs),
+        )
+
+    def forward(self, x: Tensor, octave: int) -> Tensor:
+        return self.second(self.first(x, octave), octave)
+
+
+class DescriptorNetwork(nn.Module):
+    """Describes keypoints of luma whose sides are multiples of 128."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.at_half = Convolution(2, HALF, 4, 2)
+        self.at_quarter = Halving(HALF, QUARTER)
+        self.at_eighth = Halving(QUARTER, EIGHTH)
+        self.at_sixteenth = Halving(EIGHTH, SIXTEENTH)
+        self.at_coarsest = Halving(SIXTEENTH, COARSEST)
+        self.to_sixteenth = nn.Conv2d(COARSEST, SIXTEENTH, 1)
+        self.around_sixteenth = Convolution(SIXTEENTH, SIXTEENTH)
+        self.to_eighth = nn.Conv2d(SIXTEENTH, EIGHTH, 1)
+        self.around_eighth = Convolution(EIGHTH, EIGHTH)
+        features = HALF + QUARTER + 2 * EIGHTH + SIXTEENTH
+        self.input = nn.Linear(2 * features, HIDDEN)
+        self.by_size = nn.Sequential(nn.Linear(3, 32), nn.ReLU(), nn.Linear(32, 2 * HIDDEN))
+        nn.init.zeros_(self.get_parameter("by_size.2.weight"))
+        nn.init.zeros_(self.get_parameter("by_size.2.bias"))
+        self.norm, self.middle_norm = nn.BatchNorm1d(HIDDEN), nn.BatchNorm1d(HIDDEN)
+        self.middle, self.output = nn.Linear(HIDDEN, HIDDEN), nn.Linear(HIDDEN, DIMENSIONS)
+        self.temperature = nn.Parameter(torch.tensor(math.log(20.0)))  # of the loss
+
+    def forward(self, luma: Tensor, xy: Tensor, sizes: Tensor) -> Tensor:
+        """Map (B, 1, H, W) in [0, 1], (B, N, 2) and (B, N) pixels to (B, N, 64) of length 1."""
+        return self.describe(self.maps(luma), xy, sizes)
+
+    def maps(self, luma: Tensor) -> list[list[Tensor]]:
+        """Return, of each octave, features at 1/2, 1/4, 1/8, 1/8 with surroundings, 1/16."""
+        x, result = _normalized(luma), []
+        for octave in range(OCTAVES):
+            if octave:
+                x = avg_pool2d(x, 2)
+            half = self.at_half(x, octave)
+            quarter = self.at_quarter(half, octave)
+            eighth = self.at_eighth(quarter, octave)
+            sixteenth = self.at_sixteenth(eighth, octave)
+            coarse = _doubled(self.to_sixteenth(self.at_coarsest(sixteenth, octave)))
+            sixteenth = self.around_sixteenth(sixteenth + coarse, octave)
+            coarse = _doubled(self.to_eighth(sixteenth))
+            around = self.around_eighth(eighth + coarse, octave)
+            result.append([half, quarter, eighth, around, sixteenth])
+        return result
+
+    def describe(self, maps: list[list[Tensor]], xy: Tensor, sizes: Tensor) -> Tensor:
+        """Return (B, N, 64) descriptors by the features."""
+        octaves = [
+            torch.cat(
+                [
+                    _read(features, (xy + 0.5) / (stride << octave) - 0.5)
+                    for features, stride in zip(maps[octave], (2, 4, 8, 8, 16), strict=True)
+                ],
+                2,
+            )
+            for octave in range(OCTAVES)
+        ]
+        sizes = sizes.clamp(min=SMALLEST_SIZE_PX)
+        own = (sizes / FIRST_OCTAVE_PX).log2().clamp(0, OCTAVES - 1)[..., None]
+        shares = (1 - (own - torch.arange(OCTAVES, device=xy.device)).abs()).clamp(min=0)
+        parts = map(torch.mul, octaves, shares.split(1, -1))
+        own_octave = reduce(torch.add, parts)
+        features = self.input(torch.cat([octaves[0], own_octave], 2)).flatten(0, 1)
+        scale = (sizes / SMALLEST_SIZE_PX).flatten().log()[:, None]
+        seen = torch.cat([scale - 0.7, (scale - 0.7) ** 2 - 0.3, (scale * 3).sin()], 1)
+        gain, shift = self.by_size(seen).chunk(2, 1)
+        features = relu(self.norm(features) * (1 + gain) + shift)
+        features = relu(self.middle_norm(self.middle(features)))
+        return normalize(self.output(features), dim=1).unflatten(0, xy.shape[:2])
+
+
+def _normalized(luma: Tensor) -> Tensor:
+    """Return (B, 2, H, W): luma by the contrast of the whole image, and by that around."""
+    mean = luma.mean((2, 3), keepdim=True)
+    variance = (luma - mean).square().mean((2, 3), keepdim=True)
+    whole = (luma - mean) / (variance + 1e-6).sqrt()
+    local, square = (
+        avg_pool2d(avg_pool2d(x, CELL_PX), CELLS, 1, CELLS // 2, count_include_pad=False)
+        for x in (luma, luma * luma)
+    )
+    gain = ((square - local * local).clamp(min=0) + NOISE**2).rsqrt()
+    field = torch.cat([local * gain, gain], 1)
+    field = interpolate(field, scale_factor=CELL_PX, mode="bilinear", align_corners=False)
+    return torch.cat([whole, luma * field[:, 1:] - field[:, :1]], 1)
+
+
+def _doubled(features: Tensor) -> Tensor:
+    return interpolate(features, scale_factor=2, mode="bilinear", align_corners=False)
+
+
+def _read(features: Tensor, xy: Tensor) -> Tensor:
+    """Return (B, N, C) values of (B, C, H, W) at positions, bilinearly, as of the nearest inside.
+
+    Rows of the pixels are gathered: twenty times as fast on a CPU as grid_sample, of which each
+    channel has its own place in memory.
+    """
+    shape = torch._shape_as_tensor(features)
+    last = shape[[3, 2]].to(xy.dtype) - 1
+    xy = xy.clamp(min=0).minimum(last)
+    origin = xy.floor().minimum(last - 1)
+    (right, below), width = (xy - origin).unbind(-1), shape[3]
+    image = torch.arange(len(features), device=xy.device)[:, None] * (shape[2] * width)
+    first = (origin[..., 1] * width + origin[..., 0]).long() + image
+    pixels = features.permute(0, 2, 3, 1).flatten(0, 2)
+    weights = (1 - right) * (1 - below), right * (1 - below), (1 - right) * below, right * below
+    corners = first, first + 1, first + width, first + width + 1
+    values = (
+        pixels[corner].float() * weight[..., None]
+        for corner, weight in zip(corners, weights, strict=True)
+    )
+    return reduce(torch.add, values)
+
+
+def turn(descriptors: Tensor, angles: Tensor) -> Tensor:
+    """Turn (..., 64) descriptors by (...) radians, as `turn_descriptors` does by degrees."""
+    turns = angles[..., None] * torch.from_numpy(FREQUENCIES).to(angles)
+    constant, numbers = descriptors[..., :CONSTANT], descriptors[..., CONSTANT:]
+    (real, imaginary), (c, s) = numbers.chunk(2, -1), (turns.cos(), turns.sin())
+    return torch.cat([constant, c * real - s * imaginary, s * real + c * imaginary], -1)

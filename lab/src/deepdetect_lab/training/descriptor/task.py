@@ -1,0 +1,218 @@
+"""The training of the learned descriptor: pairs of views, their loss, the validation metric."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from deepdetect._shared.errors import OptionError
+from deepdetect._shared.records import key
+from deepdetect.features.learned import CROSS_MODAL, LEARNED, angles_counted
+
+from ...evaluation.report import Table
+from ...networks.weights import load_network, weights_digest
+from ..checkpoint import Point
+from ..optim import Muon
+from ..recipe import DescriptorTrainingOptions, DeviceOptions
+from ..sampler import milestones
+from ..trainer import Trainer
+from .export import export_descriptor
+from .losses import KINDS, contrastive_loss, kind_of, shares_right
+from .network import DescriptorNetwork
+from .views import SIDE_PX, Pair, draw_pair
+
+ONNX = "descriptor.onnx"
+
+REUSE, WINDOW, FIRST_BATCHES = 4, 4096, 8
+"""Steps that see a pair, in the mean (to draw one takes longer than to train on it); pairs that
+are kept for it, the last ones; and batches' worth of them at the first step."""
+
+WARM_UP_STEPS, WARM_UP_SHARE = 300, 0.15
+"""Steps of the warm-up; of short runs a share."""
+
+DECAY_SHARE = 0.65
+"""Of the steps, the last ones, in which the learning rate falls to 0, linearly."""
+
+VECTOR_RATE = 0.4
+"""Learning rate of AdamW, which trains what Muon does not, in that of Muon."""
+
+ATTEMPTS = 200
+"""Of drawing a pair: images in which so many show too little have no detail."""
+
+
+def pairs_of_step(options: DescriptorTrainingOptions, step: int) -> np.ndarray:
+    """Return the numbers of the pairs that a step trains on, out of a window that moves on."""
+    last = (step + 1) * options.pairs // REUSE + FIRST_BATCHES * options.pairs
+    generator = np.random.default_rng([options.seed, 4, step])
+    return generator.integers(max(0, last - WINDOW), last, options.pairs)
+
+
+def pairs_to_draw(
+    options: DescriptorTrainingOptions, first: int, last: int
+) -> Iterator[tuple[int, list[int]]]:
+    """Yield each step with the numbers of its pairs that no step since the first one had."""
+    drawn: set[int] = set()
+    for step in range(first, last):
+        wanted = set(pairs_of_step(options, step).tolist())
+        yield step, sorted(wanted - drawn)
+        drawn |= wanted
+
+
+def draw_numbered(files: Sequence[Path], cross_modal: bool, *seed: int) -> Pair:
+    """Draw a pair by a seed; an OptionError where the images show too little."""
+    generator = np.random.default_rng(seed)
+    for _ in range(ATTEMPTS):
+        if (pair := draw_pair(generator, files, cross_modal)) is not None:
+            return pair
+    raise OptionError("the images show too little for pairs of views: use photographs with detail")
+
+
+def stack(pairs: Sequence[Pair]) -> Pair:
+    """Make a batch, of tensors."""
+    return Pair(*(torch.from_numpy(np.stack(values)) for values in zip(*pairs, strict=True)))
+
+
+class PairDataset(Dataset[tuple[int, list[int], Pair | None]]):
+    """Pairs by step; each is a pure function of the seed and its number."""
+
+    def __init__(self, files: Sequence[Path], options: DescriptorTrainingOptions) -> None:
+        self.files, self.options = files, options
+
+    def __getitem__(self, index: tuple[int, list[int]]) -> tuple[int, list[int], Pair | None]:
+        step, numbers = index
+        fixed = self.files, self.options.cross_modal, self.options.seed, 3
+        pairs = [draw_numbered(*fixed, number) for number in numbers]
+        return step, numbers, stack(pairs) if pairs else None
+
+
+def validation_batches(files: Sequence[Path], options: DescriptorTrainingOptions) -> list[Pair]:
+    """Draw the fixed pairs that weights are measured on, as many of each of `KINDS`."""
+    pairs: dict[str, list[Pair]] = {kind: [] for kind in KINDS}
+    number = 0
+    while min(map(len, pairs.values())) < options.val_pairs:
+        pair = draw_numbered(files, options.cross_modal, 0, 2, number)
+        number += 1
+        if len(of_kind := pairs[kind_of(pair.turn, pair.zoom)]) < options.val_pairs:
+            of_kind.append(pair)
+    drawn = [pair for of_kind in pairs.values() for pair in of_kind]
+    return [stack(drawn[k : k + options.pairs]) for k in range(0, len(drawn), options.pairs)]
+
+
+class DescriptorTrainer(Trainer):
+    """A network that describes keypoints, and the images whose views it is trained on."""
+
+    objective, sign = "score", -1
+    weights_file = "descriptor.safetensors"
+    max_gradient_norm = 2.0
+    average_decay = 0.998
+    network: DescriptorNetwork
+    average: DescriptorNetwork
+    window: Pair | None = None
+
+    def __init__(
+        self,
+        images: Sequence[Path],
+        validation: Sequence[Path],
+        options: DescriptorTrainingOptions,
+        init_weights: str | Path | None,
+        device: DeviceOptions,
+    ) -> None:
+        self.options, self.num_workers = options, device.worker_count
+        self.kind = CROSS_MODAL if options.cross_modal else LEARNED
+        self.device = torch.device(device.accelerator)
+        self.files = images
+        if init_weights is None:
+            with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
+                torch.default_generator.manual_seed(options.seed)
+                network: Any = DescriptorNetwork()
+        else:
+            network = load_network(init_weights, DescriptorNetwork)
+        self.origin = {
+            "images_digest": key(self.files)[:16],
+            "validation_digest": key(validation)[:16],
+            "initial_weights": weights_digest(network)[:16],
+        }
+        self.notes = {"images": str(len(self.files)), "run_on": str(self.device)}
+        batches = validation_batches(validation, options)
+        self.batches = [Pair(*(each.to(self.device) for each in batch)) for batch in batches]
+        self.network = network.to(self.device).to(memory_format=torch.channels_last)
+        self.average = copy.deepcopy(self.network).eval()
+        self.network.train()
+        # The kernels of the first layer and of sizes are no maps between many features.
+        kernels: list[Any] = []
+        vectors: list[Any] = []
+        for name, parameter in self.network.named_parameters():
+            kernel = parameter.ndim > 1 and not name.startswith(("at_half", "by_size"))
+            (kernels if kernel else vectors).append(parameter)
+        group = {"params": vectors, "rate_factor": VECTOR_RATE}
+        adam = torch.optim.AdamW([group], betas=(0.9, 0.98), weight_decay=0, fused=True)
+        self.optimizers = [Muon(kernels), adam]
+        self.steps = options.steps
+        self.milestones = milestones(options.steps, options.val_count)
+
+    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
+        """Return the loader of some steps: the step, numbers of pairs, and these pairs."""
+        to_draw = pairs_to_draw(self.options, first, self.steps if last is None else last)
+        return DataLoader(
+            PairDataset(self.files, self.options),
+            batch_size=None,
+            sampler=list(to_draw),
+            num_workers=self.num_workers,
+            generator=torch.Generator(),
+        )
+
+    def pixels(self, batch: Any) -> int:
+        return 2 * self.options.pairs * SIDE_PX**2
+
+    def loss(self, batch: tuple[int, list[int], Pair | None]) -> Tensor:
+        """Return the loss of a step's pairs, of which the batch has those it is the first to see.
+
+        They come into the window, on the device, in place of older ones; the others are there.
+        """
+        step, numbers, pairs = batch
+        if pairs is not None:
+            pairs = Pair(*(values.to(self.device) for values in pairs))
+            if self.window is None:
+                self.window = Pair(*(each.new_zeros(WINDOW, *each.shape[1:]) for each in pairs))
+            slots = torch.tensor(numbers, device=self.device) % WINDOW
+            for kept, values in zip(self.window, pairs, strict=True):
+                kept[slots] = values
+        rows = torch.from_numpy(pairs_of_step(self.options, step) % WINDOW).to(self.device)
+        chosen = Pair(*(kept[rows] for kept in self.window or ()))
+        generator = np.random.default_rng([self.options.seed, 5, step])
+        return contrastive_loss(self.network, chosen, generator, angles_counted(self.kind))
+
+    def learning_rate(self, step: int) -> float:
+        """Return the rate of Muon in a step: a warm-up, a plateau, a linear decay to 0."""
+        warm_up = (step + 1) / min(WARM_UP_STEPS, WARM_UP_SHARE * self.steps)
+        decay = (1 - step / self.steps) / DECAY_SHARE
+        return self.options.learning_rate * min(1, warm_up, decay)
+
+    def validate(self, step: int) -> dict[str, float]:
+        """Measure the average of the weights so far."""
+        shares = shares_right(self.average, self.batches, angles_counted(self.kind))
+        return {"score": sum(shares.values()) / len(shares), **shares}
+
+    def export(self, folder: Path) -> Path:
+        best: Any = load_network(folder / self.weights_file, DescriptorNetwork)
+        export_descriptor(best, folder / ONNX, self.kind)
+        return folder / ONNX
+
+    def card(self, best: Point) -> tuple[str, list[str]]:
+        count = sum(parameter.numel() for parameter in self.network.parameters())
+        rows = [{"pairs": kind, "correct": best[f"{kind} correct"]} for kind in KINDS]
+        return f"a network of {count:,} parameters that describes keypoints.", [
+            "Share of keypoints that are mutual nearest neighbours and right to 3 px, on pairs of",
+            "views of the validation images, by whose mean this step was chosen:",
+            "",
+            Table("measures", "", {"pairs": "", "correct": ".3f"}, rows).to_markdown(),
+            "",
+            f"Score {best['score']:.4f} at step {best['step']:,}.",
+        ]

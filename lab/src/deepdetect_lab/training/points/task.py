@@ -1,0 +1,195 @@
+"""The training of the ranker: pairs of views, the loss of their order, the validation metric."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from deepdetect._shared.atomic import atomic_path
+from deepdetect._shared.records import key
+from deepdetect.detector.points.detection import detect_points
+from deepdetect.detector.points.ranker import MAX_DEVIATIONS, Ranker, load_ranker
+
+from ...evaluation.report import Table
+from ..checkpoint import Point
+from ..recipe import PointsTrainingOptions
+from ..sampler import milestones
+from ..trainer import Trainer
+from .losses import pair_loss
+from .measure import MEASURES, measure, validation_pairs
+from .pairs import CandidatePair, PairDataset
+from .views import KINDS
+
+STATISTICS_PAIRS = 64
+"""Of views, whose features give mean and deviation."""
+
+WARM_UP_STEPS = 100
+FINAL_RATE = 0.02
+"""Of the learning rate, at the end of the cosine annealing."""
+
+WEIGHT_DECAY = 1e-4
+
+AVERAGE_DECAY = 0.995
+"""Of the running mean of the weights, which is what is measured and kept."""
+
+HIDDEN_UNITS = (48, 32)
+MIN_DEVIATION = 1e-3
+INITIAL_OUTPUT = 0.01
+"""The last layer starts at almost nothing: an untrained ranker ranks as |det Hessian| does."""
+
+
+class RankerModule(nn.Module):
+    """A perceptron of the features, added to the first of them; made from their statistics (F,)."""
+
+    mean: Tensor
+    deviation: Tensor
+
+    def __init__(self, mean: np.ndarray, deviation: np.ndarray) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.from_numpy(mean.astype(np.float32)))
+        spread = np.maximum(deviation, MIN_DEVIATION).astype(np.float32)
+        self.register_buffer("deviation", torch.from_numpy(spread))
+        first, second = HIDDEN_UNITS
+        self.first = nn.Linear(len(mean), first)
+        self.second = nn.Linear(first, second)
+        self.output = nn.Linear(second, 1)
+        with torch.no_grad():
+            self.output.weight.mul_(INITIAL_OUTPUT)
+            self.output.bias.zero_()
+
+    def forward(self, features: Tensor) -> Tensor:
+        """Map (N, F) features to (N,) logits."""
+        values = (features - self.mean) / self.deviation
+        values = values.clamp(-MAX_DEVIATIONS, MAX_DEVIATIONS)
+        values = self.second(self.first(values).relu()).relu()
+        logits: Tensor = features[:, 0] + self.output(values)[:, 0]
+        return logits
+
+    def export(self, notes: dict[str, Any]) -> Ranker:
+        """Return the same ranker without torch."""
+        layers = tuple(
+            (layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy())
+            for layer in (self.first, self.second, self.output)
+        )
+        text = json.dumps(notes, default=str, sort_keys=True)
+        return Ranker(self.mean.numpy().copy(), self.deviation.numpy().copy(), layers, text)
+
+
+def save_ranker(ranker: Ranker, path: Path) -> None:
+    """Write a ranker as `load_ranker` reads it: the same bytes for the same ranker."""
+    arrays = {"mean": ranker.mean, "deviation": ranker.deviation}
+    for k, (weight, bias) in enumerate(ranker.layers):
+        arrays |= {f"weight{k}": weight, f"bias{k}": bias}
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, allow_pickle=False, notes=np.array(ranker.notes), **arrays)
+
+
+class RankerTrainer(Trainer):
+    """A ranker of points, and the folders of images whose views it is trained on."""
+
+    objective, sign = "score", -1
+    weights_file = "best.npz"
+    max_gradient_norm = 1.0
+    average_decay = AVERAGE_DECAY
+    network: RankerModule
+    average: RankerModule
+
+    def __init__(
+        self,
+        images: Sequence[Path],
+        validation: Sequence[Path],
+        options: PointsTrainingOptions,
+        num_workers: int = 0,
+    ) -> None:
+        self.options, self.num_workers, self.files = options, num_workers, images
+        self.pairs = validation_pairs(validation, options.val_pairs)
+        dataset = PairDataset(self.files, options)
+        pairs = (dataset[2**31, number] for number in range(STATISTICS_PAIRS))  # not trained on
+        features = np.concatenate([view.features for pair in pairs for view in pair.views])
+        features = features.astype(np.float64)
+        with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
+            torch.default_generator.manual_seed(options.seed)
+            self.network = RankerModule(features.mean(0), features.std(0))
+        self.average = copy.deepcopy(self.network)
+        self.optimizers = [
+            torch.optim.AdamW(
+                self.network.parameters(), options.learning_rate, weight_decay=WEIGHT_DECAY
+            )
+        ]
+        self.steps = options.steps
+        self.milestones = {0} | milestones(options.steps, options.val_count)
+        self.origin = {
+            "images_digest": key(self.files)[:16],
+            "validation_digest": key(validation)[:16],
+        }
+        self.notes = {"images": str(len(self.files))}
+
+    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
+        """Return the loader of the batches of some steps: lists of `CandidatePair`."""
+        steps, pairs = range(first, self.steps if last is None else last), range(self.options.pairs)
+        return DataLoader(
+            PairDataset(self.files, self.options),
+            batch_sampler=[[(step, number) for number in pairs] for step in steps],
+            collate_fn=list,
+            num_workers=self.num_workers,
+            generator=torch.Generator(),
+        )
+
+    def pixels(self, batch: Sequence[CandidatePair]) -> int:
+        return 2 * len(batch) * self.options.side**2
+
+    def loss(self, batch: Sequence[CandidatePair]) -> Tensor:
+        """Return the mean loss of some pairs; those with nothing to see count as 0."""
+        losses = [
+            pair_loss(self.network, pair)
+            for pair in batch
+            if min(len(view.xy) for view in pair.views) > 1
+        ]
+        if not losses:
+            return torch.stack([p.sum() for p in self.network.parameters()]).sum() * 0
+        return torch.stack(losses).sum() / len(batch)
+
+    def learning_rate(self, step: int) -> float:
+        """Return the learning rate of a step: a linear warm-up into cosine annealing."""
+        cosine = (1 + math.cos(math.pi * step / self.steps)) / 2
+        rate = self.options.learning_rate * (FINAL_RATE + (1 - FINAL_RATE) * cosine)
+        return rate * min(1.0, (step + 1) / WARM_UP_STEPS)
+
+    def validate(self, step: int) -> dict[str, float]:
+        """Measure the average of the weights so far."""
+        return measure(partial(detect_points, ranker=self.average.export({})), self.pairs)
+
+    def save(self, path: Path, notes: Mapping[str, Any]) -> None:
+        save_ranker(self.average.export(dict(notes)), path)
+
+    def read_notes(self, path: Path) -> Mapping[str, Any]:
+        notes: dict[str, Any] = json.loads(load_ranker(path).notes)
+        return notes
+
+    def card(self, best: Point) -> tuple[str, list[str]]:
+        count = sum(parameter.numel() for parameter in self.network.parameters())
+        network = (
+            f"a perceptron of {count:,} parameters that ranks maxima of |det Hessian| in a scale\n"
+            "space by how surely they are found again."
+        )
+        columns = {"pairs": "", **dict.fromkeys(MEASURES, ".3f")}
+        rows = [{"pairs": kind, **{m: best[f"{kind} {m}"] for m in MEASURES}} for kind in KINDS]
+        return network, [
+            "On synthetic pairs of views of the validation images, by whose score this step was",
+            "chosen: one-to-one repeatability by number of keypoints (of an image of 800x640), and",
+            "matches correct to 1 px over the number of keypoints.",
+            "",
+            Table("measures", "", columns, rows).to_markdown(),
+            "",
+            f"Score {best['score']:.4f} at step {best['step']:,}.",
+        ]

@@ -1,0 +1,345 @@
+"""Training recipes, the options that decide which weights come out; presets; device options."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from deepdetect._shared.errors import OptionError, check_name
+from deepdetect._shared.machine import processor_count
+from deepdetect._shared.options import check_ranges, suggest_keywords
+
+from ..labels import LABEL_SETTINGS, LabelOptions
+
+InitWeights = str | Path | Sequence[str | Path]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A part of the training with one crop size and one batch size.
+
+    Attributes:
+        crop: side of the square crops in pixels, a multiple of 8.
+        batch: crops per batch.
+        epochs: how often each image is seen.
+        sides: shorter sides of the views that crops are taken from; default: all that are
+            large enough.
+    """
+
+    crop: int
+    batch: int
+    epochs: int
+    sides: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.crop < 16 or self.crop % 8:
+            raise OptionError(f"crop must be a multiple of 8 from 16 on, not {self.crop}")
+        if self.batch < 1 or self.epochs < 1:
+            raise OptionError("a stage needs a batch and a number of epochs of at least 1")
+        if self.sides and min(self.sides) < self.crop:
+            raise OptionError(
+                f"a crop of {self.crop} pixels does not fit into views of {min(self.sides)}"
+            )
+
+    @classmethod
+    def parse(cls, text: str) -> Stage:
+        """Read a stage from its text CROPxBATCHxEPOCHS, with @SIDE,SIDE for some views only.
+
+        Example:
+            >>> Stage.parse("240x16x40@240")
+            Stage(crop=240, batch=16, epochs=40, sides=(240,))
+        """
+        numbers, at, sides = text.lower().partition("@")
+        try:
+            crop, batch, epochs = (int(part) for part in numbers.split("x"))
+            chosen = tuple(int(part) for part in sides.split(",")) if at else ()
+        except ValueError:
+            raise OptionError(
+                f"a stage is written CROPxBATCHxEPOCHS, as 240x16x40, or 240x16x40@360 for views "
+                f"of one size, not {text!r}"
+            ) from None
+        return cls(crop, batch, epochs, chosen)
+
+
+@suggest_keywords
+@dataclass(frozen=True)
+class TrainingOptions:
+    """Everything that decides which weights come out, given the images.
+
+    Attributes:
+        network: name of the network that is trained: "fast" or "espnet".
+        stages: stages of the training, one after the other. Crops as large as the view show all
+            that its label depends on (Harris and Sobel labels are relative to the image's largest
+            response), which the global term of `fast` needs; smaller ones give many cheap steps.
+        interleave: go through all stages at the same time, their steps evenly mixed, so that
+            every size is seen until the end.
+        short_sides: sizes in pixels that the shorter side of the images is scaled to. Crops are
+            taken from those that are large enough. The first is that of the validation.
+        square: make the images squares: "crop" cuts the middle out, "squash" squashes them, as the
+            paper does. None: they keep their shape.
+        max_images: use at most this many images, including those for validation.
+        val_fraction: fraction of the images held out for validation, when no folder is given.
+        dark_fraction: fraction of darkened crops (paper: a quarter).
+        augmentations: augmented views of each image at the first size, in normal and in dark
+            light: rotated, relit, blurred, noisy or compressed. Each is used as often as the plain
+            view of a size.
+        transpositions: mirror crops along their diagonal, which changes labels of BRISK only;
+            flips also change those of Shi-Tomasi, SIFT and ORB.
+        color_jitter: fraction of the crops whose colours are removed, or rotated with the same
+            luma to a grey level, the only thing that labels and `fast` depend on.
+        optimizer: "adam", or "soap", which learns more per image (docs/history.md has the
+            measurements).
+        learning_rate: learning rate at the start of the cosine annealing to 1e-6.
+        warm_up: fraction of the steps over which the learning rate rises from zero. A run that
+            starts from trained weights needs it: the first steps of Adam, whose moments are not
+            known yet, would undo much.
+        average_decay: decay, in each step, of the exponential average of the weights, which is what
+            is validated and saved; 0: the weights themselves are.
+        max_gradient_norm: larger gradients are scaled down to it; None: none are.
+        frozen_batch_norm: normalise by the batch statistics of the initial weights, as the
+            finished network does, not by those of each batch, which vary much between batches of a
+            few images. None: if the initial weights are trained ones.
+        pos_weight: weight of marked pixels in the loss. With 1 the network marks too little
+            where it is uncertain, since most pixels are not marked; above 1 it finds more
+            keypoints at a probability of 0.5.
+        low_light_pos_weight: weight of marked pixels in crops of low visibility. None: the same.
+        labels: the label detectors and their settings.
+        val_count: number of times that the validation loss is computed.
+        seed: seed of the initial weights, the order of the images, the crops and their
+            augmentation.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    network: str = "fast"
+    stages: tuple[Stage, ...] = (
+        Stage(480, 16, 40, (480,)),
+        Stage(240, 64, 36, (240,)),
+        Stage(352, 30, 16, (352,)),
+        Stage(960, 4, 2, (960,)),
+    )
+    interleave: bool = True
+    short_sides: tuple[int, ...] = (480, 240, 352, 960)
+    square: Literal["crop", "squash"] | None = "crop"
+    max_images: int | None = None
+    val_fraction: float = 0.05
+    dark_fraction: float = 0.5
+    augmentations: int = 4
+    transpositions: bool = True
+    color_jitter: float = 0.0
+    optimizer: str = "soap"
+    learning_rate: float = 2e-3
+    warm_up: float = 0.05
+    average_decay: float = 0.999
+    max_gradient_norm: float | None = 1.0
+    frozen_batch_norm: bool | None = None
+    pos_weight: float = 1.0
+    low_light_pos_weight: float | None = None
+    labels: LabelOptions = field(default_factory=LabelOptions)
+    val_count: int = 12
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_name("optimizer", self.optimizer, ("adam", "soap"))
+        if self.square is not None:
+            check_name("square", self.square, ("crop", "squash"))
+        self._check_sizes()
+        check_ranges(
+            self,
+            positive=("learning_rate", "max_gradient_norm"),
+            not_negative=("augmentations",),
+            fractions=("dark_fraction", "color_jitter", "warm_up", "average_decay"),
+            counts=("val_count",),
+            between={
+                "max_images": (2, math.inf),
+                "pos_weight": (0.1, 10),
+                "low_light_pos_weight": (0.1, 10),
+                "seed": (0, 2**31 - 1),
+            },
+        )
+        if not 0 < self.val_fraction < 1:
+            raise OptionError(f"`val_fraction` must lie in (0, 1), not {self.val_fraction}")
+
+    def _check_sizes(self) -> None:
+        if not self.stages or not self.short_sides or min(self.short_sides) < 16:
+            raise OptionError("give `stages`, and `short_sides` of at least 16 pixels")
+        for side in (side for stage in self.stages for side in stage.sides):
+            if side not in self.short_sides:
+                raise OptionError(
+                    f"a stage takes views of {side} pixels, which are not among `short_sides` "
+                    f"({', '.join(map(str, self.short_sides))}): add them"
+                )
+        largest = max(stage.crop for stage in self.stages)
+        if largest > max(self.short_sides):
+            raise OptionError(
+                f"a crop of {largest} pixels does not fit into images of "
+                f"{max(self.short_sides)}: make `short_sides` larger or the crops smaller"
+            )
+
+
+@suggest_keywords
+@dataclass(frozen=True)
+class DeviceOptions:
+    """How the network is run, which does not change the recipe.
+
+    Attributes:
+        device: "auto" (CUDA if there is a GPU, else the CPU), "cpu" or "cuda".
+        precision: "float32", "bfloat16", or "auto", which is bfloat16 where the processor
+            computes with it.
+        compile: use torch.compile; by default if there is a C++ compiler.
+        threads: CPU threads of torch; by default torch's choice.
+        num_workers: processes that load and augment crops (of a torch DataLoader), 0 for none
+            but the one that trains; by default 0 when training on a CPU, which has no time to
+            spare, and one per processor but one when training on a GPU.
+    """
+
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    compile: bool | None = None
+    threads: int | None = None
+    num_workers: int | None = None
+
+    def __post_init__(self) -> None:
+        check_name("device", self.device, ("auto", "cpu", "cuda"))
+        check_name("precision", self.precision, ("auto", "float32", "bfloat16"))
+        check_ranges(self, counts=("threads",), not_negative=("num_workers",))
+
+    @property
+    def accelerator(self) -> str:
+        """The device, with "auto" resolved: "cpu" or "cuda"."""
+        if self.device != "auto":
+            return self.device
+        from torch.cuda import is_available
+
+        return "cuda" if is_available() else "cpu"
+
+    @property
+    def worker_count(self) -> int:
+        """The number of loading processes, with the default resolved."""
+        if self.num_workers is not None:
+            return self.num_workers
+        return 0 if self.accelerator == "cpu" else max(1, processor_count() - 1)
+
+
+@suggest_keywords
+@dataclass(frozen=True)
+class PointsTrainingOptions:
+    """A training of the ranker of points.
+
+    Attributes:
+        steps: optimiser steps.
+        pairs: pairs of views in each step.
+        side: side of the square views, in pixels.
+        learning_rate: highest learning rate; cosine annealing to 2 % of it.
+        min_density, max_density: range of the budgets in keypoints per pixel, log-uniform.
+        val_count: how many times the weights are measured after the start.
+        val_pairs: pairs of each kind that they are measured on: zoom, blur, viewpoint, light.
+        seed: seed of the weights and the pairs.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    steps: int = 3000
+    pairs: int = 4
+    side: int = 224
+    learning_rate: float = 3e-3
+    min_density: float = 0.003
+    max_density: float = 0.025
+    val_count: int = 12
+    val_pairs: int = 24
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=("learning_rate", "min_density", "max_density"),
+            not_negative=("seed",),
+            counts=("steps", "pairs", "val_count", "val_pairs"),
+            between={"side": (64, math.inf)},
+        )
+        if self.min_density > self.max_density:
+            raise OptionError("`min_density` must not be above `max_density`")
+
+
+@suggest_keywords
+@dataclass(frozen=True)
+class DescriptorTrainingOptions:
+    """A training of the learned descriptor.
+
+    Attributes:
+        steps: optimiser steps.
+        pairs: pairs of views in each step.
+        learning_rate: highest learning rate (of Muon), after the warm-up; it falls linearly to 0.
+        val_count: number of times that the weights are measured.
+        val_pairs: pairs of each kind that they are measured on: upright, turned, zoomed.
+        cross_modal: make the views of a pair look like those of different sensors: with other
+            mixtures of colours, inverted or any other tones, or edges.
+        seed: seed of the weights and the pairs.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    steps: int = 4000
+    pairs: int = 8
+    learning_rate: float = 0.012
+    val_count: int = 12
+    val_pairs: int = 48
+    cross_modal: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=("learning_rate",),
+            not_negative=("seed",),
+            counts=("steps", "val_count", "val_pairs"),
+            between={"pairs": (1, 400)},
+        )
+
+
+_ESPNET = TrainingOptions(
+    network="espnet",
+    stages=(Stage(240, 16, 44), Stage(480, 8, 10)),
+    interleave=False,
+    short_sides=(480, 360, 240),
+    square=None,
+    dark_fraction=0.25,
+    augmentations=0,
+    color_jitter=0.5,
+    optimizer="adam",
+    learning_rate=1e-3,
+    warm_up=0.0,
+    average_decay=0.0,
+    max_gradient_norm=None,
+)
+
+PRESETS: dict[str, TrainingOptions] = {
+    # Whole views of several sizes and lights, the average of the weights.
+    "default": TrainingOptions(),
+    # Small crops first, evenly scaled images of several sizes.
+    "espnet": _ESPNET,
+    # The paper's (Section III-B): about 33,000 images to train on and 8,000 for validation,
+    # squashed to 480x480, a quarter darkened, 100 epochs in batches of 64.
+    "paper": replace(
+        _ESPNET,
+        stages=(Stage(480, 64, 100),),
+        short_sides=(480,),
+        square="squash",
+        max_images=41_000,
+        val_fraction=8 / 41,
+        transpositions=False,
+        color_jitter=0.0,
+        val_count=20,
+    ),
+    # For two-view geometry (the paper's second weights, Figure 8): normal light only, denser
+    # labels. Meant to start from trained weights.
+    "dense": TrainingOptions(
+        dark_fraction=0.0, labels=LABEL_SETTINGS["dense"], learning_rate=1.5e-3
+    ),
+}

@@ -1,0 +1,160 @@
+"""The steps of a run, and their batches: pure functions of the seed and the step.
+
+So an interrupted run resumes with exactly the batches it would have seen.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from torch.utils.data import Sampler
+
+from deepdetect._shared.errors import OptionError
+
+from .recipe import Stage, TrainingOptions
+
+FINAL_LEARNING_RATE = 1e-6
+"""At the end of the cosine annealing (paper, Section III-B)."""
+
+SHUFFLED_SHARDS = 4
+"""So many shards are read at a time, and their images shuffled."""
+
+
+class CropIndex(NamedTuple):
+    """An image's number, the epoch and the image's position in its order, and the stage."""
+
+    image: int
+    epoch: int
+    position: int
+    stage: Stage
+
+
+class Position(NamedTuple):
+    """Where a step lies: its stage, its first crop in the stage, and the stage's first epoch."""
+
+    stage: Stage
+    sample: int
+    first_epoch: int
+
+
+class Schedule:
+    """The steps of a run by a recipe over a number of images."""
+
+    def __init__(self, options: TrainingOptions, images: int) -> None:
+        self.options = options
+        self.images = images
+        self.steps_of_stage = [
+            max(1, stage.epochs * images // stage.batch) for stage in options.stages
+        ]
+        self.steps = sum(self.steps_of_stage)
+        stages = [np.full(steps, k) for k, steps in enumerate(self.steps_of_stage)]
+        within = [np.arange(steps) for steps in self.steps_of_stage]
+        self._stages, self._within = np.concatenate(stages), np.concatenate(within)
+        if options.interleave:
+            progress = [(each + 0.5) / len(each) for each in within]
+            order = np.argsort(np.concatenate(progress), kind="stable")
+            self._stages, self._within = self._stages[order], self._within[order]
+        batches = np.array([stage.batch for stage in options.stages])
+        self._crops = np.concatenate([[0], np.cumsum(batches[self._stages])])
+
+    def position(self, step: int) -> Position:
+        """Find the stage of a step, and its place in it."""
+        number = int(self._stages[step])
+        stage = self.options.stages[number]
+        first_epoch = sum(each.epochs for each in self.options.stages[:number])
+        return Position(stage, int(self._within[step]) * stage.batch, first_epoch)
+
+    def learning_rate(self, step: int) -> float:
+        """Return the learning rate of a step: a linear warm-up into cosine annealing."""
+        options = self.options
+        cosine = (1 + math.cos(math.pi * step / self.steps)) / 2
+        rate = FINAL_LEARNING_RATE + cosine * (options.learning_rate - FINAL_LEARNING_RATE)
+        return rate * min(1.0, (step + 1) / (options.warm_up * self.steps + 1))
+
+    def crops_until(self, step: int) -> int:
+        """Return how many crops the steps before this one have."""
+        return int(self._crops[step])
+
+
+def milestones(steps: int, count: int) -> set[int]:
+    """Return the numbers of steps done at `count` evenly spaced points, the end among them."""
+    return {round(steps * part / count) for part in range(1, count + 1)} - {0}
+
+
+class CropSampler(Sampler[list[CropIndex]]):
+    """The batches of consecutive steps, a batch sampler for `torch.utils.data.DataLoader`.
+
+    Args:
+        schedule: the steps.
+        shard_sizes: number of images in each shard, whose images are read together; None if
+            images can be read in any order.
+        first_step, last_step: from which step on, and before which; default: all.
+        rank, world_size: number of this process, for its part of each batch, and of all.
+
+    Raises:
+        OptionError: a batch cannot be divided evenly among the processes.
+
+    Example:
+        >>> schedule = Schedule(TrainingOptions(stages=(Stage(240, 2, 1),)), images=4)
+        >>> [[index.image for index in batch] for batch in CropSampler(schedule)]
+        [[3, 0], [2, 1]]
+    """
+
+    def __init__(
+        self,
+        schedule: Schedule,
+        shard_sizes: Sequence[int] | None = None,
+        first_step: int = 0,
+        last_step: int | None = None,
+        *,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        for stage in schedule.options.stages:
+            if stage.batch % world_size:
+                raise OptionError(
+                    f"a batch of {stage.batch} cannot be divided evenly among {world_size} "
+                    "processes: choose `stages` whose batches are multiples of that number"
+                )
+        self.schedule, self.rank, self.world_size = schedule, rank, world_size
+        self.shard_sizes = None if shard_sizes is None else tuple(shard_sizes)
+        self.steps = range(first_step, schedule.steps if last_step is None else last_step)
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def __iter__(self) -> Iterator[list[CropIndex]]:
+        return map(self.batch, self.steps)
+
+    def batch(self, step: int) -> list[CropIndex]:
+        """Return the crops of a step, or this process's part of them."""
+        position, count = self.schedule.position(step), self.schedule.images
+        stage = position.stage
+        batch = []
+        part = stage.batch // self.world_size
+        for sample in range(self.rank * part, (self.rank + 1) * part):
+            epoch, place = divmod(position.sample + sample, count)
+            epoch += position.first_epoch
+            order = epoch_order(self.schedule.options.seed, epoch, count, self.shard_sizes)
+            batch.append(CropIndex(int(order[place]), epoch, place, stage))
+        return batch
+
+
+@functools.lru_cache(maxsize=16)  # interleaved stages are in epochs of their own
+def epoch_order(
+    seed: int, epoch: int, count: int, shard_sizes: tuple[int, ...] | None = None
+) -> np.ndarray:
+    """Return the numbers of the images in the order of an epoch, by a few shards at a time."""
+    if shard_sizes is None:
+        return np.random.default_rng([seed, 1, epoch]).permutation(count)
+    shards = np.split(np.arange(count), np.cumsum(shard_sizes)[:-1])
+    order = np.random.default_rng([seed, 3, epoch]).permutation(len(shards))
+    groups = []
+    for k, first in enumerate(range(0, len(order), SHUFFLED_SHARDS)):
+        group = np.concatenate([shards[s] for s in order[first : first + SHUFFLED_SHARDS]])
+        groups.append(np.random.default_rng([seed, 4, epoch, k]).permutation(group))
+    return np.concatenate(groups)

@@ -1,0 +1,318 @@
+"""A training run, of whatever is trained: its steps, validations, files, and how it resumes."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor, nn
+from torch.nn.utils import clip_grad_norm_
+from torch.optim import Optimizer
+from torch.utils.data import DataLoader
+
+from deepdetect._shared.atomic import atomic_path
+from deepdetect._shared.errors import OptionError
+from deepdetect._shared.progress import progress
+from deepdetect._shared.provenance import provenance
+from deepdetect._shared.records import check_same, file_digest, plain
+
+from ..evaluation.report import Table, line_chart
+from ..networks.weights import read_notes, save_tensors
+from .checkpoint import Point, read_checkpoint, restore, save_checkpoint
+from .dataset import loading
+
+CHECKPOINT = "checkpoint.safetensors"
+CARD = "MODEL_CARD.md"
+FULL_IMAGE_PIXELS = 480 * 480
+
+CHECKPOINT_INTERVAL_S = 60.0
+"""A killed run loses at most this much time."""
+
+
+@dataclass
+class TrainingState:
+    """The steps done, the curves, and the losses of the batches since their last point."""
+
+    step: int = 0
+    loss_sum: float = 0.0
+    loss_count: int = 0
+    points: list[Point] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """The results of a run.
+
+    Attributes:
+        weights: the weights that the validation found best, safetensors or npz.
+        onnx: the same weights as ONNX, for `DeepDetect(weights=...)`, or as a descriptor; None for
+            a ranker.
+        points: the curves: losses and measures by name, for each validation.
+        best: the point of those weights.
+        images_per_second: mean rate, in 480x480 images' worth of pixels.
+    """
+
+    weights: Path
+    onnx: Path | None
+    points: list[Point]
+    best: Point
+    images_per_second: float
+
+
+class Trainer(abc.ABC):
+    """A training run; a class below it says what is trained, its loss and how it is measured.
+
+    Attributes:
+        network: all of the state that is trained.
+        average: the exponential average of that state, which is what is measured and saved.
+        average_decay: of the average, in each step; 0: it is the network.
+        optimizers: what trains it.
+        options: the recipe.
+        origin: digests of the images and of the initial weights: a run is resumed with the same
+            recipe and origin only.
+        notes: what else is written into the weights.
+        introduction: what the user is told before the first step.
+        steps: of the whole run.
+        milestones: numbers of steps done after which it is validated.
+        objective: the value of a point of the curves that the best weights are chosen by.
+        sign: 1 if its lowest value is the best, -1 if the highest.
+        weights_file: name of the file of the best weights.
+        max_gradient_norm: larger gradients are scaled down to it.
+        is_main: whether this process writes the files.
+    """
+
+    network: nn.Module
+    average: nn.Module
+    average_decay: float
+    optimizers: list[Optimizer]
+    options: Any
+    origin: dict[str, str]
+    notes: dict[str, str]
+    introduction: Sequence[str] = ()
+    steps: int
+    milestones: set[int]
+    objective: str
+    sign: int
+    weights_file: str
+    max_gradient_norm = math.inf
+    is_main: bool = True
+
+    @abc.abstractmethod
+    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
+        """Return the loader of the batches of some steps."""
+
+    @abc.abstractmethod
+    def pixels(self, batch: Any) -> int:
+        """Return the number of pixels in a batch, over all processes."""
+
+    @abc.abstractmethod
+    def learning_rate(self, step: int) -> float:
+        """Return the learning rate of a step."""
+
+    @abc.abstractmethod
+    def loss(self, batch: Any) -> Tensor:
+        """Return the loss of a batch, or of this process's part of it."""
+
+    @abc.abstractmethod
+    def validate(self, step: int) -> dict[str, float]:
+        """Measure the weights after a number of steps."""
+
+    def save(self, path: Path, notes: Mapping[str, Any]) -> None:
+        """Write the weights that are measured."""
+        save_tensors(self.average.state_dict(), path, dict(notes))
+
+    def read_notes(self, path: Path) -> Mapping[str, Any]:
+        """Read the notes of a file of weights; a WeightsError where it is missing."""
+        return read_notes(path)
+
+    @abc.abstractmethod
+    def card(self, best: Point) -> tuple[str, list[str]]:
+        """Say in the model card what the network is, and how good it is."""
+
+    def backward(self, loss: Tensor) -> float:
+        """Compute the gradients, and return the loss over all processes."""
+        loss.backward()
+        return loss.item()
+
+    def export(self, folder: Path) -> Path | None:
+        """Write the best weights in another form; return the file."""
+        return None
+
+    def training_step(self, batch: Any, step: int) -> float:
+        """Make one optimiser step after `step` others, and return the loss over the whole batch.
+
+        Raises:
+            OptionError: the loss or its gradients are not finite.
+        """
+        for optimizer in self.optimizers:
+            optimizer.zero_grad(set_to_none=True)
+            for group in optimizer.param_groups:
+                group["lr"] = self.learning_rate(step) * group.get("rate_factor", 1)
+        value = self.backward(self.loss(batch))
+        norm = clip_grad_norm_(self.network.parameters(), self.max_gradient_norm)
+        # A finite loss can have gradients that are not, in bfloat16.
+        if not (math.isfinite(value) and norm.isfinite()):
+            raise OptionError(
+                f"the loss or its gradients are not finite at step {step}: start again with a "
+                "lower `learning_rate`, or in float32"
+            )
+        for optimizer in self.optimizers:
+            optimizer.step()
+        # At first faster, so that the start is soon forgotten.
+        decay = min(self.average_decay, (1 + step) / (10 + step))
+        states = (module.state_dict().values() for module in (self.average, self.network))
+        for mean, state in zip(*states, strict=True):
+            if mean.is_floating_point():
+                mean.lerp_(state, 1 - decay)
+            else:  # a count
+                mean.copy_(state)
+        return value
+
+    def fit(self, folder: Path, log: Callable[[str], None] | None = None) -> TrainingResult:
+        """Train to the last step in a folder; with a checkpoint there it goes on from it.
+
+        Raises:
+            OptionError: the folder holds a run with other options, images or initial weights.
+            WeightsError: its checkpoint is damaged, or its best weights are missing.
+        """
+        state = self._resume(folder)
+        quiet = log is None or not self.is_main
+        if log is not None and self.is_main and state.step < self.steps:
+            for line in self.introduction:
+                log(line)
+        measured = {point["step"] for point in state.points}
+        if state.step in self.milestones and state.step not in measured:
+            self._validate(state, folder)  # the start, or a validation that was interrupted
+        started, pixels = time.monotonic(), 0
+        saved = started
+        bar = progress(self.steps, "training", "step", quiet, state.step)
+        with bar, loading(self.loader(state.step)) as batches:
+            for batch in batches:
+                state.loss_sum += self.training_step(batch, state.step)
+                state.loss_count += 1
+                state.step += 1
+                pixels += self.pixels(batch)
+                bar.update(1)
+                speed = pixels / FULL_IMAGE_PIXELS / (time.monotonic() - started)
+                loss = state.loss_sum / state.loss_count
+                text = f"loss {loss:.4f}, {speed:.1f} images/s"
+                if state.points:
+                    text += f", best {self._best(state)[self.objective]:.4f}"
+                bar.set_postfix_str(text, False)
+                if state.step in self.milestones:
+                    self._save(state, folder)  # the validation takes its time, too
+                    self._validate(state, folder)
+                if time.monotonic() - saved >= CHECKPOINT_INTERVAL_S:
+                    self._save(state, folder)
+                    saved = time.monotonic()
+        speed = pixels / FULL_IMAGE_PIXELS / max(time.monotonic() - started, 1e-9)
+        best, weights = self._best(state), folder / self.weights_file
+        onnx = None
+        if self.is_main:
+            onnx = self.export(folder)
+            self._write_card(folder, state.points, best)
+        return TrainingResult(weights, onnx, state.points, best, speed)
+
+    def _best(self, state: TrainingState) -> Point:
+        return min(state.points, key=lambda point: self.sign * point[self.objective])
+
+    def _validate(self, state: TrainingState, folder: Path) -> None:
+        """Measure the weights, keep them if they are the best so far, and save the state."""
+        loss = state.loss_sum / max(state.loss_count, 1)
+        point = {"step": state.step, "training_loss": loss, **self.validate(state.step)}
+        state.loss_sum, state.loss_count = 0.0, 0
+        state.points.append(point)
+        if self.is_main:
+            if self._best(state) is point:
+                notes = {**self._all_notes(), "point": json.dumps(point)}
+                self.save(folder / self.weights_file, notes)
+            save_curves(state.points, folder)
+        self._save(state, folder)
+
+    def _save(self, state: TrainingState, folder: Path) -> None:
+        if self.is_main:
+            metadata = {**dataclasses.asdict(state), "inputs": self._inputs(), **self._all_notes()}
+            modules = self.network, self.average
+            save_checkpoint(folder / CHECKPOINT, *modules, self.optimizers, metadata)
+
+    def _resume(self, folder: Path) -> TrainingState:
+        if not (folder / CHECKPOINT).exists():
+            return TrainingState()
+        tensors, metadata = read_checkpoint(folder / CHECKPOINT)
+        advice = "use the same to resume the run, or another `output`"
+        check_same(folder, metadata.get("inputs"), self._inputs(), advice)
+        names = [each.name for each in dataclasses.fields(TrainingState)]
+        state = TrainingState(**{name: metadata[name] for name in names})
+        restore(tensors, self.network, self.average, self.optimizers)
+        if state.points:
+            self.read_notes(folder / self.weights_file)  # an error now rather than at the end
+        return state
+
+    def _inputs(self) -> dict[str, Any]:
+        return {**plain(self.options), **self.origin}
+
+    def _all_notes(self) -> dict[str, Any]:
+        recipe = json.dumps(dataclasses.asdict(self.options), sort_keys=True)
+        return {"options": recipe, **self.origin, **self.notes, **provenance()}
+
+    def _write_card(self, folder: Path, points: Sequence[Point], best: Point) -> None:
+        weights = folder / self.weights_file
+        notes, (network, quality) = self.read_notes(weights), self.card(best)
+        known = ("command", "options", "point")
+        options = json.loads(notes["options"])
+        recipe = [{"option": name, "value": json.dumps(value)} for name, value in options.items()]
+        lines = [
+            "# Model card",
+            "",
+            f"`{weights.name}`, SHA-256 `{file_digest(weights)}`:",
+            network,
+            "",
+            "## How good the weights are",
+            "",
+            *quality,
+            "",
+            "## Where they come from",
+            "",
+            "```sh",
+            notes["command"],
+            "```",
+            "",
+            *(f"- {name.replace('_', ' ')}: {notes[name]}" for name in notes if name not in known),
+            "",
+            "## Recipe",
+            "",
+            Table("recipe", "", {"option": "", "value": ""}, recipe).to_markdown(),
+            "",
+            "## Curves",
+            "",
+            _curves(points).to_markdown(),
+            "",
+        ]
+        with atomic_path(folder / CARD) as temporary:
+            temporary.write_text("\n".join(lines), encoding="utf-8")
+
+
+def save_curves(points: Sequence[Point], folder: Path) -> None:
+    """Write curves.csv, and curves.png (paper, Figure 5)."""
+    with atomic_path(folder / "curves.csv") as temporary:
+        temporary.write_text(_curves(points).to_csv(), newline="")
+    steps = [point["step"] for point in points]
+    lines = {
+        name.replace("_", " "): (steps, [point[name] for point in points])
+        for name in points[0]
+        if name.endswith(("loss", "score", "correct"))
+    }
+    with atomic_path(folder / "curves.png") as temporary:
+        temporary.write_bytes(line_chart(lines, "step", ""))
+
+
+def _curves(points: Sequence[Point]) -> Table:
+    styles = {name: "d" if isinstance(value, int) else ".6g" for name, value in points[0].items()}
+    return Table("curves", "", styles, points)

@@ -1,0 +1,149 @@
+"""The source images of a run, their views (sizes, light, augmentation), and labels of these."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from deepdetect._shared.errors import ImageError
+from deepdetect._shared.opencv import cv2
+from deepdetect._shared.records import file_digest, key
+from deepdetect.io.image import find_images, load_image, luma, scale_short_side
+
+from ..labels import LabelOptions, fuse
+from ..labels.settings import Visibility
+from .augmentation import AUGMENTATION_VERSION, Darkening, augment, darken, draw_darkening
+from .recipe import TrainingOptions
+
+
+@dataclass(frozen=True)
+class View:
+    """How an image is shown to the network: its shorter side in pixels, and its light.
+
+    Scaled evenly, its middle square, squashed to a square, or the augmented square of a seed.
+    """
+
+    short_side: int
+    darkening: Darkening | None = None
+    square: Literal["crop", "squash"] | None = None
+    augmentation: int | None = None
+
+    @property
+    def name(self) -> str:
+        """A short text, unique among the views of an image and fit for a file name."""
+        light = "normal"
+        if self.darkening is not None:
+            light = f"b{self.darkening.brightness:.3f}c{self.darkening.contrast:.3f}"
+        shape = {None: "", "crop": "c", "squash": "x"}[self.square]
+        if self.augmentation is not None:
+            shape = f"v{AUGMENTATION_VERSION}-{self.augmentation:08x}"
+        return f"{self.short_side}{shape}_{light}"
+
+
+@dataclass(frozen=True)
+class SourceImage:
+    """An image that is trained on or validated with: file, digest of its content, and views."""
+
+    path: Path
+    digest: str
+    normal: tuple[View, ...]
+    dark: tuple[View, ...]
+
+    @property
+    def validation_views(self) -> tuple[View, View]:
+        """The normal and the dark view that are validated with."""
+        return self.normal[0], self.dark[0]
+
+
+def views_of(name: str, options: TrainingOptions) -> tuple[tuple[View, ...], tuple[View, ...]]:
+    """List the normal and the dark views of an image: each size in turn, the augmented ones last.
+
+    The image's relative path is the seed of its dark and augmented views.
+    """
+    generator = np.random.default_rng(zlib.crc32(name.encode()))
+    normal = tuple(View(side, None, options.square) for side in options.short_sides)
+    dark = tuple(
+        View(side, draw_darkening(generator), options.square) for side in options.short_sides
+    )
+    generator = np.random.default_rng([zlib.crc32(name.encode()), 1])
+    side = options.short_sides[0]
+    for _ in range(options.augmentations):
+        seed = int(generator.integers(2**32))
+        normal += (View(side, augmentation=seed),)
+        dark += (View(side, draw_darkening(generator), augmentation=seed),)
+    return normal, dark
+
+
+def render(image: object, view: View) -> np.ndarray:
+    """Make a view, (H, W, 3) uint8 RGB, of anything `load_image` takes."""
+    rgb = load_image(image)
+    if view.augmentation is not None:
+        rgb = augment(rgb, view.short_side, view.augmentation)
+    elif view.square != "squash":
+        if view.square == "crop":
+            side = min(rgb.shape[:2])
+            top, left = ((length - side) // 2 for length in rgb.shape[:2])
+            rgb = np.ascontiguousarray(rgb[top : top + side, left : left + side])
+        rgb = scale_short_side(rgb, view.short_side)
+    elif rgb.shape[:2] != (view.short_side, view.short_side):
+        size = (view.short_side, view.short_side)
+        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_CUBIC)
+    return rgb if view.darkening is None else darken(rgb, view.darkening)
+
+
+def label_view(rgb: np.ndarray, view: View, options: LabelOptions) -> np.ndarray:
+    """Make the label, (H, W) bool, of a rendered view, (H, W, 3) uint8 RGB.
+
+    A dark view gets the low-visibility settings, a normal one the normal settings.
+    """
+    visibility: Visibility = "normal" if view.darkening is None else "low"
+    return fuse(luma(rgb), replace(options, visibility=visibility)).mask
+
+
+def label_key(options: LabelOptions) -> str:
+    """Return a digest of everything a label depends on besides the image and the view."""
+    names = options.detectors
+    return key({n: [options.parameters(n, "normal"), options.parameters(n, "low")] for n in names})
+
+
+def list_images(
+    root: Path, options: TrainingOptions, exclude: Sequence[Path] = (), limit: int | None = None
+) -> list[SourceImage]:
+    """List the images below a folder; above the limit some, by the checksums of their names."""
+    paths = find_images(root, exclude)
+    if limit is not None and len(paths) > limit:
+        chosen = sorted(paths, key=lambda path: (zlib.crc32(path.name.encode()), path))[:limit]
+        paths = sorted(chosen)
+    return [
+        SourceImage(
+            path, file_digest(path)[:16], *views_of(path.relative_to(root).as_posix(), options)
+        )
+        for path in paths
+    ]
+
+
+def train_val_split(
+    images: Sequence[SourceImage], val_fraction: float = 0.05
+) -> tuple[list[SourceImage], list[SourceImage]]:
+    """Split images into those to train on and about a fraction for validation.
+
+    By the checksums of their names, so that an image stays on its side when others are added.
+    """
+    training: list[SourceImage] = []
+    validation: list[SourceImage] = []
+    for image in images:
+        # Of the reversed checksum, which is independent of the choice of `list_images`.
+        draw = int(f"{zlib.crc32(image.path.name.encode()):032b}"[::-1], 2) / 2**32
+        (validation if draw < val_fraction else training).append(image)
+    if not validation:
+        training, validation = training[:-1], training[-1:]
+    if not validation or not training:
+        raise ImageError(
+            "one image is too few to train on: add more, or give a folder for `validation`"
+        )
+    return training, validation

@@ -1,0 +1,1 @@
+from tests.cli.conftest import photos, run  # noqa: F401

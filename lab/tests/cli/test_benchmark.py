@@ -1,0 +1,143 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from skimage import data
+from tests.command_line import run_command
+
+FILES = {"report.md", "report.json", "tables/foreground.csv"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One small photograph with a mask."""
+    root = tmp_path_factory.mktemp("data") / "foreground"
+    root.mkdir()
+    Image.fromarray(data.chelsea()[60:124, 90:170]).save(root / "cat.png")
+    mask = np.zeros((64, 80), np.uint8)
+    mask[:, :40] = 255
+    Image.fromarray(mask).save(root / "cat_mask.png")
+    return root.parent
+
+
+@pytest.fixture(scope="module")
+def made(folder: Path, tmp_path_factory: pytest.TempPathFactory):
+    """The first run, whose results the others find."""
+    output = tmp_path_factory.mktemp("output")
+    arguments = ["dev", "benchmark", "foreground", "--data", str(folder), "-o", str(output)]
+    result = run_command([*arguments, "--baselines", "fast, harris"])
+    assert result.exit_code == 0, result.output
+    return result, output
+
+
+def test_the_report_is_written_and_printed(made, folder: Path) -> None:
+    result, output = made
+    written = {path.relative_to(output).as_posix() for path in output.rglob("*") if path.is_file()}
+    assert {path for path in written if not path.startswith("cache/")} == FILES
+    assert any(path.startswith("cache/keypoints/") for path in written)
+    assert f"report: {output / 'report.md'}" in result.stdout
+    assert "| FAST |" in result.stdout
+    assert "Traceback" not in result.output
+    gray = cv2.cvtColor(cv2.imread(str(folder / "foreground" / "cat.png")), cv2.COLOR_BGR2GRAY)
+    points = cv2.FastFeatureDetector_create().detect(gray, None)
+    share = np.mean([p.pt[0] < 40 for p in points])
+    rows = (output / "tables" / "foreground.csv").read_text().splitlines()
+    (fast,) = [row.split(",") for row in rows if row.startswith("FAST,")]
+    assert float(fast[1]) == pytest.approx(share)
+    assert float(fast[4]) == pytest.approx(len(points) / gray.size)
+    assert [row.split(",")[0] for row in rows[:3]] == ["method", "FAST", "Harris"]
+
+
+def test_json_can_be_parsed_and_names_the_files(made, folder: Path, run) -> None:
+    _, output = made
+    result = run(
+        *(
+            "dev",
+            "benchmark",
+            "foreground",
+            "--data",
+            folder,
+            "-o",
+            "out",
+            "--baselines",
+            "fast,harris",
+        ),
+        *("--cache", output / "cache", "--json"),
+    )
+    assert result.exit_code == 0, result.output
+    values = json.loads(result.stdout)
+    assert {Path(path).relative_to("out").as_posix() for path in values["files"]} == FILES
+    assert all(Path(path).is_file() for path in values["files"])
+    assert [row["method"] for row in values["tables"]["foreground"]["rows"]][:2] == [
+        *("FAST", "Harris"),
+    ]
+    assert values["metadata"]["results made, not found in the cache"] == "0"
+    assert values["skipped"] == []
+
+
+def test_a_further_method_is_one_more_row_and_the_rest_is_found(made, folder: Path, run) -> None:
+    _, output = made
+    Path("own_corner_finder.py").write_text(
+        "def find(rgb):\n    return {'keypoints': [[1, 1], [70, 1]], 'scores': [1, 1]}\n"
+    )
+    result = run(
+        *("dev", "benchmark", "foreground", "--data", folder / "foreground", "-o", "out"),
+        *("--baselines", "fast", "--method", "own_corner_finder:find", "--method", "agast"),
+        *("--cache", output / "cache", "--json"),
+    )
+    assert result.exit_code == 0, result.output
+    values = json.loads(result.stdout)
+    rows = {row["method"]: row for row in values["tables"]["foreground"]["rows"]}
+    assert list(rows)[:3] == ["FAST", "own_corner_finder:find", "AGAST"]
+    assert rows["own_corner_finder:find"]["fraction on the foreground"] == 0.5
+    assert values["metadata"]["results made, not found in the cache"] == "2"
+
+
+def test_what_fails_is_listed_and_the_rest_is_there(made, folder: Path, run) -> None:
+    _, output = made
+    Path("never_works.py").write_text("def find(rgb):\n    raise ValueError('not today')\n")
+    arguments = (
+        *("dev", "benchmark", "foreground", "--data", folder, "-o", "out", "--baselines", "fast"),
+        *("--cache", output / "cache", "--method", "never_works:find"),
+    )
+    result = run(*arguments)
+    assert result.exit_code == 1, result.output
+    assert "| FAST |" in result.stdout
+    assert "report: out/report.md" in result.stdout
+    first, *failures = result.stderr.strip().splitlines()[-2:]
+    assert first == "deepdetect: 1 of the parts failed, the others are done:"
+    assert all("not today" in failure for failure in failures)
+    as_json = run(*arguments, "--json")
+    assert as_json.exit_code == 1
+    assert json.loads(as_json.stdout)["skipped"] == [failure.strip() for failure in failures]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        ("oxfort", "'oxford'"),
+        ("foreground --protocol papers", "'paper'"),
+        ("foreground --baselines siift", "'sift'"),
+        ("foreground --method none.onnx", "none.onnx"),
+        ("foreground --method no_such_module:find", "no_such_module"),
+        ("oxford", "img1"),
+        ("hpatches", "HPatches"),
+        ("pose", "no images with cameras"),
+        ("pose --max-pairs 0", "--max-pairs must be a whole number"),
+    ],
+)
+def test_a_wrong_name_ends_with_one_line_and_exit_code_2(
+    run, folder: Path, arguments: str, hint: str
+) -> None:
+    result = run("dev", "benchmark", *arguments.split(), "--data", folder, "-o", "out")
+    assert result.exit_code == 2, result.output
+    message = result.stderr.strip()
+    assert message.startswith("deepdetect: ")
+    assert len(message.splitlines()) == 1, message
+    assert hint in message.replace('"', "'")
+    assert not Path("out").exists()

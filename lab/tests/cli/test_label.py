@@ -1,0 +1,122 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from deepdetect import load_image
+from deepdetect.io.image import luma
+from deepdetect_lab.labels import LabelOptions, find_label_settings, fuse
+
+
+def test_writes_one_bit_masks(run, photos: Path) -> None:
+    result = run("label", photos, "-o", "masks", "--workers", 1)
+    assert result.exit_code == 0, result.output
+    assert {p.name for p in Path("masks").glob("*.png")} == {"cat.png", "left.png", "right.png"}
+    with Image.open("masks/cat.png") as mask:
+        assert mask.mode == "1"
+        expected = fuse(luma(load_image(photos / "cat.jpg"))).mask
+        np.testing.assert_array_equal(np.asarray(mask), expected)
+    assert "3 labelled, 0 already done" in result.stdout
+
+
+def test_several_processes_give_the_same_and_what_is_done_is_skipped(run, photos: Path) -> None:
+    words = ("label", photos, "--detectors", "fast,sobel", "--json", "-o")
+    for output, workers in (("one", 1), ("two", 2)):
+        assert len(json.loads(run(*words, output, "--workers", workers).stdout)["labelled"]) == 3
+    for path in Path("one").glob("*.png"):
+        assert path.read_bytes() == (Path("two") / path.name).read_bytes()
+    Path("one/cat.png").unlink()
+    kept = Path("one/left.png").stat().st_mtime_ns
+    report = json.loads(run(*words, "one", "--workers", 1).stdout)
+    assert [Path(entry["image"]).name for entry in report["labelled"]] == ["cat.jpg"]
+    assert report["skipped"] == 2
+    assert Path("one/left.png").stat().st_mtime_ns == kept
+
+
+def test_masks_of_other_settings_are_not_passed_off(run, photos: Path) -> None:
+    run("label", photos / "cat.jpg", "-o", "masks", "--workers", 1)
+    before = Path("masks/cat.png").read_bytes()
+    result = run("label", photos / "cat.jpg", "-o", "masks", "--detectors", "fast")
+    assert result.exit_code == 2
+    assert "--overwrite" in result.stderr
+    assert Path("masks/cat.png").read_bytes() == before
+    result = run("label", photos / "cat.jpg", "-o", "masks", "--detectors", "fast", "--overwrite")
+    assert result.exit_code == 0
+    assert Path("masks/cat.png").read_bytes() != before
+
+
+def test_visualize_draws_four_panels(run, photos: Path) -> None:
+    run("label", photos / "cat.jpg", "-o", "masks", "--visualize", "--workers", 1)
+    panels = np.asarray(Image.open("masks/cat_labels.png"))
+    label = fuse(luma(load_image(photos / "cat.jpg")))
+    assert panels.shape[1] == 4 * 200 + 3 * 6
+    # The panels in order: image, keypoint mask, edge mask, combined.
+    np.testing.assert_array_equal(panels[:150, :200], load_image(photos / "cat.jpg"))
+    for k, mask in ((1, label.keypoints), (2, label.edges), (3, label.mask)):
+        left = k * 206
+        np.testing.assert_array_equal(panels[:150, left : left + 200, 0] > 0, mask)
+
+
+def test_subset_and_override(run, photos: Path) -> None:
+    run(
+        *("label", photos / "cat.jpg", "-o", "masks", "--detectors", "sobel, fast"),
+        *("--visibility", "low", "--workers", 1),
+    )
+    options = LabelOptions(("fast", "sobel"), "low")
+    expected = fuse(luma(load_image(photos / "cat.jpg")), options).mask
+    np.testing.assert_array_equal(np.asarray(Image.open("masks/cat.png")), expected)
+
+
+def test_a_bad_image_is_reported_and_the_others_are_done(run, photos: Path) -> None:
+    Path("in").mkdir()
+    Path("in/bad.jpg").write_bytes(b"not a photograph")
+    Path("in/good.png").write_bytes((photos / "left.png").read_bytes())
+    result = run("label", "in", "-o", "masks", "--workers", 1)
+    assert result.exit_code == 1
+    *_, told, failure = result.stderr.splitlines()
+    assert told == "deepdetect: 1 of 2 images failed, the others are done:"
+    assert "bad.jpg" in failure
+    assert [p.name for p in Path("masks").glob("*.png")] == ["good.png"]
+
+
+def test_a_photograph_is_never_replaced_by_its_mask(run, photos: Path, tmp_path: Path) -> None:
+    photograph = tmp_path / "photo.png"
+    photograph.write_bytes((photos / "left.png").read_bytes())
+    for more in ([], ["--overwrite"]):
+        result = run("label", "photo.png", "-o", ".", *more)
+        assert result.exit_code == 2
+        assert "would replace an input" in result.stderr
+    assert photograph.read_bytes() == (photos / "left.png").read_bytes()
+
+
+def test_an_image_that_has_changed_is_labelled_again(run, photos: Path) -> None:
+    Path("x.png").write_bytes((photos / "left.png").read_bytes())
+    run("label", "x.png", "-o", "masks", "--workers", 1)
+    Path("x.png").write_bytes((photos / "right.png").read_bytes())
+    result = run("label", "x.png", "-o", "masks", "--workers", 1)
+    assert "1 labelled, 0 already done" in result.stdout
+    expected = fuse(luma(load_image(photos / "right.png"))).mask
+    np.testing.assert_array_equal(np.asarray(Image.open("masks/x.png")), expected)
+
+
+def test_a_figure_is_never_written_over_a_mask(run, photos: Path) -> None:
+    Path("in").mkdir()
+    for name in ("x.png", "x_labels.png"):
+        Path("in", name).write_bytes((photos / "left.png").read_bytes())
+    result = run("label", "in", "-o", "masks", "--workers", 1, "--visualize")
+    assert result.exit_code == 2
+    assert "would both write" in result.stderr
+    assert not Path("masks").exists()
+
+
+def test_detectors_leave_out_the_settings_of_others(run, photos: Path) -> None:
+    words = ("label", photos / "cat.jpg", "--label-settings", "dense", "--workers", 1)
+    for names in ("fast", "fast,sobel"):
+        result = run(*words, "-o", names, "--detectors", names)
+        assert result.exit_code == 0, result.output
+        options = find_label_settings("dense").with_detectors(tuple(names.split(",")))
+        expected = fuse(luma(load_image(photos / "cat.jpg")), options).mask
+        np.testing.assert_array_equal(np.asarray(Image.open(f"{names}/cat.png")), expected)

@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import math
+import mmap
+import os
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from deepdetect import DeepDetectError
+from deepdetect_lab.evaluation.profiling import StageProfiler, peak_memory, profiled, run_in_child
+
+
+def test_the_time_is_that_of_the_block() -> None:
+    started = time.perf_counter()
+    with profiled() as profiler:
+        time.sleep(0.05)
+    assert 0.05 <= profiler.total.seconds <= time.perf_counter() - started
+
+
+def written(size_bytes: int) -> mmap.mmap:
+    """Take memory from the system: an array may get some that was freed before."""
+    block = mmap.mmap(-1, size_bytes)
+    np.frombuffer(block, np.uint8)[:] = 1
+    return block
+
+
+def test_memory_that_is_freed_within_the_block_counts() -> None:
+    with profiled() as profiler:
+        block = written(128_000_000)
+        time.sleep(0.1)
+        block.close()
+    assert 120e6 < profiler.total.memory < 300e6
+
+
+def test_what_an_earlier_stage_holds_counts_in_the_whole() -> None:
+    profiler = StageProfiler()
+    held = [written(64_000_000)]
+    profiler.record("first")
+    held.append(written(64_000_000))
+    profiler.record("second")
+    assert all(50e6 < profile.memory < 100e6 for profile in profiler.stages.values())
+    assert 110e6 < profiler.total.memory < 180e6
+    assert len(held) == 2
+
+
+def test_stages_of_one_name_add_up() -> None:
+    profiler = StageProfiler()
+    for _ in range(2):
+        time.sleep(0.02)
+        profiler.record("waiting")
+    assert list(profiler.stages) == ["waiting"]
+    assert profiler.stages["waiting"].seconds >= 0.04
+
+
+def _leave() -> None:
+    os._exit(1)
+
+
+def test_a_child_tells_its_own_memory_not_that_of_its_parent() -> None:
+    held = np.ones(30_000_000)  # 240 MB
+    assert peak_memory() > held.nbytes
+    assert 1e6 < run_in_child(peak_memory) < held.nbytes
+
+
+def test_a_child_that_is_ended_is_one_sentence() -> None:
+    with pytest.raises(DeepDetectError, match="process was ended") as caught:
+        run_in_child(_leave)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(ValueError, match="math domain"):
+        run_in_child(math.sqrt, -1)
+
+
+def test_a_child_has_one_thread() -> None:
+    assert run_in_child(cv2.getNumThreads) == 1

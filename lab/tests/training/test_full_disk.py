@@ -1,0 +1,48 @@
+"""What writes weights where no space is left: one sentence, and nothing half-written stays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
+resource = pytest.importorskip("resource", reason="needs a limit on the size of files")
+
+from deepdetect import DeepDetectError  # noqa: E402
+from deepdetect.detector.points.ranker import load_ranker  # noqa: E402
+from deepdetect_lab.networks.espnet import ESPNet  # noqa: E402
+from deepdetect_lab.networks.export import export_onnx  # noqa: E402
+from deepdetect_lab.networks.weights import save_tensors  # noqa: E402
+from deepdetect_lab.training.checkpoint import save_checkpoint  # noqa: E402
+from deepdetect_lab.training.points.task import save_ranker  # noqa: E402
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """Let writing fail beyond a size, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+WRITERS: dict[str, Callable[[Path], None]] = {
+    "best.safetensors": lambda path: save_tensors(ESPNet().state_dict(), path, {}),
+    "checkpoint.safetensors": lambda path: save_checkpoint(path, ESPNet(), ESPNet(), [], {}),
+    "deepdetect.onnx": lambda path: export_onnx(ESPNet(), path),
+    "best.npz": lambda path: save_ranker(load_ranker(), path),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_is_one_sentence(name: str, tmp_path: Path, one_line) -> None:
+    (tmp_path / name).write_bytes(b"old")
+    with files_of_at_most(1024), pytest.raises(DeepDetectError, match="cannot write") as caught:
+        WRITERS[name](tmp_path / name)
+    assert str(tmp_path / name) in one_line(caught.value)
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [(name, b"old")]

@@ -1,0 +1,103 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="needs torch, which is for training only")
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from deepdetect import OptionError
+from deepdetect_lab.training.recipe import Stage
+from deepdetect_lab.training.sampler import CropSampler, Schedule, epoch_order
+
+from .conftest import plain_options
+
+OPTIONS = plain_options(stages=(Stage(64, 4, 2), Stage(32, 2, 1)), short_sides=(64,), seed=5)
+
+
+def test_the_warm_up_rises_evenly_into_the_cosine() -> None:
+    stages = (Stage(64, 2, 10),)
+    plain = Schedule(plain_options(stages=stages, short_sides=(64,)), 20)
+    warm = Schedule(plain_options(stages=stages, short_sides=(64,), warm_up=0.09), 20)
+    shares = [warm.learning_rate(step) / plain.learning_rate(step) for step in range(12)]
+    assert shares == pytest.approx([k / 10 for k in range(1, 11)] + [1, 1])
+
+
+def test_crops_are_counted() -> None:
+    schedule = Schedule(OPTIONS, 10)
+    assert [schedule.crops_until(step) for step in (0, 1, 5, 6, 10)] == [0, 4, 20, 22, 30]
+
+
+@given(
+    photos=st.integers(1, 50),
+    stages=st.lists(st.tuples(st.integers(1, 8), st.integers(1, 4)), min_size=1, max_size=3),
+)
+def test_interleaved_stages_advance_together(photos: int, stages: list[tuple[int, int]]) -> None:
+    made = tuple(Stage(16, batch, epochs) for batch, epochs in stages)
+    options = plain_options(stages=made, short_sides=(16,))
+    mixed = Schedule(dataclasses.replace(options, interleave=True), photos)
+    plain = Schedule(options, photos)
+    positions = [mixed.position(step) for step in range(mixed.steps)]
+    expected = [plain.position(step) for step in range(plain.steps)]
+    key = lambda position: (position.first_epoch, position.sample)  # noqa: E731
+    assert sorted(positions, key=key) == sorted(expected, key=key)
+    done = [0] * len(made)
+    starts = [sum(stage.epochs for stage in made[:k]) for k in range(len(made))]
+    for step, position in enumerate(positions, start=1):
+        number = starts.index(position.first_epoch)
+        assert position.sample == done[number] * position.stage.batch
+        done[number] += 1
+        for number, total in enumerate(mixed.steps_of_stage):
+            assert abs(done[number] - total * step / mixed.steps) < len(made) + 1
+
+
+def test_each_image_is_seen_once_an_epoch() -> None:
+    orders = [epoch_order(0, epoch, 12).tolist() for epoch in range(3)]
+    for order in orders:
+        assert sorted(order) == list(range(12))
+    assert orders[0] != orders[1]
+    assert epoch_order(1, 0, 12).tolist() != orders[0]
+
+
+def test_batches_go_through_the_epochs_of_each_stage() -> None:
+    schedule = Schedule(OPTIONS, 10)
+    sampler = CropSampler(schedule)
+    assert len(sampler) == len(list(sampler)) == schedule.steps == 5 + 5
+    crops = [index for batch in sampler for index in batch]
+    assert [index.epoch for index in crops] == [0] * 10 + [1] * 10 + [2] * 10
+    assert [index.stage.crop for index in crops] == [64] * 20 + [32] * 10
+    for epoch in range(3):
+        images = [index.image for index in crops if index.epoch == epoch]
+        assert images == epoch_order(5, epoch, 10).tolist()
+    assert [index.position for index in crops] == 3 * list(range(10))
+
+
+def test_a_sampler_starts_at_any_step() -> None:
+    schedule = Schedule(OPTIONS, 10)
+    whole = list(CropSampler(schedule))
+    assert list(CropSampler(schedule, first_step=3)) == whole[3:]
+    assert list(CropSampler(schedule, first_step=2, last_step=7)) == whole[2:7]
+
+
+def test_processes_share_each_batch() -> None:
+    schedule = Schedule(OPTIONS, 10)
+    halves = [CropSampler(schedule, rank=rank, world_size=2) for rank in range(2)]
+    for batch, first, second in zip(CropSampler(schedule), *halves, strict=True):
+        assert batch == first + second
+    with pytest.raises(OptionError, match="a batch of 4 cannot be divided evenly among 3"):
+        CropSampler(schedule, world_size=3)
+
+
+@given(sizes=st.lists(st.integers(1, 5), min_size=1, max_size=14), epoch=st.integers(0, 3))
+def test_few_shards_are_read_at_a_time(sizes: list[int], epoch: int) -> None:
+    count = sum(sizes)
+    order = epoch_order(0, epoch, count, tuple(sizes))
+    assert sorted(order) == list(range(count))
+    shard_of = np.repeat(np.arange(len(sizes)), sizes)[order]
+    places = [np.flatnonzero(shard_of == shard) for shard in range(len(sizes))]
+    for step in range(count):  # shards that have been begun and not finished
+        assert sum(place[0] <= step < place[-1] for place in places) <= 4

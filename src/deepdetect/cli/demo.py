@@ -1,0 +1,103 @@
+"""`deepdetect demo`: the matches of a real stereo pair, evaluated by its true disparity."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._shared.errors import require_packages
+from ..detector.detector import DeepDetect, HeatmapDetector
+from ..features.display import draw_matches
+from ..features.selection import SelectionOptions
+from ..geometry.transforms import TOLERANCE_PX, disparity_errors, score_errors
+from ..matching.pipeline import match_images
+from ..viz.draw import add_caption, draw_dense_keypoints, draw_heatmap, save_picture
+from . import _options as cli
+from ._detection import NETWORK
+
+
+@cli.command(NETWORK)
+def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Result:
+    """Detect and match the Motorcycle stereo pair; evaluate the matches by its true disparity.
+
+    The images (Middlebury 2014) come with the package scikit-image. Random points of the same
+    number are shown for comparison: a match by chance is not to be mistaken for skill.
+    """
+    require_packages("the Motorcycle pair", "skimage")
+    from skimage import data
+
+    detector = DeepDetect(**values)
+    folder = cli.output_folder(output)
+    numbers = run_demo(*data.stereo_motorcycle(), detector, folder)
+    values = {"weights": detector.weights, "backend": detector.runtime, **numbers}
+    found, random = numbers["all_matches"], numbers["random"]
+    sentence = f"{found['matches']:,} matches, {found['precision']:.0%} of them within "
+    sentence += f"{TOLERANCE_PX:g} px of the truth (of random pixels {random['precision']:.0%})"
+    return cli.Result(values, cli.headed(sentence, values, "keypoints seconds pictures"))
+
+
+class RandomPixels:
+    """A detector to which any pixel is as good as another: the baseline of chance."""
+
+    def __init__(self) -> None:
+        self._generator = np.random.default_rng(0)
+
+    def heatmap(self, image: np.ndarray) -> np.ndarray:
+        """Draw a probability for each pixel."""
+        return self._generator.random(image.shape[:2], dtype=np.float32)
+
+
+def run_demo(
+    left: np.ndarray,
+    right: np.ndarray,
+    disparity: np.ndarray,
+    detector: HeatmapDetector,
+    folder: Path,
+) -> dict[str, Any]:
+    """Detect and match a stereo pair; evaluate the matches; write pictures; return the numbers.
+
+    As many random points as there are keypoints are matched, too, by descriptors alone.
+
+    Args:
+        left, right: (H, W, 3) uint8 RGB, rectified.
+        disparity: (H, W) true disparity of the left view in pixels; not finite where unknown.
+        detector: the network.
+        folder: where the pictures are written.
+    """
+    matches = match_images(left, right, detector)
+    both = matches.keypoints0, matches.keypoints1
+    density = SelectionOptions(density=max((both[0].density + both[1].density) / 2, 1e-6))
+    random = match_images(
+        left, right, RandomPixels(), selection=density, guided_matching=False, model="none"
+    )
+    disparity = np.where(np.isfinite(disparity), disparity, np.nan).squeeze()
+    errors = disparity_errors(matches.points0, matches.points1, disparity)
+    random_errors = disparity_errors(random.points0, random.points1, disparity)
+    sets = {"all_matches": errors, "inliers": errors[matches.inliers], "random": random_errors}
+    scores = {name: score_errors(each) for name, each in sets.items()}
+    known = np.isfinite(errors)
+    points = matches.points0[known], matches.points1[known]
+    lines = draw_matches(left, right, *points, errors[known] <= TOLERANCE_PX)
+    caption = (
+        f"{len(matches):,} matches, a random sample drawn; green: within {TOLERANCE_PX:g} px of "
+        f"the true disparity ({scores['all_matches']['precision']:.1%}), red: not"
+    )
+    heatmap = draw_heatmap(detector.heatmap(left))
+    pictures = {
+        "left_keypoints": draw_dense_keypoints(left, both[0]),
+        "right_keypoints": draw_dense_keypoints(right, both[1]),
+        "left_heatmap": add_caption(heatmap, "probability of a keypoint: dark blue 0, yellow 1"),
+        "matches": add_caption(lines, caption),
+    }
+    paths = [folder / f"motorcycle_{name}.jpg" for name in pictures]
+    for path, picture in zip(paths, pictures.values(), strict=True):
+        save_picture(picture, path)
+    return {
+        "keypoints": [len(each) for each in both],
+        "density": [each.density for each in both],
+        **scores,
+        "seconds": matches.seconds,
+        "pictures": paths,
+    }
