@@ -50,9 +50,9 @@ NOT_PROSE = re.compile(
 
 
 def texts() -> dict[str, str]:
-    """Return what users read, by its name: `docs/history.md` is of its time and left out."""
+    """Return what users read, by its name."""
     pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-    found = {page.name: page.read_text("utf-8") for page in pages if page.name != "history.md"}
+    found = {page.name: page.read_text("utf-8") for page in pages}
     for notebook in sorted((ROOT / "docs/notebooks").glob("*.ipynb")):
         cells = json.loads(notebook.read_text("utf-8"))["cells"]
         prose = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown"]

@@ -1,6 +1,7 @@
 """The pages of the Python interface: which names are on which; mkdocstrings writes the rest.
 
-A test demands that each name that `import deepdetect` exports is on one of them.
+A test demands that each name that `import deepdetect` exports is on one of them. Names of
+deepdetect-lab begin with `LAB`.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[2] / "src" / "deepdetect"
+
+LAB = "deepdetect_lab."
 
 WHOLE_NAME = "\n    options:\n      show_root_full_path: true"
 """Of modules, which are imported by it."""
@@ -26,7 +29,8 @@ class ApiPage:
     def text(self) -> str:
         """Return the page in Markdown."""
         blocks = "\n\n".join(
-            f"::: deepdetect.{name}" + (WHOLE_NAME if is_module(name) else "")
+            f"::: {name if name.startswith(LAB) else f'deepdetect.{name}'}"
+            + (WHOLE_NAME if is_module(name) else "")
             for name in self.names
         )
         return f"# {self.title}\n\n{self.introduction}\n\n{blocks}\n"
@@ -95,6 +99,7 @@ _PAGES = (
             "Calibration",
             "Camera",
             "geometry.point_cloud.PointCloud",
+            "estimate_pose",
             "reconstruct_many",
             "sfm.MultiViewReconstruction",
             "sfm.MultiViewOptions",
@@ -104,7 +109,18 @@ _PAGES = (
         "api/tracking.md",
         "Tracking",
         "Points followed through a video.",
-        ("tracking",),
+        (
+            "track",
+            "tracking.track_frames",
+            "tracking.Tracker",
+            "tracking.TrackingOptions",
+            "tracking.TrackedFrame",
+            "tracking.TrackingReport",
+            "tracking.FrameSource",
+            "tracking.Frame",
+            "tracking.load_tracks",
+            "tracking.point_candidates",
+        ),
     ),
     ApiPage(
         "api/interchange.md",
@@ -122,15 +138,15 @@ _PAGES = (
         "api/training.md",
         "Labels, training, evaluation",
         "The masks that the network learns ([labels](../training.md#labels)), and how it does "
-        "([training](../training.md)).",
+        "([training](../training.md)), in `deepdetect-lab`.",
         (
-            "labels.fuse",
-            "labels.Label",
-            "labels.LabelOptions",
-            "training.train",
-            "training.TrainingOptions",
-            "evaluation.evaluate",
-            "evaluation.Evaluation",
+            LAB + "labels.fuse",
+            LAB + "labels.Label",
+            LAB + "labels.LabelOptions",
+            LAB + "training.train",
+            LAB + "training.TrainingOptions",
+            LAB + "evaluation.evaluate",
+            LAB + "evaluation.Evaluation",
         ),
     ),
     ApiPage(
@@ -166,7 +182,7 @@ _PAGES = (
 )
 
 # Packages that are not there have no page.
-WHOLE_PACKAGES = {"tracking", "interchange"}
+WHOLE_PACKAGES = {"interchange"}
 PAGES = tuple(
     page for page in _PAGES if not WHOLE_PACKAGES & set(page.names) or is_module(page.names[0])
 )

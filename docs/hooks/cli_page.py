@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,19 +17,30 @@ when a command continues where it stopped, and what the exit codes mean: [comman
 `-h` or `--help` shows the common options of a command, `--help-all` shows all, `--version` prints
 the version.
 
-| command | what it does |
-|---|---|
+## Shared options
+
+Many commands take these. Each command below names those that it takes.
+
 """
+
+TABLE_HEAD = "| option | what it does |\n|---|---|\n"
+
+SHARED_BY = 4
+"""An option that so many commands have, with the same words, is explained once for all of them."""
 
 
 def make_page() -> str:
     """Return the page in Markdown."""
     commands = dict(walk())
-    table = "".join(
-        f"| [`{name}`](#{_anchor(name)}) | {_text(_help(app).partition(chr(10))[0])} |\n"
-        for name, app in commands.items()
-    )
-    return INTRODUCTION + table + "".join(_section(*each) for each in commands.items())
+    tables = {name: _options(app) for name, app in commands.items()}
+    uses = Counter(option for table in tables.values() for option in table.items())
+    shared = {
+        flags: text
+        for (flags, text), times in uses.items()
+        if times >= SHARED_BY and flags.startswith("-")
+    }
+    sections = (_section(name, app, tables[name], shared) for name, app in commands.items())
+    return f"{INTRODUCTION}{_table(shared)}{''.join(sections)}"
 
 
 def walk() -> Iterator[tuple[str, Any]]:
@@ -52,29 +64,43 @@ def _help(app: Any) -> str:
     return doc.partition("\nArgs:\n")[0].strip()
 
 
-def _anchor(heading: str) -> str:
-    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+def _arguments(app: Any) -> list[Any]:
+    return [each for each in app.assemble_argument_collection(parse_docstring=True) if each.show]
 
 
-def _section(name: str, app: Any) -> str:
-    arguments = [
-        each for each in app.assemble_argument_collection(parse_docstring=True) if each.show
-    ]
-    usage = [name, *(each.name for each in arguments if not each.name.startswith("-"))]
-    lines = [f"\n## {name}\n", f"```text\n{' '.join(usage)} [OPTIONS]\n```\n"]
+def _options(app: Any) -> dict[str, str]:
+    """Return what each argument of a command does, by its names."""
+    options = {}
+    for each in _arguments(app):
+        shown = f"  [default: {each.field_info.default}]" if _has_default(each) else ""
+        options[", ".join(each.names)] = _text(each.parameter.help + shown)
+    return options
+
+
+def _table(options: dict[str, str]) -> str:
+    return TABLE_HEAD + "".join(f"| `{flags}` | {text} |\n" for flags, text in options.items())
+
+
+def _section(name: str, app: Any, options: dict[str, str], shared: dict[str, str]) -> str:
+    positional = [each.name for each in _arguments(app) if not each.name.startswith("-")]
+    lines = [f"\n## {name}\n", f"```text\n{' '.join([name, *positional])} [OPTIONS]\n```\n"]
     for paragraph in _help(app).split("\n\n"):
         code = paragraph.startswith("    ")
         lines.append(f"```sh\n{inspect.cleandoc(paragraph)}\n```\n" if code else _text(paragraph))
         lines.append("")
-    lines.append("| option | what it does |\n|---|---|")
-    for each in arguments:
-        shown = f"  [default: {each.field_info.default}]" if _has_default(each) else ""
-        lines.append(f"| `{', '.join(each.names)}` | {_text(each.parameter.help + shown)} |")
-    return "\n".join(lines) + "\n"
+    own = {flags: text for flags, text in options.items() if shared.get(flags) != text}
+    others = [f"`{flags.partition(',')[0]}`" for flags in options if flags not in own]
+    if own:
+        lines.append(_table(own))
+    if others:
+        lines.append(f"[Shared options](#shared-options): {', '.join(others)}\n")
+    return "\n".join(lines)
 
 
 def _has_default(argument: Any) -> bool:
     default = argument.field_info.default
+    if default is False:  # a switch is off unless it is given
+        return False
     return isinstance(default, (str, int, float)) and "[default:" not in argument.parameter.help
 
 

@@ -90,7 +90,7 @@ class TrainingOptions:
             flips also change those of Shi-Tomasi, SIFT and ORB.
         color_jitter: fraction of the crops whose colours are removed, or rotated with the same
             luma to a grey level, the only thing that labels and `fast` depend on.
-        optimizer: "adam", or "soap", which learns more per image (docs/history.md has the
+        optimizer: "adam", or "soap", which learns more per image (lab/HISTORY.md has the
             measurements).
         learning_rate: learning rate at the start of the cosine annealing to 1e-6.
         warm_up: fraction of the steps over which the learning rate rises from zero. A run that
