@@ -71,7 +71,7 @@ print(json.dumps(sorted(sys.modules)))
 def test_commands_and_matching_import_opencv_when_they_use_it() -> None:
     code = """
 import json, sys
-from deepdetect.cli import detect, evaluate, export, features, match, reconstruct, train
+from deepdetect.cli import demo, detect, export, features, match, reconstruct
 from deepdetect import matching, reconstruction, sfm
 print(json.dumps(sorted(sys.modules)))
 """

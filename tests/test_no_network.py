@@ -128,4 +128,4 @@ def test_only_downloads_and_the_page_import_what_connects() -> None:
                 found.add(path.relative_to(ROOT).as_posix())
     # The page's server listens, on the loopback address only; its command can open a browser.
     page = {"app/server.py", "cli/app.py", "cli/view.py"}
-    assert found == {"datasets/download.py", *page}
+    assert found == page

@@ -33,7 +33,7 @@ def test_every_public_name_can_be_imported() -> None:
 
 @pytest.mark.parametrize(
     "package",
-    ["detector", "evaluation", "features", "matching", "reconstruction", "sfm"],
+    ["detector", "features", "matching", "reconstruction", "sfm"],
 )
 def test_every_name_of_a_namespace_can_be_imported(package: str) -> None:
     code = (
@@ -41,13 +41,6 @@ def test_every_name_of_a_namespace_can_be_imported(package: str) -> None:
         "print(json.dumps([str(getattr(names, name)) for name in names.__all__]))"
     )
     assert in_a_fresh_interpreter(code)
-
-
-def test_every_name_of_training_can_be_imported() -> None:
-    pytest.importorskip("torch")
-    import deepdetect_lab.training as names
-
-    assert set(names.__all__) <= {name for name in names.__all__ if getattr(names, name)}
 
 
 def test_the_stub_exports_what_it_imports() -> None:

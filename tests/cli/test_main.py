@@ -8,19 +8,23 @@ from pathlib import Path
 import pytest
 from tests.command_line import run_command
 
-from deepdetect.cli._app import COMMANDS, DEVELOPMENT, make_app, with_flags
+from deepdetect.cli._app import COMMANDS, make_app, with_flags
+from deepdetect_lab.cli import COMMANDS as LAB_COMMANDS
+from deepdetect_lab.cli import DEVELOPMENT
 
-PARTS = {"export": ("colmap", "hloc", "onnx"), "datasets": ("list", "get"), "dev": ()}
+PARTS = {"export": ("colmap", "hloc", "onnx"), "datasets": ("list", "get")}
 WORDS = [
     [*before, name, *([part] if part else [])]
-    for before, groups in (([], COMMANDS), (["dev"], DEVELOPMENT))
+    for before, groups in (([], COMMANDS | LAB_COMMANDS), (["dev"], DEVELOPMENT))
     for group in groups.values()
     for name in group
     for part in PARTS.get(name, ("",))
 ]
 
 
-@pytest.mark.parametrize(("before", "groups"), [([], COMMANDS), (["dev"], DEVELOPMENT)])
+@pytest.mark.parametrize(
+    ("before", "groups"), [([], COMMANDS | LAB_COMMANDS), (["dev"], DEVELOPMENT)]
+)
 def test_help_names_every_command(before: list[str], groups: dict) -> None:
     text = run_command([*before, "--help"]).stdout
     for name in (name for group in groups.values() for name in group):
@@ -41,6 +45,20 @@ def test_every_option_says_what_it_is(words: list[str]) -> None:
             assert argument.name in result.stdout
 
 
+@pytest.mark.parametrize(
+    "words", [["train", "a"], ["dev", "average"], ["dev"], ["label", "--help"]]
+)
+def test_without_the_laboratory_one_sentence_says_what_to_install(
+    words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: ())
+    result = run_command(words)
+    assert result.exit_code == 2
+    assert len(result.stderr.splitlines()) == 1
+    assert "pip install ./lab" in result.stderr
+    assert "train" not in run_command(["--help"]).stdout
+
+
 def test_common_options_come_first_and_the_others_on_request() -> None:
     short, long = (run_command(["match", flag]).stdout for flag in ("--help", "--help-all"))
     assert "--max-keypoints" in short
@@ -56,7 +74,7 @@ def test_common_options_come_first_and_the_others_on_request() -> None:
         ("give `focal_px` or `calibration`", "give --focal or --calibration"),
         ("give `rectified=False`", "give --not-rectified"),
         ("give `rectified=True`", "give --rectified"),
-        ('use `backend="torch"`', "use --backend torch"),
+        ('use `backend="openvino"`', "use --backend openvino"),
         ("use `no_such_option`, `LEFT`", "use no_such_option, LEFT"),
         ("focal_px must be above 0", "--focal must be above 0"),
         ('there is no "focal_px" in my_focal_px.json, focal_px.json', None),

@@ -152,7 +152,8 @@ def _module_of(words: Sequence[str]) -> str | None:
     commands, development = _all_commands()
     if words[:1] and words[0] in LAB_COMMANDS and not development:
         raise MissingExtraError(
-            f"`deepdetect {words[0]}` belongs to deepdetect-lab: run pip install deepdetect-lab"
+            f"`deepdetect {words[0]}` belongs to deepdetect-lab, which is not installed: run "
+            "pip install ./lab in the folder of the sources"
         )
     groups = development if words[:1] == ["dev"] else commands
     return next((group[name][0] for group in groups.values() if name in group), None)
