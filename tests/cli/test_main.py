@@ -52,11 +52,13 @@ def test_without_the_laboratory_one_sentence_says_what_to_install(
     words: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.metadata.entry_points", lambda group: ())
+    make_app.cache_clear()
     result = run_command(words)
     assert result.exit_code == 2
     assert len(result.stderr.splitlines()) == 1
     assert "pip install ./lab" in result.stderr
     assert "train" not in run_command(["--help"]).stdout
+    make_app.cache_clear()
 
 
 def test_common_options_come_first_and_the_others_on_request() -> None:
