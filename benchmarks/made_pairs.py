@@ -279,7 +279,7 @@ def main() -> None:
             for pair in islice(maker, 0, None, arguments.every):
                 matches = match_images(*pair.images, detector)
                 wrong = len(matches) > 0 and not pair.is_right(matches.points0, matches.points1)
-                high, fair = (matches.confidence == word for word in ("high", "fair"))
+                high, fair = (matches.geometry.confidence == word for word in ("high", "fair"))
                 counts = [high, high and wrong, fair, fair and wrong]
                 rows.setdefault(pair.kind, []).append(counts)
     print("| kind | pairs | high | of these wrong | fair | of these wrong |")

@@ -66,7 +66,7 @@ def measure(paths: Sequence[Path], files: Sequence[str]) -> Row:
     for pair in map(ModalPair, paths):
         matches = match_images(*pair.images, detector)
         good = 2 * pair.right(matches) >= len(matches)
-        answers.append((len(matches) > 0, matches.confidence == "high", good))
+        answers.append((len(matches) > 0, matches.geometry.confidence == "high", good))
         for name, extract in extractors.items():
             first, second = (extract(image) for image in pair.images)
             right[name] += pair.right(match_features(first, second, ratio=1))

@@ -13,27 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from deepdetect import DeepDetect, MatchingOptions, match_images
+from deepdetect import DeepDetect, estimate_geometry, match_images
 from deepdetect_lab.datasets.middlebury import load_motorcycle
 from deepdetect_lab.evaluation.metrics.stereo import stereo_score
 from deepdetect_lab.evaluation.protocols.stereo_matches import match_random_points
+from deepdetect_lab.evaluation.unguided import UPRIGHT_SIFT, match_unguided
 
-
-def _unguided(mutual: bool = False, **options: Any) -> dict[str, Any]:
-    return {
-        "guided_matching": False,
-        "mutual": mutual,
-        "options": MatchingOptions(**options),
-    }
-
-
-WAYS: dict[str, dict[str, Any]] = {
-    "guided": {},
-    "unguided": _unguided(),
-    "... mutual": _unguided(mutual=True),
-    "... ratio=0.9": _unguided(ratio=0.9),
-    "... ratio=0.9, mutual": _unguided(mutual=True, ratio=0.9),
-    "... ratio=0.9, mutual, patchmatch": _unguided(mutual=True, ratio=0.9, matcher="patchmatch"),
+UNGUIDED: dict[str, dict[str, Any]] = {
+    "unguided": {},
+    "... mutual": {"mutual": True},
+    "... ratio=0.9": {"ratio": 0.9},
+    "... ratio=0.9, mutual": {"mutual": True, "ratio": 0.9},
+    "... ratio=0.9, mutual, patchmatch": {"mutual": True, "ratio": 0.9, "matcher": "patchmatch"},
 }
 
 
@@ -45,10 +36,12 @@ def main() -> None:
     pair = load_motorcycle()
     print("| options | matches | within 1 px | inliers | of these within 1 px |")
     print("|---|---|---|---|---|")
-    found = {
-        name: match_images(pair.left, pair.right, detector, **options)
-        for name, options in WAYS.items()
-    }
+    found = {"guided": match_images(pair.left, pair.right, detector)}
+    for name, options in UNGUIDED.items():
+        matches = match_unguided(
+            pair.left, pair.right, detector, descriptor=UPRIGHT_SIFT, **options
+        )
+        found[name] = matches.with_geometry(estimate_geometry(matches, model="auto"))
     both = found["guided"].keypoints0, found["guided"].keypoints1
     density = sum(each.density for each in both) / 2
     found["random points, unguided"] = match_random_points(pair, density)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -22,11 +23,9 @@ import numpy as np
 
 from deepdetect import (
     DeepDetect,
-    MatchingOptions,
     MissingExtraError,
     WeightsError,
     load_image,
-    match_images,
 )
 from deepdetect.detector import HeatmapOptions
 from deepdetect.detector.pretrained import PRETRAINED
@@ -37,6 +36,7 @@ from deepdetect_lab.evaluation.profiling import profiled
 from deepdetect_lab.evaluation.protocols.paper import CORRECT_PX
 from deepdetect_lab.evaluation.protocols.planar import select_pairs
 from deepdetect_lab.evaluation.report import Row, Table
+from deepdetect_lab.evaluation.unguided import UPRIGHT_SIFT, match_unguided
 
 PLANAR = (("wall", 6), ("graf", 3))
 STEREO = "cones"
@@ -142,12 +142,9 @@ def _sides(
     torch_detector = published_detector(detector)
 
     def ours() -> int:
-        found = match_images(
-            *images,
-            detector,
-            guided_matching=False,
-            model="none",
-            options=MatchingOptions(matcher="patchmatch", descriptor="rootsift", ratio=RATIO),
+        descriptor = replace(UPRIGHT_SIFT, name="rootsift")
+        found = match_unguided(
+            *images, detector, descriptor=descriptor, matcher="patchmatch", ratio=RATIO
         )
         return int(np.count_nonzero(every(found.points0, found.points1)))
 

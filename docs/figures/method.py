@@ -8,6 +8,7 @@ of Middlebury 2014 (Scharstein et al.; free to use and publish with citation).
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from deepdetect.features.display import draw_matches
 from deepdetect.geometry import disparity_errors
 from deepdetect.viz.draw import draw_heatmap
 from deepdetect_lab.datasets import StereoPair, load_motorcycle
+from deepdetect_lab.evaluation.unguided import UPRIGHT_SIFT, match_unguided
 from deepdetect_lab.labels import LabelOptions, fuse
 
 FOLDER = Path(__file__).parents[1] / "images"
@@ -71,10 +73,13 @@ def draw_kinds(rgb: np.ndarray) -> np.ndarray:
 def draw_guidance(pair: StereoPair) -> np.ndarray:
     """Draw matches by descriptors alone above those that a geometry guided."""
     detector = DeepDetect()
-    kinds = {"by descriptors alone": False, "guided by a geometry": True}
+    kinds = {
+        "by descriptors alone": partial(match_unguided, descriptor=UPRIGHT_SIFT),
+        "guided by a geometry": match_images,
+    }
     cells = []
-    for title, guided in kinds.items():
-        matches = match_images(pair.left, pair.right, detector, guided_matching=guided)
+    for title, match in kinds.items():
+        matches = match(pair.left, pair.right, detector)
         cells.append(_matches(pair, matches, title))
     return np.concatenate(cells, axis=1)
 

@@ -17,10 +17,10 @@ from deepdetect import (
     DeepDetect,
     Keypoints,
     Matches,
-    MatchingOptions,
     PointDetector,
     SelectionOptions,
 )
+from deepdetect.geometry import GeometryOptions
 from deepdetect.geometry.point_cloud import PointCloud
 
 from ..case import Target, prepared
@@ -31,7 +31,7 @@ ODD: tuple[Any, ...] = (
     *(Path("missing.png"), Path("/"), np.zeros(0), np.zeros((3, 2)), np.full((5, 2), np.nan)),
     *(np.zeros((20, 20)), np.zeros((20, 20, 3), "u1"), np.array("a"), np.array([None, 1])),
     *(np.float32(2), np.int64(7), np.bool_(True), slice(3), iter([1, 2]), SelectionOptions()),
-    *(Camera((20, 20), 30.0), MatchingOptions()),
+    *(Camera((20, 20), 30.0), GeometryOptions()),
 )
 
 
@@ -70,9 +70,9 @@ def calls() -> dict[str, tuple[Callable[..., Any], dict[str, Any]]]:
         "Keypoints": (Keypoints, {"xy": xy, "scores": np.ones(30), "image_size": (112, 96)}),
         "draw": (found.draw, {"image": scene}),
         "match_features": (deepdetect.match_features, {"features0": found, "features1": found}),
-        "estimate_geometry": (deepdetect.estimate_geometry, {"points0": xy, "points1": xy + 3}),
+        "estimate_geometry": (deepdetect.estimate_geometry, {"matches": xy, "points1": xy + 3}),
         "SelectionOptions": (SelectionOptions, {}),
-        "MatchingOptions": (MatchingOptions, {}),
+        "GeometryOptions": (GeometryOptions, {}),
         "Camera": (Camera, {"size": (112, 96), "focal_px": 100.0}),
         "Calibration": (Calibration, {"camera0": camera, "camera1": camera}),
         "Calibration.load": (Calibration.load, {"path": "missing.json"}),

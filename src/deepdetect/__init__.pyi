@@ -23,15 +23,12 @@ from .io.tables import (
     save_keypoints as save_keypoints,
     save_matches as save_matches,
 )
-from .matching.pipeline import (
-    MatchingOptions as MatchingOptions,
-    match_features as match_features,
-    match_images as match_images,
-)
+from .matching.pipeline import match_features as match_features, match_images as match_images
 from .matching.registration import register as register
 from .matching.stereo.matching import disparity_map as disparity_map
 from .matching.stitching import stitch as stitch
-from .reconstruction.pipeline import reconstruct as reconstruct
+from .reconstruction.pipeline import estimate_pose as estimate_pose, reconstruct as reconstruct
 from .sfm.pipeline import reconstruct_many as reconstruct_many
+from .tracking.pipeline import track as track
 
 __version__: str

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, ImageError, OptionError, match_images
+from deepdetect import DeepDetect, ImageError, OptionError
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.geometry.transforms import transfer_errors
 from deepdetect.io.image import luma
-from deepdetect.matching import PUBLISHED_MATCHING
 from deepdetect_lab.datasets.planar import OXFORD_KINDS, load_oxford
 from deepdetect_lab.evaluation.baselines.method import deepdetect_feature
 from deepdetect_lab.evaluation.options import PAPER_RESOLUTION_PX, THRESHOLDS
@@ -25,6 +24,7 @@ from deepdetect_lab.evaluation.protocols.masks import (
 )
 from deepdetect_lab.evaluation.protocols.paper import OXFORD_PAIRS, mean_correct_matches
 from deepdetect_lab.evaluation.run import Run
+from deepdetect_lab.evaluation.unguided import match_unguided
 from deepdetect_lab.evaluation.weights import _of_paper, evaluate, evaluate_oxford
 from deepdetect_lab.labels import fuse
 
@@ -176,15 +176,7 @@ def test_counts_are_those_of_the_published_matching(
     feature = deepdetect_feature(labels, version="1")
     counts = []
     for seed in range(2):
-        found = match_images(
-            pair.first,
-            pair.second,
-            labels,
-            guided_matching=False,
-            model="none",
-            seed=seed,
-            options=PUBLISHED_MATCHING,
-        )
+        found = match_unguided(pair.first, pair.second, labels, seed=seed)
         errors = transfer_errors(found.points0, found.points1, pair.homography)
         counts.append([np.count_nonzero(errors < 1), len(found)])
     expected = np.rint(np.mean(counts, axis=0)).astype(int).tolist()

@@ -64,7 +64,10 @@ _MALLOPT = ((-4, 0), (-1, -1), (-2, 2**28))
 _MMAP_THRESHOLD = (-3, 2**20)  # M_MMAP_THRESHOLD
 
 _max_threads: int | None = None
-"""Of this process, in `parallel_for`; None: one per processor."""
+"""The most threads that `parallel_for` uses in this process; None: one for each processor."""
+
+_chosen = threading.local()
+"""The number of threads that a caller has chosen, while its call runs."""
 
 
 TaskMap = Callable[..., Iterator[Any]]
@@ -181,12 +184,25 @@ def use_one_thread() -> None:
     _max_threads = 1
 
 
+@contextmanager
+def limited_threads(threads: int | None) -> Iterator[None]:
+    """Let what this thread calls use at most this many threads while the block runs; None: all."""
+    before = getattr(_chosen, "threads", None)
+    _chosen.threads = threads or before
+    try:
+        yield
+    finally:
+        _chosen.threads = before
+
+
 def thread_limit() -> int | None:
     """Return how many threads this process may use, by OMP_NUM_THREADS too; None: a library's own.
 
     ONNX Runtime's own are bound to processors, in every process to the same ones and also to those
     that the process may not use: a process that is one of several is given a number.
     """
+    if chosen := getattr(_chosen, "threads", None):
+        return int(chosen)
     # Who was started by it has it; others need not load it.
     parent_of = getattr(sys.modules.get("multiprocessing.process"), "parent_process", None)
     wished = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]

@@ -122,12 +122,13 @@ def run_match(images: Images, options: Options, folder: Path, report: Report) ->
     save_matches(matches, folder / "matches.npz")
     picture = matches.draw(first, second, by_position=True)
     inliers = int(matches.inliers.sum())
-    caption = f"{len(matches):,} matches, of equal colour where they belong together"
+    model = "none" if matches.geometry is None else matches.geometry.model
+    caption = f"{len(matches):,} matches: matching points share a colour"
     save_picture(add_caption(picture, caption), folder / "matches.jpg")
     numbers = {
         "Keypoints": f"{len(matches.keypoints0):,} and {len(matches.keypoints1):,}",
         "Matches": f"{len(matches):,}",
-        f"Agree ({matches.model})": f"{inliers:,}",
+        f"Agree ({model})": f"{inliers:,}",
     }
     return TaskResult(numbers, "matches.jpg", ("matches.csv", "matches.npz", "matches.jpg"))
 

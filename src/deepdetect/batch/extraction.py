@@ -36,7 +36,7 @@ ROOT_SIFT_NORM = 512
 def extract_features(
     folder: str | Path,
     path: str | Path,
-    detector: DeepDetect | PointDetector = PointDetector(),
+    detector: DeepDetect | PointDetector | None = None,
     *,
     selection: SelectionOptions | None = None,
     max_megapixels: float | None = None,
@@ -63,7 +63,8 @@ def extract_features(
     Args:
         folder: of the images.
         path: the file.
-        detector: a `PointDetector` or a `DeepDetect` (with `threads=1`: every process has one).
+        detector: a `PointDetector`, the default, or a `DeepDetect` (with `threads=1`: every process
+            has one).
         selection: which pixels of a `DeepDetect`; None: those over 0.5.
         max_megapixels: of an image, as of `load_image`; larger ones are failures.
         engine: "processes" of this machine, or "ray" for a cluster.
@@ -84,6 +85,7 @@ def extract_features(
         >>> if __name__ == "__main__":  # doctest: +SKIP
         ...     extract_features("images", "features.h5").check()
     """
+    detector = PointDetector() if detector is None else detector
     check_selection(detector, selection)
     root = Path(folder).absolute()
     names = [image.relative_to(root).as_posix() for image in find_images(root)]

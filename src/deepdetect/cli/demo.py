@@ -10,9 +10,11 @@ import numpy as np
 from .._shared.errors import require_packages
 from ..detector.detector import DeepDetect, HeatmapDetector
 from ..features.display import draw_matches
-from ..features.selection import SelectionOptions
+from ..features.keypoints import Keypoints
+from ..features.sift import describe_keypoints
 from ..geometry.transforms import TOLERANCE_PX, disparity_errors, score_errors
-from ..matching.pipeline import match_images
+from ..io.image import luma
+from ..matching.pipeline import match_features, match_images
 from ..viz.draw import add_caption, draw_dense_keypoints, draw_heatmap, save_picture
 from . import _options as cli
 from ._detection import NETWORK
@@ -30,7 +32,8 @@ def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Resu
 
     detector = DeepDetect(**values)
     folder = cli.output_folder(output)
-    numbers = run_demo(*data.stereo_motorcycle(), detector, folder)
+    left, right, disparity = data.stereo_motorcycle()
+    numbers = run_demo(left, right, disparity, detector, folder)
     values = {"weights": detector.weights, "backend": detector.runtime, **numbers}
     found, random = numbers["all_matches"], numbers["random"]
     sentence = f"{found['matches']:,} matches, {found['precision']:.0%} of them within "
@@ -38,15 +41,12 @@ def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Resu
     return cli.Result(values, cli.headed(sentence, values, "keypoints seconds pictures"))
 
 
-class RandomPixels:
-    """A detector to which any pixel is as good as another: the baseline of chance."""
-
-    def __init__(self) -> None:
-        self._generator = np.random.default_rng(0)
-
-    def heatmap(self, image: np.ndarray) -> np.ndarray:
-        """Draw a probability for each pixel."""
-        return self._generator.random(image.shape[:2], dtype=np.float32)
+def random_pixels(image: np.ndarray, count: int, generator: np.random.Generator) -> Keypoints:
+    """Draw pixels of an image, each as good as another: the baseline of chance."""
+    height, width = image.shape[:2]
+    drawn = generator.choice(height * width, min(count, height * width), replace=False)
+    xy = np.column_stack([drawn % width, drawn // width])
+    return Keypoints(xy, np.ones(len(xy)), (width, height))
 
 
 def run_demo(
@@ -68,10 +68,13 @@ def run_demo(
     """
     matches = match_images(left, right, detector)
     both = matches.keypoints0, matches.keypoints1
-    density = SelectionOptions(density=max((both[0].density + both[1].density) / 2, 1e-6))
-    random = match_images(
-        left, right, RandomPixels(), selection=density, guided_matching=False, model="none"
-    )
+    count = max(sum(len(each) for each in both) // 2, 1)
+    generator = np.random.default_rng(0)
+    features = [
+        describe_keypoints(luma(image), random_pixels(image, count, generator))
+        for image in (left, right)
+    ]
+    random = match_features(*features, mutual=False)
     disparity = np.where(np.isfinite(disparity), disparity, np.nan).squeeze()
     errors = disparity_errors(matches.points0, matches.points1, disparity)
     random_errors = disparity_errors(random.points0, random.points1, disparity)

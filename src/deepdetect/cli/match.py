@@ -2,62 +2,53 @@
 
 from __future__ import annotations
 
-import functools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from cyclopts import Parameter
 
 from .._shared.errors import ImageError, OptionError, RegistrationError, noted_failures
 from .._shared.image_array import array_to_rgb
-from .._shared.progress import progress, stage_progress
+from .._shared.progress import StageTimer, progress, stage_progress
 from ..batch.pair_list import list_pairs
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.matchers import MATCHERS_OF_NUMBERS
-from ..features.matches import Matches
-from ..features.sift import DESCRIPTORS
-from ..geometry import GeometryOptions
+from ..features.matches import Matches, TwoViewGeometry
+from ..features.selection import SelectionOptions
+from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import MODEL_NAMES
 from ..geometry.transforms import translation_matrix
 from ..io.image import load_image
 from ..io.metadata import read_metadata
 from ..io.tables import read_matrix, save_matches
-from ..matching.pipeline import (
-    GUIDED_STAGES,
-    PUBLISHED_MATCHING,
-    TWO_VIEW_MODELS,
-    UNGUIDED_ONLY,
-    UNGUIDED_STAGES,
-    MatchingOptions,
-    match_images,
-)
+from ..matching.pipeline import GUIDED_STAGES, match_features, match_images
 from ..matching.registration import register as register_images
 from ..matching.stitching import StitchingOptions, stages_of
 from ..matching.stitching import stitch as stitch_images
 from ..viz.draw import add_caption, picture_suffix, save_picture
 from . import _options as cli
-from ._detection import NETWORK, POINTS, SELECTION, Detector, Kind, chosen_detector
+from ._detection import (
+    DESCRIBED_POINTS,
+    NETWORK,
+    POINTS,
+    SELECTION,
+    Detector,
+    Kind,
+    chosen_detector,
+)
 
-PAIR = cli.From(
-    match_images,
-    "guided_matching model mutual",
-    more="seed",
-    flags={"guided_matching": "--guided-matching/--unguided"},
-    types={"model": Literal[MODEL_NAMES]},
+PAIR = cli.From(match_images, "model mutual", more="seed", types={"model": Literal[MODEL_NAMES]})
+UNGUIDED = cli.From(
+    match_features, more="matcher filter_by ratio", types={"matcher": Literal[MATCHERS_OF_NUMBERS]}
 )
-MATCHING = cli.From(
-    MatchingOptions,
-    more="ratio two_view_model descriptor keypoint_size angle matcher",
-    types={
-        "two_view_model": Literal[TWO_VIEW_MODELS],
-        "descriptor": Literal[tuple(DESCRIPTORS)],
-        "matcher": Literal[MATCHERS_OF_NUMBERS],
-    },
-)
+UNGUIDED_STAGES = ("keypoints", "matching", "geometry")
+
 GEOMETRY = cli.From(
     GeometryOptions,
     more="inlier_threshold confidence iterations",
@@ -68,13 +59,13 @@ OPTIONS = cli.From(StitchingOptions)
 STITCH_KEYPOINTS = cli.From(PointDetector, more="max_keypoints")
 
 
-@cli.command(PAIR, SELECTION, MATCHING, GEOMETRY, POINTS, NETWORK, cli.READING)
+@cli.command(PAIR, SELECTION, UNGUIDED, GEOMETRY, DESCRIBED_POINTS, NETWORK, cli.READING)
 def match(
     *images: cli.Images,
     output: cli.Folder = Path("deepdetect-output"),
     pairs: str = "exhaustive",
     detector: Detector = "network",
-    preset: cli.More[Literal["default", "published"]] = "default",
+    unguided: Annotated[bool, Parameter(negative="")] = False,
     homography: cli.More[Path | None] = None,
     camera0: cli.More[Path | None] = None,
     camera1: cli.More[Path | None] = None,
@@ -87,20 +78,20 @@ def match(
 
     Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their scores, the
     estimated geometry and which matches agree with it, and a picture of them. The options
-    --descriptor, --keypoint-size, --angle, --matcher and --ratio apply with --unguided.
+    --descriptor, --matcher, --filter-by and --ratio are for --unguided.
 
     Ends with exit code 3 where no geometry between the images can be trusted, or nothing matches.
 
         deepdetect match left.jpg right.jpg
         deepdetect match page1.jpg page2.jpg --model homography --mutual
-        deepdetect match left.jpg right.jpg --unguided --ratio 0.9 --mutual
+        deepdetect match left.jpg right.jpg --unguided --detector points --ratio 0.9
         deepdetect match frames/ --pairs sequential:1
-        deepdetect match a.png b.png --preset published --homography H1to2p
 
     Args:
         pairs: Which of more than two images: exhaustive (all), sequential:1 (each with the next by
             name), or a text file with the names of two images on each line.
-        preset: Options to start from: default, or published (exactly the paper's code).
+        unguided: Match by descriptors alone, of the whole image, and estimate a geometry of these
+            matches.
         homography: Text file of a known 3x3 homography to evaluate matches by.
         camera0: Text file of the 3x3 camera matrix, for the model essential.
         camera1: The same of the second image.  [default: camera0]
@@ -114,26 +105,22 @@ def match(
     }
     inputs = [path for pair in outputs for path in pair]
     cli.check_outputs([path for files in outputs.values() for path in files.values()], inputs)
-    start = MatchingOptions()
-    if preset == "published":
-        start = PUBLISHED_MATCHING
-        values = {"resolution": 480, "guided_matching": False, "model": "none", **values}
-    chosen, selection = chosen_detector(detector, values)
-    if preset == "published" and isinstance(chosen, DeepDetect):
-        chosen = chosen.configured(replace(chosen.heatmap_options, network_channels="bgr"))
+    by_descriptors = UNGUIDED.take(values)
+    if not unguided:
+        flags = [*by_descriptors, *(["descriptor"] if "descriptor" in values else [])]
+        for name in flags:
+            raise OptionError(f"`{name}` is for --unguided: add that, or leave it out")
+    chosen, selection = chosen_detector(detector, values, options=DESCRIBED_POINTS)
     matrices = {"homography": homography, "camera0": camera0, "camera1": camera1 or camera0}
     known: dict[str, Any] = {
         name: read_matrix(path) for name, path in matrices.items() if path is not None
     }
     geometry = GeometryOptions(**known, **GEOMETRY.take(values))
-    changes = MATCHING.take(values)
-    values |= {"selection": selection, "options": replace(start, geometry=geometry, **changes)}
-    guided = values.get("guided_matching", True)
-    if guided and (unused := [name for name in UNGUIDED_ONLY if name in changes]):
-        flags = " and ".join("--" + name.replace("_", "-") for name in unused)
-        cli.say(f"only unguided matching uses {flags}: add --unguided")
-    stages = _guided_stages(detector) if guided else UNGUIDED_STAGES
-    load = functools.lru_cache(2)(load_image)  # pairs that follow each other share one
+    match_pair: Callable[..., Matches] = match_images
+    if unguided:
+        match_pair = partial(_match_unguided, **by_descriptors)
+    stages = UNGUIDED_STAGES if unguided else _guided_stages(detector)
+    load = lru_cache(2)(load_image)  # pairs that follow each other share one
     found: list[dict[str, Any]] = []
     failures: list[str] = []
     with progress(len(outputs), "matching", "pair", quiet=not many) as bar:
@@ -143,7 +130,8 @@ def match(
                 with cli.writing(files, pair, overwrite) as made:
                     rgb0, rgb1 = map(load, pair)
                     with stage_progress("matching", stages, quiet=many) as done:
-                        matches = match_images(rgb0, rgb1, chosen, progress=done, **values)
+                        settings = values | {"options": geometry, "progress": done}
+                        matches = match_pair(rgb0, rgb1, chosen, selection=selection, **settings)
                     save_matches(matches, made["file"])
                     if pictures:
                         _draw(rgb0, rgb1, matches, made["picture"])
@@ -165,16 +153,41 @@ def match(
     )
 
 
+def _match_unguided(
+    image0: np.ndarray,
+    image1: np.ndarray,
+    detector: DeepDetect | PointDetector,
+    *,
+    selection: SelectionOptions | None,
+    options: GeometryOptions,
+    progress: Callable[[str], object],
+    model: str = "auto",
+    seed: int = 0,
+    **values: Any,
+) -> Matches:
+    """Match by descriptors alone, and estimate a geometry of these matches."""
+    timer = StageTimer(progress)
+    with timer.stage("keypoints"):
+        chosen = {} if selection is None else vars(selection)
+        features = [detector.extract(image, **chosen) for image in (image0, image1)]
+    with timer.stage("matching"):
+        matches = match_features(*features, seed=seed, **values)
+    with timer.stage("geometry"):
+        found = estimate_geometry(matches, model=model, seed=seed, options=options)
+        matches = matches.with_geometry(found, options.inlier_threshold)
+    return replace(matches, seconds=timer.seconds)
+
+
 def _headline(found: dict[str, Any]) -> str:
     if not found["matches"]:
         return "no matches"
     text = f"{found['matches']:,} matches"
-    if found["model"] != "none":
-        fits = found["inliers"] / found["matches"]
-        text += f", {fits:.0%} of them agree with one geometry ({found['model']})"
-    if geometry := found["two_view_geometry"]:
-        return f"{text}; scene: {geometry['scene']}; confidence: {found['confidence']}"
-    return f"{text}; by descriptors alone"
+    geometry = found["geometry"]
+    if not found["success"]:
+        return f"{text}; no geometry can be trusted"
+    fits = found["inliers"] / found["matches"]
+    text += f", {fits:.0%} of them agree with one geometry ({geometry['model']})"
+    return f"{text}; scene: {geometry['scene']}; confidence: {geometry['confidence']}"
 
 
 def _line(found: dict[str, Any]) -> str:
@@ -199,17 +212,17 @@ def _choose_pairs(
 
 
 def _why_none(matches: Matches) -> str | None:
-    """Say why there are no matches, or no matrix."""
-    if not matches.success:
-        return (
-            "no geometry between these images can be trusted, so there are no matches: if they "
-            "show the same scene, --unguided matches by descriptors alone"
-        )
-    if not len(matches):
+    """Say why there are no matches, or no geometry."""
+    if not len(matches) and matches.success:
         return "there are no matches: the images show too little, or the options leave none"
-    if matches.matrix is None and matches.model != "none":
-        return f"no {matches.model} could be estimated from these matches"
-    return None
+    if matches.success:
+        return None
+    if len(matches):
+        return "no geometry can be trusted: most of these matches by descriptors may be wrong"
+    return (
+        "no geometry between these images can be trusted, so there are no matches: if they "
+        "show the same scene, --unguided matches by descriptors alone"
+    )
 
 
 def _numbers(
@@ -225,12 +238,8 @@ def _numbers(
         "matches": len(matches),
         "inliers": int(matches.inliers.sum()),
         "one_to_one": len(matches.unique()),
-        "confidence": matches.confidence,
-        "model": matches.model,
-        "matrix": None if matches.matrix is None else matches.matrix.tolist(),
-        "guided": matches.guided,
         "success": matches.success,
-        "two_view_geometry": _two_view_numbers(matches),
+        "geometry": _geometry_values(matches.geometry),
         "seconds": {stage: round(value, 4) for stage, value in matches.seconds.items()},
         "file": files["file"],
         "picture": files.get("picture"),
@@ -241,19 +250,21 @@ def _guided_stages(detector: Kind) -> tuple[str, ...]:
     return GUIDED_STAGES[1:] if detector == "points" else GUIDED_STAGES
 
 
-def _two_view_numbers(matches: Matches) -> dict[str, Any] | None:
-    found = matches.two_view_geometry
-    if found is None:
+def _geometry_values(geometry: TwoViewGeometry | None) -> dict[str, Any] | None:
+    if geometry is None:
         return None
-    elsewhere = "matrix", "confidence"
-    numbers = {name: value for name, value in vars(found).items() if name not in elsewhere}
-    return {**numbers, "log10_nfa": found.log10_nfa if math.isfinite(found.log10_nfa) else None}
+    evidence = vars(geometry.evidence)
+    if not math.isfinite(geometry.evidence.log10_nfa):  # which JSON has not
+        evidence = evidence | {"log10_nfa": None}
+    matrix = None if geometry.matrix is None else geometry.matrix.tolist()
+    return vars(geometry) | {"matrix": matrix, "evidence": evidence}
 
 
 def _draw(rgb0: np.ndarray, rgb1: np.ndarray, matches: Matches, path: Path) -> None:
     picture = matches.draw(rgb0, rgb1, by_position=True)
     others = len(matches) - int(matches.inliers.sum())
-    caption = f"{len(matches):,} matches ({matches.model}): matching points share a colour"
+    model = "none" if matches.geometry is None else matches.geometry.model
+    caption = f"{len(matches):,} matches ({model}): matching points share a colour"
     if others:
         caption += f"; {others:,} that do not fit it: red"
     save_picture(add_caption(picture, caption), path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Protocol, Self
 
@@ -13,7 +14,12 @@ from .._shared.image_array import Channels
 from .._shared.options import suggest_keywords
 from .._shared.records import file_digest
 from ..features.keypoints import Keypoints
-from ..features.selection import SelectionOptions, select_from_maps, select_keypoints
+from ..features.selection import (
+    SelectionOptions,
+    check_max_keypoints,
+    select_from_maps,
+    select_keypoints,
+)
 from ..features.sift import describe_keypoints
 from ..io.image import Images, batch_length, ignore_masks, image_named, load_each, load_image, luma
 from .backends import RuntimeOptions, open_network
@@ -54,6 +60,8 @@ class DeepDetect:
     Args:
         weights: "default", "dense", "free" or "espnet", the weights inside the package; or an ONNX
             file.
+        max_keypoints: at most this many of an image, the most probable pixels. None: all over the
+            threshold. Of a few thousand, `PointDetector` finds better ones.
         resolution: "auto" (the image as it is up to two megapixels, larger ones scaled down to
             that), "native" (always as it is), or a number of pixels: the image is squashed to a
             square of that side, as the paper does with 480.
@@ -83,11 +91,11 @@ class DeepDetect:
         >>> import numpy as np
         >>> image = np.zeros((48, 64), np.uint8)
         >>> image[16:32, 16:48] = 255
-        >>> detector = DeepDetect()
+        >>> detector = DeepDetect(max_keypoints=10)
         >>> detector.heatmap(image).shape
         (48, 64)
-        >>> len(detector.detect(image, max_keypoints=10))
-        10
+        >>> len(detector.detect(image)), len(detector.detect(image, max_keypoints=5))
+        (10, 5)
     """
 
     @functools.partial(suggest_keywords, elsewhere={"channels": CHANNELS_OF_IMAGES})
@@ -95,6 +103,7 @@ class DeepDetect:
         self,
         weights: str | Path = "default",
         *,
+        max_keypoints: int | None = None,
         resolution: Literal["auto", "native"] | int = "auto",
         backend: str = "auto",
         device: str = "cpu",
@@ -104,6 +113,8 @@ class DeepDetect:
         tta: Literal["none", "flip"] = "none",
         tile_megapixels: float | Literal["auto"] = "auto",
     ) -> None:
+        check_max_keypoints(max_keypoints)
+        self.max_keypoints = max_keypoints
         self.weights = resolve_weights(weights)
         self.heatmap_options = HeatmapOptions(resolution, network_channels, tta, tile_megapixels)
         self._portable = weights if weights in PRETRAINED else self.weights.absolute()
@@ -145,6 +156,7 @@ class DeepDetect:
         """What its heat maps depend on besides the image: the digest of the weights, options."""
         return {
             "detector": "network",
+            "max_keypoints": self.max_keypoints,
             "weights": file_digest(self.weights),
             "backend": self.runtime,
             **vars(self.heatmap_options),
@@ -160,7 +172,8 @@ class DeepDetect:
     @suggest_keywords
     def with_weights(self, weights: str | Path) -> DeepDetect:
         """Return a detector with other weights, and all other options as they are."""
-        return DeepDetect(weights, **vars(self._runtime), **vars(self.heatmap_options))
+        options = vars(self._runtime) | vars(self.heatmap_options)
+        return DeepDetect(weights, max_keypoints=self.max_keypoints, **options)
 
     @suggest_keywords
     def heatmap(self, image: Any, *, channels: Channels = "rgb") -> np.ndarray:
@@ -222,8 +235,8 @@ class DeepDetect:
             threshold: tau: pixels with a probability above it.
             density: wanted keypoints per pixel, in (0, 1], instead of the threshold. This many
                 are returned even where there is little to detect.
-            max_keypoints: at most this many, the most probable pixels. Of a few thousand,
-                `PointDetector` finds better ones.
+            max_keypoints: at most this many, the most probable pixels. None: as many as the
+                detector was made for.
             nms_radius: of non-maximum suppression in pixels (0: none).
             subpixel: refine positions to a fraction of a pixel.
             ignore: (H, W) array, true where no keypoint is wanted.
@@ -307,6 +320,8 @@ class DeepDetect:
     def _select(
         self, rgb: np.ndarray, options: SelectionOptions, ignore: np.ndarray | None
     ) -> Keypoints:
+        if options.max_keypoints is None:
+            options = replace(options, max_keypoints=self.max_keypoints)
         with memory_named(rgb.shape):
             maps = compute_maps(rgb, self._network, self.heatmap_options)
             del rgb  # the keypoints need the room

@@ -4,25 +4,35 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
 from .._shared.errors import OptionError, check_name
 from .._shared.image_array import Channels
+from .._shared.machine import limited_threads
 from .._shared.opencv import cv2
-from .._shared.options import names_a_file, suggest_keywords
+from .._shared.options import check_ranges, names_a_file, suggest_keywords
 from .._shared.records import file_digest
 from ..features.keypoints import Keypoints
 from ..features.learned import LEARNED
 from ..features.selection import check_ignore, check_max_keypoints
 from ..features.sift import ROOT_SIFT, describe_keypoints
 from ..io.image import Images, batch_length, ignore_masks, image_named, load_each, load_image, luma
+from .backends.interface import RuntimeOptions
 from .heatmap import MAX_AUTO_PIXELS, memory_named
 from .points.descriptor import DESCRIPTOR_GRAPHS, describe_learned, descriptor_type
 from .points.detection import SPREADS, Spread, detect_points
 from .points.ranker import load_ranker
 from .pretrained import RANKER
+
+
+@runtime_checkable
+class Descriptor(Protocol):
+    """What describes keypoints, as `PointDetector` does."""
+
+    def describe(self, image: Any, keypoints: Keypoints) -> Keypoints:
+        """Return the keypoints of an image with descriptors and their type."""
 
 
 class PointDetector:
@@ -43,8 +53,12 @@ class PointDetector:
         descriptor: what `extract` computes: "learned", by a small network that also sees the
             surroundings of a keypoint; "learned-free", by one trained only on freely licensed
             images; "cross-modal", for images of different sensors, such as infrared and visible
-            light, or a map; the ONNX file of `deepdetect train-descriptor`; or "rootsift", for
-            programs that expect SIFT's.
+            light, or a map; the ONNX file of `deepdetect train-descriptor`; "rootsift", for
+            programs that expect SIFT's; or an object with a method `describe(image, keypoints)`
+            that returns the keypoints with descriptors, as `PointDetector.describe` does.
+        backend, device, precision: as of `DeepDetect`; points run with ONNX Runtime on the CPU in
+            float32, and refuse others.
+        threads: largest number of threads. None: one for each processor.
 
     Raises:
         WeightsError: the ranker or the descriptor is missing, damaged or does not fit.
@@ -66,9 +80,25 @@ class PointDetector:
         spread: Spread = "none",
         resolution: Literal["auto", "native"] = "auto",
         ranker: str | Path | None = None,
-        descriptor: str | Path = LEARNED,
+        descriptor: str | Path | Descriptor = LEARNED,
+        backend: str = "auto",
+        device: str = "cpu",
+        threads: int | None = None,
+        precision: str = "float32",
     ) -> None:
         check_max_keypoints(max_keypoints)
+        for name, value, known in (
+            ("backend", backend, ("auto", "onnxruntime")),
+            ("device", device, ("cpu",)),
+            ("precision", precision, ("float32",)),
+        ):
+            if value not in known:
+                raise OptionError(
+                    f"`{name}={value!r}` cannot be had for points: leave it out, or take a "
+                    "DeepDetect"
+                )
+        check_ranges(RuntimeOptions(threads=threads), counts=("threads",))
+        self.threads = threads
         check_name("spread", spread, SPREADS)
         if spread != "none" and max_keypoints is None:
             raise OptionError(f"`spread={spread!r}` needs `max_keypoints`: how many to spread")
@@ -77,11 +107,15 @@ class PointDetector:
         self.spread, self.resolution = spread, resolution
         self.ranker = RANKER if ranker is None else Path(ranker).absolute()
         self._ranker = load_ranker(self.ranker)
-        if names_a_file(descriptor):
+        if isinstance(descriptor, Descriptor):
+            kind = getattr(descriptor, "descriptor_type", type(descriptor).__name__)
+        elif names_a_file(descriptor):
             descriptor = Path(descriptor).absolute()
+            kind = descriptor_type(descriptor)
         else:
             check_name("descriptor", descriptor, (*DESCRIPTOR_GRAPHS, ROOT_SIFT))
-        self.descriptor, self.descriptor_type = descriptor, descriptor_type(descriptor)
+            kind = str(descriptor)
+        self.descriptor, self.descriptor_type = descriptor, kind
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -96,12 +130,18 @@ class PointDetector:
 
     @suggest_keywords
     def detect(
-        self, image: Any, *, ignore: np.ndarray | None = None, channels: Channels = "rgb"
+        self,
+        image: Any,
+        *,
+        max_keypoints: int | None = None,
+        ignore: np.ndarray | None = None,
+        channels: Channels = "rgb",
     ) -> Keypoints:
         """Detect the best keypoints of an image.
 
         Args:
             image: anything `load_image` takes.
+            max_keypoints: at most this many. None: as many as the detector was made for.
             ignore: (H, W) array, true where no keypoint is wanted.
             channels: order of the colours in arrays and tensors, as of `load_image`.
 
@@ -111,15 +151,16 @@ class PointDetector:
 
         Raises:
             ImageError: the image cannot be read or is not fit.
-            OptionError: the mask has another size than the image.
+            OptionError: an option is out of its range, or the mask has another size than the image.
         """
-        return self._find(load_image(image, channels=channels), ignore)
+        return self._find(load_image(image, channels=channels), ignore, max_keypoints)
 
     @suggest_keywords
     def detect_batch(
         self,
         images: Images,
         *,
+        max_keypoints: int | None = None,
         ignore: np.ndarray | Images | None = None,
         channels: Channels = "rgb",
     ) -> list[Keypoints]:
@@ -128,7 +169,7 @@ class PointDetector:
         Args:
             images: in a list, a tuple or an array of four dimensions; their sizes may differ.
             ignore: a mask for each image, or None, in a list or a tuple; or one array for all.
-            channels: as of `detect`.
+            max_keypoints, channels: as of `detect`.
 
         Returns:
             The keypoints of each, in their order.
@@ -140,7 +181,7 @@ class PointDetector:
         masks, found = ignore_masks(ignore, batch_length(images)), []
         for number, rgb in load_each(images, channels):
             with image_named(number):
-                found.append(self._find(rgb, masks[number]))
+                found.append(self._find(rgb, masks[number], max_keypoints))
         return found
 
     @suggest_keywords
@@ -148,13 +189,14 @@ class PointDetector:
         self,
         image: Any,
         *,
+        max_keypoints: int | None = None,
         ignore: np.ndarray | None = None,
         channels: Channels = "rgb",
     ) -> Keypoints:
         """Detect the best keypoints of an image, and describe them.
 
         Args:
-            image, ignore, channels: as of `detect`.
+            image, max_keypoints, ignore, channels: as of `detect`.
 
         Returns:
             As `detect`, with descriptors at the keypoints' own sizes and angles: (N, 64) float32
@@ -166,7 +208,7 @@ class PointDetector:
             WeightsError: the descriptor's file is damaged.
         """
         rgb = load_image(image, channels=channels)
-        return self.describe(rgb, self._find(rgb, ignore))
+        return self.describe(rgb, self._find(rgb, ignore, max_keypoints))
 
     @suggest_keywords
     def describe(
@@ -183,10 +225,14 @@ class PointDetector:
             OptionError: keypoints have no sizes above 0.
             WeightsError: the descriptor's file is damaged.
         """
-        gray = luma(load_image(image, channels=channels))
-        if self.descriptor_type == ROOT_SIFT:
-            return describe_keypoints(gray, keypoints)
-        return describe_learned(self._scaled(gray), keypoints, self.descriptor)
+        rgb = load_image(image, channels=channels)
+        if isinstance(self.descriptor, Descriptor):
+            return self.descriptor.describe(rgb, keypoints)
+        gray = luma(rgb)
+        with limited_threads(self.threads):
+            if self.descriptor_type == ROOT_SIFT:
+                return describe_keypoints(gray, keypoints)
+            return describe_learned(self._scaled(gray), keypoints, self.descriptor)
 
     def __repr__(self) -> str:
         return (
@@ -195,7 +241,11 @@ class PointDetector:
             f"descriptor={str(self.descriptor)!r})"
         )
 
-    def _find(self, rgb: np.ndarray, ignore: np.ndarray | None) -> Keypoints:
+    def _find(
+        self, rgb: np.ndarray, ignore: np.ndarray | None, max_keypoints: int | None = None
+    ) -> Keypoints:
+        check_max_keypoints(max_keypoints)
+        most = self.max_keypoints if max_keypoints is None else int(max_keypoints)
         gray = luma(rgb)
         height, width = gray.shape
         if ignore is not None:
@@ -207,9 +257,9 @@ class PointDetector:
             # Wherever a pixel of the small image, or one beside it, holds something to be ignored.
             share = cv2.resize(ignore.astype(np.float32), size, interpolation=cv2.INTER_AREA)
             ignore = cv2.dilate((share > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
-        with memory_named(gray.shape):
+        with memory_named(gray.shape), limited_threads(self.threads):
             found = detect_points(
-                gray, self.max_keypoints, spread=self.spread, ignore=ignore, ranker=self._ranker
+                gray, most, spread=self.spread, ignore=ignore, ranker=self._ranker
             )
         if not scaled:
             return found

@@ -12,6 +12,7 @@ from .._shared.errors import OptionError
 from .._shared.image_array import Channels
 from .._shared.opencv import cv2
 from .._shared.options import numbers_of, suggest_keywords, whole
+from ..geometry.estimation import MAX_LOG10_NFA, Geometry, log10_nfa
 from .keypoints import Keypoints, nearest_keypoints
 
 MAX_KEYPOINT_DISTANCE_PX = 1.0
@@ -27,19 +28,15 @@ _COLUMNS: dict[str, Any] = {
 
 @suggest_keywords
 @dataclass(frozen=True, eq=False)
-class TwoViewGeometry:
-    """The geometry that guided the matching of two images.
+class Evidence:
+    """Why a geometry between two images is believed, or not.
 
     Attributes:
-        model: "homography", "fundamental", or "none": no geometry is trusted, no matches.
-        matrix: (3, 3) float64, refined, of the first image to the second; None without one.
-        tentative_matches: number of tentative matches that it was first estimated from.
+        tentative_matches: number of tentative matches that the geometry was first estimated from.
         tentative_inliers: number of those that agree with it, and of more along its lines.
-        log10_nfa: decimal logarithm of its number of false alarms (a contrario).
+        log10_nfa: decimal logarithm of its number of false alarms (a contrario): how many
+            geometries with as many inliers are expected among random matches.
         simulated_views: number of views that were simulated to find it, as in ASIFT.
-        scene: "planar", "rotation" (a turning camera explains the homography as well; a flat scene
-            may look so), "depth", "depth with a dominant plane", or "none". Matches of a planar
-            scene tell two poses from known cameras, those of a rotation no translation.
         on_plane, off_plane: number of matches on the plane that most of them lie on, where there
             is one, and of the others.
         verified: fraction of what it proposed that the images confirm: of a homography the partners
@@ -47,21 +44,41 @@ class TwoViewGeometry:
             sparse matches are returned, these.
         correlation: median ZNCC of windows of both images, each where the matches around it say,
             without its own: right matches predict what looks alike. 0 for few matches.
-        confidence: "high", "fair" (only sparse matches, or weak evidence) or "none".
     """
 
-    model: str
-    matrix: np.ndarray | None
-    tentative_matches: int
-    tentative_inliers: int
-    log10_nfa: float
-    simulated_views: int
-    scene: str = "none"
+    tentative_matches: int = 0
+    tentative_inliers: int = 0
+    log10_nfa: float = np.inf
+    simulated_views: int = 0
     on_plane: int = 0
     off_plane: int = 0
     verified: float = 0.0
     correlation: float = 0.0
+
+
+@suggest_keywords
+@dataclass(frozen=True, eq=False)
+class TwoViewGeometry:
+    """The geometry between two images.
+
+    Attributes:
+        model: "homography", "fundamental", "essential", or "none": no geometry can be trusted.
+        matrix: (3, 3) float64; None where the model is "none". A homography maps the first image to
+            the second; else x1^T M x0 = 0 (essential: in normalised coordinates).
+        scene: "planar", "rotation" (a turning camera explains the homography as well; a flat scene
+            may look so), "depth", "depth with a dominant plane", or "none" where the model is.
+            Matches of a planar scene tell two poses from known cameras, those of a rotation no
+            translation.
+        confidence: "high", "fair" (only sparse matches, or weak evidence), or "none" where the
+            model is.
+        evidence: what this rests on.
+    """
+
+    model: str
+    matrix: np.ndarray | None = None
+    scene: str = "none"
     confidence: str = "none"
+    evidence: Evidence = field(default_factory=Evidence)
 
     def swapped(self) -> TwoViewGeometry:
         """Return the geometry from the second image to the first."""
@@ -157,17 +174,14 @@ class Matches:
             dissimilarity of the two patches (0: only just more similar than unrelated patches); by
             a fundamental matrix, their correlation; else 1 - Lowe's ratio.
         inliers: (M,) bool, the matches whose error under the geometry is below
-            `GeometryOptions.inlier_threshold`; all of them where none was asked for. Not those of
-            guided matches that the images contradict: windows that others predict, around them,
-            are no more alike than unrelated ones.
-        model: which geometry that is: "homography", "fundamental", "essential" or "none".
-        matrix: (3, 3) float64, the geometry; None when it could not be estimated, or was not
-            asked for. A homography maps the first image to the second; else x1^T M x0 = 0
-            (essential: in normalised coordinates).
+            `GeometryOptions.inlier_threshold`; all of them where there is no geometry yet. Not
+            those of guided matches that the images contradict: windows that others predict, around
+            them, are no more alike than unrelated ones.
         keypoints0, keypoints1: all keypoints of the two images. Of a pair without success they may
             be lazy: they are found when they are first asked for.
         seconds: time of each stage, both images together.
-        two_view_geometry: the geometry that guided the matching; None without guided matching.
+        geometry: the geometry between the images; None for the matches of `match_features`, of
+            which none has been estimated yet.
         subpixel: whether the matching itself found sub-pixel positions in the second image, by
             rectification: they need no refinement.
         indices0, indices1: (M,) int32 rows of `keypoints0` and `keypoints1`: the keypoints that are
@@ -188,23 +202,21 @@ class Matches:
     Example:
         >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))
         >>> ends = points.xy, points.xy
-        >>> m = Matches(*ends, [0.5, 0.2], [True, False], "none", None, points, points)
+        >>> m = Matches(*ends, [0.5, 0.2], [True, False], points, points)
         >>> m
-        Matches(2 matches of 2 and 2 keypoints, 1 inliers, model='none', confidence='none')
-        >>> m[m.inliers].indices1.tolist()
-        [0]
+        Matches(2 matches of 2 and 2 keypoints, 1 inliers)
+        >>> m[m.inliers].pairs.tolist()
+        [[0, 0]]
     """
 
     points0: np.ndarray
     points1: np.ndarray
     scores: np.ndarray
     inliers: np.ndarray
-    model: str
-    matrix: np.ndarray | None
     keypoints0: Keypoints = _Lazy()  # type: ignore[assignment]
     keypoints1: Keypoints = _Lazy()  # type: ignore[assignment]
     seconds: dict[str, float] = field(default_factory=dict)
-    two_view_geometry: TwoViewGeometry | None = None
+    geometry: TwoViewGeometry | None = None
     subpixel: bool = False
     indices0: np.ndarray = None  # type: ignore[assignment]  # never None once it is made
     indices1: np.ndarray = None  # type: ignore[assignment]
@@ -238,32 +250,41 @@ class Matches:
         return {**self.__dict__, "keypoints0": self.keypoints0, "keypoints1": self.keypoints1}
 
     @property
-    def guided(self) -> bool:
-        """Whether a geometry guided these matches."""
-        return self.two_view_geometry is not None and self.two_view_geometry.model != "none"
-
-    @property
     def success(self) -> bool:
-        """False where a geometry was to guide these matches and none could be trusted."""
-        return self.two_view_geometry is None or self.guided
+        """False where no geometry can be trusted: its model is "none"."""
+        return self.geometry is None or self.geometry.model != "none"
 
     @property
-    def confidence(self) -> str:
-        """How far these matches can be trusted as a whole: "high", "fair" or "none".
+    def pairs(self) -> np.ndarray:
+        """(K, 2) uint32 rows of both images' keypoints, as COLMAP and kornia take matches.
 
-        By their `two_view_geometry`; without one "none".
+        Matches that end at no keypoint are left out.
         """
-        return "none" if self.two_view_geometry is None else self.two_view_geometry.confidence
+        found = np.column_stack([self.indices0, self.indices1])
+        return found[(found >= 0).all(axis=1)].astype(np.uint32)
 
-    @property
-    def homography(self) -> np.ndarray | None:
-        """The (3, 3) homography of the first image to the second; None where it is another."""
-        return self.matrix if self.model == "homography" else None
+    def with_geometry(self, found: Geometry, inlier_threshold: float = 1.0) -> Matches:
+        """Return the same matches with what `estimate_geometry` has found, judged.
 
-    @property
-    def fundamental(self) -> np.ndarray | None:
-        """The (3, 3) fundamental matrix, x1^T F x0 = 0; None where the geometry is another."""
-        return self.matrix if self.model == "fundamental" else None
+        Its confidence is "fair" where chance does not explain that so many matches agree, else its
+        model is "none" and no match is an inlier.
+
+        Args:
+            found: the geometry that was estimated from these matches.
+            inlier_threshold: the one of `GeometryOptions`, in pixels.
+        """
+        alarms = np.inf
+        if found.matrix is not None:
+            size = self.keypoints1.image_size
+            alarms = log10_nfa(found.inliers, found.model, inlier_threshold, size)
+        agreeing = int(np.count_nonzero(found.inliers))
+        evidence = Evidence(len(self), agreeing, alarms)
+        if alarms >= MAX_LOG10_NFA:
+            nothing = TwoViewGeometry("none", evidence=evidence)
+            return replace(self, geometry=nothing, inliers=np.zeros(len(self), bool))
+        scene = "planar" if found.model == "homography" else "depth"
+        geometry = TwoViewGeometry(found.model, found.matrix, scene, "fair", evidence)
+        return replace(self, geometry=geometry, inliers=found.inliers)
 
     def to_opencv(self) -> list[cv2.DMatch]:
         """Convert to OpenCV's matches of `keypoints0.to_opencv()` and `keypoints1.to_opencv()`.
@@ -273,7 +294,7 @@ class Matches:
         Example:
             >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))
             >>> ends = points.xy, points.xy[::-1]
-            >>> m = Matches(*ends, [0.5, 0.2], [True, True], "none", None, points, points)
+            >>> m = Matches(*ends, [0.5, 0.2], [True, True], points, points)
             >>> [(match.queryIdx, match.trainIdx) for match in m.to_opencv()]
             [(0, 1), (1, 0)]
         """
@@ -288,7 +309,7 @@ class Matches:
         Example:
             >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))
             >>> ends = points.xy[[0, 0, 1]], points.xy[[1, 0, 1]]
-            >>> m = Matches(*ends, [0.5, 0.9, 0.3], [True] * 3, "none", None, points, points)
+            >>> m = Matches(*ends, [0.5, 0.9, 0.3], [True] * 3, points, points)
             >>> m.unique().points1.tolist()
             [[1.0, 2.0]]
         """
@@ -304,15 +325,14 @@ class Matches:
 
     def swapped(self) -> Matches:
         """Return the same matches from the second image to the first."""
-        guide = self.two_view_geometry
+        geometry = self.geometry
         return replace(
             self,
             points0=self.points1,
             points1=self.points0,
-            matrix=_swapped(self.model, self.matrix),
             keypoints0=self.keypoints1,
             keypoints1=self.keypoints0,
-            two_view_geometry=None if guide is None else guide.swapped(),
+            geometry=None if geometry is None else geometry.swapped(),
             indices0=self.indices1,
             indices1=self.indices0,
         )
@@ -361,12 +381,11 @@ class Matches:
         """Return what a notebook shows: a small table, and where some of the matches are."""
         from .display import html_summary
 
-        inliers, geometry = np.count_nonzero(self.inliers), self.two_view_geometry
-        guide = "nothing" if geometry is None else geometry.model
-        rows = {
-            "inliers": f"{inliers:,} ({self.model})",
-            "guided by": guide if self.success else "no geometry that could be trusted",
-        }
+        inliers, geometry = np.count_nonzero(self.inliers), self.geometry
+        rows = {"inliers": f"{inliers:,}"}
+        if geometry is not None:
+            told = f"{geometry.model}, confidence: {geometry.confidence}"
+            rows["geometry"] = told if self.success else "none that can be trusted"
         for side, keypoints in enumerate((self.keypoints0, self.keypoints1)):
             width, height = keypoints.image_size
             rows[f"image {side}"] = f"{width}x{height}, {len(keypoints):,} keypoints"
@@ -383,10 +402,12 @@ class Matches:
     def __repr__(self) -> str:
         if not self.success:  # whose keypoints may have to be found first
             return f"Matches({len(self)} matches, as no geometry could be trusted)"
+        told = ""
+        if self.geometry is not None:
+            told = f", model={self.geometry.model!r}, confidence={self.geometry.confidence!r}"
         return (
             f"Matches({len(self)} matches of {len(self.keypoints0)} and {len(self.keypoints1)} "
-            f"keypoints, {np.count_nonzero(self.inliers)} inliers, model={self.model!r}, "
-            f"confidence={self.confidence!r})"
+            f"keypoints, {np.count_nonzero(self.inliers)} inliers{told})"
         )
 
     def _checked_indices(self, indices: np.ndarray, side: int) -> np.ndarray:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from math import inf, lgamma, log, pi
 from numbers import Integral
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from .._shared.opencv import cv2
 from .._shared.options import check_ranges, numbers_of, suggest_keywords
 from .transforms import epipolar_errors, transfer_errors, transform_points
 
-MODEL_NAMES = ("auto", "homography", "fundamental", "essential", "none")
+MODEL_NAMES = ("auto", "homography", "fundamental", "essential")
 
 MIN_MATCHES = {"homography": 4, "fundamental": 15, "essential": 6}
 """With fewer than 15 matches OpenCV's RANSAC ignores the threshold of a fundamental matrix."""
@@ -104,7 +104,7 @@ class Geometry:
     """An estimated geometry.
 
     Attributes:
-        model: "homography", "fundamental", "essential" or "none".
+        model: "homography", "fundamental" or "essential".
         matrix: (3, 3) float64, or None when nothing could be estimated. A homography
             maps the first image to the second; for the others x1^T M x0 = 0 (essential:
             in normalised coordinates).
@@ -120,10 +120,23 @@ class Geometry:
         return f"Geometry(model={self.model!r}, {inliers} inliers of {len(self.inliers)} matches)"
 
 
+@runtime_checkable
+class MatchedPoints(Protocol):
+    """What has (M, 2) matched positions in two images, as `Matches`."""
+
+    @property
+    def points0(self) -> np.ndarray:
+        """Positions in the first image."""
+
+    @property
+    def points1(self) -> np.ndarray:
+        """Positions in the second image."""
+
+
 @suggest_keywords
 def estimate_geometry(
-    points0: np.ndarray,
-    points1: np.ndarray,
+    matches: MatchedPoints | np.ndarray,
+    points1: np.ndarray | None = None,
     model: str = "fundamental",
     *,
     seed: int = 0,
@@ -132,9 +145,11 @@ def estimate_geometry(
     """Estimate the geometry between two images from matches, some of which are wrong.
 
     Args:
-        points0, points1: (M, 2) matched positions, centre of the first pixel (0, 0).
+        matches: `Matches`, or (M, 2) positions in the first image, centre of the first pixel
+            (0, 0).
+        points1: the (M, 2) positions that they match in the second image; None with `Matches`.
         model: "homography" (planes, pure rotation), "fundamental" (any static scene), "auto"
-            (one of these two; `measure_parallax`), "essential" (known cameras), or "none".
+            (one of these two; `measure_parallax`), or "essential" (known cameras).
         seed: seed of the random samples.
         options: how.
 
@@ -155,6 +170,13 @@ def estimate_geometry(
         [3.0, 3.0]
     """
     check_model(model, seed, options)
+    points0: Any = matches
+    if isinstance(matches, MatchedPoints):
+        if points1 is not None:
+            raise OptionError("`points1` goes with positions: leave it out where matches are given")
+        points0, points1 = matches.points0, matches.points1
+    elif points1 is None:
+        raise OptionError("positions in one image are no matches: give `points1`, or `Matches`")
     points0 = numbers_of("points0", points0, np.float64, 2)
     points1 = numbers_of("points1", points1, np.float64, 2)
     if len(points0) != len(points1):
@@ -163,8 +185,6 @@ def estimate_geometry(
     if options.homography is not None:
         errors = transfer_errors(points0, points1, options.homography)
         return Geometry("homography", options.homography, errors < options.inlier_threshold)
-    if model == "none":
-        return Geometry("none", None, np.ones(len(points0), bool))
     if model == "auto":
         plane, depth = (
             estimate_geometry(points0, points1, each, seed=seed, options=options)
@@ -198,10 +218,15 @@ def estimate_geometry(
 def check_model(model: str, seed: int, options: GeometryOptions) -> None:
     """Raise an OptionError where `estimate_geometry` would, whatever the matches."""
     check_name("model", model, MODEL_NAMES)
-    if not (isinstance(seed, Integral) and 0 <= seed < 2**31):
-        raise OptionError(f"the seed must lie in [0, 2147483647] and be whole, not {seed}")
+    check_seed(seed)
     if model == "essential":
         _cameras(options)
+
+
+def check_seed(seed: int) -> None:
+    """Raise an OptionError where a seed is not one that OpenCV takes, too."""
+    if not (isinstance(seed, Integral) and 0 <= seed < 2**31):
+        raise OptionError(f"the seed must lie in [0, 2147483647] and be whole, not {seed}")
 
 
 def _fit(

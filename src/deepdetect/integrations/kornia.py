@@ -33,9 +33,9 @@ class DeepDetectDetector(Module):
         OptionError: an option is unknown or out of its range.
     """
 
-    def __init__(self, detector: PointDetector = PointDetector()) -> None:
+    def __init__(self, detector: PointDetector | None = None) -> None:
         super().__init__()
-        self._detector = detector
+        self._detector = PointDetector() if detector is None else detector
 
     def forward(self, img: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Find keypoints.

@@ -40,10 +40,12 @@ class DeepDetectExtractor(Module):
     @suggest_keywords
     def __init__(
         self,
-        detector: PointDetector = PointDetector(descriptor=ROOT_SIFT),
+        detector: PointDetector | None = None,
         *,
         scale: Scale = "diameter",
     ) -> None:
+        if detector is None:
+            detector = PointDetector(descriptor=ROOT_SIFT)
         super().__init__()
         if detector.descriptor_type != ROOT_SIFT:
             raise OptionError(

@@ -44,11 +44,11 @@ class DeepDetectFeature2D:
 
     @suggest_keywords
     def __init__(
-        self, detector: PointDetector = PointDetector(), *, channels: Channels = "bgr"
+        self, detector: PointDetector | None = None, *, channels: Channels = "bgr"
     ) -> None:
         check_channels(channels)
         self._channels = channels
-        self._detector = detector
+        self._detector = PointDetector() if detector is None else detector
 
     def detect(self, image: Any, mask: np.ndarray | None = None) -> tuple[cv2.KeyPoint, ...]:
         """Detect keypoints.

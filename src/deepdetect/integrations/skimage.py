@@ -51,8 +51,8 @@ class DeepDetectFeatures:
     responses: np.ndarray | None = None
     descriptors: np.ndarray | None = None
 
-    def __init__(self, detector: PointDetector = PointDetector()) -> None:
-        self._detector = detector
+    def __init__(self, detector: PointDetector | None = None) -> None:
+        self._detector = PointDetector() if detector is None else detector
 
     def detect(self, image: Any) -> None:
         """Detect keypoints, and set all attributes but `descriptors`.

@@ -202,7 +202,7 @@ def _pair_of_stem(stem: str, names: Mapping[str, str] | None, path: Path) -> Pai
 @suggest_keywords
 def match_folder(
     folder: str | Path,
-    detector: DeepDetect | PointDetector = PointDetector(),
+    detector: DeepDetect | PointDetector | None = None,
     *,
     pairs: str | Path | Sequence[Pair] | None = None,
     workers: int | None = None,

@@ -21,13 +21,13 @@ from .._shared.errors import (
 from .._shared.options import suggest_keywords
 from .._shared.records import save_arrays
 from ..features.keypoints import Keypoints
-from ..features.matches import Matches, TwoViewGeometry
+from ..features.matches import Evidence, Matches, TwoViewGeometry
 
 OPTIONAL = ("logits", "sizes", "angles", "descriptors", "descriptor_type")
 """Of keypoints, in npz files where there are any."""
 
 MATCH_VALUES = (
-    *("points0", "points1", "scores", "inliers", "model", "matrix"),
+    *("points0", "points1", "scores", "inliers"),
     *("subpixel", "indices0", "indices1"),
 )
 """Of matches, by the names of their attributes, beside keypoints and geometry."""
@@ -91,11 +91,11 @@ def save_matches(matches: Matches, path: str | Path) -> None:
         matches: the matches.
         path: ending in .npz (arrays named as the attributes of `Matches`: `points0` and `points1`
             (M, 2) float32, `indices0` and `indices1` (M,) int32 rows of the keypoints, `scores`
-            (M,) float32, `inliers` (M,) bool, `model` a string, `matrix` (3, 3), or (0, 0) without
-            one; `guided` and `subpixel` bool; `keypoints0` (N, 2) float32, `keypoint_scores0` (N,)
-            float32 and `image_size0` (width, height), and the same of the second image; and of a
-            `TwoViewGeometry` its attributes, as `two_view_model`) or .csv (columns x0, y0, x1, y1,
-            score, inlier).
+            (M,) float32, `inliers` (M,) bool and `subpixel` bool; `keypoints0` (N, 2) float32,
+            `keypoint_scores0` (N,) float32 and `image_size0` (width, height), and the same of the
+            second image; and of a geometry `model`, `scene` and `confidence`, strings, `matrix`
+            (3, 3), or (0, 0) without one, and the numbers of its `Evidence`) or .csv (columns x0,
+            y0, x1, y1, score, inlier).
 
     Raises:
         OptionError: the file's ending is another.
@@ -105,14 +105,14 @@ def save_matches(matches: Matches, path: str | Path) -> None:
         columns = [matches.points0, matches.points1, matches.scores, matches.inliers]
         _save_csv(path, "x0,y0,x1,y1,score,inlier", columns)
         return
-    values = {name: getattr(matches, name) for name in (*MATCH_VALUES, "guided")}
+    values = {name: getattr(matches, name) for name in MATCH_VALUES}
     for side, keypoints in enumerate((matches.keypoints0, matches.keypoints1)):
         values[f"keypoints{side}"] = keypoints.xy
         values[f"keypoint_scores{side}"] = keypoints.scores
         values[f"image_size{side}"] = keypoints.image_size
-    if matches.two_view_geometry is not None:
-        for name, value in vars(matches.two_view_geometry).items():
-            values[f"two_view_{name}"] = value
+    if matches.geometry is not None:
+        values |= vars(matches.geometry) | vars(matches.geometry.evidence)
+        del values["evidence"]
     none = np.empty((0, 0))
     save_arrays(path, {name: none if value is None else value for name, value in values.items()})
 
@@ -137,13 +137,14 @@ def load_matches(path: str | Path) -> Matches:
             for side in (0, 1)
         ]
         geometry = None
-        if "two_view_model" in arrays:
-            names = [field.name for field in fields(TwoViewGeometry)]
-            geometry = TwoViewGeometry(*(arrays[f"two_view_{name}"] for name in names))
+        if "model" in arrays:
+            evidence = Evidence(**{each.name: arrays[each.name] for each in fields(Evidence)})
+            values = {name: arrays[name] for name in ("model", "matrix", "scene", "confidence")}
+            geometry = TwoViewGeometry(**values, evidence=evidence)
         return Matches(
             keypoints0=keypoints[0],
             keypoints1=keypoints[1],
-            two_view_geometry=geometry,
+            geometry=geometry,
             **{name: arrays[name] for name in MATCH_VALUES},
         )
 

@@ -3,8 +3,6 @@ from .guided import (
     find_tentative_matches as find_tentative_matches,
 )
 from .pipeline import (
-    PUBLISHED_MATCHING as PUBLISHED_MATCHING,
-    MatchingOptions as MatchingOptions,
     match_features as match_features,
     match_images as match_images,
 )

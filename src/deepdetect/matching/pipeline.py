@@ -4,38 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any, Literal
 
 import numpy as np
 
-from .._shared.errors import OptionError, check_name
+from .._shared.errors import OptionError
 from .._shared.image_array import Channels
 from .._shared.machine import require_memory
-from .._shared.options import check_ranges, suggest_keywords
+from .._shared.options import suggest_keywords
 from .._shared.progress import StageTimer
 from ..detector.detector import AnyDetector, DeepDetect, check_selection, find_keypoints
-from ..detector.point_detector import PointDetector
 from ..features.keypoints import Keypoints, nearest_keypoints
 from ..features.learned import LEARNED_RATIO, RATIO, is_learned, match_learned
 from ..features.match_filter import check_filter, filter_matches, require_suited
 from ..features.matchers import (
-    MATCHERS_OF_NUMBERS,
     DescriptorMatches,
     get_matcher,
     match_descriptors,
 )
 from ..features.matches import Matches, TwoViewGeometry, lazy
 from ..features.selection import SelectionOptions
-from ..features.sift import (
-    DESCRIPTORS,
-    ROOT_SIFT,
-    describe_keypoints,
-    describe_scaled,
-)
 from ..geometry import Geometry, GeometryOptions, estimate_geometry
-from ..geometry.estimation import check_model
+from ..geometry.estimation import check_model, check_seed
 from ..geometry.transforms import epipolar_errors, transfer_errors
 from ..io.image import Images, ignore_masks, load_image, luma
 from .guided import TentativeMatches, guided_matches, guiding_geometry
@@ -44,64 +36,9 @@ from .guided.tentative_matches import checked_positions
 GUIDED_STAGES = ("initial geometry", "keypoints", "guided matching", "geometry")
 """A `PointDetector` has no first of them: its points give the geometry."""
 
-UNGUIDED_STAGES = ("keypoints", "descriptors", "matching", "geometry")
-
-TWO_VIEW_MODELS = ("auto", "homography", "fundamental")
-
 MAX_RETURN_ERROR_PX = 2.0
 """Of a match that is also found the other way: from the match nearest to its end, up to 1.5 px
 away, the way back ends this near to its start."""
-
-UNGUIDED_ONLY = ("descriptor", "keypoint_size", "angle", "matcher", "ratio")
-"""Options of `MatchingOptions` that do not apply to guided matching."""
-
-
-@suggest_keywords
-@dataclass(frozen=True, eq=False)
-class MatchingOptions:
-    """How two images are matched.
-
-    Those of `UNGUIDED_ONLY` (descriptor, keypoint_size, angle, matcher, ratio) apply only to
-    matches by descriptors alone, with `guided_matching=False`.
-
-    Attributes:
-        two_view_model: the geometry that guides if `model` leaves it open: "homography",
-            "fundamental", or "auto": the one that fits the images.
-        descriptor: "sift" or "rootsift". None: what a `PointDetector` extracts; of others "sift".
-        keypoint_size: diameter of a keypoint for its descriptor, in pixels (paper: 3). Keypoints
-            with sizes and angles of their own are described at these.
-        angle: direction of all keypoints in degrees; -1 is OpenCV's "unset".
-        matcher: "auto" ("exact" for few keypoints, else "patchmatch" for dense ones and "flann" for
-            others), "flann", "exact" or "patchmatch".
-        ratio: the ratio test keeps matches strictly under it (paper's code: 0.99).
-        geometry: how the geometry is estimated in the end.
-
-    Raises:
-        OptionError: a name is unknown, or a value out of its range.
-    """
-
-    two_view_model: str = "auto"
-    descriptor: str | None = None
-    keypoint_size: float = 3.0
-    angle: float = 0.0
-    matcher: str = "flann"
-    ratio: float = 0.99
-    geometry: GeometryOptions = field(default_factory=GeometryOptions)
-
-    def __post_init__(self) -> None:
-        check_name("descriptor", self.descriptor, (None, *DESCRIPTORS))
-        check_name("matcher", self.matcher, MATCHERS_OF_NUMBERS)
-        check_name("two-view model", self.two_view_model, TWO_VIEW_MODELS)
-        if self.angle != -1 and not 0 <= self.angle < 360:
-            raise OptionError(f"the angle must lie in [0, 360) or be -1, not {self.angle}")
-        limits = {"keypoint_size": (0, 100), "ratio": (0, 1)}
-        check_ranges(self, positive=tuple(limits), between=limits)
-
-
-PUBLISHED_MATCHING = MatchingOptions(descriptor="sift", angle=-1.0, ratio=0.99, matcher="flann")
-"""What the authors' published code runs, with `DeepDetect(resolution=480, network_channels="bgr")`
-(BGR although the weights were trained on RGB), `guided_matching=False` and `model="none"`: every
-match is evaluated by the true homography."""
 
 Points = tuple[np.ndarray, np.ndarray]
 
@@ -115,15 +52,16 @@ def match_images(
     channels: Channels = "rgb",
     selection: SelectionOptions | None = None,
     ignore: np.ndarray | Images | None = None,
-    guided_matching: bool = True,
     model: str = "auto",
     mutual: bool = False,
     tentative_matches: Points | TentativeMatches | None = None,
     seed: int = 0,
-    options: MatchingOptions = MatchingOptions(),
+    options: GeometryOptions = GeometryOptions(),
     progress: Callable[[str], object] | None = None,
 ) -> Matches:
-    """Detect and match the keypoints of two images.
+    """Detect and match the keypoints of two images: a geometry from a few matches guides the rest.
+
+    `match_features` matches by descriptors alone.
 
     Args:
         image0, image1: anything `load_image` takes.
@@ -134,23 +72,22 @@ def match_images(
             `PointDetector` has none.
         ignore: a mask for each image, or None, in a tuple; or one array for both: true where no
             keypoint is wanted.
-        guided_matching: whether a geometry from a few matches guides the matching.
-        model: the geometry, "homography" (planes, pure rotation), "fundamental" (any static
-            scene), "essential" (with both cameras in `options.geometry`), "auto" (one of the first
-            two) or "none"; it also chooses what guides.
-        mutual: keep only mutual nearest neighbours; guided, one-to-one matches that are found from
-            either image, the same ones whichever image comes first, in twice the time.
+        model: the geometry, which also guides: "homography" (planes, pure rotation), "fundamental"
+            (any static scene), "essential" (with both cameras in the options), or "auto": the one
+            of the first two that fits the images.
+        mutual: keep only one-to-one matches that are found from either image, the same ones
+            whichever image comes first, in twice the time.
         tentative_matches: a few matches of any other matcher (LightGlue, LoFTR, a person's clicks),
             two (K, 2) arrays of positions, row by row; they take the place of our own SIFT matches
             that guide, and some may be wrong. Or what `find_tentative_matches` has made already.
         seed: seed of all random choices.
-        options: all else.
+        options: how the geometry is estimated in the end.
         progress: called with the name of each stage when it ends.
 
     Returns:
-        The matches, the geometry, and which agree with it. Where guided matching can trust no
-        geometry there are none (`Matches.success` is False), and the keypoints are found when they
-        are first asked for; `guided_matching=False` matches by descriptors alone.
+        The matches, the geometry, and which agree with it. Where no geometry can be trusted there
+        are none (`Matches.success` is False), and the keypoints are found when they are first asked
+        for.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
@@ -163,10 +100,8 @@ def match_images(
         >>> bool((matches.points0 == matches.points1).all())
         True
     """
-    check_model(model, seed, options.geometry)
-    guiding = guiding_model(model, options)
-    if tentative_matches is not None and not guided_matching:
-        raise OptionError("`tentative_matches` guide: leave them out, or `guided_matching=False`")
+    check_model(model, seed, options)
+    guiding = "fundamental" if model == "essential" else model
     source: Any = tentative_matches
     if not (source is None or isinstance(source, TentativeMatches)):
         source = checked_positions(source)
@@ -180,14 +115,10 @@ def match_images(
         cache(partial(find_keypoints, detector, image, selection, mask))
         for image, mask in zip(rgb, masks, strict=True)
     ]
-    if not guided_matching:
-        with timer.stage("keypoints"):
-            keypoints = find[0](), find[1]()
-        return _match_unguided(grays, keypoints, detector, model, mutual, seed, options, timer)
     # Keypoints of the network take no part in the first geometry, and finding them cannot fail:
     # where no geometry can be trusted nobody may ever ask for them.
     keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
-    settings = guiding, model, seed, options.geometry, keypoints_last, timer
+    settings = guiding, model, seed, options, keypoints_last, timer
     matches = _match_guided(grays, (find[0], find[1]), source, *settings)
     if not (mutual and matches.success):
         return matches
@@ -224,8 +155,8 @@ def match_features(
         seed: seed of a matcher that is random.
 
     Returns:
-        The matches, of the model "none"; their scores are 1 - ratio; by neighbours the network's,
-        above 0.5, higher ones being more often right.
+        The matches, without a geometry (`estimate_geometry` finds it); their scores are 1 - ratio;
+        by neighbours the network's, above 0.5, higher ones being more often right.
 
     Raises:
         OptionError: an option is unknown or out of its range or does not suit the others, keypoints
@@ -249,7 +180,7 @@ def match_features(
             f"descriptors of the types {features0.descriptor_type} ({length0} numbers) and "
             f"{features1.descriptor_type} ({length1}) cannot be compared: extract both alike"
         )
-    check_model("none", seed, GeometryOptions())
+    check_seed(seed)
     learned = is_learned(features0.descriptor_type)
     check_filter(filter_by, ratio, mutual)
     by_neighbours = filter_by == "neighbours"
@@ -283,8 +214,6 @@ def match_features(
         features1.xy[matches.indices1],
         np.clip(1 - matches.ratios, 0, 1),
         np.ones(len(matches), bool),
-        "none",
-        None,
         features0,
         features1,
         indices0=matches.indices0,
@@ -329,15 +258,15 @@ def _match_guided(
         geometry = _final_geometry(points, model, seed, options, guide)
         assert matched.alike is not None
         inliers = geometry.inliers & matched.alike
+    if geometry.matrix is None:
+        return _no_matches(*keypoints, TwoViewGeometry("none", evidence=guide.evidence), timer)
     return Matches(
         *points,
         matched.scores,
         inliers,
-        geometry.model,
-        geometry.matrix,
         *keypoints,
         timer.seconds,
-        guide,
+        replace(guide, model=geometry.model, matrix=geometry.matrix),
         matched.subpixel,
         matched.indices0,
         matched.indices1,  # type: ignore[arg-type]  # looked up where there are none
@@ -355,63 +284,10 @@ def _found_both_ways(matches: Matches, back: Matches) -> Matches:
         returned = other.points1[rows] - one.points0
         near = np.isfinite(distances) & (np.linalg.norm(returned, axis=1) <= MAX_RETURN_ERROR_PX)
         kept.append(one[near].unique())
-    guide, back_guide = matches.two_view_geometry, back.two_view_geometry
-    assert guide is not None
-    assert back_guide is not None
-    return kept[0] if guide.log10_nfa <= back_guide.log10_nfa else kept[1].swapped()
-
-
-def _match_unguided(
-    grays: tuple[np.ndarray, np.ndarray],
-    keypoints: tuple[Keypoints, Keypoints],
-    detector: AnyDetector,
-    model: str,
-    mutual: bool,
-    seed: int,
-    options: MatchingOptions,
-    timer: StageTimer,
-) -> Matches:
-    check_memory([len(each) for each in keypoints])
-    with timer.stage("descriptors"):
-        features0, features1 = (
-            _describe(gray, each, detector, options)
-            for gray, each in zip(grays, keypoints, strict=True)
-        )
-    with timer.stage("matching"):
-        matches = match_features(
-            features0,
-            features1,
-            matcher=options.matcher,
-            ratio=options.ratio,
-            mutual=mutual,
-            seed=seed,
-        )
-    with timer.stage("geometry"):
-        points = matches.points0, matches.points1
-        geometry = estimate_geometry(*points, model, seed=seed, options=options.geometry)
-    return replace(
-        matches,
-        inliers=geometry.inliers,
-        model=geometry.model,
-        matrix=geometry.matrix,
-        keypoints0=keypoints[0],
-        keypoints1=keypoints[1],
-        seconds=timer.seconds,
+    alarms, back_alarms = (
+        each.geometry.evidence.log10_nfa for each in (matches, back) if each.geometry is not None
     )
-
-
-def _describe(
-    gray: np.ndarray, keypoints: Keypoints, detector: AnyDetector, options: MatchingOptions
-) -> Keypoints:
-    """Add descriptors at the keypoints' own sizes and angles, or at those of the options."""
-    kind = options.descriptor or "sift"
-    if options.descriptor is None and isinstance(detector, PointDetector):
-        return detector.describe(gray, keypoints)
-    if keypoints.sizes is None or keypoints.angles is None:
-        of_pixels = DESCRIPTORS[kind]
-        descriptors = of_pixels(gray, keypoints.xy, options.keypoint_size, options.angle)
-        return replace(keypoints, descriptors=descriptors, descriptor_type=kind)
-    return (describe_keypoints if kind == ROOT_SIFT else describe_scaled)(gray, keypoints)
+    return kept[0] if alarms <= back_alarms else kept[1].swapped()
 
 
 def check_memory(keypoints: Sequence[int]) -> None:
@@ -423,25 +299,10 @@ def check_memory(keypoints: Sequence[int]) -> None:
     )
 
 
-def guiding_model(model: str, options: MatchingOptions) -> str:
-    """Return the geometry that guides: a plane would drop what is off it, so the model decides.
-
-    Raises:
-        OptionError: the model and the options contradict each other.
-    """
-    asked = options.two_view_model
-    fitting = {"essential": "fundamental", "auto": asked, "none": asked}.get(model, model)
-    if asked not in ("auto", fitting):
-        raise OptionError(
-            f"`two_view_model={asked!r}` contradicts the model {model}: leave one of them out"
-        )
-    return fitting
-
-
 def _no_matches(
     keypoints0: Keypoints, keypoints1: Keypoints, guide: TwoViewGeometry, timer: StageTimer
 ) -> Matches:
-    nothing = np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty(0), "none", None
+    nothing = np.empty((0, 2)), np.empty((0, 2)), np.empty(0), np.empty(0)
     return Matches(*nothing, keypoints0, keypoints1, timer.seconds, guide)
 
 

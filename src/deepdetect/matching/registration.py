@@ -154,8 +154,9 @@ def register(
         seed=seed,
         progress=progress,
     )
-    homography = matches.homography
-    if not matches.guided or homography is None:
+    geometry = matches.geometry
+    homography = None if geometry is None else geometry.matrix
+    if homography is None:
         raise RegistrationError(
             "no homography can be trusted: both images must show a plane, or be from one place"
         )

@@ -27,7 +27,7 @@ from ..geometry.images import window_sums
 from ..geometry.relative_pose import RelativePose
 from ..io.exif import calibration_from_exif
 from ..io.image import Images, ignore_masks, load_image, luma
-from ..matching.pipeline import MatchingOptions, match_images
+from ..matching.pipeline import match_images
 from ..matching.stereo.matching import DENSE, DisparityOptions, compute_disparity
 from .outliers import PointFilterOptions
 from .rectification import (
@@ -53,8 +53,8 @@ MIN_MATCHED_FRACTION = 0.25
 
 @suggest_keywords
 def reconstruct(
-    left: Any,
-    right: Any,
+    image0: Any,
+    image1: Any,
     detector: AnyDetector | None = None,
     *,
     channels: Channels = "rgb",
@@ -73,8 +73,8 @@ def reconstruct(
     points; `disparity_map` gives that map without a detector.
 
     Args:
-        left, right: anything `load_image` takes. For a pair that is not rectified "left" is only
-            the first one, whose frame the points are in.
+        image0, image1: anything `load_image` takes. The points are in the frame of the first
+            camera, which of a rectified pair is the left one.
         detector: as of `match_images`; default `DeepDetect("dense")`.
         channels: order of the colours in images that are arrays, as of `load_image`.
         calibration: file of the cameras, as for `Calibration.load`, or a `Calibration`. Without one
@@ -110,7 +110,7 @@ def reconstruct(
         (True, 'baseline')
     """
     check_model("fundamental", seed, GeometryOptions())
-    rgb, grays, known = _load_pair((left, right), channels, calibration, focal_px)
+    rgb, grays, known = _load_pair((image0, image1), channels, calibration, focal_px)
     timer = StageTimer(progress)
     tentative = rectification = None
     if rectified is None:
@@ -141,8 +141,7 @@ def reconstruct(
                 selection=whole,
                 ignore=masks,
                 # A homography would keep the points of one plane, and drop all in front of it.
-                model="none",
-                options=MatchingOptions(two_view_model="fundamental"),
+                model="fundamental",
                 seed=seed,
                 tentative_matches=tentative,
             )
@@ -162,8 +161,8 @@ def reconstruct(
 
 @suggest_keywords
 def estimate_pose(
-    first: Any,
-    second: Any,
+    image0: Any,
+    image1: Any,
     detector: AnyDetector | None = None,
     *,
     channels: Channels = "rgb",
@@ -175,7 +174,7 @@ def estimate_pose(
     """Estimate the pose of the second camera in the frame of the first, from their images.
 
     Args:
-        first, second: anything `load_image` takes.
+        image0, image1: anything `load_image` takes.
         detector: as of `match_images`; default `DeepDetect()`.
         channels: order of the colours in images that are arrays, as of `load_image`.
         calibration: file of the cameras, as for `Calibration.load`, or a `Calibration`. Without one
@@ -204,14 +203,13 @@ def estimate_pose(
         (True, True)
     """
     check_model("fundamental", seed, GeometryOptions())
-    rgb, grays, known = _load_pair((first, second), channels, calibration, focal_px)
+    rgb, grays, known = _load_pair((image0, image1), channels, calibration, focal_px)
     timer = StageTimer(progress)
     with timer.stage("keypoints and matching"):
         matches = match_images(
             *rgb,
             detector,
-            model="none",
-            options=MatchingOptions(two_view_model="fundamental"),
+            model="fundamental",
             seed=seed,
         )
     with timer.stage("sub-pixel"):

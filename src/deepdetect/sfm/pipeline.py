@@ -53,7 +53,7 @@ MIN_KEYPOINTS = 15
 def reconstruct_many(
     images: str | Path | Sequence[str | Path],
     output: str | Path,
-    detector: DeepDetect | PointDetector = PointDetector(MAX_KEYPOINTS),
+    detector: DeepDetect | PointDetector | None = None,
     *,
     selection: SelectionOptions | None = None,
     calibration: Camera | Calibration | str | Path | None = None,
@@ -76,7 +76,7 @@ def reconstruct_many(
     Args:
         images: a folder, or image files.
         output: folder for the results.
-        detector, selection: as of `extract_features`.
+        detector, selection: as of `extract_features`; None: a `PointDetector` of 8,192.
         calibration: file of the cameras, as for `Calibration.load`, a `Calibration` or a `Camera`,
             which is taken to be exact. Without one the focal length begins with `focal_px`, EXIF,
             or a guess, and is estimated with the distortion.
@@ -104,6 +104,7 @@ def reconstruct_many(
     import_pycolmap()  # what is missing is said before hours of work
     check_formats(options.formats)
     control = read_control_points(options.control_points) if options.control_points else None
+    detector = PointDetector(MAX_KEYPOINTS) if detector is None else detector
     target = Path(output)
     check_output_folder(target)
     if focal_px is not None:

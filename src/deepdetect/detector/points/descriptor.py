@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..._shared.errors import OptionError, WeightsError, first_line
+from ..._shared.machine import thread_limit
 from ..._shared.opencv import cv2
 from ..._shared.records import file_digest
 from ..._shared.runtimes import start_session
@@ -70,7 +71,8 @@ def describe_learned(
         "sizes": sizes[None],
     }
     path = DESCRIPTOR_GRAPHS.get(str(descriptor), Path(descriptor))
-    upright = _session(path, kind[-DIGEST_LENGTH:]).run(["descriptors"], inputs)[0][0]
+    session = _session(path, kind[-DIGEST_LENGTH:], thread_limit())
+    upright = session.run(["descriptors"], inputs)[0][0]
     descriptors = turn_descriptors(upright, -angles_counted(kind) * angles)
     return replace(keypoints, angles=angles, descriptors=descriptors, descriptor_type=kind)
 
@@ -81,15 +83,15 @@ def descriptor_type(descriptor: str | Path) -> str:
         return str(descriptor)
     path = resolve_weights(descriptor)
     digest = file_digest(path)[:DIGEST_LENGTH]
-    cross_modal = _session(path, digest).get_modelmeta().description == CROSS_MODAL
+    cross_modal = _session(path, digest, thread_limit()).get_modelmeta().description == CROSS_MODAL
     return f"{CROSS_MODAL if cross_modal else LEARNED}-{digest}"
 
 
 @functools.cache
-def _session(path: Path, content: str) -> Any:
-    """Start a session of a file, once for each content that it has had."""
+def _session(path: Path, content: str, threads: int | None) -> Any:
+    """Start a session of a file, once for each content that it has had and number of threads."""
     try:
-        session = start_session(str(path))
+        session = start_session(str(path), threads)
         names = [each.name for each in (*session.get_inputs(), *session.get_outputs())]
         if names != ["luma", "xy", "sizes", "descriptors"]:
             raise ValueError("it is no descriptor")

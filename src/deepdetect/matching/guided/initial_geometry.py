@@ -17,7 +17,7 @@ import numpy as np
 from ...detector.points.descriptor import describe_learned
 from ...features.keypoints import Keypoints
 from ...features.learned import CROSS_MODAL
-from ...features.matches import TwoViewGeometry
+from ...features.matches import Evidence, TwoViewGeometry
 from ...geometry.estimation import TwoViewModel
 from ...geometry.images import downscale, zncc_at_points
 from ...geometry.semi_calibrated import MATCH_SIGMA_PX, refine_fundamental
@@ -152,9 +152,8 @@ class InitialGeometry(TwoViewModel):
     def as_two_view_geometry(self) -> TwoViewGeometry:
         """Return what the user is told of it."""
         counts = len(self.inliers), len(self.points0)
-        return TwoViewGeometry(
-            self.model, self.matrix, *counts, float(self.log10_nfa), self.num_views
-        )
+        evidence = Evidence(*counts, float(self.log10_nfa), self.num_views)
+        return TwoViewGeometry(self.model, self.matrix, evidence=evidence)
 
 
 def guiding_geometry(

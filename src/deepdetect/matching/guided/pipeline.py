@@ -142,10 +142,11 @@ def guided_matches(
     matches = _with_further_planes(grays, pixels, geometry, matches, first, enough, seed)
     ends = matches.starts(pixels[0]), matches.points1
     correlation, alike = compare_held_out(grays, *ends)
-    clear = geometry.log10_nfa < MAX_CLEAR_LOG10_NFA and correlation > MIN_CLEAR_CORRELATION
+    evidence = replace(geometry.evidence, correlation=correlation)
+    clear = evidence.log10_nfa < MAX_CLEAR_LOG10_NFA and correlation > MIN_CLEAR_CORRELATION
     clear = clear and own >= MIN_OWN_FRACTION * len(matches)
     confidence = "high" if clear and matches.points0 is None else "fair"
-    geometry = replace(geometry, correlation=correlation, confidence=confidence)
+    geometry = replace(geometry, confidence=confidence, evidence=evidence)
     return geometry, replace(matches, alike=alike)
 
 
@@ -163,18 +164,19 @@ def _with_scene(
         assert geometry.matrix is not None
         rotation = is_usual_rotation(points0[some], points1[some], sizes)
         scene = "rotation" if rotation else "planar"
-        told = replace(geometry, scene=scene, on_plane=len(matches))
-        return told, (points0, geometry.matrix)
-    proposed = len(xy0) if matches.points0 is None else geometry.tentative_inliers
-    geometry = replace(geometry, scene="depth", verified=len(matches) / max(proposed, 1))
+        evidence = replace(geometry.evidence, on_plane=len(matches))
+        return replace(geometry, scene=scene, evidence=evidence), (points0, geometry.matrix)
+    proposed = len(xy0) if matches.points0 is None else geometry.evidence.tentative_inliers
+    evidence = replace(geometry.evidence, verified=len(matches) / max(proposed, 1))
+    geometry = replace(geometry, scene="depth", evidence=evidence)
     plane = _fit(points0[some], points1[some], "homography", grays[1], seed)
     if plane.matrix is None or np.mean(plane.inliers) < MIN_PLANE_FRACTION:
         return geometry, None
     near = transfer_errors(points0, points1, plane.matrix) <= OFF_PLANE_PX
     on = int(np.count_nonzero(near))
     if np.mean(plane.inliers) >= DOMINANT_FRACTION:
-        scene, off = "depth with a dominant plane", len(matches) - on
-        geometry = replace(geometry, scene=scene, on_plane=on, off_plane=off)
+        evidence = replace(evidence, on_plane=on, off_plane=len(matches) - on)
+        geometry = replace(geometry, scene="depth with a dominant plane", evidence=evidence)
     return geometry, (points0[near], plane.matrix)
 
 
@@ -193,7 +195,8 @@ def _plane_or_depth(
     # Points with learned descriptors lie where they belong less exactly, which looks like parallax.
     off_plane = first.parallax is not None and first.parallax.significant and not first.learned
     plane = _trusted(first, matrix, on_plane, enough)
-    plane = replace(plane[0], verified=verified), plane[1]
+    evidence = replace(plane[0].evidence, verified=verified)
+    plane = replace(plane[0], evidence=evidence), plane[1]
     if first.cross_modal:
         # What patches of different sensors do not show is no evidence of depth.
         if plane[1] is None:

@@ -168,8 +168,8 @@ class DisparityMap:
 
 @suggest_keywords
 def disparity_map(
-    left: Any,
-    right: Any,
+    image0: Any,
+    image1: Any,
     options: DisparityOptions = DisparityOptions(),
     *,
     channels: Channels = "rgb",
@@ -183,7 +183,8 @@ def disparity_map(
     points from this map, at the keypoints of the left image.
 
     Args:
-        left, right: images of the same size, anything `load_image` takes; only their luma is used.
+        image0, image1: the left and the right image, of the same size, anything `load_image` takes;
+            only their luma is used.
         options: what is matched and kept; `DENSE` gives as many pixels as possible.
         channels: order of the colours in images that are arrays, as of `load_image`.
 
@@ -203,7 +204,7 @@ def disparity_map(
         >>> disparities.at(np.array([[40, 20], [60, 30], [2, 30]])).indices.tolist()
         [0, 1]
     """
-    grays = [luma(load_image(image, channels=channels)) for image in (left, right)]
+    grays = [luma(load_image(image, channels=channels)) for image in (image0, image1)]
     return compute_disparity(grays[0], grays[1], options)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from deepdetect._shared.opencv import cv2
 from deepdetect.detector.detector import DeepDetect
-from deepdetect.matching.pipeline import MatchingOptions, match_images
+from deepdetect.matching.pipeline import match_images
 
 from ...datasets.posed_images import PosedPair, PosedScene, load_posed_scenes
 from ..baselines.method import LocalFeature
@@ -42,6 +42,7 @@ from ..report import (
     where,
 )
 from ..run import MatchSettings, Run
+from ..unguided import UPRIGHT_SIFT, match_unguided
 
 THRESHOLD_PX = 1.0
 CONFIDENCE = 0.99999
@@ -138,29 +139,32 @@ def pose(run: Run, options: BenchmarkOptions) -> list[Section]:
 def pose_methods(run: Run, options: BenchmarkOptions) -> list[PoseMethod]:
     """Return DeepDetect's rows, the baselines that were chosen, and the control."""
     detector, own = options.native_detector(), options.deepdetect_native()
-    ways: dict[str, dict[str, Any]] = {
-        "DeepDetect": {},
-        "DeepDetect, unguided": {"guided_matching": False, "mutual": True},
-    }
+    ways = {"DeepDetect": _match_guided, "DeepDetect, unguided": _match_unguided}
     chosen = {"sift": CLASSICAL["sift"], "orb": STANDARD["orb"]}
     classical = [feature for name, feature in chosen.items() if name in options.classical]
     features = without_repeats((*classical, *options.others))
     return [
         *(
-            PoseMethod(title, title, partial(_match_images, detector, way), (*own.key, way))
-            for title, way in ways.items()
+            PoseMethod(title, title, partial(match, detector), (*own.key, title))
+            for title, match in ways.items()
         ),
         *(_feature_method(run, feature) for feature in features),
         PoseMethod("straight", STRAIGHT_AHEAD),
     ]
 
 
-def _match_images(detector: DeepDetect, way: dict[str, Any], images: tuple[Path, Path]) -> Found:
-    options = MatchingOptions(matcher="patchmatch")
-    found = match_images(*images, detector, model="none", options=options, **way)
-    geometry, seconds = found.two_view_geometry, sum(found.seconds.values())
-    told = ("", "") if geometry is None else (geometry.model, geometry.confidence)
-    return found.points0, found.points1, seconds, *told
+def _match_guided(detector: DeepDetect, images: tuple[Path, Path]) -> Found:
+    found = match_images(*images, detector)
+    geometry = found.geometry
+    assert geometry is not None
+    told = geometry.model, geometry.confidence
+    return found.points0, found.points1, sum(found.seconds.values()), *told
+
+
+def _match_unguided(detector: DeepDetect, images: tuple[Path, Path]) -> Found:
+    how: dict[str, Any] = {"descriptor": UPRIGHT_SIFT, "matcher": "patchmatch", "mutual": True}
+    found = match_unguided(*images, detector, **how)
+    return found.points0, found.points1, sum(found.seconds.values()), "", ""
 
 
 def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:

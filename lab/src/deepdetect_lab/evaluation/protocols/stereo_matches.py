@@ -9,11 +9,11 @@ from deepdetect._shared.progress import progress
 from deepdetect.detector.detector import AnyDetector
 from deepdetect.features.matches import Matches
 from deepdetect.features.selection import SelectionOptions
-from deepdetect.matching.pipeline import match_images
 
 from ...datasets.middlebury import StereoPair
 from ..baselines.random import AllPixels, RandomDetector
 from ..metrics.stereo import stereo_score
+from ..unguided import UPRIGHT_SIFT, match_unguided
 
 
 def score_stereo_matches(
@@ -47,8 +47,8 @@ def score_stereo_matches(
 def match_stereo(pair: StereoPair, detector: AnyDetector, density: float | None = None) -> Matches:
     """Match both views by descriptors alone and without estimating their geometry."""
     selection = SelectionOptions(density=density)
-    return match_images(
-        pair.left, pair.right, detector, selection=selection, guided_matching=False, model="none"
+    return match_unguided(
+        pair.left, pair.right, detector, selection=selection, descriptor=UPRIGHT_SIFT
     )
 
 

@@ -1,0 +1,54 @@
+"""Matches by descriptors alone, as the paper makes them: what guided matching is compared with."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from typing import Any
+
+from deepdetect.detector.detector import AnyDetector, find_keypoints
+from deepdetect.features.matches import Matches
+from deepdetect.features.selection import SelectionOptions
+from deepdetect.io.image import load_image
+from deepdetect.matching import match_features
+
+from .baselines.method import PAPER_DESCRIPTOR, PointDescriptor
+
+PAPER_RATIO = 0.99
+"""The ratio test of the authors' published code keeps matches strictly under it."""
+
+UPRIGHT_SIFT = PointDescriptor(angle_deg=0.0)
+"""SIFT of the paper's size, but upright: OpenCV takes the paper's angle of -1 as it is."""
+
+
+def match_unguided(
+    image0: Any,
+    image1: Any,
+    detector: AnyDetector,
+    *,
+    selection: SelectionOptions | None = None,
+    descriptor: PointDescriptor = PAPER_DESCRIPTOR,
+    matcher: str = "flann",
+    ratio: float = PAPER_RATIO,
+    mutual: bool = False,
+    seed: int = 0,
+) -> Matches:
+    """Match the keypoints of two images over the whole images, each described by its position.
+
+    Args:
+        image0, image1: anything `load_image` takes.
+        detector: anything with a method `heatmap` or `detect`.
+        selection: which pixels of a heat map become keypoints; None: those over 0.5.
+        descriptor: how they are described.
+        matcher, ratio, mutual, seed: as of `match_features`.
+    """
+    start = time.perf_counter()
+    features = []
+    for image in (image0, image1):
+        rgb = load_image(image)
+        found = find_keypoints(detector, rgb, selection)
+        values = descriptor.describe(rgb, found)
+        plain = replace(found, sizes=None, angles=None)
+        features.append(replace(plain, descriptors=values, descriptor_type=descriptor.name))
+    matches = match_features(*features, matcher=matcher, ratio=ratio, mutual=mutual, seed=seed)
+    return replace(matches, seconds={"matching": time.perf_counter() - start})
