@@ -147,7 +147,7 @@ results: $(VENV)/.test
 # A folder for each of the weights, as model hubs take them.
 hub: $(VENV)/.test
 	rm -rf dist/hub
-	$(VENV)/bin/python tools/hub.py dist/hub
+	$(VENV)/bin/python tools/hub dist/hub
 
 # The wheel and the source archive are made, looked at, and installed without a network into empty
 # environments of each Python that is here. With VERSION=0.2.0 all files must name this version.

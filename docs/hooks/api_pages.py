@@ -158,9 +158,6 @@ _PAGES = (
             "integrations.kornia",
             "integrations.lightglue",
             "integrations.hloc",
-            "integrations.vismatch",
-            "integrations.skimage",
-            "integrations.transformers",
         ),
     ),
     ApiPage(

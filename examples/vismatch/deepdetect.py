@@ -1,5 +1,28 @@
-"""For vismatch: `vismatch/im_models/deepdetect.py`. The matcher itself is part of deepdetect."""
+"""For vismatch: `vismatch/im_models/deepdetect.py`."""
 
-from deepdetect.integrations.vismatch import DeepDetectMatcher
+from vismatch import BaseMatcher
 
-__all__ = ["DeepDetectMatcher"]
+from deepdetect import DeepDetect, PointDetector, match_images
+
+
+class DeepDetectMatcher(BaseMatcher):
+    """Guided matches of two images: the matching itself runs on the processor.
+
+    The confidences are DeepDetect's scores; there are no descriptors, as patches are compared.
+
+    Args:
+        device: where the images are.
+        max_num_keypoints: at most this many, the best of all scales; None: dense keypoints.
+        **kwargs: of every matcher.
+    """
+
+    def __init__(self, device="cpu", max_num_keypoints=2048, **kwargs):
+        super().__init__(device, **kwargs)
+        dense = max_num_keypoints is None
+        self.detector = DeepDetect() if dense else PointDetector(max_num_keypoints)
+
+    def _forward(self, img0, img1):
+        # Filters that scale images leave values a little beyond the range.
+        found = match_images(img0.clamp(0, 1), img1.clamp(0, 1), self.detector)
+        all0, all1 = found.keypoints0.xy, found.keypoints1.xy
+        return found.points0, found.points1, all0, all1, None, None, found.scores

@@ -97,7 +97,7 @@ def test_every_exported_name_is_on_one_page_of_the_interface(hooks: ModuleType) 
         path.stem
         for path in (ROOT / "src/deepdetect/integrations").glob("*.py")
         if re.search(rf"^### {path.stem}$", INTEGRATIONS, re.M | re.I)
-    } | {"skimage"}
+    }
     modules = {name for name in names if name.startswith("integrations.")}
     assert {name.partition(".")[2] for name in modules} == drop_ins
 

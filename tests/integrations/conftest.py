@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,6 +14,8 @@ from types import ModuleType
 import cv2
 import numpy as np
 import pytest
+
+ROOT = Path(__file__).parents[2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +40,17 @@ def views(photo: np.ndarray) -> Views:
     affinity = cv2.getRotationMatrix2D((128, 100), 30, 1.2)
     second = cv2.warpAffine(first, affinity, (256, 200), flags=cv2.INTER_CUBIC)
     return Views(first, second, affinity)
+
+
+@pytest.fixture(scope="session")
+def hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folders for model hubs; what transformers makes of their code is kept beside them."""
+    pytest.importorskip("hatchling", reason="needs hatchling, which builds the wheel")
+    folder = tmp_path_factory.mktemp("hub")
+    subprocess.run([sys.executable, ROOT / "tools/hub", folder / "hub"], check=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("transformers.dynamic_module_utils.HF_MODULES_CACHE", str(folder / "modules"))
+        yield folder / "hub"
 
 
 @pytest.fixture

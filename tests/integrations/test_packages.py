@@ -12,8 +12,6 @@ NEEDED = {
     "hloc": "hloc",
     "kornia": "kornia",
     "lightglue": "torch",
-    "transformers": "transformers",
-    "vismatch": "vismatch",
 }
 
 
@@ -31,9 +29,7 @@ def test_without_its_program_a_drop_in_says_what_to_install(
     assert install_command(package).removeprefix("pip install ").split(",")[0] in str(caught.value)
 
 
-def test_some_need_nothing_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    for package in ("skimage", "torch"):
-        monkeypatch.setitem(sys.modules, package, None)
-    for name, kind in (("opencv", "DeepDetectFeature2D"), ("skimage", "DeepDetectFeatures")):
-        monkeypatch.delitem(sys.modules, f"deepdetect.integrations.{name}", raising=False)
-        getattr(importlib.import_module(f"deepdetect.integrations.{name}"), kind)()
+def test_opencv_needs_nothing_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, "deepdetect.integrations.opencv", raising=False)
+    importlib.import_module("deepdetect.integrations.opencv").DeepDetectFeature2D()

@@ -34,7 +34,6 @@ COUNTS: dict[str, Callable[[dict[str, Any]], int]] = {
     "kornia": lambda found: len(found["matches"]["keypoints0"]),
     "LightGlue": lambda found: found["matches"]["matches0"].shape[1],  # their weights are random
     "hloc": stored_matches,
-    "vismatch": lambda found: found["matches"]["num_inliers"],
     "scikit-image": lambda found: len(found["points"]),
     "transformers": lambda found: int(found["outputs"].mask.sum()),
 }
@@ -47,7 +46,11 @@ def test_every_program_has_a_snippet() -> None:
 @pytest.mark.parametrize("name", COUNTS)
 @pytest.mark.filterwarnings("ignore")  # of the programs
 def test_the_snippet_runs(
-    name: str, views: Views, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str,
+    views: Views,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
 ) -> None:
     snippet = SNIPPETS[name]
     needed = set(re.findall(r"^(?:from|import) (\w+)", snippet, re.M)) - {"deepdetect"}
@@ -59,6 +62,9 @@ def test_the_snippet_runs(
         Image.fromarray(view).save(tmp_path / f"{side}.png")
         Image.fromarray(view).save(tmp_path / f"images/{side}.png")
     (tmp_path / "pairs.txt").write_text("left.png right.png\n")
+    if "dist/hub" in snippet:
+        (tmp_path / "dist").mkdir()
+        (tmp_path / "dist/hub").symlink_to(request.getfixturevalue("hub"))
     monkeypatch.chdir(tmp_path)
     found: dict[str, Any] = {}
     exec(compile(snippet, f"{PAGE.name}: {name}", "exec"), found)

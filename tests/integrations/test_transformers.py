@@ -1,10 +1,14 @@
+"""The folders for model hubs load in transformers, by the code inside them."""
+
 from __future__ import annotations
 
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -12,162 +16,142 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, OptionError
+from deepdetect import DeepDetect
+from deepdetect.detector.heatmap import HeatmapOptions, seen_size
+from deepdetect.detector.pretrained import PRETRAINED
 
 from .conftest import Views
 
 torch = pytest.importorskip("torch", reason="needs torch")
 transformers = pytest.importorskip("transformers", reason="needs transformers")
-drop_in = pytest.importorskip("deepdetect.integrations.transformers")
-
-from deepdetect_lab.networks.weights import NETWORKS, save_tensors  # noqa: E402
 
 
-@pytest.fixture(scope="module")
-def model() -> Any:
-    return drop_in.DeepDetectForKeypointDetection.from_deepdetect()
+@pytest.fixture
+def load(hub: Path) -> Callable[..., Any]:
+    """Load what transformers makes of a folder: a model, and what prepares its images."""
+
+    def made(name: str = "default", **options: Any) -> Any:
+        folder = hub / f"deepdetect-{name}"
+        model, processor = (
+            kind.from_pretrained(folder, trust_remote_code=True, **options)
+            for kind in (
+                transformers.AutoModelForKeypointDetection,
+                transformers.AutoImageProcessor,
+            )
+        )
+        return SimpleNamespace(model=model, processor=processor)
+
+    return made
 
 
-@pytest.fixture(scope="module")
-def processor() -> Any:
-    return drop_in.DeepDetectImageProcessor()
-
-
-def run(model: Any, inputs: Any) -> Any:
+def run(loaded: Any, *images: np.ndarray) -> tuple[Any, list[dict[str, Any]]]:
     with torch.inference_mode():
-        return model(**inputs)
+        output = loaded.model(**loaded.processor(list(images), return_tensors="pt"))
+    sizes = [image.shape[:2] for image in images]
+    return output, loaded.processor.post_process_keypoint_detection(output, sizes)
 
 
-def test_it_gives_what_onnx_gives(views: Views, model: Any, processor: Any) -> None:
-    detector = DeepDetect(backend="onnxruntime")
+@pytest.mark.parametrize("name", PRETRAINED)
+def test_it_gives_what_onnx_gives(name: str, views: Views, load: Callable[..., Any]) -> None:
+    detector, loaded = DeepDetect(name, backend="onnxruntime"), load(name)
     for image in (views.first, views.first[:195, :251]):  # no multiples of 8
-        output = run(model, processor(image, return_tensors="pt"))
+        output, (found,) = run(loaded, image)
         height, width = image.shape[:2]
         probability = torch.sigmoid(output.logits[0, :height, :width]).numpy()
-        assert np.abs(probability - detector.heatmap(image)).max() < 1e-5
-        (found,) = processor.post_process_keypoint_detection(output, [(height, width)])
+        assert np.abs(probability - detector.heatmap(image)).max() < 1e-4
         expected = detector.detect(image)
         assert abs(len(found["scores"]) - len(expected)) <= 2  # at the threshold
         if len(found["scores"]) == len(expected):
             assert np.abs(found["keypoints"].numpy() - expected.xy).max() < 1e-4
-            assert np.abs(found["scores"].numpy() - expected.scores).max() < 1e-5
+            assert np.abs(found["scores"].numpy() - expected.scores).max() < 1e-4
 
 
-@pytest.mark.parametrize("name", NETWORKS)
-def test_the_network_is_the_one_of_the_weights(name: str, tmp_path: Path) -> None:
-    save_tensors(NETWORKS[name]().state_dict(), tmp_path / "weights.safetensors", {})
-    make = drop_in.DeepDetectForKeypointDetection
-    model = make.from_deepdetect(tmp_path / "weights.safetensors")
-    model.save_pretrained(tmp_path)
-    again = make.from_pretrained(tmp_path)
-    assert type(again.network) is NETWORKS[name]
-    state = again.network.state_dict()
-    assert all(torch.equal(state[key], value) for key, value in model.network.state_dict().items())
+def test_options_choose_as_detect_does(views: Views, load: Callable[..., Any]) -> None:
+    how = {"max_keypoints": 50, "nms_radius": 3}
+    _, (found,) = run(load(**how), views.first)
+    expected = DeepDetect(backend="onnxruntime").detect(views.first, **how)
+    assert np.abs(found["keypoints"].numpy() - expected.xy).max() < 1e-4
 
 
-OFFLINE = """
-import json, sys
-import numpy as np, torch, transformers
-from deepdetect.integrations.transformers import register
-
-register()
-folder, image = sys.argv[1:]
-model = transformers.AutoModelForKeypointDetection.from_pretrained(folder)
-processor = transformers.AutoImageProcessor.from_pretrained(folder)
-with torch.inference_mode():
-    output = model(**processor(image, return_tensors="pt"))
-np.save(folder + "/logits.npy", output.logits.numpy())
-print(json.dumps([type(model).__name__, type(processor).__name__, processor.max_pixels,
-                  model.config.max_keypoints, int(output.mask.sum())]))
-"""
-
-
-def test_what_was_saved_is_loaded_without_network(views: Views, model: Any, tmp_path: Path) -> None:
-    copy = drop_in.DeepDetectForKeypointDetection.from_deepdetect(max_keypoints=100)
-    copy.save_pretrained(tmp_path)
-    drop_in.DeepDetectImageProcessor(max_pixels=10**6).save_pretrained(tmp_path)
-    Image.fromarray(views.first).save(tmp_path / "photo.png")
-    done = subprocess.run(
-        [sys.executable, "-c", OFFLINE, str(tmp_path), str(tmp_path / "photo.png")],
-        env={**os.environ, "HF_HUB_OFFLINE": "1"},
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 0, done.stderr
-    names = ["DeepDetectForKeypointDetection", "DeepDetectImageProcessor", 10**6, 100, 100]
-    assert json.loads(done.stdout.splitlines()[-1]) == names
-    logits = run(model, drop_in.DeepDetectImageProcessor()(views.first, return_tensors="pt")).logits
-    saved = torch.from_numpy(np.load(tmp_path / "logits.npy"))
-    assert torch.equal(saved, logits)
-    probability = torch.sigmoid(saved[0]).numpy()
-    onnx = DeepDetect(backend="onnxruntime").heatmap(views.first)
-    assert np.abs(probability - onnx).max() < 1e-5
-    again = drop_in.DeepDetectForKeypointDetection.from_pretrained(tmp_path, nms_radius=2)
-    assert again.config.nms_radius == 2
-    assert again.config.max_keypoints == 100
-
-
-def test_a_batch_of_unequal_sizes(views: Views, model: Any, processor: Any) -> None:
-    small = views.first[:120, :160]
-    inputs = processor([views.first, small], return_tensors="pt")
-    assert inputs["pixel_values"].shape == (2, 3, 200, 256)
-    output = run(model, inputs)
+def test_a_batch_of_unequal_sizes(views: Views, load: Callable[..., Any]) -> None:
+    loaded, images = load(), (views.first, views.first[:120, :160])
+    output, results = run(loaded, *images)
+    assert output.logits.shape == (2, 200, 256)
     assert output.mask.shape == output.scores.shape == output.keypoints.shape[:2]
-    sizes = [views.first.shape[:2], small.shape[:2]]
-    results = processor.post_process_keypoint_detection(output, sizes)
-    for image, found in zip((views.first, small), results, strict=True):
-        (alone,) = processor.post_process_keypoint_detection(
-            run(model, processor(image, return_tensors="pt")), [image.shape[:2]]
-        )
+    assert torch.sigmoid(output.logits[1, 120:]).max() < 1e-30
+    for image, found in zip(images, results, strict=True):
+        _, (alone,) = run(loaded, image)
         assert torch.allclose(found["keypoints"], alone["keypoints"], atol=1e-4)
         assert torch.allclose(found["scores"], alone["scores"], atol=1e-5)
-    outside = output.logits[1][inputs["pixel_mask"][1] == 0]
-    assert torch.sigmoid(outside).max() < 1e-30
-    with pytest.raises(OptionError, match="2 images need as many `target_sizes`, not 1"):
-        processor.post_process_keypoint_detection(output, sizes[:1])
 
 
-def test_images_scaled_down_keep_their_pixel_centres(model: Any, views: Views) -> None:
-    large = cv2.resize(views.first, None, fx=3, fy=3, interpolation=cv2.INTER_NEAREST)
-    processor = drop_in.DeepDetectImageProcessor(max_pixels=views.first[..., 0].size)
-    inputs = processor(large, return_tensors="pt")
-    assert inputs["pixel_values"].shape[2:] == (200, 256)
-    (found,) = processor.post_process_keypoint_detection(run(model, inputs), [large.shape[:2]])
-    (small,) = processor.post_process_keypoint_detection(
-        run(model, drop_in.DeepDetectImageProcessor()(views.first, return_tensors="pt")),
-        [views.first.shape[:2]],
-    )
-    # Of three pixels in a row that are one in the small image, the middle one.
-    assert torch.allclose(found["keypoints"], 3 * small["keypoints"] + 1, atol=1e-3)
+def test_images_of_any_kind(views: Views, load: Callable[..., Any], tmp_path: Path) -> None:
+    processor = load().processor
+    path = tmp_path / "photo.png"
+    Image.fromarray(views.first).save(path)
+    planes = torch.tensor(views.first).permute(2, 0, 1) / 255
+    kinds = (views.first, path, str(path), Image.open(path), planes)
+    for image in kinds:
+        values = processor(image, return_tensors="np")["pixel_values"]
+        np.testing.assert_array_equal(values[0], planes)
+    gray = processor(views.first[:, :, 1], return_tensors="np")["pixel_values"]
+    np.testing.assert_array_equal(gray[0], planes[[1, 1, 1]])
 
 
-def test_it_can_be_trained(views: Views, processor: Any) -> None:
-    model = drop_in.DeepDetectForKeypointDetection.from_deepdetect()
-    inputs = processor(views.first, return_tensors="pt")
+def test_large_images_are_scaled_down_as_the_detector_does(
+    views: Views, load: Callable[..., Any]
+) -> None:
+    large = cv2.resize(views.first, (2110, 1402), interpolation=cv2.INTER_CUBIC)
+    found = load().processor(large, return_tensors="np")["pixel_values"][0]
+    size = seen_size(large.shape, HeatmapOptions())
+    expected = cv2.resize(large, size, interpolation=cv2.INTER_AREA).transpose(2, 0, 1)
+    assert np.abs(found * 255 - expected).max() < 0.501
+
+
+def test_it_can_be_trained(views: Views, load: Callable[..., Any]) -> None:
+    loaded = load()
+    inputs = loaded.processor(views.first, return_tensors="pt")
     labels = (torch.from_numpy(DeepDetect().heatmap(views.first)) < 0.5)[None]
-    optimizer = torch.optim.Adam(model.parameters(), 1e-3)
+    optimizer = torch.optim.Adam(loaded.model.parameters(), 1e-3)
     losses = []
     for _ in range(3):
-        output = model(**inputs, labels=labels)
+        output = loaded.model(**inputs, labels=labels)
         losses.append(float(output.loss.detach()))
         optimizer.zero_grad()
         output.loss.backward()
         optimizer.step()
     assert losses[-1] < losses[0]
-    as_tuple = model(**inputs, labels=labels, return_dict=False)
+    as_tuple = loaded.model(**inputs, labels=labels, return_dict=False)
     assert [tuple(part.shape) for part in as_tuple[:2]] == [(), (1, 200, 256)]
 
 
-def test_options(views: Views, processor: Any) -> None:
-    drop_in.register()
-    drop_in.register()  # twice does no harm
-    assert transformers.AutoConfig.for_model("deepdetect", max_keypoints=7).max_keypoints == 7
-    dense = drop_in.DeepDetectForKeypointDetection.from_deepdetect(
-        "dense", max_keypoints=50, nms_radius=3
+OFFLINE = """
+import json, sys
+import transformers
+
+made = [
+    kind.from_pretrained(sys.argv[1], trust_remote_code=True)
+    for kind in (transformers.AutoModelForKeypointDetection, transformers.AutoImageProcessor)
+]
+output = made[0](**made[1](sys.argv[2], return_tensors="pt"))
+print(json.dumps([*(type(one).__name__ for one in made), int(output.mask.sum()),
+                  "deepdetect" in sys.modules]))
+"""
+
+
+def test_what_was_saved_is_loaded_without_network_and_package(
+    views: Views, load: Callable[..., Any], tmp_path: Path
+) -> None:
+    loaded = load(max_keypoints=100)
+    loaded.model.save_pretrained(tmp_path / "saved")
+    loaded.processor.save_pretrained(tmp_path / "saved")
+    Image.fromarray(views.first).save(tmp_path / "photo.png")
+    done = subprocess.run(
+        [sys.executable, "-c", OFFLINE, tmp_path / "saved", tmp_path / "photo.png"],
+        env={**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path), "PYTHONPATH": ""},
+        capture_output=True,
+        text=True,
     )
-    output = run(dense, processor(views.first, return_tensors="pt"))
-    (found,) = processor.post_process_keypoint_detection(output, [views.first.shape[:2]])
-    expected = DeepDetect("dense", backend="onnxruntime").detect(
-        views.first, max_keypoints=50, nms_radius=3
-    )
-    assert np.abs(found["keypoints"].numpy() - expected.xy).max() < 1e-2
+    assert done.returncode == 0, done.stderr
+    expected = ["DeepDetectForKeypointDetection", "DeepDetectImageProcessor", 100, False]
+    assert json.loads(done.stdout.splitlines()[-1]) == expected

@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[2]
 def hub(tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.importorskip("hatchling", reason="needs hatchling, which builds the wheel")
     folder = tmp_path_factory.mktemp("hub") / "hub"
-    subprocess.run([sys.executable, ROOT / "tools/hub.py", folder], check=True)
+    subprocess.run([sys.executable, ROOT / "tools/hub", folder], check=True)
     return folder
 
 

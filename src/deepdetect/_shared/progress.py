@@ -90,8 +90,6 @@ def say(text: str) -> None:
 class StageTimer:
     """Measures the stages of a computation in seconds, and reports each one as it ends.
 
-    `expected`, where it is filled, has the seconds that each is expected to take.
-
     Example:
         >>> timer = StageTimer(progress=print)
         >>> with timer.stage("matching"):
@@ -103,15 +101,7 @@ class StageTimer:
 
     def __init__(self, progress: Callable[[str], object] | None = None) -> None:
         self.seconds: dict[str, float] = {}
-        self.expected: dict[str, float] = {}
         self._progress = progress
-
-    @property
-    def left(self) -> float:
-        """Expected seconds of the stages to come, at the pace of those that have ended."""
-        ended = self.expected.keys() & self.seconds
-        to_come = sum(self.expected.values()) - (thought := sum(self.expected[k] for k in ended))
-        return to_come * sum(self.seconds[k] for k in ended) / thought if ended else to_come
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

@@ -9,6 +9,7 @@ import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,20 +27,9 @@ BLOCK_SIZE = 2_000_000
 MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
 """Length of descriptors of bytes up to which single precision computes distances exactly."""
 
-BYTE_PRODUCT = (
-    b'\x08\x08:b\n\x18\n\x01a\n\x01b\x12\x01y"\rMatMulInteger\x12\x01gZ\x15\n\x01a\x12\x10\n\x0e\x08\x02\x12'
-    b"\n\n\x03\x12\x01n\n\x03\x12\x01dZ\x15\n\x01b\x12\x10\n\x0e\x08\x03\x12\n\n\x03\x12\x01d\n\x03"
-    b"\x12\x01mb\x15\n\x01y\x12\x10\n\x0e\x08\x06\x12\n\n\x03\x12\x01n\n\x03\x12\x01mB\x04\n\x00\x10\r"
-)
-"""An ONNX file of one node, MatMulInteger: y (n, m) int32 of a (n, d) uint8 and b (d, m) int8."""
-
-FLOAT_PRODUCT = (
-    b'\x08\x08:[\n\x11\n\x01a\n\x01b\x12\x01y"\x06MatMul\x12\x01gZ\x15\n\x01a\x12\x10\n\x0e\x08\x01\x12'
-    b"\n\n\x03\x12\x01n\n\x03\x12\x01dZ\x15\n\x01b\x12\x10\n\x0e\x08\x01\x12\n\n\x03\x12\x01d\n\x03"
-    b"\x12\x01mb\x15\n\x01y\x12\x10\n\x0e\x08\x01\x12\n\n\x03\x12\x01n\n\x03\x12\x01mB\x04\n\x00\x10\r"
-)
-"""The same of MatMul: all are float32. NumPy's own product takes twice the time, and its threads
-take processors from what follows."""
+PRODUCTS = Path(__file__).with_name("products")
+"""ONNX files of one product each, which `tools/product_graphs.py` makes. NumPy's product of single
+precision takes twice the time, and its threads take processors from what follows."""
 
 MAX_EXACT_PRODUCT = 4e8
 """Keypoints of both images, multiplied, up to which all distances are computed in a moment."""
@@ -98,7 +88,7 @@ def _search_both_ways(
         terms0 -= 2 * offset * queries.sum(1, dtype=np.float64)
     else:
         queries, base = (np.asarray(part, np.float32) for part in (queries, base))
-        session, factor = _float_product(), np.ascontiguousarray(base.T)
+        session, factor = _product("float"), np.ascontiguousarray(base.T)
     found = min(count + 1, len(base))  # one more tells whether rounding could change the others
     rows = np.empty((len(queries), found), np.int32)
     squared = np.empty((len(queries), found), np.float32)
@@ -148,8 +138,8 @@ def _nearest_in_double(queries: np.ndarray, base: np.ndarray, count: int) -> np.
 
 
 @functools.cache
-def _float_product() -> Any:
-    return start_session(FLOAT_PRODUCT)
+def _product(name: str) -> Any:
+    return start_session(str(PRODUCTS / f"{name}.onnx"))
 
 
 @functools.cache
@@ -159,12 +149,11 @@ def _byte_product() -> tuple[Any, int]:
     The fastest instructions take signed bytes on one side. Processors without VNNI have others of
     the kind, whose sums saturate: they are given bytes without a sign.
     """
-    session = start_session(BYTE_PRODUCT)
+    session = _product("signed")
     most = np.full((8, 64), 255, np.uint8), np.full((64, 64), 127, np.int8)
     if (session.run(None, dict(zip("ab", most, strict=True)))[0] == 64 * 255 * 127).all():
         return session, 128
-    unsigned = BYTE_PRODUCT.replace(b"\x08\x03\x12", b"\x08\x02\x12")
-    return start_session(unsigned), 0
+    return _product("unsigned"), 0
 
 
 def hamming_neighbours(

@@ -1,4 +1,4 @@
-"""DeepDetect as a part of OpenCV, kornia, LightGlue, hloc, vismatch, scikit-image, transformers.
+"""DeepDetect as a part of OpenCV, kornia, LightGlue, hloc.
 
 One module for each program, which is the only one that imports it; it cannot be imported without.
 """

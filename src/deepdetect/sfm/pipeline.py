@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import timedelta
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,7 @@ import numpy as np
 from .._shared.atomic import atomic_path
 from .._shared.errors import NoDepthError, OptionError, ReconstructionError
 from .._shared.options import suggest_keywords
-from .._shared.progress import StageTimer, say
+from .._shared.progress import StageTimer
 from ..batch.pair_list import Pair
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
@@ -27,7 +26,6 @@ from ..geometry.point_cloud import EAST_NORTH_UP, PointCloud
 from ..io.html_viewer import write_html_page
 from ..io.point_cloud import save_point_cloud
 from .colmap import import_pycolmap, initial_intrinsics, known_cameras
-from .forecast import expected_seconds
 from .formats import FORMATS, FormatName, check_formats
 from .fusion import DENSE_POINT
 from .georeference import (
@@ -123,9 +121,7 @@ def reconstruct_many(
     folder = stages.folder_of(images)
     if control is None and (placed := [n for n in options.formats if FORMATS[n].placed]):
         require_fixes(folder, f"the format {placed[0]}")
-    timer = StageTimer(None if quiet else lambda _: _say_left(timer))
-    with timer.stage("first images"):
-        timer.expected = expected_seconds(stages, folder, detector, selection)
+    timer = StageTimer()
     with timer.stage("features"):
         sizes, keypoints, unregistered = stages.extract(folder, detector, selection)
     for name, count in keypoints.items():
@@ -152,8 +148,6 @@ def reconstruct_many(
         )
     with timer.stage("matching"):
         matches, alike = stages.match_images(sizes)
-    for stage in timer.expected.keys() - timer.seconds:
-        timer.expected[stage] *= 1 - len(alike) / len(sizes)
     for name, other in alike.items():
         unregistered[name] = f"it shows nearly the same as {other}"
         del sizes[name]
@@ -200,7 +194,6 @@ def reconstruct_many(
             pairs=len(matches),
             pair_choice=options.pair_choice(len(sizes)),
             seconds=timer.seconds,
-            expected_seconds=timer.expected,
             files=output_files(target, options.formats)[:-1],
         )
         (target / "sparse" / "0").mkdir(parents=True, exist_ok=True)
@@ -268,11 +261,6 @@ def _seen_from(
     points = found.cloud.points @ view.rotation.T + view.translation
     cameras = [each.relative_to(view) for each in found.views.values()]
     return PointCloud(points, found.cloud.colors, found.cloud.unit, frame), cameras
-
-
-def _say_left(timer: StageTimer) -> None:
-    if timer.left:
-        say(f"time left, hours:minutes:seconds: about {timedelta(seconds=round(timer.left))}")
 
 
 def _why_unregistered(

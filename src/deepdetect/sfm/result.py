@@ -45,8 +45,6 @@ class MultiViewReconstruction:
         pairs: number of pairs that were matched.
         pair_choice: how they were chosen: "exhaustive", "sequential:10" or "similar".
         seconds: time of each stage of this run; what an earlier run had done took none.
-        expected_seconds: what each stage was expected to take; empty for a few images, and where an
-            earlier run had begun.
         files: what was written.
     """
 
@@ -67,7 +65,6 @@ class MultiViewReconstruction:
     pairs: int
     pair_choice: str
     seconds: Mapping[str, float]
-    expected_seconds: Mapping[str, float]
     files: tuple[Path, ...]
 
     def __repr__(self) -> str:
@@ -109,7 +106,6 @@ class MultiViewReconstruction:
             "dense_points_by_views": _counts(self.dense_views),
             "cameras": {name: self._camera(name) for name in self.views},
             "seconds": {stage: round(value, 3) for stage, value in self.seconds.items()},
-            "expected_seconds": {name: round(s, 1) for name, s in self.expected_seconds.items()},
         }
 
     def _camera(self, name: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..._shared.errors import OptionError, first_line, unknown_name
 from ..._shared.runtimes import CPU, import_onnxruntime, start_session
-from ..pretrained import POINTS
+from ..pretrained import LOGITS, POINTS
 from .interface import (
     PROBE_SHAPE,
     RuntimeOptions,
@@ -19,7 +19,7 @@ from .interface import (
     output_to_read,
     unreadable,
 )
-from .onnx_parts import leave_out_outputs
+from .onnx_parts import cut_onnx
 
 PROVIDERS = {"cpu": CPU, "cuda": "CUDAExecutionProvider"}
 
@@ -66,7 +66,7 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
             f"{' or '.join(['cpu', *(name for name in available if name != CPU)])}"
         )
     try:
-        session = start_session(_maps_only(path), options.threads, provider)
+        session = start_session(_logits_only(path), options.threads, provider)
     except Exception as error:  # its exceptions share no base class
         raise unreadable(path, error) if provider == CPU else _not_started(device, error) from None
     # It goes on with the CPU when a provider cannot start, and says so in a log only.
@@ -82,11 +82,13 @@ def _not_started(device: str, reason: object) -> OptionError:
     )
 
 
-def _maps_only(path: Path) -> str | bytes:
-    """Return the content of a file that gives keypoints, too, without them; else its path."""
-    with contextlib.suppress(Exception):  # of a damaged file: ONNX Runtime says what is wrong
-        model = path.read_bytes()
-        without = leave_out_outputs(model, set(POINTS))
-        if without is not model:
-            return without
+def _logits_only(path: Path) -> str | bytes:
+    """Return the content of a file that gives keypoints, too, without them; else its path.
+
+    ONNX Runtime computes all outputs of a file, asked for or not.
+    """
+    model = path.read_bytes()
+    if all(name.encode() in model for name in (LOGITS, *POINTS)):
+        with contextlib.suppress(KeyError):
+            return cut_onnx(model, ["image"], [LOGITS])
     return str(path)

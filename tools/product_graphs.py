@@ -1,0 +1,49 @@
+"""The ONNX files of one node that matchers multiply descriptors by.
+
+    python tools/product_graphs.py
+
+Each maps a (n, d) and b (d, m) to y (n, m).
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from onnx import ModelProto, TensorProto, helper
+
+from deepdetect.features.matchers import PRODUCTS
+
+OPSET, IR_VERSION = 13, 8
+GRAPHS = {
+    "float": ("MatMul", TensorProto.FLOAT, TensorProto.FLOAT, TensorProto.FLOAT),
+    "signed": ("MatMulInteger", TensorProto.UINT8, TensorProto.INT8, TensorProto.INT32),
+    "unsigned": ("MatMulInteger", TensorProto.UINT8, TensorProto.UINT8, TensorProto.INT32),
+}
+"""Operator, and types of a, b and y, by the names of files."""
+
+
+def product_graph(name: str) -> ModelProto:
+    """Make the graph of this name."""
+    operator, *types = GRAPHS[name]
+    shapes = (("a", ["n", "d"]), ("b", ["d", "m"]), ("y", ["n", "m"]))
+    a, b, y = (
+        helper.make_tensor_value_info(tensor, kind, shape)
+        for (tensor, shape), kind in zip(shapes, types, strict=True)
+    )
+    graph = helper.make_graph([helper.make_node(operator, ["a", "b"], ["y"])], "g", [a, b], [y])
+    opset = helper.make_opsetid("", OPSET)
+    return helper.make_model(graph, ir_version=IR_VERSION, opset_imports=[opset])
+
+
+def main() -> None:
+    """Write all graphs into the package, or a folder."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("output", nargs="?", type=Path, default=PRODUCTS)
+    output = parser.parse_args().output
+    for name in GRAPHS:
+        (output / f"{name}.onnx").write_bytes(product_graph(name).SerializeToString())
+
+
+if __name__ == "__main__":
+    main()
