@@ -361,7 +361,7 @@ def test_what_is_wrong_is_said(level: Any, one_line: Any, tmp_path: Path) -> Non
     assert "images of 370x250" in refusal(
         one_line, level.left, narrow, focal_px=None, calibration=level.calibration
     )
-    with pytest.raises(ImageError, match="must have one size"):
+    with pytest.raises(ImageError, match="must have the same size"):
         reconstruct(level.left, narrow, AllPixels(), focal_px=500, rectified=True)
 
 
