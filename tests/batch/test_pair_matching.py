@@ -178,7 +178,7 @@ def test_keypoints_that_neighbours_do_not_suit_are_refused_at_once(tmp_path: Pat
     whole = generator.uniform(0, 99, (40, 2)), generator.normal(size=(8, 40))
     write_foreign(tmp_path / "f.h5", a=whole, b=whole)
     how = PairMatchingOptions(filter_by="neighbours")
-    with pytest.raises(OptionError, match="take 'ratio'"):
+    with pytest.raises(OptionError, match="use 'ratio'"):
         match_pairs(tmp_path / "f.h5", "exhaustive", tmp_path / "m.h5", options=how, workers=1)
     assert not (tmp_path / "m.h5").exists()
 

@@ -67,7 +67,7 @@ def test_indexing_is_that_of_numpy(index: Any, kept: list[int]) -> None:
 @pytest.mark.parametrize(
     ("indices", "words"),
     [
-        ([0, 1, 2], "one whole number each as indices0"),
+        ([0, 1, 2], "one whole number each in indices0"),
         ([0.0, 1, 2, 3], "float64"),
         ([0, 1, 2, 80], r"lie in \[-1, 79\]"),
         ([0, 1, 2, -2], r"not in \[-2, 2\]"),
