@@ -167,7 +167,7 @@ BAD_WEIGHTS = {
     "none.onnx": (None, "there is no weights file"),
     "half.onnx": (write_half, "is not an ONNX file that can be read"),
     "words.onnx": (write_words, "is not an ONNX file that can be read"),
-    "words.safetensors": (write_words, "is no ONNX file"),
+    "words.safetensors": (write_words, "is not an ONNX file"),
 }
 
 
@@ -208,7 +208,7 @@ BAD_NETWORKS: dict[str, tuple[Sequence[tuple[str, str]], dict[str, Any], str]] =
     "twice as wide": ((("Tile", "repeats"),), {}, "does not fit"),
     "not finite": (NAN, {}, "not finite"),
     "logits that are not finite": (NAN, {"output": "logits"}, "not finite"),
-    "no probabilities": ((("Add", "five"),), {}, "no probabilities"),
+    "no probabilities": ((("Add", "five"),), {}, "not probabilities"),
     "constant": ((("Sub", "mean"),), {"output": "logits"}, "the same value at every pixel"),
 }
 
@@ -424,7 +424,7 @@ def test_keypoints_of_another_detector_outside_of_the_image_are_refused() -> Non
     outside = Keypoints(np.array([[3.0, 1.0], [8.0, 1.0]]), np.ones(2, np.float32), (9, 9))
     detector = SimpleNamespace(detect=lambda rgb, ignore: outside)
     assert find_keypoints(detector, np.zeros((4, 9, 3), np.uint8)) is outside
-    with pytest.raises(OptionError, match="outside of the image"):
+    with pytest.raises(OptionError, match="outside the image"):
         find_keypoints(detector, np.zeros((4, 8, 3), np.uint8))
 
 
