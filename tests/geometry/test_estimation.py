@@ -221,7 +221,7 @@ def test_wrong_options_say_what_is_wrong(values: dict[str, Any], message: str) -
     [
         ("homografy", 2, "unknown model 'homografy': did you mean 'homography'"),
         ("essential", 2, "needs both cameras"),
-        ("homography", 3, "as many positions in both images, not 3 and 2"),
+        ("homography", 3, "equally many positions in both images, not 3 and 2"),
     ],
 )
 def test_what_cannot_be_estimated(model: str, count: int, message: str) -> None:
