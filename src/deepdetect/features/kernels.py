@@ -15,10 +15,10 @@ import numpy as np
 from .._shared.kernels import compiled
 
 TILE_COLUMNS = 32
-"""Number of lattice columns in a tile."""
+"""Number of lattice columns in a tile. Chosen by hand."""
 
 TILE_HEIGHT = 96
-"""Height of a tile in pixels."""
+"""Height of a tile in pixels. Chosen by hand."""
 
 TAPS_AT_ONCE = 4
 """Spans of taps are multiples of this number, which are summed in one go."""

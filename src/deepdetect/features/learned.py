@@ -15,8 +15,7 @@ LEARNED_FREE: Final = "learned-free"
 CROSS_MODAL: Final = "cross-modal"
 """`Keypoints.descriptor_type` of learned descriptors. The second has weights from freely licensed
 photographs only. The third is for images of different sensors, where dark and bright may be
-swapped. With your own weights the type is "learned-" or "cross-modal-" and the first characters of
-the file's SHA-256."""
+swapped. Your own weights have "learned-" or "cross-modal-" and the start of their SHA-256."""
 
 RATIO, LEARNED_RATIO = 0.85, 0.88
 """Ratio tests of other and of learned descriptors. On photos/val, learned ones at 0.88 are as

@@ -47,8 +47,7 @@ BAND_HEIGHT_PX = 96
 """One thread works on a band of this height, on which the result depends. Chosen by hand."""
 
 SEARCH_SHRINK = 3
-"""Random tries start in the whole image around the best neighbour, and get this much nearer each
-time."""
+"""Random tries start in the whole image around the best neighbour; radii shrink by this factor."""
 
 Neighbours = tuple[np.ndarray, np.ndarray]
 """(N, count) int32 rows and (N, count) float32 distances, nearest first."""

@@ -16,7 +16,7 @@ from ..geometry.estimation import MAX_LOG10_NFA, Geometry, log10_nfa
 from .keypoints import Keypoints, nearest_keypoints
 
 MAX_KEYPOINT_DISTANCE_PX = 1.0
-"""A match ends at a keypoint if its position is at most this far away."""
+"""A match ends at a keypoint if its position is at most this far away. Chosen by hand."""
 
 _COLUMNS: dict[str, Any] = {
     "points0": np.float32,

@@ -26,7 +26,7 @@ GRID_CELLS = 24
 keypoints cover the image. Chosen by hand."""
 
 DISTANCE_STEP_PX = 0.25
-"""Precision to which `spread_by_distance` finds the distance."""
+"""Precision to which `spread_by_distance` finds the distance. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)

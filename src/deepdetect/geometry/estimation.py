@@ -45,7 +45,7 @@ MIN_FRACTION_OF_REST = 0.5
 """If matches alone decide, this fraction of those off the plane must also agree."""
 
 MAX_MATCHES = 2000
-"""Maximum number of matches off the plane that are used; more are sampled at random."""
+"""Maximum number of matches off the plane; more are sampled at random. Chosen by hand."""
 
 SAMPLES = 1000
 """Number of random pairs of matches whose lines are intersected. Chosen by hand."""

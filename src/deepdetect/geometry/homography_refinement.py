@@ -39,7 +39,7 @@ MIN_TRACKS = 15
 
 TRACKING_ITERATIONS = 15
 TRACKING_STEP_PX = 0.02
-"""A track that moves by less than this has converged."""
+"""A track that moves by less than this has converged. Chosen by hand."""
 
 MAX_ROUND_TRIP_PX = 0.3
 """A track counts if it ends this near to its start, forth and back. Chosen by hand."""
@@ -53,7 +53,7 @@ ALIGNMENT_SIDE_PX = 480
 """Images are reduced to this longer side for the alignment of all pixels. Chosen by hand."""
 
 ALIGNMENT_SIGMA_PX = 1.0
-"""Sigma of the blur of these copies."""
+"""Sigma of the blur of these copies. Chosen by hand."""
 
 ALIGNMENT_ITERATIONS = 15
 
@@ -61,7 +61,7 @@ SQUARES = 8
 """Number of squares along the longer side of the image. Chosen by hand."""
 
 STEP_PX = WINDOW_PX // 3
-"""Distance between the windows in which images are compared."""
+"""Distance between the windows in which images are compared. Chosen by hand."""
 
 Fit = Callable[[np.ndarray], "np.ndarray | None"]
 """Maps the (H, W) bool mask of the pixels that may be used to a correction, (3, 3), or None."""
@@ -132,8 +132,7 @@ def _fit_to_corners(
     """Track corners, and return the fit to those in a part of the image.
 
     It is weighted least squares, which is accurate on most of an image that no single homography
-    fits (lens distortion, a wall that is not quite flat); a consensus would be a different one each
-    time.
+    fits (lens distortion, a wall that is not quite flat); a consensus would differ each time.
     """
     margin = np.ones((window_px, window_px), np.uint8)
     inside = cv2.erode(valid_mask.astype(np.uint8), margin, borderValue=0)

@@ -18,13 +18,13 @@ BLUR_SIGMA_PX = 1.25
 """Sigma of the blur before images are compared, against noise and resampling. Chosen by hand."""
 
 NOISE_STD = 2.0
-"""Grey levels added to a window's standard deviation, so that noise is not amplified."""
+"""Grey levels added to a window's deviation, so that noise is not amplified. Chosen by hand."""
 
 MAX_UNKNOWN_WEIGHT = 1e-3
-"""Maximum weight of pixels without data in an interpolated pixel."""
+"""Maximum weight of pixels without data in an interpolated pixel. Chosen by hand."""
 
 MIN_VARIANCE = 1.0
-"""Windows with a lower variance of grey levels are too flat to be compared."""
+"""Windows with a lower variance of grey levels are too flat to be compared. Chosen by hand."""
 
 
 def downscale(gray: np.ndarray, max_side: int) -> tuple[np.ndarray, float]:

@@ -28,7 +28,7 @@ MIN_AREA_POINTS, MIN_AREA = 8, 0.2
 to that along. Chosen by hand."""
 
 MUCH_BETTER = 0.5
-"""The known upward direction is wrong if the median distance without it falls by this factor."""
+"""The known up is wrong if the median distance falls by this factor without it. Chosen by hand."""
 
 HUBER_STDS = 2.0
 """Residuals above this many standard deviations get less weight. Chosen by hand."""

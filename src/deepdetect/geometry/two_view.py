@@ -25,8 +25,7 @@ from .semi_calibrated import START_FOCAL_LENGTHS, estimate_semi_calibrated
 from .transforms import transfer_errors
 
 GUIDING_THRESHOLDS_PX = {"homography": 3.0, "fundamental": 1.5}
-"""Inlier thresholds of models that only guide the matching: keypoints of small copies are
-coarse."""
+"""Inlier thresholds of models that only guide: keypoints of small copies are coarse."""
 
 SCENE_THRESHOLDS_PX = {"homography": 2.0, "fundamental": 1.5}
 """Inlier thresholds for classifying a scene by refined matches. Chosen on the data named above."""

@@ -32,11 +32,11 @@ MAX_UNION = 4
 """A union may have this many times the pixels of both images together. Chosen by hand."""
 
 SQUARES = 8
-"""Number of the checkerboard's squares along the shorter side."""
+"""Number of the checkerboard's squares along the shorter side. Chosen by hand."""
 
 SHIFTS = (1 / 6, 1 / 4)
 """The second image is shifted by these fractions of the shorter side, in eight directions, to
-measure how well unrelated content correlates."""
+measure how well unrelated content correlates. Chosen by hand."""
 
 MIN_DEVIATIONS = 4.0
 """Images agree if their correlation exceeds the mean of the shifted ones by this many standard

@@ -14,7 +14,7 @@ from ..._shared.options import suggest_keywords
 from ..pretrained import LOGITS
 
 PROBE_SHAPE = (24, 32)
-"""Height and width of the image on which a network is tested."""
+"""Height and width of the image on which a network is tested. Chosen by hand."""
 
 
 class Network(Protocol):

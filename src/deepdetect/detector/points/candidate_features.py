@@ -15,7 +15,7 @@ RING_RADII = (1.0, 2.0, 3.5, 6.0)
 """Radii of the rings that are sampled around a candidate, in sigmas. Chosen by hand."""
 
 RING_POINTS = 8
-"""Number of points on each ring, at equal angles."""
+"""Number of points on each ring, at equal angles. Chosen by hand."""
 
 FEATURES = 23 + 8 * len(RING_RADII)
 DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR = map(np.float32, (1e-7, 1e-6, 1e-8))

@@ -28,7 +28,7 @@ ranked, unless all keypoints are wanted or they are spread. Half as many candida
 save 7 of 56 ms at 640x480, but cost 0.01 of repeatability at 3 px."""
 
 TILE_PX = 32
-"""Side of the tiles in which candidates of all scales are processed together, for the cache."""
+"""Candidates of all scales are processed in tiles of this side, for the cache. Chosen by hand."""
 
 GRID_CELLS = 16
 """Number of cells along the longer side for the spread "grid". Chosen by hand."""

@@ -28,8 +28,7 @@ MIN_SEPARATION_PX = 5.0
 """Keypoints this near to the best one show the same place and are no rivals. Chosen by hand."""
 
 NULL_SHIFTS = (0.05, 0.1)
-"""Lines are shifted by these fractions of the longer side to count chance matches. Chosen by
-hand."""
+"""Shifts of lines that count chance matches, as fractions of the longer side. Chosen by hand."""
 
 
 def epipolar_search(

@@ -1,10 +1,10 @@
 """Evidence for or against matches: repeated patterns, held-out windows, and neighbours.
 
 **Repeated patterns** (windows, tiles, fences). Patches look as similar one period further on, so
-they cannot tell a homography from its shifted copy. The aligned images are therefore correlated at
-all shifts. If one of these is nearly as good, two things decide: the places that only one of the
-two homographies explains, and sparse matches off the plane, which agree on an epipole only with the
-correct one.
+they cannot tell a homography from a shifted copy. So the aligned images are correlated at all
+shifts. If one of these is nearly as good, two things decide: the places that only one of the two
+homographies explains, and sparse matches off the plane, which only agree on an epipole with the
+correct homography.
 
 **Held-out windows.** The matches around a window predict, by an affine map, where the second image
 shows it. Correct matches predict similar content; chance matches predict unrelated content.
@@ -73,7 +73,7 @@ HELD_OUT_SIDE_PX = 640
 """Images are reduced to this longer side before held-out windows are compared. Chosen by hand."""
 
 WINDOW_PX = 16
-"""The first image is divided into windows of this side, in pixels of the reduced image."""
+"""Side of the windows that divide the reduced first image, in pixels. Chosen by hand."""
 
 MIN_AROUND = 5
 """A window is predicted if this many of its eight neighbours have matches. Chosen by hand."""
@@ -86,7 +86,7 @@ FALSE_POSITIVE_RATE = 0.05
 fraction of unrelated windows. Chosen by hand."""
 
 NEIGHBOURS = 8
-"""Each sparse match is compared with this many of the nearest ones."""
+"""Each sparse match is compared with this many of the nearest ones. Chosen by hand."""
 
 MAX_MOVE_DIFFERENCE, MOVE_NOISE_PX = 0.35, 2.0
 """Steps between matches agree if rotation and scale differ by at most the first, relative to the

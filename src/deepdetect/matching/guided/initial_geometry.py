@@ -48,8 +48,7 @@ COARSE_SIDE_PX, COARSE_KEYPOINTS = 640, 2000
 """Longer side and keypoints of the copies for the coarse pass. Chosen on the data named above."""
 
 MIN_COARSE_INLIERS = 50
-"""The coarse pass, or a pair of given points, decides if this many matches agree with a homography.
-Chosen on the data named above."""
+"""The coarse pass, or given points, decide if this many matches agree with a homography."""
 
 MIN_COARSE_DEPTH_INLIERS = 200
 """The same number for a fundamental matrix. Chosen on the data named above."""
@@ -78,8 +77,7 @@ Unrelated photographs reach -8 with learned ones; with cross-modal ones noise of
 -20, visible and infrared light -24 or less."""
 
 MAX_MATCHES_TO_SEARCH = 200
-"""If fewer matches agree with a fundamental matrix, more are searched for along its lines. Chosen
-on the data named above."""
+"""A fundamental matrix with fewer inliers leads to a search for more along its lines."""
 
 MAX_HINT_LOG10_NFA = 0.0
 """If the log10 number of false alarms of the best geometry is below this, it may be more than

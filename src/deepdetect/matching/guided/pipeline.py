@@ -40,8 +40,7 @@ MIN_VERIFIED_FRACTION = 0.5
 verified. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MIN_UNMATCHED_FRACTION = 0.5
-"""A further plane counts if this fraction of its matches is new: a repeated pattern that is shifted
-by a period is already matched."""
+"""This fraction of a further plane's matches must be new, unlike those of a shifted pattern."""
 
 MATCHED_PX = 9
 """Side of the window around a match in which the first image counts as matched. Chosen by hand."""
@@ -82,8 +81,7 @@ of held-out windows above the second. Chosen by hand."""
 
 MIN_OWN_FRACTION = 0.67
 """High confidence also needs this fraction of the matches to agree with the geometry. What moves
-differently may be no scene but an overlay that stands still, such as the round rim of a
-microscope."""
+differently may be an overlay that stands still, such as the round rim of a microscope."""
 
 MIN_MATCHED_FRACTION = 0.02
 """If a smaller fraction of the keypoints of a scene with depth is matched, the result is the sparse

@@ -46,7 +46,7 @@ NULL_SHIFTS = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
 """Shifts between the patches of a null pair, as fractions of width and height."""
 
 NULL_BLOCK_PX = 64
-"""Null pairs are taken from blocks of the image with this side."""
+"""Null pairs are taken from blocks of the image with this side. Chosen by hand."""
 
 MAX_NULL_BLOCKS = 256
 """Each shift uses up to this many random blocks: all of them up to a megapixel."""

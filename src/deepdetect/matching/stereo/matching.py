@@ -30,15 +30,14 @@ MAX_SPECKLE_AREA_PX = 100
 """Patches of one surface up to this size are dropped. Chosen by hand."""
 
 SPECKLE_SUBDIVISIONS = 4
-"""OpenCV's speckle filter takes integers, so a pixel of disparity is divided into this many
-steps."""
+"""Steps per pixel of the integer disparities for OpenCV's speckle filter. Chosen by hand."""
 
 BORDER_PX = 4
 """Matches this near to the border of the right image are dropped: windows there give what lies just
-outside the disparity of what lies inside."""
+outside the disparity of what lies inside. Chosen by hand."""
 
 OCCLUDING_EDGE_PX = 1
-"""If occlusions are filled, this many outermost pixels of a nearer surface are dropped."""
+"""Outermost pixels of a nearer surface that are dropped if occlusions are filled."""
 
 OCCLUSION_SLACK_PX = 8
 """A gap may be this much wider than the disparity step: windows reach over both ends."""

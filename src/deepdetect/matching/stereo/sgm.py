@@ -35,10 +35,10 @@ VOLUME_BYTES = 400_000_000
 """Larger cost volumes are processed in bands of rows, one after the other."""
 
 SAMPLED_ROW_STEP = 48
-"""One row in this many is sampled to find the typical distance of the pair's matches."""
+"""One row in this many is sampled for the typical distance of matches. Chosen by hand."""
 
 BAND_OVERLAP_PX = 32
-"""Paths enter a band from this many rows above and below it."""
+"""Paths enter a band from this many rows above and below it. Chosen by hand."""
 
 # The penalties are the best of a few that were tried on the Motorcycle pair; noisy images of full
 # size would need larger ones.
@@ -59,7 +59,7 @@ wrong place. Between them a surface that leaves the image is continued from its 
 less, more of what is seen at the border is lost in noisy views."""
 
 MAX_DIFFERENCE_PX = 1.0
-"""Neighbouring disparities that differ by more than this belong to different surfaces."""
+"""Neighbouring disparities that differ by more are on different surfaces. Chosen by hand."""
 
 WINDOW_RADIUS_PX = 2
 """Radius of the fitted windows. Chosen on the Motorcycle pair, as the next five values."""
