@@ -49,11 +49,11 @@ class PointDetector:
             keep their size).
         ranker: npz file of `deepdetect dev train-points` that ranks the points. None: the bundled
             one.
-        descriptor: what `extract` computes: "learned", by a small network that also sees the
+        descriptor: type of the descriptors: "learned", by a small network that also sees the
             surroundings of a keypoint; "learned-free", by one trained only on freely licensed
             images; "cross-modal", for images of different sensors, such as infrared and visible
-            light, or a map; the ONNX file of `deepdetect train-descriptor`; "rootsift", for
-            programs that expect SIFT's; or an object with a method `describe(image, keypoints)`
+            light, or a map; the ONNX file of `deepdetect train-descriptor`; or "rootsift", for
+            programs that expect SIFT's. Or an object with a method `describe(image, keypoints)`
             that returns the keypoints with descriptors, as `PointDetector.describe` does.
         backend, device, precision: for the same call as `DeepDetect`; points only run with ONNX
             Runtime on the CPU in float32, and other values are errors.
