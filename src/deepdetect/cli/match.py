@@ -25,7 +25,7 @@ from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import MODEL_NAMES
 from ..geometry.transforms import translation_matrix
 from ..io.image import load_image
-from ..io.metadata import read_metadata
+from ..io.metadata import Metadata, read_metadata
 from ..io.tables import read_matrix, save_matches
 from ..matching.pipeline import GUIDED_STAGES, match_features, match_images
 from ..matching.registration import register as register_images
@@ -296,11 +296,12 @@ def register(
     Args:
         apply_to: More files of the second camera, moved by the same homography.
     """
-    reference, folder = read_metadata(image0), cli.output_folder(output)
+    reference, folder = read_metadata(image0, placed=True), cli.output_folder(output)
     own = {path: read_metadata(path) for path in (image1, *apply_to)}
     files: dict[Any, Path] = {}
+    geotiff = reference.to_world is not None and image0.suffix.lower() in (".tif", ".tiff")
     for path, each in own.items():
-        ending = ".png" if each.plain and not reference.keys else ".tif"
+        ending = ".png" if each.plain and not geotiff else ".tif"
         files[path] = folder / f"{path.stem}_on_{image0.stem}{ending}"
     for ending in ("_checkerboard.png", "_difference.png", "_homography.txt"):
         files[ending] = folder / f"{image1.stem}_on_{image0.stem}{ending}"
@@ -366,11 +367,14 @@ def stitch(
         raise OptionError("--max-keypoints is for --detector points: leave it out, or choose that")
     chosen, _ = chosen_detector(detector, values)
     options = StitchingOptions(**OPTIONS.take(values))
+    flat = values.get("projection", "plane") == "plane"
     images: list[Path] = []
+    carried: list[Metadata] = []
     failures: list[str] = []
     for path in paths:
         with noted_failures(str(path), failures):
             load_image(path)
+            carried.append(read_metadata(path, placed=flat))
             images.append(path)
     if len(images) < min(len(paths), 2) or (reference is not None and reference not in images):
         what = "too few images, or not the reference, can be read"
@@ -392,9 +396,8 @@ def stitch(
             for number, path in enumerate(images):
                 text = text.replace(f"images[{number}]", str(path))
             raise type(error)(text) from error
-        flat = values.get("projection", "plane") == "plane"
         moved = panorama.homographies[panorama.reference] if flat else None
-        kept = replace(read_metadata(images[panorama.reference]), no_data=None).moved(moved)
+        kept = replace(carried[panorama.reference], no_data=None).moved(moved)
         save_picture(panorama.image, made["file"], kept)
         kept.write_beside(file)
     for number, reason in panorama.unregistered.items():
