@@ -225,18 +225,13 @@ def _caption(text: str, width: int, unit: float) -> np.ndarray:
     return strip
 
 
-def hstack(panels: Sequence[np.ndarray]) -> np.ndarray:
-    """Join pictures from left to right, with a white gap, and white below lower ones."""
-    turned = vstack([panel.transpose(1, 0, 2) for panel in panels])
-    return np.ascontiguousarray(turned.transpose(1, 0, 2))
-
-
-def vstack(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """Join pictures from top to bottom, with a white gap, and white beside narrower ones."""
-    width = max(row.shape[1] for row in rows)
-    gaps = [GAP_PX] * (len(rows) - 1) + [0]
-    padded = [
-        np.pad(row, ((0, gap), (0, width - row.shape[1]), (0, 0)), constant_values=255)
-        for row, gap in zip(rows, gaps, strict=True)
-    ]
-    return np.concatenate(padded)
+def join_pictures(panels: Sequence[np.ndarray], columns: int) -> np.ndarray:
+    """Join pictures of one size, this many in a row, with white gaps between them."""
+    height, width = panels[0].shape[:2]
+    rows = -(-len(panels) // columns)
+    size = rows * (height + GAP_PX) - GAP_PX, columns * (width + GAP_PX) - GAP_PX, 3
+    joined = np.full(size, 255, np.uint8)
+    for k, panel in enumerate(panels):
+        top, left = k // columns * (height + GAP_PX), k % columns * (width + GAP_PX)
+        joined[top : top + height, left : left + width] = panel
+    return joined
