@@ -20,18 +20,18 @@ from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.matchers import MATCHERS_OF_NUMBERS
 from ..features.matches import Matches, TwoViewGeometry
+from ..features.pictures import draw_all_matches
 from ..features.selection import SelectionOptions
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import MODEL_NAMES
 from ..geometry.transforms import translation_matrix
 from ..io.image import load_image
-from ..io.metadata import Metadata, read_metadata
+from ..io.picture_file import Metadata, picture_suffix, read_metadata, save_picture
 from ..io.tables import read_matrix, save_matches
 from ..matching.pipeline import GUIDED_STAGES, match_features, match_images
 from ..matching.registration import register as register_images
 from ..matching.stitching import StitchingOptions, stages_of
 from ..matching.stitching import stitch as stitch_images
-from ..viz.draw import add_caption, picture_suffix, save_picture
 from . import _options as cli
 from ._detection import (
     DESCRIBED_POINTS,
@@ -134,7 +134,7 @@ def match(
                         matches = match_pair(rgb0, rgb1, chosen, selection=selection, **settings)
                     save_matches(matches, made["file"])
                     if pictures:
-                        _draw(rgb0, rgb1, matches, made["picture"])
+                        save_picture(draw_all_matches(rgb0, rgb1, matches), made["picture"])
                 if reason := _why_none(matches):
                     cli.say(f"{name}: {reason}" if many else reason)
                 numbers = _numbers(pair, matches, files)
@@ -258,16 +258,6 @@ def _geometry_values(geometry: TwoViewGeometry | None) -> dict[str, Any] | None:
         evidence = evidence | {"log10_nfa": None}
     matrix = None if geometry.matrix is None else geometry.matrix.tolist()
     return vars(geometry) | {"matrix": matrix, "evidence": evidence}
-
-
-def _draw(rgb0: np.ndarray, rgb1: np.ndarray, matches: Matches, path: Path) -> None:
-    picture = matches.draw(rgb0, rgb1, by_position=True)
-    others = len(matches) - int(matches.inliers.sum())
-    model = "none" if matches.geometry is None else matches.geometry.model
-    caption = f"{len(matches):,} matches ({model}): matching points share a colour"
-    if others:
-        caption += f"; {others:,} that do not fit it: red"
-    save_picture(add_caption(picture, caption), path)
 
 
 @cli.command(REGISTRATION, SELECTION, POINTS, NETWORK, cli.READING)

@@ -16,7 +16,7 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import ReconstructionError, check_name, require_packages
 from ..geometry.point_cloud import BOX_PERCENTILE, PointCloud, robust_box
 from ..io.glb import write_glb
-from ..io.metadata import Metadata
+from ..io.picture_file import Metadata
 from ..io.point_cloud import save_point_cloud
 from .colmap import quiet_pycolmap
 from .georeference import Georeference

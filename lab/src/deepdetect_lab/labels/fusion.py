@@ -18,7 +18,8 @@ from deepdetect._shared.options import suggest_keywords
 from deepdetect._shared.records import Outputs
 from deepdetect.io.image import load_image, luma
 from deepdetect.io.masks import save_mask
-from deepdetect.viz.draw import add_caption, join_pictures, save_picture
+from deepdetect.io.picture_file import save_picture
+from deepdetect.viz.draw import add_caption, join_pictures
 
 from .detectors import DETECTORS
 from .settings import LabelOptions, Visibility

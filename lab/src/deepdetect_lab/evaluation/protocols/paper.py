@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from deepdetect._shared.errors import ImageError
-from deepdetect.features.display import draw_matches
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.geometry.transforms import transfer_errors
 from deepdetect.io.image import load_image, luma
 from deepdetect.io.masks import load_mask
-from deepdetect.viz.draw import add_caption, join_pictures
+from deepdetect.viz.draw import add_caption, draw_matches, join_pictures
 
 from ...datasets.foreground import MaskedPhotograph, load_foreground
 from ...datasets.planar import PlanarPair, PlanarScene

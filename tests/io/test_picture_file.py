@@ -3,6 +3,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,17 @@ from PIL import Image, ImageCms
 from PIL.ExifTags import IFD, Base
 from tests.command_line import run_command
 
-from deepdetect import MissingExtraError, RegistrationError, load_image, register
+from deepdetect import (
+    DeepDetectError,
+    MissingExtraError,
+    OptionError,
+    RegistrationError,
+    load_image,
+    register,
+)
 from deepdetect.geometry import transform_points
 from deepdetect.io.exif import camera_from_exif
-from deepdetect.io.metadata import Metadata, read_metadata
-from deepdetect.viz.draw import save_picture
+from deepdetect.io.picture_file import Metadata, read_metadata, save_picture
 
 SPACING_M, EAST, NORTH = 0.5, 500_000.0, 5_400_000.0
 UTM = 32632
@@ -346,3 +353,30 @@ def test_exif_that_cannot_be_written_does_not_cost_the_picture(
     for name in ("b.png", "b.jpg", "b.tif"):
         save_picture(photo, tmp_path / name, metadata)
         assert load_image(tmp_path / name).shape == photo.shape
+
+
+def test_a_picture_ends_in_png_or_jpg(tmp_path: Path) -> None:
+    picture = np.full((20, 30, 3), (200, 30, 90), np.uint8)
+    for ending in (".png", ".jpg", ".JPEG"):
+        save_picture(picture, tmp_path / f"deep/a{ending}")
+        with Image.open(tmp_path / f"deep/a{ending}") as found:
+            assert np.abs(np.asarray(found).astype(int) - picture).max() < 8
+    with pytest.raises(OptionError, match="must end in"):
+        save_picture(picture, tmp_path / "a.bmp")
+    assert not (tmp_path / "a.bmp").exists()
+
+
+def test_a_picture_too_large_for_its_format_is_refused(
+    tmp_path: Path, one_line: Callable[[BaseException], str], capfd: pytest.CaptureFixture[str]
+) -> None:
+    wide = np.zeros((2, 65_501, 3), np.uint8)
+    for name in ("p.jpg", "p.JPEG"):
+        with pytest.raises(DeepDetectError, match="65501x2 pixels: give it a name") as error:
+            save_picture(wide, tmp_path / name)
+        one_line(error.value)
+    assert not list(tmp_path.iterdir())
+    assert capfd.readouterr().err == ""
+    save_picture(wide[:, :-1], tmp_path / "p.jpg")
+    save_picture(wide, tmp_path / "p.png")
+    with Image.open(tmp_path / "p.png") as picture:
+        assert picture.size == (65_501, 2)

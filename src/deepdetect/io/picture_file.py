@@ -1,4 +1,4 @@
-"""What an image file carries beside its pixels, and pictures that keep it.
+"""Pictures as files, and what an image file carries beside its pixels, which they keep.
 
 Where it lies on the Earth (a GeoTIFF, or a world file, by rasterio), its colour profile, its EXIF.
 """
@@ -18,7 +18,8 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from .._shared.atomic import atomic_path
-from .._shared.errors import require_packages
+from .._shared.errors import DeepDetectError, OptionError, require_packages
+from .._shared.image_array import to_8_bits
 from .._shared.opencv import cv2
 from .image_file import open_file, open_image, reading_options
 from .tiff import NO_DATA, TIFF_STARTS, chosen_page, no_data_of
@@ -33,6 +34,12 @@ FIRST_CENTRE = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
 """From pixels to those of GDAL, where the first corner of the first one is (0, 0)."""
 
 ICC_PROFILE = 34675
+
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+MAX_JPEG_SIDE_PX = 65_500
+"""The largest width and height that libjpeg writes."""
+
+JPEG_QUALITY = 85
 
 EXIF_TEXTS = (
     Base.ImageDescription,
@@ -273,3 +280,35 @@ def _of_tiff(file: Any) -> tuple[Metadata, Any]:
     plain = page.samplesperpixel in (1, 3, 4) and str(page.dtype) in ("uint8", "uint16", "bool")
     profile = None if profile is None else bytes(profile)
     return Metadata(no_data=no_data_of(page), profile=profile, plain=plain), page
+
+
+def save_picture(rgb: np.ndarray, path: str | Path, metadata: Metadata = Metadata()) -> None:
+    """Write a (H, W, 3) uint8 or uint16 RGB picture as .png or .tif, or of 8 bits as .jpg.
+
+    It is written whole or not at all.
+    """
+    suffix = picture_suffix(path)
+    if suffix.startswith(".tif"):
+        metadata.write_tiff(rgb, Path(path))
+        return
+    # Checked before OpenCV is asked, which would also log it.
+    if suffix != ".png" and max(rgb.shape[:2]) > MAX_JPEG_SIDE_PX:
+        size = f"{rgb.shape[1]}x{rgb.shape[0]}"
+        raise DeepDetectError(
+            f"{path} cannot hold a picture of {size} pixels: give it a name that ends in .png"
+        )
+    settings = []
+    if suffix != ".png":
+        rgb, settings = to_8_bits(rgb), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    data = metadata.encode(rgb, suffix, settings)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def picture_suffix(path: str | Path) -> str:
+    """Return the suffix of a picture's file in lower case; call it before any expensive work."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in PICTURE_SUFFIXES:
+        *names, last = PICTURE_SUFFIXES
+        raise OptionError(f"{path} must end in {', '.join(names)} or {last}")
+    return suffix
