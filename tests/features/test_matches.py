@@ -118,7 +118,7 @@ def test_a_geometry_is_judged_by_the_matches_that_agree() -> None:
     # What could not be estimated is no geometry either.
     nothing = bare.with_geometry(Geometry("fundamental", None, np.zeros(40, bool)))
     assert (nothing.geometry.model, nothing.success, len(nothing)) == ("none", False, 40)
-    assert "no geometry could be trusted" in repr(nothing)
+    assert "40 matches; no geometry can be trusted" in repr(nothing)
     assert "none that can be trusted" in nothing._repr_html_()
 
 

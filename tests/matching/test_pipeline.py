@@ -288,7 +288,7 @@ def test_a_pair_without_a_geometry_needs_no_keypoints_before_they_are_asked_for(
     monkeypatch.setattr(pipeline, "find_keypoints", counted)
     matches = match(first, second, detector)
     assert not matches.success
-    assert repr(matches) == "Matches(0 matches, as no geometry could be trusted)"
+    assert repr(matches) == "Matches(0 matches; no geometry can be trusted)"
     assert len(calls) == 0
     found = matches.keypoints1
     assert matches.keypoints1 is found
