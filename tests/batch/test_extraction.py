@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -87,6 +88,23 @@ def test_dense_keypoints(collection: Callable[..., Path], tmp_path: Path) -> Non
         np.testing.assert_allclose(
             file["a/00.png/descriptors"][()].T, descriptors / np.maximum(lengths, 1), atol=1e-6
         )
+
+
+def test_the_number_of_keypoints_is_the_detectors_unless_the_selection_has_one(
+    collection: Callable[..., Path], tmp_path: Path
+) -> None:
+    folder, path = collection(1), tmp_path / "f.h5"
+    few, whole = DeepDetect(threads=1, max_keypoints=20), SelectionOptions(threshold=0.1)
+    extract_features(folder, path, few, workers=1, selection=whole)
+    again = extract_features(
+        folder, path, few, workers=1, selection=replace(whole, max_keypoints=20)
+    )
+    assert again.skipped == 1
+    with pytest.raises(OptionError, match=r"other settings \(`max_keypoints`\)"):
+        extract_features(folder, path, DeepDetect(threads=1), workers=1, selection=whole)
+    more = replace(whole, max_keypoints=30)
+    found = extract_features(folder, path, few, workers=1, selection=more, overwrite=True)
+    assert found.counts == {"a/00.png": 30}
 
 
 def test_an_image_without_keypoints(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from ..features.keypoints import Keypoints
 from ..features.match_filter import check_filter, require_suited
 from ..features.matchers import MATCHERS_OF_NUMBERS
 from ..geometry import GeometryOptions, estimate_geometry
-from ..geometry.estimation import check_model
+from ..geometry.estimation import check_model, check_seed
 from ..matching.pipeline import match_features
 from .extraction import read_keypoints
 from .hdf5 import (
@@ -78,7 +78,9 @@ class PairMatchingOptions:
         check_name("matcher", self.matcher, MATCHERS_OF_NUMBERS)
         if self.verify == "essential":
             raise OptionError("`verify` knows no cameras: use fundamental, homography or auto")
-        check_model(self.verify, self.seed, GeometryOptions())
+        check_seed(self.seed)
+        if self.verify != "none":
+            check_model(self.verify, self.seed, GeometryOptions())
 
 
 @suggest_keywords
