@@ -1,15 +1,23 @@
-"""Phrases that must be read twice, in the README, the pages, the notebooks and the help texts.
+"""Phrases that must be read twice: in pages, notebooks, help texts, and in the sources' own words.
 
 python tools/plain_english.py    # `make lint` runs it; it ends with 1 and names each place
+python tools/plain_english.py src/deepdetect/io    # only these files and folders
+
+Of Python files it reads docstrings, notes under constants, comments and the texts of messages.
 
 codespell knows words; this knows phrases. To add one, write a line of `PHRASES`.
 """
 
 from __future__ import annotations
 
+import ast
+import io
 import json
 import re
 import sys
+import tokenize
+from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -40,8 +48,30 @@ PHRASES = {
     r"\bread wrongly\b": "'misread'",
     r"\bit is needed\b(?=\.)": "say when",
     r"\bas (?:it is )?told\b": "'as you set'",
+    r"\b(?:has|have|had|does|do|did|is|are) (?:not|none)(?=[.;:,)])": (
+        "finish the clause: 'does not have one'"
+    ),
+    r"\bis none of\b|\bare none of\b": "'is not one of'",
+    r"\bhangs? together\b": "'are connected', 'overlap'",
+    r"\bsatellite fix": "'GPS'",
+    r"\blosses beside wins\b": "'including where it loses'",
+    r"\bhad a say\b": "'we chose ... on ...'",
+    r"\b(?:is|are) at work\b": "'is running'",
+    r"\bat the most\b": "'at most'",
+    r"\bso (?:many|few|much) (?:as|for)\b|\b(?:of more|of these), so many\b": "name the number",
+    r"\bas of `": "'as in `...`'",
 }
 """Patterns of phrases, with what to write."""
+
+NOTE_BEGINNINGS = re.compile(
+    r"(?:Of|To|For|From|In|With|By|At|On|Up|Over|Under|Below|Above|Around|Between|Beyond|Along|"
+    r"Until|Through|After|Before|Within|Beside|As|So|Than|Relative|Also|Least|Largest|Smallest|Most)"
+    r"\b(?! is\b)"
+)
+"""How a note under a constant begins that continues the constant's name in place of a sentence."""
+
+PYTHON = ("src", "lab/src", "benchmarks", "tools", "examples")
+"""The folders whose Python files are read."""
 
 NOT_PROSE = re.compile(
     r"<!-- results?:.*?<!-- /results? -->|^ *```.*?^ *```$|`[^`\n]*`|\]\([^)]*\)",
@@ -58,6 +88,56 @@ def texts() -> dict[str, str]:
         prose = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown"]
         found[notebook.name] = "\n\n".join(prose)
     return found | {"--help-all": cli_page.make_page()}
+
+
+def python_texts(path: Path) -> Iterator[tuple[int, str, bool]]:
+    """Yield the line, the text, and whether it is a note under a constant, of all prose in a file.
+
+    Strings of one word or two are names; examples in docstrings are code.
+    """
+    source = path.read_text("utf-8")
+    tree = ast.parse(source)
+    inside = {id(part) for f in ast.walk(tree) if isinstance(f, ast.JoinedStr) for part in f.values}
+    notes = {
+        id(after.value)
+        for body in (getattr(node, "body", ()) for node in ast.walk(tree))
+        if isinstance(body, list)
+        for before, after in pairwise(body)
+        if isinstance(before, ast.Assign | ast.AnnAssign) and isinstance(after, ast.Expr)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            parts = [str(p.value) if isinstance(p, ast.Constant) else "{}" for p in node.values]
+            text = "".join(parts)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            text = "" if id(node) in inside else node.value
+        else:
+            continue
+        if len(text.split()) > 2:
+            prose = re.sub(r"^ *(?:>>>|\.\.\.) .*$", "", text, flags=re.MULTILINE)
+            yield node.lineno, prose, id(node) in notes
+    comments: list[tuple[int, str]] = []
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            text = token.string.lstrip("#! ")
+            if comments and comments[-1][0] + comments[-1][1].count("\n") + 1 == token.start[0]:
+                comments[-1] = (comments[-1][0], f"{comments[-1][1]}\n{text}")
+            else:
+                comments.append((token.start[0], text))
+    yield from ((line, text, False) for line, text in comments)
+
+
+def python_problems(path: Path) -> list[str]:
+    """Return a line for each phrase in the words of a Python file."""
+    found = []
+    name = path.relative_to(ROOT).as_posix() if path.is_relative_to(ROOT) else str(path)
+    for line, text, is_note in python_texts(path):
+        for problem in problems("", text):
+            _, number, rest = problem.split(":", 2)
+            found.append(f"{name}:{line + int(number) - 1}:{rest}")
+        if is_note and NOTE_BEGINNINGS.match(text):
+            found.append(f"{name}:{line}: {text.split()[0]!r}: give the note a subject of its own")
+    return found
 
 
 def problems(name: str, text: str) -> list[str]:
@@ -79,7 +159,14 @@ def problems(name: str, text: str) -> list[str]:
 
 def main() -> None:
     """Print all problems, and end with 1 if there are any."""
-    found = [line for name, text in texts().items() for line in problems(name, text)]
+    chosen = [Path(word).resolve() for word in sys.argv[1:]]
+    found = []
+    if not chosen:
+        found = [line for name, text in texts().items() for line in problems(name, text)]
+    for folder in chosen or [ROOT / folder for folder in PYTHON]:
+        for path in [folder] if folder.is_file() else sorted(folder.rglob("*.py")):
+            if path != Path(__file__).resolve():
+                found += python_problems(path)
     if found:
         raise SystemExit("\n".join(found))
 

@@ -19,7 +19,7 @@ from deepdetect.batch import extract_features
 from deepdetect.detector.pretrained import pretrained_weights
 from deepdetect.features.sift import root_sift_descriptors
 from deepdetect.io.image import luma
-from deepdetect.viz.draw import save_picture
+from deepdetect.io.picture_file import save_picture
 
 FEW, PIXELS = PointDetector(50), SelectionOptions(max_keypoints=50)
 

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from deepdetect import ImageError, Keypoints, Matches
-from deepdetect.features.display import GREEN, RED
+from deepdetect.viz.draw import GREEN, RED
 
 
 def keypoints(count: int, size: tuple[int, int] = (256, 256), **columns: Any) -> Keypoints:

@@ -50,7 +50,7 @@ def placed(
     write_fountain, centres: np.ndarray, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, MultiViewReconstruction]:
     """The folder of a model in all formats, and the model."""
-    for package in ("h5py", "pycolmap", "laspy", "lazrs", "pyproj"):
+    for package in ("h5py", "pycolmap", "laspy", "lazrs", "pyproj", "rasterio"):
         pytest.importorskip(package, reason=f"needs {package}")
     root = tmp_path_factory.mktemp("placed")
     folder = write_fountain(root / "photos", NAMES, 288)
@@ -116,7 +116,8 @@ def test_laz_is_read_by_laspy(placed) -> None:
 
 
 def test_maps_are_read_by_rasterio(placed) -> None:
-    rasterio = pytest.importorskip("rasterio", reason="needs rasterio")
+    import rasterio
+
     output, found = placed
     utm, _ = found.georeference.origin.to_utm(found.dense.points)
     with (

@@ -20,7 +20,7 @@ from ..features.keypoints import Keypoints
 from ..features.match_filter import check_filter, require_suited
 from ..features.matchers import MATCHERS_OF_NUMBERS
 from ..geometry import GeometryOptions, estimate_geometry
-from ..geometry.estimation import check_model, check_seed
+from ..geometry.estimation import check_model
 from ..matching.pipeline import match_features
 from .extraction import read_keypoints
 from .hdf5 import (
@@ -51,7 +51,7 @@ class PairMatchingOptions:
             those that move as the matches around them do, as of `match_features`.
         matcher: name of the matcher: "auto", "exact", "patchmatch" or "flann".
         verify: keep only the matches that agree with a geometry that is estimated from them:
-            "fundamental", "homography" or "auto"; "none" keeps all.
+            "fundamental", "homography" or "auto". None keeps all.
         inlier_threshold: largest error under this geometry, in pixels.
         seed: seed of random choices.
 
@@ -63,7 +63,7 @@ class PairMatchingOptions:
     mutual: bool = True
     filter_by: Literal["ratio", "neighbours"] = "ratio"
     matcher: str = "auto"
-    verify: str = "none"
+    verify: str | None = None
     inlier_threshold: float = GeometryOptions.inlier_threshold
     seed: int = 0
 
@@ -78,9 +78,7 @@ class PairMatchingOptions:
         check_name("matcher", self.matcher, MATCHERS_OF_NUMBERS)
         if self.verify == "essential":
             raise OptionError("`verify` knows no cameras: use fundamental, homography or auto")
-        check_seed(self.seed)
-        if self.verify != "none":
-            check_model(self.verify, self.seed, GeometryOptions())
+        check_model(self.verify or "auto", self.seed, GeometryOptions())
 
 
 @suggest_keywords
@@ -256,9 +254,9 @@ def _match(
     taken = "matcher", "filter_by", "ratio", "mutual", "seed"
     found = match_features(features0, features1, **{name: getattr(options, name) for name in taken})
     kept = found.inliers
-    if options.verify != "none":
+    if options.verify is not None:
         geometry = GeometryOptions(inlier_threshold=options.inlier_threshold)
         kept = estimate_geometry(
-            found.points0, found.points1, options.verify, seed=options.seed, options=geometry
+            found, model=options.verify, seed=options.seed, options=geometry
         ).inliers
     return np.column_stack([found.indices0, found.indices1])[kept], found.scores[kept]

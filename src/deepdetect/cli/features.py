@@ -21,7 +21,7 @@ MATCHING = cli.From(
     "filter_by ratio mutual verify",
     types={
         "matcher": Literal[MATCHERS_OF_NUMBERS],
-        "verify": Literal["none", "fundamental", "homography", "auto"],
+        "verify": Literal["fundamental", "homography", "auto"],
     },
 )
 

@@ -362,7 +362,8 @@ class Matches:
         Raises:
             ImageError: an image has another size than its keypoints'.
         """
-        from .display import checked_image, draw_matches
+        from ..viz.draw import draw_matches
+        from .display import checked_image
 
         rgb0 = checked_image(image0, self.keypoints0.image_size, channels)
         rgb1 = checked_image(image1, self.keypoints1.image_size, channels)
