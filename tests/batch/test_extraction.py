@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -194,16 +195,16 @@ def test_weights_that_have_changed_are_loaded_again(
     collection: Callable[..., Path], tmp_path: Path, same_content: Callable[..., bool]
 ) -> None:
     folder, weights = collection(1), tmp_path / "weights.onnx"
+    options: dict[str, Any] = {"selection": PIXELS, "workers": 1}
     for name in ("dense", "free"):
         weights.write_bytes(pretrained_weights(name).read_bytes())
         detector = DeepDetect(weights, threads=1)
         if name == "free":
             with pytest.raises(OptionError, match=r"other settings \(`weights`\)"):
-                extract_features(folder, tmp_path / "f.h5", detector, workers=1)
-        options = {"selection": PIXELS, "workers": 1, "overwrite": True}
-        extract_features(folder, tmp_path / "f.h5", detector, **options)
+                extract_features(folder, tmp_path / "f.h5", detector, **options)
+        extract_features(folder, tmp_path / "f.h5", detector, **options, overwrite=True)
         own = DeepDetect(name, threads=1)
-        extract_features(folder, tmp_path / f"{name}.h5", own, **options)
+        extract_features(folder, tmp_path / f"{name}.h5", own, **options, overwrite=True)
         assert same_content(tmp_path / "f.h5", tmp_path / f"{name}.h5")
     assert not same_content(tmp_path / "dense.h5", tmp_path / "free.h5")
 
