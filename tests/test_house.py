@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src/deepdetect"
 MAX_OPTION_CLASSES = 30
 MAX_KEYWORDS = 12
-MAX_ROOT_NAMES = 30
+MAX_ROOT_NAMES = 32
 
 
 @cache
