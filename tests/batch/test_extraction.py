@@ -7,7 +7,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,6 +89,23 @@ def test_dense_keypoints(collection: Callable[..., Path], tmp_path: Path) -> Non
         np.testing.assert_allclose(
             file["a/00.png/descriptors"][()].T, descriptors / np.maximum(lengths, 1), atol=1e-6
         )
+
+
+def test_the_number_of_keypoints_is_the_detectors_unless_the_selection_has_one(
+    collection: Callable[..., Path], tmp_path: Path
+) -> None:
+    folder, path = collection(1), tmp_path / "f.h5"
+    few, whole = DeepDetect(threads=1, max_keypoints=20), SelectionOptions(threshold=0.1)
+    extract_features(folder, path, few, workers=1, selection=whole)
+    again = extract_features(
+        folder, path, few, workers=1, selection=replace(whole, max_keypoints=20)
+    )
+    assert again.skipped == 1
+    with pytest.raises(OptionError, match=r"other settings \(`max_keypoints`\)"):
+        extract_features(folder, path, DeepDetect(threads=1), workers=1, selection=whole)
+    more = replace(whole, max_keypoints=30)
+    found = extract_features(folder, path, few, workers=1, selection=more, overwrite=True)
+    assert found.counts == {"a/00.png": 30}
 
 
 def test_an_image_without_keypoints(tmp_path: Path) -> None:
@@ -176,16 +195,16 @@ def test_weights_that_have_changed_are_loaded_again(
     collection: Callable[..., Path], tmp_path: Path, same_content: Callable[..., bool]
 ) -> None:
     folder, weights = collection(1), tmp_path / "weights.onnx"
+    options: dict[str, Any] = {"selection": PIXELS, "workers": 1}
     for name in ("dense", "free"):
         weights.write_bytes(pretrained_weights(name).read_bytes())
         detector = DeepDetect(weights, threads=1)
         if name == "free":
             with pytest.raises(OptionError, match=r"other settings \(`weights`\)"):
-                extract_features(folder, tmp_path / "f.h5", detector, workers=1)
-        options = {"selection": PIXELS, "workers": 1, "overwrite": True}
-        extract_features(folder, tmp_path / "f.h5", detector, **options)
+                extract_features(folder, tmp_path / "f.h5", detector, **options)
+        extract_features(folder, tmp_path / "f.h5", detector, **options, overwrite=True)
         own = DeepDetect(name, threads=1)
-        extract_features(folder, tmp_path / f"{name}.h5", own, **options)
+        extract_features(folder, tmp_path / f"{name}.h5", own, **options, overwrite=True)
         assert same_content(tmp_path / "f.h5", tmp_path / f"{name}.h5")
     assert not same_content(tmp_path / "dense.h5", tmp_path / "free.h5")
 

@@ -1,4 +1,4 @@
-"""The slow way gives what the preset `published` gives: it is only timed."""
+"""The slow way gives what `match_unguided` gives: it is only timed."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, match_images
+from deepdetect import DeepDetect
 from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.io.image import load_image
-from deepdetect.matching import PUBLISHED_MATCHING
+from deepdetect_lab.evaluation.unguided import match_unguided
 
 pytest.importorskip("torch", reason="the published pipeline runs in torch")
 
@@ -23,7 +23,7 @@ def script(load_script: Callable[[str], ModuleType]) -> ModuleType:
 
 
 @pytest.mark.slow
-def test_counts_as_the_preset_does(script: ModuleType, photo_path: Path) -> None:
+def test_counts_as_match_unguided_does(script: ModuleType, photo_path: Path) -> None:
     image = load_image(photo_path)[:240, :320]
     shift = 7
     images = image[:, :-shift], image[:, shift:]
@@ -33,13 +33,7 @@ def test_counts_as_the_preset_does(script: ModuleType, photo_path: Path) -> None
         return float(np.hypot(x - shift - u, y - v)) < 1
 
     counted = script.published_pipeline(images, script.published_detector(detector), correct)
-    found = match_images(
-        *images,
-        detector,
-        guided_matching=False,
-        model="none",
-        options=PUBLISHED_MATCHING,
-    )
+    found = match_unguided(*images, detector)
     gaps = np.linalg.norm(found.points0 - (shift, 0) - found.points1, axis=1)
     expected = int((gaps < 1).sum())
     assert expected > 5000

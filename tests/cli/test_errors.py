@@ -48,7 +48,6 @@ CASES = {
     "stereo without a scene": "dev evaluate-stereo {bad}/empty",
     "output is a file": "detect {bad}/good.png -o {bad}/text.png",
     "ignore mask": "detect {bad}/good.png --ignore {bad}/small.png",
-    "preset": "match {bad}/good.png {bad}/good.png --preset publishd",
     "seed": "match {bad}/good.png {bad}/good.png --seed -1",
     "essential without cameras": "match {bad}/good.png {bad}/good.png --model essential",
     "model": "match {bad}/good.png {bad}/good.png --model homografy",

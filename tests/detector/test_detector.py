@@ -388,6 +388,26 @@ def test_joblib_and_ray_map_the_methods_of_detectors(program: str, image: np.nda
             np.testing.assert_array_equal(each.xy, detector.detect(image).xy)
 
 
+def test_the_number_of_keypoints_is_that_of_the_call_or_else_of_the_detector(
+    image: np.ndarray,
+) -> None:
+    few = DeepDetect(max_keypoints=12)
+    best = DeepDetect().detect(image, max_keypoints=12)
+    np.testing.assert_array_equal(few.detect(image).xy, best.xy)
+    np.testing.assert_array_equal(few.extract(image).xy, best.xy)
+    assert len(few.detect(image, max_keypoints=30)) == 30
+    assert [len(each) for each in few.detect_batch([image, image])] == [12, 12]
+    assert len(few.detect_batch([image], max_keypoints=5)[0]) == 5
+    np.testing.assert_array_equal(find_keypoints(few, image).xy, best.xy)
+    others = pickle.loads(pickle.dumps(few)), few.with_weights("default")
+    for other in (*others, few.configured(HeatmapOptions())):
+        assert other.settings == few.settings
+        assert len(other.detect(image)) == 12
+    assert few.settings["max_keypoints"] == 12
+    with pytest.raises(OptionError, match="max_keypoints"):
+        DeepDetect(max_keypoints=0)
+
+
 def test_extracted_keypoints_are_the_detected_ones_described(
     detector: DeepDetect, image: np.ndarray
 ) -> None:

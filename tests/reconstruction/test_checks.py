@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, Matches, MatchingOptions, match_images
+from deepdetect import DeepDetect, Matches, match_images
 from deepdetect._shared.errors import DeepDetectError, ReconstructionError
 from deepdetect.features.matchers import get_matcher, match_descriptors
 from deepdetect.features.sift import detect_sift
@@ -66,8 +66,7 @@ def refined(turned: Any, turned_matches: Matches) -> tuple[np.ndarray, np.ndarra
 def test_a_camera_that_only_rotated(
     level: Any, only_turned: np.ndarray, guide: str, one_line
 ) -> None:
-    options = MatchingOptions(two_view_model=guide)
-    found = match_images(level.left, only_turned, DeepDetect("dense"), options=options)
+    found = match_images(level.left, only_turned, DeepDetect("dense"), model=guide)
     points = found.points0, found.points1
     camera = level.calibration.camera0
     assert "a rotation explains all" in refusal(

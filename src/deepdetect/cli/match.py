@@ -135,7 +135,7 @@ def match(
                     save_matches(matches, made["file"])
                     if pictures:
                         save_picture(draw_all_matches(rgb0, rgb1, matches), made["picture"])
-                if reason := _why_none(matches):
+                if reason := _why_none(matches, unguided):
                     cli.say(f"{name}: {reason}" if many else reason)
                 numbers = _numbers(pair, matches, files)
                 found.append(numbers | {"backend": getattr(chosen, "runtime", None)})
@@ -211,9 +211,9 @@ def _choose_pairs(
     return {pair: f"{stems[pair[0]]}_{stems[pair[1]]}" for pair in chosen}
 
 
-def _why_none(matches: Matches) -> str | None:
+def _why_none(matches: Matches, unguided: bool) -> str | None:
     """Say why there are no matches, or no geometry."""
-    if not len(matches) and matches.success:
+    if not len(matches) and (matches.success or unguided):
         return "there are no matches: the images show too little, or the options leave none"
     if matches.success:
         return None

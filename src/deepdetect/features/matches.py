@@ -402,7 +402,7 @@ class Matches:
 
     def __repr__(self) -> str:
         if not self.success:  # whose keypoints may have to be found first
-            return f"Matches({len(self)} matches, as no geometry could be trusted)"
+            return f"Matches({len(self)} matches; no geometry can be trusted)"
         told = ""
         if self.geometry is not None:
             told = f", model={self.geometry.model!r}, confidence={self.geometry.confidence!r}"
