@@ -65,9 +65,7 @@ def test_train_and_shards(run, images: Path, monkeypatch: pytest.MonkeyPatch) ->
         (["--optimizer", "sopa"], "did you mean 'soap'"),
     ],
 )
-def test_errors_speak_of_flags(
-    run, images: Path, arguments: list[str], message: str, one_line
-) -> None:
+def test_errors_speak_of_flags(run, images: Path, arguments: list[str], message: str) -> None:
     result = run("train", images, "-o", "out", *arguments)
     assert result.exit_code == 2
     assert message in result.stderr

@@ -226,26 +226,25 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("case", DAMAGES)
-def test_damaged_files_are_named_in_one_sentence(case: str, tmp_path: Path, one_line) -> None:
+def test_damaged_files_are_named_in_one_sentence(case: str, tmp_path: Path) -> None:
     layout, name, old, new, hint = DAMAGES[case]
     folder = WRITERS[layout](tmp_path / "scene")
     damage(folder, name, old, new)
     with pytest.raises(ImageError) as caught:
         load_posed_scenes(folder)
-    message = one_line(caught.value)
+    message = str(caught.value)
     assert hint in message
     assert str(tmp_path) in message
 
 
-def test_images_that_are_missing_damaged_or_turned_are_refused(tmp_path: Path, one_line) -> None:
+def test_images_that_are_missing_damaged_or_turned_are_refused(tmp_path: Path) -> None:
     folder = write_strecha(tmp_path)
     turned = Image.new("L", SIZE)
     exif = turned.getexif()
     exif[0x0112] = 6
     turned.save(folder / "0001.png", exif=exif)
-    with pytest.raises(ImageError, match="EXIF orientation") as caught:
+    with pytest.raises(ImageError, match="EXIF orientation"):
         load(folder)
-    one_line(caught.value)
     (folder / "0001.png").write_text("no image")
     with pytest.raises(ImageError, match="not an image"):
         load(folder)
@@ -254,13 +253,10 @@ def test_images_that_are_missing_damaged_or_turned_are_refused(tmp_path: Path, o
         load(folder)
 
 
-def test_what_is_no_scene_is_said(
-    tmp_path: Path, one_line, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_scene_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for folder in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(ImageError, match="no images with cameras") as caught:
+        with pytest.raises(ImageError, match="no images with cameras"):
             load_posed_scenes(folder)
-        one_line(caught.value)
     (tmp_path / "sparse").mkdir()
     (tmp_path / "sparse" / "images.bin").touch()
     with pytest.raises(ImageError, match="no model that pycolmap"):

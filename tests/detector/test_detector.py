@@ -28,7 +28,6 @@ from deepdetect.io import image as io_image
 
 # The bundled weights change, so nothing here depends on the values that they give.
 
-OneLine = Callable[[BaseException], str]
 MakeOnnx = Callable[..., Path]
 FREE_MAP = ("n", 1, "h", "w")
 TORCH_WEIGHTS = pretrained_weights().with_suffix(".safetensors")
@@ -153,10 +152,9 @@ def test_the_automatic_backend() -> None:
         {"device": "cuda", "weights": TORCH_WEIGHTS},
     ],
 )
-def test_wrong_options(arguments: dict[str, Any], one_line: OneLine) -> None:
-    with pytest.raises(OptionError) as caught:
+def test_wrong_options(arguments: dict[str, Any]) -> None:
+    with pytest.raises(OptionError):
         DeepDetect(**arguments)
-    one_line(caught.value)
 
 
 # Weights that are wrong.
@@ -199,7 +197,6 @@ def test_wrong_weights(
     name: str,
     backend: str,
     tmp_path: Path,
-    one_line: OneLine,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     if backend == "torch":
@@ -209,7 +206,7 @@ def test_wrong_weights(
         write(tmp_path / name)
     with pytest.raises(WeightsError) as caught:
         DeepDetect(tmp_path / name, backend=backend)
-    assert words in one_line(caught.value)
+    assert words in str(caught.value)
     assert name in str(caught.value)
     printed = capfd.readouterr()
     assert printed.out == printed.err == ""
@@ -236,20 +233,16 @@ BAD_NETWORKS: dict[str, tuple[Sequence[tuple[str, str]], dict[str, Any], str]] =
 
 
 @pytest.mark.parametrize("name", BAD_NETWORKS)
-def test_a_network_that_does_not_fit(
-    name: str, backend: str, onnx_file: MakeOnnx, one_line: OneLine
-) -> None:
+def test_a_network_that_does_not_fit(name: str, backend: str, onnx_file: MakeOnnx) -> None:
     nodes, options, words = BAD_NETWORKS[name]
     path = onnx_file(*nodes, **options)
     with pytest.raises(WeightsError) as caught:
         DeepDetect(path, backend=backend)
-    assert words in one_line(caught.value)
+    assert words in str(caught.value)
     assert str(path) in str(caught.value)
 
 
-def test_a_network_that_answers_wrongly_later(
-    backend: str, onnx_file: MakeOnnx, one_line: OneLine
-) -> None:
+def test_a_network_that_answers_wrongly_later(backend: str, onnx_file: MakeOnnx) -> None:
     """Finite on what a network is tried on, which is never black."""
     detector = DeepDetect(onnx_file(("Div", "mean"), ("Mul", "mean")), backend=backend)
     image = np.random.default_rng(0).integers(1, 256, (48, 64, 3), np.uint8)
@@ -257,7 +250,7 @@ def test_a_network_that_answers_wrongly_later(
     image[7, 9] = 0
     with pytest.raises(WeightsError) as caught:
         detector.detect(image)
-    assert "not finite" in one_line(caught.value)
+    assert "not finite" in str(caught.value)
 
 
 def test_threads_get_their_own_images(backend: str) -> None:
@@ -332,7 +325,7 @@ def test_bfloat16_moves_few_keypoints(image: np.ndarray) -> None:
 @pytest.mark.parametrize(
     "heatmap", [np.full((48, 64), np.nan, np.float32), np.zeros((24, 32), np.float32)]
 )
-def test_a_heat_map_of_somebody_s_own_detector(heatmap: np.ndarray, one_line: OneLine) -> None:
+def test_a_heat_map_of_somebody_s_own_detector(heatmap: np.ndarray) -> None:
     class Own:
         def heatmap(self, image: Any) -> np.ndarray:
             return heatmap
@@ -340,7 +333,7 @@ def test_a_heat_map_of_somebody_s_own_detector(heatmap: np.ndarray, one_line: On
     image = np.zeros((48, 64, 3), np.uint8)
     with pytest.raises(OptionError) as caught:
         match_images(image, image, Own())
-    assert "heat map must be" in one_line(caught.value)
+    assert "heat map must be" in str(caught.value)
 
 
 def test_a_network_is_loaded_once_until_its_file_changes(

@@ -31,10 +31,10 @@ def options(edge_detector: DeepDetect) -> BenchmarkOptions:
     ],
     ids=str,
 )
-def test_wrong_names_bring_the_nearest(options, change, nearest: str, one_line) -> None:
+def test_wrong_names_bring_the_nearest(options, change, nearest: str) -> None:
     with pytest.raises(OptionError) as caught:
         dataclasses.replace(options, **change).deepdetect_480()
-    assert nearest in one_line(caught.value)
+    assert nearest in str(caught.value)
 
 
 def names(methods) -> list[str]:

@@ -73,10 +73,9 @@ def test_indexing_is_that_of_numpy(index: Any, kept: list[int]) -> None:
         ([0, 1, 2, -2], r"not in \[-2, 2\]"),
     ],
 )
-def test_indices_that_do_not_fit_are_an_error(indices: Any, words: str, one_line) -> None:
-    with pytest.raises(OptionError, match=words) as caught:
+def test_indices_that_do_not_fit_are_an_error(indices: Any, words: str) -> None:
+    with pytest.raises(OptionError, match=words):
         matches_of([5, 6, 7, 8], [1, 2, 3, 4], indices0=np.array(indices))
-    one_line(caught.value)
 
 
 def test_indices_are_looked_up_where_none_are_given() -> None:

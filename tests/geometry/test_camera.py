@@ -93,20 +93,19 @@ def test_views_may_differ(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_is_wrong_is_said(tmp_path: Path, one_line, values: Any, message: str) -> None:
+def test_what_is_wrong_is_said(tmp_path: Path, values: Any, message: str) -> None:
     path = written(tmp_path, values)
     with pytest.raises(ReconstructionError, match=message) as error:
         Calibration.load(path, SIZE, SIZE)
-    message = one_line(error.value)
+    message = str(error.value)
     assert str(path) in message
     assert len(message) < 300 + len(str(path))
 
 
-def test_a_missing_file_is_said(tmp_path: Path, one_line) -> None:
+def test_a_missing_file_is_said(tmp_path: Path) -> None:
     for path, words in ((tmp_path / "no.json", "cannot be read"), (tmp_path, "does not hold")):
-        with pytest.raises(ReconstructionError, match=words) as error:
+        with pytest.raises(ReconstructionError, match=words):
             Calibration.load(path, SIZE, SIZE)
-        one_line(error.value)
 
 
 def test_the_principal_point_is_the_middle_where_none_is_given() -> None:

@@ -36,10 +36,10 @@ def test_slices_masks_and_numbers_select_points() -> None:
         (np.zeros((1, 3)), [[0, 0, 0]], "baselin", "did you mean 'baseline'"),
     ],
 )
-def test_mistakes_are_one_sentence(points, colors, unit: str, word: str, one_line) -> None:
+def test_mistakes_are_one_sentence(points, colors, unit: str, word: str) -> None:
     with pytest.raises(OptionError) as caught:
         PointCloud(points, colors, unit)
-    assert word in one_line(caught.value)
+    assert word in str(caught.value)
 
 
 def test_normals_have_the_shape_of_the_points() -> None:

@@ -19,7 +19,7 @@ NEEDED = {
 
 @pytest.mark.parametrize("name", NEEDED)
 def test_without_its_program_a_drop_in_says_what_to_install(
-    name: str, monkeypatch: pytest.MonkeyPatch, one_line
+    name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for package in (*NEEDED, "torch"):
         monkeypatch.setitem(sys.modules, package, None)
@@ -27,7 +27,7 @@ def test_without_its_program_a_drop_in_says_what_to_install(
     with pytest.raises(MissingExtraError) as caught:
         importlib.import_module(f"deepdetect.integrations.{name}")
     package = NEEDED[name]
-    assert package in one_line(caught.value)
+    assert package in str(caught.value)
     assert install_command(package).removeprefix("pip install ").split(",")[0] in str(caught.value)
 
 

@@ -81,7 +81,7 @@ def test_files_of_detect_and_match(pair: Path, tmp_path: Path) -> None:
         read_collection(files, images=pair)
 
 
-def test_names_with_folders_and_what_does_not_fit(tmp_path: Path, one_line) -> None:
+def test_names_with_folders_and_what_does_not_fit(tmp_path: Path) -> None:
     import h5py
 
     rng = np.random.default_rng(0)
@@ -111,9 +111,8 @@ def test_names_with_folders_and_what_does_not_fit(tmp_path: Path, one_line) -> N
         {"files": [tmp_path / "f.h5", tmp_path / "a.npz"]},
         {"files": []},
     ):
-        with pytest.raises(DeepDetectError) as caught:
+        with pytest.raises(DeepDetectError):
             read_collection(**arguments)
-        one_line(caught.value)
 
 
 def _write_hloc_files(folder: Path, count: int) -> None:
@@ -129,11 +128,10 @@ def _write_hloc_files(folder: Path, count: int) -> None:
 
 
 @pytest.mark.parametrize("count", [3, 7])
-def test_matches_of_other_features_are_refused(tmp_path: Path, one_line, count: int) -> None:
+def test_matches_of_other_features_are_refused(tmp_path: Path, count: int) -> None:
     _write_hloc_files(tmp_path, count)
-    with pytest.raises(DeepDetectError, match=f"{count} keypoints of 1.jpg, which has 5") as caught:
+    with pytest.raises(DeepDetectError, match=f"{count} keypoints of 1.jpg, which has 5"):
         read_collection([tmp_path / "f.h5"], matches=tmp_path / "m.h5")
-    one_line(caught.value)
 
 
 def test_a_pair_both_ways_round_is_one_pair(tmp_path: Path) -> None:
@@ -152,13 +150,12 @@ def test_a_pair_both_ways_round_is_one_pair(tmp_path: Path) -> None:
     assert matches.rows.tolist() == [[0, 1], [3, 2]]  # the better one of keypoint 2's two
 
 
-def test_the_folder_of_other_photographs_is_refused(tmp_path: Path, one_line) -> None:
+def test_the_folder_of_other_photographs_is_refused(tmp_path: Path) -> None:
     _write_hloc_files(tmp_path, 5)
     (tmp_path / "photos").mkdir()
     for folder in ("photos", "none"):
-        with pytest.raises(OptionError, match="none of the images") as caught:
+        with pytest.raises(OptionError, match="none of the images"):
             read_collection([tmp_path / "f.h5"], images=tmp_path / folder)
-        one_line(caught.value)
     (tmp_path / "photos" / "2.jpg").write_bytes(b"")
     assert read_collection([tmp_path / "f.h5"], images=tmp_path / "photos").path("1.jpg") is None
 

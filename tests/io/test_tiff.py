@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from deepdetect import DeepDetectError, load_image
 from deepdetect._shared.errors import ImageError, MissingExtraError
 from fuzz.targets.tiff import expected_rgb, tiff_files
 
-OneLine = Callable[[BaseException], str]
 RNG = np.random.default_rng(5)
 GREY = RNG.integers(0, 256, (20, 30), dtype=np.uint8)
 COLOUR = RNG.integers(0, 256, (20, 30, 3), dtype=np.uint8)
@@ -90,16 +88,15 @@ def test_16_bit_colour_png_keeps_the_numbers_of_its_sensor(tmp_path: Path) -> No
     np.testing.assert_array_equal(load_image(tmp_path / "a.png"), exact)
 
 
-def test_ranges_are_given_for_signed_and_large_numbers(one_line: OneLine) -> None:
+def test_ranges_are_given_for_signed_and_large_numbers() -> None:
     for values, low, high in (
         (GREY.astype(np.int16) - 100, -100, 155),
         (GREY.astype(np.uint32) * 1000, 0, 255000),
         (GREY.astype(np.float64) - 7, -7, 248),
     ):
         content = written(values, photometric="minisblack")
-        with pytest.raises(ImageError, match="value_range") as caught:
+        with pytest.raises(ImageError, match="value_range"):
             load_image(content)
-        one_line(caught.value)
         np.testing.assert_array_equal(load_image(content, value_range=(low, high)), triple(GREY))
         np.testing.assert_array_equal(load_image(values, value_range=(low, high)), triple(GREY))
 
@@ -115,16 +112,15 @@ def test_numbers_that_use_little_of_their_range_are_told(values: np.ndarray) -> 
 
 
 @pytest.mark.parametrize("planes", ["contig", "separate"])
-def test_bands_are_chosen(planes: str, one_line: OneLine) -> None:
+def test_bands_are_chosen(planes: str) -> None:
     bands = RNG.integers(0, 256, (7, 20, 30), dtype=np.uint8)
     stored = bands if planes == "separate" else np.moveaxis(bands, 0, 2)
     content = written(stored, photometric="minisblack", planarconfig=planes)
     expected = np.moveaxis(bands[[3, 2, 1]], 0, 2)
     np.testing.assert_array_equal(load_image(content, bands=(4, 3, 2)), expected)
     np.testing.assert_array_equal(load_image(stored, bands=(4, 3, 2)), expected)
-    with pytest.raises(ImageError, match="has 7 bands: choose three") as caught:
+    with pytest.raises(ImageError, match="has 7 bands: choose three"):
         load_image(content)
-    one_line(caught.value)
     with pytest.raises(ImageError, match="has 7 bands"):
         load_image(content, bands=(8, 2, 1))
 
@@ -151,7 +147,7 @@ def test_white_is_zero_and_palettes() -> None:
         np.testing.assert_array_equal(load_image(content), np.moveaxis(colours[:, GREY], 0, 2))
 
 
-def test_the_full_image_is_read_and_further_pages_by_number(one_line: OneLine) -> None:
+def test_the_full_image_is_read_and_further_pages_by_number() -> None:
     small = GREY[:16, :16].copy()
     file = io.BytesIO()
     with tifffile.TiffWriter(file) as writer:
@@ -205,11 +201,11 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_what_is_not_read_is_refused_by_name(kind: str, one_line: OneLine) -> None:
+def test_what_is_not_read_is_refused_by_name(kind: str) -> None:
     content, words = REFUSED[kind]
     with pytest.raises(ImageError) as caught:
         load_image(content)
-    assert words in one_line(caught.value)
+    assert words in str(caught.value)
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG", "TIFF"])
@@ -230,7 +226,7 @@ def test_truncated_files_are_read_where_that_is_asked_for(kind: str, photo: np.n
 
 
 def test_without_imagecodecs_pillow_decodes_what_it_decodes_rightly(
-    monkeypatch: pytest.MonkeyPatch, one_line: OneLine
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     fine = [
         written(COLOUR, photometric="rgb", compression="lzw"),
@@ -249,10 +245,10 @@ def test_without_imagecodecs_pillow_decodes_what_it_decodes_rightly(
         np.testing.assert_array_equal(load_image(content), expected)
     with pytest.raises(MissingExtraError, match="compressed by LZW") as caught:
         load_image(deep)
-    assert "pip install imagecodecs" in one_line(caught.value)
+    assert "pip install imagecodecs" in str(caught.value)
 
 
-def test_reading_options_are_checked(one_line: OneLine) -> None:
+def test_reading_options_are_checked() -> None:
     for wrong in (
         {"page": -1},
         {"page": 0.5},
@@ -263,6 +259,5 @@ def test_reading_options_are_checked(one_line: OneLine) -> None:
         {"value_range": (0, np.nan)},
         {"value_range": "ab"},
     ):
-        with pytest.raises(deepdetect.OptionError) as caught:
+        with pytest.raises(deepdetect.OptionError):
             load_image(written(GREY), **wrong)
-        one_line(caught.value)

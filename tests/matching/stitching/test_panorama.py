@@ -115,14 +115,12 @@ def test_registration_at_reduced_size(views) -> None:
     assert corner_error(between, double @ true @ np.linalg.inv(double), (600, 560)) < 1
 
 
-def test_what_makes_no_panorama_is_refused(views, one_line) -> None:
+def test_what_makes_no_panorama_is_refused(views) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (200, 200, 3)).astype(np.uint8)
-    with pytest.raises(DeepDetectError, match="no two of these 2 images overlap") as error:
+    with pytest.raises(DeepDetectError, match="no two of these 2 images overlap"):
         stitch([views.images[0], noise])
-    one_line(error.value)
-    with pytest.raises(OptionError, match="max_canvas_megapixels") as error:
+    with pytest.raises(OptionError, match="max_canvas_megapixels"):
         stitch(views.images[:2], options=StitchingOptions(max_canvas_megapixels=0.1))
-    one_line(error.value)
     with pytest.raises(ImageError, match="no file"):
         stitch([views.images[0], "missing.png"])
     with pytest.raises(OptionError, match="two images"):
@@ -140,10 +138,9 @@ def test_what_makes_no_panorama_is_refused(views, one_line) -> None:
     ],
     ids=str,
 )
-def test_options_out_of_range_are_refused(views, options: dict, one_line) -> None:
-    with pytest.raises(OptionError) as error:
+def test_options_out_of_range_are_refused(views, options: dict) -> None:
+    with pytest.raises(OptionError):
         stitch(views.images[:2], **options)
-    one_line(error.value)
 
 
 MEASURED = """
