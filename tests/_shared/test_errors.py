@@ -103,6 +103,6 @@ def missing_files() -> dict[str, Callable[[Path], object]]:
 @pytest.mark.parametrize("name", missing_files())
 def test_a_missing_file_is_a_file_not_found_error(name: str, tmp_path: Path) -> None:
     path = tmp_path / "missing.onnx"
-    with pytest.raises(FileNotFoundError, match="missing") as caught:
+    with pytest.raises(FileNotFoundError) as caught:
         missing_files()[name](path)
     assert isinstance(caught.value, DeepDetectError)

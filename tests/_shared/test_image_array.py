@@ -56,7 +56,7 @@ def test_what_is_no_image_is_one_sentence(shape: tuple[int, ...], words: str) ->
 
 
 def test_an_unknown_order_is_named_before_the_work() -> None:
-    with pytest.raises(OptionError, match="did you mean 'rgb'"):
+    with pytest.raises(OptionError, match="'rgb'"):
         check_channels("brg")
-    with pytest.raises(OptionError, match="unknown channel order 'gray'"):
+    with pytest.raises(OptionError, match="'gray'"):
         array_to_rgb(np.zeros((20, 20), np.uint8), "gray")  # type: ignore[arg-type]

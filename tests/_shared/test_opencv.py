@@ -27,7 +27,7 @@ def put(monkeypatch: pytest.MonkeyPatch, **names: object) -> None:
 
 def test_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(MissingExtraError, match=r"cannot be imported .*opencv-python-headless"):
+    with pytest.raises(MissingExtraError):
         assert opencv.cv2.resize
 
 
@@ -39,13 +39,13 @@ def test_new_enough(monkeypatch: pytest.MonkeyPatch, version: str) -> None:
 
 def test_too_old(monkeypatch: pytest.MonkeyPatch) -> None:
     put(monkeypatch, __version__="4.9.0")
-    with pytest.raises(MissingExtraError, match=r"4\.9\.0 is installed"):
+    with pytest.raises(MissingExtraError, match=r"4\.9\.0"):
         assert opencv.cv2.resize
 
 
 def test_an_empty_folder_that_another_package_left(monkeypatch: pytest.MonkeyPatch) -> None:
     put(monkeypatch)
-    with pytest.raises(MissingExtraError, match=r"not complete.*--force-reinstall opencv"):
+    with pytest.raises(MissingExtraError, match="force-reinstall"):
         assert opencv.cv2.resize
 
 

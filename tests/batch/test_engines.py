@@ -24,7 +24,7 @@ def test_the_engines() -> None:
 
 def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingExtraError, match=r"pip install .ray\[data\]"):
+    with pytest.raises(MissingExtraError):
         list(map_on_ray(math.sqrt, [1.0]))
 
 
@@ -42,7 +42,7 @@ def test_outcomes_and_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     assert list(map_on_ray(math.factorial, [])) == []
     tasks = list(range(50))
     assert sorted(map_on_ray(math.factorial, tasks, 2)) == [math.factorial(n) for n in tasks]
-    with pytest.raises(ImageError, match="there is no file"):
+    with pytest.raises(ImageError):
         list(map_on_ray(load_image, ["none.png"], 1))
 
 

@@ -71,7 +71,7 @@ def test_what_is_done_is_skipped(features: Path, tmp_path: Path, monkeypatch) ->
     more = [PAIR[::-1], ("b/01.png", "a/02.png")]
     report = match_pairs(features, more, path, workers=1)
     assert (list(report.counts), report.skipped) == ([more[1]], 1)
-    with pytest.raises(OptionError, match=r"other settings \(`ratio`\)"):
+    with pytest.raises(OptionError, match="`ratio`"):
         match_pairs(features, more, path, options=PairMatchingOptions(ratio=0.7))
     monkeypatch.setattr("shutil.rmtree", lambda path: None)  # the shards stay
     report = match_pairs(features, more, path, workers=1, overwrite=True)
@@ -178,7 +178,7 @@ def test_keypoints_that_neighbours_do_not_suit_are_refused_at_once(tmp_path: Pat
     whole = generator.uniform(0, 99, (40, 2)), generator.normal(size=(8, 40))
     write_foreign(tmp_path / "f.h5", a=whole, b=whole)
     how = PairMatchingOptions(filter_by="neighbours")
-    with pytest.raises(OptionError, match="take 'ratio'"):
+    with pytest.raises(OptionError, match="'ratio'"):
         match_pairs(tmp_path / "f.h5", "exhaustive", tmp_path / "m.h5", options=how, workers=1)
     assert not (tmp_path / "m.h5").exists()
 
@@ -250,7 +250,7 @@ def test_features_that_do_not_fit_do_not_stop_the_others(tmp_path: Path) -> None
 
 @pytest.mark.parametrize("pairs", [["a.jpg"], ["ab"], [("a", "b", "c")], [("a", "a")], [("a", "")]])
 def test_wrong_pairs_from_python(pairs: object, tmp_path: Path) -> None:
-    with pytest.raises(OptionError, match="in `pairs` is no pair"):
+    with pytest.raises(OptionError, match="`pairs`"):
         match_pairs(tmp_path / "f.h5", pairs, tmp_path / "m.h5")
 
 

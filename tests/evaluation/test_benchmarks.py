@@ -231,7 +231,7 @@ def test_hpatches_has_the_tables_of_all_protocols(
 
 
 def test_unknown_names_and_missing_data_are_said(tmp_path: Path, options: BenchmarkOptions) -> None:
-    with pytest.raises(OptionError, match="did you mean 'oxford'"):
+    with pytest.raises(OptionError, match="'oxford'"):
         run_benchmarks(["oxfrod"], tmp_path, options)
     for name in BENCHMARKS:
         with pytest.raises(ImageError) as missing:
@@ -256,7 +256,7 @@ def test_a_missing_package_stops_only_the_benchmark_that_needs_it(
     with pytest.raises(MissingExtraError):
         run_benchmarks(["one"], tmp_path, options)
     monkeypatch.setitem(sys.modules, "scipy", None)
-    with pytest.raises(MissingExtraError, match="the package scipy"):
+    with pytest.raises(MissingExtraError, match="scipy"):
         run_benchmarks(["other"], tmp_path, options)
-    with pytest.raises(MissingExtraError, match="the package scipy"):
+    with pytest.raises(MissingExtraError, match="scipy"):
         evaluate(oxford=tmp_path)

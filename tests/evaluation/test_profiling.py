@@ -66,7 +66,7 @@ def test_a_child_tells_its_own_memory_not_that_of_its_parent() -> None:
 
 
 def test_a_child_that_is_ended_is_one_sentence() -> None:
-    with pytest.raises(DeepDetectError, match="process was ended") as caught:
+    with pytest.raises(DeepDetectError) as caught:
         run_in_child(_leave)
     assert "\n" not in str(caught.value)
     with pytest.raises(ValueError, match="math domain"):

@@ -227,7 +227,7 @@ def test_a_damaged_file_is_made_anew_and_repaired(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(CacheError, match="cannot write"):
+    with pytest.raises(CacheError):
         is_made(Run(tmp_path, tmp_path / "file"), "matches", 1)
 
 

@@ -277,7 +277,7 @@ def test_damaged_photographs_do_not_end_the_measurement_of_the_others(
     assert "2 of the parts failed, the others are done" in result.stderr
     for name in ("b.png", "c.png"):
         (photographs / name).write_bytes(b"damaged")
-    with pytest.raises(ImageError, match=r"foreground of the weights on a\.png"):
+    with pytest.raises(ImageError, match=r"a\.png"):
         evaluate(foreground=photographs)
 
 

@@ -61,9 +61,9 @@ def test_images_of_any_kind_lie_below(photo: np.ndarray) -> None:
         (Image.fromarray(photo), "bgr"),
     ):
         np.testing.assert_array_equal(points.draw(image, channels=channels), photo // 2)
-    with pytest.raises(ImageError, match="100x256 pixels, the keypoints are of one of 256x256"):
+    with pytest.raises(ImageError, match="100x256"):
         points.draw(photo[:, :100])
-    with pytest.raises(ImageError, match=r"give load_image\(path\)"):
+    with pytest.raises(ImageError, match="load_image"):
         points.draw("photo.png")
 
 

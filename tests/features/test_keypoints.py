@@ -78,9 +78,9 @@ def test_the_best_have_the_highest_scores(scores: list[float], count: int) -> No
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_numbers_that_are_not_finite_are_an_error(value: float) -> None:
-    with pytest.raises(OptionError, match="finite"):
+    with pytest.raises(OptionError):
         Keypoints(np.array([[value, 0]]), np.zeros(1), SIZE)
-    with pytest.raises(OptionError, match="finite"):
+    with pytest.raises(OptionError):
         Keypoints(np.zeros((1, 2)), np.array([value]), SIZE)
 
 

@@ -138,7 +138,7 @@ def test_ties_are_spread_over_the_image(radius: int, count: int) -> None:
 @pytest.mark.parametrize("shape", [(31, 24), (24, 30), (24, 31, 1), (24,), ()])
 def test_an_ignore_mask_of_another_size(shape: tuple[int, ...]) -> None:
     heatmap = np.zeros((24, 31), np.float32)
-    with pytest.raises(OptionError, match="ignore mask must have") as caught:
+    with pytest.raises(OptionError) as caught:
         select_keypoints(heatmap, ignore=np.zeros(shape, bool))
     assert "(24, 31)" in str(caught.value)
 

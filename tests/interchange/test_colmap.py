@@ -79,11 +79,11 @@ def test_without_sizes_and_descriptors(tmp_path: Path) -> None:
     with pycolmap.Database.open(path) as database:
         np.testing.assert_allclose(database.read_keypoints(1)[:, :2], [[3.5, 4.5]])
         assert not len(database.read_descriptors(1).data)
-    with pytest.raises(OptionError, match="SIFT descriptors"):
+    with pytest.raises(OptionError):
         write_colmap_text(Collection({"a": points}), tmp_path / "text")
-    with pytest.raises(OptionError, match="no camera"):
+    with pytest.raises(OptionError):
         write_colmap(Collection({"a": points}), tmp_path / "e.db", intrinsics={})
-    with pytest.raises(OptionError, match=r"\.db"):
+    with pytest.raises(OptionError):
         write_colmap(Collection({"a": points}), tmp_path / "e.txt", intrinsics={"a": INTRINSICS})
 
 

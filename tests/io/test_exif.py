@@ -98,10 +98,10 @@ def test_what_carries_no_focal_length_says_what_to_give(tmp_path: Path) -> None:
         photograph({FOCAL: 5.0, PLANE_X: 0.0}),
         b"no image",
     ):
-        with pytest.raises(ReconstructionError, match="give `focal_px` or `calibration`"):
+        with pytest.raises(ReconstructionError, match=r"`focal_px`.*`calibration`"):
             camera_from_exif(image, (300, 200))
     cropped = photograph({FILM: 24, WIDTH: 400, HEIGHT: 200})
-    with pytest.raises(ReconstructionError, match=r"cropped .*400x200"):
+    with pytest.raises(ReconstructionError, match="400x200"):
         camera_from_exif(cropped, (300, 200))
 
 

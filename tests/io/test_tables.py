@@ -220,7 +220,7 @@ def test_indices_of_no_keypoint_are_damage(tmp_path: Path) -> None:
     with np.load(tmp_path / "m.npz") as file:
         arrays = dict(file)
     np.savez(tmp_path / "bad.npz", **{**arrays, "indices1": arrays["indices1"] + 5})
-    with pytest.raises(ValueError, match=r"holds no matches \(indices1 must lie in \[-1, 2\]"):
+    with pytest.raises(ValueError, match="indices1"):
         load_matches(tmp_path / "bad.npz")
 
 

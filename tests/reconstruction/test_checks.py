@@ -156,7 +156,7 @@ def check_all(points: Any, calibration: Calibration) -> None:
 @pytest.mark.parametrize("factor", [0.2, 0.3, 0.5])
 def test_a_wrong_focal_length(turned: Any, refined: Any, factor: float, one_line) -> None:
     calibration = scaled(turned.calibration, factor)
-    with pytest.raises(ReconstructionError, match="focal length") as error:
+    with pytest.raises(ReconstructionError) as error:
         check_all(refined, calibration)
     message = one_line(error.value)
     assert f"{calibration.camera0.focal_px[0]:.0f} px (calib.json) is probably wrong" in message
@@ -176,7 +176,7 @@ def test_too_long_a_focal_length_is_seen_where_the_camera_turned_more(
     if factor == 1:
         check_all(points, calibration)
         return
-    with pytest.raises(ReconstructionError, match="focal length"):
+    with pytest.raises(ReconstructionError):
         check_all(points, calibration)
 
 

@@ -26,7 +26,7 @@ def test_small_sets_are_matched_exhaustively_and_large_ones_by_likeness() -> Non
     ],
 )
 def test_wrong_options_are_refused(wrong: dict) -> None:
-    with pytest.raises(OptionError, match=r"sequential|must|unknown"):
+    with pytest.raises(OptionError):
         MultiViewOptions(**wrong)
 
 

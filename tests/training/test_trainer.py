@@ -240,7 +240,7 @@ def test_a_run_can_start_from_the_mean_of_several_weights(run: Path, tmp_path: P
 
 def test_random_weights_are_not_kept(photographs: Path, tmp_path: Path) -> None:
     options = dataclasses.replace(TINY, frozen_batch_norm=True)
-    with pytest.raises(OptionError, match=r"`frozen_batch_norm` .* `init_weights`"):
+    with pytest.raises(OptionError, match=r"`frozen_batch_norm`.*`init_weights`"):
         train(photographs, tmp_path / "run", options, device=PLAIN)
     assert not (tmp_path / "run").exists()
 

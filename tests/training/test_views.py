@@ -118,5 +118,5 @@ def test_photographs_keep_their_side_when_others_come() -> None:
 def test_few_photographs_still_give_one_for_validation() -> None:
     kept, held = train_val_split(images(2))
     assert (len(kept), len(held)) == (1, 1)
-    with pytest.raises(ImageError, match="too few"):
+    with pytest.raises(ImageError):
         train_val_split(images(1))

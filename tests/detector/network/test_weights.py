@@ -34,15 +34,15 @@ def test_weights_with_a_tensor_of_another_shape_are_refused(
 ) -> None:
     state = fast_network.state_dict() | {"logits.bias": torch.zeros(5)}
     save_tensors(state, tmp_path / "weights.safetensors", {})
-    with pytest.raises(WeightsError, match=r"does not fit .*logits\.bias"):
+    with pytest.raises(WeightsError, match=r"logits\.bias"):
         load_network(tmp_path / "weights.safetensors")
 
 
 def test_networks_are_not_mixed(fast_files: tuple[Path, Path], tmp_path: Path) -> None:
     fast, espnet = fast_files[1], pretrained_weights("espnet", ".safetensors")
-    with pytest.raises(WeightsError, match="another network"):
+    with pytest.raises(WeightsError):
         average_weights([espnet, fast])
-    with pytest.raises(OptionError, match="not of the network espnet"):
+    with pytest.raises(OptionError, match="espnet"):
         initial_network(TrainingOptions(network="espnet"), fast)
     start = initial_network(TrainingOptions(network="fast"), [fast, fast])[1]
     assert type(start) is NETWORKS["fast"]
