@@ -8,16 +8,13 @@ import pytest
 
 pytest.importorskip("torch", reason="needs torch, which is for training only")
 
-import importlib.util
 
-from deepdetect import MissingExtraError
 from deepdetect.labels import LabelOptions
 from deepdetect.training import (
     DeviceOptions,
     Stage,
     TrainingOptions,
     profile,
-    train,
     train_descriptor,
     train_points,
 )
@@ -51,16 +48,6 @@ def test_a_profile_times_each_stage_and_writes_no_weights(
         assert 50e6 < stage.memory_bytes < 20e9
         assert stage.device_memory_bytes is None
     assert {path.name for path in tmp_path.iterdir()} == {"labels"}
-
-
-def test_a_missing_package_is_named_before_any_work(
-    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    for function in (train, profile):
-        with pytest.raises(MissingExtraError, match="torch"):
-            function(photographs, tmp_path / "run")
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("validation", ["images/val", "other"])

@@ -158,7 +158,7 @@ def test_a_damaged_image_is_named(shards: Shards, source: ShardSource, tmp_path:
                 new.addfile(member, data)
         damaged = ShardSource(((copy, count),), OPTIONS)
         name = source[0].path.name
-        with pytest.raises(ImageError, match=f"{copy.name} is damaged .*{name}"):
+        with pytest.raises(ImageError, match=f"{copy.name}.*{name}"):
             damaged.load(0, source[0].normal[0])
 
 

@@ -186,12 +186,12 @@ def test_starting_again_after_the_end_changes_nothing(run: Path, tmp_path: Path,
 def test_another_run_in_the_same_folder_is_refused(
     run: Path, photographs: Path, tmp_path: Path, fit
 ) -> None:
-    for changes, match in (
-        ({"options": dataclasses.replace(OPTIONS, seed=5)}, "`seed`"),
-        ({"validation": photographs}, r"\(`images_digest`\)"),
-        ({"init_weights": "espnet"}, r"\(`frozen_batch_norm`, `initial_weights`\)"),
+    for name, changes in (
+        ("`seed`", {"options": dataclasses.replace(OPTIONS, seed=5)}),
+        ("`images_digest`", {"validation": photographs}),
+        ("`initial_weights`", {"init_weights": "espnet"}),
     ):
-        with pytest.raises(OptionError, match=match):
+        with pytest.raises(OptionError, match=name):
             fit(run, **changes)
 
 
@@ -310,16 +310,9 @@ def test_own_images_and_settings_from_the_pretrained_weights(
     """The command of docs/training.md, on few images."""
     settings = tmp_path / "labels.toml"
     settings.write_text('detectors = ["fast", "sobel"]\n[fast]\nnormal = { threshold = 30 }\n')
-    arguments = [sys.executable, "-m", "deepdetect", "train", str(photographs), "-o"]
-    arguments += [
-        str(tmp_path / "run"),
-        "--preset",
-        "espnet",
-        "--init",
-        "espnet",
-        "--label-settings",
-        str(settings),
-    ]
+    arguments = [sys.executable, "-m", "deepdetect", "train", str(photographs)]
+    arguments += ["-o", str(tmp_path / "run"), "--label-settings", str(settings)]
+    arguments += ["--preset", "espnet", "--init", "espnet"]
     arguments += ["--stage", "96x4x12", "--short-side", "96", "--learning-rate", "0.0005"]
     arguments += ["--warm-up", "0.05", "--dark-fraction", "0", "--val-count", "3", "--no-compile"]
     subprocess.run(

@@ -35,21 +35,6 @@ def images(count: int) -> list[SourceImage]:
     return [SourceImage(Path(f"photo{k}.jpg"), f"{k:08x}", (), ()) for k in range(count)]
 
 
-@pytest.mark.parametrize(
-    ("view", "name"),
-    [
-        (View(480), "480_normal"),
-        (View(240, Darkening(0.3, 0.4)), "240_b0.300c0.400"),
-        (View(240, Darkening(0.2345, 1)), "240_b0.234c1.000"),
-        (View(240, None, "squash"), "240x_normal"),
-        (View(240, None, "crop"), "240c_normal"),
-        (View(240, Darkening(0.3, 0.4), None, 255), "240v3-000000ff_b0.300c0.400"),
-    ],
-)
-def test_names(view: View, name: str) -> None:
-    assert view.name == name
-
-
 @given(
     name=st.text("abcAB/._äß0", max_size=20),
     short_sides=st.lists(st.integers(64, 999), min_size=1, max_size=4, unique=True).map(tuple),

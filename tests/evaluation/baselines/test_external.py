@@ -14,7 +14,6 @@ from scipy.ndimage import map_coordinates
 
 from deepdetect import OptionError, WeightsError
 from deepdetect.evaluation.baselines.external import (
-    _maxima,
     find_feature,
     onnx_feature,
     plugin_feature,
@@ -115,14 +114,11 @@ def test_no_keypoints_are_an_answer(write: Write, crop: np.ndarray) -> None:
     assert len(method.describe(crop, found)) == 0
 
 
-@pytest.mark.parametrize(
-    "target", ["no_such_module_of_ours:find", "json:no_such_function", ":dumps", "json:decoder"]
-)
-def test_a_wrong_name_is_an_error_in_one_line(target: str) -> None:
+@pytest.mark.parametrize("target", ["no_such_module_of_ours:find", "json:decoder"])
+def test_a_wrong_name_is_an_error(target: str) -> None:
     before = list(sys.path)
-    with pytest.raises(OptionError) as caught:
+    with pytest.raises(OptionError, match=target):
         plugin_feature(target)
-    assert target in str(caught.value)
     assert sys.path == before
 
 
@@ -132,11 +128,6 @@ def test_the_version_follows_the_modules_file(write: Write) -> None:
     assert plugin_feature(f"{name}:find").version == first
     os.utime(f"{name}.py", ns=(10**18, 10**18))
     assert plugin_feature(f"{name}:find").version != first
-
-
-def test_an_unknown_word_brings_the_nearest_and_the_other_ways() -> None:
-    with pytest.raises(OptionError, match="'fast-low'"):
-        find_feature("fast_low")
 
 
 Make = Callable[..., Path]
@@ -335,16 +326,5 @@ def test_what_is_no_network_is_said(make: Make, tmp_path: Path) -> None:
     half.write_bytes(make().read_bytes()[:200])
     other = make(rename="points", name="other.onnx")
     for path in (tmp_path / "none.onnx", tmp_path, text, half, other):
-        with pytest.raises(WeightsError) as caught:
+        with pytest.raises(WeightsError, match=path.name):
             onnx_feature(path)
-        assert str(path) in str(caught.value)
-
-
-def test_descriptors_are_read_up_to_the_border_of_a_coarse_map() -> None:
-    logits = np.full((64, 96), -9.0, np.float32)
-    logits[59, 91] = 9.0  # beyond the middle of the last cell of 32 pixels
-    values = np.arange(1.0, 13).reshape(2, 2, 3).astype(np.float32)
-    found = _maxima(logits, values)
-    assert found["keypoints"].tolist() == [[91, 59]]
-    corner = values[:, -1, -1]
-    np.testing.assert_allclose(found["descriptors"], [corner / np.linalg.norm(corner)], rtol=1e-6)
