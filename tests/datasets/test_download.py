@@ -223,8 +223,8 @@ def test_archives_and_single_files_are_put_together(server: Server, tmp_path: Pa
     assert same == content_digest(folder, "scene/img2") != content_digest(folder, "scene/img1")
     checked = replace(made, contents={"scene/img2": same})
     assert get_dataset(checked, tmp_path / "again").is_dir()
-    for name, word in (("scene/img1", "not the one"), ("scene/img9", "missing")):
-        with pytest.raises(DeepDetectError, match=word):
+    for name in ("scene/img1", "scene/img9"):
+        with pytest.raises(DeepDetectError, match=name):
             get_dataset(replace(made, contents={name: same}), tmp_path / "wrong")
         assert not (tmp_path / "wrong").exists()
         assert not (tmp_path / "wrong.download").exists()
@@ -261,9 +261,8 @@ def test_damaged_archives_are_one_sentence_and_do_not_stay(
     kind: str, dataset: RemoteDataset, server: Server, tmp_path: Path
 ) -> None:
     server.content = DAMAGED_ARCHIVES[kind]
-    with pytest.raises(DeepDetectError) as caught:
+    with pytest.raises(DeepDetectError, match=server.url):
         get_dataset(with_file(dataset, checksum=None), tmp_path / "tiny")
-    assert f"{server.url} is no archive that can be unpacked (" in str(caught.value)
     assert list(tmp_path.iterdir()) == []
     server.content = archive()
     assert unpacked(get_dataset(with_file(dataset, checksum=None), tmp_path / "tiny")) == NAMES

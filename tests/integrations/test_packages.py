@@ -6,7 +6,6 @@ import sys
 import pytest
 
 from deepdetect import MissingExtraError
-from deepdetect._shared.errors import install_command
 
 NEEDED = {
     "hloc": "hloc",
@@ -24,11 +23,8 @@ def test_without_its_program_a_drop_in_says_what_to_install(
     for package in (*NEEDED, "torch"):
         monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, f"deepdetect.integrations.{name}", raising=False)
-    with pytest.raises(MissingExtraError) as caught:
+    with pytest.raises(MissingExtraError, match=NEEDED[name]):
         importlib.import_module(f"deepdetect.integrations.{name}")
-    package = NEEDED[name]
-    assert package in str(caught.value)
-    assert install_command(package).removeprefix("pip install ").split(",")[0] in str(caught.value)
 
 
 def test_some_need_nothing_more(monkeypatch: pytest.MonkeyPatch) -> None:

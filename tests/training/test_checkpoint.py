@@ -84,8 +84,7 @@ def test_altered_tensors_and_states_are_refused(tmp_path: Path) -> None:
         (tensors, {}),
     ):
         save_file(values, path, metadata=changed)
-        with pytest.raises(WeightsError) as caught:
+        with pytest.raises(WeightsError, match=path.name):
             read_checkpoint(path)
-        assert str(path) in str(caught.value)
     save_file(tensors, path, metadata=header)
     assert read_checkpoint(path)[1] == {"step": 1}

@@ -206,5 +206,5 @@ def test_who_asks_for_depth_gets_no_plane(facade: Any, model: str) -> None:
     errors = np.linalg.norm(found.points1 - pair.match(found.points0), axis=1)
     for part in (near, ~near):
         assert (errors[part] < 2).mean() > 0.9
-    with pytest.raises(OptionError, match=f"contradicts the model {model}"):
+    with pytest.raises(OptionError, match=model):
         match(*images, model=model, camera0=camera, camera1=camera, two_view_model="homography")
