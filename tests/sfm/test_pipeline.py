@@ -30,7 +30,7 @@ from deepdetect import (
     reconstruct_many,
 )
 from deepdetect._shared.records import key
-from deepdetect.batch.hdf5 import SETTINGS, open_hdf5
+from deepdetect.batch.hdf5 import open_hdf5
 from deepdetect.datasets.posed_images import load_posed_scenes
 from deepdetect.evaluation.metrics.pose import camera_errors, rotation_error
 from deepdetect.geometry.camera import PosedView
@@ -39,7 +39,7 @@ from deepdetect.sfm.colmap import CameraIntrinsics, write_database
 from deepdetect.sfm.formats import FORMATS
 from deepdetect.sfm.mapping import read_sparse_model, verify_pairs
 from deepdetect.sfm.pipeline import _write
-from deepdetect.sfm.stages import Stages, check_images
+from deepdetect.sfm.stages import Stages
 
 QUICK = {
     "workers": 1,
@@ -322,22 +322,6 @@ def test_photographs_of_another_size_do_not_stop_a_calibrated_run(
     assert not (tmp_path / "another").exists()
 
 
-@pytest.mark.parametrize(
-    ("descriptor", "filter_by"), [("rootsift", "neighbours"), ("cross-modal", "ratio")]
-)
-def test_matches_are_filtered_as_their_descriptors_allow(
-    write_fountain, tmp_path: Path, pycolmap, descriptor: str, filter_by: str
-) -> None:
-    folder = write_fountain(tmp_path / "photos", ("0004", "0005", "0006"))
-    detector = PointDetector(1000, descriptor=descriptor)
-    found = reconstruct_many(folder, tmp_path / "model", **{**SPARSE, "detector": detector})
-    with open_hdf5(tmp_path / "model" / "work" / "matches.h5") as file:
-        assert json.loads(file.attrs[SETTINGS])["filter_by"] == filter_by
-    assert len(found.views) == 3
-    assert len(found.sparse) > 200
-    assert np.median(found.sparse_errors) < 0.5
-
-
 def test_pairs_are_chosen(small) -> None:
     _, output, found = small
     names = ["0004.jpg", "0005.jpg", "0006.jpg", "other.jpg"]
@@ -375,20 +359,6 @@ def test_too_few_photographs_are_one_sentence(tmp_path: Path, photo: np.ndarray,
     Image.new("RGB", (200, 200)).save(folder / "black.png")
     with pytest.raises(ReconstructionError, match=r"black\.png"):
         reconstruct_many(folder, tmp_path / "model", **QUICK)
-
-
-def test_two_files_of_one_name_keep_their_folders(
-    tmp_path: Path, photo_path: Path, pycolmap
-) -> None:
-    paths = [tmp_path / name / photo_path.name for name in "ab"]
-    for path in paths:
-        path.parent.mkdir()
-        shutil.copy(photo_path, path)
-    assert check_images([*paths, paths[0]]) == {f"{p.parent.name}/{p.name}": p for p in paths}
-    with pytest.raises(ImageError):
-        reconstruct_many([photo_path, tmp_path / "missing.jpg"], tmp_path / "model")
-    with pytest.raises(OptionError):
-        reconstruct_many([photo_path, paths[1].rename(tmp_path / "other")], tmp_path / "model")
 
 
 def test_without_pycolmap_there_is_one_sentence(tmp_path: Path, monkeypatch) -> None:
@@ -511,30 +481,6 @@ def test_a_name_that_is_no_text_is_a_named_failure(
     assert odd in failures[odd]
 
 
-@pytest.fixture
-def nested(tmp_path: Path, photo_path: Path) -> Path:
-    """A folder of images in folders, with pictures of an earlier run's model among them."""
-    folder = tmp_path / "photos"
-    for name in ("3.png", "a/1.png", "b/2.png", "model/splat/images/3.png", "model/height.png"):
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(photo_path, folder / name)
-    return folder
-
-
-def test_results_among_the_images_are_no_images(nested: Path) -> None:
-    for _ in range(2):
-        made = Stages(nested / "model", MultiViewOptions(), 1, True).folder_of(nested)
-        files = {path.resolve() for path in check_images(made).values()}
-        assert files == {nested / name for name in ("3.png", "a/1.png", "b/2.png")}
-    outside = Stages(nested.parent / "model", MultiViewOptions(), 1, True)
-    assert len(check_images(outside.folder_of(nested))) == 5
-
-
-def test_images_keep_their_names_where_results_are_among_them(nested: Path) -> None:
-    made = Stages(nested / "model", MultiViewOptions(), 1, True).folder_of(nested)
-    assert {*check_images(made)} == {"3.png", "a/1.png", "b/2.png"}
-
-
 def test_formats_after_one_that_fails_are_written(
     small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -583,16 +529,6 @@ def test_dense_matches_of_another_stride_are_mapped_anew(
             Stages(tmp_path, options, 1, True).map(tmp_path, found.intrinsics, {}, False)
     assert keys[0] == keys[2]
     assert (keys[0] != keys[1]) == differ
-
-
-@pytest.mark.parametrize(
-    "values",
-    [{"ratio": 0}, {"ratio": 1.2}, {"formats": ("text", "mesh"), "dense": False}],
-    ids=str,
-)
-def test_options_that_can_give_nothing_are_refused(values: dict) -> None:
-    with pytest.raises(OptionError):
-        MultiViewOptions(**values)
 
 
 @pytest.mark.parametrize(("name", "kept"), [("notes.txt", True), ("features.h5", False)])
