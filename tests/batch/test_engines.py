@@ -13,13 +13,8 @@ from pathlib import Path
 import pytest
 
 from deepdetect import ImageError, MissingExtraError, PointDetector, load_image
-from deepdetect.batch import ENGINES, extract_features
+from deepdetect.batch import extract_features
 from deepdetect.batch.engines import map_on_ray
-
-
-def test_the_engines() -> None:
-    assert set(ENGINES) == {"processes", "ray"}
-    assert ENGINES["ray"] is map_on_ray
 
 
 def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -156,15 +156,6 @@ def test_groups_are_written_one_by_one(tmp_path: Path) -> None:
     assert values(tmp_path / "part.h5") == {f"{k}": k for k in range(9)}
 
 
-@pytest.mark.parametrize("count", [0, 1, 255, 256, 600, 10_000])
-def test_shards_are_small_and_hold_everything_once(count: int, tmp_path: Path) -> None:
-    items = [(number, (1,)) for number in range(count)]
-    tasks = hdf5._divided(items, tmp_path)
-    assert [item for _, shard in tasks for item in shard] == items
-    assert all(1 <= len(shard) <= 32 for _, shard in tasks)
-    assert len({path for path, _ in tasks}) == len(tasks) >= min(count, 256)
-
-
 def test_files_of_others_are_not_replaced(tmp_path: Path) -> None:
     import h5py
 

@@ -53,33 +53,6 @@ def test_the_report_is_written_and_printed(made, folder: Path) -> None:
     assert [row.split(",")[0] for row in rows[:3]] == ["method", "FAST", "Harris"]
 
 
-def test_json_can_be_parsed_and_names_the_files(made, folder: Path, run) -> None:
-    _, output = made
-    result = run(
-        *(
-            "dev",
-            "benchmark",
-            "foreground",
-            "--data",
-            folder,
-            "-o",
-            "out",
-            "--baselines",
-            "fast,harris",
-        ),
-        *("--cache", output / "cache", "--json"),
-    )
-    assert result.exit_code == 0, result.output
-    values = json.loads(result.stdout)
-    assert {Path(path).relative_to("out").as_posix() for path in values["files"]} == FILES
-    assert all(Path(path).is_file() for path in values["files"])
-    assert [row["method"] for row in values["tables"]["foreground"]["rows"]][:2] == [
-        *("FAST", "Harris"),
-    ]
-    assert values["metadata"]["results made, not found in the cache"] == "0"
-    assert values["skipped"] == []
-
-
 def test_a_further_method_is_one_more_row_and_the_rest_is_found(made, folder: Path, run) -> None:
     _, output = made
     Path("own_corner_finder.py").write_text(

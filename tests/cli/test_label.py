@@ -8,7 +8,7 @@ from PIL import Image
 
 from deepdetect import load_image
 from deepdetect.io.image import luma
-from deepdetect.labels import LabelOptions, find_label_settings, fuse
+from deepdetect.labels import fuse
 
 
 def test_writes_one_bit_masks(run, photos: Path) -> None:
@@ -59,16 +59,6 @@ def test_visualize_draws_four_panels(run, photos: Path) -> None:
         np.testing.assert_array_equal(panels[:150, left : left + 200, 0] > 0, mask)
 
 
-def test_subset_and_override(run, photos: Path) -> None:
-    run(
-        *("label", photos / "cat.jpg", "-o", "masks", "--detectors", "sobel, fast"),
-        *("--visibility", "low", "--workers", 1),
-    )
-    options = LabelOptions(("fast", "sobel"), "low")
-    expected = fuse(luma(load_image(photos / "cat.jpg")), options).mask
-    np.testing.assert_array_equal(np.asarray(Image.open("masks/cat.png")), expected)
-
-
 def test_a_bad_image_is_reported_and_the_others_are_done(run, photos: Path) -> None:
     Path("in").mkdir()
     Path("in/bad.jpg").write_bytes(b"not a photograph")
@@ -87,29 +77,9 @@ def test_a_photograph_is_never_replaced_by_its_mask(run, photos: Path, tmp_path:
     assert photograph.read_bytes() == (photos / "left.png").read_bytes()
 
 
-def test_an_image_that_has_changed_is_labelled_again(run, photos: Path) -> None:
-    Path("x.png").write_bytes((photos / "left.png").read_bytes())
-    run("label", "x.png", "-o", "masks", "--workers", 1)
-    Path("x.png").write_bytes((photos / "right.png").read_bytes())
-    result = run("label", "x.png", "-o", "masks", "--workers", 1)
-    assert "1 labelled, 0 already done" in result.stdout
-    expected = fuse(luma(load_image(photos / "right.png"))).mask
-    np.testing.assert_array_equal(np.asarray(Image.open("masks/x.png")), expected)
-
-
 def test_a_figure_is_never_written_over_a_mask(run, photos: Path) -> None:
     Path("in").mkdir()
     for name in ("x.png", "x_labels.png"):
         Path("in", name).write_bytes((photos / "left.png").read_bytes())
     assert run("label", "in", "-o", "masks", "--workers", 1, "--visualize").exit_code == 2
     assert not Path("masks").exists()
-
-
-def test_detectors_leave_out_the_settings_of_others(run, photos: Path) -> None:
-    words = ("label", photos / "cat.jpg", "--label-settings", "dense", "--workers", 1)
-    for names in ("fast", "fast,sobel"):
-        result = run(*words, "-o", names, "--detectors", names)
-        assert result.exit_code == 0, result.output
-        options = find_label_settings("dense").with_detectors(tuple(names.split(",")))
-        expected = fuse(luma(load_image(photos / "cat.jpg")), options).mask
-        np.testing.assert_array_equal(np.asarray(Image.open(f"{names}/cat.png")), expected)

@@ -47,19 +47,6 @@ def folder(report: Report, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_all_files_are_written_and_named_with_the_report_first(
-    report: Report, tmp_path: Path
-) -> None:
-    paths = report.save(tmp_path)
-    assert paths[0] == tmp_path / "report.md"
-    assert len(set(paths)) == len(paths)
-    assert set(paths) == {path for path in tmp_path.rglob("*") if path.is_file()}
-    assert {path.relative_to(tmp_path).as_posix() for path in paths} == {
-        *("report.md", "figures/fig.png", "figures/other.png"),
-        *("tables/first.csv", "tables/second.csv", "report.json"),
-    }
-
-
 def test_csv_has_every_digit_and_empty_cells(report: Report, folder: Path) -> None:
     with (folder / "tables" / "first.csv").open(newline="", encoding="utf-8") as file:
         head, *rows = csv.reader(file)

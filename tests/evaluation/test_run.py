@@ -79,6 +79,20 @@ def test_keypoints_from_the_cache_equal_fresh_ones(tmp_path: Path, pair: Pair, n
     assert made[1].seconds > 0
 
 
+def test_own_columns_come_back_from_the_cache(tmp_path: Path, pair: Pair) -> None:
+    more = {
+        "logits": np.array([17.5, 17.25], np.float32),
+        "sizes": np.array([1.5, 2], np.float32),
+        "angles": np.array([0.25, -1], np.float32),
+        "octaves": np.array([-1, 16777215], np.int32),
+        "descriptors": np.arange(6, dtype=np.uint8).reshape(2, 3),
+    }
+    method = points((1, 2), (3, 4), **more)
+    for _ in range(2):
+        found, _ = Run(tmp_path, tmp_path).keypoints(method, pair[0])
+        assert_same(found, method.detect(load_image(pair[0])))
+
+
 @pytest.mark.parametrize("name", ["orb", "fast"])
 @pytest.mark.parametrize(
     "settings",

@@ -35,6 +35,12 @@ def images(count: int) -> list[SourceImage]:
     return [SourceImage(Path(f"photo{k}.jpg"), f"{k:08x}", (), ()) for k in range(count)]
 
 
+def test_names_are_those_of_the_labels_on_disk() -> None:
+    assert View(240, None, "squash").name == "240x_normal"
+    assert View(240, Darkening(0.2345, 1)).name == "240_b0.234c1.000"
+    assert View(240, Darkening(0.3, 0.4), None, 255).name == "240v3-000000ff_b0.300c0.400"
+
+
 @given(
     name=st.text("abcAB/._äß0", max_size=20),
     short_sides=st.lists(st.integers(64, 999), min_size=1, max_size=4, unique=True).map(tuple),

@@ -14,6 +14,7 @@ from scipy.ndimage import map_coordinates
 
 from deepdetect import OptionError, WeightsError
 from deepdetect.evaluation.baselines.external import (
+    _maxima,
     find_feature,
     onnx_feature,
     plugin_feature,
@@ -328,3 +329,13 @@ def test_what_is_no_network_is_said(make: Make, tmp_path: Path) -> None:
     for path in (tmp_path / "none.onnx", tmp_path, text, half, other):
         with pytest.raises(WeightsError, match=path.name):
             onnx_feature(path)
+
+
+def test_descriptors_are_read_up_to_the_border_of_a_coarse_map() -> None:
+    logits = np.full((64, 96), -9.0, np.float32)
+    logits[59, 91] = 9.0  # beyond the middle of the last cell of 32 pixels
+    values = np.arange(1.0, 13).reshape(2, 2, 3).astype(np.float32)
+    found = _maxima(logits, values)
+    assert found["keypoints"].tolist() == [[91, 59]]
+    corner = values[:, -1, -1]
+    np.testing.assert_allclose(found["descriptors"], [corner / np.linalg.norm(corner)], rtol=1e-6)
