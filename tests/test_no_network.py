@@ -34,26 +34,6 @@ def refuse(event, arguments):
 sys.addaudithook(refuse)
 """
 
-FUNCTIONS = """
-import contextlib
-from deepdetect import (
-    DeepDetect, DeepDetectError, PointDetector, load_image, match_images, reconstruct, register
-)
-from deepdetect.labels import LabelOptions, fuse
-from deepdetect.io.image import luma
-
-if __name__ == "__main__":
-    left, right = load_image("left.png"), load_image("right.png")
-    detector = DeepDetect()
-    assert len(detector.detect(left)) and len(PointDetector(50).detect(left))
-    assert len(match_images(left, right, detector))
-    with contextlib.suppress(DeepDetectError):  # little can be seen in so small images
-        register(left, right, detector)
-    with contextlib.suppress(DeepDetectError):
-        reconstruct(left, right, focal_px=200.0)
-    assert fuse(luma(left), LabelOptions()).mask.any()
-"""
-
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
@@ -87,14 +67,6 @@ def test_the_guard_notices_attempts(log: Path) -> None:
     code += "with contextlib.suppress(Exception): urllib.request.urlopen('http://127.0.0.1:9')"
     assert run(log, "-c", code).returncode == 0
     assert "urllib.Request" in log.read_text()
-
-
-@pytest.mark.slow
-def test_public_functions_connect_to_nothing(log: Path) -> None:
-    (log.parent / "functions.py").write_text(FUNCTIONS)
-    result = run(log, "functions.py")
-    assert result.returncode == 0, result.stderr
-    assert not log.exists(), log.read_text()
 
 
 def test_commands_connect_to_nothing(log: Path) -> None:

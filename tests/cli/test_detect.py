@@ -192,18 +192,6 @@ def test_the_first_thing_that_one_tries_works(run, photos: Path) -> None:
     assert {*contents(Path("deepdetect-output"))} == {"cat.npz", "cat_keypoints.jpg"}
 
 
-def test_results_appear_whole_or_not_at_all(
-    run, photos: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        raise DeepDetectError("no picture today")
-
-    monkeypatch.setattr("deepdetect.cli.detect.draw_logits", fail)
-    result = run("detect", photos / "cat.jpg", "-o", "out")
-    assert result.exit_code == 2
-    assert not Path("out").exists()
-
-
 def _of_another_image(photos: Path) -> None:
     Path("other").mkdir()
     shutil.copy(photos / "left.png", "other/0.png")

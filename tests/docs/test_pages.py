@@ -52,32 +52,41 @@ def test_first_steps(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_points(folder: Path) -> None:
+@pytest.mark.parametrize(
+    ("page", "count"),
+    [
+        ("python.md", 99),
+        ("points.md", 2),
+        ("comparison.md", 1),
+        ("matching.md", 1),
+        ("other-programs.md", 1),
+    ],
+)
+def test_the_code_of_guides(folder: Path, page: str, count: int) -> None:
+    """The first blocks of a page run, from top to bottom."""
     from skimage import data
 
     for name, view in zip(("left", "right"), data.stereo_motorcycle(), strict=False):
-        Image.fromarray(view).save(f"{name}.png")
-    block = "\n".join(blocks("points.md", "python")[:2])
+        Image.fromarray(view[100:420, 220:620]).save(f"{name}.png")
     found: dict[str, object] = {}
-    exec(compile(block, "points.md", "exec"), found)
-    assert len(found["surer"]) < len(found["dense"])
-    assert len(found["thinner"]) == pytest.approx(0.05 * 741 * 500, rel=0.02)
-    assert found["spaced"].sizes is None
-    assert len(found["points"]) == len(found["spread"]) == 1000
-    assert found["spread"].sizes is not None
+    for block in blocks(page, "python")[:count]:
+        exec(compile(block, page, "exec"), found)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", ["comparison.md", "matching.md", "other-programs.md"])
-def test_the_first_lines_of_guides(folder: Path, page: str) -> None:
-    from skimage import data
+def test_points_in_the_file(folder: Path, photo: np.ndarray) -> None:
+    """The page's Python on ONNX finds what the package finds."""
+    pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
+    from deepdetect import PointDetector
+    from deepdetect.detector.network.onnx_export import write_onnx
 
-    for name, view in zip(("left", "right"), data.stereo_motorcycle(), strict=False):
-        Image.fromarray(view[100:340, 220:540]).save(f"{name}.png")
+    write_onnx("default", "deepdetect.onnx")
+    Image.fromarray(photo[:123, :157]).save("photo.jpg", quality=100)
     found: dict[str, object] = {}
-    exec(compile(blocks(page, "python")[0], page, "exec"), found)
-    (result,) = {"pairs", "good", "keypoints"} & set(found)
-    assert len(found[result]) > 500
+    exec(compile(blocks("other-programs.md", "python")[-1], "other-programs.md", "exec"), found)
+    expected = PointDetector(2048).detect("photo.jpg")
+    gaps = np.linalg.norm(found["xy"][:, None] - expected.xy, axis=2)
+    assert (gaps.min(0) < 0.05).mean() > 0.99
 
 
 RECIPES = blocks("recipes.md", "python")

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import base64
 import re
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -132,12 +131,3 @@ def test_deep_pil_images_are_drawn_as_their_arrays(mode: str) -> None:
     np.testing.assert_array_equal(points.draw(image), points.draw(array))
     bare = keypoints(0, (60, 50)).draw(image)
     np.testing.assert_allclose(bare[..., 0], deep / 257 / 2, atol=1)
-
-
-def test_a_pgm_file_of_16_bits_is_drawn(tmp_path: Path) -> None:
-    """Pillow holds its numbers in 32 bits."""
-    deep = np.random.default_rng(0).integers(0, 65536, (50, 60)).astype(np.uint16)
-    cv2.imwrite(str(tmp_path / "deep.pgm"), deep)
-    with Image.open(tmp_path / "deep.pgm") as image:
-        picture = keypoints(0, (60, 50)).draw(image)
-    np.testing.assert_array_equal(picture, keypoints(0, (60, 50)).draw(deep))
