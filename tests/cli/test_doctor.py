@@ -106,16 +106,6 @@ def test_every_extra_has_a_purpose() -> None:
     assert set(doctor.PURPOSES) == set(project["optional-dependencies"])
 
 
-def test_speeds_are_measured(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "TIMED_ROUNDS", 1)
-    result = run("doctor", "--benchmark", "--json")
-    assert result.exit_code == 0
-    found = json.loads(result.output)
-    times = [value for value in found.values() if isinstance(value, float)]
-    assert len(times) == 6
-    assert min(times) > 0
-
-
 def test_the_self_test_knows_wrong_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("openvino", reason="needs OpenVINO")
     from deepdetect.matching import pipeline

@@ -141,26 +141,3 @@ def test_a_bad_photograph_does_not_stop_the_export(run, photos: Path, tmp_path: 
     result = run("export", "hloc", *words, "-o", "small", "--max-megapixels", 0.001)
     assert result.exit_code == 1
     assert "--max-megapixels" in result.stderr
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        "colmap photos -o a.db --focal -5",
-        "colmap photos -o a.db --calibration none.json",
-        "hloc photos -o a",
-    ],
-)
-def test_what_is_wrong_is_said_before_the_work(
-    run, photos: Path, tmp_path: Path, monkeypatch, words: str
-) -> None:
-    import deepdetect.interchange
-
-    if words.startswith("colmap"):
-        pytest.importorskip("pycolmap", reason="needs pycolmap")
-    shutil.copytree(photos, tmp_path / "photos")
-    (tmp_path / "photos" / "cat.jpg").rename(tmp_path / "photos" / "my cat.jpg")
-    monkeypatch.setattr(deepdetect.interchange, "match_folder", lambda *_, **__: 1 / 0)
-    result = run("export", *words.split())
-    assert result.exit_code == 2, result.output
-    assert not (tmp_path / "a").exists()

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import pytest
@@ -83,16 +82,6 @@ def test_no_file_is_named_that_is_not_there(run, photos: Path) -> None:
     result = run("match-many", "features.h5", "--pairs", "pairs.txt", "--workers", 1)
     assert result.exit_code == 2
     assert "matches.h5" not in result.stdout
-
-
-def test_a_start_without_ray_leaves_nothing(
-    run, photos: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
-    result = run("extract", photos, "--engine", "ray")
-    assert result.exit_code == 2
-    assert "pip install 'ray[data]'" in result.stderr
-    assert list(Path().iterdir()) == []
 
 
 @pytest.mark.parametrize(

@@ -75,11 +75,3 @@ def test_a_photograph_is_never_replaced_by_its_mask(run, photos: Path, tmp_path:
     for more in ([], ["--overwrite"]):
         assert run("label", "photo.png", "-o", ".", *more).exit_code == 2
     assert photograph.read_bytes() == (photos / "left.png").read_bytes()
-
-
-def test_a_figure_is_never_written_over_a_mask(run, photos: Path) -> None:
-    Path("in").mkdir()
-    for name in ("x.png", "x_labels.png"):
-        Path("in", name).write_bytes((photos / "left.png").read_bytes())
-    assert run("label", "in", "-o", "masks", "--workers", 1, "--visualize").exit_code == 2
-    assert not Path("masks").exists()

@@ -142,20 +142,3 @@ def test_a_pair_without_a_geometry_has_its_own_exit_code(run, tmp_path: Path) ->
     assert len(load_matches(Path("out/a_b_matches.npz"))) == 0
     report = json.loads(result.stdout)
     assert (report["matches"], report["success"]) == (0, False)
-
-
-def test_matches_of_other_images_are_not_written_over(run, photos: Path) -> None:
-    others = Path("others")
-    others.mkdir()
-    for name, source in (("left.png", "right.png"), ("right.png", "left.png")):
-        (others / name).write_bytes((photos / source).read_bytes())
-    options = ("-o", "out", "--max-keypoints", 300, "--unguided")
-    first = ("match", photos / "left.png", photos / "right.png", *options)
-    other = ("match", others / "left.png", others / "right.png", *options)
-    assert run(*first).exit_code == 0
-    written = Path("out/left_right_matches.npz").read_bytes()
-    assert run(*other).exit_code == 2
-    assert Path("out/left_right_matches.npz").read_bytes() == written
-    assert run(*first, "--no-pictures").exit_code == 0, "the same images again"
-    assert run(*other, "--overwrite").exit_code == 0
-    assert Path("out/left_right_matches.npz").read_bytes() != written

@@ -243,16 +243,6 @@ def test_one_sentence_and_no_file(run, folder: Path, arguments: str, named: str)
     assert result.stdout == ""
 
 
-def test_inputs_are_not_written_over(run, folder: Path) -> None:
-    content = (folder / "calib.json").read_bytes()
-    Path("calib.json").write_bytes(content)
-    pair = folder / "left.png", folder / "right.png"
-    words = ("--calibration", "calib.json", "-o", "calib.ply")
-    assert run("reconstruct", *pair, *words).exit_code == 2
-    assert Path("calib.json").read_bytes() == content
-    assert [path.name for path in Path().iterdir()] == ["calib.json"]
-
-
 def test_models_of_before_survive_a_failure(
     run, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

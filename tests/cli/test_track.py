@@ -79,22 +79,7 @@ def test_nothing_is_replaced_silently(run, frames: Path, tmp_path: Path) -> None
 def test_recordings_of_a_camera_are_kept(run, tmp_path: Path, monkeypatch) -> None:
     import cv2
 
-    class Camera:
-        def __init__(self, number: int) -> None:
-            self.left = 2
-
-        def isOpened(self) -> bool:
-            return True
-
-        def get(self, _: int) -> float:
-            return 0.0
-
-        def read(self):
-            self.left -= 1
-            return self.left >= 0, np.full((64, 96, 3), 90, np.uint8)
-
-        def release(self) -> None:
-            pass
+    from tests.tracking.test_video import Camera
 
     opened = cv2.VideoCapture
     monkeypatch.setattr(

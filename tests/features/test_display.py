@@ -119,15 +119,3 @@ def test_what_a_notebook_shows_is_small(size: tuple[int, int], count: int) -> No
         assert picture.shape[0] <= 240
         assert picture.shape[1] <= 240 * pictures
         assert bool(picture.any()) == bool(count)
-
-
-@pytest.mark.parametrize("mode", ["I;16", "F"])
-def test_deep_pil_images_are_drawn_as_their_arrays(mode: str) -> None:
-    deep = np.random.default_rng(0).integers(0, 65536, (50, 60)).astype(np.uint16)
-    array = deep if mode == "I;16" else (deep / 65535).astype(np.float32)
-    image = Image.fromarray(array)
-    assert image.mode == mode
-    points = keypoints(3, (60, 50))
-    np.testing.assert_array_equal(points.draw(image), points.draw(array))
-    bare = keypoints(0, (60, 50)).draw(image)
-    np.testing.assert_allclose(bare[..., 0], deep / 257 / 2, atol=1)

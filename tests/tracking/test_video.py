@@ -145,23 +145,6 @@ def test_there_is_no_file_unless_it_is_whole(moving_photo, tmp_path: Path) -> No
     assert not list(tmp_path.iterdir())
 
 
-def test_no_encoder_is_one_sentence(moving_photo, tmp_path: Path, monkeypatch) -> None:
-    class Closed:
-        def open(self, *arguments: object) -> None:
-            pass
-
-        def isOpened(self) -> bool:
-            return False
-
-        def release(self) -> None:
-            pass
-
-    monkeypatch.setattr(cv2, "VideoWriter", Closed)
-    with pytest.raises(DeepDetectError), write_video(tmp_path / "v.mp4", 10) as write:
-        write(moving_photo(0))
-    assert not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("suffix", sorted(CODECS))
 def test_a_full_disk_is_one_sentence(suffix: str, tmp_path: Path) -> None:
     """The limit of a file's size stands for the disk, of which OpenCV says nothing."""
