@@ -15,6 +15,7 @@ from deepdetect.io.image import load_image
 
 TILT = np.array([[0.9, 0.12, 20.0], [-0.1, 0.95, 18.0], [4e-4, 1e-4, 1.0]])
 SMALL_SIDE_PX = 480
+SMALL_PARALLAX = ("rocks", "cloth", "dolls", "moebius")
 MODELS = {"plane": "homography", "static": "homography", "depth": "fundamental"}
 
 
@@ -86,13 +87,11 @@ too_small = pytest.mark.xfail(
 @pytest.mark.parametrize(
     ("folder", "names", "scene"),
     [
-        pytest.param("middlebury/rocks", "left right", "depth", marks=too_small),
-        pytest.param("middlebury/cloth", "left right", "depth", marks=too_small),
-        pytest.param("middlebury/dolls", "left right", "depth", marks=too_small),
-        pytest.param("middlebury/moebius", "left right", "depth", marks=too_small),
-        ("middlebury/art", "left right", "depth"),
-        ("middlebury/cones", "left right", "depth"),
-        ("middlebury/teddy", "left right", "depth"),
+        *(
+            pytest.param(f"middlebury/{name}", "left right", "depth", marks=too_small)
+            for name in SMALL_PARALLAX
+        ),
+        *((f"middlebury/{name}", "left right", "depth") for name in ("art", "cones", "teddy")),
         ("oxford/graf", "img1 img2", "plane"),
         ("oxford/graf", "img1 img3", "plane"),
         ("oxford/wall", "img1 img3", "plane"),
@@ -105,7 +104,7 @@ def test_small_copies_of_shared_pairs(shared: Path, folder: str, names: str, sce
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["rocks", "cloth", "dolls", "moebius"])
+@pytest.mark.parametrize("name", SMALL_PARALLAX)
 def test_depth_of_shared_pairs_at_their_own_size(shared: Path, name: str) -> None:
     folder = shared / "data/middlebury" / name
     check(tuple(load_image(next(folder.glob(f"{v}.*"))) for v in ("left", "right")), "depth")
