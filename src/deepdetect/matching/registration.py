@@ -135,7 +135,7 @@ def register(
         >>> scene = cv2.GaussianBlur(rng.integers(0, 256, (160, 200)).astype(np.uint8), (0, 0), 2)
         >>> scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
         >>> registration = register(scene[:, :180], scene[:, 12:], PointDetector())
-        >>> registration.homography[:2, 2].round(1).tolist()
+        >>> (registration.homography[:2, 2].round(1) + 0.0).tolist()
         [-12.0, 0.0]
     """
     check_name("extent", extent, get_args(Extent))
