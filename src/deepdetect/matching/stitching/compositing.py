@@ -50,23 +50,23 @@ def composite(
     width, height = canvas.size
     scale = min(1.0, float(np.sqrt(SEAM_MEGAPIXELS * 1e6 / (width * height))))
     low = {place: canvas.draw(place, *small[image_of(place)], scale) for place in canvas.boxes}
+    low = {place: one for place, one in low.items() if one.mask.size}  # rests are too narrow there
     gains = _gains(low)
     seams = _seams(low, gains)
     parallax = {pair: px / scale for pair, px in _parallax(low, gains, seams).items()}
     blender = _Blender(width, height)
     kind: type = np.uint8
-    for place, box in canvas.boxes.items():
+    for place in low:
         number = image_of(place)
         drawn = canvas.draw(place, load(number), 1.0, 1.0)
-        mask = drawn.mask & _upscale_mask(seams[place], low[place].corner, scale, box)
+        mask = drawn.mask & _upscale_mask(seams[place], drawn.mask.shape)
         kind = np.uint16 if drawn.image.dtype == np.uint16 else kind
         top = np.iinfo(drawn.image.dtype).max
-        blender.feed(drawn.image, gains[number] / top, mask, box[:2])
+        blender.feed(drawn.image, gains[number] / top, mask, drawn.corner)
     del drawn, mask
     blended, valid = blender.blend()
-    panorama: np.ndarray = np.empty(blended.shape, kind)
-    for row, values in zip(panorama, blended, strict=True):  # of all at once the copies are large
-        row[:] = np.rint(values.clip(0, 1) * np.iinfo(kind).max)
+    depth = cv2.CV_16U if kind is np.uint16 else cv2.CV_8U
+    panorama = cv2.multiply(blended, (float(np.iinfo(kind).max),) * 4, dtype=depth)
     panorama[~valid] = 0
     return panorama, valid, gains, parallax
 
@@ -213,19 +213,10 @@ def _seams(low: Mapping[int, WarpedImage], gains: Mapping[int, float]) -> dict[i
     }
 
 
-def _upscale_mask(seam: np.ndarray, corner: tuple[int, int], scale: float, box: Box) -> np.ndarray:
-    """Return a mask of the small canvas in a box of the canvas, with a margin: no gaps."""
-    wide = cv2.dilate(seam, np.ones((3, 3), np.uint8))
-    left, top, right, bottom = box
-    shift = 0.5 * scale - 0.5
-    x, y = scale * left + shift - corner[0], scale * top + shift - corner[1]
-    large = cv2.warpAffine(
-        wide,
-        np.array([[scale, 0, x], [0, scale, y]]),
-        (right - left, bottom - top),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+def _upscale_mask(seam: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a mask of the small canvas in the shape of the large one, with a margin: no gaps."""
+    wide = cv2.dilate(seam, np.ones((5, 5), np.uint8))
+    large = cv2.resize(wide, shape[::-1], interpolation=cv2.INTER_LINEAR)
     return np.where(large > 127, np.uint8(255), np.uint8(0))
 
 
