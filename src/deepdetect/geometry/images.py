@@ -35,9 +35,14 @@ def downscale(gray: np.ndarray, max_side: int) -> tuple[np.ndarray, float]:
     # Sides are seldom whole numbers of pixels. Sampling by the scale itself keeps it exact for
     # both sides.
     size = (max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale)))
-    smooth = cv2.GaussianBlur(gray, (0, 0), ANTIALIASING_SIGMA * np.sqrt(1 / scale**2 - 1))
+    smooth = antialiased(gray, scale)
     affine = scaling_matrix(scale)[:2]
     return cv2.warpAffine(smooth, affine, size, borderMode=cv2.BORDER_REPLICATE), scale
+
+
+def antialiased(image: np.ndarray, scale: float) -> np.ndarray:
+    """Blur an image that will be sampled at a scale below 1."""
+    return cv2.GaussianBlur(image, (0, 0), ANTIALIASING_SIGMA * np.sqrt(1 / scale**2 - 1))
 
 
 def warp_to_reference(
