@@ -1,6 +1,6 @@
-"""`train`, `train_points`, `train_descriptor`, and `profile`: how fast a run would be.
+"""The trainings, and `profile`: how fast a run would be.
 
-Their module imports no torch, so that the package can offer them where it is missing.
+Torch is imported by a run, not with this module: commands that do not train start without it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from deepdetect._shared.errors import require_packages
 from deepdetect._shared.options import suggest_keywords
 from deepdetect._shared.progress import progress
 from deepdetect.io.image import find_images
@@ -21,6 +20,7 @@ from .recipe import (
     DescriptorTrainingOptions,
     DeviceOptions,
     InitWeights,
+    MatchFilterTrainingOptions,
     PointsTrainingOptions,
     Stage,
     TrainingOptions,
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from .trainer import TrainingResult
 
 Log = Callable[[str], None]
-
-TRAINING_PACKAGES = ("torch", "lightning_fabric", "matplotlib", "safetensors", "onnx")
 
 
 @suggest_keywords
@@ -71,7 +69,6 @@ def train(
         The weights' files and the loss curves.
 
     Raises:
-        MissingExtraError: a package of the extra `train` is not installed.
         ImageError: a folder is missing or empty.
         OptionError: the folder holds a run with other options, the initial weights are of another
             network, or the batch statistics of random weights are to be frozen.
@@ -115,11 +112,9 @@ def train_points(
         The weights' file and the curves.
 
     Raises:
-        MissingExtraError: a package of the extra `train` is not installed.
         ImageError: a folder is missing or empty.
         OptionError: the folder holds a run with other options or images.
     """
-    require_packages("training", *TRAINING_PACKAGES)
     from .points.task import RankerTrainer
 
     trainer = RankerTrainer(*_files(images, validation, output), options, num_workers)
@@ -165,12 +160,44 @@ def train_descriptor(
         >>> result = train_descriptor("photos/train", "photos/val", "run")  # doctest: +SKIP
         >>> PointDetector(descriptor=result.onnx).extract("a.png")  # doctest: +SKIP
     """
-    require_packages("training", *TRAINING_PACKAGES)
     from .descriptor.task import DescriptorTrainer
 
     where = DeviceOptions(device=device, num_workers=num_workers)
     initial = None if init_weights is None else Path(init_weights)
     trainer = DescriptorTrainer(*_files(images, validation, output), options, initial, where)
+    return trainer.fit(Path(output), log)
+
+
+@suggest_keywords
+def train_match_filter(
+    images: str | Path,
+    validation: str | Path,
+    output: str | Path,
+    options: MatchFilterTrainingOptions = MatchFilterTrainingOptions(),
+    *,
+    log: Log | None = None,
+) -> TrainingResult:
+    """Train the match filter on pairs of views that are made of single images.
+
+    Pairs are drawn, described and matched before the first step, by the bundled descriptors; an
+    interrupted run draws the same again. On two processors it takes a quarter of an hour.
+
+    Args:
+        images: folder of images.
+        validation: folder of other images, which choose the best weights.
+        output: folder for checkpoint.safetensors, match_filter.safetensors, match_filter.onnx,
+            MODEL_CARD.md and the curves.
+        options, log: as of `train_points`.
+
+    Returns:
+        The weights' files and the curves.
+
+    Raises:
+        The errors of `train_points`; an OptionError, too, where the images show nothing.
+    """
+    from .match_filter import MatchFilterTrainer
+
+    trainer = MatchFilterTrainer(*_files(images, validation, output), options, log is None)
     return trainer.fit(Path(output), log)
 
 
@@ -192,7 +219,6 @@ def _dense_trainer(
     data: Mapping[str, Any],
 ) -> DenseTrainer:
     """Make the labels, and what is trained on them; `data` are further arguments of `train`."""
-    require_packages("training", *TRAINING_PACKAGES)
     from .dataset import prepare_data
     from .dense import DenseTrainer, initial_network, launch
 
