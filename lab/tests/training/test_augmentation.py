@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from skimage import data
 
 from deepdetect.io.image import luma
 from deepdetect_lab.labels import (
@@ -49,7 +50,6 @@ def test_other_colors_have_the_same_luma(
 
 @pytest.fixture(scope="module")
 def photos() -> dict[str, np.ndarray]:
-    data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
     return {
         "astronaut": np.ascontiguousarray(data.astronaut()[::4, ::4]),
         "chelsea": np.ascontiguousarray(data.chelsea()[::3, ::3]),

@@ -8,6 +8,7 @@ import numpy as np
 import onnxruntime
 import pytest
 import torch
+from skimage import data
 
 from deepdetect_lab.networks.weights import load_network
 from deepdetect_lab.training import MatchFilterTrainingOptions, match_filter
@@ -26,7 +27,6 @@ from deepdetect_lab.training.match_filter import (
 
 @pytest.fixture(scope="module")
 def samples(tmp_path_factory: pytest.TempPathFactory) -> list[Sample]:
-    data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
     files = [tmp_path_factory.mktemp("large") / f"{k}.png" for k in range(3)]
     for file, photograph in zip(files, (data.astronaut, data.coffee, data.chelsea), strict=True):
         large = cv2.resize(photograph(), (960, 960), interpolation=cv2.INTER_CUBIC)

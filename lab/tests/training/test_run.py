@@ -6,19 +6,14 @@ from unittest.mock import Mock
 
 import pytest
 
-pytest.importorskip("torch", reason="needs torch, which is for training only")
-
-import importlib.util
-
-from deepdetect import MissingExtraError
 from deepdetect_lab.labels import LabelOptions
 from deepdetect_lab.training import (
     DeviceOptions,
     Stage,
     TrainingOptions,
     profile,
-    train,
     train_descriptor,
+    train_match_filter,
     train_points,
 )
 
@@ -53,23 +48,13 @@ def test_a_profile_times_each_stage_and_writes_no_weights(
     assert {path.name for path in tmp_path.iterdir()} == {"labels"}
 
 
-def test_a_missing_package_is_named_before_any_work(
-    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one_line
-) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    for function in (train, profile):
-        with pytest.raises(MissingExtraError, match="needs the packages torch") as caught:
-            function(photographs, tmp_path / "run")
-        one_line(caught.value)
-    assert not (tmp_path / "run").exists()
-
-
 @pytest.mark.parametrize("validation", ["images/val", "other"])
 @pytest.mark.parametrize(
     ("train_one", "trainer"),
     [
         (train_points, "points.task.RankerTrainer"),
         (train_descriptor, "descriptor.task.DescriptorTrainer"),
+        (train_match_filter, "match_filter.MatchFilterTrainer"),
     ],
 )
 def test_pictures_of_validation_and_of_the_run_are_not_trained_on(

@@ -220,21 +220,12 @@ def _dense_trainer(
 ) -> DenseTrainer:
     """Make the labels, and what is trained on them; `data` are further arguments of `train`."""
     from .dataset import prepare_data
-    from .dense import DenseTrainer, initial_network, launch
+    from .dense import DenseTrainer, initial_network
 
     options, network = initial_network(options, init_weights)  # before the labels, for its errors
-    fabric = launch(device, options)
-    prepared = prepare_data(
-        images,
-        options,
-        output,
-        **data,
-        processes=fabric.world_size * max(1, device.worker_count),
-        make_labels=fabric.local_rank == 0,
-        quiet=log is None or not fabric.is_global_zero,
-    )
-    fabric.barrier()
-    return DenseTrainer(network, options, prepared, device, fabric)
+    loading = max(1, device.worker_count)
+    prepared = prepare_data(images, options, output, **data, processes=loading, quiet=log is None)
+    return DenseTrainer(network, options, prepared, device)
 
 
 TIMED_STEPS = 30
@@ -246,16 +237,16 @@ WARM_UP_STEPS = 5
 
 @dataclass(frozen=True)
 class StageProfile:
-    """The speed of one stage, over all processes.
+    """The speed of one stage.
 
     Attributes:
         stage: the stage.
         steps: steps that were timed.
         images_per_second: crops per second.
         full_images_per_second: the same in 480x480 images' worth of pixels.
-        waiting_fraction: fraction of the time in which the main process waited for data.
-        memory_bytes: peak resident memory of the main process so far, 0 where unknown.
-        device_memory_bytes: peak memory of torch on the main process's GPU, or None.
+        waiting_fraction: fraction of the time in which the training waited for data.
+        memory_bytes: peak resident memory of the process so far, 0 where unknown.
+        device_memory_bytes: peak memory of torch on the GPU, or None.
     """
 
     stage: Stage
@@ -300,7 +291,6 @@ def profile(
     trainer = _dense_trainer(images, output, options, init_weights, device, log, data)
     steps_of_stage = trainer.schedule.steps_of_stage
     lengths = [min(n, TIMED_STEPS + WARM_UP_STEPS) for n in steps_of_stage]
-    log = log if trainer.is_main else None
     if log is not None:
         log(f"timing {trainer.describe()}")
     profiles, first = [], 0
