@@ -106,9 +106,7 @@ def test_matches_have_the_colour_of_their_position() -> None:
 def test_what_a_notebook_shows_is_small(size: tuple[int, int], count: int) -> None:
     points = keypoints(count, size)
     good = np.arange(count) % 4 > 0
-    crossed = Matches(
-        points.xy, points.xy[::-1], points.scores, good, points, points[::-1]
-    )
+    crossed = Matches(points.xy, points.xy[::-1], points.scores, good, points, points[::-1])
     for thing, pictures in ((points, 1), (crossed, 2)):
         text = thing._repr_html_()
         assert len(text) < 20_000
