@@ -14,7 +14,7 @@ MAX_UINT16 = 65535
 
 HEADROOM = 4.0
 """The scale of a PNG covers depths up to this many times their 99th percentile: a few outliers
-would make the steps coarse for all. Chosen by hand; not measured."""
+would make the steps coarse for all. Chosen by hand."""
 
 
 def save_depth_png(

@@ -22,7 +22,7 @@ TRANSPOSED = (5, 6, 7, 8)
 
 MAX_FOCAL_DIFFERENCE = 0.1
 """The focal length computed from the sensor resolution is finer than the 35 mm equivalent but often
-wrong. It is used if both differ by less than this ratio. Chosen by hand; not measured."""
+wrong. It is used if both differ by less than this ratio. Chosen by hand."""
 
 MAX_ASPECT_DIFFERENCE = 0.01
 """Photographs whose aspect ratio differs more from EXIF's count as cropped. Chosen by hand."""

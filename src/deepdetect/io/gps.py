@@ -16,7 +16,7 @@ XMP_OF_DRONES = re.compile(rb"(?<!/)drone-dji:(\w+)\s*(?:=\s*[\"']([^\"']*)|>([^
 """XMP properties of DJI drones, which write them as attributes or as elements."""
 
 MAX_GRAVITY_TILT_DEG = 120.0
-"""Larger gimbal angles, in degrees, are treated as invalid. Chosen by hand; not measured."""
+"""Larger gimbal angles, in degrees, are treated as invalid. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)

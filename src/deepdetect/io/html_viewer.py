@@ -21,23 +21,23 @@ from ..geometry.camera import PosedView, camera_spacing
 from ..geometry.point_cloud import UNITS, PointCloud, RobustBox, angular_spacing, robust_box
 
 DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
-"""Tangent of half the field of view: default and allowed range. Chosen by hand; not measured."""
+"""Tangent of half the field of view: default and allowed range. Chosen by hand."""
 
 MAX_LEVEL = 65535
 """Positions are stored in 16 bits per axis."""
 
 MARGIN = 1.0
 """Points further outside the robust box than this many times its size are left out: a few very
-distant points would make the quantisation steps coarse for all. Chosen by hand; not measured."""
+distant points would make the quantisation steps coarse for all. Chosen by hand."""
 
 CAMERA_SIZE = 0.35
 """Depth of a camera's pyramid relative to the distance to the nearest camera. Chosen by hand."""
 
 OVERVIEW_RADIANS = (0.4, 0.5)
-"""A page with cameras opens at this azimuth and elevation. Chosen by hand; not measured."""
+"""A page with cameras opens at this azimuth and elevation. Chosen by hand."""
 
 OVERVIEW_POINTS = 2000
-"""The opening view is fitted to about this many points, for speed. Chosen by hand; not measured."""
+"""The opening view is fitted to about this many points, for speed. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ Images = list[Any] | tuple[Any, ...] | np.ndarray
 """Several images: a list, a tuple, or a batch in an array of four dimensions."""
 
 MINIMUM_SIDE = 16
-"""Images must be at least this many pixels wide and high. Chosen by hand; not measured."""
+"""Images must be at least this many pixels wide and high. Chosen by hand."""
 
 ORIENTATION_TAG = 0x0112
 HEADER_BYTES = 26

@@ -40,7 +40,7 @@ MAX_JPEG_SIDE_PX = 65_500
 """The largest width and height, in pixels, that libjpeg writes."""
 
 JPEG_QUALITY = 85
-"""Quality of JPEG files on libjpeg's scale of 0 to 100. Chosen by hand; not measured."""
+"""Quality of JPEG files on libjpeg's scale of 0 to 100. Chosen by hand."""
 
 EXIF_TEXTS = (
     Base.ImageDescription,

@@ -35,7 +35,7 @@ ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
 
 MAX_BYTES_PER_PIXEL = 256
 """Files with more bytes per pixel, over all bands, are rejected, since a small file can claim any
-number of bands. Chosen by hand; not measured."""
+number of bands. Chosen by hand."""
 
 
 def read_tiff(
