@@ -13,7 +13,7 @@ MAX_CIRCLES = 5000
 """More keypoints than this are drawn as single pixels: circles would cover the image."""
 
 LEAST_RADIUS_PX = 2.0
-"""Circles of keypoints have at least this radius, or a pixel more without a size. Chosen by hand."""
+"""A keypoint's circle has at least this radius, and a pixel more without size. Chosen by hand."""
 
 PICTURE_SIDE_PX = 2000
 """Longest side of a visualisation, in pixels: as JPEG it then takes less than two megabytes."""
