@@ -13,8 +13,7 @@ from .._shared.records import save_arrays
 MAX_UINT16 = 65535
 
 HEADROOM = 4.0
-"""The scale of a PNG covers depths up to this many times their 99th percentile: a few outliers
-would make the steps coarse for all. Chosen by hand."""
+"""A PNG's scale covers this many times the 99th percentile: outliers would make its steps coarse."""
 
 
 def save_depth_png(

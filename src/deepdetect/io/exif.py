@@ -25,7 +25,7 @@ MAX_FOCAL_DIFFERENCE = 0.1
 wrong. It is used if both differ by less than this ratio. Chosen by hand."""
 
 MAX_ASPECT_DIFFERENCE = 0.01
-"""Photographs whose aspect ratio differs more from EXIF's count as cropped. Chosen by hand."""
+"""Photographs count as cropped if EXIF's aspect ratio differs by more than this. Chosen by hand."""
 
 ADVICE = "give `focal_px` or `calibration`"
 

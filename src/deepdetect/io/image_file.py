@@ -159,8 +159,8 @@ def open_image(
     """Open an image file as a PIL image; its pixels are decoded when it is loaded.
 
     The source is a path, the content of a file as bytes, or a binary file, which is read from its
-    beginning and stays open. Pillow's errors in the block become those below, which name an image
-    without a path "the" and `what`.
+    beginning and stays open. Pillow's errors in the block become those below. `what` is the name
+    of an image without a path.
 
     Raises:
         ImageError: the file is missing, truncated, damaged (where the format allows to detect it),

@@ -62,7 +62,7 @@ class Metadata:
     Attributes:
         to_world: (3, 3) matrix that maps pixels (centre of the first at (0, 0)) to world
             coordinates, or None.
-        crs: coordinate reference system of the world, of rasterio; None: a local grid.
+        crs: coordinate reference system as an object of rasterio; None: a local grid.
         no_data: value that means "no data" according to GDAL's tag, or None.
         profile, exif: the ICC profile, and EXIF as Pillow's object; or None.
         plain: whether pixels are grey or RGB of 8 or 16 bits.

@@ -69,7 +69,7 @@ def load_keypoints(path: str | Path) -> Keypoints:
     """Read keypoints from the npz file that `save_keypoints` wrote.
 
     Raises:
-        DeepDetectError: the file is missing or is no such file.
+        DeepDetectError: the file is missing or has other content.
 
     Example:
         >>> import tempfile
@@ -125,7 +125,7 @@ def load_matches(path: str | Path) -> Matches:
         The matches. Their `seconds` are empty, and their keypoints have no logits.
 
     Raises:
-        DeepDetectError: the file is missing or is no such file.
+        DeepDetectError: the file is missing or has other content.
     """
     with _arrays_in(path, "matches") as arrays:
         keypoints = [
