@@ -58,7 +58,7 @@ COMMANDS = {
         "view": ("view", "Show a result in the browser."),
     },
     "DeepDetect itself": {
-        "app": ("app", "Serve a page in the browser, on this computer."),
+        "app": ("app", "Serve a page for the browser on this computer."),
         "demo": ("demo", "Match a real stereo pair, and evaluate the matches."),
         "doctor": ("doctor", "Check the installation, and suggest repairs."),
         "completion": ("_app", "Print a script that completes commands and options by Tab."),

@@ -13,7 +13,7 @@ from .._shared.records import save_arrays
 MAX_UINT16 = 65535
 
 HEADROOM = 4.0
-"""A PNG's scale covers this many times the 99th percentile: outliers would make its steps coarse."""
+"""The scale covers this many times the 99th percentile: outliers would make its steps coarse."""
 
 
 def save_depth_png(
