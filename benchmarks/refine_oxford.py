@@ -66,7 +66,7 @@ def main() -> None:
     """Refine the pairs, write files and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("oxford", type=Path, help="the data set")
-    parser.add_argument("output", type=Path, help="where the files go")
+    parser.add_argument("output", type=Path, help="folder for the files")
     arguments = parser.parse_args()
     rows = refine_oxford(arguments.oxford, arguments.output, quiet=False)
     print(Table("refined", "", COLUMNS, rows).to_markdown())
