@@ -69,8 +69,7 @@ COMMANDS = {
 LAB_ENTRY_POINTS = "deepdetect.commands"
 """Group of the entry points by which deepdetect-lab adds commands, as tables such as `COMMANDS`.
 
-The entry point `dev` is the table of the commands `deepdetect dev ...`. The tables contain full
-module names.
+The entry point `dev` is the table of commands below `dev`. The tables have full module names.
 """
 
 LAB_COMMANDS = ("label", "train", "train-descriptor", "dev")
@@ -101,8 +100,7 @@ FORMATTER = HelpFormatter()
 def make_app(summaries: bool = False) -> App:
     """Return the application, which imports the module of a command when it is called.
 
-    With `summaries`, the list of commands shows those of `COMMANDS`, without any import. Without,
-    each command's help is its docstring.
+    With `summaries`, commands are listed with those of `COMMANDS`, otherwise with docstrings.
     """
     commands, development = _all_commands()
     app = App(

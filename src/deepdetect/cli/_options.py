@@ -39,15 +39,13 @@ TEXT_WIDTH = 100
 class From:
     """Parameters of a function or class that become options of a command.
 
-    An option has the name, type and default of the parameter; its help is the first sentence about
-    it in the docstring.
+    An option has the parameter's name, type and default, and the docstring's first sentence on it.
 
     Attributes:
         target: the function or class.
         common: names of the options that --help shows, separated by blanks.
         more: names of those that only --help-all shows. None: all others.
-        flags: flags that differ from the name, such as {"focal_px": "--focal"}; "--on/--off" also
-            names the opposite.
+        flags: flags that differ from the name, such as {"focal_px": "--focal"}, or "--on/--off".
         types: types of options whose parameter accepts more than can be typed.
         defaults: texts that the help shows in place of the default value.
     """

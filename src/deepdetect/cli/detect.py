@@ -44,9 +44,8 @@ def detect(
     """Detect keypoints in images (files or folders).
 
     Writes for each image STEM.npz (or .csv) with the positions and scores, and the visualisations
-    STEM_keypoints.jpg (the best in all parts of the image, coloured by score), STEM_dense.jpg (all
-    keypoints) and STEM_heatmap.jpg (logits). With --detector points only the first is written.
-    Subfolders are kept.
+    STEM_keypoints.jpg (the best in all parts of the image, coloured by score) and, for the network,
+    STEM_dense.jpg (all keypoints) and STEM_heatmap.jpg (logits). Subfolders are kept.
 
     Run again, the command skips finished images, and repeats them if its options differ. Results
     of other images with the same name, and files of unknown origin, are replaced only with

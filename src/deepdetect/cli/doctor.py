@@ -31,8 +31,7 @@ TIMED_ROUNDS = 5
 NEAR_SHIFT_PX = 16
 """Disparity of the foreground in the self-test's second pair. Chosen by hand."""
 MIN_PRECISION = 0.95
-"""The self-test fails below this share of matches within 1 px of ground truth. It is 1 if all is
-well; the margin is chosen by hand."""
+"""The self-test needs this share of correct matches, which is 1 if all is well. Chosen by hand."""
 
 
 class Finding(NamedTuple):

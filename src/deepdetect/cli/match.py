@@ -203,9 +203,7 @@ def _choose_pairs(
     paths = cli.expand_images(images, output)
     wanted = list_pairs(pairs, [*paths])
     for name in {name for pair in wanted for name in pair} - paths.keys():
-        raise OptionError(
-            f"{name} in {pairs} is not one of the images: use its path below the folder"
-        )
+        raise OptionError(f"{name} in {pairs} is not one of the images: use its relative path")
     if not wanted:
         raise OptionError("one image makes no pair: give two or more images, or a folder")
     stems = {path: stem.replace("/", "-") for path, stem in cli.result_stems(paths).items()}

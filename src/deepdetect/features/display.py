@@ -23,10 +23,7 @@ Points = tuple[np.ndarray, tuple[int, int]]
 
 
 def checked_image(image: Any, size: tuple[int, int], channels: Channels) -> np.ndarray:
-    """Convert the image that keypoints belong to, of any kind, to (H, W, 3) uint8 RGB.
-
-    It must have the (width, height) of the keypoints' image.
-    """
+    """Convert an image of any kind with this (width, height) to (H, W, 3) uint8 RGB."""
     if isinstance(image, (str, bytes)) or hasattr(image, "__fspath__"):
         raise ImageError("drawing needs the image itself, not a path: give load_image(path)")
     if hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image

@@ -156,9 +156,8 @@ class DeepDetectMatcher(BaseModel):
 class DeepDetectDenseMatcher(BaseModel):
     """Dense guided matcher of two images, for `hloc.match_dense`.
 
-    With the option `max_keypoints`, keypoints are those of a `PointDetector`. If it is None, they
-    are the dense ones of a `DeepDetect` with the option `weights`. Without a trusted geometry there
-    are no matches.
+    With the option `max_keypoints`, a `PointDetector` is used, otherwise a `DeepDetect` with the
+    option `weights`. Without a trusted geometry there are no matches.
     """
 
     default_conf: dict[str, Any] = {"weights": "default", "max_keypoints": None}  # noqa: RUF012

@@ -30,8 +30,7 @@ class DeepDetectExtractor(Module):
     """A replacement for an extractor of LightGlue such as `lightglue.SIFT`.
 
     Args:
-        detector: detector of at most 4,096 points with RootSIFT descriptors, for which LightGlue
-            has weights.
+        detector: detector of at most 4,096 points with RootSIFT, for which LightGlue has weights.
         scale: as in `Keypoints.to_lightglue`.
 
     Raises:

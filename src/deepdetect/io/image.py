@@ -186,9 +186,7 @@ def ignore_masks(ignore: Any, images: int) -> list[Any]:
     if not (isinstance(ignore, (list, tuple)) or getattr(ignore, "ndim", 2) == 3):
         return [ignore] * images
     if len(ignore) != images:
-        raise OptionError(
-            f"`ignore` holds {len(ignore)} masks for {images} images: give one for each image"
-        )
+        raise OptionError(f"`ignore` has {len(ignore)} masks for {images} images: give one each")
     return list(ignore)
 
 
@@ -242,9 +240,7 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
         )
     images = [path for path in found if not was_made(path, root)]
     if not images:
-        raise ImageError(
-            f"all images in {root} are results of earlier runs: name the files, or another folder"
-        )
+        raise ImageError(f"all images in {root} are results of earlier runs: give files by name")
     return images
 
 

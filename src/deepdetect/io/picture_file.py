@@ -60,8 +60,7 @@ class Metadata:
     """What an image file contains in addition to its pixels.
 
     Attributes:
-        to_world: (3, 3) matrix that maps pixels (centre of the first at (0, 0)) to world
-            coordinates, or None.
+        to_world: (3, 3) matrix from pixels (first centre at (0, 0)) to world coordinates, or None.
         crs: coordinate reference system as an object of rasterio; None: a local grid.
         no_data: value that means "no data" according to GDAL's tag, or None.
         profile, exif: the ICC profile, and EXIF as Pillow's object; or None.

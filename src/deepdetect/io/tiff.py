@@ -34,8 +34,7 @@ ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
 """Codes of tags; GDAL defines the last one."""
 
 MAX_BYTES_PER_PIXEL = 256
-"""Files with more bytes per pixel, over all bands, are rejected, since a small file can claim any
-number of bands. Chosen by hand."""
+"""Files with more bytes per pixel are rejected: a small file can claim any number of bands."""
 
 
 def read_tiff(
