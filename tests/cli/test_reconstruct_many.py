@@ -100,7 +100,7 @@ def test_a_list_of_photographs_and_results_within_the_folder(
     assert np.linalg.norm(centres[1] - centres[0]) == pytest.approx(2.5)
     refused = run("reconstruct", ".", *few, "--format", "map")
     assert refused.exit_code == 2
-    assert "needs a place" in refused.stderr
+    assert "needs GPS" in refused.stderr
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,7 @@ def test_good_photographs_are_registered_and_bad_ones_named(small, shared: Path)
     assert "it is black" in found.unregistered["black.png"]
     assert "broken.jpg" in found.unregistered["broken.jpg"]
     assert "04.jpg is not an image" in found.unregistered["04.jpg"]
-    assert "matches none of the others" in found.unregistered["other.jpg"]
+    assert "matches no other image" in found.unregistered["other.jpg"]
     # Of a path of 2.5 m; the focal length is estimated.
     assert pose_errors(found.views, true_views(shared))[0] < 25
     assert relative_rotation_error(found.views, true_views(shared)) < 0.5
@@ -268,9 +268,9 @@ def test_dense_matches_give_more_and_longer_tracks(small, tmp_path: Path, shared
     [
         ({"calibration": "none.json"}, "none.json cannot be read"),
         ({"calibration": "damaged.json"}, "damaged.json"),
-        ({"scale_by": (0.5, "0004.jpg", "none.jpg")}, "none.jpg is no image"),
-        ({"scale_by": (0.5, "0004.jpg", "none.jpg:3,4")}, "none.jpg is no image"),
-        ({"control_points": "gcp_list.txt"}, "0 ground control points are in two or more images"),
+        ({"scale_by": (0.5, "0004.jpg", "none.jpg")}, "none.jpg is not an image"),
+        ({"scale_by": (0.5, "0004.jpg", "none.jpg:3,4")}, "none.jpg is not an image"),
+        ({"control_points": "gcp_list.txt"}, "0 ground control points are marked"),
     ],
 )
 def test_what_is_named_wrongly_is_said_before_the_work(
@@ -359,7 +359,7 @@ def test_of_two_scenes_the_larger_is_the_model(write_fountain, tmp_path: Path, p
     assert set(found.views) == {"0003.jpg", "0004.jpg", "0005.jpg", "0006.jpg"}
     negatives = tuple(f"negative-{name}.jpg" for name in ("0003", "0004", "0005"))
     assert found.components == (negatives,)
-    assert all("with 2 others only" in found.unregistered[name] for name in negatives)
+    assert all("with only 2 others" in found.unregistered[name] for name in negatives)
     values = json.loads((tmp_path / "model/model.json").read_text())
     assert values["components"] == [list(negatives)]
     assert (values["pairs"], values["pair_choice"]) == (21, "exhaustive")
@@ -389,7 +389,7 @@ def test_two_files_of_one_name_keep_their_folders(
     assert check_images([*paths, paths[0]]) == {f"{p.parent.name}/{p.name}": p for p in paths}
     with pytest.raises(ImageError, match="there is no file"):
         reconstruct_many([photo_path, tmp_path / "missing.jpg"], tmp_path / "model")
-    with pytest.raises(OptionError, match="other must end as images do"):
+    with pytest.raises(OptionError, match="other does not end in"):
         reconstruct_many([photo_path, paths[1].rename(tmp_path / "other")], tmp_path / "model")
 
 
