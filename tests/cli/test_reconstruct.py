@@ -207,7 +207,7 @@ def test_options_reach_the_detector_and_a_name_without_an_ending_is_a_folder(
     values = json.loads(run("reconstruct", *pair, *options).stdout)
     expected = DeepDetect("default").detect(folder / "left.png", threshold=0.7)
     assert values["keypoints"] == len(expected)
-    assert values["rectified_why"] == "as asked for"
+    assert values["rectified_why"] == "set by the caller"
     assert {path.name for path in Path("rec").glob("*.html")} == {"model.html"}
 
 
@@ -254,7 +254,7 @@ CASES = {
     ),
     "left and right exchanged": (
         "right left --calibration {}/calib.json",
-        "left and right exchanged",
+        "are exchanged",
         2,
     ),
     "an unknown ending": ("left right --focal 995 -o out/m.plyy", "did you mean '.ply'", 2),

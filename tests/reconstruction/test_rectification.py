@@ -210,9 +210,9 @@ def test_rows_bent_by_a_lens_are_not_taken_for_level(motorcycle: Any) -> None:
 def test_disparities_that_do_not_differ(shared: Path, one_line) -> None:
     noise = np.random.default_rng(0).normal(0, 0.1, 1000)
     for disparity, message in (
-        (noise, "taken from one place"),
-        (5 * noise, "taken from one place"),
-        (np.zeros(10), "taken from one place"),
+        (noise, "from two different places"),
+        (5 * noise, "from two different places"),
+        (np.zeros(10), "from two different places"),
         (noise + 40, "all disparities are 40"),
         (noise - 7, "all disparities are -7"),
     ):
