@@ -8,6 +8,9 @@ TORCH := torch==2.13.0
 # Two processes, each with whole files (what a file sets up is set up once), on one thread each. One
 # that crashes ends the run: with a new one in its place pytest-xdist may wait for ever.
 PYTEST := -m pytest -q -n 2 --dist loadfile --max-worker-restart 0
+# With COVERAGE=1, as continuous integration runs it, too few lines that run are a failure.
+COVERAGE ?=
+coverage_flags := $(if $(COVERAGE),--cov --cov-report term:skip-covered)
 export OMP_NUM_THREADS ?= 1
 export UV_PYTHON_DOWNLOADS ?= never
 # The tests start many interpreters: what one has compiled, the next should find.
@@ -27,14 +30,14 @@ EVERYTHING := --all-packages --all-extras
 export = $(VENV)/bin/uv export --quiet --locked --all-packages --all-extras --no-emit-workspace --format $(1)
 install_torch = $(VENV)/bin/python -m pip --python $(1)/bin/python install $(PIP_FLAGS) --no-compile --no-deps $(TORCH)
 
-.PHONY: demo test test-all fuzz onnxruntime test-opencv4 test-ray test-integrations test-lowest web test-web coverage hub lint spelling types contracts check \
+.PHONY: demo test test-all fuzz onnxruntime test-opencv4 test-ray test-integrations test-lowest web test-web hub lint spelling types contracts check \
 	format lock upgrade check-lock audit sbom docs test-docs notebooks figures results release-check clean
 demo: $(VENV)/.demo
 	$(VENV)/bin/deepdetect demo -o $(DEMO_OUTPUT)
 
 # The fast tests. Those marked as slow run with `make test-all`.
 test: $(VENV)/.test
-	$(VENV)/bin/python $(PYTEST)
+	$(VENV)/bin/python $(PYTEST) $(coverage_flags)
 
 # All tests, and ten minutes of wrong input and kills.
 test-all: $(VENV)/.test test-opencv4 test-ray test-integrations onnxruntime
@@ -74,9 +77,6 @@ web: web/node_modules/.package-lock.json $(VENV)/.test
 # The page in Chromium: alone, and with `deepdetect app`.
 test-web: web
 	cd web && DEEPDETECT_PYTHON=$(abspath $(VENV))/bin/python npx playwright test $(TESTS_WEB)
-
-coverage: $(VENV)/.test
-	$(VENV)/bin/python $(PYTEST) --cov --cov-report term:skip-covered --cov-report html
 
 lint: $(VENV)/.test spelling
 	$(VENV)/bin/ruff check .

@@ -30,16 +30,17 @@ IN_THE_WHEEL = (
     "deepdetect/py.typed",
     "deepdetect/__init__.pyi",
     "deepdetect/detector/weights/default.onnx",
-    "deepdetect/detector/weights/default.safetensors",
     "deepdetect/detector/weights/dense.onnx",
-    "deepdetect/detector/weights/dense.safetensors",
     "deepdetect/detector/weights/free.onnx",
-    "deepdetect/detector/weights/free.safetensors",
+    "deepdetect/detector/weights/espnet.onnx",
     "deepdetect/detector/points/ranker.npz",
     "deepdetect/io/viewer.html",
 )
 IN_THE_ARCHIVE = ("README.md", "LICENSE", "CHANGELOG.md", "hatch_build.py", "mkdocs.yml", "tests")
-MAX_WHEEL_BYTES = 12_000_000
+NOT_IN_THE_WHEEL = r"\.(safetensors|csv|gz|tar)$"
+"""What only training reads belongs to deepdetect-lab."""
+
+MAX_WHEEL_BYTES = 9_000_000
 
 DRAW = """
 import numpy as np
@@ -131,6 +132,8 @@ def check_contents(wheel: Path, archive: Path) -> None:
         fail(f"the wheel lacks {', '.join(absent)}")
     if strange := [n for n in names if not re.match(r"deepdetect(/|-[\d.a-z]+\.dist-info/)", n)]:
         fail(f"the wheel holds {', '.join(strange[:5])}, which is none of the package's")
+    if training := [name for name in names if re.search(NOT_IN_THE_WHEEL, name)]:
+        fail(f"the wheel holds {', '.join(training)}, which only training reads: move it to lab/")
     if wheel.stat().st_size > MAX_WHEEL_BYTES:
         fail(f"the wheel takes {wheel.stat().st_size / 1e6:.0f} MB: something large got into it")
     if relative := re.findall(r"\]\((?!https?:|#|mailto:)([^)\s]+)\)", readme):

@@ -25,7 +25,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from deepdetect._shared.provenance import provenance
+from deepdetect_lab.evaluation.provenance import provenance
 
 ROOT = Path(__file__).parents[1]
 RESULTS_FOLDER = ROOT / "docs" / "results"

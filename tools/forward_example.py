@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from deepdetect.viz.draw import save_picture
+from deepdetect.io.picture_file import save_picture
 from deepdetect_lab.datasets import load_motorcycle
 
 OUTPUT = Path("src/deepdetect/app/static/examples/motorcycle-ahead.jpg")

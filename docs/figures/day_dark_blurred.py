@@ -26,13 +26,12 @@ from deepdetect import (
     match_images,
     reconstruct,
 )
-from deepdetect.features.display import draw_circle
 from deepdetect.geometry import disparity_errors
 from deepdetect.reconstruction import Reconstruction
-from deepdetect.viz.draw import draw_heatmap
-from deepdetect.viz.render import orbit_camera, render
+from deepdetect.viz.draw import draw_circle, draw_heatmap
 from deepdetect_lab.datasets import load_motorcycle
 from deepdetect_lab.datasets.degradation import DEGRADATIONS, degrade
+from deepdetect_lab.evaluation.clouds import orbit_camera, render
 
 OUTPUT = Path(__file__).parents[1] / "images" / "day-dark-blurred.jpg"
 LIGHTS = {"daylight": None, "an eighth of the light": "dark-8", "out of focus": "blur-2"}

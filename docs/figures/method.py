@@ -16,9 +16,8 @@ from day_dark_blurred import POINTS, draw_points
 from layout import caption, write_jpeg
 
 from deepdetect import DeepDetect, Matches, PointDetector, match_images
-from deepdetect.features.display import draw_matches
 from deepdetect.geometry import disparity_errors
-from deepdetect.viz.draw import draw_heatmap
+from deepdetect.viz.draw import draw_heatmap, draw_matches
 from deepdetect_lab.datasets import StereoPair, load_motorcycle
 from deepdetect_lab.evaluation.unguided import UPRIGHT_SIFT, match_unguided
 from deepdetect_lab.labels import LabelOptions, fuse

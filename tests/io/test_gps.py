@@ -10,7 +10,7 @@ from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
 from deepdetect.io.gps import read_gps
-from deepdetect.io.metadata import Metadata
+from deepdetect.io.picture_file import Metadata
 
 XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description
  xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" {}/></x:xmpmeta>"""

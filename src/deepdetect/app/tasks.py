@@ -17,8 +17,10 @@ import numpy as np
 from .._shared.errors import DeepDetectError, OptionError, ReconstructionError, install_command
 from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
+from ..features.pictures import draw_all_matches
 from ..io.exif import calibration_from_exif
 from ..io.image import load_image
+from ..io.picture_file import save_picture
 from ..io.tables import save_keypoints, save_matches
 from ..matching.pipeline import GUIDED_STAGES, match_images
 from ..matching.registration import register
@@ -26,7 +28,6 @@ from ..matching.stitching import stages_of, stitch
 from ..reconstruction.files import ENDINGS, save_reconstruction
 from ..reconstruction.pipeline import reconstruct
 from ..sfm.pipeline import reconstruct_many
-from ..viz.draw import add_caption, save_picture
 
 FOLDER_KEYPOINTS = 2048
 MODEL_STAGES = 9
@@ -120,15 +121,12 @@ def run_match(images: Images, options: Options, folder: Path, report: Report) ->
         raise DeepDetectError("no geometry can be trusted: both images must show the same scene")
     save_matches(matches, folder / "matches.csv")
     save_matches(matches, folder / "matches.npz")
-    picture = matches.draw(first, second, by_position=True)
-    inliers = int(matches.inliers.sum())
+    save_picture(draw_all_matches(first, second, matches), folder / "matches.jpg")
     model = "none" if matches.geometry is None else matches.geometry.model
-    caption = f"{len(matches):,} matches: matching points share a colour"
-    save_picture(add_caption(picture, caption), folder / "matches.jpg")
     numbers = {
         "Keypoints": f"{len(matches.keypoints0):,} and {len(matches.keypoints1):,}",
         "Matches": f"{len(matches):,}",
-        f"Agree ({model})": f"{inliers:,}",
+        f"Agree ({model})": f"{int(matches.inliers.sum()):,}",
     }
     return TaskResult(numbers, "matches.jpg", ("matches.csv", "matches.npz", "matches.jpg"))
 

@@ -87,6 +87,8 @@ def extract_features(
     """
     detector = PointDetector() if detector is None else detector
     check_selection(detector, selection)
+    if selection is not None and selection.max_keypoints is None:
+        selection = replace(selection, max_keypoints=detector.max_keypoints)
     root = Path(folder).absolute()
     names = [image.relative_to(root).as_posix() for image in find_images(root)]
     utf8 = [name for name in names if name == name.encode("utf-8", "ignore").decode()]

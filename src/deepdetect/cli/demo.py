@@ -9,13 +9,14 @@ import numpy as np
 
 from .._shared.errors import require_packages
 from ..detector.detector import DeepDetect, HeatmapDetector
-from ..features.display import draw_matches
 from ..features.keypoints import Keypoints
+from ..features.pictures import draw_dense_keypoints
 from ..features.sift import describe_keypoints
 from ..geometry.transforms import TOLERANCE_PX, disparity_errors, score_errors
 from ..io.image import luma
+from ..io.picture_file import save_picture
 from ..matching.pipeline import match_features, match_images
-from ..viz.draw import add_caption, draw_dense_keypoints, draw_heatmap, save_picture
+from ..viz.draw import add_caption, draw_heatmap, draw_matches
 from . import _options as cli
 from ._detection import NETWORK
 

@@ -18,12 +18,14 @@ from .._shared.progress import progress
 from .._shared.records import Outputs, plain
 from ..detector.detector import DeepDetect, find_keypoints
 from ..detector.point_detector import PointDetector
+from ..features.pictures import draw_best_keypoints, draw_dense_keypoints
 from ..features.selection import SelectionOptions, select_keypoints
 from ..io.image import load_image
 from ..io.image_file import reading_options
 from ..io.masks import load_mask
+from ..io.picture_file import save_picture
 from ..io.tables import save_keypoints
-from ..viz.draw import draw_best_keypoints, draw_dense_keypoints, draw_logits, save_picture
+from ..viz.draw import draw_logits
 from . import _options as cli
 from ._detection import NETWORK, POINTS, SELECTION, Detector, chosen_detector
 

@@ -22,7 +22,7 @@ from ._options import Result, command, table
 PURPOSES = {
     "all": "the fast back end, ONNX files, the demo, HEIC, raw and compressed TIFF images",
     "app": "the page in a browser",
-    "sfm": "reconstruct of three images and more, extract, match-many, export, control points",
+    "sfm": "reconstruct of three images and more, extract, match-many, export, places on the Earth",
 }
 MAX_BACKEND_DIFFERENCE = 5e-3
 """Between the probabilities of two back ends; five times what is usual."""

@@ -20,18 +20,18 @@ from ..detector.detector import DeepDetect
 from ..detector.point_detector import PointDetector
 from ..features.matchers import MATCHERS_OF_NUMBERS
 from ..features.matches import Matches, TwoViewGeometry
+from ..features.pictures import draw_all_matches
 from ..features.selection import SelectionOptions
 from ..geometry import GeometryOptions, estimate_geometry
 from ..geometry.estimation import MODEL_NAMES
 from ..geometry.transforms import translation_matrix
 from ..io.image import load_image
-from ..io.metadata import read_metadata
+from ..io.picture_file import Metadata, picture_suffix, read_metadata, save_picture
 from ..io.tables import read_matrix, save_matches
 from ..matching.pipeline import GUIDED_STAGES, match_features, match_images
 from ..matching.registration import register as register_images
 from ..matching.stitching import StitchingOptions, stages_of
 from ..matching.stitching import stitch as stitch_images
-from ..viz.draw import add_caption, picture_suffix, save_picture
 from . import _options as cli
 from ._detection import (
     DESCRIBED_POINTS,
@@ -134,8 +134,8 @@ def match(
                         matches = match_pair(rgb0, rgb1, chosen, selection=selection, **settings)
                     save_matches(matches, made["file"])
                     if pictures:
-                        _draw(rgb0, rgb1, matches, made["picture"])
-                if reason := _why_none(matches):
+                        save_picture(draw_all_matches(rgb0, rgb1, matches), made["picture"])
+                if reason := _why_none(matches, unguided):
                     cli.say(f"{name}: {reason}" if many else reason)
                 numbers = _numbers(pair, matches, files)
                 found.append(numbers | {"backend": getattr(chosen, "runtime", None)})
@@ -211,9 +211,9 @@ def _choose_pairs(
     return {pair: f"{stems[pair[0]]}_{stems[pair[1]]}" for pair in chosen}
 
 
-def _why_none(matches: Matches) -> str | None:
+def _why_none(matches: Matches, unguided: bool) -> str | None:
     """Say why there are no matches, or no geometry."""
-    if not len(matches) and matches.success:
+    if not len(matches) and (matches.success or unguided):
         return "there are no matches: the images show too little, or the options leave none"
     if matches.success:
         return None
@@ -260,16 +260,6 @@ def _geometry_values(geometry: TwoViewGeometry | None) -> dict[str, Any] | None:
     return vars(geometry) | {"matrix": matrix, "evidence": evidence}
 
 
-def _draw(rgb0: np.ndarray, rgb1: np.ndarray, matches: Matches, path: Path) -> None:
-    picture = matches.draw(rgb0, rgb1, by_position=True)
-    others = len(matches) - int(matches.inliers.sum())
-    model = "none" if matches.geometry is None else matches.geometry.model
-    caption = f"{len(matches):,} matches ({model}): matching points share a colour"
-    if others:
-        caption += f"; {others:,} that do not fit it: red"
-    save_picture(add_caption(picture, caption), path)
-
-
 @cli.command(REGISTRATION, SELECTION, POINTS, NETWORK, cli.READING)
 def register(
     image0: cli.Image,
@@ -296,11 +286,12 @@ def register(
     Args:
         apply_to: More files of the second camera, moved by the same homography.
     """
-    reference, folder = read_metadata(image0), cli.output_folder(output)
+    reference, folder = read_metadata(image0, placed=True), cli.output_folder(output)
     own = {path: read_metadata(path) for path in (image1, *apply_to)}
     files: dict[Any, Path] = {}
+    geotiff = reference.to_world is not None and image0.suffix.lower() in (".tif", ".tiff")
     for path, each in own.items():
-        ending = ".png" if each.plain and not reference.keys else ".tif"
+        ending = ".png" if each.plain and not geotiff else ".tif"
         files[path] = folder / f"{path.stem}_on_{image0.stem}{ending}"
     for ending in ("_checkerboard.png", "_difference.png", "_homography.txt"):
         files[ending] = folder / f"{image1.stem}_on_{image0.stem}{ending}"
@@ -366,11 +357,14 @@ def stitch(
         raise OptionError("--max-keypoints is for --detector points: leave it out, or choose that")
     chosen, _ = chosen_detector(detector, values)
     options = StitchingOptions(**OPTIONS.take(values))
+    flat = values.get("projection", "plane") == "plane"
     images: list[Path] = []
+    carried: list[Metadata] = []
     failures: list[str] = []
     for path in paths:
         with noted_failures(str(path), failures):
             load_image(path)
+            carried.append(read_metadata(path, placed=flat))
             images.append(path)
     if len(images) < min(len(paths), 2) or (reference is not None and reference not in images):
         what = "too few images, or not the reference, can be read"
@@ -392,9 +386,8 @@ def stitch(
             for number, path in enumerate(images):
                 text = text.replace(f"images[{number}]", str(path))
             raise type(error)(text) from error
-        flat = values.get("projection", "plane") == "plane"
         moved = panorama.homographies[panorama.reference] if flat else None
-        kept = replace(read_metadata(images[panorama.reference]), no_data=None).moved(moved)
+        kept = replace(carried[panorama.reference], no_data=None).moved(moved)
         save_picture(panorama.image, made["file"], kept)
         kept.write_beside(file)
     for number, reason in panorama.unregistered.items():

@@ -11,8 +11,8 @@ from cyclopts import Parameter
 
 from .._shared.errors import MissingFileError, OptionError
 from ..io.image import load_image
+from ..io.picture_file import save_picture
 from ..io.tables import load_keypoints, load_matches
-from ..viz.draw import save_picture
 from . import _options as cli
 
 SHOWN = (".html", ".jpg", ".jpeg", ".png", ".webp", ".gif", ".svg", ".pdf")

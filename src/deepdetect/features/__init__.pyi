@@ -1,5 +1,9 @@
 from .keypoints import Keypoints as Keypoints
-from .matches import Matches as Matches, TwoViewGeometry as TwoViewGeometry
+from .matches import (
+    Evidence as Evidence,
+    Matches as Matches,
+    TwoViewGeometry as TwoViewGeometry,
+)
 from .selection import (
     SelectionOptions as SelectionOptions,
     select_keypoints as select_keypoints,

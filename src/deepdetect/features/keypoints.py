@@ -234,7 +234,8 @@ class Keypoints:
         Raises:
             ImageError: the image has another size than the keypoints'.
         """
-        from .display import checked_image, draw_keypoints
+        from ..viz.draw import draw_keypoints
+        from .display import checked_image
 
         return draw_keypoints(checked_image(image, self.image_size, channels), self.xy, self.sizes)
 

@@ -362,7 +362,8 @@ class Matches:
         Raises:
             ImageError: an image has another size than its keypoints'.
         """
-        from .display import checked_image, draw_matches
+        from ..viz.draw import draw_matches
+        from .display import checked_image
 
         rgb0 = checked_image(image0, self.keypoints0.image_size, channels)
         rgb1 = checked_image(image1, self.keypoints1.image_size, channels)
@@ -401,7 +402,7 @@ class Matches:
 
     def __repr__(self) -> str:
         if not self.success:  # whose keypoints may have to be found first
-            return f"Matches({len(self)} matches, as no geometry could be trusted)"
+            return f"Matches({len(self)} matches; no geometry can be trusted)"
         told = ""
         if self.geometry is not None:
             told = f", model={self.geometry.model!r}, confidence={self.geometry.confidence!r}"

@@ -79,7 +79,11 @@ def read_camera_file(path: Path, views: tuple[int, int] | None = None) -> dict[s
 
 
 def _parsed(content: bytes) -> Values:
-    """Return what a file says by key."""
+    """Return what a file says by key.
+
+    Files of OpenCV are not read by `cv2.FileStorage`: on damaged ones it hangs, and where they are
+    nested deeply it ends the process.
+    """
     text = content.decode("utf-8", "replace").lstrip("\ufeff \r\n\t")
     if text.startswith("{"):
         return json.loads(text)

@@ -23,7 +23,7 @@ from ..geometry.transforms import (
 )
 from ..io.image import Images, load_deep, load_image, luma
 from ..io.image_file import file_name, is_file
-from ..io.metadata import read_metadata
+from ..io.picture_file import read_metadata
 from .pipeline import match_images
 
 Extent = Literal["reference", "union"]

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from ..io.depth import save_depth_npz, save_depth_png
+from ..io.picture_file import save_picture
 from ..io.point_cloud import POINT_CLOUD_WRITERS, save_point_cloud
-from ..viz.draw import draw_depth, save_picture
+from ..viz.draw import draw_depth
 from .result import Reconstruction
 
 ENDINGS = (*POINT_CLOUD_WRITERS, "_depth.png", "_depth.npz", "_depth.jpg", ".json")

@@ -6,6 +6,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -15,7 +16,7 @@ from .._shared.atomic import atomic_path
 from .._shared.errors import ReconstructionError, check_name, require_packages
 from ..geometry.point_cloud import BOX_PERCENTILE, PointCloud, robust_box
 from ..io.glb import write_glb
-from ..io.metadata import KEY_DIRECTORY, Metadata
+from ..io.picture_file import Metadata
 from ..io.point_cloud import save_point_cloud
 from .colmap import quiet_pycolmap
 from .georeference import Georeference
@@ -90,12 +91,10 @@ def write_map(found: MultiViewReconstruction, folder: Path, output: Path) -> Non
     photo[filled] = colors[middle]
     corner = cell * np.array([west + 0.5, north - 0.5])
     to_world = np.array([[cell, 0, corner[0]], [0, -cell, corner[1]], [0, 0, 1.0]])
-    # GeoTIFF 1.1: a projected system, pixels are areas, of this number.
-    directory = (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, epsg)
-    keys = ((KEY_DIRECTORY, 3, len(directory), directory, True),)
-    Metadata(to_world, keys, no_data=np.nan).write_tiff(heights, output / "height.tif")
+    place = Metadata(to_world, f"EPSG:{epsg}")
+    replace(place, no_data=np.nan).write_tiff(heights, output / "height.tif")
     bands = photo.reshape(height, width, 3)
-    Metadata(to_world, keys, no_data=0).write_tiff(bands, output / "orthophoto.tif")
+    replace(place, no_data=0).write_tiff(bands, output / "orthophoto.tif")
 
 
 def _in_utm(found: MultiViewReconstruction, what: str) -> tuple[np.ndarray, int]:
@@ -172,7 +171,7 @@ class Format(NamedTuple):
 
 FORMATS: dict[FormatName, Format] = {
     "laz": Format(write_laz, ("model.laz",), ("laspy", "lazrs", "pyproj"), True),
-    "map": Format(write_map, ("height.tif", "orthophoto.tif"), placed=True),
+    "map": Format(write_map, ("height.tif", "orthophoto.tif"), ("rasterio",), True),
     "mesh": Format(write_mesh, ("mesh.ply", "mesh.glb")),
     "splat": Format(write_splat, ("splat",)),
     "text": Format(write_text, ("sparse_text",)),

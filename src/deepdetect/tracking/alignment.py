@@ -6,6 +6,7 @@ is computed once for each patch); gain and offset of the light drop out of the e
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -37,10 +38,6 @@ MAX_GROWTH = 4.0
 RIDGE = 1e-4
 """Added to the equations, as a share of their size: patches of parallel edges can be solved."""
 
-OFFSETS = np.indices((2 * RADIUS_PX + 1,) * 2, np.float32)[::-1].reshape(2, -1) - RADIUS_PX
-WINDOW = np.exp(-2 * (OFFSETS**2).sum(axis=0) / RADIUS_PX**2)
-WINDOW /= WINDOW.sum()
-
 MOST_READ = 1 << 14
 """Patches that are read at once: OpenCV's limit for the sides of an image is 32,767."""
 
@@ -60,8 +57,9 @@ class Patches(NamedTuple):
     @classmethod
     def none(cls) -> Patches:
         """Return no patches."""
-        values = np.empty((0, OFFSETS.shape[1]), np.float32)
-        steps = np.empty((0, 6, OFFSETS.shape[1]), np.float32)
+        pixels = (2 * RADIUS_PX + 1) ** 2
+        values = np.empty((0, pixels), np.float32)
+        steps = np.empty((0, 6, pixels), np.float32)
         return cls(values, steps, np.empty(0, np.float32), np.empty((0, 2, 2)))
 
     def select(self, rows: np.ndarray) -> Patches:
@@ -74,25 +72,26 @@ def cut_patches(image: np.ndarray, xy: np.ndarray) -> Patches:
 
     One that the border or its blur reaches is empty, and is never found.
     """
+    offsets, weights = _pixels()
     affinities = np.tile(np.eye(2), (len(xy), 1, 1))
     slopes = [
         _read(cv2.Sobel(image, cv2.CV_32F, *axis, ksize=1, scale=0.5), xy, affinities)
         for axis in ((1, 0), (0, 1))
     ]
     slope = np.stack(slopes, axis=1)
-    deformation = (slope[:, :, None] * OFFSETS).reshape(len(xy), 4, -1)
+    deformation = (slope[:, :, None] * offsets).reshape(len(xy), 4, -1)
     changes = _centred(np.concatenate([slope, deformation], axis=1))
     margin = RADIUS_PX + BORDER_PX
     most = np.array(image.shape[::-1]) - 1 - margin
     inside = np.all((xy >= margin) & (xy <= most), axis=1)
     values = _centred(_read(image, xy, affinities)) * inside[:, None]
-    variances = np.maximum((values**2) @ WINDOW, 1e-6)
-    by_gain = changes @ (values * WINDOW)[..., None] / variances[:, None, None]
+    variances = np.maximum((values**2) @ weights, 1e-6)
+    by_gain = changes @ (values * weights)[..., None] / variances[:, None, None]
     changes -= by_gain * values[:, None]
-    weighted = changes * WINDOW
+    weighted = changes * weights
     normal = weighted @ changes.transpose(0, 2, 1)
-    scale = (slope**2 @ WINDOW).sum(axis=1) + 1e-6
-    ridge = RIDGE * np.diag([1.0] * 2 + [WINDOW @ OFFSETS[0] ** 2] * 4)
+    scale = (slope**2 @ weights).sum(axis=1) + 1e-6
+    ridge = RIDGE * np.diag([1.0] * 2 + [weights @ offsets[0] ** 2] * 4)
     normal += scale[:, None, None] * ridge
     steps = np.linalg.inv(normal).astype(np.float32) @ weighted
     return Patches(values, steps, variances, affinities)
@@ -110,6 +109,7 @@ def find_patches(
     arrived = np.zeros(len(xy), bool)
     rows = np.arange(len(xy))
     most = np.array(image.shape[::-1]) - 1
+    weights = _pixels()[1]
     for _ in range(MAX_ITERATIONS):
         spread = RADIUS_PX * np.abs(affinities[rows]).sum(axis=2) + BORDER_PX
         rows = rows[((found[rows] >= spread) & (found[rows] <= most - spread)).all(axis=1)]
@@ -117,8 +117,8 @@ def find_patches(
             break
         values, steps, variances, _ = patches.select(rows)
         seen = _centred(_read(image, found[rows], affinities[rows]))
-        shared = (seen * values) @ WINDOW
-        correlation = shared / np.sqrt(np.maximum((seen**2) @ WINDOW, 1e-6) * variances)
+        shared = (seen * values) @ weights
+        correlation = shared / np.sqrt(np.maximum((seen**2) @ weights, 1e-6) * variances)
         step = (steps @ seen[..., None])[..., 0] * (variances / np.maximum(shared, 1e-6))[:, None]
         deformed = np.eye(2) + step[:, 2:].reshape(-1, 2, 2)
         regular = (shared > 0) & (np.linalg.det(deformed) > 1 / MAX_GROWTH)
@@ -133,12 +133,20 @@ def find_patches(
     return found, affinities, arrived & (growth > 1 / MAX_GROWTH) & (growth < MAX_GROWTH)
 
 
+@cache
+def _pixels() -> tuple[np.ndarray, np.ndarray]:
+    """Return where a patch's pixels lie from its middle, (2, P), and how much they count, (P,)."""
+    offsets = np.indices((2 * RADIUS_PX + 1,) * 2, np.float32)[::-1].reshape(2, -1) - RADIUS_PX
+    weights = np.exp(-2 * (offsets**2).sum(axis=0) / RADIUS_PX**2)
+    return offsets, weights / weights.sum()
+
+
 def _read(image: np.ndarray, xy: np.ndarray, affinities: np.ndarray) -> np.ndarray:
     """Return the (N, P) values of an image around points, where the affinities put the pixels.
 
     By Lanczos' kernel: OpenCV's cubic one moves what it reads by up to .05 px.
     """
-    places = xy.astype(np.float32)[:, :, None] + affinities.astype(np.float32) @ OFFSETS
+    places = xy.astype(np.float32)[:, :, None] + affinities.astype(np.float32) @ _pixels()[0]
     parts = np.array_split(places, len(places) // MOST_READ + 1)
     return np.concatenate(
         [cv2.remap(image, *part.transpose(1, 0, 2), cv2.INTER_LANCZOS4) for part in parts]
@@ -147,4 +155,4 @@ def _read(image: np.ndarray, xy: np.ndarray, affinities: np.ndarray) -> np.ndarr
 
 def _centred(values: np.ndarray) -> np.ndarray:
     """Subtract the weighted mean of each patch."""
-    return values - (values @ WINDOW)[..., None]
+    return values - (values @ _pixels()[1])[..., None]

@@ -14,7 +14,7 @@ import numpy as np
 from .._shared.atomic import atomic_path
 from .._shared.errors import InvalidFileError, MissingFileError, OptionError, first_line
 from .._shared.opencv import cv2
-from ..features.display import line_scale
+from ..viz.draw import line_scale
 
 HEADER = "frame,track,x,y,score"
 

@@ -1,37 +1,34 @@
-"""Pictures of heat maps, keypoints, matches and labels."""
+"""Pictures of keypoints, matches, heat maps and depth: everything that is drawn, from arrays."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
-from .._shared.atomic import atomic_path
-from .._shared.errors import DeepDetectError, OptionError
-from .._shared.image_array import to_8_bits
 from .._shared.opencv import cv2
-from ..features.display import PICTURE_SIDE_PX, draw_circle, line_scale
-from ..features.keypoints import Keypoints
-from ..features.selection import spread_over_grid
-from ..geometry.transforms import scaled_points
-from ..io.metadata import Metadata
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-MAX_JPEG_SIDE_PX = 65_500
-"""The largest width and height that libjpeg writes."""
+MAX_CIRCLES = 5000
+"""More keypoints than this are drawn as single pixels."""
 
-JPEG_QUALITY = 85
-SHOWN_KEYPOINTS = 1000
-AREA_OF_KEYPOINT_PX = 200
-"""Pixels of a small picture for each keypoint that is drawn, so that all can be told apart."""
+LEAST_RADIUS_PX = 2.0
+"""Of the circle of a keypoint that has a size; without one it is a pixel more."""
+
+PICTURE_SIDE_PX = 2000
+"""Longer side of a picture of matches: as JPEG it takes less than two megabytes."""
+
+READABLE_WIDTH_PX = 800
+"""Captions, lines and points grow with pictures that are wider than this."""
+
+LINES, DOTS = 60, 1500
+"""Of matches that have the colour of their position."""
 
 SHOWN_PERCENTILE = 99.0
 """Values above it, and below the opposite one, have the last colours: few may be far away."""
 
-LEAST_LEVEL, LEAST_DEPTH_LEVEL = 0.35, 0.2
-"""Darker colours of the scale are not seen on a photograph, or look like unknown depth."""
+LEAST_DEPTH_LEVEL = 0.2
+"""Darker colours of the scale look like unknown depth."""
 
 CAPTION_HEIGHT = 28
 """Of pictures that are not wider than `READABLE_WIDTH_PX`."""
@@ -43,38 +40,86 @@ CAPTION_SCALE = 0.5
 GAP_PX = 6
 """Between pictures that are joined."""
 
-WHITE = (255, 255, 255)
+GREEN, RED, WHITE = (60, 255, 60), (255, 60, 60), (255, 255, 255)
 
 
-def save_picture(rgb: np.ndarray, path: str | Path, metadata: Metadata = Metadata()) -> None:
-    """Write a (H, W, 3) uint8 or uint16 RGB picture as .png or .tif, or of 8 bits as .jpg.
+def draw_keypoints(rgb: np.ndarray, xy: np.ndarray, sizes: np.ndarray | None) -> np.ndarray:
+    """Draw keypoints on a (H, W, 3) uint8 RGB image, which is dimmed; as `Keypoints.draw`."""
+    canvas, unit = rgb // 2, line_scale(rgb)
+    if len(xy) > MAX_CIRCLES:
+        # Half transparent, so that the image shows through the dense points.
+        columns, rows = np.clip(np.rint(xy).astype(int), 0, np.array(rgb.shape[1::-1]) - 1).T
+        canvas[rows, columns] = canvas[rows, columns] // 2 + np.array(GREEN, np.uint8) // 2
+        return canvas
+    least = LEAST_RADIUS_PX * unit
+    radii = np.full(len(xy), least + unit) if sizes is None else np.maximum(sizes / 2, least)
+    for centre, radius in zip(xy, radii, strict=True):
+        draw_circle(canvas, centre, radius, GREEN, round(unit))
+    return canvas
 
-    It is written whole or not at all.
+
+def draw_matches(
+    rgb0: np.ndarray,
+    rgb1: np.ndarray,
+    points0: np.ndarray,
+    points1: np.ndarray,
+    good: np.ndarray,
+    lines: int = 150,
+    *,
+    by_position: bool = False,
+) -> np.ndarray:
+    """Draw the two images side by side, with lines between a random sample of the matches.
+
+    The lower image is enlarged to the height of the other, and both are scaled down where the
+    picture would be wider or higher than `PICTURE_SIDE_PX`. Good matches are green, the others red;
+    by position the good ones are coloured by their place in the first image, and most are dots.
     """
-    suffix = picture_suffix(path)
-    if suffix.startswith(".tif"):
-        metadata.write_tiff(rgb, Path(path))
-        return
-    # Checked before OpenCV is asked, which would also log it.
-    if suffix != ".png" and max(rgb.shape[:2]) > MAX_JPEG_SIDE_PX:
-        size = f"{rgb.shape[1]}x{rgb.shape[0]}"
-        raise DeepDetectError(
-            f"{path} cannot hold a picture of {size} pixels: give it a name that ends in .png"
-        )
-    settings = []
-    if suffix != ".png":
-        rgb, settings = to_8_bits(rgb), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    data = metadata.encode(rgb, suffix, settings)
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(data)
+    height = max(rgb0.shape[0], rgb1.shape[0])
+    width = sum(rgb.shape[1] * height / len(rgb) for rgb in (rgb0, rgb1))
+    height = max(1, round(height * min(1.0, PICTURE_SIDE_PX / max(width, height))))
+    shown = [resized(rgb, height / len(rgb)) for rgb in (rgb0, rgb1)]
+    canvas = cv2.convertScaleAbs(np.concatenate(shown, axis=1), alpha=0.7)
+    points0, points1 = (
+        (np.asarray(points, np.float64) + 0.5) * (view.shape[1] / rgb.shape[1], height / len(rgb))
+        - 0.5
+        for points, view, rgb in zip((points0, points1), shown, (rgb0, rgb1), strict=True)
+    )
+    good = np.asarray(good, bool)
+    order = np.random.default_rng(0).permutation(len(points0))[: DOTS if by_position else lines]
+    colors = np.where(good[order, None], GREEN, RED)
+    if by_position:
+        relative = points0[order] / (shown[0].shape[1], height)
+        colors[good[order]] = _colors_of_positions(relative[good[order]])
+    with_line = np.arange(len(order)) < (LINES if by_position else lines)
+    unit = line_scale(canvas)
+    for k in np.argsort(good[order], kind="stable"):  # the good ones on top
+        row, color = order[k], tuple(int(v) for v in colors[k])
+        start = tuple(int(v) for v in np.rint(points0[row]))
+        end = tuple(int(v) for v in np.rint(points1[row] + [shown[0].shape[1], 0]))
+        if with_line[k]:
+            cv2.line(canvas, start, end, color, round(unit), cv2.LINE_AA)
+        for point in (start, end):
+            cv2.circle(canvas, point, round(2 * unit), color, -1, cv2.LINE_AA)
+    return canvas
 
 
-def picture_suffix(path: str | Path) -> str:
-    """Return the suffix of a picture's file in lower case; call it before any expensive work."""
-    suffix = Path(path).suffix.lower()
-    if suffix not in SUFFIXES:
-        raise OptionError(f"{path} must end in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
-    return suffix
+def _colors_of_positions(positions: np.ndarray) -> np.ndarray:
+    """Return (N, 3) RGB colours of positions in [0, 1]: hue from left to right, dark downwards.
+
+    None is red, which matches that are not good have.
+    """
+    x, y = np.clip(positions, 0, 1).T
+    hsv = np.stack([20 + 120 * x, np.full(len(x), 230), 255 - 110 * y], 1)  # of 180, 255, 255
+    hsv = np.rint(hsv).astype(np.uint8)[None]
+    return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0] if len(x) else np.empty((0, 3), np.uint8)
+
+
+def draw_circle(
+    canvas: np.ndarray, centre: np.ndarray, radius: float, color: Sequence[int], width: int
+) -> None:
+    """Draw a circle with sub-pixel position and radius."""
+    x, y = np.rint(centre * 16).astype(int).tolist()
+    cv2.circle(canvas, (x, y), round(radius * 16), tuple(color), width, cv2.LINE_AA, 4)
 
 
 def draw_heatmap(heatmap: np.ndarray) -> np.ndarray:
@@ -91,7 +136,7 @@ def draw_logits(logits: np.ndarray) -> np.ndarray:
     """
     shown = fit_picture(np.asarray(logits, np.float32))
     known = np.where(np.isfinite(shown), shown, 0)
-    low, high = _shown_range(known)
+    low, high = shown_range(known)
     low, high = min(low, -1.0), max(high, 1.0)
     levels = np.where(np.isfinite(shown), (known - low) / (high - low), shown > 0)
     words = "logit of a keypoint, 0 is a probability of 0.5"
@@ -106,7 +151,7 @@ def draw_depth(depth: np.ndarray, unit: str) -> np.ndarray:
     known = np.isfinite(depth)
     if not known.any():
         return add_caption(np.zeros((*depth.shape, 3), np.uint8), "no depth is known")
-    near, far = _shown_range(depth[known])
+    near, far = shown_range(depth[known])
     # By inverse depth, as differences are seen.
     inverse = 1 / np.maximum(np.where(known, depth, far), 1e-9)
     levels = (inverse - 1 / far) / max(1 / near - 1 / far, 1e-12)
@@ -118,73 +163,34 @@ def draw_depth(depth: np.ndarray, unit: str) -> np.ndarray:
     return add_scale(fit_picture(colors), words, far, near, LEAST_DEPTH_LEVEL)
 
 
-def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    """Draw the best keypoints of all parts of an image, coloured by score or logit, with a scale.
-
-    At most `SHOWN_KEYPOINTS`, fewer on small images: in turn the best of each cell of a grid. They
-    are circles of their size, or all alike where they have none. `fit_picture` sizes the picture.
-    """
-    shown = fit_picture(rgb)
-    factor = shown.shape[1] / rgb.shape[1]
-    # A grey, darker copy, on which colours are seen.
-    gray = cv2.convertScaleAbs(cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY), alpha=0.6)
-    canvas = cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB)
-    values = keypoints.scores if keypoints.logits is None else keypoints.logits
-    name = "score" if keypoints.logits is None else "logit"
-    unit = line_scale(canvas)
-    room = int(canvas.shape[0] * canvas.shape[1] / (AREA_OF_KEYPOINT_PX * unit**2))
-    most = max(1, min(SHOWN_KEYPOINTS, room, len(keypoints)))
-    # No more cells than keypoints, or the dimmest parts would be left out.
-    shorter, longer = sorted(canvas.shape[:2])
-    cells = max(1, int((most * longer / shorter) ** 0.5))
-    rows = spread_over_grid(keypoints.xy, values, keypoints.image_size, most, cells)
-    counted = f"{len(rows):,} of " if len(rows) < len(keypoints) else ""
-    counted += _counted(keypoints)
-    if not len(rows):
-        return add_caption(canvas, "no keypoints")
-    low, high = _shown_range(values[rows])
-    levels = np.clip((values[rows] - low) / max(high - low, 1e-9), 0, 1)
-    colors = _viridis(LEAST_LEVEL + (1 - LEAST_LEVEL) * levels).tolist()
-    radii = np.full(len(rows), 3 * unit)
-    if keypoints.sizes is not None:
-        radii = np.maximum(keypoints.sizes[rows] * factor / 2, 2 * unit)
-    centres = scaled_points(keypoints.xy[rows], factor)
-    # The best on top, and a dark rim, so that each is seen before any colour.
-    for k in np.argsort(values[rows]):
-        draw_circle(canvas, centres[k], radii[k], (0, 0, 0), max(2, round(2.5 * unit)))
-        draw_circle(canvas, centres[k], radii[k], colors[k], max(1, round(1.25 * unit)))
-    return add_scale(canvas, f"{counted}, coloured by {name}", low, high, LEAST_LEVEL)
-
-
-def draw_dense_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    """Draw all keypoints, with a caption that counts them, as `fit_picture` sizes it."""
-    caption = f"{_counted(keypoints)}, {keypoints.density:.1%} of the pixels"
-    return add_caption(fit_picture(keypoints.draw(rgb)), caption)
-
-
-def _counted(keypoints: Keypoints) -> str:
-    return f"{len(keypoints):,} keypoint{'' if len(keypoints) == 1 else 's'}"
-
-
-def _shown_range(values: np.ndarray) -> tuple[float, float]:
+def shown_range(values: np.ndarray) -> tuple[float, float]:
     """Return the values that have the last colours."""
     low, high = np.percentile(values, (100 - SHOWN_PERCENTILE, SHOWN_PERCENTILE))
     return float(low), float(high)
 
 
-def fit_picture(picture: np.ndarray) -> np.ndarray:
-    """Scale a picture or a map down so that its longer side is at most `PICTURE_SIDE_PX`."""
-    height, width = picture.shape[:2]
-    factor = PICTURE_SIDE_PX / max(height, width)
-    if factor >= 1:
-        return picture
-    size = max(1, round(width * factor)), max(1, round(height * factor))
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
-
-
-def _viridis(levels: np.ndarray) -> np.ndarray:
+def viridis(levels: np.ndarray) -> np.ndarray:
+    """Return the (N, 3) colours of (N,) levels, as `draw_heatmap` has them."""
     colors: np.ndarray = draw_heatmap(np.asarray(levels).reshape(1, -1))[0]
     return colors
+
+
+def line_scale(picture: np.ndarray) -> float:
+    """Return by how much captions, lines and points are enlarged."""
+    return max(1.0, picture.shape[1] / READABLE_WIDTH_PX)
+
+
+def resized(picture: np.ndarray, factor: float) -> np.ndarray:
+    """Scale a picture or a map; where it shrinks without aliasing."""
+    size = [max(1, round(side * factor)) for side in picture.shape[1::-1]]
+    method = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
+    return cv2.resize(picture, size, interpolation=method)
+
+
+def fit_picture(picture: np.ndarray) -> np.ndarray:
+    """Scale a picture or a map down so that its longer side is at most `PICTURE_SIDE_PX`."""
+    factor = PICTURE_SIDE_PX / max(picture.shape[:2])
+    return picture if factor >= 1 else resized(picture, factor)
 
 
 def add_caption(rgb: np.ndarray, text: str) -> np.ndarray:
@@ -207,7 +213,7 @@ def add_scale(
     strip = _caption(text, width - bar - 2 * end, unit)
     gap = len(strip) // 4
     colors = np.zeros((len(strip), bar, 3), np.uint8)
-    colors[gap : len(strip) - gap] = _viridis(np.linspace(least_level, 1, bar))
+    colors[gap : len(strip) - gap] = viridis(np.linspace(least_level, 1, bar))
     return np.concatenate([rgb, np.concatenate([strip, left, colors, right], axis=1)])
 
 
@@ -225,18 +231,13 @@ def _caption(text: str, width: int, unit: float) -> np.ndarray:
     return strip
 
 
-def hstack(panels: Sequence[np.ndarray]) -> np.ndarray:
-    """Join pictures from left to right, with a white gap, and white below lower ones."""
-    turned = vstack([panel.transpose(1, 0, 2) for panel in panels])
-    return np.ascontiguousarray(turned.transpose(1, 0, 2))
-
-
-def vstack(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """Join pictures from top to bottom, with a white gap, and white beside narrower ones."""
-    width = max(row.shape[1] for row in rows)
-    gaps = [GAP_PX] * (len(rows) - 1) + [0]
-    padded = [
-        np.pad(row, ((0, gap), (0, width - row.shape[1]), (0, 0)), constant_values=255)
-        for row, gap in zip(rows, gaps, strict=True)
-    ]
-    return np.concatenate(padded)
+def join_pictures(panels: Sequence[np.ndarray], columns: int) -> np.ndarray:
+    """Join pictures of one size, this many in a row, with white gaps between them."""
+    height, width = panels[0].shape[:2]
+    rows = -(-len(panels) // columns)
+    size = rows * (height + GAP_PX) - GAP_PX, columns * (width + GAP_PX) - GAP_PX, 3
+    joined = np.full(size, 255, np.uint8)
+    for k, panel in enumerate(panels):
+        top, left = k // columns * (height + GAP_PX), k % columns * (width + GAP_PX)
+        joined[top : top + height, left : left + width] = panel
+    return joined

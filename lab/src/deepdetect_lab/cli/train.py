@@ -11,11 +11,11 @@ from cyclopts import Parameter
 
 from deepdetect._shared.options import look_up
 from deepdetect._shared.progress import progress
-from deepdetect._shared.provenance import provenance
 from deepdetect.batch.engines import ENGINES
 from deepdetect.cli import _options as cli
 from deepdetect.cli.features import EXTRACTION
 
+from ..evaluation.provenance import provenance
 from ..labels import LabelOptions, find_label_settings
 from ..labels.fusion import LabelTask, label_file
 from ..training import (

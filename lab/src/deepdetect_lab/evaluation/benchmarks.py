@@ -12,12 +12,12 @@ from pathlib import Path
 
 from deepdetect._shared.errors import ImageError, MissingExtraError, require_packages
 from deepdetect._shared.options import look_up
-from deepdetect._shared.provenance import provenance
 from deepdetect._shared.records import file_digest
 from deepdetect.detector.pretrained import resolve_weights
 
 from .options import BenchmarkOptions
 from .profiling import peak_memory
+from .provenance import provenance
 from .report import Report, Section
 from .run import Run
 

@@ -18,7 +18,8 @@ from deepdetect._shared.options import suggest_keywords
 from deepdetect._shared.records import Outputs
 from deepdetect.io.image import load_image, luma
 from deepdetect.io.masks import save_mask
-from deepdetect.viz.draw import add_caption, hstack, save_picture
+from deepdetect.io.picture_file import save_picture
+from deepdetect.viz.draw import add_caption, join_pictures
 
 from .detectors import DETECTORS
 from .settings import LabelOptions, Visibility
@@ -124,7 +125,7 @@ def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
     for name, mask in masks.items():
         picture = np.repeat((mask * np.uint8(255))[:, :, None], 3, 2)
         panels.append(add_caption(picture, f"{name}: {mask.mean():.1%} of pixels"))
-    return hstack(panels)
+    return join_pictures(panels, len(panels))
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from torch.utils.data import DataLoader
 from deepdetect._shared.atomic import atomic_path
 from deepdetect._shared.errors import OptionError
 from deepdetect._shared.progress import progress
-from deepdetect._shared.provenance import provenance
 from deepdetect._shared.records import check_same, file_digest, plain
 
+from ..evaluation.provenance import provenance
 from ..evaluation.report import Table, line_chart
 from ..networks.weights import read_notes, save_tensors
 from .checkpoint import Point, read_checkpoint, restore, save_checkpoint

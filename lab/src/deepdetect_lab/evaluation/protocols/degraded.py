@@ -9,7 +9,7 @@ from pathlib import Path
 
 from deepdetect._shared.records import file_digest
 from deepdetect.io.image import load_image
-from deepdetect.viz.draw import save_picture
+from deepdetect.io.picture_file import save_picture
 
 from ...datasets.degradation import DEGRADATIONS, Degradation, degrade
 from ...datasets.planar import PlanarPair

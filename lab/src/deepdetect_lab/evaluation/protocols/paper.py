@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from deepdetect._shared.errors import ImageError
-from deepdetect.features.display import draw_matches
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.geometry.transforms import transfer_errors
 from deepdetect.io.image import load_image, luma
 from deepdetect.io.masks import load_mask
-from deepdetect.viz.draw import add_caption, hstack
+from deepdetect.viz.draw import add_caption, draw_matches, join_pictures
 
 from ...datasets.foreground import MaskedPhotograph, load_foreground
 from ...datasets.planar import PlanarPair, PlanarScene
@@ -252,7 +251,7 @@ def keypoint_figure(run: Run, features: Sequence[LocalFeature], scene: PlanarSce
         counts.append(f"{feature.title} {len(found):,}")
         panels.append(add_caption(drawn, f"{feature.title}: {len(found):,}"))
     title = f"Figure 2: keypoints of {scene.name}: {'; '.join(counts)}"
-    return Figure(f"keypoints_{scene.name}", title, picture(hstack(panels)))
+    return Figure(f"keypoints_{scene.name}", title, picture(join_pictures(panels, len(panels))))
 
 
 def mask_figure(scene: PlanarScene) -> Figure:

@@ -12,9 +12,9 @@ import numpy as np
 from deepdetect._shared.errors import ImageError
 from deepdetect.geometry.camera import Calibration
 from deepdetect.geometry.point_cloud import PointCloud
-from deepdetect.viz.render import draw_clouds
 
 from ...datasets.middlebury import CalibratedStereoPair, load_calibrated_pair, load_middlebury
+from ..clouds import draw_clouds
 from ..metrics.stereo import DISPARITY_TOLERANCES_PX, disparity_scores
 from ..options import BenchmarkOptions
 from ..report import Figure, Row, Section, Table, picture, where

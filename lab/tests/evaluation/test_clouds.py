@@ -9,7 +9,7 @@ import pytest
 from deepdetect.geometry.camera import Camera, PosedView
 from deepdetect.geometry.point_cloud import PointCloud
 from deepdetect.viz.draw import CAPTION_HEIGHT
-from deepdetect.viz.render import draw_clouds, orbit_camera, render
+from deepdetect_lab.evaluation.clouds import draw_clouds, orbit_camera, render
 
 
 def left_camera(size: tuple[int, int], focal_px: float, centre: tuple[float, float]) -> PosedView:

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import importlib.util
 import json
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +15,17 @@ from PIL import Image, ImageCms
 from PIL.ExifTags import IFD, Base
 from tests.command_line import run_command
 
-from deepdetect import RegistrationError, load_image, register
+from deepdetect import (
+    DeepDetectError,
+    MissingExtraError,
+    OptionError,
+    RegistrationError,
+    load_image,
+    register,
+)
 from deepdetect.geometry import transform_points
 from deepdetect.io.exif import camera_from_exif
-from deepdetect.io.metadata import Metadata, read_metadata
-from deepdetect.viz.draw import save_picture
+from deepdetect.io.picture_file import Metadata, read_metadata, save_picture
 
 SPACING_M, EAST, NORTH = 0.5, 500_000.0, 5_400_000.0
 UTM = 32632
@@ -133,7 +142,8 @@ def test_world_files_profiles_and_exif_are_kept(photo: np.ndarray, tmp_path: Pat
     Image.fromarray(cv2.warpPerspective(photo, warp, (256, 256))).save(tmp_path / "b.png")
     numbers = [0.5, 0.0, 0.0, -0.5, 1000.25, 1999.75]
     (tmp_path / "a.pgw").write_text("\n".join(map(str, numbers)))
-    (tmp_path / "a.prj").write_text("LOCAL_CS[]")
+    rasterio = pytest.importorskip("rasterio")
+    (tmp_path / "a.prj").write_text(rasterio.CRS.from_epsg(UTM).to_wkt())
     for extent, size in (("reference", 256), ("union", 286)):
         out = tmp_path / extent
         words = [str(tmp_path / "a.png"), str(tmp_path / "b.png"), "--extent", extent]
@@ -148,7 +158,8 @@ def test_world_files_profiles_and_exif_are_kept(photo: np.ndarray, tmp_path: Pat
         assert (Base.FocalLengthIn35mmFilm in kept.get_ifd(IFD.Exif)) == (size == 256)
         moved = np.loadtxt(out / "b_on_a.pgw")
         np.testing.assert_allclose(moved, [*numbers[:4], 1000.25, 1999.75])
-        assert (out / "b_on_a.prj").read_text() == "LOCAL_CS[]"
+        projection = (out / "b_on_a.prj").read_text()
+        assert rasterio.CRS.from_wkt(projection, morph_from_esri_dialect=True).to_epsg() == UTM
     save_picture(photo, tmp_path / "c.jpg", read_metadata(tmp_path / "a.png"))
     with Image.open(tmp_path / "c.jpg") as written:
         assert written.info["icc_profile"] == profile
@@ -167,25 +178,96 @@ def test_world_files_profiles_and_exif_are_kept(photo: np.ndarray, tmp_path: Pat
     assert cameras[0] == cameras[1] == cameras[2]
 
 
+TURNED_180 = np.diag([-1.0, -1, 1])
+NORTHWARD = np.diag([1.0, -1, 1])
+
+
+@pytest.mark.parametrize("crs", [f"EPSG:{UTM}", None])
 @pytest.mark.parametrize("point", [False, True])
-def test_pixels_are_corners_or_points(point: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize("turn", [np.eye(3), NORTHWARD, TURNED_180, None])
+def test_corners_of_geotiff_are_those_of_gdal(
+    turn: np.ndarray | None, point: bool, crs: str | None, tmp_path: Path
+) -> None:
+    """Rows may go north, whole coordinates may be centres, and a local grid has no system."""
     rasterio = pytest.importorskip("rasterio")
     bands = np.zeros((20, 30, 1), np.uint8)
-    tags = {"GTIFF_POINT": "YES"} if point else {}
-    geotiff(tmp_path / "a.tif", bands, place(), **tags)
-    if point:
-        with rasterio.open(tmp_path / "a.tif", "r+") as file:
+    geotiff(tmp_path / "a.tif", bands, place(degrees=20) if turn is None else place() @ turn)
+    with rasterio.open(tmp_path / "a.tif", "r+") as file:
+        file.crs = crs or rasterio.CRS()
+        if point:
             file.update_tags(AREA_OR_POINT="Point")
-    found = read_metadata(tmp_path / "a.tif")
+    found = read_metadata(tmp_path / "a.tif", placed=True)
     assert found.to_world is not None
     with rasterio.open(tmp_path / "a.tif") as file:
         expected = [file.xy(0, 0), file.xy(7, 11)]
-    np.testing.assert_allclose(
-        transform_points(np.array([[0, 0], [11, 7.0]]), found.to_world), expected
-    )
+    pixels = np.array([[0, 0], [11, 7.0]])
+    np.testing.assert_allclose(transform_points(pixels, found.to_world), expected)
     found.write_tiff(bands, tmp_path / "b.tif")
     with rasterio.open(tmp_path / "b.tif") as file:
         np.testing.assert_allclose([file.xy(0, 0), file.xy(7, 11)], expected)
+        assert file.crs == found.crs
+    found.write_beside(tmp_path / "b.png")
+    Image.new("L", (30, 20)).save(tmp_path / "b.png")
+    with rasterio.open(tmp_path / "b.png") as file:
+        np.testing.assert_allclose([file.xy(0, 0), file.xy(7, 11)], expected)
+    again = read_metadata(tmp_path / "b.png", placed=True)
+    np.testing.assert_allclose(transform_points(pixels, again.to_world), expected)
+    assert crs is None or again.crs.to_epsg() == found.crs.to_epsg() == UTM
+
+
+@pytest.mark.parametrize("second_page", [False, True])
+def test_a_tie_point_inside_and_a_second_page(second_page: bool, tmp_path: Path) -> None:
+    pytest.importorskip("rasterio")
+    keys = (1, 1, 0, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, UTM)
+    tags = [(33550, "d", 3, (0.5, 0.25, 0.0), True), (34735, "H", 16, keys, True)]
+    tags.append((33922, "d", 6, (10.0, 5.0, 0.0, EAST, NORTH, 0.0), True))
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        if second_page:
+            file.write(np.zeros((16, 16), np.uint8), metadata=None)
+        file.write(np.zeros((20, 30), np.uint8), metadata=None, extratags=tags)
+    found = read_metadata(tmp_path / "a.tif", placed=True)
+    expected = [[0.5, 0, EAST - 5 + 0.25], [0, -0.25, NORTH + 1.25 - 0.125], [0, 0, 1]]
+    np.testing.assert_allclose(found.to_world, expected)
+    assert found.crs.to_epsg() == UTM
+
+
+@pytest.mark.parametrize("world", ["jgw", "JGW", "jpgw", "pgw", "pngw", "tfw", "wld", "bpw", "j2w"])
+def test_world_files_of_all_names(world: str, tmp_path: Path) -> None:
+    pytest.importorskip("rasterio")
+    kinds = {"j": "jpg", "p": "png", "t": "tif", "b": "bmp", "w": "jpeg"}
+    image = "jp2" if world == "j2w" else kinds[world[0].lower()]
+    Image.new("RGB", (30, 20)).save(tmp_path / f"a.{image}")
+    (tmp_path / f"a.{world}").write_text("0.5\n0.1\n0.2\n0.25\n1000.25\n1999.75\n")
+    found = read_metadata(tmp_path / f"a.{image}", placed=True)
+    expected = [[0.5, 0.2, 1000.25], [0.1, 0.25, 1999.75], [0, 0, 1]]
+    np.testing.assert_allclose(found.to_world, expected)
+    assert found.crs is None
+
+
+def test_without_rasterio_a_place_is_said_not_lost(
+    photo: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    geotiff(tmp_path / "a.tif", photo, place())
+    save_picture(photo, tmp_path / "b.png")
+    save_picture(photo, tmp_path / "c.jpg")
+    (tmp_path / "c.wld").write_text("1 0 0 1 0 0")
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        "importlib.util.find_spec", lambda name: None if name == "rasterio" else find(name)
+    )
+    np.testing.assert_array_equal(load_image(tmp_path / "a.tif"), photo)
+    assert read_metadata(tmp_path / "b.png", placed=True).to_world is None
+    for name in ("a.tif", "c.jpg"):
+        assert read_metadata(tmp_path / name).to_world is None
+        words = f"the place of {tmp_path / name} on the Earth needs the package rasterio: run pip"
+        with pytest.raises(MissingExtraError, match=re.escape(words)):
+            read_metadata(tmp_path / name, placed=True)
+        for command in ("register", "stitch"):
+            words = [command, str(tmp_path / name), str(tmp_path / "b.png")]
+            result = run_command([*words, "-o", str(tmp_path / "out")])
+            assert result.exit_code == 2
+            assert "run pip install rasterio" in result.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_no_union_reaches_the_horizon(photo: np.ndarray) -> None:
@@ -271,3 +353,30 @@ def test_exif_that_cannot_be_written_does_not_cost_the_picture(
     for name in ("b.png", "b.jpg", "b.tif"):
         save_picture(photo, tmp_path / name, metadata)
         assert load_image(tmp_path / name).shape == photo.shape
+
+
+def test_a_picture_ends_in_png_or_jpg(tmp_path: Path) -> None:
+    picture = np.full((20, 30, 3), (200, 30, 90), np.uint8)
+    for ending in (".png", ".jpg", ".JPEG"):
+        save_picture(picture, tmp_path / f"deep/a{ending}")
+        with Image.open(tmp_path / f"deep/a{ending}") as found:
+            assert np.abs(np.asarray(found).astype(int) - picture).max() < 8
+    with pytest.raises(OptionError, match="must end in"):
+        save_picture(picture, tmp_path / "a.bmp")
+    assert not (tmp_path / "a.bmp").exists()
+
+
+def test_a_picture_too_large_for_its_format_is_refused(
+    tmp_path: Path, one_line: Callable[[BaseException], str], capfd: pytest.CaptureFixture[str]
+) -> None:
+    wide = np.zeros((2, 65_501, 3), np.uint8)
+    for name in ("p.jpg", "p.JPEG"):
+        with pytest.raises(DeepDetectError, match="65501x2 pixels: give it a name") as error:
+            save_picture(wide, tmp_path / name)
+        one_line(error.value)
+    assert not list(tmp_path.iterdir())
+    assert capfd.readouterr().err == ""
+    save_picture(wide[:, :-1], tmp_path / "p.jpg")
+    save_picture(wide, tmp_path / "p.png")
+    with Image.open(tmp_path / "p.png") as picture:
+        assert picture.size == (65_501, 2)

@@ -10,8 +10,8 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-from .machine import processor_count
-from .opencv import DISTRIBUTIONS
+from deepdetect._shared.machine import processor_count
+from deepdetect._shared.opencv import DISTRIBUTIONS
 
 RUNTIMES = ("onnxruntime", "openvino", "torch")
 PACKAGES = ("numpy", *DISTRIBUTIONS, "pillow", *RUNTIMES, "lightning-fabric")
@@ -40,16 +40,16 @@ def _versions() -> list[str]:
 
 def _commit() -> str:
     """Return the git commit of the sources, with "+" when files are modified, or ""."""
-    sources = Path(__file__).resolve().parents[1]
 
     def git(*words: str) -> str:
-        command = ["git", "-C", str(sources), *words]
+        command = ["git", "-C", str(Path(__file__).resolve().parent), *words]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         return done.stdout.strip()
 
     try:
         # An installed package may lie in the folder of another project's repository.
         git("ls-files", "--error-unmatch", __file__)
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--", ".") else "")
+        changed = git("status", "--porcelain", "--", ":/src", ":/lab/src")
+        return git("rev-parse", "HEAD") + ("+" if changed else "")
     except (OSError, subprocess.CalledProcessError):
         return ""

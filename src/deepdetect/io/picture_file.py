@@ -1,12 +1,14 @@
-"""What an image file carries beside its pixels, and pictures that keep it.
+"""Pictures as files, and what an image file carries beside its pixels, which they keep.
 
-Where it lies on the Earth (GeoTIFF 1.1, or a world file), its colour profile, and its EXIF.
+Where it lies on the Earth (a GeoTIFF, or a world file, by rasterio), its colour profile, its EXIF.
 """
 
 from __future__ import annotations
 
 import struct
-from contextlib import suppress
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,18 +18,28 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from .._shared.atomic import atomic_path
+from .._shared.errors import DeepDetectError, OptionError, require_packages
+from .._shared.image_array import to_8_bits
 from .._shared.opencv import cv2
 from .image_file import open_file, open_image, reading_options
 from .tiff import NO_DATA, TIFF_STARTS, chosen_page, no_data_of
 
-PIXEL_SCALE, TIE_POINTS, TRANSFORMATION, KEY_DIRECTORY = 33550, 33922, 34264, 34735
-KEYS = (KEY_DIRECTORY, 34736, 34737)
-"""Tags of GeoTIFF: the directory of keys, their numbers and their texts."""
+PIXEL_SCALE, TRANSFORMATION = 33550, 34264
+"""Tags of GeoTIFF: a file that has a place has one of them."""
 
-RASTER_TYPE_KEY, POINT = 1025, 2
-"""Of the directory: whether whole coordinates are corners of pixels, or their centres."""
+PLACED_FORMATS = ("TIFF", "JPEG", "PNG", "JPEG2000", "BMP", "GIF")
+"""Formats of Pillow that GDAL reads a place of."""
+
+FIRST_CENTRE = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+"""From pixels to those of GDAL, where the first corner of the first one is (0, 0)."""
 
 ICC_PROFILE = 34675
+
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+MAX_JPEG_SIDE_PX = 65_500
+"""The largest width and height that libjpeg writes."""
+
+JPEG_QUALITY = 85
 
 EXIF_TEXTS = (
     Base.ImageDescription,
@@ -48,16 +60,14 @@ class Metadata:
 
     Attributes:
         to_world: (3, 3) from pixels, the centre of the first at (0, 0), to coordinates; or None.
-        keys: tags that tell the coordinate system, as `tifffile` writes them.
-        projection: content of the .prj file beside it, or None.
+        crs: the system of these coordinates, as rasterio takes it; None: a local grid.
         no_data: number that stands for none, as GDAL's tag says, or None.
         profile, exif: ICC profile, and EXIF as Pillow's; or None.
         plain: whether its pixels are grey or RGB of 8 or 16 bits.
     """
 
     to_world: np.ndarray | None = None
-    keys: tuple[tuple[Any, ...], ...] = ()
-    projection: bytes | None = None
+    crs: Any = None
     no_data: float | None = None
     profile: bytes | None = None
     exif: Any = None
@@ -66,20 +76,20 @@ class Metadata:
     def moved(self, matrix: np.ndarray | None) -> Metadata:
         """Return that of the image whose pixels are these, moved by an affine (3, 3) matrix."""
         if self.to_world is None or matrix is None:
-            return replace(self, to_world=None, keys=())
+            return replace(self, to_world=None, crs=None)
         return replace(self, to_world=self.to_world @ np.linalg.inv(matrix / matrix[2, 2]))
 
     def write_beside(self, path: Path) -> None:
         """Write a world file, and a .prj file, beside a picture that cannot tell its place."""
-        if self.to_world is None or (self.keys and path.suffix in (".tif", ".tiff")):
+        if self.to_world is None or path.suffix.lower() in (".tif", ".tiff"):
             return
         numbers = self.to_world[:2].T.ravel()
-        world = "".join(f"{number:.17g}\n" for number in numbers).encode()
-        beside = {_world_file(path): world, path.with_suffix(".prj"): self.projection}
-        for place, content in beside.items():
-            if content is not None:
-                with atomic_path(place) as temporary:
-                    temporary.write_bytes(content)
+        texts = {_world_files(path)[0]: "".join(f"{number:.17g}\n" for number in numbers)}
+        with suppress(AttributeError, ValueError):  # there is none, or not in this dialect
+            texts[path.with_suffix(".prj")] = self.crs.to_wkt(version="WKT1_ESRI")
+        for place, text in texts.items():
+            with atomic_path(place) as temporary:
+                temporary.write_text(text)
 
     def encode(self, rgb: np.ndarray, suffix: str, settings: list[int]) -> bytes:
         """Return a PNG or JPEG file of an (H, W, 3) RGB image."""
@@ -122,16 +132,7 @@ class Metadata:
         """Write an (H, W) or (H, W, C) image of any type as TIFF, whole or not at all."""
         from tifffile import imwrite
 
-        tags = [*self.keys]
-        if self.keys and self.to_world is not None:
-            matrix = self.to_world @ np.linalg.inv(_from_raster(self.keys))
-            if matrix[0, 1] == matrix[1, 0] == 0:  # all programs read these
-                tie = (0.0, 0.0, 0.0, matrix[0, 2], matrix[1, 2], 0.0)
-                tags.append((PIXEL_SCALE, "d", 3, (matrix[0, 0], -matrix[1, 1], 0.0), True))
-                tags.append((TIE_POINTS, "d", 6, tie, True))
-            else:
-                whole = np.insert(np.insert(matrix, 2, 0.0, axis=0), 2, 0.0, axis=1)
-                tags.append((TRANSFORMATION, "d", 16, tuple(whole.ravel()), True))
+        tags: list[tuple[Any, ...]] = []
         if self.no_data is not None:
             tags.append((NO_DATA, "s", 0, f"{self.no_data:.17g}", True))
         exif = self._exif_of(bands)
@@ -157,6 +158,11 @@ class Metadata:
             )
             for code, values in directories.items():
                 _append_directory(temporary, code, values)
+            if self.to_world is not None:
+                with _rasterio() as rasterio, rasterio.open(temporary, "r+") as file:
+                    corner = self.to_world @ np.linalg.inv(FIRST_CENTRE)
+                    file.transform = rasterio.Affine(*corner[:2].ravel())
+                    file.crs = self.crs or rasterio.CRS()
 
 
 def _can_be_written(values: dict[int, Any]) -> bool:
@@ -188,31 +194,69 @@ def _append_directory(path: Path, code: int, values: dict[int, Any]) -> None:
         file.write(struct.pack(tiff.byteorder + "H", code))
 
 
-def read_metadata(source: Any) -> Metadata:
-    """Read what an image file carries beside its pixels; nothing of what cannot be read."""
-    found = Metadata()
+def read_metadata(source: Any, *, placed: bool = False) -> Metadata:
+    """Read what an image file carries beside its pixels; nothing of what cannot be read.
+
+    Where it lies on the Earth is read where `placed`, of a file that is named by its path.
+
+    Raises:
+        MissingExtraError: it has such a place, and rasterio is not installed.
+    """
+    found, kind, page, orientation = Metadata(), "", None, 1
     path = Path(source) if isinstance(source, (str, Path)) else None
     if path is not None and not path.is_file():  # a pipe is read once
         return found
     with open_file(source) as (file, _):
         if file.read(4) in TIFF_STARTS:
-            found = _of_tiff(file)
+            (found, page), kind = _of_tiff(file), "TIFF"
     with suppress(Exception), open_image(source) as image:  # raw photographs and others have none
         found = replace(found, profile=found.profile or image.info.get("icc_profile"))
-        exif = image.getexif()
-        kept = _kept_exif(exif) if image.format == "TIFF" else exif
+        exif, kind = image.getexif(), image.format
+        kept = _kept_exif(exif) if kind == "TIFF" else exif
         found = replace(found, exif=kept if len(kept) else None)
-        if exif.get(Base.Orientation, 1) != 1:  # the place is of it as it is stored
-            return replace(found, to_world=None, keys=())
-    if path is not None and found.to_world is None:
-        with suppress(OSError, ValueError):
-            numbers = np.array(_world_file(path).read_text().split(), np.float64)
-            found = replace(
-                found, to_world=np.vstack([numbers.reshape(3, 2).T, [0, 0, 1]]), keys=()
-            )
-        with suppress(OSError):
-            found = replace(found, projection=path.with_suffix(".prj").read_bytes())
+        orientation = exif.get(Base.Orientation, 1)
+    # The place is that of the image as it is stored.
+    if placed and path is not None and kind in PLACED_FORMATS and orientation == 1:
+        found = replace(found, **_read_place(path, page))
     return found
+
+
+def _read_place(path: Path, page: Any) -> dict[str, Any]:
+    """Return `to_world` and `crs` of an image file, and of the page of a TIFF file, if known."""
+    place: dict[str, Any] = {}
+    tagged = page is not None and {PIXEL_SCALE, TRANSFORMATION} & {*page.tags.keys()}
+    if not (tagged or any(each.is_file() for each in _world_files(path))):
+        return place
+    require_packages(f"the place of {path} on the Earth", "rasterio")
+    name = str(path.absolute())  # in others a colon has a meaning
+    if page is not None and page.index:
+        name = f"GTIFF_DIR:{page.index + 1}:{name}"
+    # What GDAL does not read has no place; the errors of a .prj file are ValueErrors.
+    with _rasterio() as rasterio, suppress(OSError, ValueError), rasterio.open(name) as file:
+        if not file.transform.is_identity:
+            place["to_world"] = np.reshape(file.transform, (3, 3)) @ FIRST_CENTRE
+            place["crs"] = file.crs
+            if file.crs is None:
+                text = path.with_suffix(".prj").read_text("utf-8")
+                place["crs"] = rasterio.CRS.from_user_input(text)
+    return place
+
+
+@contextmanager
+def _rasterio() -> Iterator[Any]:
+    """Give rasterio, which does not warn in the block of images without a place."""
+    import rasterio
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+        yield rasterio
+
+
+def _world_files(path: Path) -> list[Path]:
+    """Return what world files beside an image may be called, the usual name first."""
+    ending = path.suffix[1:]
+    names = [f".{ending[:1]}{ending[-1:]}w", f".{ending}w", ".wld"]
+    return [path.with_suffix(name) for name in [*names, *map(str.upper, names)]]
 
 
 def _kept_exif(exif: Any) -> Any:
@@ -225,42 +269,46 @@ def _kept_exif(exif: Any) -> Any:
     return kept
 
 
-def _of_tiff(file: Any) -> Metadata:
+def _of_tiff(file: Any) -> tuple[Metadata, Any]:
+    """Return what a TIFF file carries, and the page that is read."""
     from tifffile import TiffFile
 
     file.seek(0)
     with TiffFile(file, name="image.tif") as tiff:
         page = chosen_page([*tiff.pages], "the image", reading_options())
-        tags = {tag.code: (int(tag.dtype), tag.count, tag.value) for tag in page.tags}
-        plain = page.samplesperpixel in (1, 3, 4) and str(page.dtype) in ("uint8", "uint16", "bool")
-    own = KEYS if KEY_DIRECTORY in tags else ()
-    keys = tuple((code, *tags[code], True) for code in own if code in tags)
-    values = {code: np.array(tags[code][2]) for code in (PIXEL_SCALE, TIE_POINTS) if code in tags}
-    matrix = None
-    if TRANSFORMATION in tags:
-        matrix = np.reshape(tags[TRANSFORMATION][2], (4, 4))[np.ix_([0, 1, 3], [0, 1, 3])]
-    elif len(values) == 2:
-        (x, y), (i, j, _, east, north, _) = values[PIXEL_SCALE][:2], values[TIE_POINTS][:6]
-        matrix = np.array([[x, 0, east - i * x], [0, -y, north + j * y], [0, 0, 1]])
-    if not keys:
-        matrix = None
-    return Metadata(
-        to_world=None if matrix is None else matrix @ _from_raster(keys),
-        keys=() if matrix is None else keys,
-        no_data=no_data_of(page),
-        profile=bytes(tags[ICC_PROFILE][2]) if ICC_PROFILE in tags else None,
-        plain=plain,
-    )
+        profile = page.tags.valueof(ICC_PROFILE)
+    plain = page.samplesperpixel in (1, 3, 4) and str(page.dtype) in ("uint8", "uint16", "bool")
+    profile = None if profile is None else bytes(profile)
+    return Metadata(no_data=no_data_of(page), profile=profile, plain=plain), page
 
 
-def _from_raster(keys: tuple[tuple[Any, ...], ...]) -> np.ndarray:
-    """Return the (3, 3) matrix from pixels to the raster coordinates of GeoTIFF."""
-    directory = next(np.reshape(key[3], (-1, 4)) for key in keys if key[0] == KEY_DIRECTORY)
-    point = any(row[0] == RASTER_TYPE_KEY and row[3] == POINT for row in directory[1:])
-    shift = 0.0 if point else 0.5
-    return np.array([[1, 0, shift], [0, 1, shift], [0, 0, 1]])
+def save_picture(rgb: np.ndarray, path: str | Path, metadata: Metadata = Metadata()) -> None:
+    """Write a (H, W, 3) uint8 or uint16 RGB picture as .png or .tif, or of 8 bits as .jpg.
+
+    It is written whole or not at all.
+    """
+    suffix = picture_suffix(path)
+    if suffix.startswith(".tif"):
+        metadata.write_tiff(rgb, Path(path))
+        return
+    # Checked before OpenCV is asked, which would also log it.
+    if suffix != ".png" and max(rgb.shape[:2]) > MAX_JPEG_SIDE_PX:
+        size = f"{rgb.shape[1]}x{rgb.shape[0]}"
+        raise DeepDetectError(
+            f"{path} cannot hold a picture of {size} pixels: give it a name that ends in .png"
+        )
+    settings = []
+    if suffix != ".png":
+        rgb, settings = to_8_bits(rgb), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    data = metadata.encode(rgb, suffix, settings)
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
 
 
-def _world_file(path: Path) -> Path:
-    """Return the world file beside an image, as .pgw beside .png."""
-    return path.with_suffix(f".{path.suffix[1:2]}{path.suffix[-1:]}w")
+def picture_suffix(path: str | Path) -> str:
+    """Return the suffix of a picture's file in lower case; call it before any expensive work."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in PICTURE_SUFFIXES:
+        *names, last = PICTURE_SUFFIXES
+        raise OptionError(f"{path} must end in {', '.join(names)} or {last}")
+    return suffix

@@ -7,16 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from .._shared.opencv import cv2
-from ..geometry.camera import Camera, PosedView
-from ..geometry.point_cloud import (
+from deepdetect._shared.opencv import cv2
+from deepdetect.geometry.camera import Camera, PosedView
+from deepdetect.geometry.point_cloud import (
     BOX_PERCENTILE,
     PointCloud,
     angular_spacing,
     require_points,
     robust_box,
 )
-from .draw import add_caption, hstack, vstack
+from deepdetect.viz.draw import add_caption, join_pictures
 
 SUPERSAMPLING = 2
 """Each pixel is the mean of this many by this many, which makes edges smooth."""
@@ -89,7 +89,7 @@ def draw_clouds(left: np.ndarray, clouds: Mapping[str, PointCloud], width: int =
         empty = np.full((size[1], size[0], 3), 255, np.uint8)
         drawn = render(cloud, camera) if len(cloud) else empty
         panels.append(add_caption(drawn, f"{title}: {len(cloud):,} points"))
-    return vstack([hstack(panels[k : k + 2]) for k in range(0, len(panels), 2)])
+    return join_pictures(panels, 2)
 
 
 def _nearest_points(cloud: PointCloud, camera: PosedView) -> np.ndarray:

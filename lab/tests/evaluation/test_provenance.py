@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deepdetect._shared.provenance import provenance
+from deepdetect_lab.evaluation.provenance import provenance
 
 
 def test_versions_and_machine_are_named() -> None:
