@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from mpl_toolkits.mplot3d import Axes3D
 
 from deepdetect._shared.opencv import cv2
 from deepdetect.geometry.point_cloud import PointCloud, robust_box
@@ -37,9 +37,8 @@ def draw_cloud(
     another cloud, or its own, fills the picture.
     """
     figure = Figure((size[0] / DPI, size[1] / DPI), DPI)
-    canvas = FigureCanvasAgg(figure)
-    axes = Axes3D(figure, (0, 0, 1, 1))
-    figure.add_axes(axes)
+    canvas: Any = FigureCanvasAgg(figure)
+    axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d")
     box = robust_box(cloud if like is None else like)
     right, down, ahead = cloud.points.T
     colors = cloud.colors / 255

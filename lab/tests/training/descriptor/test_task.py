@@ -66,7 +66,7 @@ def test_training_changes_the_weights_and_measures(whole: TrainingResult) -> Non
     shares = [whole.best[f"{kind} correct"] for kind in KINDS]
     assert whole.best["score"] == pytest.approx(np.mean(shares))
     card = (whole.weights.parent / "MODEL_CARD.md").read_text()
-    assert "| zoomed |" in card
+    assert "| zoomed correct |" in card
     assert "635,585 parameters" in card
 
 
