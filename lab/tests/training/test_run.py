@@ -8,13 +8,14 @@ import pytest
 
 from deepdetect_lab.labels import LabelOptions
 from deepdetect_lab.training import (
+    DescriptorTrainingOptions,
     DeviceOptions,
+    MatchFilterTrainingOptions,
+    PointsTrainingOptions,
     Stage,
     TrainingOptions,
     profile,
-    train_descriptor,
-    train_match_filter,
-    train_points,
+    train_on_pairs,
 )
 
 
@@ -34,31 +35,30 @@ def test_a_profile_times_each_stage_and_writes_no_weights(
         photographs, tmp_path, options, device=device, workers=1, log=lines.append
     )
     assert lines == ["timing cpu, float32, eager"]
-    assert (first.stage.crop, second.stage.crop) == (64, 96)
-    assert first.steps == 11 * 4 // 4 - 5
-    assert second.steps == 1, "as many as the stage has, the warm-up left out"
-    for stage in (first, second):
-        assert stage.images_per_second > 0
-        assert stage.full_images_per_second == pytest.approx(
-            stage.images_per_second * stage.stage.crop**2 / 480**2
-        )
-        assert 0 <= stage.waiting_fraction < 1
-        assert 50e6 < stage.memory_bytes < 20e9
-        assert stage.device_memory_bytes is None
+    assert (first["stage"]["crop"], second["stage"]["crop"]) == (64, 96)
+    assert first["steps"] == 11 * 4 // 4 - 5
+    assert second["steps"] == 1, "as many as the stage has, the warm-up left out"
+    for row in (first, second):
+        rate = row["images_per_second"]
+        assert rate > 0
+        assert row["full_images_per_second"] == rate * row["stage"]["crop"] ** 2 / 480**2
+        assert 0 <= row["waiting_fraction"] < 1
+        assert 50e6 < row["memory_bytes"] < 20e9
+        assert row["device_memory_bytes"] == 0
     assert {path.name for path in tmp_path.iterdir()} == {"labels"}
 
 
 @pytest.mark.parametrize("validation", ["images/val", "other"])
 @pytest.mark.parametrize(
-    ("train_one", "trainer"),
+    ("options", "trainer"),
     [
-        (train_points, "points.task.RankerTrainer"),
-        (train_descriptor, "descriptor.task.DescriptorTrainer"),
-        (train_match_filter, "match_filter.MatchFilterTrainer"),
+        (PointsTrainingOptions(), "points.task.RankerTrainer"),
+        (DescriptorTrainingOptions(), "descriptor.task.DescriptorTrainer"),
+        (MatchFilterTrainingOptions(), "match_filter.MatchFilterTrainer"),
     ],
 )
 def test_pictures_of_validation_and_of_the_run_are_not_trained_on(
-    train_one: Any, trainer: str, validation: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    options: Any, trainer: str, validation: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     images, output = tmp_path / "images", tmp_path / "images/run"
     for path in (
@@ -71,7 +71,7 @@ def test_pictures_of_validation_and_of_the_run_are_not_trained_on(
         path.touch()
     made = Mock()
     monkeypatch.setattr(f"deepdetect_lab.training.{trainer}", made)
-    train_one(images, tmp_path / validation, output)
+    train_on_pairs(images, tmp_path / validation, output, options)
     listed, held_out = made.call_args.args[:2]
     assert listed == [images / "0.png", images / "a/1.png"]
     assert held_out == [tmp_path / validation / "3.png"]

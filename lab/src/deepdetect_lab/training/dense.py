@@ -145,6 +145,10 @@ class DenseTrainer(Trainer):
             self._forward = self._set_up()
             return self.logits(images)
 
+    def device_memory_bytes(self) -> int:
+        """Return the peak memory of torch on the GPU, 0 on the CPU."""
+        return torch.cuda.max_memory_allocated() if self.device.type == "cuda" else 0
+
     def describe(self) -> str:
         """Say in words how the network is run."""
         precision = "bfloat16" if self.bfloat16 else "float32"
