@@ -1,4 +1,4 @@
-"""Pictures of point clouds from any side, drawn without a screen."""
+"""Render point clouds from any viewpoint, without a display."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from deepdetect.geometry.point_cloud import (
 from deepdetect.viz.draw import add_caption, join_pictures
 
 SUPERSAMPLING = 2
-"""Each pixel is the mean of this many by this many, which makes edges smooth."""
+"""Each pixel is the mean of 2x2 rendered pixels, so that edges are smooth."""
 
 FILL_RATIO = 0.95
-"""Fraction of the picture's width or height that the cloud takes."""
+"""The cloud fills this fraction of the figure, so that a small margin is left."""
 
 POINT_OVERLAP = 1.4
-"""Points are drawn this much wider than their spacing, to close gaps also in side views."""
+"""Points are drawn wider than their spacing by this factor, since side views would show gaps."""
 
 MAX_POINT_WIDTH_PX = 5
-"""No point is drawn wider, so that a sparse cloud looks sparse."""
+"""Points have at most this width, so that a sparse cloud looks sparse."""
 
 
 def orbit_camera(
@@ -37,10 +37,10 @@ def orbit_camera(
     elevation: float = 8.0,
     size: tuple[int, int] = (800, 600),
 ) -> PosedView:
-    """Place a camera that looks at the robust centre of a cloud, which fills its picture.
+    """Place a camera that looks at the robust centre of a cloud and sees all of it.
 
-    Its distance from the centre is that of the left camera, so that small angles give a picture
-    like the photograph: to the right of the scene (azimuth) and up (elevation; 90 looks down).
+    The camera is as far from the centre as the left camera, so small angles give a view like the
+    photograph. The azimuth moves it to the right; the elevation moves it up (90: it looks down).
     """
     a, e = np.deg2rad([azimuth, elevation])
     right = [np.cos(a), 0, np.sin(a)]
@@ -50,7 +50,7 @@ def orbit_camera(
     box = robust_box(cloud)
     distance = max(float(np.linalg.norm(box.centre)), box.radius)
     translation = distance * np.array([0, 0, 1.0]) - axes @ box.centre
-    # With a focal length of 1 and the axis at 0, to see what the cloud covers.
+    # A camera with focal length 1 and principal point 0 shows the extent of the cloud.
     plain = PosedView("", Camera(size, 1.0, (0, 0)), axes, translation)
     xy, depth = plain.project(cloud.points)
     low, high = np.percentile(xy[depth > 0], (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0)
@@ -61,23 +61,24 @@ def orbit_camera(
 
 
 def render(cloud: PointCloud, camera: PosedView) -> np.ndarray:
-    """Draw a cloud on white, (H, W, 3) uint8, each point as a square that hides what is behind it.
+    """Render a cloud on white, (H, W, 3) uint8; each point is a square that hides those behind it.
 
-    Each is as wide as a closed surface needs at its spacing and depth.
+    Squares are wide enough to close a surface at the points' spacing and depth.
     """
     require_points(cloud)
     width, height = camera.camera.size
     fine_camera = camera.camera.scaled((width * SUPERSAMPLING, height * SUPERSAMPLING))
     nearest = _nearest_points(cloud, replace(camera, camera=fine_camera))
-    # The last colour is that of pixels which show no point.
+    # Pixels that show no point have index -1: the last colour, white.
     colors = np.append(cloud.colors, np.full((1, 3), 255, np.uint8), axis=0)
     return cv2.resize(colors[nearest], (width, height), interpolation=cv2.INTER_AREA)
 
 
 def draw_clouds(left: np.ndarray, clouds: Mapping[str, PointCloud], width: int = 796) -> np.ndarray:
-    """Draw the left image and clouds by title, which share its frame and one unit, two in a row.
+    """Draw the left image and clouds by title in a grid of two columns.
 
-    All are seen by one camera, which the one with the most points places.
+    The clouds are in the left camera's frame, in one unit. One camera shows them all; its pose
+    depends on the cloud with the most points.
     """
     size = (width, max(1, round(width * left.shape[0] / left.shape[1])))
     shrinks = left.shape[1] > width
@@ -85,7 +86,7 @@ def draw_clouds(left: np.ndarray, clouds: Mapping[str, PointCloud], width: int =
     panels = [add_caption(image, "left image")]
     camera = orbit_camera(max(clouds.values(), key=len), size=size)
     for title, cloud in clouds.items():
-        # Without points there is a white panel, which is what a method that finds none shows.
+        # A method without points has a white panel.
         empty = np.full((size[1], size[0], 3), 255, np.uint8)
         drawn = render(cloud, camera) if len(cloud) else empty
         panels.append(add_caption(drawn, f"{title}: {len(cloud):,} points"))
@@ -93,7 +94,7 @@ def draw_clouds(left: np.ndarray, clouds: Mapping[str, PointCloud], width: int =
 
 
 def _nearest_points(cloud: PointCloud, camera: PosedView) -> np.ndarray:
-    """Find which point each pixel shows: (H, W) int64 index, -1 for none."""
+    """Return the index of the point that each pixel shows, (H, W) int64; -1: no point."""
     width, height = camera.camera.size
     xy, depth = camera.project(cloud.points)
     spread = camera.camera.focal_px[0] * POINT_OVERLAP * angular_spacing(cloud)
@@ -101,7 +102,7 @@ def _nearest_points(cloud: PointCloud, camera: PosedView) -> np.ndarray:
     sides = np.clip(np.rint(sides), 1, MAX_POINT_WIDTH_PX * SUPERSAMPLING).astype(np.int64)
     corners = np.rint(xy - (sides[:, None] - 1) / 2)
     visible = (depth > 0) & (corners > -sides[:, None]).all(1) & (corners < (width, height)).all(1)
-    # From here on a point is its rank by depth, and the smallest rank is what a pixel shows.
+    # Points are ranked by depth: a pixel shows the point of the smallest rank.
     order = np.flatnonzero(visible)
     order = order[np.argsort(depth[order].astype(np.float32), kind="stable")]
     sides, corners = sides[order], corners[order].astype(np.int64)
