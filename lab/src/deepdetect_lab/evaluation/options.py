@@ -51,7 +51,8 @@ class BenchmarkOptions:
         max_pairs: largest number of pairs per scene, evenly spaced; 1 takes the last pair.
         max_images: largest number of images per scene: the first ones of a sequence, else evenly
             spaced ones.
-        ranker: name or file of the weights that rank keypoints; the default ranker if not given.
+        ranker: npz file of `deepdetect dev train-points` that ranks the keypoints. None: the
+            bundled file.
 
     Raises:
         OptionError: a name is unknown, or a number is out of its range.

@@ -1,4 +1,4 @@
-"""The standard metrics where one image is dark or blurred, beside those in daylight."""
+"""The standard metrics if one image is dark or blurred, relative to daylight."""
 
 from __future__ import annotations
 
@@ -37,21 +37,23 @@ HOMOGRAPHY_THRESHOLD_PX = 3.0
 DAYLIGHT = "daylight"
 
 TEXT = (
-    "Dark and blurred copies of the same images, made in linear light with the same random numbers "
-    "every time. In 1/4 or 1/8 of the light white gives 2,500 or 1,250 electrons instead of "
-    "10,000; shot noise is Poisson's, reading adds 3 electrons (standard deviation), the result "
-    "has 8 bits. Motion blur has a direction drawn for each image. The second image of each pair "
-    "is degraded, the first is not."
+    "Dark and blurred copies of the same images are simulated in linear light with fixed random "
+    "numbers. With 1/4 or 1/8 of the light, white gives 2,500 or 1,250 electrons instead of 10,000. "
+    "Shot noise is Poisson noise, read noise has a standard deviation of 3 electrons, and the "
+    "result has 8 bits. The direction of motion blur is random for each image. Only the second "
+    "image of each pair is degraded."
 )
 
 OVERVIEW_NOTE = (
-    f"Score over that of the same pairs in daylight, at {MATCHING_BUDGET:,} keypoints: mutual-NN "
-    "repeatability, and correct matches at 1 px. A dash where a method does not fill the budget."
+    f"Score divided by the score of the same pairs in daylight, at {MATCHING_BUDGET:,} keypoints: "
+    "mutual-NN repeatability, and correct matches at 1 px. A dash means that a method does not "
+    "find enough keypoints."
 )
 
 NOTE = (
-    "As in the standard protocol; of daylight: over the score of the same pairs in daylight. "
-    "A budget that is not filled is a dash. Keypoints: in the image that has fewer."
+    "Metrics as in the standard protocol. 'of daylight' means divided by the score of the same "
+    "pairs in daylight. A dash means that a method finds too few keypoints. Keypoints: number in "
+    "the image that has fewer."
 )
 
 Score = Callable[[Rows], float | None]
@@ -64,7 +66,7 @@ VALUES: tuple[tuple[str, int, str, Score], ...] = (
     ),
     ("correct at 1 px", MATCHING_BUDGET, ",.0f", correct),
 )
-"""Title, budget, style and function of what is compared."""
+"""Title, keypoint budget, number format and function of each compared score."""
 
 
 def degraded_sections(
@@ -83,7 +85,7 @@ def degraded_rows(run: Run, features: Sequence[LocalFeature], pairs: Sequence[Pl
     """Measure all features on all pairs, in daylight and with each degradation.
 
     Returns the rows of `standard.pair_row` with "light" and "daylight", the row of the same pair in
-    daylight; those of pairs that could not be measured in both are missing.
+    daylight. Pairs that failed in either of the two have no row.
     """
     lights = (DAYLIGHT, *DEGRADATIONS)
     items = {f"{pair.name}, {light}": (light, pair) for light in lights for pair in pairs}
@@ -104,12 +106,12 @@ def degraded_rows(run: Run, features: Sequence[LocalFeature], pairs: Sequence[Pl
 
 
 def degraded_pair(pair: PlanarPair, degradation: Degradation, folder: Path) -> PlanarPair:
-    """Return a pair whose second image is a degraded copy in a folder."""
+    """Return a pair whose second image is a degraded copy, which a folder holds."""
     return replace(pair, second=degraded_copy(pair.second, degradation, folder))
 
 
 def degraded_copy(image: Path, degradation: Degradation, folder: Path) -> Path:
-    """Return the PNG file of a degraded copy of an image; it is made where it is missing."""
+    """Return the PNG file of a degraded copy of an image; create it if it is missing."""
     digest = file_digest(image)[:16]
     path = folder / "degraded" / f"{digest}-{degradation.name}-v{degradation.version}.png"
     if not path.exists():
@@ -120,7 +122,7 @@ def degraded_copy(image: Path, degradation: Degradation, folder: Path) -> Path:
 def degraded_tables(
     features: Sequence[LocalFeature], rows: Rows, key: str, what: str
 ) -> list[Table]:
-    """Tabulate what is left of the daylight's score, and the scores with each degradation."""
+    """Tabulate the scores relative to daylight, and the scores with each degradation."""
     overview: Columns = {
         f"{degradation.title}: {title}": (".0%", partial(_relative, light=light, value=value))
         for light, degradation in DEGRADATIONS.items()
@@ -148,7 +150,7 @@ def _homography_accuracy(own: Rows) -> Cell:
 
 
 def _relative(rows: Rows, light: str, value: Score) -> Cell:
-    """Return a score in a light over that of the same pairs in daylight."""
+    """Return a score in a given light divided by the score of the same pairs in daylight."""
     own = where(rows, light=light)
     degraded, daylight = value(own), value([row["daylight"] for row in own])
     return degraded / daylight if degraded is not None and daylight else None
