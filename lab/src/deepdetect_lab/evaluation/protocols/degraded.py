@@ -37,8 +37,8 @@ HOMOGRAPHY_THRESHOLD_PX = 3.0
 DAYLIGHT = "daylight"
 
 TEXT = (
-    "Dark and blurred copies of the same images are simulated in linear light with fixed random "
-    "numbers. With 1/4 or 1/8 of the light, white gives 2,500 or 1,250 electrons instead of 10,000. "
+    "Dark and blurred image copies are simulated in linear light with fixed random numbers. "
+    "With 1/4 or 1/8 of the light, white gives 2,500 or 1,250 electrons instead of 10,000. "
     "Shot noise is Poisson noise, read noise has a standard deviation of 3 electrons, and the "
     "result has 8 bits. The direction of motion blur is random for each image. Only the second "
     "image of each pair is degraded."

@@ -48,12 +48,12 @@ DENSE_COLUMNS = {
 }
 
 DENSE_NOTE = (
-    "True intrinsics are used where they are known. Share: fraction of the attempted pixels of an "
-    "image that have a point in its own depth map, or that see any point of the cloud; mean over "
-    "the images. Error: distance from a point to the matches of its image alone. Halves: two halves "
-    "of the images, taken alternately, are reconstructed independently. Where both have a point, "
-    "the table gives the relative difference of the depths, and the share of differences over 1 %. "
-    "CPU seconds: time for depth maps and their fusion. SGBM: each image is matched with its best "
+    "True intrinsics are used where known. Share: fraction of the attempted pixels of an image "
+    "that have a point in its own depth map, or that see any point of the cloud; mean over the "
+    "images. Error: distance from a point to the matches of its image alone. Halves: two halves of "
+    "the images, taken alternately, are reconstructed separately. Where both have a point, columns "
+    "give the relative difference of the depths and the share of differences over 1 %. CPU "
+    "seconds: time for depth maps and their fusion. SGBM: each image is matched with its best "
     "neighbour after rectification by the same cameras, where they overlap. Instead of halves, its "
     "depth maps from the best and the second-best neighbour are compared."
 )
@@ -245,16 +245,12 @@ def read_ply_points(path: Path) -> np.ndarray:
     """
     try:
         head, end, rest = path.read_bytes().partition(b"end_header")
-        head = head.decode("ascii", "replace").encode(
-            "ascii", "replace"
-        )  # comments may hold any text
+        head = head.decode("ascii", "replace").encode("ascii", "replace")  # any text
         vertices = plyfile.PlyData.read(BytesIO(head + end + rest))["vertex"]
         points = np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
     except FileNotFoundError:
         raise MissingFileError(f"there is no file {path}: check the path") from None
     except (plyfile.PlyParseError, OSError, KeyError, ValueError, MemoryError) as error:
         reason = first_line(error) or type(error).__name__
-        raise InvalidFileError(
-            f"{path} is not a PLY file of points ({reason}): check it"
-        ) from error
+        raise InvalidFileError(f"{path} is no PLY file of points ({reason}): check it") from error
     return points[np.isfinite(points).all(axis=1)]

@@ -51,8 +51,8 @@ NOTE = (
     f"the second image counts once. Guided: the run with the median count of {SEEDS} seeds (the "
     "lower of two). ±: standard deviation of the counts. Lowest: the smallest count as a fraction "
     "of the matchable points. Without a trusted geometry a seed has no matches, as in "
-    "match_images. Corner error: median over the seeds guided by a homography. Seconds: median time "
-    "of guided matching alone, when it was computed."
+    "match_images. Corner error: median over the seeds guided by a homography. Seconds: median "
+    "time of guided matching alone, when it was computed."
 )
 
 

@@ -18,7 +18,7 @@ from deepdetect.io.masks import load_mask
 from ...labels import LabelOptions, fuse, visibility_of
 
 EPSILON = 1e-7
-"""Probabilities are clipped to this distance from 0 and 1; float32 numbers near 1 differ by 6e-8."""
+"""Probabilities keep this distance from 0 and 1, since float32 numbers near 1 differ by 6e-8."""
 
 NUM_BINS = 20
 """Number of equal bins for the calibration error. Chosen by hand; not measured."""
@@ -82,7 +82,7 @@ def mean_score(measured: Sequence[Measured]) -> MaskScore:
 
 
 CERTAIN_LOGIT = 200.0
-"""In float32 the probability of this logit is 1, and that of its negative is 0."""
+"""The probability of this logit is 1 in float32, and that of its negative is 0."""
 
 
 def sample_images(folder: str | Path) -> list[Path]:

@@ -1,4 +1,4 @@
-"""Points that pipelines make of stereo pairs, beside the true disparity: Figure 8 of the paper."""
+"""Evaluate points of stereo pipelines by the true disparity: Figure 8 of the paper."""
 
 from __future__ import annotations
 
@@ -23,35 +23,38 @@ from .paper_numbers import FIGURE_8, with_paper_column
 from .stereo_pipelines import ROUNDS, STAGES, Pipeline, pipelines
 
 TRUTH_OFFSETS = {"dolls": 2}
-"""Baselines by which the view of a ground truth lies to the left of the left image.
+"""Stereo baselines by which the ground truth's view is to the left of the left image.
 
-Shifted by them it has under 0.7 of the photometric error; points are evaluated by both.
+After this shift its photometric error is below 0.7 of that before; both versions are evaluated.
 """
 
 AS_IT_IS = ""
 SHIFTED = "ground truth shifted to its photographs"
 
 TEXT = (
-    "Ours: `deepdetect reconstruct --rectified`: strict, so what lies at a disparity discontinuity "
-    "is left out; --density 1 asks for every pixel and fills what only the left view shows. The "
-    "paper's pipeline, as in the authors' notebooks: images squashed to 480x480 as BGR, SIFT, "
-    "FLANN (10 trees, 100 checks), a ratio for each scene (cones, rocks, cloth 0.9, dolls 0.85, "
-    "moebius 0.77; others 0.9), essential matrix by RANSAC at 0.5 px. SIFT: the same with its own "
-    "keypoints. SGBM: block 5, three ways, uniqueness 10, speckle filter, both views extended."
+    "Ours: `deepdetect reconstruct --rectified`, which leaves out points at disparity "
+    "discontinuities; --density 1 gives a point for every pixel and fills pixels that only the "
+    "left view shows. The paper's pipeline, as in the authors' notebooks: images resized to "
+    "480x480 as BGR, SIFT descriptors, FLANN (10 trees, 100 checks), a ratio for each scene "
+    "(cones, rocks, cloth 0.9, dolls 0.85, moebius 0.77; others 0.9), essential matrix by RANSAC "
+    "at 0.5 px. SIFT: the same with SIFT keypoints. SGBM: block size 5, three-way mode, uniqueness "
+    "ratio 10, speckle filter, both views extended."
 )
 
 NOTE = (
-    "1 - bad-t: fraction of the points with known truth at most t px off; EPE: their mean error; "
-    "completeness: fraction of the pixels with known truth, hidden ones too, with a point at most "
-    "1 px off; F-score: harmonic mean of both. Half-occluded: the true counterpart lies outside "
-    "the right image. Voxels: cubes that hold a point; the paper means the matches left by the "
-    f"essential matrix. Seconds: median of {ROUNDS} runs (ours, SGBM) or one, from images in "
-    "memory. Memory: growth of the process in the stage; all: since the first began, largest run."
+    "1 - bad-t: fraction of the points with ground truth whose error is at most t px; EPE: their "
+    "mean error; completeness: fraction of the pixels with ground truth, occluded ones included, "
+    "that have a point with an error of at most 1 px; F-score: harmonic mean of accuracy at 1 px "
+    "and completeness. Half-occluded: the true counterpart is outside the right image. Voxels: "
+    "cubes that contain a point; in the paper, the number of inliers of the essential matrix. "
+    f"Seconds: median of {ROUNDS} runs (ours, SGBM) or one run, with images in memory. Memory: "
+    "growth of the process in the stage; all: growth over all stages, largest run."
 )
 
 SHIFTED_NOTE = (
-    "The true disparity belongs to another view than the photographs; here it is shifted by whole "
-    "baselines, which fits them far better, without what the left view does not see."
+    "The true disparity belongs to another view than the photographs. Here it is shifted by whole "
+    "stereo baselines, which fits the photographs far better; pixels hidden in the left view are "
+    "left out."
 )
 
 
@@ -81,9 +84,9 @@ def middlebury(run: Run, options: BenchmarkOptions) -> list[Section]:
 
 
 def reconstruct_points(run: Run, pipeline: Pipeline, scene: Path) -> Row:
-    """Reconstruct a scene, the run of median time, or read it from the cache.
+    """Reconstruct a scene, cached; of several runs the one with median time is returned.
 
-    Returns the "pixels", their "disparity", and the columns that do not depend on the truth.
+    Returns the "pixels", their "disparity", and the columns that do not depend on ground truth.
     """
 
     def make() -> Row:
@@ -114,7 +117,7 @@ def points_table(
     which: str,
     truth: np.ndarray | None,
 ) -> Table:
-    """Tabulate number, accuracy, time and memory of the points of all pipelines."""
+    """Tabulate number and accuracy of the points, time and memory for all pipelines."""
     unit, edge = _voxel(pair)
     voxels = f"voxels of {edge:g} {unit}"
     columns = {
@@ -138,7 +141,7 @@ def points_table(
     key = f"middlebury_{pair.name}" + ("_shifted" if which == SHIFTED else "")
     paper = {p.name: p.paper[pair.name] for p in compared if pair.name in p.paper}
     title = f"{pair.name}, {which}" if which else pair.name
-    unknown = "" if truth is not None else "There is no true disparity: nothing is evaluated. "
+    unknown = "" if truth is not None else "There is no true disparity to evaluate by. "
     note = f"{SHIFTED_NOTE} {NOTE}" if which == SHIFTED else unknown + NOTE
     return with_paper_column(Table(key, title, columns, lines, note), "points", paper)
 
@@ -150,7 +153,7 @@ def _voxel(pair: CalibratedStereoPair) -> tuple[str, float]:
 def count_voxels(
     calibration: Calibration, pixels: np.ndarray, disparity: np.ndarray, edge: float
 ) -> int:
-    """Count the cubes of a grid, with edges in mm or baselines, that hold a point."""
+    """Count the cubes of a grid that contain a point; edges are in mm or stereo baselines."""
     cubes = np.floor(_triangulate(calibration, pixels, disparity)[0] / edge).astype(np.int64)
     return len(np.unique(cubes, axis=0))
 
@@ -166,7 +169,7 @@ def _triangulate(
 def clouds_figure(
     pair: CalibratedStereoPair, compared: Sequence[Pipeline], found: Mapping[str, Row]
 ) -> Figure | None:
-    """Draw Figure 8: the points of the pipelines that the paper draws; None without any."""
+    """Draw Figure 8: points of the pipelines that the paper draws; None without points."""
     clouds = {}
     # Ours come last, as in the paper.
     for pipeline in sorted(compared, key=lambda pipeline: pipeline.drawn == "ours"):
@@ -186,16 +189,16 @@ def clouds_figure(
 
 
 def ground_truths(scene: Path) -> Mapping[str, np.ndarray | None]:
-    """Return the true disparities of a scene: as its file has it, and perhaps shifted."""
+    """Return the true disparities of a scene: that of its file and, for some, a shifted one."""
     disparity = load_middlebury(scene).disparity
     offset = TRUTH_OFFSETS.get(scene.name, 0)
     return {AS_IT_IS: disparity} | ({SHIFTED: shift_view(disparity, offset)} if offset else {})
 
 
 def shift_view(disparity: np.ndarray, baselines: int) -> np.ndarray:
-    """Show a disparity map from a view this many baselines to the right; NaN where it is hidden.
+    """Warp a disparity map to a view some stereo baselines to the right; hidden pixels are NaN.
 
-    Where several places fall on one pixel the nearest of them is visible.
+    If several points map to one pixel, the nearest is visible.
     """
     rows, columns = np.nonzero(np.isfinite(disparity))
     values = disparity[rows, columns]
