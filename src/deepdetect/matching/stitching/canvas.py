@@ -29,8 +29,8 @@ Box = tuple[int, int, int, int]
 """Left, top, right and bottom in pixels; right and bottom are exclusive."""
 
 MAX_DEPTH_RATIO = 5.0
-"""On a flat canvas the depths of an image's corners differ at most by this ratio, because images
-near the horizon are stretched without bound. Chosen by hand; not measured."""
+"""The depths of an image's corners may differ by this ratio on a flat canvas, because images near
+the horizon are stretched without bound. Chosen by hand; not measured."""
 
 MIN_WARP_SCALE = 0.67
 """Images drawn at a smaller scale are blurred first, because they would alias."""

@@ -25,8 +25,8 @@ MIN_OVERLAP_PX = 100
 """Brightness is compared if two images overlap by more pixels there. Chosen by hand."""
 
 SEAM_TOLERANCE_PX, SEAM_PERCENT = 1.0, 90.0
-"""Parallax is reported if this percentile of displacements along a seam exceeds the tolerance (small
-canvas), since smaller ones would be invisible on a screen."""
+"""Parallax is reported if this percentile of displacements along a seam exceeds the tolerance, in
+pixels of the small canvas, since smaller ones would be invisible on a screen."""
 
 MIN_FLOW_PX = 32
 """Optical flow needs an overlap with at least this side. Chosen by hand; not measured."""
