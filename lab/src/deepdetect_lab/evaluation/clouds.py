@@ -56,7 +56,7 @@ def draw_cloud(
 
 
 def draw_clouds(left: np.ndarray, clouds: Mapping[str, PointCloud], width: int = 796) -> np.ndarray:
-    """Draw the left image and clouds by title, which share its frame and one unit, two in a row.
+    """Draw the left image and clouds by title in a grid of two columns.
 
     All are seen from one place, which the one with the most points decides.
     """

@@ -173,5 +173,5 @@ def test_a_whole_run_on_small_images(write_posed_fountain, tmp_path: Path) -> No
     assert lines[1]["sparse points"] == pytest.approx(len(whole.sparse), rel=0.02)
     # A second run finds all in the cache.
     again = run_benchmarks(["sfm"], folder, options, cache=tmp_path / "cache")
-    assert again.metadata["results made, not found in the cache"] == "0"
+    assert again.metadata["results computed, not read from the cache"] == "0"
     assert str(again.sections) == str(report.sections)
