@@ -73,7 +73,7 @@ ACCEPTED: Mapping[Any, tuple[Any, ...]] = {
 }
 """Types that are accepted for an annotation, including those of NumPy."""
 MADE_LATER = type(functools.cache(len))
-"""Type of cached functions, which stand for options that are created at first use."""
+"""Type of a cached function, which can stand for keypoints that it makes at first use."""
 KINDS_OF: Mapping[Any, Any] = {Literal: str, Callable: Callable, Mapping: Mapping}
 
 

@@ -77,7 +77,7 @@ def file_digest(path: Path) -> str:
     try:
         return _file_digest(path.resolve(), *file_state(path))
     except OSError as error:
-        raise MissingFileError(f"{path} cannot be read ({error.strerror})") from None
+        raise MissingFileError(f"{path} cannot be read ({error.strerror}): check it") from None
 
 
 @lru_cache(maxsize=4096)

@@ -98,10 +98,7 @@ def end_by_interrupt() -> None:
 
 
 def end_worker_by_signals() -> None:
-    """Let SIGTERM and Ctrl-C, which `signals_held` has blocked, end a worker by SystemExit.
-
-    The worker then cleans up what its task holds open.
-    """
+    """Let SIGTERM, and Ctrl-C that `signals_held` has deferred, end a worker by SystemExit."""
     both = (signal.SIGINT, signal.SIGTERM)
 
     def end(number: int, frame: FrameType | None) -> None:
