@@ -115,13 +115,3 @@ def test_markdown_tables_have_as_many_cells_in_each_line(report: Report) -> None
     assert lines[1] == "|---|---:|---:|"
     assert lines[3] == "| nothing | – | – |"
     assert "a\\|b <c>" in lines[0]
-
-
-def test_a_table_out_of_the_text_is_named_there_and_written_as_csv(tmp_path: Path) -> None:
-    table = Table("long", "All", {"a": ""}, [{"a": "cell 1"}, {"a": "cell 2"}], "note", False)
-    Report("title", {}, (Section("one", (), (table,)),)).save(tmp_path)
-    text = (tmp_path / "report.md").read_text()
-    assert "**All**\n\nIn `tables/long.csv`.\n\nnote" in text
-    assert "cell" not in text
-    assert (tmp_path / "tables" / "long.csv").read_text().split() == ["a", "cell", "1", "cell", "2"]
-    assert len(json.loads((tmp_path / "report.json").read_text())["tables"]["long"]["rows"]) == 2

@@ -46,7 +46,7 @@ class Table:
     """A table; its key, as "oxford_matches", is the name of its file.
 
     The columns say how numbers are written, as ".3f", ",d" or ".1%", by title. The rows have cells
-    by title; one that is missing, None or NaN is a dash. report.md only names one not `in_text`.
+    by title; one that is missing, None or NaN is a dash.
     """
 
     key: str
@@ -54,7 +54,6 @@ class Table:
     columns: Mapping[str, str]
     rows: Sequence[Row]
     note: str = ""
-    in_text: bool = True
 
     def values(self) -> list[dict[str, Cell]]:
         """Return each row in the order of the columns; JSON has no NaN: it becomes None."""
@@ -208,8 +207,7 @@ class Report:
         for section in self.sections:
             parts += [f"## {section.title}", *section.text]
             for table in section.tables:
-                shown = table.to_markdown() if table.in_text else f"In `tables/{table.key}.csv`."
-                parts += [f"**{table.title}**", shown, *filter(None, [table.note])]
+                parts += [f"**{table.title}**", table.to_markdown(), *filter(None, [table.note])]
             parts += [f"![{f.title}](figures/{f.key}.png)\n\n{f.title}" for f in section.figures]
         skipped = "\n".join(f"- {reason}" for reason in self.skipped) or "- nothing"
         made = "\n".join(f"- {name}: {text}" for name, text in self.metadata.items())
