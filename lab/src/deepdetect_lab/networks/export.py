@@ -1,4 +1,4 @@
-"""Networks of torch as ONNX files for any size, as `deepdetect` reads them."""
+"""Export networks from torch to ONNX files for any image size, which `deepdetect` reads."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from torch import nn
 
 OPSET = 17
-"""The ONNX operator set of all files: ONNX Runtime 1.24, OpenVINO and OpenCV 4 read it."""
+"""This ONNX operator set is chosen because ONNX Runtime 1.24, OpenVINO and OpenCV 4 read it."""
 
 
 def export_onnx(network: nn.Module, path: str | Path) -> None:
-    """Write a network for any size; whole or not at all."""
+    """Write a network for any image size, atomically."""
     write_model(_of_torch(network), path, OnnxOptions(max_keypoints=0), {})
 
 
@@ -29,7 +29,7 @@ def _of_torch(network: nn.Module) -> ModelProto:
     import onnx
     import torch
 
-    # Its parts are named after it: `tiling` knows the names that PyTorch's exporter gives.
+    # This name is part of all node names, on which `tiling` relies.
     module = torch.nn.Sequential(OrderedDict(network=network.cpu())).eval()
     axes = {0: "batch", 2: "height", 3: "width"}
     written = io.BytesIO()
@@ -39,14 +39,14 @@ def _of_torch(network: nn.Module) -> ModelProto:
         torch.onnx.export(
             module,
             (torch.zeros(2, 3, 64, 96),),
-            written,  # type: ignore[arg-type]  # its annotation is of the other exporter
+            written,  # type: ignore[arg-type]  # annotated for the other exporter
             input_names=["image"],
             output_names=["logits"],
             dynamic_axes={"image": axes, "logits": axes},
             opset_version=OPSET,
             dynamo=False,
-            # Keeps batch normalisation as nodes, for `add_padding` to fold in float64. The network
-            # is in evaluation mode already.
+            # Keeps batch normalisation as nodes, which `add_padding` folds in float64. The network
+            # is already in evaluation mode.
             training=torch.onnx.TrainingMode.PRESERVE,
         )
     model = onnx.load_model_from_string(written.getvalue())
