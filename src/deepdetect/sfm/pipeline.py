@@ -199,10 +199,7 @@ def _usable_images(
     calibration: Camera | Calibration | str | Path | None,
     unregistered: dict[str, str],
 ) -> tuple[dict[str, tuple[int, int]], Mapping[str, Camera]]:
-    """Return sizes and known cameras of the images with enough keypoints and a size that fits.
-
-    The others are added to `unregistered` with the reason.
-    """
+    """Return sizes and cameras of usable images; add reasons for others to `unregistered`."""
     for name, count in keypoints.items():
         if count < MIN_KEYPOINTS:
             unregistered[name] = (

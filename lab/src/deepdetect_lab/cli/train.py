@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,9 +31,8 @@ from ..training import (
     write_shards,
 )
 from ..training import train as train_network
-from ..training import train_descriptor as train_descriptor_network
-from ..training import train_match_filter as train_filter
-from ..training import train_points as train_ranker
+from ..training import train_on_pairs as train_network_on_pairs
+from ..training.run import PairOptions
 
 Folder = Annotated[Path, Parameter(help="Folder of images; `train` also takes shards.")]
 RUN = cli.From(
@@ -71,16 +71,16 @@ SHARDS = replace(RECIPE, common="max_images augmentations", more="short_sides sq
 
 SHARD_SIZE = cli.From(write_shards, "shard_size", more="")
 ENGINE = replace(EXTRACTION, common="")
-POINTS_RUN = cli.From(train_ranker, "validation num_workers", more="", types={"validation": Path})
-FILTER_RUN = cli.From(train_filter, "validation", more="", types={"validation": Path})
-DESCRIPTOR_RUN = cli.From(
-    train_descriptor_network,
+PAIRS_RUN = cli.From(
+    train_network_on_pairs,
     "validation init_weights device num_workers",
     more="",
     flags={"init_weights": "--init"},
     types={"validation": Path, "init_weights": Path | None},
     defaults={"init_weights": "random, by the seed", "num_workers": "0 on a CPU"},
 )
+WORKERS_RUN = replace(PAIRS_RUN, common="validation num_workers")
+FILTER_RUN = replace(PAIRS_RUN, common="validation")
 
 
 def chosen_label_settings(
@@ -156,7 +156,7 @@ def train(
     run |= {"device": DeviceOptions(**DEVICE.take(values)), "log": cli.say}
     recipe = chosen_recipe(**values)
     if profiling:
-        profiles = [asdict(each) for each in profile(images, output, recipe, **run)]
+        profiles = profile(images, output, recipe, **run)
         return cli.Result(profiles, "\n".join(map(cli.table, profiles)))
     result = train_network(images, output, recipe, **run)
     best = result.best
@@ -173,42 +173,45 @@ def train(
     )
 
 
-@cli.command(POINTS_RUN, cli.From(PointsTrainingOptions, "steps seed"))
+def _train_on_pairs(
+    images: Path, output: Path, make_options: Callable[..., PairOptions], values: dict[str, Any]
+) -> cli.Result:
+    run = {**PAIRS_RUN.take(values), "log": cli.say}
+    result = train_network_on_pairs(images, output=output, options=make_options(**values), **run)
+    files = {"weights": result.weights, "onnx": result.onnx}
+    return cli.Result({**files, "best": result.best, "points": result.points})
+
+
+@cli.command(WORKERS_RUN, cli.From(PointsTrainingOptions, "steps seed"))
 def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
     """Train the ranker of keypoints on the images in a folder.
 
     Pairs of synthetic views are generated from single images, so no labels are needed. The output
-    folder gets best.npz (the weights with the highest validation score), MODEL_CARD.md, curves.csv,
-    curves.png and checkpoint.safetensors. Run the same command again to resume an interrupted run.
+    folder gets best.npz, MODEL_CARD.md, the curves and a checkpoint. Run the same command again to
+    resume an interrupted run.
 
         deepdetect dev train-points photos/train --validation photos/val -o run
 
     Args:
         output: Folder of the run.
     """
-    run = {**POINTS_RUN.take(values), "output": output, "log": cli.say}
-    result = train_ranker(images, options=PointsTrainingOptions(**values), **run)
-    return cli.Result({"weights": result.weights, "best": result.best, "points": result.points})
+    return _train_on_pairs(images, output, PointsTrainingOptions, values)
 
 
-@cli.command(DESCRIPTOR_RUN, cli.From(DescriptorTrainingOptions, "steps pairs seed"))
+@cli.command(PAIRS_RUN, cli.From(DescriptorTrainingOptions, "steps pairs seed"))
 def train_descriptor(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
     """Train the learned descriptor of keypoints on the images in a folder.
 
     Pairs of synthetic views are generated from single images, so no labels are needed. The output
-    folder gets descriptor.onnx and descriptor.safetensors (the weights with the highest validation
-    score), MODEL_CARD.md, curves.csv, curves.png and checkpoint.safetensors. Run the same command
-    again to resume an interrupted run.
+    folder gets descriptor.onnx, descriptor.safetensors, MODEL_CARD.md, the curves and a checkpoint.
+    Run the same command again to resume an interrupted run.
 
         deepdetect train-descriptor photos/train --validation photos/val -o run
 
     Args:
         output: Folder of the run.
     """
-    run = {**DESCRIPTOR_RUN.take(values), "output": output, "log": cli.say}
-    result = train_descriptor_network(images, options=DescriptorTrainingOptions(**values), **run)
-    files = {"weights": result.weights, "onnx": result.onnx}
-    return cli.Result({**files, "best": result.best, "points": result.points})
+    return _train_on_pairs(images, output, DescriptorTrainingOptions, values)
 
 
 @cli.command(FILTER_RUN, cli.From(MatchFilterTrainingOptions, "steps drawn val_pairs seed"))
@@ -216,18 +219,15 @@ def train_match_filter(images: Folder, /, *, output: cli.Output, **values: Any) 
     """Train the network that separates correct matches from wrong ones by their neighbours.
 
     Pairs of synthetic views are generated from single images. The output folder gets
-    match_filter.onnx and match_filter.safetensors (the weights with the lowest validation loss),
-    MODEL_CARD.md, curves.csv, curves.png and checkpoint.safetensors.
+    match_filter.onnx, match_filter.safetensors, MODEL_CARD.md, the curves and a checkpoint. Run the
+    same command again to resume an interrupted run.
 
         deepdetect dev train-match-filter photos/train --validation photos/val -o run
 
     Args:
         output: Folder of the run.
     """
-    run = {**FILTER_RUN.take(values), "output": output, "log": cli.say}
-    result = train_filter(images, options=MatchFilterTrainingOptions(**values), **run)
-    files = {"weights": result.weights, "onnx": result.onnx}
-    return cli.Result({**files, "best": result.best, "points": result.points})
+    return _train_on_pairs(images, output, MatchFilterTrainingOptions, values)
 
 
 @cli.command(PRESET, LABELS, SHARDS, SHARD_SIZE, ENGINE)

@@ -6,8 +6,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from deepdetect._shared.errors import DeepDetectError
 from deepdetect._shared.machine import start_child
@@ -15,61 +16,33 @@ from deepdetect._shared.machine import start_child
 Outcome = TypeVar("Outcome")
 
 
-class Profile(NamedTuple):
-    """Wall time of some work, and the largest growth of the process's memory in bytes."""
+@dataclass
+class Profile:
+    """What a piece of work took: wall time, and bytes that the process grew by at most."""
 
     seconds: float = 0.0
     memory: float = 0.0
 
 
-class StageProfiler:
-    """Measure successive stages; `record` ends a stage. Only one profiler may run at a time.
-
-    On Linux the memory is exact, since the peak is reset when a stage begins. On other systems a
-    stage's peak counts only if it is the highest of the process so far.
-
-    Attributes:
-        stages: profiles by name; seconds of stages with the same name are added, and their largest
-            memory is kept.
-        total: profile of all stages; its memory includes what earlier stages still hold.
-    """
-
-    def __init__(self) -> None:
-        self.stages: dict[str, Profile] = {}
-        self.total = Profile()
-        self._begin()
-        self._first = self._before
-
-    def record(self, name: str) -> None:
-        """End a stage, and begin the next one."""
-        seconds = time.perf_counter() - self._started
-        peak = max(_memory("VmHWM"), self._before)
-        before = self.stages.get(name, Profile())
-        memory = max(before.memory, peak - self._before)
-        self.stages[name] = Profile(before.seconds + seconds, memory)
-        memory = max(self.total.memory, peak - self._first)
-        self.total = Profile(self.total.seconds + seconds, memory)
-        self._begin()
-
-    def _begin(self) -> None:
-        global _highest
-        _highest = peak_memory()
-        with suppress(OSError):
-            Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM, see man 5 proc
-        self._before = _memory("VmRSS")
-        self._started = time.perf_counter()
-
-
 _highest = 0
-"""The highest peak that was reset, in bytes."""
+"""The highest of the peaks that were forgotten."""
 
 
 @contextmanager
-def profiled() -> Iterator[StageProfiler]:
-    """Measure time and memory growth of a block; read `total` after the block."""
-    profiler = StageProfiler()
-    yield profiler
-    profiler.record("block")
+def profiled() -> Iterator[Profile]:
+    """Measure the time and the growth of memory of a block, which are known when it has ended.
+
+    The memory is exact on Linux, which is told to forget the peak where a block begins; elsewhere a
+    peak counts where it is the highest of the process so far. No two blocks may run at a time.
+    """
+    global _highest
+    _highest = peak_memory()
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM, see man 5 proc
+    profile, before, started = Profile(), _memory("VmRSS"), time.perf_counter()
+    yield profile
+    profile.seconds = time.perf_counter() - started
+    profile.memory = max(_memory("VmHWM") - before, 0)
 
 
 def peak_memory() -> int:

@@ -24,16 +24,16 @@ from deepdetect.io.image import load_image
 from deepdetect.matching.pipeline import check_memory
 
 from .baselines.method import LocalFeature
-from .profiling import Profile, profiled
+from .profiling import profiled
 from .report import Row, Rows
 
 Result = TypeVar("Result")
 
 STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
-    "keypoints": (1, ()),
-    "matches": (1, ("keypoints",)),
+    "keypoints": (2, ()),
+    "matches": (2, ("keypoints",)),
     "guided": (8, ("keypoints",)),
-    "stereo": (4, ()),
+    "stereo": (5, ()),
     "repeatability_paper": (1, ("keypoints",)),
     "repeatability_mutual_nn": (1, ("keypoints",)),
     "corner_errors": (1, ("matches",)),
@@ -72,15 +72,14 @@ class MatchSettings:
 class PairMatches:
     """The (M, 2) matched positions of a pair, and the positions of all keypoints used.
 
-    `describe` and `match` are the time and memory of these steps when they were computed.
+    With the seconds that describing both images and matching took when it was done.
     """
 
     points0: np.ndarray
     points1: np.ndarray
     keypoints0: np.ndarray
     keypoints1: np.ndarray
-    describe: Profile
-    match: Profile
+    seconds: float
 
 
 class Run:
@@ -102,8 +101,8 @@ class Run:
         self.made = 0
         self.skipped: list[str] = []
         self.failures: list[str] = []
-        self._recent: OrderedDict[str, tuple[Keypoints, Profile]] = OrderedDict()
-        self._described: tuple[str, list[np.ndarray], Profile] | None = None
+        self._recent: OrderedDict[str, tuple[Keypoints, float]] = OrderedDict()
+        self._described: tuple[str, list[np.ndarray], float] | None = None
 
     def folder(self, name: str) -> Path:
         """Return the folder of a data set: a subfolder of `data`, or `data` itself."""
@@ -184,8 +183,8 @@ class Run:
                     raise CacheError(str(error)) from None
         return {name: value if value.ndim else value.item() for name, value in kept.items()}
 
-    def keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, Profile]:
-        """Return the keypoints of an image and the cost of detection, cached if possible."""
+    def keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, float]:
+        """Find the keypoints of an image and the seconds it took, or read both from the cache."""
         name = f"{feature.detection} {file_digest(image)}"
         if name not in self._recent:
             self._recent[name] = self._keypoints(feature, image)
@@ -194,18 +193,18 @@ class Run:
             self._recent.popitem(last=False)
         return self._recent[name]
 
-    def _keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, Profile]:
+    def _keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, float]:
         def make() -> Row:
             rgb = load_image(image)
-            with profiled() as profiler:
+            with profiled() as profile:
                 found = feature.detect(rgb)
             known = {name: value for name, value in vars(found).items() if value is not None}
-            return {**known, "profile": profiler.total}
+            return {**known, "seconds": profile.seconds}
 
         kept = self.cached("keypoints", (feature.detection, image), make)
-        profile = Profile(*kept.pop("profile").tolist())
+        seconds = kept.pop("seconds")
         width, height = kept.pop("image_size").tolist()
-        return Keypoints(image_size=(width, height), **kept), profile
+        return Keypoints(image_size=(width, height), **kept), seconds
 
     def matches(
         self, feature: LocalFeature, images: tuple[Path, Path], settings: MatchSettings
@@ -219,7 +218,7 @@ class Run:
             check_memory([len(keypoints) for keypoints in both])
             descriptors, describe = self._descriptors(feature, images, both)
             matcher = get_matcher("hamming" if feature.binary else settings.matcher)
-            with profiled() as profiler:
+            with profiled() as profile:
                 found = match_descriptors(
                     descriptors[0],
                     descriptors[1],
@@ -229,28 +228,27 @@ class Run:
                     seed=settings.seed,
                     positions=(both[0].xy, both[1].xy),
                 )
-            profiles = describe, profiler.total
-            return {"rows0": found.indices0, "rows1": found.indices1, "profiles": profiles}
+            seconds = describe + profile.seconds
+            return {"rows0": found.indices0, "rows1": found.indices1, "seconds": seconds}
 
         kept = self.cached("matches", (*feature.key, images, settings), make)
-        describe, match = (Profile(*profile) for profile in kept["profiles"].tolist())
         points = both[0].xy[kept["rows0"]], both[1].xy[kept["rows1"]]
-        return PairMatches(*points, both[0].xy, both[1].xy, describe, match)
+        return PairMatches(*points, both[0].xy, both[1].xy, kept["seconds"])
 
     def _descriptors(
         self, feature: LocalFeature, images: tuple[Path, Path], both: Sequence[Keypoints]
-    ) -> tuple[list[np.ndarray], Profile]:
-        """Describe both images; the last pair's descriptors are kept for other match settings."""
+    ) -> tuple[list[np.ndarray], float]:
+        """Describe both images; those of the last pair are kept for other settings of matching."""
         name = key(*feature.key, images, [len(keypoints) for keypoints in both])
         if self._described is None or self._described[0] != name:
             self._described = None  # frees memory before new descriptors are computed
             rgb = [load_image(image) for image in images]
-            with profiled() as profiler:
+            with profiled() as profile:
                 descriptors = [
                     feature.describe(pixels, keypoints)
                     for pixels, keypoints in zip(rgb, both, strict=True)
                 ]
-            self._described = name, descriptors, profiler.total
+            self._described = name, descriptors, profile.seconds
         return self._described[1:]
 
 

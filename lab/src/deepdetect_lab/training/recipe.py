@@ -314,7 +314,7 @@ class MatchFilterTrainingOptions:
         drawn: pairs of views that are drawn before the first step, to be taken from.
         learning_rate: highest learning rate, after the warm-up; it falls linearly to 0.
         val_count: number of times that the weights are measured.
-        val_pairs: pairs that they are measured on.
+        val_pairs: pairs that the weights are measured on.
         seed: seed of the weights and the pairs.
 
     Raises:

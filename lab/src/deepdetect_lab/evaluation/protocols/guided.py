@@ -167,7 +167,7 @@ def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -
 
     def make() -> Row:
         grays = luma(load_image(pair.first)), luma(load_image(pair.second))
-        with profiled() as profiler:
+        with profiled() as profile:
             geometry = guiding_geometry(grays, seed=seed)
             trusted, found = guided_matches(grays, (first, second), geometry, seed)
         return {
@@ -175,7 +175,7 @@ def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -
             "matrix": np.empty((0, 3)) if trusted.matrix is None else trusted.matrix,
             "points0": np.empty((0, 2)) if found is None else found.starts(first),
             "points1": np.empty((0, 2)) if found is None else found.points1,
-            "seconds": profiler.total.seconds,
+            "seconds": profile.seconds,
         }
 
     return run.cached("guided", (feature.detection, images, seed), make)

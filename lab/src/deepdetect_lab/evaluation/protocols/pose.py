@@ -156,9 +156,9 @@ def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
     settings = MatchSettings("exact", ratio, mutual=True, budget=BUDGET)
 
     def match(images: tuple[Path, Path]) -> Found:
-        detect = [run.keypoints(feature, image)[1].seconds for image in images]
+        detect = [run.keypoints(feature, image)[1] for image in images]
         found = run.matches(feature, images, settings)
-        seconds = sum(detect) + found.describe.seconds + found.match.seconds
+        seconds = sum(detect) + found.seconds
         return found.points0, found.points1, seconds, "", ""
 
     title = f"{feature.title}, {test}"

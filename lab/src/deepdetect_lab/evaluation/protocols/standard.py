@@ -64,21 +64,27 @@ MATCHING_NOTE = (
 
 
 def standard_sections(
+    run: Run, options: BenchmarkOptions, pairs: Sequence[PlanarPair], *texts: str
+) -> list[Section]:
+    """Return the section of `standard_section`, where the protocol is wanted."""
+    wanted = "standard" in options.protocols
+    return [standard_section(run, options, pairs, *texts)] if wanted else []
+
+
+def standard_section(
     run: Run,
     options: BenchmarkOptions,
     pairs: Sequence[PlanarPair],
     key: str,
     title: str,
     text: str,
-) -> list[Section]:
+) -> Section:
     """Measure and show all features on all pairs."""
-    if "standard" not in options.protocols:
-        return []
     features = options.standard_features()
     rows = standard_rows(run, features, pairs)
     what = f"{title} ({len(pairs)} pairs)"
     tables = standard_tables(features, rows, key, what)
-    return [Section(f"{title}, the standard protocol", (text,), tables)]
+    return Section(f"{title}, the standard protocol", (text,), tables)
 
 
 def standard_rows(run: Run, features: Sequence[LocalFeature], pairs: Sequence[PlanarPair]) -> Rows:
@@ -87,9 +93,7 @@ def standard_rows(run: Run, features: Sequence[LocalFeature], pairs: Sequence[Pl
     return run.rows("", features, items, lambda feature, pair: pair_row(run, feature, pair))
 
 
-def pair_row(
-    run: Run, feature: LocalFeature, pair: PlanarPair, budgets: Sequence[int | None] = BUDGETS
-) -> Row:
+def pair_row(run: Run, feature: LocalFeature, pair: PlanarPair) -> Row:
     """Measure a feature on a pair.
 
     Returns:
@@ -132,7 +136,7 @@ def pair_row(
     }
     # Positions count once, although SIFT repeats some with other orientations.
     places = [first.distinct(), second.distinct()]
-    for budget in budgets:
+    for budget in BUDGETS:
         row |= _at_budget(run, feature, pair, places, budget)
     return row
 

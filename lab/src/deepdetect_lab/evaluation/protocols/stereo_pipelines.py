@@ -24,28 +24,26 @@ from ..baselines.method import LocalFeature, deepdetect_feature
 from ..baselines.opencv import self_described
 from ..baselines.random import AllPixels, RandomDetector
 from ..options import PAPER_RESOLUTION_PX, BenchmarkOptions
-from ..profiling import StageProfiler
 from .paper_numbers import FIGURE_8
 
-STAGES = ("keypoints", "matching", "geometry")
 ROUNDS = 3
 """Pipelines that take seconds run this often, and the run of median time is reported."""
 
-Points = tuple[np.ndarray, np.ndarray, int, StageProfiler]
-"""(N, 2) float32 pixels of the left image, (N,) float32 disparities, the number of filled-in
-disparities, and the profile of the stages."""
+Points = tuple[np.ndarray, np.ndarray, int]
+"""(N, 2) float32 pixels of the left image, (N,) float32 disparities, and how many of them were not
+matched but filled in."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
     """A function from two images to points; `name` is also the title in tables.
 
-    Name and `version` identify cached results. `drawn` is the title in Figure 8 (empty: not drawn),
-    `paper` the number of points by scene in the paper.
+    `prepare` returns what is timed. Results depend on `version` besides the name. `drawn` is the
+    title in Figure 8 (empty: not drawn), `paper` the number of points in the paper by scene.
     """
 
     name: str
-    run: Callable[[CalibratedStereoPair], Points]
+    prepare: Callable[[CalibratedStereoPair], Callable[[], Points]]
     version: str = ""
     rounds: int = ROUNDS
     drawn: str = ""
@@ -88,7 +86,7 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
     every = partial(_ours, detector=AllPixels())
     return [
         *found,
-        Pipeline("OpenCV's SGBM", sgbm),
+        Pipeline("OpenCV's SGBM", lambda scene: partial(sgbm, scene)),
         Pipeline("baseline: as many random pixels as ours", random, found[0].version, 1),
         Pipeline("baseline: all pixels", every),
         Pipeline("all pixels, --density 1", partial(every, density=1)),
@@ -97,9 +95,14 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
 
 def _ours(
     scene: CalibratedStereoPair, *, detector: AnyDetector, density: float | None = None
-) -> Points:
+) -> Callable[[], Points]:
     _compile_kernels()
-    profiler = StageProfiler()
+    return partial(_reconstructed, scene, detector, density)
+
+
+def _reconstructed(
+    scene: CalibratedStereoPair, detector: AnyDetector, density: float | None
+) -> Points:
     found = reconstruct(
         scene.left,
         scene.right,
@@ -107,32 +110,31 @@ def _ours(
         calibration=scene.calibration,
         rectified=True,
         selection=SelectionOptions(density=density),
-        progress=lambda stage: profiler.record(stage if stage in STAGES else "geometry"),
     )
-    profiler.record("geometry")
     assert found.disparity is not None
-    filled = int(np.count_nonzero(~found.matched))
-    return found.pixels, found.disparity, filled, profiler
+    return found.pixels, found.disparity, int(np.count_nonzero(~found.matched))
 
 
-def _random(scene: CalibratedStereoPair, *, like: DeepDetect) -> Points:
+def _random(scene: CalibratedStereoPair, *, like: DeepDetect) -> Callable[[], Points]:
     density = float((like.heatmap(scene.left) > 0.5).mean())
     return _ours(scene, detector=RandomDetector(), density=density)
 
 
 def _paper(feature: LocalFeature, drawn: str = "", paper: Mapping[str, float] = {}) -> Pipeline:
     def run(scene: CalibratedStereoPair) -> Points:
-        feature.detect(scene.left)  # the first run of a size takes longer
-        profiler = StageProfiler()
-        points0, points1 = paper_points(feature, scene, profiler)
+        points0, points1 = paper_points(feature, scene)
         disparity = (points0[:, 0] - points1[:, 0]).astype(np.float32)
-        return points0.astype(np.float32), disparity, 0, profiler
+        return points0.astype(np.float32), disparity, 0
 
-    return Pipeline(feature.title, run, feature.version, 1, drawn, paper)
+    def prepare(scene: CalibratedStereoPair) -> Callable[[], Points]:
+        feature.detect(scene.left)  # the first run of a size takes longer
+        return partial(run, scene)
+
+    return Pipeline(feature.title, prepare, feature.version, 1, drawn, paper)
 
 
 def paper_points(
-    feature: LocalFeature, scene: CalibratedStereoPair, profiler: StageProfiler, seed: int = 0
+    feature: LocalFeature, scene: CalibratedStereoPair, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Match a stereo pair; return the (M, 2) inliers of the essential matrix ("voxels").
 
@@ -142,19 +144,15 @@ def paper_points(
     images = scene.left, scene.right
     ratio, camera_matrix = paper_settings(scene)
     features = [feature.detect(rgb) for rgb in images]
-    profiler.record("keypoints")
     check_memory([len(one) for one in features])
     first, second = (feature.describe(rgb, one) for rgb, one in zip(images, features, strict=True))
     flann = partial(flann_neighbours, trees=PAPER_FLANN_TREES, checks=PAPER_FLANN_CHECKS)
     found = match_descriptors(first, second, flann, ratio=ratio, seed=seed)
-    profiler.record("matching")
-    kept = essential_inliers(
+    return essential_inliers(
         features[0].xy[found.indices0].astype(np.float64),
         features[1].xy[found.indices1].astype(np.float64),
         camera_matrix,
     )
-    profiler.record("geometry")
-    return kept
 
 
 def paper_settings(scene: CalibratedStereoPair) -> tuple[float, np.ndarray]:
@@ -195,7 +193,6 @@ def sgbm(scene: CalibratedStereoPair) -> Points:
 
     The range starts at 0 or below. Views are extended by it, so that margins also get values.
     """
-    profiler = StageProfiler()
     gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
     search = find_disparity_range(*gray)
     smallest, largest = (0, 64) if search is None else (min(search[0], 0), search[1])
@@ -203,9 +200,8 @@ def sgbm(scene: CalibratedStereoPair) -> Points:
     borders = max(smallest + count, 0), -smallest
     disparity = sgbm_disparity(scene.left, scene.right, count, borders, smallest)
     rows, columns = np.nonzero(np.isfinite(disparity))
-    profiler.record("matching")
     pixels = np.column_stack([columns, rows]).astype(np.float32)
-    return pixels, disparity[rows, columns], 0, profiler
+    return pixels, disparity[rows, columns], 0
 
 
 def sgbm_disparity(
