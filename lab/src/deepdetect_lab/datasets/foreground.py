@@ -22,7 +22,7 @@ class MaskedPhotograph:
 
 
 def load_foreground(folder: str | Path) -> list[MaskedPhotograph]:
-    """List the photographs with masks; raise an ImageError if there is none."""
+    """List the photographs with masks; raise an ImageError without any."""
     found = []
     for mask in sorted(Path(folder).glob("*_mask.png")):
         stem = mask.name.removesuffix("_mask.png")

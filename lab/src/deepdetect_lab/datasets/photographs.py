@@ -32,7 +32,7 @@ from .download import RemoteFile
 
 CROP_SIDE_PX = 480
 JPEG_QUALITY = 97
-"""At this JPEG quality labels hardly change, because the loss is smaller than image noise."""
+"""Labels hardly change at this JPEG quality, because the loss is smaller than image noise."""
 
 VALIDATION_SHARE = 1 / 20
 

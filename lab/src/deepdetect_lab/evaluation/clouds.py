@@ -17,11 +17,11 @@ DPI = 100
 """Pixels to an inch, in which matplotlib counts."""
 
 POINT_AREA = 1.5
-"""Area of a point in square points of 1/72 inch: 1.7 pixels wide, so that a surface of one point
-for each pixel of an image is closed from the side also."""
+"""Area of a drawn point, in units of (1/72 inch)^2. It is 1.7 pixels wide, so that a surface with one
+point per image pixel has no gaps in side views."""
 
 ZOOM = 2.2
-"""At 1 the robust box of a cloud takes less than half of the width of a picture."""
+"""Zoom of the plot; at 1 the robust box of a cloud fills less than half of the figure's width."""
 
 
 def draw_cloud(
