@@ -39,7 +39,7 @@ CONFIDENCE = 0.9999
 """RANSAC stops when the best model has been found with this probability."""
 
 ITERATIONS = 5000
-"""Most samples that are drawn for each focal length. Chosen by hand."""
+"""RANSAC draws at most this many samples for each focal length. Chosen by hand."""
 
 FOCAL_SPREAD = 0.7
 """Prior standard deviation of ln(focal length / longer side). Chosen by hand."""
