@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from deepdetect_lab.cli.evaluate import run_demo
-from deepdetect_lab.datasets import StereoPair
+from deepdetect.cli.demo import run_demo
 
 
 class FakeDetector:
@@ -23,12 +22,12 @@ def test_a_shifted_copy_is_matched_right(tmp_path: Path) -> None:
 
     noise = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
     texture = cv2.resize(noise, (120, 80), interpolation=cv2.INTER_CUBIC)
-    pair = StereoPair("noise", texture[:, :-6], texture[:, 6:], np.full((80, 114), 6.0, np.float32))
-    result = run_demo(pair, FakeDetector(), tmp_path)
+    views, truth = (texture[:, :-6], texture[:, 6:]), np.full((80, 114), 6.0, np.float32)
+    result = run_demo(*views, truth, FakeDetector(), tmp_path)
     assert result["all_matches"]["precision"] > 0.9
     assert result["inliers"]["precision"] >= result["all_matches"]["precision"]
     assert result["random"]["precision"] < result["all_matches"]["precision"]
     assert result["all_matches"]["evaluated"] == result["all_matches"]["matches"]
     assert {path.name for path in result["pictures"]} == {path.name for path in tmp_path.iterdir()}
-    wrong = StereoPair(pair.name, pair.left, pair.right, pair.disparity + 3)
-    assert run_demo(wrong, FakeDetector(), tmp_path)["all_matches"]["precision"] < 0.1
+    wrong = run_demo(*views, truth + 3, FakeDetector(), tmp_path)
+    assert wrong["all_matches"]["precision"] < 0.1

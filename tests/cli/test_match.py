@@ -7,8 +7,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import DeepDetect, MatchingOptions, SelectionOptions, load_matches, match_images
-from deepdetect.matching import PUBLISHED_MATCHING
+from deepdetect import (
+    DeepDetect,
+    PointDetector,
+    estimate_geometry,
+    load_matches,
+    match_features,
+    match_images,
+)
 from deepdetect.matching.pipeline import GUIDED_STAGES
 
 
@@ -22,31 +28,48 @@ def test_writes_matches_and_a_picture(run, photos: Path) -> None:
         np.testing.assert_array_equal(file["points0"], expected.points0)
         np.testing.assert_array_equal(file["points1"], expected.points1)
         np.testing.assert_array_equal(file["inliers"], expected.inliers)
-        np.testing.assert_allclose(file["matrix"], expected.matrix)
-        assert str(file["model"]) == expected.model
+        np.testing.assert_allclose(file["matrix"], expected.geometry.matrix)
+        assert str(file["model"]) == expected.geometry.model
     assert np.asarray(Image.open("out/left_right_matches.jpg")).shape[1] == 400
     assert f"{len(expected):,}" in result.stdout
 
 
-def test_options_reach_the_matcher(run, photos: Path) -> None:
+@pytest.mark.parametrize(
+    ("kind", "descriptor", "detector"),
+    [
+        ("network", (), DeepDetect()),
+        ("points", ("--descriptor", "rootsift"), PointDetector(descriptor="rootsift")),
+    ],
+    ids=["network", "points"],
+)
+def test_options_reach_the_matcher(
+    run, photos: Path, kind: str, descriptor: tuple[str, ...], detector: DeepDetect | PointDetector
+) -> None:
     result = run(
         *("match", photos / "left.png", photos / "right.png", "--json", "--no-pictures"),
-        *("--ratio", 0.8, "--mutual", "--model", "none", "--matcher", "exact"),
-        *("--max-keypoints", 500, "--descriptor", "rootsift", "--unguided"),
+        *("--ratio", 0.8, "--mutual", "--matcher", "exact", "--model", "fundamental"),
+        *("--max-keypoints", 500, "--unguided", "--detector", kind, *descriptor),
     )
     report = json.loads(result.stdout)
-    expected = match_images(
-        photos / "left.png",
-        photos / "right.png",
-        selection=SelectionOptions(max_keypoints=500),
-        guided_matching=False,
-        model="none",
-        mutual=True,
-        options=MatchingOptions(ratio=0.8, matcher="exact", descriptor="rootsift"),
-    )
+    features = [
+        detector.extract(photos / name, max_keypoints=500) for name in ("left.png", "right.png")
+    ]
+    expected = match_features(*features, ratio=0.8, matcher="exact")
+    geometry = expected.with_geometry(estimate_geometry(expected)).geometry
     assert report["keypoints0"] == 500
     assert report["matches"] == len(expected)
-    assert report["matrix"] is None
+    np.testing.assert_array_equal(report["geometry"].pop("matrix"), geometry.matrix)
+    assert report["geometry"].pop("evidence") == vars(geometry.evidence)
+    told = {name: getattr(geometry, name) for name in ("model", "scene", "confidence")}
+    assert report["geometry"] == told
+
+
+def test_options_of_descriptors_are_for_unguided_matches(run, photos: Path) -> None:
+    for words in (("--ratio", 0.8), ("--matcher", "exact"), ("--descriptor", "rootsift")):
+        how = ("--detector", "points", *words)
+        result = run("match", photos / "left.png", photos / "right.png", *how)
+        assert result.exit_code == 2
+        assert f"{words[0]} is for --unguided: add that, or leave it out" in result.stderr
 
 
 def test_pairs_of_a_folder_are_those_of_the_images_one_by_one(run, photos: Path) -> None:
@@ -60,8 +83,9 @@ def test_pairs_of_a_folder_are_those_of_the_images_one_by_one(run, photos: Path)
     assert names == [("1", "2"), ("2", "10")]
     one = json.loads(run("match", "frames/a/1.png", "frames/a/2.png", *how).stdout)
     assert Path(found[0]["file"]).name == "a-1_a-2_matches.npz"
-    assert one["matrix"] == found[0]["matrix"]
-    np.testing.assert_allclose(found[0]["matrix"], [[1, 0, -8], [0, 1, 0], [0, 0, 1]], atol=0.05)
+    matrix = found[0]["geometry"]["matrix"]
+    assert one["geometry"]["matrix"] == matrix
+    np.testing.assert_allclose(matrix, [[1, 0, -8], [0, 1, 0], [0, 0, 1]], atol=0.05)
     Path("pairs.txt").write_text("a/10.png a/1.png\n")
     listed = json.loads(run("match", "frames", *how, "--pairs", "pairs.txt").stdout)["pairs"]
     assert [Path(each["image0"]).name for each in listed] == ["10.png"]
@@ -69,42 +93,16 @@ def test_pairs_of_a_folder_are_those_of_the_images_one_by_one(run, photos: Path)
     Path("frames/a/2.png").write_bytes(b"no image")
     rest = run("match", "frames", *how)
     assert rest.exit_code == 1
-    assert "2 of 3 pairs failed" in rest.stderr
-    for words, message in (
-        (("frames", "--pairs", "sequential"), "give one, or exhaustive, or sequential:10"),
-        ((photos / "cat.jpg",), "one image has no pair"),
-    ):
-        refused = run("match", *words, *how)
-        assert refused.exit_code == 2
-        assert message in refused.stderr
+    assert "2 of 3" in rest.stderr
+    assert run("match", "frames", "--pairs", "sequential", *how).exit_code == 2
+    assert run("match", photos / "cat.jpg", *how).exit_code == 2
 
 
 def test_the_one_file_that_is_written_may_be_named(run, photos: Path) -> None:
     pair = (photos / "cat.jpg", photos / "cat.jpg", "--detector", "points")
     assert run("match", *pair, "--no-pictures", "-o", "m.csv").exit_code == 0
     assert Path("m.csv").read_text().startswith("x0,y0,x1,y1,score,inlier\n")
-    refused = run("match", *pair, "-o", "m.npz")
-    assert refused.exit_code == 2
-    assert "-o names the folder for all results" in refused.stderr
-
-
-@pytest.mark.slow
-def test_the_preset_is_changed_by_given_options_only(run, photos: Path) -> None:
-    result = run(
-        *("match", photos / "left.png", photos / "right.png", "--preset", "published", "--json"),
-        "--no-pictures",
-    )
-    expected = match_images(
-        photos / "left.png",
-        photos / "right.png",
-        DeepDetect(resolution=480, network_channels="bgr"),
-        guided_matching=False,
-        model="none",
-        options=PUBLISHED_MATCHING,
-    )
-    report = json.loads(result.stdout)
-    assert report["matches"] == len(expected)
-    assert report["model"] == "none"
+    assert run("match", *pair, "-o", "m.npz").exit_code == 2
 
 
 def test_a_given_homography_judges_and_csv(run, photos: Path) -> None:
@@ -114,7 +112,7 @@ def test_a_given_homography_judges_and_csv(run, photos: Path) -> None:
         *("--no-pictures", "--format", "csv", "--unguided", "--max-keypoints", 300, "-o", "out"),
     )
     report = json.loads(result.stdout)
-    assert report["model"] == "homography"
+    assert report["geometry"]["model"] == "homography"
     assert report["inliers"] > 0.9 * report["matches"] > 0
     header, *lines = Path("out/cat_cat_matches.csv").read_text().splitlines()
     assert header == "x0,y0,x1,y1,score,inlier"
@@ -128,16 +126,20 @@ def test_images_without_a_match_have_an_exit_code_of_their_own(run, tmp_path: Pa
         Image.new("RGB", (64, 64), (90, 90, 90)).save(tmp_path / f"{name}.png")
     result = run("match", "a.png", "b.png", "-o", "out", "--unguided", "--json")
     assert result.exit_code == 3
-    assert "there are no matches" in result.stderr
+    assert "there are no matches: the images have too little texture" in result.stderr
     report = json.loads(result.stdout)
-    assert (report["matches"], report["success"]) == (0, True)
+    assert (report["matches"], report["success"]) == (0, False)
 
 
 def test_a_failed_estimate_is_said(run, photos: Path) -> None:
     words = ("match", photos / "left.png", photos / "right.png", "-o", "out", "--unguided")
-    result = run(*words, "--max-keypoints", 4, "--model", "fundamental")
-    assert result.exit_code == 0
-    assert "no fundamental could be estimated" in result.stderr
+    result = run(*words, "--max-keypoints", 6, "--detector", "points", "--json")
+    assert result.exit_code == 3
+    assert "no geometry can be trusted: most of these matches by descriptors" in result.stderr
+    report = json.loads(result.stdout)
+    assert (report["success"], report["geometry"]["model"]) == (False, "none")
+    assert report["matches"] > 0 == report["inliers"]
+    assert not load_matches(report["file"]).success
 
 
 def test_a_pair_without_a_geometry_has_its_own_exit_code(run, tmp_path: Path) -> None:
@@ -147,27 +149,6 @@ def test_a_pair_without_a_geometry_has_its_own_exit_code(run, tmp_path: Path) ->
         Image.fromarray(noise).save(tmp_path / f"{name}.png")
     result = run("match", "a.png", "b.png", "-o", "out", "--json")
     assert result.exit_code == 3
-    assert result.stderr.count("no geometry between these images can be trusted") == 1
     assert len(load_matches(Path("out/a_b_matches.npz"))) == 0
     report = json.loads(result.stdout)
     assert (report["matches"], report["success"]) == (0, False)
-
-
-def test_matches_of_other_images_are_not_written_over(run, photos: Path) -> None:
-    others = Path("others")
-    others.mkdir()
-    for name, source in (("left.png", "right.png"), ("right.png", "left.png")):
-        (others / name).write_bytes((photos / source).read_bytes())
-    options = ("-o", "out", "--max-keypoints", 300, "--unguided")
-    first = ("match", photos / "left.png", photos / "right.png", *options)
-    other = ("match", others / "left.png", others / "right.png", *options)
-    assert run(*first).exit_code == 0
-    written = Path("out/left_right_matches.npz").read_bytes()
-    refused = run(*other)
-    assert refused.exit_code == 2
-    assert "exists, made from" in refused.stderr
-    assert "--overwrite" in refused.stderr
-    assert Path("out/left_right_matches.npz").read_bytes() == written
-    assert run(*first, "--no-pictures").exit_code == 0, "the same images again"
-    assert run(*other, "--overwrite").exit_code == 0
-    assert Path("out/left_right_matches.npz").read_bytes() != written

@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from deepdetect import OptionError, PointDetector, WeightsError
+from deepdetect import Keypoints, OptionError, PointDetector, WeightsError, match_features
 from deepdetect.detector.points.detection import detect_points
 from deepdetect.detector.points.ranker import load_ranker
 from deepdetect.features.sift import scaled_sift_descriptors, to_root_sift
@@ -85,8 +86,70 @@ def test_points_of_large_images_are_found_on_two_megapixels(
         {"max_keypoints": None, "spread": "grid"},
         {"resolution": 480},
         {"threshold": 0.5},
+        {"threads": 0},
     ],
 )
 def test_wrong_options_are_reported(options: dict[str, object]) -> None:
     with pytest.raises(OptionError):
         PointDetector(**options)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("backend", "openvino"), ("device", "cuda"), ("precision", "bfloat16")]
+)
+def test_what_points_have_not_is_refused_by_its_name(name: str, value: str) -> None:
+    with pytest.raises(OptionError, match=f"`{name}='{value}'` cannot be had for points"):
+        PointDetector(**{name: value})
+    PointDetector(backend="onnxruntime", device="cpu", precision="float32")
+
+
+def test_the_number_of_threads_changes_no_keypoint(image: np.ndarray) -> None:
+    one, all_ = PointDetector(60, threads=1).extract(image), PointDetector(60).extract(image)
+    np.testing.assert_array_equal(one.xy, all_.xy)
+    np.testing.assert_array_equal(one.scores, all_.scores)
+    np.testing.assert_allclose(one.descriptors, all_.descriptors, atol=1e-5)
+
+
+def test_the_number_of_keypoints_is_that_of_the_call_or_else_of_the_detector(
+    image: np.ndarray,
+) -> None:
+    points = PointDetector(40)
+    best = points.detect(image)
+    for find in (points.detect, points.extract):
+        for asked, count in ((None, 40), (7, 7), (60, 60)):
+            found = find(image, max_keypoints=asked)
+            assert len(found) == count
+            shared = min(count, 40)
+            np.testing.assert_array_equal(found.xy[:shared], best.xy[:shared])
+    found = points.detect_batch([image, image[:60]], max_keypoints=9)
+    assert [len(each) for each in found] == [9, 9]
+    assert len(pickle.loads(pickle.dumps(points)).detect(image)) == 40
+    assert points.settings != PointDetector(41).settings
+    with pytest.raises(OptionError, match="max_keypoints"):
+        points.detect(image, max_keypoints=0)
+
+
+class Shades:
+    """A descriptor of somebody's own: the pixel below a keypoint and what surrounds it."""
+
+    descriptor_type = "shades"
+
+    def describe(self, image: np.ndarray, keypoints: Keypoints) -> Keypoints:
+        padded = np.pad(image, ((3, 3), (3, 3), (0, 0)), mode="edge")
+        x, y = np.rint(keypoints.xy).astype(int).T
+        windows = np.lib.stride_tricks.sliding_window_view(padded, (7, 7), axis=(0, 1))
+        values = windows[y, x].reshape(len(keypoints), -1).astype(np.float32)
+        return replace(keypoints, descriptors=values, descriptor_type=self.descriptor_type)
+
+
+def test_a_descriptor_of_ones_own_describes(image: np.ndarray) -> None:
+    points = PointDetector(50, descriptor=Shades())
+    assert points.descriptor_type == "shades"
+    found = points.extract(image)
+    np.testing.assert_array_equal(found.xy, PointDetector(50).detect(image).xy)
+    assert (found.descriptors.shape, found.descriptor_type) == ((50, 147), "shades")
+    matches = match_features(found, found)
+    np.testing.assert_array_equal(matches.indices0, matches.indices1)
+    assert len(matches) == 50
+    again = pickle.loads(pickle.dumps(points)).extract(image)
+    np.testing.assert_array_equal(again.descriptors, found.descriptors)

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from deepdetect import Keypoints, Matches, OptionError
 from deepdetect.features.keypoints import nearest_keypoints
+from deepdetect.features.matches import TwoViewGeometry
+from deepdetect.geometry.estimation import MAX_LOG10_NFA, Geometry
 
 GRID = np.stack(np.meshgrid(np.arange(0, 40, 4), np.arange(0, 32, 4)), -1).reshape(-1, 2)
 KEYPOINTS = Keypoints(GRID, np.linspace(0, 1, len(GRID)), (40, 32))
@@ -23,11 +25,10 @@ def matches_of(first: Any, second: Any, scores: Any = None, **changes: Any) -> M
         "points1": KEYPOINTS.xy[list(second)],
         "scores": np.linspace(1, 0.5, count) if scores is None else scores,
         "inliers": np.arange(count) % 2 == 0,
-        "model": "homography",
-        "matrix": np.eye(3),
         "keypoints0": KEYPOINTS,
         "keypoints1": KEYPOINTS,
         "seconds": {"matching": 0.5},
+        "geometry": TwoViewGeometry("homography", np.eye(3), "planar", "high"),
         "indices0": np.array(first, np.int64),
         "indices1": np.array(second, np.int64),
     }
@@ -59,24 +60,15 @@ def test_indexing_is_that_of_numpy(index: Any, kept: list[int]) -> None:
         whole, chosen = getattr(MATCHES, name), getattr(part, name)
         np.testing.assert_array_equal(chosen, whole[kept])
         assert chosen.dtype == whole.dtype
-    assert part.model == "homography"
+    assert part.geometry is MATCHES.geometry
     assert part.keypoints0 is MATCHES.keypoints0
     assert part.seconds == MATCHES.seconds
 
 
-@pytest.mark.parametrize(
-    ("indices", "words"),
-    [
-        ([0, 1, 2], "one whole number each as indices0"),
-        ([0.0, 1, 2, 3], "float64"),
-        ([0, 1, 2, 80], r"lie in \[-1, 79\]"),
-        ([0, 1, 2, -2], r"not in \[-2, 2\]"),
-    ],
-)
-def test_indices_that_do_not_fit_are_an_error(indices: Any, words: str, one_line) -> None:
-    with pytest.raises(OptionError, match=words) as caught:
+@pytest.mark.parametrize("indices", [[0, 1, 2], [0.0, 1, 2, 3], [0, 1, 2, 80], [0, 1, 2, -2]])
+def test_indices_that_do_not_fit_are_an_error(indices: Any) -> None:
+    with pytest.raises(OptionError, match="indices0"):
         matches_of([5, 6, 7, 8], [1, 2, 3, 4], indices0=np.array(indices))
-    one_line(caught.value)
 
 
 def test_indices_are_looked_up_where_none_are_given() -> None:
@@ -87,6 +79,47 @@ def test_indices_are_looked_up_where_none_are_given() -> None:
     found = matches_of(rows, rows, points1=places, indices0=None, indices1=None)
     np.testing.assert_array_equal(found.indices0, rows)
     np.testing.assert_array_equal(found.indices1, [-1, *rows[1:]])
+
+
+def test_pairs_leave_out_what_ends_at_no_keypoint() -> None:
+    found = matches_of([5, 6, 7], [1, 2, 3], indices0=[5, -1, 7], indices1=[1, 2, -1])
+    assert found.pairs.dtype == np.uint32
+    assert found.pairs.tolist() == [[5, 1]]
+    assert MATCHES.pairs.tolist() == [[5, 1], [6, 2], [7, 3], [8, 4]]
+    assert MATCHES[:0].pairs.shape == (0, 2)
+
+
+def test_a_geometry_is_judged_by_the_matches_that_agree() -> None:
+    rows = range(40)
+    bare = matches_of(rows, rows, geometry=None, inliers=np.ones(40, bool))
+    assert (bare.geometry, bare.success) == (None, True)
+    for agreeing, expected in ((30, "homography"), (5, "none")):
+        inliers = np.arange(40) < agreeing
+        judged = bare.with_geometry(Geometry("homography", np.eye(3), inliers), 1.0)
+        told = judged.geometry
+        trusted = expected != "none"
+        assert told.model == expected
+        assert judged.success is trusted
+        assert (told.scene, told.confidence) == (("planar", "fair") if trusted else ("none",) * 2)
+        assert (told.matrix is not None) is trusted
+        assert (told.evidence.tentative_matches, told.evidence.tentative_inliers) == (40, agreeing)
+        assert (told.evidence.log10_nfa < MAX_LOG10_NFA) is trusted
+        np.testing.assert_array_equal(judged.inliers, inliers & trusted)
+        np.testing.assert_array_equal(judged.points0, bare.points0)
+    # What could not be estimated is no geometry either.
+    nothing = bare.with_geometry(Geometry("fundamental", None, np.zeros(40, bool)))
+    assert (nothing.geometry.model, nothing.success, len(nothing)) == ("none", False, 40)
+    assert "40 matches; no geometry can be trusted" in repr(nothing)
+    assert "none that can be trusted" in nothing._repr_html_()
+
+
+def test_swapped_matches_have_the_geometry_the_other_way() -> None:
+    matrix = np.array([[2.0, 0, 3], [0, 1, 1], [0, 0, 1]])
+    for model, expected in (("homography", np.linalg.inv(matrix)), ("fundamental", matrix.T)):
+        swapped = matches_of([5, 6], [1, 2], geometry=TwoViewGeometry(model, matrix)).swapped()
+        np.testing.assert_allclose(swapped.geometry.matrix, expected)
+        assert swapped.pairs.tolist() == [[1, 5], [2, 6]]
+    assert matches_of([5], [1], geometry=None).swapped().geometry is None
 
 
 @given(st.data())

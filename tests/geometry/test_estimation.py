@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from skimage.transform import FundamentalMatrixTransform, ProjectiveTransform
 
-from deepdetect import OptionError, estimate_geometry
+from deepdetect import Keypoints, Matches, OptionError, estimate_geometry
 from deepdetect.geometry import Geometry, GeometryOptions
 
 CAMERA0 = np.array([[600, 0, 320], [0, 600, 240], [0, 0, 1]], float)
@@ -120,6 +120,25 @@ def test_the_same_seed_gives_the_same_result(model: str) -> None:
 
 
 @every_way
+def test_matches_are_what_their_positions_are(model: str) -> None:
+    scene = make_scene(model)
+    ends = [
+        Keypoints(points, np.ones(len(points)), (2000, 2000))
+        for points in (scene.points0, scene.points1)
+    ]
+    count = len(scene.true)
+    matches = Matches(ends[0].xy, ends[1].xy, np.ones(count), np.ones(count), *ends)
+    expected = estimate_geometry(matches.points0, matches.points1, **make_options(model))
+    found = estimate_geometry(matches, **make_options(model))
+    np.testing.assert_array_equal(found.matrix, expected.matrix)
+    np.testing.assert_array_equal(found.inliers, expected.inliers)
+    with pytest.raises(OptionError, match="leave it out"):
+        estimate_geometry(matches, scene.points1)
+    with pytest.raises(OptionError, match="give `points1`, or `Matches`"):
+        estimate_geometry(scene.points0)
+
+
+@every_way
 def test_the_seed_decides_the_samples(model: str) -> None:
     """Among many outliers few iterations end at whatever was drawn."""
     scene = make_scene(model, outliers=0.6, noise=1.0)
@@ -186,7 +205,7 @@ def test_few_and_degenerate_matches_do_no_harm(model: str) -> None:
         assert_consistent(geometry, len(points0))
 
 
-@pytest.mark.parametrize("model", [*MODELS, "none"])
+@pytest.mark.parametrize("model", [*MODELS, "auto"])
 def test_a_given_homography_is_judged_and_not_estimated(model: str) -> None:
     """Whatever the model: all matches agree with one translation, another one is given."""
     points = np.random.default_rng(0).uniform(0, 100, (30, 2)).astype(np.float32)
@@ -201,32 +220,23 @@ def test_a_given_homography_is_judged_and_not_estimated(model: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "message"),
+    ("name", "value"),
     [
-        ({"inlier_threshold": 0}, "`inlier_threshold` must be above 0, not 0"),
-        ({"iterations": 0.5}, "`iterations` must be a whole number from 1 on, not 0.5"),
-        ({"confidence": 0.0}, "confidence must lie between 0 and 1, not 0.0"),
-        ({"homography": np.diag([1, 1, np.nan])}, "of finite numbers"),
-        ({"camera0": np.ones((3, 4))}, "camera0 must be a (3, 3) matrix"),
+        ("inlier_threshold", 0),
+        ("confidence", 0.0),
+        ("homography", np.diag([1, 1, np.nan])),
+        ("camera0", np.ones((3, 4))),
     ],
 )
-def test_wrong_options_say_what_is_wrong(values: dict[str, Any], message: str) -> None:
-    with pytest.raises(OptionError) as caught:
-        GeometryOptions(**values)
-    assert message in str(caught.value)
+def test_wrong_options_are_refused_by_name(name: str, value: Any) -> None:
+    with pytest.raises(OptionError, match=name):
+        GeometryOptions(**{name: value})
 
 
-@pytest.mark.parametrize(
-    ("model", "count", "message"),
-    [
-        ("homografy", 2, "unknown model 'homografy': did you mean 'homography'"),
-        ("essential", 2, "needs both cameras"),
-        ("homography", 3, "as many positions in both images, not 3 and 2"),
-    ],
-)
-def test_what_cannot_be_estimated(model: str, count: int, message: str) -> None:
-    with pytest.raises(OptionError, match=message):
-        estimate_geometry(np.zeros((count, 2)), np.eye(2), model)
+def test_what_cannot_be_estimated() -> None:
+    for model, count in (("homografy", 2), ("none", 2), ("essential", 2), ("homography", 3)):
+        with pytest.raises(OptionError):
+            estimate_geometry(np.zeros((count, 2)), np.eye(2), model)
 
 
 def test_a_number_of_iterations_may_be_a_float() -> None:

@@ -2,31 +2,12 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from deepdetect_lab.evaluation.report import Figure, Report, Section, Table, picture
-
-
-@pytest.mark.parametrize(
-    ("style", "cell", "text"),
-    [
-        (".2%", 0.12345, "12.35%"),
-        (",d", 1234567, "1,234,567"),
-        (",.0f", 1234.5, "1,234"),
-        (",d", "as text", "as text"),
-        (",d", None, "–"),
-        (".3f", float("nan"), "–"),
-        (".3f", float("inf"), "inf"),
-    ],
-)
-def test_cells_are_written_in_the_style_of_their_column(style: str, cell, text: str) -> None:
-    shown = Table("key", "Title", {"title": style}, [{"title": cell}]).to_markdown()
-    assert shown.splitlines()[-1] == f"| {text} |"
-
 
 EVIL = "<b>Tom & \"Jerry\"</b> | 'x' <script src=http://evil.example/a.js>"
 THIRD = 1 / 3
@@ -64,19 +45,6 @@ def folder(report: Report, tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("report")
     report.save(root)
     return root
-
-
-def test_all_files_are_written_and_named_with_the_report_first(
-    report: Report, tmp_path: Path
-) -> None:
-    paths = report.save(tmp_path)
-    assert paths[0] == tmp_path / "report.md"
-    assert len(set(paths)) == len(paths)
-    assert set(paths) == {path for path in tmp_path.rglob("*") if path.is_file()}
-    assert {path.relative_to(tmp_path).as_posix() for path in paths} == {
-        *("report.md", "figures/fig.png", "figures/other.png"),
-        *("tables/first.csv", "tables/second.csv", "report.json"),
-    }
 
 
 def test_csv_has_every_digit_and_empty_cells(report: Report, folder: Path) -> None:

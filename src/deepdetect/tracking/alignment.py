@@ -1,11 +1,12 @@
-"""Patches of an image found again in later ones by Gauss-Newton, with their affine deformation.
+"""Alignment of patches of an image in later images, with an affine deformation, by Gauss-Newton.
 
-Baker and Matthews, "Lucas-Kanade 20 years on", 2004 (inverse compositional: all but the residuals
-is computed once for each patch); gain and offset of the light drop out of the equations.
+The method is inverse compositional (Baker and Matthews, "Lucas-Kanade 20 years on", 2004):
+everything but the residuals is computed once for each patch. Gain and offset are eliminated.
 """
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -13,43 +14,43 @@ import numpy as np
 from .._shared.opencv import cv2
 
 RADIUS_PX = 10
-"""Of a patch; its middle counts most."""
+"""Radius of a patch, whose pixels have a Gaussian weight of sigma radius / 2. Chosen by hand."""
 
 BLUR_SIGMA_PX = 1.0
-"""Of images before their patches are read: what lies between pixels is then well defined."""
+"""Sigma of the blur of images, so that values between pixels can be interpolated well."""
 
 BORDER_PX = 3
-"""Of an image, that its blur makes unlike what other images show there."""
+"""Width of the border that is not used: it is blurred with values from beyond the image."""
 
 MAX_ITERATIONS = 30
 CONVERGENCE_PX = 0.03
-"""A patch that moves by less has arrived; OpenCV 4 reads images at steps of 1/32."""
+"""A patch that moves by less has converged; OpenCV 4 reads images at steps of 1/32 px."""
 
 MAX_SHIFT_PX = 3.0
-"""From where a patch is expected; translation alone may be off by it where surfaces come nearer."""
+"""A patch may move by this from its expected position, as translation alone may be off by it where
+surfaces come nearer. Chosen by hand."""
 
 MIN_CORRELATION = 0.8
-"""Of a patch that is found."""
+"""A patch that correlates less is not found. Chosen by hand."""
 
 MAX_GROWTH = 4.0
-"""Of the area of a patch: beyond it, too few of its pixels are seen in one of the images."""
+"""The area of a patch may grow or shrink by this factor. If it changes more, one of the images
+shows too few of its pixels. Chosen by hand."""
 
 RIDGE = 1e-4
-"""Added to the equations, as a share of their size: patches of parallel edges can be solved."""
-
-OFFSETS = np.indices((2 * RADIUS_PX + 1,) * 2, np.float32)[::-1].reshape(2, -1) - RADIUS_PX
-WINDOW = np.exp(-2 * (OFFSETS**2).sum(axis=0) / RADIUS_PX**2)
-WINDOW /= WINDOW.sum()
+"""This share of their scale is added to the normal equations, since parallel edges make these
+singular. Chosen by hand."""
 
 MOST_READ = 1 << 14
-"""Patches that are read at once: OpenCV's limit for the sides of an image is 32,767."""
+"""Number of patches read at once, since OpenCV limits the sides of an image to 32,767."""
 
 
 class Patches(NamedTuple):
-    """Patches of P pixels: float32 values (N, P), step for each residual (N, 6, P), variance (N,).
+    """Patches of P pixels: float32 values (N, P), steps (N, 6, P), and variances (N,).
 
-    Steps are those of the place and of the deformation, row by row. `affinities` (N, 2, 2) float64
-    map offsets of pixels in the patches to offsets in the image in which they were found last.
+    Steps map residuals to changes of the position (2) and of the deformation (4, row by row).
+    `affinities` (N, 2, 2) float64 map offsets of pixels in the patches to offsets in the image in
+    which they were found last.
     """
 
     values: np.ndarray
@@ -60,8 +61,9 @@ class Patches(NamedTuple):
     @classmethod
     def none(cls) -> Patches:
         """Return no patches."""
-        values = np.empty((0, OFFSETS.shape[1]), np.float32)
-        steps = np.empty((0, 6, OFFSETS.shape[1]), np.float32)
+        pixels = (2 * RADIUS_PX + 1) ** 2
+        values = np.empty((0, pixels), np.float32)
+        steps = np.empty((0, 6, pixels), np.float32)
         return cls(values, steps, np.empty(0, np.float32), np.empty((0, 2, 2)))
 
     def select(self, rows: np.ndarray) -> Patches:
@@ -70,29 +72,27 @@ class Patches(NamedTuple):
 
 
 def cut_patches(image: np.ndarray, xy: np.ndarray) -> Patches:
-    """Return the patches around (N, 2) points of a blurred image.
-
-    One that the border or its blur reaches is empty, and is never found.
-    """
+    """Return patches around (N, 2) points of a blurred image, empty ones at its border."""
+    offsets, weights = _pixels()
     affinities = np.tile(np.eye(2), (len(xy), 1, 1))
     slopes = [
         _read(cv2.Sobel(image, cv2.CV_32F, *axis, ksize=1, scale=0.5), xy, affinities)
         for axis in ((1, 0), (0, 1))
     ]
     slope = np.stack(slopes, axis=1)
-    deformation = (slope[:, :, None] * OFFSETS).reshape(len(xy), 4, -1)
+    deformation = (slope[:, :, None] * offsets).reshape(len(xy), 4, -1)
     changes = _centred(np.concatenate([slope, deformation], axis=1))
     margin = RADIUS_PX + BORDER_PX
     most = np.array(image.shape[::-1]) - 1 - margin
     inside = np.all((xy >= margin) & (xy <= most), axis=1)
     values = _centred(_read(image, xy, affinities)) * inside[:, None]
-    variances = np.maximum((values**2) @ WINDOW, 1e-6)
-    by_gain = changes @ (values * WINDOW)[..., None] / variances[:, None, None]
+    variances = np.maximum((values**2) @ weights, 1e-6)
+    by_gain = changes @ (values * weights)[..., None] / variances[:, None, None]
     changes -= by_gain * values[:, None]
-    weighted = changes * WINDOW
+    weighted = changes * weights
     normal = weighted @ changes.transpose(0, 2, 1)
-    scale = (slope**2 @ WINDOW).sum(axis=1) + 1e-6
-    ridge = RIDGE * np.diag([1.0] * 2 + [WINDOW @ OFFSETS[0] ** 2] * 4)
+    scale = (slope**2 @ weights).sum(axis=1) + 1e-6
+    ridge = RIDGE * np.diag([1.0] * 2 + [weights @ offsets[0] ** 2] * 4)
     normal += scale[:, None, None] * ridge
     steps = np.linalg.inv(normal).astype(np.float32) @ weighted
     return Patches(values, steps, variances, affinities)
@@ -103,13 +103,14 @@ def find_patches(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find patches in a blurred image near (N, 2) expected positions.
 
-    Returns (N, 2) positions and (N, 2, 2) affinities, float64, and (N,) whether each was found; the
-    others have no meaning.
+    Returns (N, 2) positions and (N, 2, 2) affinities, float64, and (N,) bool whether each was
+    found; positions and affinities of the others are meaningless.
     """
     found, affinities = xy.astype(np.float64), patches.affinities.copy()
     arrived = np.zeros(len(xy), bool)
     rows = np.arange(len(xy))
     most = np.array(image.shape[::-1]) - 1
+    weights = _pixels()[1]
     for _ in range(MAX_ITERATIONS):
         spread = RADIUS_PX * np.abs(affinities[rows]).sum(axis=2) + BORDER_PX
         rows = rows[((found[rows] >= spread) & (found[rows] <= most - spread)).all(axis=1)]
@@ -117,8 +118,8 @@ def find_patches(
             break
         values, steps, variances, _ = patches.select(rows)
         seen = _centred(_read(image, found[rows], affinities[rows]))
-        shared = (seen * values) @ WINDOW
-        correlation = shared / np.sqrt(np.maximum((seen**2) @ WINDOW, 1e-6) * variances)
+        shared = (seen * values) @ weights
+        correlation = shared / np.sqrt(np.maximum((seen**2) @ weights, 1e-6) * variances)
         step = (steps @ seen[..., None])[..., 0] * (variances / np.maximum(shared, 1e-6))[:, None]
         deformed = np.eye(2) + step[:, 2:].reshape(-1, 2, 2)
         regular = (shared > 0) & (np.linalg.det(deformed) > 1 / MAX_GROWTH)
@@ -133,12 +134,20 @@ def find_patches(
     return found, affinities, arrived & (growth > 1 / MAX_GROWTH) & (growth < MAX_GROWTH)
 
 
-def _read(image: np.ndarray, xy: np.ndarray, affinities: np.ndarray) -> np.ndarray:
-    """Return the (N, P) values of an image around points, where the affinities put the pixels.
+@cache
+def _pixels() -> tuple[np.ndarray, np.ndarray]:
+    """Return the offsets of a patch's pixels from its centre, (2, P), and their weights, (P,)."""
+    offsets = np.indices((2 * RADIUS_PX + 1,) * 2, np.float32)[::-1].reshape(2, -1) - RADIUS_PX
+    weights = np.exp(-2 * (offsets**2).sum(axis=0) / RADIUS_PX**2)
+    return offsets, weights / weights.sum()
 
-    By Lanczos' kernel: OpenCV's cubic one moves what it reads by up to .05 px.
+
+def _read(image: np.ndarray, xy: np.ndarray, affinities: np.ndarray) -> np.ndarray:
+    """Return the (N, P) values of an image around points, at offsets warped by the affinities.
+
+    The kernel is Lanczos': OpenCV's cubic kernel shifts what it reads by up to 0.05 px.
     """
-    places = xy.astype(np.float32)[:, :, None] + affinities.astype(np.float32) @ OFFSETS
+    places = xy.astype(np.float32)[:, :, None] + affinities.astype(np.float32) @ _pixels()[0]
     parts = np.array_split(places, len(places) // MOST_READ + 1)
     return np.concatenate(
         [cv2.remap(image, *part.transpose(1, 0, 2), cv2.INTER_LANCZOS4) for part in parts]
@@ -147,4 +156,4 @@ def _read(image: np.ndarray, xy: np.ndarray, affinities: np.ndarray) -> np.ndarr
 
 def _centred(values: np.ndarray) -> np.ndarray:
     """Subtract the weighted mean of each patch."""
-    return values - (values @ WINDOW)[..., None]
+    return values - (values @ _pixels()[1])[..., None]

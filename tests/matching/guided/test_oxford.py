@@ -33,7 +33,7 @@ def test_most_of_what_can_be_matched_is(shared: Path, scene: str, number: int) -
     shares, precisions = [], []
     for seed in range(3):  # of graf they differ by .02
         found = match_images(*rgb, DeepDetect().configured(HeatmapOptions(480)), seed=seed)
-        assert found.guided
+        assert found.success
         places = transform_points(found.keypoints0.xy, pair.homography)
         size = (rgb[1].shape[1], rgb[1].shape[0])
         ceiling = np.count_nonzero(nearest_keypoints(places, found.keypoints1.xy, size)[1] < 1)
@@ -42,7 +42,7 @@ def test_most_of_what_can_be_matched_is(shared: Path, scene: str, number: int) -
         )
         shares.append(np.count_nonzero(errors < 1) / ceiling)
         precisions.append((errors < 1).mean())
-        assert corner_error(found.matrix, pair.homography, rgb[0].shape[1::-1]) <= 1.5
+        assert corner_error(found.geometry.matrix, pair.homography, rgb[0].shape[1::-1]) <= 1.5
     share, precision = BARS[scene, number]
     assert np.median(shares) >= share
     assert np.median(precisions) >= precision

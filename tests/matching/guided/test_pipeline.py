@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, OptionError
+from deepdetect import DeepDetect, estimate_geometry
 from deepdetect.geometry import transform_points
 from deepdetect.geometry.transforms import epipolar_errors, transfer_errors
 from deepdetect.io.image import luma
@@ -20,6 +20,7 @@ from deepdetect_lab.datasets.posed_images import PosedPair, load_posed_scenes
 from deepdetect_lab.evaluation.metrics.pose import translation_error
 from deepdetect_lab.evaluation.metrics.stereo import stereo_score
 from deepdetect_lab.evaluation.protocols.pose import estimate_pose
+from deepdetect_lab.evaluation.unguided import UPRIGHT_SIFT, match_unguided
 
 from ..conftest import match
 
@@ -45,8 +46,8 @@ def test_nearly_all_points_of_a_plane_are_matched_right(
     photo: np.ndarray, second: np.ndarray
 ) -> None:
     matches = match(photo, second, Everywhere())
-    assert matches.guided
-    assert matches.model == matches.two_view_geometry.model == "homography"
+    assert matches.success
+    assert matches.geometry.model == "homography"
     errors = np.linalg.norm(transform_points(matches.points0, WARP) - matches.points1, axis=1)
     assert (errors < 1).mean() > 0.99
     places = transform_points(matches.keypoints0.xy, WARP)
@@ -54,9 +55,9 @@ def test_nearly_all_points_of_a_plane_are_matched_right(
     assert len(matches) > 0.85 * seen.sum()
     assert ((matches.scores > 0) & (matches.scores <= 1)).all()
     assert matches.inliers.mean() > 0.95
-    assert matches.confidence == "high"
-    assert matches.two_view_geometry.verified > 0.8
-    assert matches.two_view_geometry.correlation > 0.9
+    assert matches.geometry.confidence == "high"
+    assert matches.geometry.evidence.verified > 0.8
+    assert matches.geometry.evidence.correlation > 0.9
     assert len(np.unique(matches.points0, axis=0)) == len(matches)
 
 
@@ -69,7 +70,7 @@ def test_a_plane_guides_no_scene_with_depth(shared: Path, pair: str) -> None:
     else:
         images = [shared / f"data/kitti-clip/{int(n):06d}.jpg" for n in numbers.split("-")]
     matches = match(*images, density=0.02)
-    assert matches.two_view_geometry.model != "homography"
+    assert matches.geometry.model != "homography"
 
 
 def test_a_small_plane_is_matched_and_nothing_else(photo: np.ndarray) -> None:
@@ -120,7 +121,7 @@ def test_of_two_motions_alike_in_size_neither_is_trusted_highly(photo: np.ndarra
     for motion in (np.eye(3), np.vstack([turn, [0, 0, 1]])):
         errors = transfer_errors(matches.points0, matches.points1, motion)
         assert 0.33 < (errors < 1).mean() < 0.67
-    assert matches.confidence == "fair"
+    assert matches.geometry.confidence == "fair"
 
 
 @pytest.mark.slow
@@ -131,10 +132,10 @@ def test_a_dominant_plane_does_not_hide_the_depth_beside_it(
     (scene,) = load_posed_scenes(shared / "data" / "entry")
     first, second = scene.images[0 if number == 1 else 2], scene.images[number]
     matches = match(first.path, second.path)
-    guide = matches.two_view_geometry
+    guide = matches.geometry
     assert guide.model == "fundamental"
     assert guide.scene == "depth with a dominant plane"
-    assert guide.on_plane > times * guide.off_plane > 10_000
+    assert guide.evidence.on_plane > times * guide.evidence.off_plane > 10_000
     pair = PosedPair("entry", first, second)
     errors = epipolar_errors(matches.points0, matches.points1, pair.fundamental)
     assert (errors < 3).mean() > 0.99
@@ -158,14 +159,13 @@ def test_of_few_keypoints_those_without_a_partner_are_verified_too(
 def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> None:
     pair = load_middlebury(shared / "data" / "middlebury" / "cones")
     detector = DeepDetect("dense")
-    guided, unguided = (
-        match(pair.left, pair.right, detector, guided_matching=guided, matcher="patchmatch")
-        for guided in (True, False)
-    )
-    assert guided.guided
+    guided = match(pair.left, pair.right, detector)
+    how = {"descriptor": UPRIGHT_SIFT, "matcher": "patchmatch"}
+    unguided = match_unguided(pair.left, pair.right, detector, **how)
+    unguided = unguided.with_geometry(estimate_geometry(unguided))
     assert guided.subpixel
     assert not unguided.subpixel
-    assert guided.model == guided.two_view_geometry.model == "fundamental"
+    assert guided.geometry.model == "fundamental"
     # The lines are estimated: near a corner they may be some rows off.
     assert (np.abs(guided.points0[:, 1] - guided.points1[:, 1]) <= 2).mean() > 0.98
     score = stereo_score(guided.points0, guided.points1, pair.disparity)
@@ -181,11 +181,9 @@ def test_a_scene_with_depth_is_matched_near_its_epipolar_lines(shared: Path) -> 
 def test_a_plane_that_is_asked_for_guides(shared: Path, name: str) -> None:
     """In scenes with depth, where nothing else would choose a plane."""
     pair = load_middlebury(shared / "data" / "middlebury" / name)
-    for asked in ({"two_view_model": "homography"}, {"model": "homography"}):
-        matches = match(pair.left, pair.right, Everywhere(), **asked)
-        assert matches.two_view_geometry.model == "homography"
-        assert matches.model == "homography"
-    assert match(pair.left, pair.right, Everywhere()).two_view_geometry.model == "fundamental"
+    for asked, expected in (("homography", "homography"), ("auto", "fundamental")):
+        matches = match(pair.left, pair.right, Everywhere(), model=asked)
+        assert matches.geometry.model == expected
 
 
 @pytest.mark.slow
@@ -196,15 +194,13 @@ def test_who_asks_for_depth_gets_no_plane(facade: Any, model: str) -> None:
     camera = pair.camera
     detector = DeepDetect("dense")
     images = pair.left, pair.right, detector
-    assert match(*images).two_view_geometry.scene == "depth with a dominant plane"
+    assert match(*images).geometry.scene == "depth with a dominant plane"
     found = match(*images, model=model, camera0=camera, camera1=camera)
-    assert found.two_view_geometry.model == "fundamental"
-    assert found.model == model
+    assert found.geometry.model == model
+    assert found.geometry.scene.startswith("depth")
     x, y = found.points0.astype(int).T
     near = pair.near[y, x]
     assert near.sum() > 1000
     errors = np.linalg.norm(found.points1 - pair.match(found.points0), axis=1)
     for part in (near, ~near):
         assert (errors[part] < 2).mean() > 0.9
-    with pytest.raises(OptionError, match=f"contradicts the model {model}"):
-        match(*images, model=model, camera0=camera, camera1=camera, two_view_model="homography")

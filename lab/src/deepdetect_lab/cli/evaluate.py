@@ -1,4 +1,4 @@
-"""`deepdetect dev evaluate`, `evaluate-stereo`, `benchmark` and `demo`: what weights are worth."""
+"""Commands that evaluate: `evaluate`, `evaluate-stereo`, `compare-clouds`, `benchmark`."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ def evaluate(
 
     Prints the mean binary cross-entropy (BCE) and intersection over union (IoU), the expected
     calibration error over all pixels, and the density of keypoints at 0.5 and of the masks,
-    separately for normal and for low-visibility images; with --oxford also what the paper's
-    protocol gives. What cannot be read or measured is listed at the end, and in no score.
+    separately for normal and for low-visibility images. With --oxford it also prints the scores of
+    the paper's protocol. Unreadable files are listed at the end and are not in the scores.
 
         deepdetect dev evaluate samples/ --weights run/deepdetect.onnx --compare other.onnx
         deepdetect dev evaluate photos/ --scale 0.5 --scale 1 --scale 2
@@ -80,7 +80,7 @@ def evaluate(
     ]
     text = cli.table(*({**c, "scales": s} for c, s in zip(columns, by_scale, strict=True)))
     failures = [failure for score in scores if score is not None for failure in score.failures]
-    # What all weights lack is listed once.
+    # Failures that all weights share are listed once.
     return cli.Result(report, text, list(dict.fromkeys(failures)), what="parts")
 
 
@@ -114,18 +114,18 @@ def evaluate_stereo(
     weights: list[str] | None = None,
     label_settings: list[str] | None = None,
 ) -> cli.Result:
-    """Match rectified stereo pairs, and evaluate the matches by their true disparity.
+    """Match rectified stereo pairs and evaluate the matches by their true disparity.
 
-    Matching uses neither the rows nor the truth; a match is correct within 1 px. Random points of
-    the same density and all pixels are the baselines.
+    Matching uses neither the rectification nor the true disparity. A match is correct within 1 px.
+    Random points of the same density and all pixels are the baselines.
 
         deepdetect dev evaluate-stereo cones/ teddy/ --weights default --weights dense
         deepdetect dev evaluate-stereo cones/ teddy/ --label-settings mine.toml
 
     Args:
-        weights: default, dense, free or espnet, the pretrained weights, or a file; may be repeated.
-        label_settings: Label settings whose labels are the keypoints, without a network: paper or
-            dense, or a file; may be repeated.
+        weights: Pretrained weights (default, dense, free or espnet), or a file; may be repeated.
+        label_settings: Label settings (paper or dense), or a file: the labels are the keypoints,
+            without a network; may be repeated.
     """
     pairs: list[StereoPair] = []
     failures: list[str] = []
@@ -148,12 +148,13 @@ def evaluate_stereo(
 def compare_clouds(
     model: Annotated[Path, Parameter(help="Folder of `deepdetect reconstruct`.")],
     /,
-    *clouds: Annotated[Path, Parameter(help="PLY files in its frame.", required=True)],
+    *clouds: Annotated[Path, Parameter(help="PLY files in the frame of the model.", required=True)],
 ) -> cli.Result:
-    """Compare the dense points of a model with the clouds of other programs.
+    """Compare the dense points of a model with point clouds of other programs.
 
-    Prints how much of the images each cloud covers, and how far its depths are from those of
-    model.ply. The clouds must be in the frame of the model: give OpenMVS or COLMAP its sparse/0.
+    Prints how much of the images each cloud covers, and how much its depths differ from those of
+    model.ply. The clouds must be in the coordinate frame of the model, so run OpenMVS or COLMAP on
+    its sparse/0.
 
         deepdetect dev compare-clouds model/ openmvs/scene_dense.ply colmap/fused.ply
     """
@@ -180,9 +181,9 @@ def benchmark(
     geometry_weights: list[str] | None = None,
     **values: Any,
 ) -> cli.Result:
-    """Write a report on the detectors: report.md with figures, tables/*.csv, report.json.
+    """Evaluate detectors and write a report: report.md with figures, tables/*.csv, report.json.
 
-    A second run does only what is new. What cannot be measured is listed at the end (exit code 1).
+    A second run computes only new results. Failures are listed at the end (exit code 1).
 
         deepdetect dev benchmark oxford --data data --max-pairs 1 --baselines sift -o quick
         deepdetect dev benchmark oxford --data data -o report --method xfeat.onnx
@@ -191,12 +192,14 @@ def benchmark(
     Args:
         data: Folder of the data sets.
         output: Folder for the report.
-        protocol: paper, standard, guided or degraded; may be repeated.  [default: all but degraded]
-        method: A further method, NAME, FILE.onnx or MODULE:FUNCTION; may be repeated.
-        baselines: Classical methods, with commas between; none for none. [default: all]
-        preset: published: show the network the channels as the paper's code does (BGR).
-        cache: Folder of the stages' results.  [default: cache in the output]
-        geometry_weights: Weights for stereo pairs, as --weights; may be repeated.  [default: dense]
+        protocol: Protocol: paper, standard, guided or degraded; may be repeated.
+            [default: all except degraded]
+        method: A further method: NAME, FILE.onnx or MODULE:FUNCTION; may be repeated.
+        baselines: Classical methods, separated by commas, or none. [default: all]
+        preset: published: give the network BGR images, as the paper's code does.
+        cache: Folder for cached results.  [default: cache in the output]
+        geometry_weights: Name or file of weights for stereo pairs; may be repeated.
+            [default: dense]
     """
     output = cli.output_folder(output)
     if values.get("resolution") not in (None, "auto", "native"):

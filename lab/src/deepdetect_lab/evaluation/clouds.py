@@ -17,11 +17,11 @@ DPI = 100
 """Pixels to an inch, in which matplotlib counts."""
 
 POINT_AREA = 1.5
-"""Area of a point in square points of 1/72 inch: 1.7 pixels wide, so that a surface of one point
-for each pixel of an image is closed from the side also."""
+"""Area of a drawn point, in units of (1/72 inch)^2. It is 1.7 pixels wide, so that a surface with one
+point per image pixel has no gaps in side views."""
 
 ZOOM = 2.2
-"""At 1 the robust box of a cloud takes less than half of the width of a picture."""
+"""Zoom of the plot; at 1 the robust box of a cloud fills less than half of the figure's width."""
 
 
 def draw_cloud(
@@ -56,7 +56,7 @@ def draw_cloud(
 
 
 def draw_clouds(left: np.ndarray, clouds: Mapping[str, PointCloud], width: int = 796) -> np.ndarray:
-    """Draw the left image and clouds by title, which share its frame and one unit, two in a row.
+    """Draw the left image and clouds by title in a grid of two columns.
 
     All are seen from one place, which the one with the most points decides.
     """

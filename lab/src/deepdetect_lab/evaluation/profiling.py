@@ -1,4 +1,4 @@
-"""Seconds and memory of a piece of work."""
+"""Measure time and memory of a piece of work."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ def profiled() -> Iterator[Profile]:
 
 
 def peak_memory() -> int:
-    """Return the most memory that the process has held so far, in bytes; 0 where unknown."""
+    """Return the peak memory of the process so far, in bytes; 0 if unknown."""
     return max(_highest, _memory("VmHWM"))
 
 
 def _memory(name: str) -> int:
-    """Return a number of bytes of /proc/self/status; the highest so far on other systems."""
-    # Linux's ru_maxrss counts what the process that started this one held, too; this does not.
+    """Return a memory value of /proc/self/status in bytes; the peak so far on other systems."""
+    # Linux's ru_maxrss includes the memory of the parent process; /proc/self/status is exact.
     with suppress(OSError), open("/proc/self/status", encoding="ascii") as status:
         return next(int(line.split()[1]) * 1024 for line in status if line.startswith(f"{name}:"))
     try:
@@ -64,21 +64,21 @@ def _memory(name: str) -> int:
 
 
 def run_in_child(function: Callable[..., Outcome], *arguments: Any) -> Outcome:
-    """Call a module's function in a process whose `peak_memory` is that of its work alone.
+    """Call a module-level function in a new process, so that `peak_memory` measures only its work.
 
-    OpenCV and our kernels have one thread there. Raises a DeepDetectError where the process was
-    ended from outside, else what the function raises.
+    OpenCV and our kernels use one thread there. Errors of the function are passed on; a
+    DeepDetectError is raised if the process is killed.
     """
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
     from concurrent.futures.process import BrokenProcessPool
 
-    # Spawned: a fork would begin with all memory of this process.
+    # A forked process would start with all memory of this one, so a new one is spawned.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context, initializer=start_child) as pool:
         try:
             return pool.submit(function, *arguments).result()
         except BrokenProcessPool:
             raise DeepDetectError(
-                "its process was ended, probably for lack of memory: take fewer or smaller images"
+                "the process was killed, probably for lack of memory: use fewer or smaller images"
             ) from None

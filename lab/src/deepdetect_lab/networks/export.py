@@ -1,4 +1,4 @@
-"""Networks of torch as ONNX files, as `deepdetect` reads them."""
+"""Export networks from torch to ONNX files, which `deepdetect` reads."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from deepdetect.detector.network.onnx_export import OnnxOptions, write_model
 from deepdetect.detector.network.onnx_graph import add_padding
 
 OPSET = 17
-"""The ONNX operator set of all files: ONNX Runtime 1.24, OpenVINO and OpenCV 4 read it."""
+"""This ONNX operator set is chosen because ONNX Runtime 1.24, OpenVINO and OpenCV 4 read it."""
 
 
 def to_onnx(
@@ -28,15 +28,15 @@ def to_onnx(
     axes: Mapping[str, Mapping[int, str]],
     training: Any = torch.onnx.TrainingMode.EVAL,
 ) -> onnx.ModelProto:
-    """Trace a network with inputs by name; `axes` are those of any length, by name and number."""
+    """Trace a network with named inputs; `axes` names the dynamic axes of inputs and output."""
     written = io.BytesIO()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of what it traces
+        warnings.simplefilter("ignore")  # warnings of the tracer
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         torch.onnx.export(
             network.cpu().eval(),
             tuple(inputs.values()),
-            written,  # type: ignore[arg-type]  # its annotation is of the other exporter
+            written,  # type: ignore[arg-type]  # annotated for the other exporter
             input_names=list(inputs),
             output_names=[output],
             dynamic_axes=axes,
@@ -48,11 +48,11 @@ def to_onnx(
 
 
 def export_onnx(network: nn.Module, path: str | Path) -> None:
-    """Write a network that makes heat maps, for any size; whole or not at all."""
-    # Its parts are named after it: `tiling` knows the names that PyTorch's exporter gives.
+    """Write a network that predicts heat maps for any image size, atomically."""
+    # This name is part of all node names, on which `tiling` relies.
     module = nn.Sequential(OrderedDict(network=network))
     axes = {0: "batch", 2: "height", 3: "width"}
-    # Batch normalisation stays as nodes, for `add_padding` to fold in float64.
+    # Batch normalisation is kept as nodes, which `add_padding` folds in float64.
     model = to_onnx(
         module,
         {"image": torch.zeros(2, 3, 64, 96)},

@@ -1,4 +1,4 @@
-"""The training of the match filter: right matches from wrong ones by their neighbours.
+"""Training of the match filter, which separates correct and wrong matches by their neighbours.
 
 Keypoints of two views of a synthetic scene, and now and then of unrelated scenes, are described in
 one of two ways and matched; which matches are right is known.
@@ -260,7 +260,7 @@ class MatchFilterTrainer(Trainer):
     """The match filter, and the images whose views it is trained on."""
 
     objective, sign = "validation_loss", 1
-    purpose = "that tells right matches from wrong ones"
+    purpose = "that separates correct matches from wrong ones"
     measures = (
         "On pairs of views of the validation images: the cross-entropy, and of the matches that a "
         "ratio test, the filter, and the filter made as precise as that keep, how many are right, "
@@ -353,8 +353,8 @@ def measure(network: MatchFilter, samples: Sequence[Sample]) -> dict[str, float]
             )
             for title, value in zip(MEASURES, values, strict=True):
                 found[f"{name}, {way}: {title}"] = value.item()
-    every, truth = map(torch.cat, zip(*losses, strict=True))
-    loss = binary_cross_entropy_with_logits(every, truth)
+    found_logits, truth = (torch.cat(each) for each in zip(*losses, strict=True))
+    loss = binary_cross_entropy_with_logits(found_logits, truth)
     return {"validation_loss": loss.item(), **found}
 
 

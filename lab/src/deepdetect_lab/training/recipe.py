@@ -98,7 +98,7 @@ class TrainingOptions:
             known yet, would undo much.
         average_decay: decay, in each step, of the exponential average of the weights, which is what
             is validated and saved; 0: the weights themselves are.
-        max_gradient_norm: larger gradients are scaled down to it; None: none are.
+        max_gradient_norm: gradients with a larger norm are scaled down to it; None: no limit.
         frozen_batch_norm: normalise by the batch statistics of the initial weights, as the
             finished network does, not by those of each batch, which vary much between batches of a
             few images. None: if the initial weights are trained ones.

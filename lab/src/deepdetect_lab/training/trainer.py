@@ -155,7 +155,7 @@ class Trainer(abc.ABC):
         loss.backward()
         value = loss.item()
         norm = clip_grad_norm_(self.network.parameters(), self.max_gradient_norm)
-        # A finite loss can have gradients that are not, in bfloat16.
+        # In bfloat16 a finite loss may have gradients that are not finite.
         if not (math.isfinite(value) and norm.isfinite()):
             raise OptionError(
                 f"the loss or its gradients are not finite at step {step}: start again with a "
@@ -205,7 +205,7 @@ class Trainer(abc.ABC):
                     text += f", best {self._best(state)[self.objective]:.4f}"
                 bar.set_postfix_str(text, False)
                 if state.step in self.milestones:
-                    self._save(state, folder)  # the validation takes its time, too
+                    self._save(state, folder)  # validation also takes time
                     self._validate(state, folder)
                 if time.monotonic() - saved >= CHECKPOINT_INTERVAL_S:
                     self._save(state, folder)

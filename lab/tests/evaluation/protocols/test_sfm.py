@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, WeightsError, reconstruct_many
+from deepdetect import DeepDetect, reconstruct_many
 from deepdetect.geometry.camera import PosedView
 from deepdetect.sfm import MultiViewOptions
 from deepdetect_lab.datasets.posed_images import (
@@ -121,16 +121,6 @@ def test_images_of_a_sequence_are_its_first(tmp_path: Path) -> None:
     assert len(choose_images(unordered, 20).images) == 9
 
 
-def test_options_choose_the_methods() -> None:
-    detector = DeepDetect()
-    titles = [method.name for method in sfm.sfm_methods(BenchmarkOptions(detector))]
-    assert titles == [POINTS, DENSE, SIFT, REFINED, RANDOM]
-    without = sfm.sfm_methods(BenchmarkOptions(detector, classical=()))
-    assert [method.name for method in without] == [POINTS, DENSE, RANDOM]
-    with pytest.raises(WeightsError, match=r"none\.npz"):
-        sfm.sfm_methods(BenchmarkOptions(detector, ranker="none.npz"))
-
-
 def test_what_cannot_be_reconstructed_is_a_result(
     write_posed_fountain, tmp_path: Path, monkeypatch
 ) -> None:
@@ -179,5 +169,5 @@ def test_a_whole_run_on_small_images(write_posed_fountain, tmp_path: Path) -> No
     assert lines[1]["sparse points"] == pytest.approx(len(whole.sparse), rel=0.02)
     # A second run finds all in the cache.
     again = run_benchmarks(["sfm"], folder, options, cache=tmp_path / "cache")
-    assert again.metadata["results made, not found in the cache"] == "0"
+    assert again.metadata["results computed, not read from the cache"] == "0"
     assert str(again.sections) == str(report.sections)

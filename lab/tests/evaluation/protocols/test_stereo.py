@@ -112,15 +112,6 @@ def test_without_a_truth_nothing_is_evaluated(section: Section) -> None:
             assert row["points"] == known[name]["points"]
 
 
-def test_the_weights_are_named_in_rows_of_their_own(data: Path) -> None:
-    second = DeepDetect().weights
-    options = BenchmarkOptions(DeepDetect(), ("paper",), (), geometry_weights=("dense", second))
-    titles = [pipeline.name for pipeline in pipelines(options)]
-    assert titles[:2] == ["ours, weights dense", "ours, weights default"]
-    assert sum(title.startswith("the paper's pipeline") for title in titles) == 2
-    assert len(set(titles)) == len(titles)
-
-
 def test_sgbm_finds_a_shift() -> None:
     texture = np.random.default_rng(0).integers(0, 256, (60, 120, 3), np.uint8)
     texture = cv2.GaussianBlur(texture, (0, 0), 1)

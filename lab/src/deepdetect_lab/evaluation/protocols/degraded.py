@@ -18,11 +18,11 @@ from ..run import Run
 from .standard import standard_section
 
 TEXT = (
-    "Dark and blurred copies of the same images, made in linear light with the same random numbers "
-    "every time. In 1/4 or 1/8 of the light white gives 2,500 or 1,250 electrons instead of "
-    "10,000; shot noise is Poisson's, reading adds 3 electrons (standard deviation), the result "
-    "has 8 bits. Motion blur has a direction drawn for each image. The second image of each pair "
-    "is degraded, the first is not."
+    "Dark and blurred image copies are simulated in linear light with fixed random numbers. "
+    "With 1/4 or 1/8 of the light, white gives 2,500 or 1,250 electrons instead of 10,000. "
+    "Shot noise is Poisson noise, read noise has a standard deviation of 3 electrons, and the "
+    "result has 8 bits. The direction of motion blur is random for each image. Only the second "
+    "image of each pair is degraded."
 )
 
 

@@ -1,4 +1,4 @@
-"""Points that pipelines make of stereo pairs, beside the true disparity: Figure 8 of the paper."""
+"""Evaluate points of stereo pipelines by the true disparity: Figure 8 of the paper."""
 
 from __future__ import annotations
 
@@ -25,21 +25,22 @@ from .paper_numbers import FIGURE_8, with_paper_column
 from .stereo_pipelines import ROUNDS, Pipeline, pipelines
 
 TRUTH_OFFSETS = {"dolls": 2}
-"""Baselines by which the view of a ground truth lies to the left of the left image.
+"""Stereo baselines by which the ground truth's view is to the left of the left image.
 
-Shifted by them it has under 0.7 of the photometric error; points are evaluated by both.
+After this shift its photometric error is below 0.7 of that before; both versions are evaluated.
 """
 
 AS_IT_IS = ""
 SHIFTED = "ground truth shifted to its photographs"
 
 TEXT = (
-    "Ours: `deepdetect reconstruct --rectified`: strict, so what lies at a disparity discontinuity "
-    "is left out; --density 1 asks for every pixel and fills what only the left view shows. The "
-    "paper's pipeline, as in the authors' notebooks: images squashed to 480x480 as BGR, SIFT, "
-    "FLANN (10 trees, 100 checks), a ratio for each scene (cones, rocks, cloth 0.9, dolls 0.85, "
-    "moebius 0.77; others 0.9), essential matrix by RANSAC at 0.5 px. SIFT: the same with its own "
-    "keypoints. SGBM: block 5, three ways, uniqueness 10, speckle filter, both views extended."
+    "Ours: `deepdetect reconstruct --rectified`, which leaves out points at disparity "
+    "discontinuities; --density 1 gives a point for every pixel and fills pixels that only the "
+    "left view shows. The paper's pipeline, as in the authors' notebooks: images resized to "
+    "480x480 as BGR, SIFT descriptors, FLANN (10 trees, 100 checks), a ratio for each scene "
+    "(cones, rocks, cloth 0.9, dolls 0.85, moebius 0.77; others 0.9), essential matrix by RANSAC "
+    "at 0.5 px. SIFT: the same with SIFT keypoints. SGBM: block size 5, three-way mode, uniqueness "
+    "ratio 10, speckle filter, both views extended."
 )
 
 NOTE = (
@@ -52,8 +53,9 @@ NOTE = (
 )
 
 SHIFTED_NOTE = (
-    "The true disparity belongs to another view than the photographs; here it is shifted by whole "
-    "baselines, which fits them far better, without what the left view does not see."
+    "The true disparity belongs to another view than the photographs. Here it is shifted by whole "
+    "stereo baselines, which fits the photographs far better; pixels hidden in the left view are "
+    "left out."
 )
 
 
@@ -85,7 +87,7 @@ def middlebury(run: Run, options: BenchmarkOptions) -> list[Section]:
 def reconstruct_points(run: Run, pipeline: Pipeline, scene: Path) -> Row:
     """Reconstruct a scene, or read that from the cache.
 
-    Returns the "pixels", their "disparity", and the columns that do not depend on the truth.
+    Returns the "pixels", their "disparity", and the columns that do not depend on ground truth.
     """
 
     def make() -> Row:
@@ -133,7 +135,7 @@ def points_table(
     key = f"middlebury_{pair.name}" + ("_shifted" if which == SHIFTED else "")
     paper = {p.name: p.paper[pair.name] for p in compared if pair.name in p.paper}
     title = f"{pair.name}, {which}" if which else pair.name
-    unknown = "" if truth is not None else "There is no true disparity: nothing is evaluated. "
+    unknown = "" if truth is not None else "There is no true disparity to evaluate by. "
     note = f"{SHIFTED_NOTE} {NOTE}" if which == SHIFTED else unknown + NOTE
     return with_paper_column(Table(key, title, columns, lines, note), "points", paper)
 
@@ -149,7 +151,7 @@ def _triangulate(
 def clouds_figure(
     pair: CalibratedStereoPair, compared: Sequence[Pipeline], found: Mapping[str, Row]
 ) -> Figure | None:
-    """Draw Figure 8: the points of the pipelines that the paper draws; None without any."""
+    """Draw Figure 8: points of the pipelines that the paper draws; None without points."""
     clouds = {}
     # Ours come last, as in the paper.
     for pipeline in sorted(compared, key=lambda pipeline: pipeline.drawn == "ours"):
@@ -170,16 +172,16 @@ def clouds_figure(
 
 
 def ground_truths(scene: Path) -> Mapping[str, np.ndarray | None]:
-    """Return the true disparities of a scene: as its file has it, and perhaps shifted."""
+    """Return the true disparities of a scene: that of its file and, for some, a shifted one."""
     disparity = load_middlebury(scene).disparity
     offset = TRUTH_OFFSETS.get(scene.name, 0)
     return {AS_IT_IS: disparity} | ({SHIFTED: shift_view(disparity, offset)} if offset else {})
 
 
 def shift_view(disparity: np.ndarray, baselines: int) -> np.ndarray:
-    """Show a disparity map from a view this many baselines to the right; NaN where it is hidden.
+    """Warp a disparity map to a view some stereo baselines to the right; hidden pixels are NaN.
 
-    Where several places fall on one pixel the nearest of them is visible.
+    If several points map to one pixel, the nearest is visible.
     """
     rows, columns = np.nonzero(np.isfinite(disparity))
     values = disparity[rows, columns]

@@ -1,4 +1,4 @@
-"""Pipelines that turn a stereo pair into points: ours, the paper's, OpenCV's SGBM, and chance."""
+"""Pipelines from a stereo pair to points: ours, the paper's, OpenCV's SGBM, and chance."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ..options import PAPER_RESOLUTION_PX, BenchmarkOptions
 from .paper_numbers import FIGURE_8
 
 ROUNDS = 3
-"""Runs of what takes seconds; the one of median time is reported."""
+"""Pipelines that take seconds run this often, and the run of median time is reported."""
 
 Points = tuple[np.ndarray, np.ndarray, int]
 """(N, 2) float32 pixels of the left image, (N,) float32 disparities, and how many of them were not
@@ -36,7 +36,7 @@ matched but filled in."""
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """What turns two images into points; `name` is also the title in tables.
+    """A function from two images to points; `name` is also the title in tables.
 
     `prepare` returns what is timed. Results depend on `version` besides the name. `drawn` is the
     title in Figure 8 (empty: not drawn), `paper` the number of points in the paper by scene.
@@ -57,14 +57,14 @@ PAPER_SETTINGS: dict[str, tuple[float, float, float, float]] = {
     "rocks": (0.9, 1512, 638, 555),
     "cloth": (0.9, 1050, 641, 555),
 }
-"""Ratio, focal length and principal point in px, by scene, of the authors' notebooks."""
+"""Ratio, focal length and principal point (pixels) of each scene, from the authors' notebooks."""
 
 PAPER_FLANN_TREES = 10
 PAPER_FLANN_CHECKS = 100
 
 
 def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
-    """Return what is compared, chance baselines last."""
+    """Return the compared pipelines, chance baselines last."""
     native = options.native_detector()
     detectors = {Path(each).stem: native.with_weights(each) for each in options.geometry_weights}
     found: list[Pipeline] = []
@@ -136,10 +136,10 @@ def _paper(feature: LocalFeature, drawn: str = "", paper: Mapping[str, float] = 
 def paper_points(
     feature: LocalFeature, scene: CalibratedStereoPair, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match a stereo pair; return the (M, 2) points that the essential matrix leaves ("voxels").
+    """Match a stereo pair; return the (M, 2) inliers of the essential matrix ("voxels").
 
-    The number of points is that of one draw of RANSAC: other trees of FLANN, by another seed, or
-    another order of the matches give up to 1 % more or less.
+    The number of points depends on the random choices of RANSAC: another seed of FLANN's trees, or
+    another order of the matches, changes it by up to 1 %.
     """
     images = scene.left, scene.right
     ratio, camera_matrix = paper_settings(scene)
@@ -156,7 +156,7 @@ def paper_points(
 
 
 def paper_settings(scene: CalibratedStereoPair) -> tuple[float, np.ndarray]:
-    """Return the authors' ratio and camera matrix; of other scenes their most frequent ratio."""
+    """Return the authors' ratio and camera matrix; other scenes get the most frequent ratio."""
     camera = scene.calibration.camera0.matrix
     own = 0.9, camera[0, 0], camera[0, 2], camera[1, 2]
     ratio, focal, x, y = PAPER_SETTINGS.get(scene.name, own)
@@ -166,7 +166,7 @@ def paper_settings(scene: CalibratedStereoPair) -> tuple[float, np.ndarray]:
 def essential_inliers(
     points0: np.ndarray, points1: np.ndarray, camera_matrix: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Keep the inliers of the essential matrix; triangulate them for the time that takes."""
+    """Return the inliers of the essential matrix; triangulation only adds its time."""
     if len(points0) < 6:
         return points0[:0], points1[:0]
     essential, inliers = cv2.findEssentialMat(
@@ -189,9 +189,9 @@ def essential_inliers(
 
 
 def sgbm(scene: CalibratedStereoPair) -> Points:
-    """Run OpenCV's semi-global matching on every pixel, in the range that ours finds.
+    """Run OpenCV's semi-global matching on every pixel, with the disparity range that ours finds.
 
-    From 0 or below; both views are extended by it, so that there are values at the margins, too.
+    The range starts at 0 or below. Views are extended by it, so that margins also get values.
     """
     gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
     search = find_disparity_range(*gray)
@@ -213,7 +213,8 @@ def sgbm_disparity(
 ) -> np.ndarray:
     """Run OpenCV's semi-global matching on RGB views, extended by borders on the left and right.
 
-    A multiple of 16 of disparities is tried. Returns (H, W) float32 in pixels, NaN without one.
+    The number of tried disparities is a multiple of 16. Returns (H, W) float32 disparities in
+    pixels, NaN where none was found.
     """
     matcher = cv2.StereoSGBM_create(
         minDisparity=min_disparity,
@@ -239,7 +240,7 @@ def sgbm_disparity(
 
 @lru_cache(maxsize=1)
 def _compile_kernels() -> None:
-    """Run once on a small scene, so that no scene's time includes the compilation."""
+    """Run once on a small scene, so that measured times do not include compilation."""
     scene = np.random.default_rng(0).integers(0, 256, (96, 160), np.uint8)
     scene = cv2.GaussianBlur(scene, (0, 0), 1)
     column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in (160, 96)))

@@ -1,4 +1,4 @@
-"""The training of the learned descriptor: pairs of views, their loss, the validation metric."""
+"""Training of the learned descriptor: pairs of views, their loss, and the validation metric."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from .views import Pair, draw_pair
 ONNX = "descriptor.onnx"
 
 REUSE, WINDOW, FIRST_BATCHES = 4, 4096, 8
-"""Steps that see a pair, in the mean (to draw one takes longer than to train on it); pairs that
-are kept for it, the last ones; and batches' worth of them at the first step."""
+"""A pair is used in 4 steps on average, because drawing takes longer than a training step. The last
+4,096 pairs are kept for this. The first step draws 8 batches."""
 
 WARM_UP_STEPS, WARM_UP_SHARE = 300, 0.15
-"""Steps of the warm-up; of short runs a share."""
+"""Number of warm-up steps, but at most this share of all steps. Chosen by hand; not measured."""
 
 DECAY_SHARE = 0.65
-"""Of the steps, the last ones, in which the learning rate falls to 0, linearly."""
+"""The learning rate falls linearly to 0 over this last share of the steps. Chosen by hand."""
 
 VECTOR_RATE = 0.4
-"""Learning rate of AdamW, which trains what Muon does not, in that of Muon."""
+"""AdamW trains the parameters that Muon cannot; its learning rate is Muon's times this factor."""
 
 
 def pairs_of_step(options: DescriptorTrainingOptions, step: int) -> np.ndarray:

@@ -27,16 +27,16 @@ from .measure import measure, validation_pairs
 from .pairs import CandidatePair, PairDataset
 
 STATISTICS_PAIRS = 64
-"""Of views, whose features give mean and deviation."""
+"""Number of pairs whose features give the mean and standard deviation. Chosen by hand."""
 
 WARM_UP_STEPS = 100
 FINAL_RATE = 0.02
-"""Of the learning rate, at the end of the cosine annealing."""
+"""Cosine annealing ends at this fraction of the learning rate. Chosen by hand; not measured."""
 
 WEIGHT_DECAY = 1e-4
 
 AVERAGE_DECAY = 0.995
-"""Of the running mean of the weights, which is what is measured and kept."""
+"""Decay per step of the weights' exponential average, which is saved. Chosen by hand."""
 
 HIDDEN_UNITS = (48, 32)
 MIN_DEVIATION = 1e-3
