@@ -13,21 +13,19 @@ from deepdetect._shared.options import look_up
 from deepdetect.cli import _options as cli
 from deepdetect.cli._detection import NETWORK
 from deepdetect.detector.detector import DeepDetect, HeatmapDetector
-from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.detector.pretrained import PRETRAINED
 
 from ..datasets import StereoPair
 from ..datasets.middlebury import load_middlebury
-from ..datasets.planar import load_oxford
 from ..evaluation.baselines.external import find_feature
 from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
-from ..evaluation.options import PAPER_RESOLUTION_PX, BenchmarkOptions
+from ..evaluation.options import BenchmarkOptions
 from ..evaluation.protocols.dense_points import CLOUD_COLUMNS, CLOUD_NOTE
 from ..evaluation.protocols.dense_points import compare_clouds as compare
 from ..evaluation.protocols.masks import LabelDetector
 from ..evaluation.protocols.stereo_matches import score_stereo_matches
 from ..evaluation.report import Table
-from ..evaluation.weights import Evaluation, evaluate_oxford
+from ..evaluation.weights import Evaluation
 from ..evaluation.weights import evaluate as run
 from ..labels import find_label_settings
 
@@ -45,7 +43,6 @@ def evaluate(
     /,
     *,
     compare: list[str] | None = None,
-    labels: bool = False,
     scale: list[float] | None = None,
     **values: Any,
 ) -> cli.Result:
@@ -61,16 +58,11 @@ def evaluate(
         deepdetect dev evaluate samples/ --oxford oxford/ --equal-density --compare other.onnx
 
     Args:
-        compare: Also evaluate these weights, for comparison; may be repeated.
-        labels: With --oxford: also evaluate the labels, which weights without error would predict.
-        scale: Also score the images scaled by this factor, with labels of the scaled images; may be
-            repeated. The images then need no masks.
+        compare: Evaluate these weights too, beside the first; may be repeated.
+        scale: Score the images scaled by this factor too, on labels of their own; may be repeated.
+            The images then need no masks.
     """
     measures = MEASURES.take(values)
-    if labels and "oxford" not in measures:
-        raise OptionError("--labels measures on the Oxford scenes: name their folder with --oxford")
-    # Missing files are reported before hours of work.
-    scenes = load_oxford(measures["oxford"]) if "oxford" in measures else []
     measures |= {"samples": samples, "scales": tuple(scale or ()), "quiet": False}
     weights = [values.pop("weights", "default"), *(compare or ())]
     detectors = [DeepDetect(path, **values) for path in weights]
@@ -82,11 +74,6 @@ def evaluate(
     report = {**columns[0], **({"compare": columns[1:]} if compare else {})}
     scores: list[Any] = [found[0], *(each.oxford for each in found)]
     scores += [each.foreground for each in found]
-    if labels:
-        squashed = LabelDetector(heatmap_options=HeatmapOptions(PAPER_RESOLUTION_PX))
-        scores.append(evaluate_oxford(squashed, scenes, quiet=False))
-        report["labels"] = {"oxford": asdict(scores[-1])}
-        columns.append({"weights": "labels", **report["labels"]})
     by_scale = [
         {f"x{row['scale']:g} {row['visibility']}": row for row in column.get("scales", ())}
         for column in columns
@@ -234,7 +221,7 @@ def benchmark(
     )
     report = run_benchmarks(names, data, options, cache=cache or output / "cache", quiet=False)
     paths = report.save(output)
-    tables = [f"{t.title}\n\n{t.to_markdown()}\n" for t in report.tables() if t.in_text]
+    tables = [f"{t.title}\n\n{t.to_markdown()}\n" for t in report.tables()]
     skipped = [f"skipped: {reason}" for reason in report.skipped if reason not in report.failures]
     return cli.Result(
         {**report.values(), "files": paths},

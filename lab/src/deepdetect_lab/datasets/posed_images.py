@@ -30,10 +30,10 @@ from .pair_selection import FRAME_DISTANCES, sequence_pairs, unordered_pairs
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 
 MAX_ROTATION_ERROR = 1e-3
-"""Rotations may deviate from orthonormal matrices by this much, since files have few digits."""
+"""The largest difference of a rotation's columns from orthonormal ones: files have few digits."""
 
 MAX_ASPECT_ERROR = 0.01
-"""Aspect ratios of image and camera may differ by this fraction, since sizes are rounded."""
+"""The largest difference of the aspect ratios of an image and its camera: sizes are rounded."""
 
 COLMAP_FILES = ("images.bin", "images.txt")
 
@@ -213,7 +213,7 @@ def _read_kitti(folder: Path) -> list[PosedImage]:
         axes, centre = pose[:, :3], pose[:, 3]
         image = _posed_image(path, projection[:, :3], axes.T, -axes.T @ centre, where)
         _image_size(path)  # raises errors for damaged images and for EXIF rotations
-        # Poses are of the first camera; the last column gives the offset of the images' camera.
+        # Poses are those of the first camera; the last column gives the images' offset from it.
         offset = np.linalg.solve(image.intrinsics, projection[:, 3])
         images.append(replace(image, translation=image.translation + offset))
     return images

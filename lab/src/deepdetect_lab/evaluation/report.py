@@ -45,9 +45,8 @@ def mean_of(values: Iterable[float | None]) -> float | None:
 class Table:
     """A table whose key, for example "oxford_matches", is the name of its file.
 
-    `columns` gives the format of numbers, such as `.3f`, by column title, `rows` the cells by
-    column title. Cells that are missing, None or NaN become dashes. If a table is not `in_text`,
-    report.md mentions only its file.
+    The columns say how numbers are written, as ".3f", ",d" or ".1%", by title. The rows have cells
+    by title; one that is missing, None or NaN is a dash.
     """
 
     key: str
@@ -55,7 +54,6 @@ class Table:
     columns: Mapping[str, str]
     rows: Sequence[Row]
     note: str = ""
-    in_text: bool = True
 
     def values(self) -> list[dict[str, Cell]]:
         """Return the rows in the order of the columns; NaN becomes None, since JSON has no NaN."""
@@ -209,8 +207,7 @@ class Report:
         for section in self.sections:
             parts += [f"## {section.title}", *section.text]
             for table in section.tables:
-                shown = table.to_markdown() if table.in_text else f"In `tables/{table.key}.csv`."
-                parts += [f"**{table.title}**", shown, *filter(None, [table.note])]
+                parts += [f"**{table.title}**", table.to_markdown(), *filter(None, [table.note])]
             parts += [f"![{f.title}](figures/{f.key}.png)\n\n{f.title}" for f in section.figures]
         skipped = "\n".join(f"- {reason}" for reason in self.skipped) or "- nothing"
         made = "\n".join(f"- {name}: {text}" for name, text in self.metadata.items())

@@ -37,7 +37,7 @@ STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
     "repeatability_paper": (1, ("keypoints",)),
     "repeatability_mutual_nn": (1, ("keypoints",)),
     "corner_errors": (1, ("matches",)),
-    "pose": (8, ("matches", "guided")),
+    "pose": (9, ("matches", "guided")),
     "sfm": (4, ()),
 }
 """Version of each cached stage, and the stages whose results it uses.

@@ -57,7 +57,7 @@ GOOD_DEG = 5.0
 
 STRAIGHT_AHEAD = "no matches: straight ahead"
 
-DISTANCE, ERROR = "frame distance", "pose error, °"
+ERROR = "pose error, °"
 AGREEING = f"agreeing within {EPIPOLAR_THRESHOLD_PX:g} px"
 
 TEXT = (
@@ -82,9 +82,9 @@ NOTE = (
     "the pairs; a pair without matches counts as 0."
 )
 
-Found = tuple[np.ndarray, np.ndarray, float, str, str]
-"""The (M, 2) matched positions of two images, the seconds, the geometry that guided ("homography",
-"fundamental" or "none"), and the confidence; both texts are "" for methods without guidance."""
+Found = tuple[np.ndarray, np.ndarray, float, str]
+"""The (M, 2) matched positions of two images, the seconds that it took, what guided: "homography",
+"fundamental" or "none"; "" for methods that are never guided."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,11 +111,10 @@ def pose(run: Run, options: BenchmarkOptions) -> list[Section]:
 
     def measure(method: PoseMethod, item: tuple[PosedScene, PosedPair]) -> Row:
         scene, pair = item
-        row = {"scene": scene.name, DISTANCE: pair.frame_distance, "pair": pair.name}
-        return row | pose_row(run, method, pair)
+        return {"scene": scene.name, **pose_row(run, method, pair)}
 
     rows = run.rows("pose of ", methods, items, measure)
-    tables = [scene_table(scenes, methods, rows), pair_table(list(items), methods, rows)]
+    tables = [scene_table(scenes, methods, rows)]
     return [Section("Relative poses", TEXT, tables)]
 
 
@@ -140,14 +139,13 @@ def _match_guided(detector: DeepDetect, images: tuple[Path, Path]) -> Found:
     found = match_images(*images, detector)
     geometry = found.geometry
     assert geometry is not None
-    told = geometry.model, geometry.confidence
-    return found.points0, found.points1, sum(found.seconds.values()), *told
+    return found.points0, found.points1, sum(found.seconds.values()), geometry.model
 
 
 def _match_unguided(detector: DeepDetect, images: tuple[Path, Path]) -> Found:
     how: dict[str, Any] = {"descriptor": UPRIGHT_SIFT, "matcher": "patchmatch", "mutual": True}
     found = match_unguided(*images, detector, **how)
-    return found.points0, found.points1, sum(found.seconds.values()), "", ""
+    return found.points0, found.points1, sum(found.seconds.values()), ""
 
 
 def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
@@ -159,7 +157,7 @@ def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
         detect = [run.keypoints(feature, image)[1] for image in images]
         found = run.matches(feature, images, settings)
         seconds = sum(detect) + found.seconds
-        return found.points0, found.points1, seconds, "", ""
+        return found.points0, found.points1, seconds, ""
 
     title = f"{feature.title}, {test}"
     return PoseMethod(feature.name, title, match, (*feature.key, settings))
@@ -176,23 +174,22 @@ def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
 
     def make() -> Row:
         assert match is not None
-        points0, points1, seconds, guided_by, confidence = match(images)
+        points0, points1, seconds, guided_by = match(images)
         return {
             **pose_errors(estimate_pose(points0, points1, *cameras), pair),
             "matches": len(points0),
             AGREEING: epipolar_inlier_ratio(points0, points1, pair.fundamental),
             "seconds": seconds,
             "guided by": guided_by,
-            "confidence": confidence,
         }
 
     if match is None:
-        nothing: Row = dict.fromkeys(("matches", AGREEING, "seconds", "guided by", "confidence"))
+        nothing: Row = dict.fromkeys(("matches", AGREEING, "seconds", "guided by"))
         return pose_errors((np.eye(3), np.array([0.0, 0.0, -1.0])), pair) | nothing
     truth = (*cameras, pair.rotation, pair.translation)
     estimate = (THRESHOLD_PX, CONFIDENCE, EPIPOLAR_THRESHOLD_PX)
     row = run.cached("pose", (method.name, method.version, images, truth, estimate), make)
-    return row | {name: row[name] or None for name in ("guided by", "confidence")}
+    return row | {"guided by": row["guided by"] or None}
 
 
 def pose_errors(pose: tuple[np.ndarray, np.ndarray] | None, pair: PosedPair) -> Row:
@@ -287,30 +284,3 @@ def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], row
     )
     groups = [{"scene": scene.name} for scene in scenes]
     return tabulate("pose", "Relative poses", methods, rows, columns, note, groups)
-
-
-PAIR_COLUMNS = {
-    "pair": "",
-    "method": "",
-    DISTANCE: "d",
-    "rotation error, °": ".3f",
-    "translation error, °": ".3f",
-    ERROR: ".3f",
-    "matches": ",d",
-    AGREEING: ".1%",
-    "guided by": "",
-    "confidence": "",
-    "seconds": ".2f",
-}
-
-
-def pair_table(items: Sequence[str], methods: Sequence[PoseMethod], rows: Rows) -> Table:
-    """Tabulate each method on each pair."""
-    lines = [
-        {**row, "method": method.title}
-        for item in items
-        for method in methods
-        for row in where(rows, item=item, method=method.name)
-    ]
-    title = "Relative poses, all pairs"
-    return Table("pose_pairs", title, PAIR_COLUMNS, lines, NOTE, in_text=False)

@@ -57,7 +57,6 @@ CAMERA_COLUMNS = {
     **{"scene": "", "keypoints": "", "intrinsics": "", "images": "d", "registered": "d"},
     **{f"AUC at {threshold:g}°": ".3f" for threshold in POSE_THRESHOLDS_DEG},
     "centres, unit of the truth": ".5f",
-    "centres, ‰ of the extent": ".2f",
     "from the first row's, unit of the truth": ".5f",
     "rotations, °": ".3f",
     **MODEL_COLUMNS,
@@ -88,15 +87,15 @@ TEXT = (
 )
 
 CAMERA_NOTE = (
-    "AUC: over the relative poses of all pairs of images. The error is the larger of rotation and "
-    "translation error (angles), and infinite if an image is not registered. Centres and "
-    "rotations: mean errors of the registered cameras after alignment of their centres; extent: "
-    "the largest distance of two true cameras. From the first row's: mean distance of the centres "
-    "from those of the first method. If it is much smaller than the errors of both methods, the "
-    "ground truth is inaccurate, or both methods share an error. For cameras on a straight line "
-    "the alignment leaves the rotation about it undetermined, so no rotation error is given; use "
-    "the AUC. Track length: mean number of images that see a point. Reprojection error: mean over "
-    "the method's own points; it does not measure the accuracy of the cameras."
+    "AUC: of the relative poses of all pairs of images, the error being the larger of the angle of "
+    "the rotation and that between the directions of translation, infinite where an image is not "
+    "registered. Centres and rotations: mean errors of the registered cameras after the alignment "
+    "of their centres. From the first row's: "
+    "mean distance of the centres from the first method's; where that is much less than the errors "
+    "of both, these are the truth's, or common to both. The alignment leaves the rotation "
+    "about a straight line of cameras open, so these have no rotations: take the AUC. Track "
+    "length: mean number of images that see a point. Reprojection error: mean over the method's "
+    "own points, so no error of the cameras."
 )
 
 COST_NOTE = (
@@ -266,9 +265,6 @@ def camera_table(rows: Rows) -> Table:
                 true = [truth[name] for name in views]
                 centres, rotations, _ = camera_errors(list(views.values()), true)
                 line["centres, unit of the truth"] = float(centres.mean())
-                places = np.array([view.centre for view in truth.values()])
-                extent = np.linalg.norm(places[:, None] - places, axis=2).max()
-                line["centres, ‰ of the extent"] = 1000 * float(centres.mean()) / float(extent)
                 if not scene.located_only:
                     line["rotations, °"] = float(rotations.mean())
             if first is not row:
