@@ -45,8 +45,8 @@ def mean_of(values: Iterable[float | None]) -> float | None:
 class Table:
     """A table whose key, for example "oxford_matches", is the name of its file.
 
-    The columns say how numbers are written, as ".3f", ",d" or ".1%", by title. The rows have cells
-    by title; one that is missing, None or NaN is a dash.
+    `columns` gives the format of numbers, such as `.3f`, by column title, `rows` the cells by
+    column title. Cells that are missing, None or NaN become dashes.
     """
 
     key: str

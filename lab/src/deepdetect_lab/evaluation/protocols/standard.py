@@ -68,7 +68,7 @@ MATCHING_NOTE = (
 def standard_sections(
     run: Run, options: BenchmarkOptions, pairs: Sequence[PlanarPair], *texts: str
 ) -> list[Section]:
-    """Return the section of `standard_section`, where the protocol is wanted."""
+    """Return the section of `standard_section` if the protocol is requested."""
     wanted = "standard" in options.protocols
     return [standard_section(run, options, pairs, *texts)] if wanted else []
 
