@@ -275,7 +275,7 @@ def test_images_come_from_standard_input(name: str, photos: Path, tmp_path: Path
     done = subprocess.run(words, input=content, capture_output=True)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
-    np.testing.assert_allclose(found["matrix"], np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(found["geometry"]["matrix"], np.eye(3), atol=1e-6)
     assert Path(found["file"]).name == "stdin_cat_matches.npz"
 
 
