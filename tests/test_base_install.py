@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -76,13 +75,6 @@ from deepdetect import matching, reconstruction, sfm
 print(json.dumps(sorted(sys.modules)))
 """
     assert "cv2" not in in_a_fresh_interpreter(code)
-
-
-def test_messages_name_no_package_that_cannot_be_had() -> None:
-    """There is no release on PyPI, and anybody could take the name."""
-    for path in ROOT.rglob("*.py"):
-        text = path.read_text("utf-8")
-        assert not re.search(r"install [\"'\\]*deepdetect", text), path
 
 
 def test_no_module_imports_opencv_itself() -> None:

@@ -59,7 +59,7 @@ def test_bgr_gives_what_rgb_gives(name: str, photo: np.ndarray, facade: Any) -> 
     np.testing.assert_array_equal(call(*planes, channels="bgr"), expected)
     # The test sees a difference where there is one.
     assert not np.array_equal(call(*as_opencv(images)), expected, equal_nan=True)
-    with pytest.raises(OptionError, match="unknown channel order 'brg'"):
+    with pytest.raises(OptionError, match="'brg'"):
         call(*images, channels="brg")
 
 
@@ -78,7 +78,7 @@ def test_luma_is_taken_as_it_is(photo: np.ndarray) -> None:
 
 
 def test_the_order_for_the_network_is_another_matter(photo: np.ndarray) -> None:
-    with pytest.raises(OptionError, match=r"detect\(image, channels='bgr'\)"):
+    with pytest.raises(OptionError, match="'bgr'"):
         deepdetect.DeepDetect(channels="bgr")  # type: ignore[call-arg]
     bgr = photo[..., ::-1]
     swapped = deepdetect.DeepDetect(network_channels="bgr", resolution=64)

@@ -1,4 +1,4 @@
-"""What keeps the interface small: few options, each set somewhere, and few keywords a function."""
+"""What keeps the house small: few options and keywords, and counts that may only fall."""
 
 from __future__ import annotations
 
@@ -19,6 +19,24 @@ SOURCE = ROOT / "src/deepdetect"
 MAX_OPTION_CLASSES = 30
 MAX_KEYWORDS = 12
 MAX_ROOT_NAMES = 32
+
+MAX_CORE_LINES = 30_200
+"""Lines of Python in src/deepdetect; an issue that brings an ability may raise it, nothing else."""
+
+MAX_FUNCTION_LINES = 120
+"""Lines of the longest function, its docstring included."""
+
+MAX_CONSTANTS_PER_1000_LINES = {"deepdetect": 20.1, "deepdetect_lab": 14.8}
+"""Numeric module constants per 1,000 lines of a distribution: these may only fall."""
+
+MIN_REASONED = {"deepdetect": 0.25, "deepdetect_lab": 0.2}
+"""The share of these constants whose note gives a reason or a measurement: it may only rise."""
+
+REASON = re.compile(
+    r"\b(because|since|so that|otherwise|measured|chosen|would|paper|published|as OpenCV|as COLMAP|"
+    r"than|on (?:Oxford|HPatches|KITTI|Middlebury|photos)|costs?|takes?|needs?)\b|\d"
+)
+DISTRIBUTIONS = {"deepdetect": SOURCE, "deepdetect_lab": ROOT / "lab/src/deepdetect_lab"}
 
 
 @cache
@@ -90,3 +108,51 @@ def test_keywords_are_few(function: object) -> None:
 
 def test_the_root_exports_what_inference_needs() -> None:
     assert len(set(deepdetect.__all__) - {"__version__"}) <= MAX_ROOT_NAMES
+
+
+def trees(distribution: str) -> dict[Path, tuple[str, ast.Module]]:
+    """Return the text and the syntax tree of each file of a distribution."""
+    files = DISTRIBUTIONS[distribution].rglob("*.py")
+    texts = {path: path.read_text("utf-8") for path in files}
+    return {path: (text, ast.parse(text)) for path, text in texts.items()}
+
+
+def numeric_constants(tree: ast.Module) -> list[str]:
+    """Return the notes under the numeric constants of a module, "" where there is none."""
+    notes = []
+    for node, after in zip(tree.body, [*tree.body[1:], None], strict=True):
+        if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
+            continue
+        target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+        numbers = [n for n in ast.walk(node.value) if isinstance(n, ast.Constant)]
+        if re.fullmatch(r"[(_A-Z0-9, )]+", ast.unparse(target)) and any(
+            type(each.value) in (int, float) for each in numbers
+        ):
+            note = after.value if isinstance(after, ast.Expr) else None
+            notes.append(str(note.value) if isinstance(note, ast.Constant) else "")
+    return notes
+
+
+def test_the_core_stays_small() -> None:
+    assert sum(text.count("\n") for text, _ in trees("deepdetect").values()) <= MAX_CORE_LINES
+
+
+@pytest.mark.parametrize("distribution", DISTRIBUTIONS)
+def test_no_function_is_long(distribution: str) -> None:
+    found = {
+        f"{path.name}: {node.name}": (node.end_lineno or 0) - node.lineno + 1
+        for path, (_, tree) in trees(distribution).items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef)
+    }
+    assert {n: lines for n, lines in found.items() if lines > MAX_FUNCTION_LINES} == {}
+
+
+@pytest.mark.parametrize("distribution", DISTRIBUTIONS)
+def test_tuned_numbers_become_fewer_and_have_reasons(distribution: str) -> None:
+    sources = trees(distribution).values()
+    lines = sum(text.count("\n") for text, _ in sources)
+    notes = [note for _, tree in sources for note in numeric_constants(tree)]
+    assert 1000 * len(notes) / lines <= MAX_CONSTANTS_PER_1000_LINES[distribution]
+    reasoned = sum(REASON.search(note) is not None for note in notes)
+    assert reasoned / len(notes) >= MIN_REASONED[distribution]

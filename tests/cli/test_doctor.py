@@ -80,7 +80,7 @@ def test_no_opencv(run: Run, opencv_of, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(doctor, "CHECKS", (doctor.opencv, doctor.packages))
     result = run("doctor")
     assert result.exit_code == 1
-    assert "run pip install opencv-python-headless" in result.output.partition("what to do\n")[2]
+    assert "pip install opencv-python-headless" in result.output
 
 
 def test_packages_that_are_too_old_or_absent(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,16 +104,6 @@ def test_packages_that_are_too_old_or_absent(monkeypatch: pytest.MonkeyPatch) ->
 def test_every_extra_has_a_purpose() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     assert set(doctor.PURPOSES) == set(project["optional-dependencies"])
-
-
-def test_speeds_are_measured(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "TIMED_ROUNDS", 1)
-    result = run("doctor", "--benchmark", "--json")
-    assert result.exit_code == 0
-    found = json.loads(result.output)
-    times = [value for value in found.values() if isinstance(value, float)]
-    assert len(times) == 6
-    assert min(times) > 0
 
 
 def test_the_self_test_knows_wrong_answers(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,13 +138,3 @@ def test_a_check_that_fails_is_a_finding(run: Run, monkeypatch: pytest.MonkeyPat
     first, second = json.loads(result.stdout)["findings"]
     assert (first["name"], first["remedy"]) == ("moon", "RuntimeError: dark side")
     assert second["status"] == "ok"
-
-
-def test_long_lines_are_wrapped_and_commands_are_not(run: Run, monkeypatch) -> None:
-    words, command = "every word is kept " * 9, "pip install " + "a-package " * 20
-    findings = [doctor.Finding("one", "ok", words), doctor.Finding("two", "problem", "", command)]
-    monkeypatch.setattr(doctor, "CHECKS", (lambda: iter(findings),))
-    above, _, below = run("doctor").output.partition("what to do\n")
-    assert max(map(len, above.splitlines())) <= 100
-    assert above.split() == ["one", *words.split(), "two", "PROBLEM:"]
-    assert command.strip() in below

@@ -42,22 +42,15 @@ CASES = {
     "text as weights": "detect {bad}/good.png --weights {bad}/weights.onnx",
     "other tensors": "detect {bad}/good.png --weights {bad}/weights.safetensors",
     "a pickle": "detect {bad}/good.png --weights {bad}/weights.pth",
-    "backend": "detect {bad}/good.png --backend onnxruntim",
     "device": "detect {bad}/good.png --device CUDA",
-    "threshold": "detect {bad}/good.png --threshold 2",
     "stereo without a scene": "dev evaluate-stereo {bad}/empty",
     "output is a file": "detect {bad}/good.png -o {bad}/text.png",
     "ignore mask": "detect {bad}/good.png --ignore {bad}/small.png",
     "seed": "match {bad}/good.png {bad}/good.png --seed -1",
     "essential without cameras": "match {bad}/good.png {bad}/good.png --model essential",
-    "model": "match {bad}/good.png {bad}/good.png --model homografy",
     "homography": "match {bad}/good.png {bad}/good.png --homography {bad}/matrix.txt",
-    "label detector": "label {bad}/good.png -o {bad}/out --detectors siift",
     "train nothing": "train {bad}/empty -o {bad}/out",
-    "train stage": "train {bad} -o {bad}/out --stage 240",
-    "train label settings": "train {bad} -o {bad}/out --label-settings {bad}/matrix.txt",
     "label settings": "label {bad}/good.png -o {bad}/out --label-settings {bad}/no.toml",
-    "evaluate oxford": "dev evaluate {bad} --oxford {bad}/empty",
     "evaluate nothing": "dev evaluate {bad}/empty",
     "long name of a folder": "detect {bad}/good.png -o {bad}/{long}",
     "long name of a file": "export onnx dense -o {bad}/{long}.onnx",
@@ -67,45 +60,14 @@ CASES = {
 
 @pytest.mark.parametrize("arguments", CASES.values(), ids=CASES.keys())
 def test_one_sentence_and_exit_code_2(run, bad: Path, arguments: str) -> None:
-    if arguments.startswith("train"):
-        pytest.importorskip("torch", reason="needs torch, which is for training only")
-    if "weights.safetensors" in arguments:
+    if arguments.startswith("train") or "weights.safetensors" in arguments:
         pytest.importorskip("torch", reason="needs torch, which is for training only")
     before = {path: path.read_bytes() for path in bad.rglob("*") if path.is_file()}
     result = run(*arguments.format(bad=bad, long="x" * 300).split())
     assert result.exit_code == 2, result.output
-    message = result.stderr.strip()
-    assert message.startswith("deepdetect: ")
-    assert len(message.splitlines()) == 1, message
-    assert "Traceback" not in message
+    assert result.stderr.startswith("deepdetect: ")
+    assert len(result.stderr.strip().splitlines()) == 1, result.stderr
     assert {path: path.read_bytes() for path in bad.rglob("*") if path.is_file()} == before
-
-
-@pytest.mark.parametrize(
-    ("arguments", "hint"),
-    [
-        ("register x.png", "IMAGE1"),
-        ("detect x.png --threshold high", "high"),
-        ("detect x.png --resolution full", "native"),
-        ("train x -o out --device tpu", "cuda"),
-    ],
-)
-def test_usage_errors_name_the_right_word(run, arguments: str, hint: str) -> None:
-    result = run(*arguments.split())
-    assert result.exit_code == 2
-    assert hint in result.stderr
-
-
-def test_a_process_of_its_own_ends_the_same_way(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "deepdetect", "detect", "nothing.png"],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-    )
-    assert done.returncode == 2
-    assert done.stderr == "deepdetect: there is no file nothing.png: check the path\n"
-    assert done.stdout == ""
 
 
 @pytest.mark.parametrize("backend", ["onnxruntime", "openvino"])
@@ -120,8 +82,8 @@ def test_bad_weights_make_no_noise_of_native_code(
     command += ["--weights", str(path), "--backend", backend]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 2
-    assert done.stderr.startswith("deepdetect: ")
-    assert len(done.stderr.strip().splitlines()) == 1, done.stderr
+    assert one_sentence(done.stderr)
+    assert done.stdout == ""
 
 
 def test_a_folder_without_permission_is_one_sentence(run, bad: Path) -> None:

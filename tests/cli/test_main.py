@@ -3,7 +3,6 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from tests.command_line import run_command
@@ -95,13 +94,14 @@ def test_errors_name_flags_instead_of_parameters(message: str, expected: str | N
         ("detect photo.jpg --detector point", "points"),
         ("detec photo.jpg", "detect"),
         ("export colmp photos", "colmap"),
+        ("register x.png", "IMAGE1"),
+        ("detect x.png --threshold high", "high"),
     ],
 )
-def test_what_is_misspelt_names_the_right_word(arguments: str, right: str) -> None:
+def test_what_is_wrong_names_the_right_word(arguments: str, right: str) -> None:
     result = run_command(arguments.split())
     assert result.exit_code == 2
-    assert re.search(f"[dD]id you mean .?{right}.?\\?", result.stderr), result.stderr
-    assert len(result.stderr.splitlines()) == 1
+    assert right in result.stderr
 
 
 @pytest.mark.parametrize(
@@ -134,15 +134,3 @@ def test_the_help_is_fast() -> None:
     loaded = done.stdout.splitlines()[-1]
     for name in ("numpy", "cv2", "onnxruntime", "openvino", "torch", "PIL"):
         assert f"'{name}'" not in loaded
-
-
-def test_a_folder_or_a_file_is_named_by_o(tmp_path: Path) -> None:
-    from deepdetect import OptionError
-    from deepdetect.cli._options import output_file, output_folder
-
-    assert output_file(tmp_path, "model.ply") == tmp_path / "model.ply"
-    assert output_file(Path("rec"), "model.ply") == Path("rec/model.ply")
-    assert output_file(Path("rec/scene.glb"), "model.ply") == Path("rec/scene.glb")
-    assert output_folder(Path("run.2")) == Path("run.2")
-    with pytest.raises(OptionError, match="names the folder"):
-        output_folder(Path("points.npz"))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import re
 import shlex
 from pathlib import Path
@@ -35,72 +33,59 @@ def test_first_steps(folder: Path) -> None:
 
     fetch, use = blocks("first-steps.md", "python")
     exec(compile(fetch, "first-steps.md", "exec"), {})
-    commands = [
-        line.partition("#")[0].strip()
-        for block in blocks("first-steps.md", "sh")
-        for line in block.splitlines()
-        if line.startswith("deepdetect ")
-    ]
-    assert [command.split()[1] for command in commands] == [
-        "doctor",
-        "detect",
-        "match",
-        "reconstruct",
-    ]
-    printed = {}
+    lines = "\n".join(blocks("first-steps.md", "sh"))
+    commands = re.findall(r"^deepdetect ([^#\n]+)", lines, re.M)
+    assert len(commands) == 4
     for command in commands:
-        result = run_command(shlex.split(command)[1:])
+        result = run_command(shlex.split(command))
         assert result.exit_code == 0, result.output
-        printed[command.split()[1]] = result.output
-    assert re.search(r"[\d,]+ keypoints, [\d.]+% of the pixels, [\d.]+ s", printed["detect"])
-    assert "agree with one geometry (fundamental); scene: depth" in printed["match"]
     disparity = data.stereo_motorcycle()[2]
     known = np.isfinite(disparity)
     true = 994.978 * 193.001 / (disparity[known] + 31.086)  # of Middlebury 2014, in mm
     ratio = np.load("deepdetect-output/model_depth.npz")["depth"][known] / true
     np.testing.assert_allclose(np.nanpercentile(ratio, [5, 50, 95]), 1, atol=0.02)
     page = (DOCS / "first-steps.md").read_text("utf-8")
-    for name in re.findall(r"^\| `(left\S+)` \|", page, re.M):
-        assert (folder / "deepdetect-output" / name).is_file()
-    for name in re.findall(r"`(?:deepdetect-output/)?(model[\w.]+)`", page):
-        assert (folder / "deepdetect-output" / name).is_file()
-    out = io.StringIO()
-    with contextlib.redirect_stdout(out):
-        exec(compile(use, "first-steps.md", "exec"), {})
-    matches = re.search(r"^([\d,]+) matches", printed["match"], re.M)[1]
-    keypoints, points, *others = map(int, out.getvalue().split())
-    assert points == 500
-    assert others[0] == int(matches.replace(",", ""))
-    assert f"{keypoints:,} keypoints" in printed["detect"]
+    for name in re.findall(r"`(?:deepdetect-output/)?((?:model|left)[\w.]+\.\w+)`", page):
+        assert (folder / "deepdetect-output" / name).is_file() or (folder / name).is_file()
+    exec(compile(use, "first-steps.md", "exec"), {})
 
 
 @pytest.mark.slow
-def test_points(folder: Path) -> None:
+@pytest.mark.parametrize(
+    ("page", "count"),
+    [
+        ("python.md", 99),
+        ("points.md", 2),
+        ("comparison.md", 1),
+        ("matching.md", 1),
+        ("other-programs.md", 1),
+    ],
+)
+def test_the_code_of_guides(folder: Path, page: str, count: int) -> None:
+    """The first blocks of a page run, from top to bottom."""
     from skimage import data
 
     for name, view in zip(("left", "right"), data.stereo_motorcycle(), strict=False):
-        Image.fromarray(view).save(f"{name}.png")
-    block = "\n".join(blocks("points.md", "python")[:2])
+        Image.fromarray(view[100:420, 220:620]).save(f"{name}.png")
     found: dict[str, object] = {}
-    exec(compile(block, "points.md", "exec"), found)
-    assert len(found["surer"]) < len(found["dense"])
-    assert len(found["thinner"]) == pytest.approx(0.05 * 741 * 500, rel=0.02)
-    assert found["spaced"].sizes is None
-    assert len(found["points"]) == len(found["spread"]) == 1000
-    assert found["spread"].sizes is not None
+    for block in blocks(page, "python")[:count]:
+        exec(compile(block, page, "exec"), found)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", ["comparison.md", "matching.md", "other-programs.md"])
-def test_the_first_lines_of_guides(folder: Path, page: str) -> None:
-    from skimage import data
+def test_points_in_the_file(folder: Path, photo: np.ndarray) -> None:
+    """The page's Python on ONNX finds what the package finds."""
+    pytest.importorskip("onnx", reason="needs onnx, which is for exporting only")
+    from deepdetect import PointDetector
+    from deepdetect.detector.network.onnx_export import write_onnx
 
-    for name, view in zip(("left", "right"), data.stereo_motorcycle(), strict=False):
-        Image.fromarray(view[100:340, 220:540]).save(f"{name}.png")
+    write_onnx("default", "deepdetect.onnx")
+    Image.fromarray(photo[:123, :157]).save("photo.jpg", quality=100)
     found: dict[str, object] = {}
-    exec(compile(blocks(page, "python")[0], page, "exec"), found)
-    (result,) = {"pairs", "good", "keypoints"} & set(found)
-    assert len(found[result]) > 500
+    exec(compile(blocks("other-programs.md", "python")[-1], "other-programs.md", "exec"), found)
+    expected = PointDetector(2048).detect("photo.jpg")
+    gaps = np.linalg.norm(found["xy"][:, None] - expected.xy, axis=2)
+    assert (gaps.min(0) < 0.05).mean() > 0.99
 
 
 RECIPES = blocks("recipes.md", "python")
@@ -135,21 +120,14 @@ def test_recipes(folder: Path, number: int) -> None:
     if "kornia" in recipe:
         pytest.importorskip("kornia", reason="needs kornia")
         recipe = recipe.replace('("sift")', "(None, input_dim=128, add_scale_ori=True)")
-    assert recipe.count("\n") <= 8
     write_photographs(folder)
     found: dict[str, object] = {}
     exec(compile(recipe, "recipes.md", "exec"), found)
-    for name in re.findall(r"\"(\w+\.(?:png|jpg|npz))\"\)$", recipe, re.M):
-        assert (folder / name).is_file()
     if "matches" in found:
         assert found["matches"].inliers.sum() > 1000
     if "result" in found:
         truth = np.array([[0.9, 0.1, 5.0], [-0.1, 0.95, 20.0], [1e-4, 1e-4, 1.0]])
         np.testing.assert_allclose(found["result"].homography, truth, atol=0.5, rtol=0.02)
-    if "tracks" in found:
-        assert len(found["tracks"]) > 50
-    if "paths" in found:
-        assert sorted(path.name for path in folder.glob("photos/*.npz")) == ["a.npz", "b.npz"]
 
 
 @pytest.mark.slow

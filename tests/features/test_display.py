@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import base64
 import re
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -61,9 +60,9 @@ def test_images_of_any_kind_lie_below(photo: np.ndarray) -> None:
         (Image.fromarray(photo), "bgr"),
     ):
         np.testing.assert_array_equal(points.draw(image, channels=channels), photo // 2)
-    with pytest.raises(ImageError, match="100x256 pixels, the keypoints are of one of 256x256"):
+    with pytest.raises(ImageError, match="100x256"):
         points.draw(photo[:, :100])
-    with pytest.raises(ImageError, match=r"give load_image\(path\)"):
+    with pytest.raises(ImageError, match="load_image"):
         points.draw("photo.png")
 
 
@@ -120,24 +119,3 @@ def test_what_a_notebook_shows_is_small(size: tuple[int, int], count: int) -> No
         assert picture.shape[0] <= 240
         assert picture.shape[1] <= 240 * pictures
         assert bool(picture.any()) == bool(count)
-
-
-@pytest.mark.parametrize("mode", ["I;16", "F"])
-def test_deep_pil_images_are_drawn_as_their_arrays(mode: str) -> None:
-    deep = np.random.default_rng(0).integers(0, 65536, (50, 60)).astype(np.uint16)
-    array = deep if mode == "I;16" else (deep / 65535).astype(np.float32)
-    image = Image.fromarray(array)
-    assert image.mode == mode
-    points = keypoints(3, (60, 50))
-    np.testing.assert_array_equal(points.draw(image), points.draw(array))
-    bare = keypoints(0, (60, 50)).draw(image)
-    np.testing.assert_allclose(bare[..., 0], deep / 257 / 2, atol=1)
-
-
-def test_a_pgm_file_of_16_bits_is_drawn(tmp_path: Path) -> None:
-    """Pillow holds its numbers in 32 bits."""
-    deep = np.random.default_rng(0).integers(0, 65536, (50, 60)).astype(np.uint16)
-    cv2.imwrite(str(tmp_path / "deep.pgm"), deep)
-    with Image.open(tmp_path / "deep.pgm") as image:
-        picture = keypoints(0, (60, 50)).draw(image)
-    np.testing.assert_array_equal(picture, keypoints(0, (60, 50)).draw(deep))

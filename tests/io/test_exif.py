@@ -85,7 +85,7 @@ def test_a_pil_image_is_not_turned() -> None:
         assert camera_from_exif(image, size_of(image)).focal_px == pytest.approx((200, 200))
 
 
-def test_what_carries_no_focal_length_says_what_to_give(one_line, tmp_path: Path) -> None:
+def test_what_carries_no_focal_length_says_what_to_give(tmp_path: Path) -> None:
     path = tmp_path / "plain.png"
     Image.fromarray(np.zeros((20, 30, 3), np.uint8)).save(path)
     for image in (
@@ -98,11 +98,10 @@ def test_what_carries_no_focal_length_says_what_to_give(one_line, tmp_path: Path
         photograph({FOCAL: 5.0, PLANE_X: 0.0}),
         b"no image",
     ):
-        with pytest.raises(ReconstructionError, match="give `focal_px` or `calibration`") as error:
+        with pytest.raises(ReconstructionError, match=r"`focal_px`.*`calibration`"):
             camera_from_exif(image, (300, 200))
-        one_line(error.value)
     cropped = photograph({FILM: 24, WIDTH: 400, HEIGHT: 200})
-    with pytest.raises(ReconstructionError, match=r"cropped .*400x200"):
+    with pytest.raises(ReconstructionError, match="400x200"):
         camera_from_exif(cropped, (300, 200))
 
 

@@ -3,7 +3,6 @@ from __future__ import annotations
 import io
 import struct
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -59,27 +58,20 @@ def test_a_palette_of_two_colours(tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_mask(tmp_path / "mask.png"), ~MASK)
 
 
-def test_masks_of_too_many_pixels_are_not_decoded(
-    tmp_path: Path, one_line: Callable[[BaseException], str]
-) -> None:
+def test_masks_of_too_many_pixels_are_not_decoded(tmp_path: Path) -> None:
     path = tmp_path / "mask.png"
     save_mask(np.zeros((20, 30), bool), path)
     for source in (path, path.read_bytes(), io.BytesIO(path.read_bytes())):
-        with (
-            pytest.raises(ImageError) as caught,
-            read_with(reading_options(max_megapixels=599e-6)),
-        ):
+        with pytest.raises(ImageError), read_with(reading_options(max_megapixels=599e-6)):
             load_mask(source)
-        assert "30x20 pixels, which is over" in one_line(caught.value)
         with read_with(reading_options(max_megapixels=600e-6)):
             assert load_mask(source).shape == (20, 30)
     content = bytearray(path.read_bytes())
     content[16:24] = (20_000).to_bytes(4, "big") * 2  # in the header
     content[29:33] = zlib.crc32(content[12:29]).to_bytes(4, "big")
     path.write_bytes(content)
-    with pytest.raises(ImageError) as caught:
+    with pytest.raises(ImageError, match="20000x20000"):
         load_mask(path)
-    assert "20000x20000 pixels" in one_line(caught.value)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

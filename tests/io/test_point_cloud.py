@@ -24,9 +24,8 @@ def test_every_exporter_writes_a_whole_file(ending: str, small: PointCloud, tmp_
 
 
 @pytest.mark.parametrize("ending", sorted(POINT_CLOUD_WRITERS))
-def test_an_empty_cloud_is_not_written(ending: str, tmp_path: Path, one_line) -> None:
+def test_an_empty_cloud_is_not_written(ending: str, tmp_path: Path) -> None:
     empty = PointCloud(np.empty((0, 3)), np.empty((0, 3), np.uint8), "mm")
-    with pytest.raises(OptionError) as caught:
+    with pytest.raises(OptionError):
         save_point_cloud(empty, tmp_path / f"model{ending}")
-    assert "no points" in one_line(caught.value)
     assert not list(tmp_path.iterdir())

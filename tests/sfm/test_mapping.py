@@ -183,7 +183,7 @@ def test_cameras_that_cannot_be_told_are_no_model(
     write_scenes(tmp_path / "database.db", {"aside": (ASIDE, 4)})
     verified = verify_pairs(tmp_path / "database.db")
     others = (False,) if name == "global_mapping" else (verified, False)
-    with pytest.raises(NoDepthError, match="focal length"):
+    with pytest.raises(NoDepthError):
         mapper(tmp_path / "database.db", tmp_path, *others)
 
 

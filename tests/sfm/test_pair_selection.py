@@ -3,31 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from deepdetect import OptionError
 from deepdetect.sfm.pair_selection import motion, thin_out
-from deepdetect.sfm.stages import MultiViewOptions
-
-
-def test_small_sets_are_matched_exhaustively_and_large_ones_by_likeness() -> None:
-    choices = [MultiViewOptions().pair_choice(count) for count in (3, 50, 51)]
-    assert choices == ["exhaustive", "exhaustive", "similar"]
-    assert MultiViewOptions(pairs="similar:2").pair_choice(3) == "similar:2"
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"pairs": "sequental:3"},
-        {"pairs": "sequential:0"},
-        {"pairs": "similar:0"},
-        {"stride_px": 1.5},
-        {"mapper": "globally"},
-        {"min_motion": 2},
-    ],
-)
-def test_wrong_options_are_refused(wrong: dict) -> None:
-    with pytest.raises(OptionError, match=r"sequential|must|unknown"):
-        MultiViewOptions(**wrong)
 
 
 def test_frames_are_left_out_up_to_the_first_that_shows_something_new() -> None:

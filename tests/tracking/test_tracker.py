@@ -140,12 +140,11 @@ def test_a_black_frame_loses_all_points_of_deepdetect_and_is_no_error(moving_pho
     assert (again.ages == 0).all()
 
 
-def test_frames_of_two_sizes_are_refused(moving_photo, one_line) -> None:
+def test_frames_of_two_sizes_are_refused(moving_photo) -> None:
     tracker = Tracker(grid_keypoints)
     tracker.update(moving_photo(0))
-    with pytest.raises(OptionError) as caught:
+    with pytest.raises(OptionError, match="320x200"):
         tracker.update(moving_photo(0)[:200])
-    assert "320x200" in one_line(caught.value)
 
 
 def test_free_keypoints_takes_the_best_first() -> None:
@@ -154,19 +153,10 @@ def test_free_keypoints_takes_the_best_first() -> None:
     assert free_keypoints(points, np.array([[51, 6]]), 5, 9).tolist() == [1, 2]
 
 
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"max_keypoints": 0},
-        {"max_keypoints": 1.5},
-        {"min_kept": 1.1},
-        {"max_return_error_px": -1},
-    ],
-)
-def test_wrong_options(values, one_line) -> None:
-    with pytest.raises(OptionError) as caught:
-        TrackingOptions(**values)
-    assert next(iter(values)) in one_line(caught.value)
+@pytest.mark.parametrize(("name", "value"), [("max_keypoints", 1.5), ("min_kept", 1.1)])
+def test_wrong_options(name: str, value: float) -> None:
+    with pytest.raises(OptionError, match=name):
+        TrackingOptions(**{name: value})
 
 
 @pytest.mark.parametrize(("start", "shift"), [(0.0, 0.25), (0.25, 0.5), (0.25, 2.3)])

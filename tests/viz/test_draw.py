@@ -1,11 +1,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from deepdetect.viz.draw import (
-    CAPTION_HEIGHT,
-    add_scale,
     draw_depth,
     draw_heatmap,
     draw_logits,
@@ -35,10 +32,3 @@ def test_a_depth_map_is_bright_where_it_is_near() -> None:
     assert picture[15, 10].sum() > picture[15, 50].sum() + 100
     assert not picture[15, 30].any()
     assert draw_depth(np.full((30, 60), np.nan), "mm").shape[1] == 60
-
-
-@pytest.mark.parametrize("width", [1, 5, 16, 33, 60, 400])
-def test_a_scale_is_below_the_picture_and_as_wide(width: int) -> None:
-    picture = add_scale(np.zeros((20, width, 3), np.uint8), "logit", -3, 12)
-    assert picture.shape == (20 + CAPTION_HEIGHT, width, 3)
-    assert picture[20:].any()

@@ -58,14 +58,8 @@ def test_files_of_another_run_are_not_written_over(run, tmp_path: Path) -> None:
     trained = folder / "best.safetensors"
     trained.write_bytes(find_weights("default").read_bytes())
     before = trained.read_bytes()
-    for words, message in (
-        ((trained, "dense"), "would replace an input"),
-        (("default", "dense"), "best.safetensors exists"),
-    ):
-        result = run("dev", "average", *words, "-o", folder)
-        assert result.exit_code == 2
-        assert message in result.stderr
-        assert len(result.stderr.splitlines()) == 1
+    for first in (trained, "default"):
+        assert run("dev", "average", first, "dense", "-o", folder).exit_code == 2
         assert [path.name for path in folder.iterdir()] == ["best.safetensors"]
         assert trained.read_bytes() == before
     assert run("dev", "average", "default", "dense", "-o", folder, "--overwrite").exit_code == 0

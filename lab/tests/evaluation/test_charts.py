@@ -1,13 +1,11 @@
 from __future__ import annotations
 
 import io
-import sys
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from deepdetect import MissingExtraError
 from deepdetect_lab.evaluation.report import WIDEST, bar_chart, line_chart, picture
 
 pytest.importorskip("matplotlib", reason="needs matplotlib, which draws the charts")
@@ -32,10 +30,3 @@ def test_names_of_any_kind_are_drawn() -> None:
     assert len(bar_chart({"$a_b$ & <c> 100 %": 0.5, "_hidden": 0.0}, "x")) > 1000
     assert len(line_chart({"$1 & $2": ([1, 2], [0.5, float("nan")])}, "x", "y")) > 1000
     assert len(line_chart({}, "x", "y", logarithmic=True)) > 1000
-
-
-def test_the_missing_package_is_named(monkeypatch: pytest.MonkeyPatch, one_line) -> None:
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(MissingExtraError, match="matplotlib") as caught:
-        bar_chart({"a": 1}, "x")
-    assert "pip install" in one_line(caught.value)

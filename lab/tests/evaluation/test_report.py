@@ -2,31 +2,12 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from deepdetect_lab.evaluation.report import Figure, Report, Section, Table, picture
-
-
-@pytest.mark.parametrize(
-    ("style", "cell", "text"),
-    [
-        (".2%", 0.12345, "12.35%"),
-        (",d", 1234567, "1,234,567"),
-        (",.0f", 1234.5, "1,234"),
-        (",d", "as text", "as text"),
-        (",d", None, "–"),
-        (".3f", float("nan"), "–"),
-        (".3f", float("inf"), "inf"),
-    ],
-)
-def test_cells_are_written_in_the_style_of_their_column(style: str, cell, text: str) -> None:
-    shown = Table("key", "Title", {"title": style}, [{"title": cell}]).to_markdown()
-    assert shown.splitlines()[-1] == f"| {text} |"
-
 
 EVIL = "<b>Tom & \"Jerry\"</b> | 'x' <script src=http://evil.example/a.js>"
 THIRD = 1 / 3
@@ -66,19 +47,6 @@ def folder(report: Report, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_all_files_are_written_and_named_with_the_report_first(
-    report: Report, tmp_path: Path
-) -> None:
-    paths = report.save(tmp_path)
-    assert paths[0] == tmp_path / "report.md"
-    assert len(set(paths)) == len(paths)
-    assert set(paths) == {path for path in tmp_path.rglob("*") if path.is_file()}
-    assert {path.relative_to(tmp_path).as_posix() for path in paths} == {
-        *("report.md", "figures/fig.png", "figures/other.png"),
-        *("tables/first.csv", "tables/second.csv", "report.json"),
-    }
-
-
 def test_csv_has_every_digit_and_empty_cells(report: Report, folder: Path) -> None:
     with (folder / "tables" / "first.csv").open(newline="", encoding="utf-8") as file:
         head, *rows = csv.reader(file)
@@ -103,25 +71,3 @@ def test_json_has_every_digit_and_no_word_that_json_lacks(folder: Path) -> None:
     assert values["figures"] == {"fig": EVIL, "other": "Other"}
     assert values["metadata"]["command"] == EVIL
     assert values["skipped"] == [f"left {EVIL}"]
-
-
-def test_markdown_tables_have_as_many_cells_in_each_line(report: Report) -> None:
-    lines = report.tables()[0].to_markdown().splitlines()
-    assert len(lines) == 2 + 5
-    for line in lines:
-        assert line.startswith("|")
-        assert line.endswith("|")
-        assert len(re.findall(r"(?<!\\)\|", line)) == 4
-    assert lines[1] == "|---|---:|---:|"
-    assert lines[3] == "| nothing | – | – |"
-    assert "a\\|b <c>" in lines[0]
-
-
-def test_a_table_out_of_the_text_is_named_there_and_written_as_csv(tmp_path: Path) -> None:
-    table = Table("long", "All", {"a": ""}, [{"a": "cell 1"}, {"a": "cell 2"}], "note", False)
-    Report("title", {}, (Section("one", (), (table,)),)).save(tmp_path)
-    text = (tmp_path / "report.md").read_text()
-    assert "**All**\n\nIn `tables/long.csv`.\n\nnote" in text
-    assert "cell" not in text
-    assert (tmp_path / "tables" / "long.csv").read_text().split() == ["a", "cell", "1", "cell", "2"]
-    assert len(json.loads((tmp_path / "report.json").read_text())["tables"]["long"]["rows"]) == 2

@@ -225,13 +225,6 @@ def test_a_damaged_file_is_made_anew_and_repaired(tmp_path: Path) -> None:
     assert not is_made(run, "matches", 1)
 
 
-def test_a_folder_that_cannot_be_written_is_said(tmp_path: Path, one_line) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(CacheError, match="cannot write") as caught:
-        is_made(Run(tmp_path, tmp_path / "file"), "matches", 1)
-    one_line(caught.value)
-
-
 def test_a_raised_version_makes_a_stage_again_and_what_is_made_from_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -259,14 +252,6 @@ def test_what_cannot_be_done_is_skipped_with_its_reason(tmp_path: Path, error: E
     assert run.attempt("sum", lambda one, other: one + other, 2, 3) == 5
 
 
-def test_what_opencv_refuses_is_skipped_with_its_reason(tmp_path: Path) -> None:
-    run = Run(tmp_path)
-    assert run.attempt("blur", cv2.medianBlur, np.zeros((8, 8), np.uint8), 4) is None
-    assert len(run.skipped) == 1
-    assert run.skipped[0].startswith("blur: ")
-    assert "cpp" not in run.skipped[0]
-
-
 @pytest.mark.parametrize(
     "error", [ValueError("reason"), MemoryError(), KeyboardInterrupt(), CacheError("no room")]
 )
@@ -275,25 +260,3 @@ def test_a_bug_of_ours_is_no_skipped_line(tmp_path: Path, error: BaseException) 
     with pytest.raises(type(error)):
         run.attempt("matches", raises(error))
     assert run.skipped == []
-
-
-def test_rows_are_of_each_method_and_item_but_for_failures(tmp_path: Path) -> None:
-    def measure(method: LocalFeature, number: int) -> dict[str, int]:
-        if (method.name, number) == ("fast", 2):
-            raise ImageError("damaged")
-        return {"value": number}
-
-    run = Run(tmp_path)
-    methods = [FAST, CLASSICAL["orb"]]
-    rows = run.rows("density of ", methods, {"one": 1, "two": 2}, measure)
-    assert [(row["method"], row["item"], row["value"]) for row in rows] == [
-        *(("fast", "one", 1), ("orb", "one", 1), ("orb", "two", 2))
-    ]
-    assert run.failures == ["density of FAST on two: damaged"]
-
-
-def test_a_data_set_is_below_the_folder_or_is_the_folder(tmp_path: Path) -> None:
-    run = Run(tmp_path)
-    assert run.folder("oxford") == tmp_path
-    (tmp_path / "oxford").mkdir()
-    assert run.folder("oxford") == tmp_path / "oxford"

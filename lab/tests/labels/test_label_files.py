@@ -55,7 +55,7 @@ def test_what_is_done_and_what_is_stale(image: Path, tmp_path: Path) -> None:
     assert task.outputs.find() is None
     label_file(task)
     assert task.outputs.find() is not None
-    with pytest.raises(OptionError, match="other settings"):
+    with pytest.raises(OptionError):
         dataclasses.replace(task, options=SOBEL).outputs.find()
     replaced = dataclasses.replace(task, options=SOBEL, overwrite=True)
     assert replaced.outputs.find() is None

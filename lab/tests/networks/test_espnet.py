@@ -65,7 +65,7 @@ def test_weights_survive_the_round_trip(tmp_path: Path) -> None:
 def test_a_pickle_is_refused_and_not_executed(tmp_path: Path) -> None:
     path = tmp_path / "w.safetensors"
     torch.save(ESPNet().state_dict(), path)
-    with pytest.raises(WeightsError, match="does not fit"):
+    with pytest.raises(WeightsError):
         load_network(path)
 
 

@@ -38,7 +38,7 @@ def test_weights_with_a_tensor_of_another_shape_are_refused(
 ) -> None:
     state = fast_network.state_dict() | {"logits.bias": torch.zeros(5)}
     save_tensors(state, tmp_path / "weights.safetensors", {})
-    with pytest.raises(WeightsError, match=r"does not fit .*logits\.bias"):
+    with pytest.raises(WeightsError, match=r"logits\.bias"):
         load_network(tmp_path / "weights.safetensors")
 
 
@@ -46,7 +46,7 @@ def test_networks_are_not_mixed(fast_files: tuple[Path, Path], tmp_path: Path) -
     fast, espnet = fast_files[1], find_weights("espnet")
     with pytest.raises(WeightsError, match="another network"):
         average_weights([espnet, fast])
-    with pytest.raises(OptionError, match="not of the network espnet"):
+    with pytest.raises(OptionError, match="espnet"):
         initial_network(TrainingOptions(network="espnet"), fast)
     start = initial_network(TrainingOptions(network="fast"), [fast, fast])[1]
     assert type(start) is NETWORKS["fast"]

@@ -63,15 +63,14 @@ def test_a_checkpoint_gives_everything_back(tmp_path: Path, optimizer: str) -> N
 
 
 @pytest.mark.parametrize("content", [b"", b"no checkpoint", b"\x80\x04K\x01."])
-def test_a_damaged_checkpoint_is_refused(tmp_path: Path, content: bytes, one_line) -> None:
+def test_a_damaged_checkpoint_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "checkpoint.safetensors"
     path.write_bytes(content)
-    with pytest.raises(WeightsError, match="delete it") as caught:
+    with pytest.raises(WeightsError):
         read_checkpoint(path)
-    one_line(caught.value)
 
 
-def test_altered_tensors_and_states_are_refused(tmp_path: Path, one_line) -> None:
+def test_altered_tensors_and_states_are_refused(tmp_path: Path) -> None:
     """A fused optimiser writes beyond a moment of another shape, and crashes Python."""
     path = tmp_path / "c.safetensors"
     save_checkpoint(path, *trained(), {"step": 1})
@@ -85,8 +84,7 @@ def test_altered_tensors_and_states_are_refused(tmp_path: Path, one_line) -> Non
         (tensors, {}),
     ):
         save_file(values, path, metadata=changed)
-        with pytest.raises(WeightsError, match="delete it") as caught:
+        with pytest.raises(WeightsError, match=path.name):
             read_checkpoint(path)
-        assert str(path) in one_line(caught.value)
     save_file(tensors, path, metadata=header)
     assert read_checkpoint(path)[1] == {"step": 1}

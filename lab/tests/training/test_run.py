@@ -8,60 +8,11 @@ import pytest
 
 pytest.importorskip("torch", reason="needs torch, which is for training only")
 
-import importlib.util
 
-from deepdetect import MissingExtraError
-from deepdetect_lab.labels import LabelOptions
 from deepdetect_lab.training import (
-    DeviceOptions,
-    Stage,
-    TrainingOptions,
-    profile,
-    train,
     train_descriptor,
     train_points,
 )
-
-
-@pytest.mark.slow
-def test_a_profile_times_each_stage_and_writes_no_weights(
-    photographs: Path, tmp_path: Path
-) -> None:
-    options = TrainingOptions(
-        stages=(Stage(64, 4, 4), Stage(96, 2, 1)),
-        short_sides=(96,),
-        labels=LabelOptions(("fast",)),
-        interleave=True,
-    )
-    device = DeviceOptions("cpu", "float32", compile=False, threads=1)
-    lines: list[str] = []
-    first, second = profile(
-        photographs, tmp_path, options, device=device, workers=1, log=lines.append
-    )
-    assert lines == ["timing cpu, float32, eager"]
-    assert (first.stage.crop, second.stage.crop) == (64, 96)
-    assert first.steps == 11 * 4 // 4 - 5
-    assert second.steps == 1, "as many as the stage has, the warm-up left out"
-    for stage in (first, second):
-        assert stage.images_per_second > 0
-        assert stage.full_images_per_second == pytest.approx(
-            stage.images_per_second * stage.stage.crop**2 / 480**2
-        )
-        assert 0 <= stage.waiting_fraction < 1
-        assert 50e6 < stage.memory_bytes < 20e9
-        assert stage.device_memory_bytes is None
-    assert {path.name for path in tmp_path.iterdir()} == {"labels"}
-
-
-def test_a_missing_package_is_named_before_any_work(
-    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one_line
-) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    for function in (train, profile):
-        with pytest.raises(MissingExtraError, match="needs the packages torch") as caught:
-            function(photographs, tmp_path / "run")
-        one_line(caught.value)
-    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("validation", ["images/val", "other"])

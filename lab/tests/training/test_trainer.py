@@ -143,7 +143,6 @@ def test_the_best_weights_say_where_they_come_from(run: Path) -> None:
     card = (run / "MODEL_CARD.md").read_text()
     for name in ("command", "commit", "versions", "images_digest", "initial_weights"):
         assert notes[name] in card
-    assert "short_sides | [64, 48]" in card
 
 
 @pytest.mark.slow
@@ -184,23 +183,21 @@ def test_starting_again_after_the_end_changes_nothing(run: Path, tmp_path: Path,
 
 
 def test_another_run_in_the_same_folder_is_refused(
-    run: Path, photographs: Path, tmp_path: Path, fit, one_line
+    run: Path, photographs: Path, tmp_path: Path, fit
 ) -> None:
-    for changes, match in (
-        ({"options": dataclasses.replace(OPTIONS, seed=5)}, "`seed`"),
-        ({"validation": photographs}, r"\(`images_digest`\)"),
-        ({"init_weights": "espnet"}, r"\(`frozen_batch_norm`, `initial_weights`\)"),
+    for name, changes in (
+        ("`seed`", {"options": dataclasses.replace(OPTIONS, seed=5)}),
+        ("`images_digest`", {"validation": photographs}),
+        ("`initial_weights`", {"init_weights": "espnet"}),
     ):
-        with pytest.raises(OptionError, match=match) as caught:
+        with pytest.raises(OptionError, match=name):
             fit(run, **changes)
-        one_line(caught.value)
 
 
-def test_missing_best_weights_are_told(run: Path, tmp_path: Path, fit, one_line) -> None:
+def test_missing_best_weights_are_told(run: Path, tmp_path: Path, fit) -> None:
     shutil.copy(run / "checkpoint.safetensors", tmp_path)
-    with pytest.raises(WeightsError, match=r"best\.safetensors") as caught:
+    with pytest.raises(WeightsError, match=r"best\.safetensors"):
         fit(tmp_path)
-    one_line(caught.value)
 
 
 @pytest.mark.slow
@@ -242,7 +239,7 @@ def test_a_run_can_start_from_the_mean_of_several_weights(run: Path, tmp_path: P
 
 def test_random_weights_are_not_kept(photographs: Path, tmp_path: Path) -> None:
     options = dataclasses.replace(TINY, frozen_batch_norm=True)
-    with pytest.raises(OptionError, match=r"`frozen_batch_norm` .* `init_weights`"):
+    with pytest.raises(OptionError, match=r"`frozen_batch_norm`.*`init_weights`"):
         train(photographs, tmp_path / "run", options, device=PLAIN)
     assert not (tmp_path / "run").exists()
 
@@ -312,16 +309,9 @@ def test_own_images_and_settings_from_the_pretrained_weights(
     """The command of docs/training.md, on few images."""
     settings = tmp_path / "labels.toml"
     settings.write_text('detectors = ["fast", "sobel"]\n[fast]\nnormal = { threshold = 30 }\n')
-    arguments = [sys.executable, "-m", "deepdetect", "train", str(photographs), "-o"]
-    arguments += [
-        str(tmp_path / "run"),
-        "--preset",
-        "espnet",
-        "--init",
-        "espnet",
-        "--label-settings",
-        str(settings),
-    ]
+    arguments = [sys.executable, "-m", "deepdetect", "train", str(photographs)]
+    arguments += ["-o", str(tmp_path / "run"), "--label-settings", str(settings)]
+    arguments += ["--preset", "espnet", "--init", "espnet"]
     arguments += ["--stage", "96x4x12", "--short-side", "96", "--learning-rate", "0.0005"]
     arguments += ["--warm-up", "0.05", "--dark-fraction", "0", "--val-count", "3", "--no-compile"]
     subprocess.run(

@@ -32,7 +32,7 @@ def broken_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_device_that_cannot_start_is_no_damaged_file(broken_cuda: None) -> None:
-    with pytest.raises(OptionError, match="CUDA failure 35: driver is insuff"):
+    with pytest.raises(OptionError, match="CUDA failure 35"):
         open_onnxruntime(pretrained_weights(), CUDA)
 
 

@@ -152,6 +152,6 @@ def test_options_are_checked(values: dict[str, object]) -> None:
 
 def test_a_changed_file_is_not_changed_again(tmp_path: Path) -> None:
     write_onnx("default", tmp_path / "one.onnx", OnnxOptions((64, 64)))
-    with pytest.raises(WeightsError, match="size 64x64: give the file that it was made from"):
+    with pytest.raises(WeightsError, match="size 64x64"):
         write_onnx(tmp_path / "one.onnx", tmp_path / "again.onnx")
     assert not (tmp_path / "again.onnx").exists()

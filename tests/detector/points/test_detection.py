@@ -88,7 +88,7 @@ def test_no_point_is_where_the_mask_is_true(gray) -> None:
     found = detect_points(gray, 100, ignore=ignore)
     assert len(found) == 100
     assert found.xy[:, 0].min() > 159
-    with pytest.raises(OptionError, match="ignore mask"):
+    with pytest.raises(OptionError):
         detect_points(gray, ignore=ignore[1:])
 
 

@@ -8,8 +8,6 @@ import pytest
 
 from deepdetect.matching.stereo import sgm as module
 from deepdetect.matching.stereo.sgm import (
-    CENSUS_RADIUS_X,
-    CENSUS_RADIUS_Y,
     census,
     is_textured,
     match_distance,
@@ -33,67 +31,12 @@ def motorcycle() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return left, right, pair.disparity[part]
 
 
-def test_the_census_says_which_neighbours_are_darker() -> None:
-    gray = np.random.default_rng(0).integers(0, 256, (20, 30), np.uint8)
-    words = census(gray)
-    x_radius, y_radius = CENSUS_RADIUS_X, CENSUS_RADIUS_Y
-    framed = np.pad(gray, ((y_radius, y_radius), (x_radius, x_radius)), mode="edge")
-    for y, x in ((0, 0), (7, 12), (19, 29)):
-        window = framed[y : y + 2 * y_radius + 1, x : x + 2 * x_radius + 1].ravel()
-        darker = np.delete(window, len(window) // 2) < gray[y, x]
-        assert f"{int(words[y, x]):062b}" == "".join(str(int(bit)) for bit in darker)
-
-
-def test_costs_are_sums_of_distances() -> None:
-    generator = np.random.default_rng(0)
-    shape = (9, 14)
-    left, right = (generator.integers(0, 2**62, shape, np.uint64) for _ in range(2))
-    for smallest, count in ((-3, 16), (0, 5), (-30, 70), (13, 4)):
-        distance = np.full((*shape, count), 31)
-        for y, x, d in np.ndindex(distance.shape):
-            there = x - (d + smallest)
-            if 0 <= there < shape[1]:
-                distance[y, x, d] = int(left[y, x] ^ right[y, there]).bit_count()
-        framed = np.pad(distance, ((1, 1), (1, 1), (0, 0)), mode="edge")
-        sums = sum(framed[j : j + 9, i : i + 14] for j in range(3) for i in range(3))
-        np.testing.assert_array_equal(matching_cost((left, right), smallest, count), sums // 4)
-
-
 def test_flat_windows_have_no_texture() -> None:
     gray = np.full((20, 40), 250, np.uint8)
     gray[5, 35] = 200
     found = is_textured(gray)
     assert found[2:9, 31:40].all()
     assert found.sum() == 63
-
-
-def test_the_paths_are_those_of_the_definition() -> None:
-    """Sums over the eight paths, step by step, on a small volume."""
-    generator = np.random.default_rng(0)
-    gray = generator.integers(0, 256, (9, 14), np.uint8)
-    left, right = (generator.integers(0, 2**62, gray.shape, np.uint64) for _ in range(2))
-    volume = matching_cost((left, right), -3, 16)
-    total = module.aggregate(gray, volume)
-    height, width = gray.shape
-    cost = volume.astype(int)
-    expected = np.zeros_like(cost)
-    for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (1, -1), (-1, 1), (-1, -1)):
-        path = np.zeros_like(cost)
-        for y in range(height)[:: dy or 1]:
-            for x in range(width)[:: dx or 1]:
-                before = (y - dy, x - dx)
-                path[y, x] = cost[y, x]
-                if not (0 <= before[0] < height and 0 <= before[1] < width):
-                    continue
-                change = abs(int(gray[y, x]) - int(gray[before]))
-                large = int(max(100 / (1 + change / 8), 25) * 9 / 4)
-                last = path[before]
-                steps = np.pad(last, 1, constant_values=10**6)
-                near = np.minimum(steps[:-2], steps[2:]) + 45
-                path[y, x] += np.minimum.reduce([last, near, np.full(16, last.min() + large)])
-                path[y, x] -= last.min()
-        expected += path
-    np.testing.assert_array_equal(total, expected)
 
 
 def test_it_is_at_least_as_right_as_opencv(motorcycle) -> None:

@@ -53,25 +53,22 @@ def test_the_canvas_holds_all_corners() -> None:
 
 
 @pytest.mark.parametrize("factor", [1, -2])
-def test_what_reaches_the_horizon_is_refused(factor: int, one_line) -> None:
+def test_what_reaches_the_horizon_is_refused(factor: int) -> None:
     # The corner of a camera with a field of view of 53 degrees.
     assert planned({0: np.eye(3), 1: factor * turned(40)}).size[0] > 1000
     for degrees in (60, 64, 90, 170):  # at 63 the corner is on the horizon; at 170 all is behind
-        with pytest.raises(DeepDetectError, match=r"images\[1\] is seen too much") as error:
+        with pytest.raises(DeepDetectError, match=r"images\[1\]"):
             planned({0: np.eye(3), 1: factor * turned(degrees)})
-        one_line(error.value)
 
 
-def test_a_canvas_too_large_is_refused(monkeypatch: pytest.MonkeyPatch, one_line) -> None:
+def test_a_canvas_too_large_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     canvas = planned({0: np.eye(3), 1: moved(10_000)})
-    with pytest.raises(OptionError, match=r"would be 10400x300 pixels, .*max_canvas_mega") as error:
+    with pytest.raises(OptionError, match="10400x300"):
         canvas.check_size(3.1)
-    one_line(error.value)
     canvas.check_size(3.13)
     monkeypatch.setattr(machine, "available_memory", lambda: 10_400 * 300 * 22)
-    with pytest.raises(OptionError, match="GB of memory, more than is free") as error:
+    with pytest.raises(OptionError):
         canvas.check_size(3.13)
-    one_line(error.value)
 
 
 def test_the_one_in_the_middle_is_least_stretched() -> None:

@@ -91,23 +91,20 @@ def test_own_descriptors_take_part_in_matching(
         "return {'keypoints': [[0, 0]], 'scores': [1], 'descriptors': [[1], [2]]}",
     ],
 )
-def test_a_wrong_answer_is_an_error_in_one_line(
-    write: Write, crop: np.ndarray, body: str, one_line
-) -> None:
+def test_a_wrong_answer_is_an_error_in_one_line(write: Write, crop: np.ndarray, body: str) -> None:
     method = plugin_feature(write(f"def find(rgb):\n    {body}") + ":find")
-    with pytest.raises(BaselineError) as caught:
+    with pytest.raises(BaselineError):
         method.detect(crop)
-    one_line(caught.value)
 
 
 @pytest.mark.parametrize("error", ["ValueError('a\\nb')", "ZeroDivisionError()"])
 def test_whatever_a_function_raises_is_an_error_of_the_baseline(
-    write: Write, crop: np.ndarray, error: str, one_line
+    write: Write, crop: np.ndarray, error: str
 ) -> None:
     name = write(f"def find(rgb):\n    raise {error}")
     with pytest.raises(BaselineError, match=error.partition("(")[0]) as caught:
         plugin_feature(f"{name}:find").detect(crop)
-    assert name in one_line(caught.value)
+    assert name in str(caught.value)
 
 
 def test_no_keypoints_are_an_answer(write: Write, crop: np.ndarray) -> None:
@@ -118,14 +115,11 @@ def test_no_keypoints_are_an_answer(write: Write, crop: np.ndarray) -> None:
     assert len(method.describe(crop, found)) == 0
 
 
-@pytest.mark.parametrize(
-    "target", ["no_such_module_of_ours:find", "json:no_such_function", ":dumps", "json:decoder"]
-)
-def test_a_wrong_name_is_an_error_in_one_line(target: str, one_line) -> None:
+@pytest.mark.parametrize("target", ["no_such_module_of_ours:find", "json:decoder"])
+def test_a_wrong_name_is_an_error(target: str) -> None:
     before = list(sys.path)
-    with pytest.raises(OptionError) as caught:
+    with pytest.raises(OptionError, match=target):
         plugin_feature(target)
-    assert target in one_line(caught.value)
     assert sys.path == before
 
 
@@ -135,11 +129,6 @@ def test_the_version_follows_the_modules_file(write: Write) -> None:
     assert plugin_feature(f"{name}:find").version == first
     os.utime(f"{name}.py", ns=(10**18, 10**18))
     assert plugin_feature(f"{name}:find").version != first
-
-
-def test_an_unknown_word_brings_the_nearest_and_the_other_ways() -> None:
-    with pytest.raises(OptionError, match=r"did you mean 'fast-low'.*ONNX.*package"):
-        find_feature("fast_low")
 
 
 Make = Callable[..., Path]
@@ -331,16 +320,15 @@ def test_the_name_is_the_files_and_the_version_its_content(make: Make) -> None:
     assert find_feature(str(moved)).name == "moved"
 
 
-def test_what_is_no_network_is_said(make: Make, tmp_path: Path, one_line) -> None:
+def test_what_is_no_network_is_said(make: Make, tmp_path: Path) -> None:
     text = tmp_path / "text.onnx"
     text.write_text("no network")
     half = tmp_path / "half.onnx"
     half.write_bytes(make().read_bytes()[:200])
     other = make(rename="points", name="other.onnx")
     for path in (tmp_path / "none.onnx", tmp_path, text, half, other):
-        with pytest.raises(WeightsError) as caught:
+        with pytest.raises(WeightsError, match=path.name):
             onnx_feature(path)
-        assert str(path) in one_line(caught.value)
 
 
 def test_descriptors_are_read_up_to_the_border_of_a_coarse_map() -> None:

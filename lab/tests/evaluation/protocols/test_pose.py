@@ -16,7 +16,6 @@ from deepdetect_lab.datasets.posed_images import (
     PosedScene,
     load_posed_scenes,
 )
-from deepdetect_lab.evaluation.baselines.opencv import CLASSICAL
 from deepdetect_lab.evaluation.benchmarks import run_benchmarks
 from deepdetect_lab.evaluation.metrics.pose import rotation_error, translation_error
 from deepdetect_lab.evaluation.options import BenchmarkOptions
@@ -244,16 +243,3 @@ def test_far_points_do_not_lose_their_side() -> None:
 def test_without_enough_matches_there_is_no_pose(count: int) -> None:
     same = np.full((count, 2), 50.0)
     assert estimate_pose(same, same, FIRST, SECOND) is None
-
-
-def test_the_rows_are_those_that_were_chosen(edge_detector: DeepDetect, tmp_path: Path) -> None:
-    def titles(**chosen) -> list[str]:
-        options = BenchmarkOptions(edge_detector, **chosen)
-        return [method.title for method in pose_methods(Run(tmp_path), options)]
-
-    own = ["DeepDetect", "DeepDetect, unguided"]
-    assert titles() == [*own, SIFT, "ORB, ratio 0.8", STRAIGHT_AHEAD]
-    assert titles(classical=()) == [*own, STRAIGHT_AHEAD]
-    assert titles(classical=("sift",), others=(CLASSICAL["sift"], CLASSICAL["brisk"])) == [
-        *(*own, SIFT, "BRISK, ratio 0.8", STRAIGHT_AHEAD)
-    ]

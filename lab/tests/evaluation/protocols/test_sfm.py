@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect import DeepDetect, WeightsError, reconstruct_many
+from deepdetect import DeepDetect, reconstruct_many
 from deepdetect.geometry.camera import PosedView
 from deepdetect.sfm import MultiViewOptions
 from deepdetect_lab.datasets.posed_images import (
@@ -126,16 +126,6 @@ def test_images_of_a_sequence_are_its_first(tmp_path: Path) -> None:
     stems = [[int(i.path.stem) for i in choose_images(s, 5).images] for s in (sequence, unordered)]
     assert stems == [[0, 1, 2, 3, 4], [0, 2, 4, 6, 8]]
     assert len(choose_images(unordered, 20).images) == 9
-
-
-def test_options_choose_the_methods() -> None:
-    detector = DeepDetect()
-    titles = [method.name for method in sfm.sfm_methods(BenchmarkOptions(detector))]
-    assert titles == [POINTS, DENSE, SIFT, REFINED, RANDOM]
-    without = sfm.sfm_methods(BenchmarkOptions(detector, classical=()))
-    assert [method.name for method in without] == [POINTS, DENSE, RANDOM]
-    with pytest.raises(WeightsError, match=r"none\.npz"):
-        sfm.sfm_methods(BenchmarkOptions(detector, ranker="none.npz"))
 
 
 def test_what_cannot_be_reconstructed_is_a_result(

@@ -21,7 +21,6 @@ from deepdetect_lab.evaluation.metrics import repeatability
 from deepdetect_lab.evaluation.metrics.repeatability import mutual_nn_repeatability
 from deepdetect_lab.evaluation.options import BenchmarkOptions
 from deepdetect_lab.evaluation.protocols.standard import (
-    BUDGETS,
     pair_row,
     repeated,
     standard_rows,
@@ -144,27 +143,6 @@ def report(low_visibility_folder: Path, edge_detector: DeepDetect, tmp_path_fact
     options = BenchmarkOptions(edge_detector, ("standard",), ("fast",), (never,))
     cache = tmp_path_factory.mktemp("cache")
     return run_benchmarks(["low-visibility"], low_visibility_folder, options, cache=cache)
-
-
-def test_all_tables_of_the_section_have_all_methods(report: Report) -> None:
-    titles = [
-        *("FAST", "Never works", "DeepDetect, pixels by logits, suppression 3x3, sub-pixel"),
-        "DeepDetect, native resolution, all pixels over 0.5",
-    ]
-    tables = {table.key: table for table in report.tables()}
-    assert list(tables) == [
-        *(f"low_visibility_repeatability_{r}px" for r in (1, 2, 3)),
-        *("low_visibility_matching", "low_visibility_homography", "low_visibility_accuracy"),
-        "low_visibility_coverage",
-    ]
-    for table in tables.values():
-        rows = [row["method"] for row in table.rows]
-        assert len(rows) == 8
-        assert [title for title in titles if title in rows] == titles
-        assert set(table.rows[rows.index("Never works")].values()) <= {"Never works", None, 0}
-    assert len(tables["low_visibility_repeatability_1px"].columns) == 2 + 3 * len(BUDGETS) + 2
-    assert any("Never works" in note for note in report.skipped)
-    assert len(report.sections[0].figures) == 3
 
 
 def test_baselines_are_worth_what_chance_is(report: Report) -> None:

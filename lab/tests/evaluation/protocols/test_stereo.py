@@ -119,15 +119,6 @@ def test_without_a_truth_nothing_is_evaluated(section: Section) -> None:
             assert row["points"] == known[name]["points"]
 
 
-def test_the_weights_are_named_in_rows_of_their_own(data: Path) -> None:
-    second = DeepDetect().weights
-    options = BenchmarkOptions(DeepDetect(), ("paper",), (), geometry_weights=("dense", second))
-    titles = [pipeline.name for pipeline in pipelines(options)]
-    assert titles[:2] == ["ours, weights dense", "ours, weights default"]
-    assert sum(title.startswith("the paper's pipeline") for title in titles) == 2
-    assert len(set(titles)) == len(titles)
-
-
 def test_voxels_are_cubes_with_a_point() -> None:
     camera = Camera((101, 101), 100.0)
     calibration = Calibration(camera, camera, baseline_mm=10)
