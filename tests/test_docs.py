@@ -51,6 +51,6 @@ def test_what_the_page_names_exists(page: Path) -> None:
         names = re.findall(r"(?<![\w/.-])deepdetect(?:\.\w+)+", part)
         if found := re.fullmatch(r"from (deepdetect[\w.]*) import ([\w, ]+)", part):
             names += [f"{found[1]}:{name}" for name in found[2].split(", ")]
-        for name in set(names) - {"deepdetect.onnx"}:
+        for name in set(names) - {"deepdetect.onnx", "deepdetect.commands"}:
             with suppress(MissingExtraError):  # a drop-in without its program
                 pkgutil.resolve_name(re.sub(r"(integrations\.\w+)(\.|$)", r"\1:", name))
