@@ -28,7 +28,7 @@ def matches(
     scores = np.ones(len(points0))
     ends = [Keypoints(xy, scores, size) for xy, size in zip((points0, points1), sizes, strict=True)]
     points = ends[0].xy, ends[1].xy
-    return Matches(*points, scores, np.array(inliers, bool), "none", None, *ends)
+    return Matches(*points, scores, np.array(inliers, bool), *ends)
 
 
 def test_dense_keypoints_colour_their_own_pixels_only() -> None:
@@ -106,9 +106,7 @@ def test_matches_have_the_colour_of_their_position() -> None:
 def test_what_a_notebook_shows_is_small(size: tuple[int, int], count: int) -> None:
     points = keypoints(count, size)
     good = np.arange(count) % 4 > 0
-    crossed = Matches(
-        points.xy, points.xy[::-1], points.scores, good, "none", None, points, points[::-1]
-    )
+    crossed = Matches(points.xy, points.xy[::-1], points.scores, good, points, points[::-1])
     for thing, pictures in ((points, 1), (crossed, 2)):
         text = thing._repr_html_()
         assert len(text) < 20_000
