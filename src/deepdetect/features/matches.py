@@ -263,6 +263,7 @@ class Matches:
         found = np.column_stack([self.indices0, self.indices1])
         return found[(found >= 0).all(axis=1)].astype(np.uint32)
 
+    @suggest_keywords
     def with_geometry(self, found: Geometry, inlier_threshold: float = 1.0) -> Matches:
         """Return the same matches with what `estimate_geometry` has found, judged.
 
