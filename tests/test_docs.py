@@ -15,7 +15,7 @@ from deepdetect.cli._app import make_app
 
 ROOT = Path(__file__).parents[1]
 app = cache(make_app)
-OF_THEIR_TIME = ("CHANGELOG.md", "history.md")
+OF_THEIR_TIME = ("CHANGELOG.md", "HISTORY.md")
 """Pages with names and options as they were."""
 
 PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("src/**/*.md")]

@@ -4,8 +4,6 @@ import json
 
 import pytest
 
-pytest.importorskip("requests", reason="needs requests (pip install '.[data]')")
-
 
 def test_list_names_size_and_licence(run) -> None:
     assert "19,336,861,798" in run("dev", "datasets", "list").output

@@ -9,8 +9,6 @@ from pathlib import Path
 import pytest
 from tests.command_line import run_command
 
-pytest.importorskip("torch", reason="needs torch, which is for training only")
-
 from deepdetect_lab.training import PRESETS
 from deepdetect_lab.training.dense import DenseTrainer
 

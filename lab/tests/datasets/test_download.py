@@ -13,9 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("requests", reason="needs requests (pip install '.[data]')")
-
 from PIL import Image
 
 import deepdetect_lab.datasets.download as download

@@ -71,7 +71,6 @@ def write_kitti_with_a_matrix(folder: Path) -> Path:
 
 
 def write_colmap(folder: Path, model: str = "sparse/0", images: str = "images") -> Path:
-    pytest.importorskip("pycolmap")
     write_images(folder / images, "{:04d}.png")
     place = folder / model
     place.mkdir(parents=True, exist_ok=True)
@@ -276,7 +275,6 @@ def test_the_shared_scenes_are_read(shared: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_satellite_fixes_are_places_in_metres(shared: Path) -> None:
-    pytest.importorskip("pycolmap", reason="needs pycolmap")
     folder = shared / "data" / "lund"
     with pytest.raises(ImageError):
         load_posed_scenes(folder)

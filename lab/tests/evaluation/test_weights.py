@@ -73,7 +73,6 @@ def test_shifted_images_repeat_and_match(folder: Path) -> None:
 @pytest.mark.slow
 def test_the_pretrained_weights_are_as_dense_as_the_paper_s(shared: Path) -> None:
     """All 48 images of Oxford: within 0.04 at each threshold."""
-    pytest.importorskip("torch", reason="needs torch to read the published weights")
     published = shared / "reference" / "published_matching.safetensors"
     squashing = [
         detector.configured(HeatmapOptions(480))

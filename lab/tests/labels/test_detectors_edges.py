@@ -3,6 +3,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from scipy import ndimage
+from skimage import feature
 
 from deepdetect_lab.labels import DETECTORS
 
@@ -41,7 +43,6 @@ def test_canny_a_weak_edge_counts_when_it_continues_a_strong_one(weak: int, mark
 
 
 def test_canny_agrees_with_scikit_image_up_to_a_pixel(gray: np.ndarray) -> None:
-    feature = pytest.importorskip("skimage.feature")
     blurred = cv2.GaussianBlur(gray, (0, 0), 1.5)
     ours = DETECTORS["canny"].mask(blurred, low_threshold=40.0, high_threshold=80.0)
     # scikit-image's gradient is the root of the sum of squares, OpenCV's the (larger) sum.
@@ -66,7 +67,6 @@ def sobel_kernels(size: int) -> tuple[np.ndarray, np.ndarray]:
 def test_sobel_equals_scipy(
     image: str, size: int, share: float, request: pytest.FixtureRequest
 ) -> None:
-    ndimage = pytest.importorskip("scipy.ndimage")
     gray = request.getfixturevalue(image)
     derivative, smooth = sobel_kernels(size)
 

@@ -5,6 +5,8 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 import pytest
+from scipy import ndimage
+from skimage import feature
 
 from deepdetect_lab.labels import DETECTORS
 
@@ -20,7 +22,6 @@ def test_sift_equals_opencv_with_the_published_settings(
 
 
 def test_sift_agrees_with_scikit_image(gray: np.ndarray) -> None:
-    feature = pytest.importorskip("skimage.feature")
     detector = feature.SIFT(upsampling=2, c_dog=0.04 / 3, c_edge=1000)
     detector.detect(gray)
     theirs = np.zeros(gray.shape, np.uint8)
@@ -74,7 +75,6 @@ def test_fast_one_bright_pixel_must_exceed_the_threshold(
 
 @pytest.mark.parametrize("threshold", [1, 13])
 def test_fast_equals_scikit_image(gray: np.ndarray, threshold: int) -> None:
-    feature = pytest.importorskip("skimage.feature")
     expected = feature.corner_fast(gray.astype(np.float64), n=9, threshold=threshold) > 0
     mask = DETECTORS["fast"].mask(gray, threshold=threshold)
     assert expected.sum() > 100
@@ -92,7 +92,6 @@ def harris_reference(
     gray: np.ndarray, k: float, share: float, dilate: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """The mask, and where it hangs on rounding, by SciPy's filters in float64."""
-    ndimage = pytest.importorskip("scipy.ndimage")
     derivative, smooth = [-1, -2, 0, 2, 1], [1, 4, 6, 4, 1]  # Sobel of width 5
     image = gray.astype(np.float64)
 
@@ -151,7 +150,6 @@ def test_shi_tomasi_the_corners_of_a_square(square: np.ndarray) -> None:
 
 
 def test_shi_tomasi_agrees_with_scipy(gray: np.ndarray) -> None:
-    ndimage = pytest.importorskip("scipy.ndimage")
     values = gray.astype(np.float64)
     dx, dy = (ndimage.sobel(values, axis, mode="mirror") for axis in (1, 0))
     a, b, c = (

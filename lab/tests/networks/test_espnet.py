@@ -4,14 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
-
-from deepdetect import DeepDetect, WeightsError  # noqa: E402
-from deepdetect_lab.evaluation.protocols.masks import load_sample, sample_images, score_samples  # noqa: E402
-from deepdetect_lab.networks.espnet import DilatedConvolution, ESPNet, ResidualPyramid  # noqa: E402
-from deepdetect_lab.networks.export import export_onnx  # noqa: E402
-from deepdetect_lab.networks.weights import load_network, save_tensors  # noqa: E402
+from deepdetect import DeepDetect, WeightsError
+from deepdetect_lab.evaluation.protocols.masks import load_sample, sample_images, score_samples
+from deepdetect_lab.networks.espnet import ESPNet, ResidualPyramid
+from deepdetect_lab.networks.export import export_onnx
+from deepdetect_lab.networks.weights import load_network, save_tensors
 
 
 def test_has_exactly_the_published_number_of_parameters() -> None:
@@ -87,22 +86,3 @@ def test_onnx_gives_the_same_probabilities_at_any_size(tmp_path: Path) -> None:
         with torch.inference_mode():
             expected = torch.sigmoid(network(torch.from_numpy(image))).numpy()
         np.testing.assert_allclose(session.run(None, {"image": image})[0], expected, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("dilation", "inputs", "outputs"), [(1, 12, 16), (4, 25, 28), (16, 2, 2), (16, 25, 28)]
-)
-def test_dilated_gradients_in_bfloat16(dilation: int, inputs: int, outputs: int) -> None:
-    torch.manual_seed(dilation)
-    layout = torch.channels_last
-    layer = DilatedConvolution(inputs, outputs, dilation).to(memory_format=layout)
-    x = torch.randn(2, inputs, 40, 36).to(memory_format=layout).requires_grad_()
-    wanted = torch.randn(2, outputs, 40, 36)
-    expected = torch.autograd.grad((layer(x) * wanted).sum(), (x, layer.conv.weight))
-    with torch.autocast("cpu", torch.bfloat16):
-        made = layer(x)
-    assert made.dtype == torch.bfloat16
-    found = torch.autograd.grad((made.float() * wanted).sum(), (x, layer.conv.weight))
-    for a, b in zip(expected, found, strict=True):
-        assert a.dtype == b.dtype
-        assert (a - b).norm() / a.norm() < 0.01, "bfloat16 keeps eight bits"

@@ -5,15 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode
 
-torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
-
-from torch.utils.flop_counter import FlopCounterMode  # noqa: E402
-
-from deepdetect import DeepDetect  # noqa: E402
-from deepdetect.io.image import luma  # noqa: E402
-from deepdetect_lab.networks.fast import Exposure, FastNetwork, Luma  # noqa: E402
-from deepdetect_lab.networks.weights import load_network  # noqa: E402
+from deepdetect import DeepDetect
+from deepdetect.io.image import luma
+from deepdetect_lab.networks.fast import Exposure, FastNetwork, Luma
+from deepdetect_lab.networks.weights import load_network
 
 
 def planes_of(rgb: np.ndarray) -> torch.Tensor:
@@ -79,7 +77,6 @@ def test_the_global_term_sees_the_whole_image(fast_network: FastNetwork) -> None
 def test_onnx_gives_the_same_logits_at_any_size(
     backend: str, size: tuple[int, int], fast_files: tuple[Path, Path], photo: np.ndarray
 ) -> None:
-    pytest.importorskip(backend)
     rgb = photo[: size[0], : size[1]]
     _, found = DeepDetect(fast_files[0], backend=backend, threads=1).heatmap_and_logits(rgb)
     padding = ((0, -size[0] % 8), (0, -size[1] % 8), (0, 0))

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
-
-from deepdetect import OptionError, WeightsError  # noqa: E402
-from deepdetect.detector.pretrained import PRETRAINED  # noqa: E402
-from deepdetect_lab.networks.weights import (  # noqa: E402
+from deepdetect import OptionError, WeightsError
+from deepdetect.detector.pretrained import PRETRAINED
+from deepdetect_lab.networks.weights import (
     NETWORKS,
     average_weights,
     find_weights,
@@ -19,8 +18,8 @@ from deepdetect_lab.networks.weights import (  # noqa: E402
     read_notes,
     save_tensors,
 )
-from deepdetect_lab.training import TrainingOptions  # noqa: E402
-from deepdetect_lab.training.dense import initial_network  # noqa: E402
+from deepdetect_lab.training import TrainingOptions
+from deepdetect_lab.training.dense import initial_network
 
 
 @pytest.mark.parametrize("name", NETWORKS)

@@ -1,13 +1,11 @@
 from __future__ import annotations
 
-import io
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from PIL import Image
+from skimage import data
 
 from deepdetect.io.image import luma
 from deepdetect_lab.labels import (
@@ -52,7 +50,6 @@ def test_other_colors_have_the_same_luma(
 
 @pytest.fixture(scope="module")
 def photos() -> dict[str, np.ndarray]:
-    data = pytest.importorskip("skimage.data", reason="needs scikit-image for its photographs")
     return {
         "astronaut": np.ascontiguousarray(data.astronaut()[::4, ::4]),
         "chelsea": np.ascontiguousarray(data.chelsea()[::3, ::3]),
@@ -139,13 +136,3 @@ def test_views_that_are_not_turned_are_cut_from_the_sizes_asked_for() -> None:
         scales.append(np.linalg.norm(across) / 50)
     assert min(scales) == pytest.approx(1.4, abs=0.1)  # CROP_SCALE of the shorter side
     assert max(scales) == pytest.approx(2, abs=0.1)
-
-
-def test_compression_is_that_of_pillow(photo: np.ndarray) -> None:
-    """Channels in their order: with red and blue swapped the luma would lose more."""
-    file = io.BytesIO()
-    Image.fromarray(photo).save(file, "JPEG", quality=30)
-    expected = np.asarray(Image.open(file)).astype(int)
-    found = augmentation._compress(photo, 30).astype(int)
-    assert np.abs(found - expected).mean() < 2
-    assert np.abs(found - photo).mean() > 2

@@ -3,19 +3,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 
-torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
-
-from safetensors import safe_open  # noqa: E402
-from safetensors.torch import load_file, save_file  # noqa: E402
-
-from deepdetect import WeightsError  # noqa: E402
-from deepdetect_lab.training.checkpoint import (  # noqa: E402
+from deepdetect import WeightsError
+from deepdetect_lab.training.checkpoint import (
     read_checkpoint,
     restore,
     save_checkpoint,
 )
-from deepdetect_lab.training.optim import make_optimizers  # noqa: E402
+from deepdetect_lab.training.optim import make_optimizers
 
 
 def small_network(channels: int = 4) -> torch.nn.Module:

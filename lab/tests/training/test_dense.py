@@ -4,24 +4,22 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
-
-from deepdetect import OptionError  # noqa: E402
-from deepdetect_lab.evaluation.protocols.masks import score_heatmap  # noqa: E402
-from deepdetect_lab.networks.espnet import ESPNet  # noqa: E402
-from deepdetect_lab.networks.fast import FastNetwork  # noqa: E402
-from deepdetect_lab.networks.weights import NETWORKS  # noqa: E402
-from deepdetect_lab.training.dataset import TrainingData  # noqa: E402
-from deepdetect_lab.training.dense import (  # noqa: E402
+from deepdetect import OptionError
+from deepdetect_lab.evaluation.protocols.masks import score_heatmap
+from deepdetect_lab.networks.espnet import ESPNet
+from deepdetect_lab.networks.fast import FastNetwork
+from deepdetect_lab.networks.weights import NETWORKS
+from deepdetect_lab.training.dataset import TrainingData
+from deepdetect_lab.training.dense import (
     DenseTrainer,
     freeze_batch_norm,
     initial_network,
-    launch,
 )
-from deepdetect_lab.training.recipe import DeviceOptions, Stage, TrainingOptions  # noqa: E402
+from deepdetect_lab.training.recipe import DeviceOptions, Stage, TrainingOptions
 
-from .conftest import plain_options  # noqa: E402
+from .conftest import plain_options
 
 PLAIN = DeviceOptions("cpu", "float32", compile=False, threads=1)
 
@@ -32,17 +30,7 @@ def make_trainer(
     """A trainer of 150 steps without warm-up, at a learning rate of 0.1 falling to nothing."""
     values = {"stages": (Stage(16, 1, 150),), "learning_rate": 0.1, **options}
     data, recipe = TrainingData([None], [None], ""), plain_options(**values)
-    return DenseTrainer(network, recipe, data, device, launch(device, recipe))
-
-
-@pytest.mark.parametrize("frozen", [False, True])
-def test_processes_are_refused_before_they_join(
-    frozen: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("TORCHELASTIC_RUN_ID", "WORLD_SIZE", "LOCAL_WORLD_SIZE"):
-        monkeypatch.setenv(name, "3")
-    with pytest.raises(OptionError):
-        launch(PLAIN, TrainingOptions(frozen_batch_norm=frozen))
+    return DenseTrainer(network, recipe, data, device)
 
 
 class Constant(torch.nn.Module):
@@ -157,7 +145,7 @@ def gradients(trainer: DenseTrainer, images: torch.Tensor, truth: torch.Tensor) 
     trainer.network.train()
     trainer.network.zero_grad()
     loss = torch.nn.functional.binary_cross_entropy_with_logits(trainer.logits(images), truth)
-    trainer.fabric.backward(loss)
+    loss.backward()
     return [parameter.grad.clone() for parameter in trainer.network.parameters()]
 
 

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
+import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
-resource = pytest.importorskip("resource", reason="needs a limit on the size of files")
-
-from deepdetect import DeepDetectError  # noqa: E402
-from deepdetect.detector.points.ranker import load_ranker  # noqa: E402
-from deepdetect_lab.networks.espnet import ESPNet  # noqa: E402
-from deepdetect_lab.networks.export import export_onnx  # noqa: E402
-from deepdetect_lab.networks.weights import save_tensors  # noqa: E402
-from deepdetect_lab.training.checkpoint import save_checkpoint  # noqa: E402
-from deepdetect_lab.training.points.task import save_ranker  # noqa: E402
+from deepdetect import DeepDetectError
+from deepdetect.detector.points.ranker import load_ranker
+from deepdetect_lab.networks.espnet import ESPNet
+from deepdetect_lab.networks.export import export_onnx
+from deepdetect_lab.networks.weights import save_tensors
+from deepdetect_lab.training.checkpoint import save_checkpoint
+from deepdetect_lab.training.points.task import save_ranker
 
 
 @contextmanager

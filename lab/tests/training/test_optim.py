@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
-
-from deepdetect_lab.networks.espnet import ESPNet  # noqa: E402
-from deepdetect_lab.training.optim import Muon, Soap, make_optimizers  # noqa: E402
+from deepdetect_lab.networks.espnet import ESPNet
+from deepdetect_lab.training.optim import Muon, Soap, make_optimizers
 
 
 def ill_conditioned(size: int = 6) -> tuple[torch.Tensor, torch.Tensor]:

@@ -6,11 +6,9 @@ from unittest.mock import Mock
 
 import pytest
 
-pytest.importorskip("torch", reason="needs torch, which is for training only")
-
-
 from deepdetect_lab.training import (
     train_descriptor,
+    train_match_filter,
     train_points,
 )
 
@@ -21,6 +19,7 @@ from deepdetect_lab.training import (
     [
         (train_points, "points.task.RankerTrainer"),
         (train_descriptor, "descriptor.task.DescriptorTrainer"),
+        (train_match_filter, "match_filter.MatchFilterTrainer"),
     ],
 )
 def test_pictures_of_validation_and_of_the_run_are_not_trained_on(

@@ -4,13 +4,9 @@ import dataclasses
 
 import numpy as np
 import pytest
-
-pytest.importorskip("torch", reason="needs torch, which is for training only")
-
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deepdetect import OptionError
 from deepdetect_lab.training.recipe import Stage
 from deepdetect_lab.training.sampler import CropSampler, Schedule, epoch_order
 
@@ -81,15 +77,6 @@ def test_a_sampler_starts_at_any_step() -> None:
     whole = list(CropSampler(schedule))
     assert list(CropSampler(schedule, first_step=3)) == whole[3:]
     assert list(CropSampler(schedule, first_step=2, last_step=7)) == whole[2:7]
-
-
-def test_processes_share_each_batch() -> None:
-    schedule = Schedule(OPTIONS, 10)
-    halves = [CropSampler(schedule, rank=rank, world_size=2) for rank in range(2)]
-    for batch, first, second in zip(CropSampler(schedule), *halves, strict=True):
-        assert batch == first + second
-    with pytest.raises(OptionError):
-        CropSampler(schedule, world_size=3)
 
 
 @given(sizes=st.lists(st.integers(1, 5), min_size=1, max_size=14), epoch=st.integers(0, 3))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import webdataset
 
 from deepdetect import ImageError, OptionError
 from deepdetect._shared.errors import BatchError
@@ -51,7 +52,6 @@ def test_every_image_is_in_one_place(
 
 def test_webdataset_reads_the_same(shards: Shards, source: ShardSource) -> None:
     """The layout is that of WebDataset, so other programs can read the shards."""
-    webdataset = pytest.importorskip("webdataset", reason="needs webdataset")
     index = 0
     for path, _ in shards.training:
         with path.open("rb") as file:

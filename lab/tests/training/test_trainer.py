@@ -13,30 +13,28 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import load_file
 
-torch = pytest.importorskip("torch", reason="needs torch, which is for training only")
-
-from safetensors.torch import load_file  # noqa: E402
-
-from deepdetect import DeepDetect, OptionError, WeightsError  # noqa: E402
-from deepdetect.detector.pretrained import pretrained_weights  # noqa: E402
-from deepdetect_lab.labels import LabelOptions  # noqa: E402
-from deepdetect_lab.networks.espnet import ESPNet  # noqa: E402
-from deepdetect_lab.networks.weights import (  # noqa: E402
+from deepdetect import DeepDetect, OptionError, WeightsError
+from deepdetect_lab.labels import LabelOptions
+from deepdetect_lab.networks.espnet import ESPNet
+from deepdetect_lab.networks.weights import (
     average_weights,
+    find_weights,
     load_network,
     read_notes,
     save_tensors,
     weights_digest,
 )
-from deepdetect_lab.training import trainer as trainer_module  # noqa: E402
-from deepdetect_lab.training.checkpoint import read_checkpoint  # noqa: E402
-from deepdetect_lab.training.dense import DenseTrainer, initial_network  # noqa: E402
-from deepdetect_lab.training.recipe import DeviceOptions, Stage, TrainingOptions  # noqa: E402
-from deepdetect_lab.training.run import train  # noqa: E402
-from deepdetect_lab.training.trainer import TrainingResult  # noqa: E402
+from deepdetect_lab.training import trainer as trainer_module
+from deepdetect_lab.training.checkpoint import read_checkpoint
+from deepdetect_lab.training.dense import DenseTrainer, initial_network
+from deepdetect_lab.training.recipe import DeviceOptions, Stage, TrainingOptions
+from deepdetect_lab.training.run import train
+from deepdetect_lab.training.trainer import TrainingResult
 
-from .conftest import plain_options  # noqa: E402
+from .conftest import plain_options
 
 PLAIN = DeviceOptions("cpu", "float32", compile=False, threads=1)
 OPTIONS = plain_options(
@@ -124,7 +122,9 @@ def test_a_run_writes_weights_and_curves(run: Path) -> None:
     assert [int(row["step"]) for row in rows] == [round(STEPS * k / 3) for k in (1, 2, 3)]
     assert len({row["training_loss"] for row in rows}) == 3
     image = np.random.default_rng(0).integers(0, 256, (40, 56, 3), np.uint8)
-    torch_map = DeepDetect(run / "best.safetensors").heatmap(image)
+    with torch.inference_mode():
+        planes = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255
+        torch_map = load_network(run / "best.safetensors")(planes)[0, 0].sigmoid()
     onnx_map = DeepDetect(run / "deepdetect.onnx", backend="onnxruntime").heatmap(image)
     np.testing.assert_allclose(torch_map, onnx_map, atol=1e-4)
 
@@ -204,7 +204,7 @@ def test_missing_best_weights_are_told(run: Path, tmp_path: Path, fit) -> None:
 def test_trained_weights_keep_their_batch_statistics_and_learn(
     tmp_path: Path, fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    start = pretrained_weights("espnet", ".safetensors")
+    start = find_weights("espnet")
     fit(tmp_path / "moved", TINY, init_weights="espnet")
     before, after = load_file(start), load_file(tmp_path / "moved" / "best.safetensors")
     kept = {name for name in before if torch.equal(before[name], after[name])}
@@ -323,24 +323,3 @@ def test_own_images_and_settings_from_the_pretrained_weights(
     image = photographs / "photo00.png"
     tuned = DeepDetect(tmp_path / "run" / "deepdetect.onnx").detect(image)
     assert 0 < len(tuned) < len(DeepDetect().detect(image)), "fewer corners are wanted"
-
-
-@pytest.mark.slow
-def test_two_processes_train_as_one(photographs: Path, labels: Path, tmp_path: Path) -> None:
-    """With the batch statistics of the initial weights, which need no sums over processes."""
-    rows = {}
-    for count in (1, 2):
-        torchrun = ["-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={count}"]
-        arguments = command(
-            photographs, tmp_path / str(count), labels, "--preset", "espnet", "--init", "espnet"
-        )
-        arguments[1:1] = torchrun if count > 1 else []
-        arguments += ["--device", "cpu", "--learning-rate", "0.0003"]
-        subprocess.run(arguments, check=True, capture_output=True, timeout=300)
-        text = (tmp_path / str(count) / "curves.csv").read_text()
-        rows[count] = list(csv.DictReader(text.splitlines()))
-    assert len(rows[1]) == len(rows[2]) == 8
-    for one, two in zip(rows[1], rows[2], strict=True):
-        assert one["images"] == two["images"]
-        for name in ("training_loss", "validation_loss"):
-            assert float(one[name]) == pytest.approx(float(two[name]), abs=1e-4)

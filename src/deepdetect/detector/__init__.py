@@ -1,4 +1,4 @@
-"""The detector: the network, its heat map and its keypoints."""
+"""The detectors: dense keypoints from the network's heat map, and ranked points."""
 
 import lazy_loader
 

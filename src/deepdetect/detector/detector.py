@@ -27,13 +27,13 @@ from .heatmap import HeatmapOptions, compute_maps, memory_named
 from .pretrained import PRETRAINED, resolve_weights
 
 CHANNELS_OF_IMAGES = (
-    "give it with each image, as detect(image, channels='bgr'); what the network itself is fed is "
+    "give it with each image, as in detect(image, channels='bgr'); the network's own input is "
     "`network_channels`"
 )
 
 
 class Detector(Protocol):
-    """What finds keypoints, as `DeepDetect` and `PointDetector` do."""
+    """Anything that finds keypoints, such as `DeepDetect` and `PointDetector`."""
 
     def detect(
         self, image: Any, *, ignore: np.ndarray | None = None, channels: Channels = "rgb"
@@ -42,7 +42,7 @@ class Detector(Protocol):
 
 
 class HeatmapDetector(Protocol):
-    """What gives a heat map, of which keypoints can be selected."""
+    """Anything that gives a heat map from which keypoints can be selected."""
 
     def heatmap(self, image: Any) -> np.ndarray:
         """Map an image to a (H, W) float32 probability of a keypoint."""
@@ -54,36 +54,37 @@ AnyDetector = Detector | HeatmapDetector
 class DeepDetect:
     """The dense keypoint detector of the paper.
 
-    Its keypoints are pixels of the network's heat map. `PointDetector` finds a few thousand better
-    points than the best of these pixels, without the network.
+    Its keypoints are pixels of the network's heat map. If you want a few thousand keypoints,
+    `PointDetector` finds better ones than the best of these pixels, without the network.
 
     Args:
-        weights: "default", "dense", "free" or "espnet", the weights inside the package; or an ONNX
-            file.
-        max_keypoints: at most this many of an image, the most probable pixels. None: all over the
-            threshold. Of a few thousand, `PointDetector` finds better ones.
-        resolution: "auto" (the image as it is up to two megapixels, larger ones scaled down to
-            that), "native" (always as it is), or a number of pixels: the image is squashed to a
-            square of that side, as the paper does with 480.
+        weights: name of bundled weights ("default", "dense", "free" or "espnet"), or an ONNX file.
+        max_keypoints: maximum number of keypoints per image, the most probable pixels. None: all
+            above the threshold. For a few thousand, `PointDetector` finds better ones.
+        resolution: "auto" (images over two megapixels are scaled down to that), "native" (images
+            keep their size), or a number of pixels: the image is squashed to a square of that side,
+            as in the paper with 480.
         backend: "auto" (ONNX Runtime, OpenVINO for bfloat16), "onnxruntime" or "openvino".
-        device: "cpu", or "cuda" or the name of any execution provider of ONNX Runtime.
+        device: "cpu", "cuda", or the name of any execution provider of ONNX Runtime.
         threads: number of threads. None: the backend's choice.
-        precision: what the network computes with, "float32", or "bfloat16" with OpenVINO: faster on
-            processors with instructions for it; a few keypoints differ, and there are no tiles.
-        network_channels: "rgb", or "bgr" as the paper's published code feeds the network. For
-            images of OpenCV leave it, and give the methods `channels="bgr"`.
-        tta: "flip": a flipped or turned image gives the same keypoints of the heat map, in eight
-            times the time.
-        tile_megapixels: with `resolution="native"`, the size of the tiles of larger images, in
-            megapixels: less memory, about twice the time. "auto": tiles only if memory is short.
-            Only weights of the network `fast` can be tiled.
+        precision: number format of the network, "float32", or "bfloat16" with OpenVINO, which is
+            faster on processors with instructions for it; a few keypoints differ, and tiles are not
+            available.
+        network_channels: order of the colours in the network's input: "rgb", or "bgr" as in the
+            paper's published code. For images of OpenCV keep "rgb", and call the methods with
+            `channels="bgr"`.
+        tta: "flip" averages over flips and quarter turns, so that a flipped or rotated image has
+            the same keypoints, in eight times the time.
+        tile_megapixels: size of the tiles of larger images in megapixels, with resolution "native":
+            less memory, about twice the time. "auto": tiles only if memory is short. Only weights
+            of the network `fast` can be tiled.
 
     Attributes:
-        backend: name of the backend that runs.
-        heatmap_options: how images are shown to the network.
+        backend: name of the backend in use.
+        heatmap_options: how images are prepared for the network.
 
     Raises:
-        WeightsError: the weights are missing, damaged or do not fit.
+        WeightsError: the weights are missing, damaged or unsuitable.
         OptionError: an option is unknown or out of its range.
         MissingExtraError: the backend is not installed.
 
@@ -123,14 +124,14 @@ class DeepDetect:
 
     @classmethod
     def from_pretrained(cls, folder: str | Path, **options: Any) -> Self:
-        """Load the network of a folder, as `train` and the model hub have them: deepdetect.onnx.
+        """Load the network `deepdetect.onnx` of a folder, as `train` and model hubs write it.
 
         Args:
             folder: a folder on this computer; nothing is downloaded.
-            **options: as of `DeepDetect`.
+            **options: options of `DeepDetect`.
 
         Raises:
-            WeightsError: the folder or its deepdetect.onnx is missing, damaged or does not fit.
+            WeightsError: the folder or its deepdetect.onnx is missing, damaged or unsuitable.
 
         Example:
             >>> DeepDetect.from_pretrained("run/", resolution="native")  # doctest: +SKIP
@@ -141,19 +142,19 @@ class DeepDetect:
         return {name: value for name, value in vars(self).items() if name != "_network"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        # Another process opens the network itself; names of weights are the same on all machines.
+        # Another process opens the network again, by names that are the same on all machines.
         vars(self).update(state, weights=resolve_weights(state["_portable"]))
         self._network, self.backend = open_network(self.weights, self._runtime)
 
     @property
     def runtime(self) -> str:
-        """What runs the network, as "openvino" or "openvino, bfloat16": results depend on it."""
+        """What runs the network, such as "openvino, bfloat16": results depend on it."""
         precision = self._runtime.precision
         return self.backend if precision == "float32" else f"{self.backend}, {precision}"
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What its heat maps depend on besides the image: the digest of the weights, options."""
+        """What its heat maps depend on besides the image: the weights' digest, and options."""
         return {
             "detector": "network",
             "max_keypoints": self.max_keypoints,
@@ -171,7 +172,7 @@ class DeepDetect:
 
     @suggest_keywords
     def with_weights(self, weights: str | Path) -> DeepDetect:
-        """Return a detector with other weights, and all other options as they are."""
+        """Return a detector with other weights and the same options."""
         options = vars(self._runtime) | vars(self.heatmap_options)
         return DeepDetect(weights, max_keypoints=self.max_keypoints, **options)
 
@@ -182,14 +183,14 @@ class DeepDetect:
         Args:
             image: a path, a PIL image, or an array or PyTorch tensor: uint8, uint16 or float in
                 [0, 1]; grey, RGB or RGBA; channels last or first.
-            channels: the order of the colours in arrays and tensors: "bgr" for the images of
+            channels: order of the colours in arrays and tensors: "rgb", or "bgr" for images of
                 `cv2.imread`.
 
         Returns:
             (H, W) float32 in [0, 1], at the image's own size.
 
         Raises:
-            ImageError: the image cannot be read or is not fit.
+            ImageError: the image cannot be read or is unsuitable.
         """
         return self.heatmap_and_logits(image, channels=channels)[0]
 
@@ -197,19 +198,19 @@ class DeepDetect:
     def heatmap_and_logits(
         self, image: Any, *, channels: Channels = "rgb"
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Compute the heat map and the logits of its probabilities, of one image.
+        """Compute the heat map and the logits of its probabilities for one image.
 
-        Float32 rounds the highest probabilities to 1; the logits still distinguish these pixels. Of
-        both `select_keypoints` selects, with other options, what `detect` would find.
+        Float32 rounds the highest probabilities to 1; logits still distinguish these pixels. From
+        both `select_keypoints` selects what `detect` finds, with any options.
 
         Args:
-            image, channels: as of `heatmap`.
+            image, channels: see `heatmap`.
 
         Returns:
-            The heat map and the logits, (H, W) float32 both.
+            The heat map and the logits, (H, W) float32 each.
 
         Raises:
-            ImageError: the image cannot be read or is not fit.
+            ImageError: the image cannot be read or is unsuitable.
         """
         rgb = load_image(image, channels=channels)
         with memory_named(rgb.shape):
@@ -228,26 +229,25 @@ class DeepDetect:
         ignore: np.ndarray | None = None,
         channels: Channels = "rgb",
     ) -> Keypoints:
-        """Detect the dense keypoints of an image: pixels with a probability over the threshold.
+        """Detect the dense keypoints of an image: pixels with a probability above the threshold.
 
         Args:
-            image: as of `heatmap`.
-            threshold: tau: pixels with a probability above it.
-            density: wanted keypoints per pixel, in (0, 1], instead of the threshold. This many
-                are returned even where there is little to detect.
-            max_keypoints: at most this many, the most probable pixels. None: as many as the
-                detector was made for.
-            nms_radius: of non-maximum suppression in pixels (0: none).
+            image: see `heatmap`.
+            threshold: minimum probability of a keypoint (tau in the paper).
+            density: keypoints per pixel, in (0, 1], instead of a threshold. This many are returned
+                even if there is little to detect.
+            max_keypoints: maximum number, the most probable pixels. None: that of the detector.
+            nms_radius: radius of non-maximum suppression in pixels (0: none).
             subpixel: refine positions to a fraction of a pixel.
             ignore: (H, W) array, true where no keypoint is wanted.
-            channels: as of `heatmap`.
+            channels: see `heatmap`.
 
         Returns:
-            The keypoints in the order of rows and columns, on pixel centres unless `subpixel`, with
-            probabilities as scores.
+            The keypoints in row-major order, on pixel centres unless `subpixel`, with probabilities
+            as scores.
 
         Raises:
-            ImageError: the image cannot be read or is not fit.
+            ImageError: the image cannot be read or is unsuitable.
             OptionError: an option is out of its range, or the mask has another size.
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
@@ -270,14 +270,14 @@ class DeepDetect:
 
         Args:
             images: in a list, a tuple or an array of four dimensions; their sizes may differ.
-            threshold, density, max_keypoints, nms_radius, subpixel, channels: as of `detect`.
+            threshold, density, max_keypoints, nms_radius, subpixel, channels: see `detect`.
             ignore: a mask for each image, or None, in a list or a tuple; or one array for all.
 
         Returns:
-            The keypoints of each, in their order.
+            The keypoints of each image, in the order of the images.
 
         Raises:
-            ImageError: an image cannot be read or is not fit.
+            ImageError: an image cannot be read or is unsuitable.
             OptionError: an option is out of its range, or a mask has another size.
         """
         options = SelectionOptions(threshold, density, max_keypoints, nms_radius, subpixel)
@@ -303,14 +303,15 @@ class DeepDetect:
         """Detect the dense keypoints of an image, and describe them by RootSIFT.
 
         Args:
-            image, threshold, density, max_keypoints, nms_radius, subpixel, ignore, channels: as of
+            image, threshold, density, max_keypoints, nms_radius, subpixel, ignore, channels: see
                 `detect`.
 
         Returns:
-            As `detect`, with (N, 128) uint8 descriptors, all of size 3 and upright as in the paper.
+            The keypoints as from `detect`, with (N, 128) uint8 descriptors, all of size 3 and
+            upright as in the paper.
 
         Raises:
-            ImageError: the image cannot be read or is not fit.
+            ImageError: the image cannot be read or is unsuitable.
             OptionError: an option is out of its range, or the mask has another size.
         """
         rgb = load_image(image, channels=channels)
@@ -324,7 +325,7 @@ class DeepDetect:
             options = replace(options, max_keypoints=self.max_keypoints)
         with memory_named(rgb.shape):
             maps = compute_maps(rgb, self._network, self.heatmap_options)
-            del rgb  # the keypoints need the room
+            del rgb  # frees memory for the keypoints
             return select_from_maps(maps, options, ignore)
 
     def __repr__(self) -> str:
@@ -336,10 +337,10 @@ class DeepDetect:
 
 
 def check_selection(detector: AnyDetector, selection: SelectionOptions | None) -> None:
-    """Raise an OptionError where pixels are to be selected of a detector without a heat map."""
+    """Raise an OptionError if pixels are to be selected but the detector has no heat map."""
     if selection is not None and not hasattr(detector, "heatmap"):
         raise OptionError(
-            "`selection` is of detectors with a heat map: leave it out, or take a DeepDetect"
+            "`selection` needs a detector with a heat map: leave it out, or use a DeepDetect"
         )
 
 
@@ -349,19 +350,19 @@ def find_keypoints(
     selection: SelectionOptions | None = None,
     ignore: np.ndarray | None = None,
 ) -> Keypoints:
-    """Find the keypoints of a (H, W, 3) uint8 image, ranked by logits where it has any.
+    """Find the keypoints of a (H, W, 3) uint8 image, ranked by logits if it has any.
 
-    The detector may be anything with a method `heatmap` or `detect`, as those of this package have.
-    The selection is of pixels of a heat map; None takes those over 0.5.
+    The detector may be any object with a method `heatmap` or `detect` like those of this package.
+    The selection applies to pixels of a heat map; None takes those above 0.5.
     """
     check_selection(detector, selection)
     if not (hasattr(detector, "heatmap") or hasattr(detector, "detect")):
-        raise OptionError(f"the detector {detector!r} has no method detect: give a DeepDetect")
+        raise OptionError(f"the detector {detector!r} has no method detect: use a DeepDetect")
     if hasattr(detector, "detect") and not hasattr(detector, "heatmap"):
         found = detector.detect(rgb, ignore=ignore)
         if not ((found.xy >= -0.5) & (found.xy < np.array(rgb.shape[1::-1]) - 0.5)).all():
             raise OptionError(
-                "the detector has found keypoints outside of the image: correct its method detect"
+                "the detector has found keypoints outside the image: correct its method detect"
             )
         return found
     options = selection or SelectionOptions()
@@ -370,7 +371,7 @@ def find_keypoints(
     heatmap = detector.heatmap(rgb)
     if np.shape(heatmap) != rgb.shape[:2] or not np.isfinite(heatmap).all():
         raise OptionError(
-            f"the detector's heat map must be {rgb.shape[:2]} finite probabilities, one per "
-            f"pixel, and has shape {np.shape(heatmap)}: correct its method heatmap"
+            f"the detector's heat map must be finite and of shape {rgb.shape[:2]}, but its shape "
+            f"is {np.shape(heatmap)}: correct its method heatmap"
         )
     return select_keypoints(np.asarray(heatmap), options, ignore=ignore)

@@ -1,4 +1,4 @@
-"""From an image to a heat map: for each pixel, the probability of a keypoint."""
+"""From an image to a heat map: the probability of a keypoint for each pixel."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from .pretrained import STRIDE
 from .tiling import BYTES_PER_PIXEL, open_tiled
 
 MAX_AUTO_PIXELS = 2_000_000
-"""Size of the largest image that the resolution "auto" takes as it is."""
+"""The resolution "auto" keeps images up to this size: finer pixels mostly show blur and noise."""
 
 RELEASE_PIXELS = 20_000_000
-"""Above this size the maps need the memory that the network keeps; below it is not worth it."""
+"""Larger images release the network's memory before maps are computed; smaller ones need not."""
 
 MIN_TILE_MEGAPIXELS = 1.5
-"""Smaller tiles would be mostly overlap."""
+"""Smaller tiles would consist mostly of overlap."""
 
 Run = Callable[[np.ndarray], np.ndarray]
 """Maps an image, (H, W, 3) uint8, to its (H, W) logits."""
@@ -37,16 +37,16 @@ Run = Callable[[np.ndarray], np.ndarray]
 @suggest_keywords
 @dataclass(frozen=True)
 class HeatmapOptions:
-    """How an image is shown to the network: the options of `DeepDetect` of these names.
+    """How an image is prepared for the network: the options of `DeepDetect` of these names.
 
     Attributes:
-        resolution: "native", a number of pixels, or "auto", which scales larger images down since
-            their finest pixels show blur and noise more than structure, and the network needs
+        resolution: "native", a number of pixels, or "auto", which scales larger images down because
+            their finest pixels show blur and noise rather than structure, and the network needs
             seconds and gigabytes for them.
-        network_channels: "rgb"; "bgr" is what the paper's published code feeds, though the weights
-            were trained on RGB. It says nothing of the images that are given.
-        tta: "none"; "flip" takes the mean of the logits in eight flips and quarter turns.
-        tile_megapixels: from 1.5 on; "auto": 2.7 where the image is too large for the free memory.
+        network_channels: "rgb", or "bgr" as in the paper's published code, although the weights
+            were trained on RGB. It does not describe the input images.
+        tta: "none", or "flip": the mean of the logits over eight flips and quarter turns.
+        tile_megapixels: 1.5 or more; "auto": 2.7 if the image is too large for the free memory.
             Only ONNX weights of the network `fast` can be tiled.
 
     Raises:
@@ -74,13 +74,13 @@ class HeatmapOptions:
 
 
 def is_native(shape: tuple[int, ...], options: HeatmapOptions) -> bool:
-    """Return whether the network sees an image of a shape (H, W, ...) at its own size."""
+    """Return whether the network sees an image of shape (H, W, ...) at its own size."""
     small = shape[0] * shape[1] <= MAX_AUTO_PIXELS
     return options.resolution == "native" or (options.resolution == "auto" and small)
 
 
 def seen_size(shape: tuple[int, ...], options: HeatmapOptions) -> tuple[int, int]:
-    """Return the width and height at which the network sees an image of a shape (H, W, ...)."""
+    """Return the width and height at which the network sees an image of shape (H, W, ...)."""
     height, width = shape[:2]
     if is_native(shape, options):
         return width, height
@@ -96,8 +96,8 @@ def compute_maps(
 ) -> Maps:
     """Run the network on a (H, W, 3) uint8 RGB image.
 
-    The maps are at the image's own pixels: a scaled one is enlarged when a map is asked for. A
-    constant image holds nothing to detect: its map is 0.
+    The maps have the image's own pixels; those of a scaled image are enlarged on access. A constant
+    image has nothing to detect: its map is 0.
     """
     shape = rgb.shape[:2]
     if all((rgb[rows] == rgb[0, 0]).all() for rows in bands(rgb.shape)):
@@ -113,7 +113,7 @@ def compute_maps(
 
 @contextmanager
 def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
-    """Make lack of memory, in work on an image of this shape, an error of one sentence."""
+    """Turn lack of memory, during work on an image of this shape, into a clear error."""
     try:
         yield
     except Exception as error:
@@ -126,7 +126,7 @@ def memory_named(shape: tuple[int, ...]) -> Iterator[None]:
 
 
 def _seen(rgb: np.ndarray, options: HeatmapOptions) -> np.ndarray:
-    """Return an image with the size and the order of channels that the network sees."""
+    """Return an image with the size and channel order that the network sees."""
     seen = rgb if options.network_channels == "rgb" else rgb[:, :, ::-1]
     if is_native(rgb.shape, options):
         return seen
@@ -137,7 +137,7 @@ def _seen(rgb: np.ndarray, options: HeatmapOptions) -> np.ndarray:
 
 
 def _enlarged(logits: np.ndarray, shape: tuple[int, ...]) -> Maps:
-    """Return the maps of an image of a shape (H, W), of the logits of a scaled one."""
+    """Return the maps for an image of shape (H, W) from the logits of a scaled one."""
 
     def enlarged(map_: np.ndarray) -> np.ndarray:
         return cv2.resize(map_, shape[::-1], interpolation=cv2.INTER_CUBIC)
@@ -150,8 +150,8 @@ def _enlarged(logits: np.ndarray, shape: tuple[int, ...]) -> Maps:
 
 
 def _tiled(network: Network, shape: tuple[int, ...], options: HeatmapOptions) -> Run | None:
-    """Return what runs the network in tiles, or None for an image that is run whole."""
-    path = getattr(network, "onnx_path", None)  # torch, bfloat16 and others run whole
+    """Return a function that runs the network in tiles, or None if the image is run as a whole."""
+    path = getattr(network, "onnx_path", None)  # torch, bfloat16 and others cannot be tiled
     area = None if options.tile_megapixels == "auto" else float(options.tile_megapixels)
     most = available_memory() / BYTES_PER_PIXEL if area is None else area * 1e6
     if not is_native(shape, options) or shape[0] * shape[1] <= most:
@@ -168,7 +168,7 @@ def _tiled(network: Network, shape: tuple[int, ...], options: HeatmapOptions) ->
 
 
 def _run(network: Network, rgb: np.ndarray) -> np.ndarray:
-    """Return the (H, W) logits of an image, which is padded to multiples of 8."""
+    """Return the (H, W) logits of an image, padded to multiples of 8 for the network."""
     height, width = rgb.shape[:2]
     planes = np.empty((1, 3, height + -height % STRIDE, width + -width % STRIDE), np.float32)
     fill_planes(rgb, planes[0])

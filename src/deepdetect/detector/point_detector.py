@@ -29,39 +29,38 @@ from .pretrained import RANKER
 
 @runtime_checkable
 class Descriptor(Protocol):
-    """What describes keypoints, as `PointDetector` does."""
+    """Anything that describes keypoints, such as `PointDetector`."""
 
     def describe(self, image: Any, keypoints: Keypoints) -> Keypoints:
         """Return the keypoints of an image with descriptors and their type."""
 
 
 class PointDetector:
-    """The best keypoints of all scales, ranked by how surely they are found again.
+    """The best keypoints of all scales, ranked by how likely they are to be found again.
 
-    They are maxima of |det Hessian|, which a small trained network ranks; the network of
-    `DeepDetect` is not run. Where a few thousand keypoints are wanted they are better than the best
-    pixels of its heat map.
+    Keypoints are maxima of |det Hessian|, ranked by a small trained network; the network of
+    `DeepDetect` is not used. A few thousand of them beat the best pixels of its heat map.
 
     Args:
-        max_keypoints: at most this many; None: all.
-        spread: "none": the best; "grid": the best of each cell of a grid in turn; "anms": the best
-            that lie as far apart as their number allows.
-        resolution: "auto" (the image as it is up to two megapixels, larger ones scaled down to
-            that) or "native" (always as it is).
-        ranker: npz file of `deepdetect dev train-points` that ranks the points. None: the one
-            inside the package.
-        descriptor: what `extract` computes: "learned", by a small network that also sees the
+        max_keypoints: maximum number of keypoints; None: all.
+        spread: "none" takes the best, "grid" the best of each cell of a grid in turn, "anms" the
+            best that lie as far apart as their number allows.
+        resolution: "auto" (images over two megapixels are scaled down to that) or "native" (images
+            keep their size).
+        ranker: npz file of `deepdetect dev train-points` that ranks the points. None: the bundled
+            one.
+        descriptor: type of the descriptors: "learned", by a small network that also sees the
             surroundings of a keypoint; "learned-free", by one trained only on freely licensed
             images; "cross-modal", for images of different sensors, such as infrared and visible
-            light, or a map; the ONNX file of `deepdetect train-descriptor`; "rootsift", for
-            programs that expect SIFT's; or an object with a method `describe(image, keypoints)`
+            light, or a map; the ONNX file of `deepdetect train-descriptor`; or "rootsift", for
+            programs that expect SIFT's. Or an object with a method `describe(image, keypoints)`
             that returns the keypoints with descriptors, as `PointDetector.describe` does.
-        backend, device, precision: as of `DeepDetect`; points run with ONNX Runtime on the CPU in
-            float32, and refuse others.
-        threads: largest number of threads. None: one for each processor.
+        backend, device, precision: for the same call as `DeepDetect`; points only run with ONNX
+            Runtime on the CPU in float32, and other values are errors.
+        threads: maximum number of threads. None: one per processor.
 
     Raises:
-        WeightsError: the ranker or the descriptor is missing, damaged or does not fit.
+        WeightsError: the ranker or the descriptor is missing, damaged or unsuitable.
         OptionError: an option is unknown or out of its range.
 
     Example:
@@ -94,7 +93,7 @@ class PointDetector:
         ):
             if value not in known:
                 raise OptionError(
-                    f"`{name}={value!r}` cannot be had for points: leave it out, or take a "
+                    f"`{name}={value!r}` is not available for points: leave it out, or use a "
                     "DeepDetect"
                 )
         check_ranges(RuntimeOptions(threads=threads), counts=("threads",))
@@ -119,7 +118,7 @@ class PointDetector:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What its keypoints depend on besides the image: options, the digest of the ranker."""
+        """What its keypoints depend on besides the image: options, and the ranker's digest."""
         return {
             "detector": "points",
             "ranker": file_digest(self.ranker),
@@ -141,16 +140,16 @@ class PointDetector:
 
         Args:
             image: anything `load_image` takes.
-            max_keypoints: at most this many. None: as many as the detector was made for.
+            max_keypoints: maximum number. None: that of the detector.
             ignore: (H, W) array, true where no keypoint is wanted.
-            channels: order of the colours in arrays and tensors, as of `load_image`.
+            channels: order of the colours in arrays and tensors: "rgb", or "bgr" as in OpenCV.
 
         Returns:
             The keypoints, best first, with sub-pixel positions, sizes and angles. Their scores rank
-            them, and are no probabilities.
+            them, but are not probabilities.
 
         Raises:
-            ImageError: the image cannot be read or is not fit.
+            ImageError: the image cannot be read or is unsuitable.
             OptionError: an option is out of its range, or the mask has another size than the image.
         """
         return self._find(load_image(image, channels=channels), ignore, max_keypoints)
@@ -169,13 +168,13 @@ class PointDetector:
         Args:
             images: in a list, a tuple or an array of four dimensions; their sizes may differ.
             ignore: a mask for each image, or None, in a list or a tuple; or one array for all.
-            max_keypoints, channels: as of `detect`.
+            max_keypoints, channels: see `detect`.
 
         Returns:
-            The keypoints of each, in their order.
+            The keypoints of each image, in the order of the images.
 
         Raises:
-            ImageError: an image cannot be read or is not fit.
+            ImageError: an image cannot be read or is unsuitable.
             OptionError: a mask has another size than its image.
         """
         masks, found = ignore_masks(ignore, batch_length(images)), []
@@ -196,14 +195,14 @@ class PointDetector:
         """Detect the best keypoints of an image, and describe them.
 
         Args:
-            image, max_keypoints, ignore, channels: as of `detect`.
+            image, max_keypoints, ignore, channels: see `detect`.
 
         Returns:
-            As `detect`, with descriptors at the keypoints' own sizes and angles: (N, 64) float32
-            learned ones of length 1, or (N, 128) uint8 RootSIFT.
+            The keypoints as from `detect`, with descriptors at their own sizes and angles: (N, 64)
+            float32 learned ones of length 1, or (N, 128) uint8 RootSIFT.
 
         Raises:
-            ImageError: the image cannot be read or is not fit.
+            ImageError: the image cannot be read or is unsuitable.
             OptionError: the mask has another size than the image.
             WeightsError: the descriptor's file is damaged.
         """
@@ -217,11 +216,11 @@ class PointDetector:
         """Describe keypoints, also of other detectors, as `extract` does.
 
         Args:
-            image, channels: as of `detect`.
-            keypoints: with sizes; angles of -1, or none, become the dominant ones.
+            image, channels: see `detect`.
+            keypoints: keypoints with sizes; missing angles, or -1, become the dominant ones.
 
         Raises:
-            ImageError: the image cannot be read or is not fit.
+            ImageError: the image cannot be read or is unsuitable.
             OptionError: keypoints have no sizes above 0.
             WeightsError: the descriptor's file is damaged.
         """
@@ -254,7 +253,7 @@ class PointDetector:
         size = (gray.shape[1], gray.shape[0])
         scaled = size != (width, height)
         if scaled and ignore is not None:
-            # Wherever a pixel of the small image, or one beside it, holds something to be ignored.
+            # A small pixel is ignored if it, or one next to it, covers an ignored pixel.
             share = cv2.resize(ignore.astype(np.float32), size, interpolation=cv2.INTER_AREA)
             ignore = cv2.dilate((share > 0).astype(np.uint8), np.ones((3, 3), np.uint8))
         with memory_named(gray.shape), limited_threads(self.threads):
@@ -272,7 +271,7 @@ class PointDetector:
         )
 
     def _scaled(self, gray: np.ndarray) -> np.ndarray:
-        """Return the image that keypoints are found in."""
+        """Return the image in which keypoints are found, scaled down if necessary."""
         height, width = gray.shape
         scale = (MAX_AUTO_PIXELS / gray.size) ** 0.5
         if self.resolution == "native" or scale >= 1:

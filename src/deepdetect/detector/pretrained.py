@@ -1,4 +1,4 @@
-"""The weights inside the package, and the names of tensors in ONNX files."""
+"""The bundled weights, and the names of tensors in ONNX files."""
 
 from __future__ import annotations
 
@@ -10,42 +10,39 @@ from .._shared.options import look_up, names_a_file
 FOLDER = Path(__file__).parent / "weights"
 
 RANKER = Path(__file__).parent / "points" / "ranker.npz"
-"""The trained ranker of points; its card is beside it."""
+"""The trained ranker of points; for its card see MODEL_CARD.md in the same folder."""
 
 POINTS_GRAPH = RANKER.with_name("points.onnx")
-"""The whole detection of points, for ONNX files."""
+"""The whole detection of points as a graph, for ONNX files."""
 
 PRETRAINED: dict[str, str] = {
     "default": "default",  # photographs in any light
     "dense": "dense",  # two views of a scene in normal light, denser
-    "free": "free",  # as default, from photographs of free licences alone
+    "free": "free",  # like default, trained only on freely licensed photographs
     "espnet": "espnet",  # the paper's network, for photographs in any light
 }
-"""File names without ending, by the names that users choose them by."""
+"""File names without suffix, by the names that users choose."""
 
 STRIDE = 8
 """The network halves an image three times, so its sides must be multiples of 8."""
 
 PADDED_IMAGE = "padded_image"
-"""Name of the tensor that holds the image, padded to multiples of 8, in files that pad it."""
+"""Name of the tensor that holds the image padded to multiples of 8, in files that pad it."""
 
 LOGITS = "logits"
 """Name of the output that holds logits; an output of another name holds probabilities."""
 
 POINTS = "keypoints", "scores", "sizes", "angles"
-"""Outputs of files that give points, too: these are not read by the package."""
+"""Outputs of files that also give points; the package does not read them."""
 
 
 def pretrained_weights(name: str = "default") -> Path:
-    """Return the path of weights inside the package.
-
-    An OptionError names the nearest name that is known.
-    """
+    """Return the path of bundled weights; an OptionError suggests the nearest known name."""
     return (FOLDER / look_up("name or file of weights", name, PRETRAINED)).with_suffix(".onnx")
 
 
 def resolve_weights(weights: str | Path) -> Path:
-    """Return the path of weights that are named in `PRETRAINED`, or are a file."""
+    """Return the path of weights, which are named in `PRETRAINED` or are a file."""
     path = Path(weights) if names_a_file(weights) else pretrained_weights(str(weights))
     if not path.is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")

@@ -1,9 +1,9 @@
-"""The network `fast` on images that are too large for the memory, in tiles.
+"""The network `fast` in tiles, for images that are too large for the memory.
 
-A few numbers tell what the whole image is like: its exposure, and the means and maxima of the
+The network uses a few numbers about the whole image: its exposure, and the means and maxima of the
 features. A first pass over the tiles collects these, a second one computes the logits. Tiles
-overlap by more than the convolutions see, so the logits are those of the whole image.
-(ESPNet cannot be tiled: its logits depend on pixels up to 1,738 px away.)
+overlap by more than the convolutions see, so the logits are those of the whole image. (ESPNet
+cannot be tiled: its logits depend on pixels up to 1,738 px away.)
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ AVERAGES, MAXIMA = (
     for kind in ("Average", "Max")
 )
 THRESHOLDS = "/network/thresholds/Unsqueeze_1_output_0"
-"""Tensors at which the network is cut, as `export_onnx` names them: all have four dimensions."""
+"""Tensors at which the network is cut, as `export_onnx` names them; all have four dimensions."""
 
 SCALES = (4, 2, 1)
-"""Sides of the features for each stride of the image."""
+"""The features have this many columns and rows for each stride of the image."""
 
 MARGIN = 4
-"""How many strides tiles reach over their border: the convolutions see up to 28 px."""
+"""Tiles overlap their neighbours by this many strides: the convolutions see up to 28 px."""
 
 BYTES_PER_PIXEL = 90
-"""Of memory that a run of the whole image takes in either runtime, about."""
+"""Memory that a run of the whole image takes in either runtime, about."""
 
 DEFAULT_TILE_MEGAPIXELS = 2.7
 
@@ -58,9 +58,9 @@ Part = Callable[..., list[np.ndarray]]
 class TiledNetwork:
     """A network in parts.
 
-    `expose` maps the luma that is counted to its mean and the gain; `encode` an image and these to
-    features; `threshold` that luma, averages and maxima to the features' thresholds; `decode` an
-    image, mean, gain and thresholds to logits.
+    `expose` maps the subsampled luma to its mean and the gain; `encode` maps an image and these to
+    features; `threshold` maps that luma, averages and maxima to the features' thresholds; `decode`
+    maps an image, mean, gain and thresholds to logits.
     """
 
     expose: Part
@@ -69,7 +69,7 @@ class TiledNetwork:
     decode: Part
 
     def __call__(self, rgb: np.ndarray, tile_megapixels: float | None = None) -> np.ndarray:
-        """Compute the (H, W) float32 logits of (H, W, 3) uint8, in tiles of so many megapixels."""
+        """Compute the (H, W) float32 logits of (H, W, 3) uint8, in tiles of this size."""
         side = int((1e6 * (tile_megapixels or DEFAULT_TILE_MEGAPIXELS)) ** 0.5) // STRIDE
         height, width = (-(-length // STRIDE) for length in rgb.shape[:2])
         tiles = list(product(_spans(height, side), _spans(width, side)))
@@ -102,7 +102,7 @@ class TiledNetwork:
 
 
 def open_tiled(path: Path, threads: int | None = None) -> TiledNetwork | None:
-    """Cut the network of an ONNX file into parts; None where it is another one than `fast`."""
+    """Cut the network of an ONNX file into parts; None if it is not the network `fast`."""
     state = path.stat()
     return _open(path.absolute(), threads, (state.st_mtime_ns, state.st_size))
 
@@ -112,7 +112,7 @@ def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwo
     model = path.read_bytes()
 
     def part(inputs: tuple[str, ...], outputs: tuple[str, ...]) -> Part:
-        # Kept memory would add up over the parts.
+        # Memory that sessions keep would add up over the parts.
         session = start_session(cut_onnx(model, inputs, outputs), threads, keep_memory=False)
 
         def run(*given: np.ndarray) -> list[np.ndarray]:
@@ -134,12 +134,12 @@ def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwo
             part((COUNTED, *AVERAGES, *MAXIMA), (THRESHOLDS,)),
             part(("image", *LIGHT, THRESHOLDS), (LOGITS,)),
         )
-    except Exception:  # parts that are not there or not alone in the file
+    except Exception:  # a tensor is missing, or needs further inputs
         return None
 
 
 class _Span(NamedTuple):
-    """A part of a length in strides: what is read, what is written, and that within the first."""
+    """A part of a length in strides: `seen` is read, `core` written, `inner` is that in `seen`."""
 
     seen: slice
     core: slice
@@ -147,7 +147,7 @@ class _Span(NamedTuple):
 
 
 def _spans(length: int, side: int) -> list[_Span]:
-    """Divide a length into as few equal parts as possible that, with margins, fit into a side."""
+    """Divide a length into as few equal parts as possible that fit a side with their margins."""
     count = 1
     while (core := -(-length // count)) + MARGIN * min(count - 1, 2) > side and core > MARGIN:
         count += 1
@@ -165,7 +165,7 @@ def _times(span: slice, scale: int) -> slice:
 
 
 def _planes(rgb: np.ndarray, rows: slice, columns: slice) -> np.ndarray:
-    """Return (1, 3, H, W) float32 of a tile, at the end of the image not padded."""
+    """Return a tile as (1, 3, H, W) float32, without padding at the end of the image."""
     tile = rgb[_times(rows, STRIDE), _times(columns, STRIDE)]
     planes = np.empty((1, 3, *tile.shape[:2]), np.float32)
     fill_planes(tile, planes[0])

@@ -1,9 +1,9 @@
 """Compiled parts of descriptors, orientations, matchers, nearest keypoints and suppression.
 
-Dense SIFT works in tiles, so that intermediate results stay in the processor's cache: for each
-pixel of a tile eight soft orientations, summed along its row into the descriptor's four columns,
-then along the column into its four rows. The innermost loops run over all keypoints in a row of the
-tile and their orientations, which lie side by side in memory.
+Dense SIFT works in tiles, so that intermediate results stay in the processor's cache. Each pixel of
+a tile votes for eight soft orientations. These are summed along its row into the descriptor's four
+columns, then along the column into its four rows. The innermost loops run over all keypoints in a
+row of the tile and their orientations, which are adjacent in memory.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ import numpy as np
 from .._shared.kernels import compiled
 
 TILE_COLUMNS = 32
-"""Columns of the lattice in a tile."""
+"""Number of lattice columns in a tile. Chosen by hand."""
 
 TILE_HEIGHT = 96
-"""Of a tile in pixels."""
+"""Height of a tile in pixels. Chosen by hand."""
 
 TAPS_AT_ONCE = 4
-"""Spans of taps are multiples of this."""
+"""Spans of taps are multiples of this number, which are summed in one go."""
 
 BINS = 36
-"""Directions that gradients vote for."""
+"""Number of directions that gradients vote for, as in Lowe (2004)."""
 
 RADIUS_PER_WINDOW = 3.0
-"""Of the pixels that vote, over the sigma of their Gaussian window."""
+"""Radius of the voting pixels relative to the sigma of their Gaussian window, as in OpenCV."""
 
 CHUNK = 64
-"""Distances of which the least is noted, so that the nearest are found without a second look."""
+"""The minimum of every this many distances is stored, so that the nearest are found in one pass."""
 
 MIN_SQUARED_NORMS = 1e-3
-"""Of the product of the squared norms: below it a descriptor is the mean."""
+"""The product of both squared norms is limited to this from below: a descriptor may be the mean."""
 
 
 @compiled(nogil=True, fastmath=True)
@@ -41,10 +41,10 @@ def describe_tiles(first, last, magnitude, orientation, rows_of, origin, step, t
     """Describe the keypoints of the tiles from `first` to before `last`, row by row, in `out`.
 
     The (H, W) float32 orientations are in units of 45 degrees. `rows_of` holds the row of `out` for
-    each point of the lattice, -1 where there is no keypoint; its first point is the pixel (x, y)
-    `origin`. `taps` are (4, T) weights of the T pixels around a keypoint for each of four bins, and
-    zeros; `spans` (4, 3): the first tap and the end of those that are not 0, in whole groups of
-    `TAPS_AT_ONCE`, and T.
+    each point of the lattice, -1 without a keypoint; its first point is the pixel (x, y) `origin`.
+    `taps` are (4, T) weights of the T pixels around a keypoint for each of four bins, padded by
+    zeros. `spans`, (4, 3), holds the first tap and the end of those that are not 0, in whole groups
+    of `TAPS_AT_ONCE`, and T.
     """
     height, width = magnitude.shape
     reach = spans[0, 2] // 2
@@ -69,7 +69,7 @@ def describe_tiles(first, last, magnitude, orientation, rows_of, origin, step, t
             left += 1
         while (rows_of[top:bottom, right - 1] < 0).all():
             right -= 1
-        numbers = 8 * (right - left)  # of one bin: eight orientations of each column
+        numbers = 8 * (right - left)  # one bin: eight orientations of each column
         x0, y0 = origin[0] + left * step - reach, origin[1] + top * step - reach
         for j in range((bottom - top - 1) * step + 2 * reach + 1):
             y = y0 + j
@@ -125,7 +125,7 @@ def _sum_along_column(summed, taps, spans, out, numbers):  # type: ignore[no-unt
 
 @compiled(nogil=True, fastmath=True)
 def _add(out, weights, a, b, c, d):  # type: ignore[no-untyped-def]
-    """Add four weighted arrays to one."""
+    """Add four weighted arrays to `out`."""
     for i in range(len(out)):
         out[i] += weights[0] * a[i] + weights[1] * b[i] + weights[2] * c[i] + weights[3] * d[i]
 
@@ -154,7 +154,7 @@ def _normalise(histogram, numbers, out):  # type: ignore[no-untyped-def]
                 out[32 * b + 8 * c + o] = np.uint8(min(np.float32(255), value))
 
 
-# No full fastmath: its approximate division and root do not give 0 for equal descriptors.
+# No full fastmath: with its approximate division and root equal descriptors do not give 0.
 @compiled(nogil=True, fastmath={"reassoc", "nsz", "contract"})
 def correlation_distances(start, stop, first, rows0, second, rows1, mean, out):  # type: ignore[no-untyped-def]
     """Write 1 - correlation of the pairs from `start` to before `stop` into `out`."""
@@ -176,8 +176,8 @@ def correlation_distances(start, stop, first, rows0, second, rows1, mean, out): 
 def nearest_of_nine(first, last, positions, xy, grid, nearest, distances):  # type: ignore[no-untyped-def]
     """Find the nearest of (M, 2) keypoints in the 3x3 pixels around positions, row by row.
 
-    `grid` holds the (H, W) row of the keypoint on each pixel, or -1. Of positions that are not
-    finite, or have none near, nothing is written.
+    `grid`, (H, W), holds the row of the keypoint on each pixel, or -1. Nothing is written for
+    positions that are not finite or have no keypoint near.
     """
     height, width = grid.shape
     for k in range(first, last):
@@ -200,7 +200,7 @@ def nearest_of_nine(first, last, positions, xy, grid, nearest, distances):  # ty
 
 @compiled(nogil=True, inline="always")
 def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
-    """Return the squared Euclidean distance; all in 32 bits, for speed."""
+    """Return the squared Euclidean distance; in 32 bits throughout, for speed."""
     total = np.int32(0)
     for d in range(queries.shape[1]):
         gap = np.int32(np.int32(queries[query, d]) - np.int32(base[row, d]))
@@ -210,7 +210,7 @@ def _distance(queries, query, base, row):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, inline="always")
 def _insert(row, distance, best, second, nearer, farther):  # type: ignore[no-untyped-def]
-    """Return the best two rows and their distances after one more row."""
+    """Return the best two rows and their distances after adding one row."""
     if distance < nearer:
         return row, best, distance, nearer
     if distance < farther:
@@ -218,15 +218,15 @@ def _insert(row, distance, best, second, nearer, farther):  # type: ignore[no-un
     return best, second, nearer, farther
 
 
-# Without NaN, so that least numbers are found many at a time.
+# Assuming no NaN lets vector registers find minima.
 @compiled(nogil=True, fastmath={"nnan", "nsz"})
 def scan_products(products, terms0, terms1, start, rows, values, nearest, best, second):  # type: ignore[no-untyped-def]
     """Find the nearest of the base to queries, and of the queries to the base, by their products.
 
-    The squared distances of a block of queries, which begins with number `start`, are
-    `terms0[i] + terms1[j] - 2 * products[i, j]`. Writes the (Q, K) nearest rows of the base, of
-    equals the lower ones, with their squared distances; and keeps for each of (M,) rows of the base
-    the nearest query so far, its squared distance and that of the second.
+    The squared distances of a block of queries, starting at number `start`, are `terms0[i] +
+    terms1[j] - 2 * products[i, j]`. Writes the (Q, K) nearest rows of the base, the lower ones of
+    equals, with their squared distances. For each of (M,) rows of the base it keeps the nearest
+    query so far, its squared distance and that of the second-nearest.
     """
     count = products.shape[1]
     chunks = (count + CHUNK - 1) // CHUNK
@@ -297,12 +297,12 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
     first, last, bands, queries, base, xy0, xy1, at0, at1, offsets, turn, seed, radii, before, rows,
     distances,
 ):  # fmt: skip
-    """Improve the two best rows of the queries of some bands, one query after the other.
+    """Improve the two best rows of the queries in some bands, one query after the other.
 
-    `bands` are the queries that each begins with, in row-major order; `at0` and `at1` the rows at
-    each pixel, -1 where there is none; `before` the rows before this sweep, which are read of other
-    bands, so that the bands may be done in any order. Even turns go down, odd ones up. Neighbours
-    of queries at `offsets` are tried, and random ones within the `radii` around the best.
+    `bands` holds the first query of each band, in row-major order; `at0` and `at1` hold the row at
+    each pixel, or -1. `before` holds the rows before this sweep; it is read for other bands, so
+    that their order does not matter. Even turns go down, odd ones up. The matches of queries at
+    `offsets` are tried, and random ones within the `radii` around the best.
     """
     (height0, width0), (height1, width1) = at0.shape, at1.shape
     direction = 1 - 2 * (turn % 2)
@@ -315,7 +315,7 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
             nearer, farther = distances[query, 0], distances[query, 1]
             state = _hash(np.uint32(query) ^ _hash(np.uint32(seed + 7919 * (turn + 1))))
             for trial in range(spread + len(radii)):
-                if trial < spread:  # what two queries beside this one found, moved along
+                if trial < spread:  # the shifted matches of two queries next to this one
                     offset = offsets[trial // 4] * direction
                     right, down = (0, offset) if trial & 2 else (offset, 0)
                     x, y = xy0[query, 0] - right, xy0[query, 1] - down
@@ -328,7 +328,7 @@ def patchmatch_sweep(  # type: ignore[no-untyped-def]
                         rows[other, trial & 1] if begin <= other < end else before[other, trial & 1]
                     )
                     x, y = xy1[row, 0] + right, xy1[row, 1] + down
-                else:  # random places around the best
+                else:  # random positions around the best
                     radius = radii[trial - spread]
                     state = _hash(state + np.uint32(1))
                     along = np.int64(state % np.uint32(2 * radius + 1)) - radius
@@ -352,8 +352,8 @@ def keep_distant(cell, columns, x, y, radii, last, before, kept):  # type: ignor
     """Find points, best first, that have no kept one closer than the smaller of their radii.
 
     Writes as many as there are, or as `kept` has room for, and returns their number. Positions are
-    0 or more. Kept points are chained by square cells: `last` holds the last one of each cell,
-    `before` the one before each point; both are -1 where there is none.
+    not negative. Kept points are chained by square cells: `last` holds the last one of each cell,
+    `before` the previous one for each point; -1 means none.
     """
     rows, count = len(last) // columns, 0
     for k in range(len(x)):
@@ -381,14 +381,14 @@ ATAN = tuple(
     np.float32(np.float32(c) * np.float32(180 / np.pi))
     for c in (0.9997878412794807, -0.3258083974640975, 0.1555786518463281, -0.04432655554792128)
 )
-"""Of OpenCV's arctangent, in degrees: the same bins are voted for."""
+"""Coefficients of OpenCV's arctangent, in degrees, so that votes go to the same bins."""
 
 
 @compiled(nogil=True, error_model="numpy")
 def strongest_directions(image, pixels, windows):  # type: ignore[no-untyped-def]
-    """Return the directions of most of the gradients around (N, 2) pixels, (N,) float32 degrees.
+    """Return the dominant gradient direction around (N, 2) pixels, (N,) float32 degrees.
 
-    They vote for `BINS` directions, each with its weight in a Gaussian window of one of (N,)
+    Gradients vote for `BINS` directions, each weighted by a Gaussian window with one of (N,)
     sigmas. The outermost pixels have no gradient.
     """
     height, width = image.shape

@@ -1,4 +1,4 @@
-"""The keypoints of one image: positions, scores, and what their descriptors need."""
+"""The keypoints of one image: positions, scores, and what descriptors need."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from .._shared.opencv import cv2
 from .._shared.options import numbers_of, shown, suggest_keywords, whole
 
 SIZES_PER_SCALE = {"diameter": 1.0, "sigma": 2.0}
-"""Diameters of a keypoint of SIFT per unit of its scale, by the meaning of the scale."""
+"""Diameter of a SIFT keypoint per unit of its scale, for each meaning of the scale."""
 
 MAX_COORDINATE_BITS = 12
-"""Of a position in `bayer_order`: float32 holds the order exactly up to this many."""
+"""`bayer_order` uses at most this many bits of a position: float32 then holds the order exactly."""
 
 UNSET_ANGLE = -1
-"""OpenCV's angle of a keypoint that has none."""
+"""OpenCV gives this angle to keypoints without an orientation."""
 
 _OPTIONAL: dict[str, Any] = {
     "logits": np.float32,
@@ -38,16 +38,17 @@ class Keypoints:
 
     Attributes:
         xy: (N, 2) float32 pixels, x right, y down, centre of the first pixel (0, 0).
-        scores: (N,) float32, the higher the better: of `PointDetector` in (0, 1), no two equal; of
-            `DeepDetect` probabilities, of which float32 rounds the highest to 1: `best` ranks
-            pixels by their logits.
+        scores: (N,) float32, higher is better. Those of a `PointDetector` lie in (0, 1) and all
+            differ. Those of `DeepDetect` are probabilities; float32 rounds the highest to 1, so
+            `best` ranks by logits.
         image_size: (width, height) of the image in pixels.
         logits: (N,) float32 logits of the probabilities, or None.
-        sizes: (N,) float32 diameters in pixels, or None where all keypoints have the same.
-        angles: (N,) float32 orientations in degrees (-1: unset), or None where all have the same.
-        octaves: (N,) int32 as OpenCV packs them, or None.
-        descriptors: (N, D) uint8 or float32 where the detector describes its keypoints, or None.
-        descriptor_type: what these are, as "rootsift"; None without any, or of unknown ones.
+        sizes: (N,) float32 diameters in pixels, or None if all keypoints have the same.
+        angles: (N,) float32 orientations in degrees (-1: unset), or None if all have the same.
+        octaves: (N,) int32 as packed by OpenCV, or None.
+        descriptors: (N, D) uint8 or float32, or None if keypoints are not described.
+        descriptor_type: type of the descriptors, such as "rootsift"; None if unknown or without
+            any.
 
     `len`, iteration over (x, y) rows and indexing by slices, masks and index arrays work.
 
@@ -114,7 +115,7 @@ class Keypoints:
     @classmethod
     @suggest_keywords
     def empty(cls, image_size: tuple[int, int]) -> Keypoints:
-        """Return a set without keypoints."""
+        """Return an empty set of keypoints."""
         return cls(np.empty((0, 2), np.float32), np.empty(0, np.float32), image_size)
 
     @classmethod
@@ -125,7 +126,7 @@ class Keypoints:
         """Convert OpenCV's keypoints; their responses become the scores.
 
         Args:
-            keypoints: as a `cv2.Feature2D` detects them.
+            keypoints: keypoints of a `cv2.Feature2D`.
             image_size: (width, height) of the image in pixels.
 
         Example:
@@ -150,8 +151,8 @@ class Keypoints:
         """Convert to OpenCV's keypoints, whose responses are the scores.
 
         Args:
-            size: diameter in pixels where the keypoints have no sizes.
-            angle: orientation in degrees where they have no angles (-1: unset).
+            size: diameter in pixels if the keypoints have no sizes.
+            angle: orientation in degrees if they have no angles (-1: unset).
 
         Example:
             >>> (point,) = Keypoints([[3, 4]], [0.5], (8, 8)).to_opencv(size=5)
@@ -176,23 +177,23 @@ class Keypoints:
         size: float = 3.0,
         angle: float = 0.0,
     ) -> dict[str, Any]:
-        """Convert to the features of one image that LightGlue takes, as PyTorch tensors.
+        """Convert to the input of LightGlue for one image, as PyTorch tensors.
 
-        `LightGlue(features="sift")` takes RootSIFT, as of `PointDetector(descriptor="rootsift")`,
-        sizes and angles; up to 4,096 keypoints are usual. Its pixels are as ours: the centre of the
-        first is (0, 0).
+        `LightGlue(features="sift")` needs sizes, angles and RootSIFT, which
+        `PointDetector(descriptor="rootsift")` computes; up to 4,096 keypoints are usual. Its pixel
+        coordinates are ours: the centre of the first pixel is (0, 0).
 
         Args:
-            scale: what its scales are: "diameter", as its own extractor has them from OpenCV, or
-                "sigma", half of it, as it has them from COLMAP, and as kornia's `LightGlueMatcher`
-                gives them. Both authors' programs use the same weights.
-            size: diameter in pixels where the keypoints have no sizes.
-            angle: orientation in degrees where they have no angles, or OpenCV's -1.
+            scale: meaning of its scales: "diameter", as its own extractor takes them from OpenCV,
+                or "sigma", half of that, as it takes them from COLMAP and as kornia's
+                `LightGlueMatcher` does. Both authors' programs use the same weights.
+            size: diameter in pixels for keypoints without a size.
+            angle: orientation in degrees for keypoints without an angle.
 
         Returns:
-            float32 tensors with a batch dimension: "keypoints" (1, N, 2), "keypoint_scores"
-            (1, N), "scales" (1, N) in pixels, "oris" (1, N) in radians, "image_size" (1, 2) as
-            (width, height), and of described keypoints "descriptors" (1, N, D) of length 1.
+            float32 tensors with a batch dimension: "keypoints" (1, N, 2), "keypoint_scores" (1, N),
+            "scales" (1, N) in pixels, "oris" (1, N) in radians, "image_size" (1, 2) as
+            (width, height), and, if there are descriptors, "descriptors" (1, N, D) of length 1.
 
         Raises:
             OptionError: the scale is unknown.
@@ -221,8 +222,8 @@ class Keypoints:
     def draw(self, image: Any, *, channels: Channels = "rgb") -> np.ndarray:
         """Draw the keypoints on their image, which is dimmed.
 
-        They are circles of their sizes, of three pixels where they have none, and single pixels
-        where they are more than 5,000.
+        They are drawn as circles of their sizes, by default three pixels; more than 5,000 are drawn
+        as single pixels.
 
         Args:
             image: an array, a PyTorch tensor or a PIL image.
@@ -247,7 +248,7 @@ class Keypoints:
 
     @suggest_keywords
     def best(self, count: int) -> Keypoints:
-        """Return the keypoints with the highest logits (or scores), in the order they have here.
+        """Return the keypoints with the highest logits (or scores), in their present order.
 
         Ties are broken by an order that spreads them evenly over the image.
         """
@@ -258,9 +259,9 @@ class Keypoints:
         return self[np.sort(np.lexsort((order, -ranks))[:count])]
 
     def distinct(self) -> Keypoints:
-        """Return each position once, with its highest score (SIFT repeats some for directions)."""
+        """Return each position once, with its highest score: SIFT repeats some for other angles."""
         order = np.argsort(-self.scores, kind="stable")
-        # Both float32 as one number: ten times faster than by rows; + 0 makes -0 the same as 0.
+        # Comparing both float32 as one number is ten times faster than rows; + 0 turns -0 into 0.
         keys = np.ascontiguousarray(self.xy[order] + np.float32(0)).view(np.uint64).ravel()
         _, first = np.unique(keys, return_index=True)
         return self if len(first) == len(self) else self[np.sort(order[first])]
@@ -310,15 +311,15 @@ def unit_length(descriptors: np.ndarray) -> np.ndarray:
 
 
 def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Rank (N, 2) positions as an ordered dither does: the first N are spread evenly, for any N.
+    """Rank (N, 2) positions by ordered dithering: for any N, the first N are spread evenly.
 
-    It is Bayer's matrix, of the image's own (width, height): neighbours come far apart. Nearest
-    pixels count. The ranks are (N,) float32 in [0, 1).
+    The ranks are those of Bayer's matrix, without repetition over the image's (width, height), at
+    the nearest pixels: neighbours get distant ranks. They are (N,) float32 in [0, 1).
     """
     column, row = np.rint(np.asarray(xy).reshape(-1, 2)).astype(np.int64).T
     bits = min(MAX_COORDINATE_BITS, max(1, (max(size) - 1).bit_length()))
     order = np.zeros(len(row), np.int64)
-    for _ in range(bits):  # the lowest bits of the position decide most
+    for _ in range(bits):  # the lowest bits of the position become the highest of the rank
         order = 4 * order + 2 * ((column ^ row) & 1) + (row & 1)
         column, row = column >> 1, row >> 1
     return (order / 4**bits).astype(np.float32)
@@ -327,10 +328,10 @@ def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def nearest_keypoints(
     positions: np.ndarray, xy: np.ndarray, image_size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the keypoint nearest to each of (N, 2) positions, of those in the 3x3 pixels around it.
+    """Find the keypoint nearest to each of (N, 2) positions, within the 3x3 pixels around it.
 
-    Of several keypoints on one pixel the first counts. Returns (N,) int32 rows of `xy`, and (N,)
-    distances in pixels: -1 and infinite where none is near.
+    The first of several keypoints on one pixel is used. Returns (N,) int32 rows of `xy` and (N,)
+    distances in pixels; -1 and infinity if no keypoint is near.
     """
     from .kernels import nearest_of_nine
 
@@ -338,7 +339,7 @@ def nearest_keypoints(
     pixels = np.floor(np.asarray(xy) + np.float32(0.5)).astype(np.int64).reshape(-1, 2)
     rows = np.flatnonzero(((pixels >= 0) & (pixels < image_size)).all(axis=1))[::-1]
     grid = np.full((height, width), -1, np.int32)
-    grid[pixels[rows, 1], pixels[rows, 0]] = rows  # the first of several is written last
+    grid[pixels[rows, 1], pixels[rows, 0]] = rows  # the first on a pixel is written last
     positions, xy = (np.ascontiguousarray(points, np.float64) for points in (positions, xy))
     nearest = np.full(len(positions), -1, np.int32)
     distances = np.full(len(positions), np.inf)

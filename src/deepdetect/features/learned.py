@@ -1,4 +1,4 @@
-"""Learned descriptors, which are turned without looking at the image again."""
+"""Learned descriptors, which can be rotated without computing them again from the image."""
 
 from __future__ import annotations
 
@@ -13,53 +13,52 @@ from .matchers import DescriptorMatches
 LEARNED: Final = "learned"
 LEARNED_FREE: Final = "learned-free"
 CROSS_MODAL: Final = "cross-modal"
-"""`Keypoints.descriptor_type` of these; the second by weights of photographs under free licences
-alone, the third for images of different sensors, where what is dark in one may be bright in the
-other. Of one's own weights it is "learned-" or "cross-modal-" and the beginning of the file's
-SHA-256."""
+"""`Keypoints.descriptor_type` of learned descriptors. The second has weights from freely licensed
+photographs only. The third is for images of different sensors, where dark and bright may be
+swapped. Your own weights have "learned-" or "cross-modal-" and the start of their SHA-256."""
 
 RATIO, LEARNED_RATIO = 0.85, 0.88
-"""Of the ratio test, of all others and of learned descriptors. On photos/val, with the second these
-match neither unrelated photographs more often nor views of one less precisely than RootSIFT with
-the first; .93 would be as precise, but match unrelated photographs four times as often."""
+"""Ratio tests of other and of learned descriptors. On photos/val, learned ones at 0.88 are as
+precise as RootSIFT at 0.85, and match unrelated photographs no more often. At 0.93 they would be as
+precise, but match unrelated photographs four times as often."""
 
 LENGTH = 64
 
 CONSTANT = 16
-"""So many numbers, the first, are the same in an image that is turned."""
+"""The first numbers of a descriptor, this many, do not change if the image is rotated."""
 
 FREQUENCIES = np.repeat([1, 2, 3], [12, 8, 4])
-"""Of the others, which are the real and then the imaginary parts of complex numbers: an image that
-is turned by an angle turns them by so many times the angle."""
+"""The other numbers are the real and then the imaginary parts of complex ones. A rotation of the
+image by an angle rotates these by the angle times these factors."""
 
 UPRIGHT_DEGREES = 15.0
-"""The network has learned to bear turns up to this: one that is wrong costs little."""
+"""Smaller rotations need no correction: the network has learned to tolerate them."""
 
 TURNED_KEYPOINTS = 512
-"""So many, the best of each image, tell by how much one is turned."""
+"""Number of best keypoints per image that determine the rotation between both. Chosen by hand."""
 
 HISTOGRAM_DEGREES = 10
 NEAR_DEGREES = 20
-"""Bins of differences of angles, and how far from the fullest the others are counted with it."""
+"""Width of the bins of angles; angles this near to the fullest bin are averaged. Chosen by hand."""
 
 
 def is_learned(descriptor_type: str | None) -> bool:
-    """Return whether descriptors are learned ones, by the weights here or by one's own."""
+    """Return whether descriptors are learned, with bundled weights or your own."""
     return descriptor_type is not None and descriptor_type.startswith((LEARNED, CROSS_MODAL))
 
 
 def angles_counted(descriptor_type: str) -> int:
-    """Return how many times a keypoint's angle its descriptor is turned by.
+    """Return the multiple of a keypoint's angle by which its descriptor is rotated.
 
-    Twice those of images of different sensors: a gradient may point the other way.
+    It is 2 between different sensors, where a gradient may point the opposite way.
     """
     return 2 if descriptor_type.startswith(CROSS_MODAL) else 1
 
 
 def turn_descriptors(descriptors: np.ndarray, degrees: np.ndarray | float) -> np.ndarray:
-    """Return (N, 64) float32 learned descriptors as in an image that is turned.
+    """Return (N, 64) float32 learned descriptors as those of a rotated image.
 
-    By (N,) or one angle, as `Keypoints.angles`: from the axis of x to that of y.
+    The rotation is one angle or (N,), in degrees from the x axis towards the y axis.
     """
     real = CONSTANT + len(FREQUENCIES)
     once = np.exp(1j * np.radians(np.reshape(degrees, -1))).astype(np.complex64)
@@ -73,10 +72,10 @@ def match_learned(
     features1: Keypoints,
     match: Callable[[np.ndarray, np.ndarray], DescriptorMatches],
 ) -> DescriptorMatches:
-    """Match learned descriptors as upright ones of images of which one is turned back.
+    """Match learned descriptors as upright ones, after undoing the rotation between the images.
 
-    Those at the keypoints' own angles bear any turn, and tell which it is; upright ones, which see
-    how keypoints are turned to each other, find about a sixth more.
+    Descriptors at the keypoints' own angles tolerate any rotation, and reveal it. Upright ones,
+    which see how keypoints are rotated relative to each other, match about a sixth more.
     """
     descriptors0, descriptors1 = features0.descriptors, features1.descriptors
     assert descriptors0 is not None
@@ -92,12 +91,12 @@ def match_learned(
     turned = match(first, turn_descriptors(descriptors1, angles1 - turn))
     if abs((turn + 180) % 360 - 180) < UPRIGHT_DEGREES:
         return turned
-    # Where few match, it is chance which turn most of them show.
+    # If few match, the most frequent rotation is chance: no rotation is tried as well.
     return max(match(first, turn_descriptors(descriptors1, angles1)), turned, key=len)
 
 
 def common_turn(degrees: np.ndarray) -> float:
-    """Return the angle that most of (N,) differences of angles are near; 0 without any."""
+    """Return the most frequent of (N,) differences of angles, in degrees; 0 without any."""
     degrees = degrees % 360
     bins = np.bincount((degrees // HISTOGRAM_DEGREES).astype(int), minlength=36)
     fullest = int((bins + np.roll(bins, 1) + np.roll(bins, -1)).argmax())

@@ -1,9 +1,9 @@
-"""Which mutual nearest neighbours are right, by what those around them do.
+"""A filter for mutual nearest neighbours, by the matches around each of them.
 
-Right matches move, turn and grow as their neighbours do, wrong ones at random. A network of 25,000
-parameters (MATCH_FILTER_CARD.md) has learned how alike these are where surfaces bend and move;
-descriptors take part by their ratio alone, so that it serves several kinds. It stands in for the
-ratio test, which discards right matches that have a rival.
+Correct matches move, rotate and grow as their neighbours do, wrong ones at random. A network of
+25,000 parameters (MATCH_FILTER_CARD.md) has learned how similar these changes are on surfaces that
+bend and move. It sees no descriptors, only their ratios, so it serves several types. It replaces
+the ratio test, which discards correct matches that have a rival.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from .sift import ROOT_SIFT
 MATCH_FILTER = Path(__file__).with_name("match_filter.onnx")
 
 AROUND = 8
-"""Nearest matches that each is compared with, in either image."""
+"""Each match is compared with this many nearest matches in either image: the network's input."""
 
 MOST_DISTINCT = 512
-"""Matches of the lowest ratios, which tell by how much one image is turned."""
+"""Number of matches, of the lowest ratios, that determine the rotation. Chosen by hand."""
 
 FLANN_KDTREE_SINGLE, ALL_LEAVES = 4, -1
-"""FLANN's tree for few dimensions, and the search that is exact."""
+"""FLANN's tree for few dimensions, and its code for an exact search."""
 
 
 def check_filter(filter_by: str, ratio: float | None, mutual: bool) -> None:
-    """Raise an OptionError where the name is unknown, or the other options are not of this one."""
+    """Raise an OptionError if the name is unknown or the other options contradict it."""
     check_name("filter_by", filter_by, ("ratio", "neighbours"))
     if filter_by == "neighbours" and (ratio is not None or not mutual):
         raise OptionError("`filter_by='neighbours'` needs `mutual=True` and no `ratio`")
 
 
 def suits_filter(features: Keypoints) -> bool:
-    """Return whether keypoints have what the filter looks at, and descriptors that it serves.
+    """Return whether keypoints have sizes, angles and descriptors that the filter supports.
 
-    Not cross-modal ones: where tones are inverted, keypoints may be turned by half a turn.
+    Cross-modal ones are not supported: inverted tones may rotate keypoints by half a turn.
     """
     kind, sizes, angles = features.descriptor_type, features.sizes, features.angles
     served = kind == ROOT_SIFT or (is_learned(kind) and not str(kind).startswith(CROSS_MODAL))
@@ -54,21 +54,21 @@ def suits_filter(features: Keypoints) -> bool:
 
 
 def require_suited(*features: Keypoints) -> None:
-    """Raise an OptionError where keypoints do not suit the filter."""
+    """Raise an OptionError if keypoints do not suit the filter."""
     if not all(map(suits_filter, features)):
         raise OptionError(
             "`filter_by='neighbours'` needs keypoints with sizes and angles, and learned "
-            "descriptors or RootSIFT, as `PointDetector.extract` returns them: take 'ratio'"
+            "descriptors or RootSIFT, as `PointDetector.extract` returns them: use 'ratio' instead"
         )
 
 
 def filter_matches(
     features0: Keypoints, features1: Keypoints, matches: DescriptorMatches
 ) -> DescriptorMatches:
-    """Keep the mutual nearest neighbours that are more likely right than wrong.
+    """Keep the mutual nearest neighbours that are more likely correct than wrong.
 
-    Of `AROUND` and fewer none: they have too few around them. The keypoints suit the filter. In
-    place of the ratios the result has the network's probability of being wrong.
+    With `AROUND` matches or fewer none is kept: they have too few neighbours. The keypoints must
+    suit the filter. In the result the ratios are the network's probabilities of being wrong.
     """
     if len(matches) <= AROUND:
         none = np.empty(0, np.int32)
@@ -82,7 +82,7 @@ def filter_matches(
 def filter_inputs(
     features0: Keypoints, features1: Keypoints, matches: DescriptorMatches
 ) -> dict[str, np.ndarray]:
-    """Return what the network is given, by name: matches of images of which one is turned back."""
+    """Return the network's inputs by name, after undoing the rotation between the images."""
     sizes, angles = [], []
     for features, rows in ((features0, matches.indices0), (features1, matches.indices1)):
         assert features.sizes is not None
@@ -108,11 +108,11 @@ def filter_inputs(
 
 
 def nearest_rows(xy: np.ndarray) -> np.ndarray:
-    """Return the (N, `AROUND`) rows of the nearest others of more than so many positions."""
+    """Return the (N, `AROUND`) rows of the nearest other positions, of which there are enough."""
     own = np.arange(len(xy))[:, None]
     tree = cv2.flann_Index(xy, {"algorithm": FLANN_KDTREE_SINGLE, "leaf_max_size": 10})
     near = tree.knnSearch(xy, AROUND + 1, params={"checks": ALL_LEAVES})[0].astype(np.int64)
-    # The own one comes last then; it is not among them where many are at one place.
+    # A row itself is moved to the end. It is missing if many positions coincide.
     return np.take_along_axis(near, np.argsort(near == own, axis=1, kind="stable"), 1)[:, :-1]
 
 

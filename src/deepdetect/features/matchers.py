@@ -1,6 +1,6 @@
 """Matching of descriptors: nearest neighbours by several matchers, and the ratio test.
 
-To add a matcher, write a function of the signature of `Matcher` and add it to `MATCHERS`.
+To add a matcher, write a function with the signature of `Matcher` and add it to `MATCHERS`.
 """
 
 from __future__ import annotations
@@ -22,39 +22,39 @@ from .._shared.runtimes import start_session
 from .keypoints import on_pixels
 
 BLOCK_SIZE = 2_000_000
-"""Numbers of four bytes that exact search holds at a time: 8 MB, most of which caches hold."""
+"""Exact search holds this many numbers of four bytes at a time: 8 MB, which most caches hold."""
 
 MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
-"""Length of descriptors of bytes up to which single precision computes distances exactly."""
+"""Descriptors of bytes have exact distances in single precision up to this length."""
 
 PRODUCTS = Path(__file__).with_name("products")
-"""ONNX files of one product each, which `tools/product_graphs.py` makes. NumPy's product of single
-precision takes twice the time, and its threads take processors from what follows."""
+"""ONNX files of one matrix product each, made by `tools/product_graphs.py`. NumPy's product in
+single precision takes twice the time, and its threads keep processors busy afterwards."""
 
 MAX_EXACT_PRODUCT = 4e8
-"""Keypoints of both images, multiplied, up to which all distances are computed in a moment."""
+"""All distances are computed up to this product of both numbers of keypoints. Chosen by hand."""
 
 FLANN_INDEX_KDTREE, TREES, CHECKS = 1, 5, 50
-"""Of FLANN, as in the paper's code."""
+"""FLANN's index, number of trees and number of visited leaves, as in the paper's code."""
 
 SWEEPS = 4
-"""Of PatchMatch over all queries, down and up in turn."""
+"""PatchMatch makes this many sweeps over all queries, down and up in turn. Chosen by hand."""
 
 OFFSETS_PX = (1, 4, 12)
-"""Distances to the queries whose neighbours are tried; one pixel where keypoints are dense."""
+"""Matches of queries at these distances are tried; dense keypoints are 1 px apart."""
 
 BAND_HEIGHT_PX = 96
-"""Of a part that one thread works on; the result depends on it."""
+"""One thread works on a band of this height, on which the result depends. Chosen by hand."""
 
 SEARCH_SHRINK = 3
-"""Random tries begin in the whole image around the best neighbour; each next is so much nearer."""
+"""Random tries start in the whole image around the best neighbour; radii shrink by this factor."""
 
 Neighbours = tuple[np.ndarray, np.ndarray]
 """(N, count) int32 rows and (N, count) float32 distances, nearest first."""
 
 Positions = tuple[np.ndarray, np.ndarray] | None
-"""Keypoints of both images in pixels; None where they are not all of one scale and angle, so that
-neighbours need not match alike."""
+"""Keypoints of both images in pixels; None if their scales or angles differ, so that nearby
+keypoints need not have nearby matches."""
 
 
 Matcher = Callable[[np.ndarray, np.ndarray, int, int, Positions], Neighbours]
@@ -65,9 +65,9 @@ float32: `matcher(queries, base, count, seed, positions)`. The same seed gives t
 def exact_neighbours(
     queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: Positions = None
 ) -> Neighbours:
-    """Find the true nearest neighbours by matrix products, as a `Matcher`; of equals the lower row.
+    """Find the exact nearest neighbours by matrix products; a `Matcher`. Ties go to the lower row.
 
-    The time grows with the product of the numbers: meant for tens of thousands.
+    The time grows with the product of both numbers: it suits tens of thousands of keypoints.
     """
     return _search_both_ways(queries, base, count)[:2]
 
@@ -75,7 +75,7 @@ def exact_neighbours(
 def _search_both_ways(
     queries: np.ndarray, base: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return `exact_neighbours`, and (M,) int32 the nearest query of each row of the base."""
+    """Return `exact_neighbours`, and (M,) int32: the nearest query for each row of the base."""
     from .kernels import scan_products
 
     width = base.shape[1]
@@ -89,7 +89,7 @@ def _search_both_ways(
     else:
         queries, base = (np.asarray(part, np.float32) for part in (queries, base))
         session, factor = _product("float"), np.ascontiguousarray(base.T)
-    found = min(count + 1, len(base))  # one more tells whether rounding could change the others
+    found = min(count + 1, len(base))  # one more: could rounding change the others?
     rows = np.empty((len(queries), found), np.int32)
     squared = np.empty((len(queries), found), np.float32)
     nearest = np.zeros(len(base), np.int32)
@@ -103,7 +103,7 @@ def _search_both_ways(
         scan_products(*block, rows[part], squared[part], nearest, best, second)
     if whole or not len(queries):
         return rows[:, :count], np.sqrt(squared[:, :count]), nearest
-    # Bounds of all rounding: of the sum of the product, and of the terms.
+    # Bounds of all rounding errors: in the sums of the product, and in the terms.
     lengths = np.sqrt(terms0), np.sqrt(terms1)
     bound = (width / 2 + 8) * float(np.finfo(np.float32).eps)
     doubt = bound * (lengths[0] + lengths[1].max()) ** 2
@@ -116,7 +116,7 @@ def _search_both_ways(
     rows.sort(axis=1)
     distances = np.empty((len(queries), count), np.float32)
     for part in parts:
-        # From the differences themselves, so that distances are exact near 0.
+        # Computed from the differences, so that distances near 0 are exact.
         gaps = np.linalg.norm(queries[part, None] - base[rows[part]], axis=2)
         order = np.argsort(gaps, axis=1, kind="stable")
         rows[part] = np.take_along_axis(rows[part], order, 1)
@@ -125,13 +125,13 @@ def _search_both_ways(
 
 
 def _nearest_in_double(queries: np.ndarray, base: np.ndarray, count: int) -> np.ndarray:
-    """Return the rows of the nearest by products in double precision, for few queries."""
+    """Return the rows of the nearest neighbours of few queries, in double precision."""
     rows = np.empty((len(queries), count), np.int32)
     squares = np.einsum("ij,ij->i", base, base, dtype=np.float64)
     step = max(1, BLOCK_SIZE // (2 * len(base)))
     for start in range(0, len(queries), step):
         block = squares - 2 * (queries[start : start + step].astype(np.float64) @ base.T)
-        for rank in range(count):  # argmin takes the lower row of equals
+        for rank in range(count):  # argmin takes the lower of equal rows
             rows[start : start + step, rank] = nearest = block.argmin(1)
             block[np.arange(len(block)), nearest] = np.inf
     return rows
@@ -144,10 +144,10 @@ def _product(name: str) -> Any:
 
 @functools.cache
 def _byte_product() -> tuple[Any, int]:
-    """Return a session that multiplies bytes, and what is to be subtracted from those of the base.
+    """Return a session that multiplies bytes, and the offset to subtract from those of the base.
 
-    The fastest instructions take signed bytes on one side. Processors without VNNI have others of
-    the kind, whose sums saturate: they are given bytes without a sign.
+    The fastest instructions take signed bytes on one side. On processors without VNNI the sums of
+    such instructions saturate; they get unsigned bytes.
     """
     session = _product("signed")
     most = np.full((8, 64), 255, np.uint8), np.full((64, 64), 127, np.int8)
@@ -159,7 +159,7 @@ def _byte_product() -> tuple[Any, int]:
 def hamming_neighbours(
     queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: Positions = None
 ) -> Neighbours:
-    """Find nearest neighbours of binary descriptors (ORB, BRISK) by Hamming, as a `Matcher`."""
+    """Find nearest neighbours of binary descriptors (ORB, BRISK), by Hamming; a `Matcher`."""
     if queries.dtype != np.uint8 or base.dtype != np.uint8:
         raise OptionError("the matcher hamming compares binary descriptors: use exact or flann")
     if not len(queries):
@@ -179,7 +179,7 @@ def flann_neighbours(
     trees: int = TREES,
     checks: int = CHECKS,
 ) -> Neighbours:
-    """Find approximate nearest neighbours in random kd-trees; otherwise as `Matcher`.
+    """Find approximate nearest neighbours in random kd-trees; a `Matcher` otherwise.
 
     `checks` leaves are visited for each query.
     """
@@ -190,7 +190,7 @@ def flann_neighbours(
         index = cv2.flann_Index(base, {"algorithm": FLANN_INDEX_KDTREE, "trees": trees})
         return index.knnSearch(queries, count, params={"checks": checks})
 
-    # OpenCV has one random number generator per thread: that of the caller is left alone.
+    # OpenCV has one random number generator per thread: the caller's stays as it is.
     with ThreadPoolExecutor(1) as thread:
         rows, squared = thread.submit(search).result()
     return rows, np.sqrt(squared)
@@ -199,12 +199,12 @@ def flann_neighbours(
 def patchmatch_neighbours(
     queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: Positions = None
 ) -> Neighbours:
-    """Find one or two approximate nearest neighbours of each query by spreading good ones.
+    """Find one or two approximate nearest neighbours of each query by propagating good ones.
 
-    A neighbour's match, moved along, is probably a good one (Barnes et al., "PatchMatch", 2009). On
-    hundreds of thousands of dense keypoints it takes a twentieth of FLANN's time and finds more
-    correct matches; it does not suit few or scattered ones. A `Matcher` of bytes on whole pixels;
-    the result is the same for any number of threads.
+    The match of a neighbouring query, shifted, is probably good (Barnes et al., "PatchMatch",
+    2009). On hundreds of thousands of dense keypoints it takes a twentieth of FLANN's time and
+    finds more correct matches; it does not suit few or scattered ones. It is a `Matcher` for
+    descriptors of bytes on whole pixels. The result does not depend on the number of threads.
     """
     if positions is None or not all(on_pixels(xy) for xy in positions):
         raise OptionError(
@@ -215,7 +215,7 @@ def patchmatch_neighbours(
     from . import kernels
 
     xy0, xy1 = (np.asarray(xy).astype(np.int32) for xy in positions)
-    # In row-major order, as of most detectors: a sweep builds on the queries before.
+    # Row-major order, as most detectors return: a sweep builds on the previous queries.
     order = np.lexsort((xy0[:, 0], xy0[:, 1]))
     queries, xy0 = queries[order], xy0[order]
     at0, at1 = _grid(xy0), _grid(xy1)
@@ -238,7 +238,7 @@ def patchmatch_neighbours(
 
 
 def _grid(xy: np.ndarray) -> np.ndarray:
-    """Return the row at each pixel of the smallest image that holds all, -1 where there is none."""
+    """Return the row at each pixel of the smallest image that holds all positions, or -1."""
     width, height = xy.max(axis=0) + 1
     grid = np.full((height, width), -1, np.int32)
     grid[xy[:, 1], xy[:, 0]] = np.arange(len(xy))
@@ -248,9 +248,9 @@ def _grid(xy: np.ndarray) -> np.ndarray:
 def automatic_neighbours(
     queries: np.ndarray, base: np.ndarray, count: int, seed: int, positions: Positions = None
 ) -> Neighbours:
-    """Find neighbours exactly where keypoints are few, else by PatchMatch, else by FLANN.
+    """Find neighbours exactly if keypoints are few, otherwise by PatchMatch or else FLANN.
 
-    PatchMatch needs bytes, and keypoints on whole pixels of one scale and angle.
+    PatchMatch needs descriptors of bytes and keypoints on whole pixels, of one scale and angle.
     """
     if len(queries) * len(base) <= MAX_EXACT_PRODUCT:
         return exact_neighbours(queries, base, count, seed, positions)
@@ -269,11 +269,11 @@ MATCHERS: dict[str, Matcher] = {
 }
 
 MATCHERS_OF_NUMBERS = tuple(name for name in MATCHERS if name != "hamming")
-"""All but that of binary descriptors, as ORB's."""
+"""All matchers except the one for binary descriptors such as ORB's."""
 
 
 def get_matcher(name: str) -> Matcher:
-    """Return the matcher of this name; an unknown one is an OptionError."""
+    """Return the matcher of this name; an unknown name is an OptionError."""
     return look_up("matcher", name, MATCHERS)
 
 
@@ -281,8 +281,8 @@ def get_matcher(name: str) -> Matcher:
 class DescriptorMatches:
     """Matched rows (M,) of two sets of descriptors.
 
-    `ratios` are Lowe's, (M,) float32: the distance of the best over that of the second-best; after
-    `filter_matches` how likely matches are wrong.
+    `ratios` are Lowe's, (M,) float32: the distance to the best divided by that to the second-best.
+    After `filter_matches` they are the probabilities that matches are wrong.
     """
 
     indices0: np.ndarray
@@ -305,8 +305,8 @@ def match_descriptors(
 ) -> DescriptorMatches:
     """Match by nearest neighbour and ratio test (Lowe, 2004), by ascending row of the first set.
 
-    The (N, D) and (M, D) descriptors are uint8 or float32; ratios must be below `ratio` (paper's
-    code: 0.99); `mutual` keeps only mutual nearest neighbours. `seed` and `positions` are of the
+    The (N, D) and (M, D) descriptors are uint8 or float32. Ratios must be below `ratio` (paper's
+    code: 0.99); `mutual` keeps only mutual nearest neighbours. `seed` and `positions` go to the
     matcher.
     """
     if len(descriptors0) == 0 or len(descriptors1) < 2:  # there is no second-best neighbour

@@ -16,7 +16,7 @@ from ..geometry.estimation import MAX_LOG10_NFA, Geometry, log10_nfa
 from .keypoints import Keypoints, nearest_keypoints
 
 MAX_KEYPOINT_DISTANCE_PX = 1.0
-"""Of a position from the keypoint that it belongs to."""
+"""A match ends at a keypoint if its position is at most this far away. Chosen by hand."""
 
 _COLUMNS: dict[str, Any] = {
     "points0": np.float32,
@@ -29,21 +29,20 @@ _COLUMNS: dict[str, Any] = {
 @suggest_keywords
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Why a geometry between two images is believed, or not.
+    """Why a geometry between two images is trusted, or not.
 
     Attributes:
-        tentative_matches: number of tentative matches that the geometry was first estimated from.
-        tentative_inliers: number of those that agree with it, and of more along its lines.
+        tentative_matches: number of tentative matches from which the geometry was first estimated.
+        tentative_inliers: number of those that agree with it, plus further ones along its lines.
         log10_nfa: decimal logarithm of its number of false alarms (a contrario): how many
             geometries with as many inliers are expected among random matches.
         simulated_views: number of views that were simulated to find it, as in ASIFT.
-        on_plane, off_plane: number of matches on the plane that most of them lie on, where there
-            is one, and of the others.
-        verified: fraction of what it proposed that the images confirm: of a homography the partners
-            of keypoints, else the keypoints of the first image that are matched, or, where only
-            sparse matches are returned, these.
-        correlation: median ZNCC of windows of both images, each where the matches around it say,
-            without its own: right matches predict what looks alike. 0 for few matches.
+        on_plane, off_plane: number of matches on and off the dominant plane, if there is one.
+        verified: fraction of its proposals that the images confirm. A homography proposes partners
+            of keypoints; a fundamental matrix proposes a match for each keypoint of the first image
+            or, if only sparse matches are returned, for each of these.
+        correlation: median ZNCC of windows of both images, each placed by the matches around it,
+            not by its own: correct matches predict similar content. 0 if there are few matches.
     """
 
     tentative_matches: int = 0
@@ -62,16 +61,15 @@ class TwoViewGeometry:
     """The geometry between two images.
 
     Attributes:
-        model: "homography", "fundamental", "essential", or "none": no geometry can be trusted.
-        matrix: (3, 3) float64; None where the model is "none". A homography maps the first image to
+        model: "homography", "fundamental", "essential", or "none" if no geometry can be trusted.
+        matrix: (3, 3) float64; None if the model is "none". A homography maps the first image to
             the second; else x1^T M x0 = 0 (essential: in normalised coordinates).
-        scene: "planar", "rotation" (a turning camera explains the homography as well; a flat scene
-            may look so), "depth", "depth with a dominant plane", or "none" where the model is.
-            Matches of a planar scene tell two poses from known cameras, those of a rotation no
-            translation.
-        confidence: "high", "fair" (only sparse matches, or weak evidence), or "none" where the
-            model is.
-        evidence: what this rests on.
+        scene: "planar", "rotation" (of the camera; a flat scene may look like it), "depth", "depth
+            with a dominant plane", or "none" if the model is. With known cameras, matches of a
+            planar scene give two possible poses, those of a rotation no translation.
+        confidence: "high", "fair" (only sparse matches, or weak evidence), or "none" if the model
+            is.
+        evidence: the figures behind these.
     """
 
     model: str
@@ -98,15 +96,15 @@ class GuidedMatches:
     """Matches of keypoints of the first image.
 
     Attributes:
-        indices0: (M,) int64 keypoints of the first image, rising, each once.
+        indices0: (M,) int64 keypoints of the first image, ascending, each once.
         points1: (M, 2) float64 positions in the second image.
         scores: (M,) float32 in [0, 1], higher is better.
-        subpixel: whether the positions are sub-pixel ones, of a rectified pair.
-        indices1: (M,) int64 keypoints of the second image; None where the positions are others.
-        points0: (M, 2) float64 positions in the first image where they are not those of keypoints:
-            then the index of a match that no keypoint is near is -1.
-        alike: (M,) bool, false where the images contradict: the window around the match, held out
-            from the matches that predict where it is, is no more alike than unrelated ones.
+        subpixel: whether the positions are sub-pixel, from a rectified pair.
+        indices1: (M,) int64 keypoints of the second image; None if the positions are not keypoints.
+        points0: (M, 2) float64 positions in the first image if they are not those of keypoints. A
+            match without a keypoint near it then has the index -1.
+        alike: (M,) bool, False if the images contradict a match: the window around it, placed by
+            the matches around, is no more similar than unrelated windows.
     """
 
     indices0: np.ndarray
@@ -125,7 +123,7 @@ class GuidedMatches:
         return xy0[self.indices0] if self.points0 is None else self.points0
 
     def joined(self, other: GuidedMatches, chosen: np.ndarray) -> GuidedMatches:
-        """Return these matches and those of the (M,) bool `chosen` of others, of keypoints."""
+        """Return these matches and the (M,) bool `chosen` ones of others, of keypoints."""
         order = np.argsort(np.append(self.indices0, other.indices0[chosen]), kind="stable")
 
         def both(name: str) -> np.ndarray:
@@ -137,14 +135,14 @@ class GuidedMatches:
 
 
 class _Lazy:
-    """A field of keypoints, or of a function that finds them when they are first asked for."""
+    """A field of keypoints, or of a function that finds them on first access."""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
 
     def __get__(self, instance: Any, owner: type | None = None) -> Keypoints:
         if instance is None:
-            raise AttributeError(self.name)  # so that the field has no default
+            raise AttributeError(self.name)  # the field then has no default
         keypoints = instance.__dict__[self.name]
         if not isinstance(keypoints, Keypoints):
             keypoints = instance.__dict__[self.name] = keypoints()
@@ -155,7 +153,7 @@ class _Lazy:
 
 
 def lazy(find: Callable[[], Keypoints]) -> Keypoints:
-    """Return what `Matches` takes as keypoints, and finds when they are first asked for."""
+    """Wrap a function as keypoints for `Matches`, which calls it on first access."""
     return cast(Keypoints, find)
 
 
@@ -165,39 +163,35 @@ class Matches:
     """Matched keypoints of two images.
 
     Attributes:
-        points0, points1: (M, 2) float32 positions in the first and in the second
-            image, matched row by row; centre of the first pixel (0, 0). Both are keypoints,
-            except where a fundamental matrix guided: then those of the first image are the pixels
-            of its keypoints, and those of the second where these pixels are seen; with `mutual`
-            it may be the other way round.
-        scores: (M,) float32 in [0, 1], higher is better. Guided by a homography, 1 - the
-            dissimilarity of the two patches (0: only just more similar than unrelated patches); by
-            a fundamental matrix, their correlation; else 1 - Lowe's ratio.
+        points0, points1: (M, 2) float32 positions in the first and in the second image, matched row
+            by row; centre of the first pixel (0, 0). They are keypoints, unless a fundamental
+            matrix guided: then those of the first image are the pixels of its keypoints, and those
+            of the second where these pixels are seen. With `mutual` it may be the other way round.
+        scores: (M,) float32 in [0, 1], higher is better. If a homography guided: 1 - the
+            dissimilarity of both patches (0: just more similar than unrelated patches); if a
+            fundamental matrix guided: their correlation; otherwise 1 - Lowe's ratio.
         inliers: (M,) bool, the matches whose error under the geometry is below
-            `GeometryOptions.inlier_threshold`; all of them where there is no geometry yet. Not
-            those of guided matches that the images contradict: windows that others predict, around
-            them, are no more alike than unrelated ones.
-        keypoints0, keypoints1: all keypoints of the two images. Of a pair without success they may
-            be lazy: they are found when they are first asked for.
-        seconds: time of each stage, both images together.
-        geometry: the geometry between the images; None for the matches of `match_features`, of
-            which none has been estimated yet.
+            `GeometryOptions.inlier_threshold`; all matches if there is no geometry yet. Guided
+            matches that the surrounding image contradicts are no inliers.
+        keypoints0, keypoints1: all keypoints of the two images. If no geometry was found they may
+            be lazy: they are detected on first access.
+        seconds: time of each stage, for both images together.
+        geometry: the geometry between the images; None for `match_features`, which estimates none.
         subpixel: whether the matching itself found sub-pixel positions in the second image, by
             rectification: they need no refinement.
-        indices0, indices1: (M,) int32 rows of `keypoints0` and `keypoints1`: the keypoints that are
-            matched. Exactly they, unguided and where a homography guided. Where a fundamental
-            matrix guided, the first is the keypoint on whose pixel the match lies, and the second
-            the one nearest to it, up to a pixel away: -1 where there is none, and
-            `m[m.indices1 >= 0]` are the others (with `mutual` it may be the other way round).
-            None: the nearest ones are looked up.
+        indices0, indices1: (M,) int32 rows of `keypoints0` and `keypoints1` that are matched. If a
+            fundamental matrix guided, the first is the keypoint on whose pixel the match lies, and
+            the second the nearest keypoint up to a pixel away, or -1 (`m[m.indices1 >= 0]` drops
+            such matches). With `mutual` it may be the other way round. None: the nearest keypoints
+            are looked up.
 
-    A detector finds the same keypoints in an image whatever it is matched with, so for the same
-    options the same index is the same keypoint in all pairs of an image: tracks chain by them.
+    A detector finds the same keypoints in an image whatever it is matched with. So with the same
+    options an index is the same keypoint in all pairs of an image, which allows tracks.
 
     `len` and indexing by slices, masks, index arrays and whole numbers work: `m[m.inliers]`.
 
     Raises:
-        OptionError: the shapes do not fit together, or an index is of no keypoint.
+        OptionError: the shapes do not fit together, or an index belongs to no keypoint.
 
     Example:
         >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))
@@ -218,7 +212,7 @@ class Matches:
     seconds: dict[str, float] = field(default_factory=dict)
     geometry: TwoViewGeometry | None = None
     subpixel: bool = False
-    indices0: np.ndarray = None  # type: ignore[assignment]  # never None once it is made
+    indices0: np.ndarray = None  # type: ignore[assignment]  # never None after construction
     indices1: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
@@ -229,10 +223,10 @@ class Matches:
         counts = [len(self.points0), len(self.points1), len(self.scores), len(self.inliers)]
         if len(set(counts)) > 1:
             raise OptionError(
-                f"matches need as many points0, points1, scores and inliers, not {counts}"
+                f"matches need equally many points0, points1, scores and inliers, not {counts}"
             )
         if not (np.isfinite(self.points0).all() and np.isfinite(self.points1).all()):
-            raise OptionError("matches need finite positions: leave out those that are not")
+            raise OptionError("matches need finite positions: leave the others out")
         for side in (0, 1):
             name = f"indices{side}"
             indices = getattr(self, name)
@@ -246,12 +240,12 @@ class Matches:
             object.__setattr__(self, name, self._checked_indices(indices, side))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return what is pickled: keypoints, not a function that would find them."""
+        """Return what is pickled: keypoints, not a function that finds them."""
         return {**self.__dict__, "keypoints0": self.keypoints0, "keypoints1": self.keypoints1}
 
     @property
     def success(self) -> bool:
-        """False where no geometry can be trusted: its model is "none"."""
+        """False if no geometry can be trusted: its model is "none"."""
         return self.geometry is None or self.geometry.model != "none"
 
     @property
@@ -265,14 +259,14 @@ class Matches:
 
     @suggest_keywords
     def with_geometry(self, found: Geometry, inlier_threshold: float = 1.0) -> Matches:
-        """Return the same matches with what `estimate_geometry` has found, judged.
+        """Return the same matches with a geometry from `estimate_geometry`, and its evidence.
 
-        Its confidence is "fair" where chance does not explain that so many matches agree, else its
-        model is "none" and no match is an inlier.
+        Its confidence is "fair" if chance does not explain its inliers; otherwise its model is
+        "none" and there are no inliers.
 
         Args:
             found: the geometry that was estimated from these matches.
-            inlier_threshold: the one of `GeometryOptions`, in pixels.
+            inlier_threshold: the threshold in the `GeometryOptions`, in pixels.
         """
         alarms = np.inf
         if found.matrix is not None:
@@ -303,9 +297,9 @@ class Matches:
         return [cv2.DMatch(i, j, d) for i, j, d in zip(*columns, strict=True) if min(i, j) >= 0]
 
     def unique(self) -> Matches:
-        """Return one-to-one matches: those that score highest at both of their ends.
+        """Return one-to-one matches: those with the highest score at both of their ends.
 
-        Ends are one keypoint, or without one near one pixel. The first of equal scores counts.
+        An end is a keypoint or, without one, a pixel. Among equal scores the first counts.
 
         Example:
             >>> points = Keypoints([[1, 2], [3, 4]], [0.9, 0.6], (8, 8))
@@ -348,14 +342,14 @@ class Matches:
         lines: int = 150,
         by_position: bool = False,
     ) -> np.ndarray:
-        """Draw matches on both images side by side: lines, green for inliers and red for others.
+        """Draw matches on both images side by side: lines, green for inliers and red for outliers.
 
         Args:
             image0, image1: arrays, PyTorch tensors or PIL images.
             channels: order of the colours in arrays and tensors.
-            lines: at most this many are drawn: a random sample, the same each time.
-            by_position: colour inliers by where they are in the first image, and draw more of them
-                as dots than as lines, so that one sees what was matched where.
+            lines: maximum number of matches that are drawn: a random sample, always the same.
+            by_position: colour inliers by their position in the first image, and draw more of them
+                as dots than as lines, which shows what was matched where.
 
         Returns:
             (H, W, 3) uint8 RGB, its longer side at most 2,000 pixels.
@@ -380,7 +374,7 @@ class Matches:
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows: a small table, and where some of the matches are."""
+        """Return what a notebook shows: a small table, and the positions of some matches."""
         from .display import html_summary
 
         inliers, geometry = np.count_nonzero(self.inliers), self.geometry
@@ -402,7 +396,7 @@ class Matches:
         return html_summary(f"{len(self):,} matches", rows, points, lines)
 
     def __repr__(self) -> str:
-        if not self.success:  # whose keypoints may have to be found first
+        if not self.success:  # its keypoints may not be detected yet
             return f"Matches({len(self)} matches; no geometry can be trusted)"
         told = ""
         if self.geometry is not None:
@@ -413,10 +407,10 @@ class Matches:
         )
 
     def _checked_indices(self, indices: np.ndarray, side: int) -> np.ndarray:
-        """Return indices of an image's keypoints as int32, checked."""
+        """Return the checked indices of an image's keypoints as int32."""
         if indices.shape != (len(self),) or (indices.size and indices.dtype.kind not in "iu"):
             raise OptionError(
-                f"matches need one whole number each as indices{side}, not {indices.dtype} "
+                f"matches need one whole number each in indices{side}, not {indices.dtype} "
                 f"numbers of shape {indices.shape}"
             )
         if indices.size:
@@ -430,7 +424,7 @@ class Matches:
 
 
 def _ends(points: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """Number the ends of matches: keypoints from 0 on, pixels without one below 0."""
+    """Number the ends of matches: keypoints from 0 up, pixels without one from -1 down."""
     ends = indices.astype(np.int64)
     without = np.flatnonzero(indices < 0)
     if len(without):

@@ -9,26 +9,26 @@ import numpy as np
 from .._shared.opencv import cv2
 
 LAYERS = 3
-"""Of an octave that hold keypoints: from one to the next, sigma grows by the cube root of 2."""
+"""Layers per octave that hold keypoints, as in Lowe (2004): sigma grows by the cube root of 2."""
 
 BASE_SIGMA_PX = 1.6
-"""Blur of the first image of an octave, in pixels of the octave."""
+"""Blur of the first image of an octave, in pixels of the octave, as in Lowe (2004)."""
 
 CAMERA_SIGMA_PX = 0.5
-"""Blur that an image is assumed to have."""
+"""Blur that an image is assumed to have already, as in Lowe (2004)."""
 
 SIZE_PER_SIGMA = 2.0
-"""OpenCV's keypoints of SIFT have this many times the sigma of their scale as their size."""
+"""The size of a SIFT keypoint in OpenCV is this many times the sigma of its scale."""
 
 MIN_SIDE_PX = 8
-"""Octaves with a shorter side are not used."""
+"""Octaves with a shorter side are not used. Chosen by hand."""
 
 
 def nearest_layers(sizes: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return the octave and the layer, from 1 to 3, whose sigma is nearest to that of keypoints.
 
-    By their (N,) sizes, twice sigma, as OpenCV's SIFT has them, in an image of a (height, width).
-    Octave -1 is that of the image at twice its size.
+    The (N,) sizes are twice sigma, as in OpenCV's SIFT; the image has this (height, width). Octave
+    -1 is that of the image at twice its size.
     """
     sigma = np.maximum(np.asarray(sizes, np.float64) / SIZE_PER_SIGMA, 1e-6)
     step = np.rint(LAYERS * np.log2(sigma / BASE_SIGMA_PX)).astype(np.int64)
@@ -39,7 +39,7 @@ def nearest_layers(sizes: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarra
 
 
 def packed_octaves(sizes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return where SIFT describes keypoints of (N,) sizes, as OpenCV notes octave and layer."""
+    """Return where SIFT describes keypoints of (N,) sizes: octave and layer as packed by OpenCV."""
     octaves, layers = nearest_layers(sizes, shape)
     return (octaves & 255) | (layers << 8)
 
@@ -73,17 +73,17 @@ def gaussian_layers(
 
 
 WINDOW_PER_SIGMA = 1.5
-"""Sigma of the Gaussian window over that of the keypoint."""
+"""Sigma of the Gaussian window relative to that of the keypoint, as in Lowe (2004)."""
 
 
 def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Return the dominant orientation of keypoints, as OpenCV's SIFT assigns it, (N,) float32.
+    """Return the dominant orientation of keypoints as in OpenCV's SIFT, (N,) float32.
 
     The gradients in a Gaussian window of 1.5 sigma around a keypoint, at its scale, vote for 36
-    directions; the histogram is smoothed, and a parabola through its highest bin and the two beside
-    it gives the angle: degrees in [0, 360) from x towards y, which points down; 0 where the image
-    is flat. Sizes are diameters, twice sigma. SIFT has further keypoints for directions with nearly
-    as many votes; here it is always the highest.
+    directions. The histogram is smoothed, and a parabola through its highest bin and both
+    neighbours gives the angle: degrees in [0, 360) from x towards y, which points down; 0 in flat
+    regions. Sizes are diameters, twice sigma. SIFT adds keypoints for directions with nearly as
+    many votes; here only the highest counts.
     """
     from .kernels import strongest_directions
 
@@ -104,7 +104,7 @@ def dominant_angles(gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray) -> np.n
 def set_angles(
     gray: np.ndarray, xy: np.ndarray, sizes: np.ndarray, angles: np.ndarray | None
 ) -> np.ndarray:
-    """Return (N,) float32 angles, the dominant ones where they are below 0, or None."""
+    """Return (N,) float32 angles; unset ones (below 0, or None) become the dominant angles."""
     angles = np.full(len(xy), -1, np.float32) if angles is None else angles.copy()
     unset = np.flatnonzero(angles < 0)
     angles[unset] = dominant_angles(gray, xy[unset], sizes[unset])

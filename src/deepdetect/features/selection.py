@@ -1,4 +1,4 @@
-"""Selection of keypoints: from heat maps by probability, of any points by where they are."""
+"""Selection of keypoints: from heat maps by probability, or of any points by their positions."""
 
 from __future__ import annotations
 
@@ -13,27 +13,29 @@ from .._shared.options import numbers_of, suggest_keywords
 from .keypoints import Keypoints, bayer_order
 
 MAX_OFFSET_PX = 0.499
-"""The nearest pixel of a refined keypoint is still the one that it was found at."""
+"""Limit of the sub-pixel offset: the nearest pixel of a keypoint stays the same."""
 
 Rows = Callable[[slice], np.ndarray]
-"""Returns the rows of a map that are asked for."""
+"""Returns the requested rows of a map."""
 
 BAND_PIXELS = 4_000_000
-"""Of a map that are worked on at a time."""
+"""Maps are processed in bands of about this many pixels, to bound memory."""
 
 GRID_CELLS = 24
-"""Along the longer side; each cell gives its strongest keypoints in turn: all parts have some."""
+"""Number of cells along the longer side. Each cell gives its strongest keypoints in turn, so that
+keypoints cover the image. Chosen by hand."""
 
 DISTANCE_STEP_PX = 0.25
-"""To which the distance of `spread_by_distance` is found."""
+"""Precision to which `spread_by_distance` finds the distance. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
 class Maps:
-    """A heat map and the logits by which its pixels are ranked, each made when it is asked for.
+    """A heat map and the logits that rank its pixels, each computed on demand.
 
-    Of a large image either takes more memory than most of its keypoints: one is held at a time.
-    Both are (H, W) float32; `heatmap` makes the map and gives its rows, `logits` makes the logits.
+    For a large image either takes more memory than its keypoints, so only one is held at a time.
+    Both are (H, W) float32; `heatmap` computes the map and returns its rows, `logits` computes the
+    logits.
     """
 
     shape: tuple[int, ...]
@@ -42,7 +44,7 @@ class Maps:
 
     @classmethod
     def of_logits(cls, logits: np.ndarray) -> Maps:
-        """Return maps whose heat map is the sigmoid of the logits, and is never held whole."""
+        """Return maps whose heat map is the sigmoid of the logits and is never held as a whole."""
         return cls(logits.shape, lambda: lambda rows: sigmoid(logits[rows]), lambda: logits)
 
     def both(self) -> tuple[np.ndarray, np.ndarray]:
@@ -50,25 +52,25 @@ class Maps:
         heatmap, rows_of = np.empty(self.shape, np.float32), self.heatmap()
         for rows in bands(self.shape):
             heatmap[rows] = rows_of(rows)
-        del rows_of  # it may hold another map
+        del rows_of  # frees the map that it may hold
         return heatmap, self.logits()
 
 
 def sigmoid(logits: np.ndarray) -> np.ndarray:
-    """Return the probabilities of logits; the exponent is never positive: nothing overflows."""
+    """Return the probabilities of logits. The exponent is never positive, so nothing overflows."""
     decay = np.exp(-np.abs(logits))
     return np.where(logits >= 0, np.float32(1), decay) / (1 + decay)
 
 
 def bands(shape: tuple[int, ...]) -> Iterator[slice]:
-    """Yield rows of a map in bands, to bound the memory of what is made of them."""
+    """Yield the rows of a map in bands, which bounds the memory for processing them."""
     rows = max(1, BAND_PIXELS // max(1, shape[1]))
     for start in range(0, shape[0], rows):
         yield slice(start, min(start + rows, shape[0]))
 
 
 def check_max_keypoints(count: int | None) -> None:
-    """Raise an OptionError where a largest number of keypoints is no whole number above 0."""
+    """Raise an OptionError if a maximum number of keypoints is not a whole number above 0."""
     if count is not None and not (count >= 1 and count % 1 == 0):
         raise OptionError(f"`max_keypoints` must be a whole number from 1 on, not {count}")
 
@@ -79,13 +81,13 @@ class SelectionOptions:
     """Which pixels of a heat map become keypoints.
 
     Attributes:
-        threshold: pixels with a probability above it become keypoints (paper: tau = 0.5).
-        density: keypoints per pixel, in (0, 1]; replaces the threshold: this fraction of the pixels
-            is taken, the most probable ones.
-        max_keypoints: at most this many are kept, the most probable ones.
-        nms_radius: non-maximum suppression radius in pixels: a pixel is kept if it ranks highest
+        threshold: pixels with a higher probability become keypoints (paper: tau = 0.5).
+        density: keypoints per pixel, in (0, 1]: the most probable pixels are taken up to this
+            fraction of all, instead of those above the threshold.
+        max_keypoints: maximum number of keypoints; the most probable ones are kept.
+        nms_radius: radius of non-maximum suppression in pixels: a pixel is kept if it ranks highest
             within this distance in x and y; 0 keeps all.
-        subpixel: refine to the maximum of a parabola through three pixels in x and in y.
+        subpixel: refine positions to the maximum of a parabola through three pixels in x and in y.
 
     Raises:
         OptionError: a value is out of its range.
@@ -117,16 +119,16 @@ def select_keypoints(
 ) -> Keypoints:
     """Select the dense keypoints of a heat map.
 
-    With a heat map and logits of `DeepDetect.heatmap_and_logits` they are exactly those that
-    `detect` finds with the same options, without running the network again.
+    With the heat map and the logits of `DeepDetect.heatmap_and_logits` the result is that of
+    `detect` with the same options, without another run of the network.
 
     Args:
-        heatmap: (H, W) float32 probability.
-        options: which ones. The order of the steps is: ignore mask, threshold, suppression,
-            density or maximum number, sub-pixel refinement.
-        logits: (H, W) float32 logits of the map, by which keypoints are ranked; by default the
-            map itself, although float32 rounds its highest probabilities to 1. Ties are broken
-            by an order that spreads the keypoints evenly (`bayer_order`).
+        heatmap: (H, W) float32 probabilities.
+        options: which pixels are selected. The order of the steps is: ignore mask, threshold,
+            suppression, density or maximum number, sub-pixel refinement.
+        logits: (H, W) float32 logits of the map, which rank the keypoints. Without them the map
+            does, although float32 rounds its highest probabilities to 1. Ties are broken by an
+            order that spreads the keypoints evenly (`bayer_order`).
         ignore: (H, W) bool or number array, true where keypoints are ignored.
 
     Returns:
@@ -158,7 +160,7 @@ def select_keypoints(
 def select_from_maps(
     maps: Maps, options: SelectionOptions, ignore: np.ndarray | None = None
 ) -> Keypoints:
-    """Select keypoints as `select_keypoints` does; their logits are their ranks."""
+    """Select keypoints as `select_keypoints` does, with the logits as ranks."""
     height, width = maps.shape
     passing = _passing(maps, options, ignore)
     ranking = maps.logits()
@@ -171,7 +173,7 @@ def select_from_maps(
         (rows, slice(end - count, end))
         for rows, end, count in zip(bands(maps.shape), np.cumsum(counts), counts, strict=True)
     ]
-    # One map at a time, and what is not written yet takes no memory.
+    # One map is held at a time, and unwritten parts of the arrays take no memory.
     for rows, part in parts:
         pixels = _unpack(chosen[rows], width)
         logits[part] = ranking[rows].ravel()[pixels]
@@ -192,16 +194,16 @@ def select_from_maps(
 
 
 def _unpack(packed: np.ndarray, width: int) -> np.ndarray:
-    """Return the numbers of the pixels that are set in packed rows."""
+    """Return the flat indices of the pixels that are set in packed rows."""
     return np.flatnonzero(np.unpackbits(packed, axis=1, count=width))
 
 
 def _passing(maps: Maps, options: SelectionOptions, ignore: np.ndarray | None) -> np.ndarray:
-    """Return the pixels over the threshold that are not ignored, eight of a row in a byte."""
+    """Return the pixels above the threshold that are not ignored; a byte holds eight of a row."""
     height, width = maps.shape
     if ignore is not None:
         ignore = check_ignore(ignore, maps.shape)
-    # With a density, all pixels but the impossible ones may be needed.
+    # A density may need all pixels except impossible ones.
     threshold = options.threshold if options.density is None else 0.0
     packed = np.empty((height, -(-width // 8)), np.uint8)
     heatmap = maps.heatmap()
@@ -214,7 +216,7 @@ def _passing(maps: Maps, options: SelectionOptions, ignore: np.ndarray | None) -
 
 
 def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions) -> np.ndarray:
-    """Return the pixels that become keypoints, packed as those are that pass the threshold."""
+    """Return the pixels that become keypoints, packed like `passing`."""
     height, width = ranking.shape
     radius = int(options.nms_radius)
     count = _wanted_count(options, ranking.size)
@@ -223,8 +225,8 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
     ranks = ranking.ravel()
 
     def wanted(rows: slice) -> np.ndarray:
-        """Return the pixels of a band that pass all but the limit on their number."""
-        # What is nearby decides which are suppressed.
+        """Return the pixels of a band that pass everything except the limit on their number."""
+        # Suppression also depends on pixels just outside the band.
         seen = slice(max(0, rows.start - radius), min(height, rows.stop + radius))
         pixels = _unpack(passing[seen], width)
         if radius and len(pixels):
@@ -235,7 +237,7 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
         return pixels[(pixels >= rows.start * width) & (pixels < rows.stop * width)]
 
     in_bands = list(bands(ranking.shape))
-    only = wanted(in_bands[0]) if len(in_bands) == 1 else None  # looked for once
+    only = wanted(in_bands[0]) if len(in_bands) == 1 else None  # computed once
     lowest = np.float32(-np.inf)
     if count is not None:
         parts = (ranks[wanted(rows) if only is None else only] for rows in in_bands)
@@ -261,8 +263,8 @@ def _choose(passing: np.ndarray, ranking: np.ndarray, options: SelectionOptions)
 
 
 def _least_of_the_best(parts: Iterable[np.ndarray], count: int, kind: np.dtype) -> np.floating:
-    """Return the rank of the last of the best of all parts; -infinity where they are fewer."""
-    if count == 0:  # of a density that is less than half a pixel
+    """Return the lowest rank among the `count` best of all parts; -infinity if there are fewer."""
+    if count == 0:  # the density is less than half a pixel
         return kind.type(np.inf)
     best = np.empty(0, kind)
     for part in parts:
@@ -282,15 +284,15 @@ def _is_highest(
 ) -> np.ndarray:
     """Return which pixels of a band of this shape rank highest in the window around them.
 
-    It begins with a row of an image of this height. Of equal scores the one that comes first in
-    `bayer_order` ranks higher: one pixel of a plateau is kept.
+    The band starts at `first_row` of an image of this height. Among equal scores the first in
+    `bayer_order` ranks higher, so one pixel of a plateau is kept.
     """
     kind = np.float32 if scores.dtype == np.float32 else np.float64
     image = np.full(shape, -np.inf, kind)
     image.ravel()[pixels] = np.maximum(scores, np.finfo(kind).min)
     radius = min(radius, max(shape))
     window = np.ones((2 * radius + 1,) * 2, np.uint8)  # a box is dilated in linear time
-    highest = cv2.dilate(image, window) == image  # beyond the border is -infinity
+    highest = cv2.dilate(image, window) == image  # outside the border the value is -infinity
     kept = highest.ravel()[pixels]
     rows = np.flatnonzero(kept)
     row, column = np.divmod(pixels[rows], shape[1])
@@ -311,9 +313,9 @@ def _is_highest(
 
 
 def peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis: int) -> np.ndarray:
-    """Return the offset of the maximum of a parabola through pixels of a map and their neighbours.
+    """Return the offset of a parabola's maximum through each pixel and its two neighbours.
 
-    It is 0 on the border, and where a pixel is not a maximum along the axis (0: down, 1: right).
+    The axis is 0 (down) or 1 (right). The offset is 0 on the border, and where there is no maximum.
     """
     position, last = (row, column)[axis], ranking.shape[axis] - 1
     inner = (position > 0) & (position < last)
@@ -332,7 +334,7 @@ def peak_offset(ranking: np.ndarray, row: np.ndarray, column: np.ndarray, axis: 
 
 
 def check_ignore(ignore: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return an ignore mask as (H, W) bool; an OptionError where it differs from the image."""
+    """Return an ignore mask as (H, W) bool; an OptionError if it differs from the image in size."""
     mask = numbers_of("ignore", ignore, bool)
     if mask.shape != shape:
         raise OptionError(
@@ -351,7 +353,7 @@ def _wanted_count(options: SelectionOptions, pixels: int) -> int | None:
 
 
 def grid_subsample(xy: np.ndarray, grid_size_px: int, seed: int = 0) -> np.ndarray:
-    """Choose one random of (N, 2) positions of each cell of a grid; (K,) rows in rising order."""
+    """Choose a random one of the (N, 2) positions in each grid cell; (K,) rows, ascending."""
     cell = np.floor(np.asarray(xy, np.float64) / grid_size_px).astype(np.int64)
     order = np.random.default_rng(seed).permutation(len(cell))
     _, first = np.unique(cell[order], axis=0, return_index=True)
@@ -367,8 +369,8 @@ def spread_over_grid(
 ) -> np.ndarray:
     """Choose keypoints by score, in turn from all cells of a grid.
 
-    Returns at most `max_keypoints` rows: first the best of each cell, then the second-best, ...
-    `grid_cells` are along the longer side of the image.
+    Returns at most `max_keypoints` rows: the best of each cell, then the second-best, and so on.
+    There are `grid_cells` cells along the longer side of the image.
     """
     side = max(image_size) / grid_cells
     cell = np.floor(np.maximum(xy, 0) / side).astype(np.int64)
@@ -381,13 +383,13 @@ def spread_over_grid(
 
 
 def descending_order(values: np.ndarray) -> np.ndarray:
-    """Return the rows of (N,) numbers from the highest, of float32 several times as fast as NumPy.
+    """Return the rows of (N,) numbers from the highest; several times as fast as NumPy for float32.
 
-    Of equal numbers the first row comes first.
+    Among equal numbers the first row comes first.
     """
     if values.dtype != np.float32:
         return np.argsort(-values, kind="stable")
-    # The bits of floats rise with their magnitude, below 0 too.
+    # The bits of floats grow with their magnitude, also below 0.
     bits = (values + np.float32(0)).view(np.int32)
     keys = np.where(bits < 0, bits & 0x7FFFFFFF, ~bits).astype(np.int64) << 32
     keys |= np.arange(len(values))
@@ -401,10 +403,10 @@ def suppress_neighbors(
     radius_px: float | np.ndarray,
     max_count: int | None = None,
 ) -> np.ndarray:
-    """Go through points from the best; return the rows that are not near a kept one, best first.
+    """Keep points from the best on that are not near a kept one; return their rows, best first.
 
-    Near is strictly closer than the radius, or of (N,) radii than the smaller one of both points.
-    Of equal scores the first row comes first. With `max_count` at most the first so many.
+    Near means strictly closer than the radius, or, for (N,) radii, than the smaller of both
+    points'. Among equal scores the first row comes first. `max_count` limits the number of rows.
     """
     from .kernels import keep_distant
 
@@ -422,10 +424,7 @@ def suppress_neighbors(
 
 
 def spread_by_distance(xy: np.ndarray, scores: np.ndarray, count: int) -> np.ndarray:
-    """Choose the best points that are as far from each other as their number allows, best first.
-
-    Adaptive non-maximal suppression (Brown et al., 2005), by bisection (Bailo et al., 2018).
-    """
+    """Choose the best points that are as far apart as their number allows, best first."""
     best = descending_order(np.asarray(scores))
     if count >= len(best):
         return best

@@ -1,6 +1,6 @@
-"""SIFT descriptors of any keypoints (paper, Section III-C), and well-spread keypoints of SIFT.
+"""SIFT descriptors of any keypoints (paper, Section III-C), and well-spread SIFT keypoints.
 
-A new one is a function `(gray, xy, size, angle) -> (N, D) uint8 or float32` in `DESCRIPTORS`.
+To add a descriptor, add `(gray, xy, size, angle) -> (N, D) uint8 or float32` to `DESCRIPTORS`.
 """
 
 from __future__ import annotations
@@ -22,23 +22,23 @@ ROOT_SIFT: Final = "rootsift"
 """`Keypoints.descriptor_type` of RootSIFT."""
 
 DENSE_SIZES_PX = (2.0, 8.0)
-"""Diameters of keypoints that can be described all at once."""
+"""Range of keypoint diameters that `dense_sift` supports."""
 
 MIN_DENSE_DENSITY = 0.02
-"""Keypoints per pixel from which that is faster than one by one."""
+"""Keypoints per pixel above which `dense_sift` is faster than one keypoint at a time."""
 
 BIN_WIDTH = 1.5
-"""Width of a spatial bin in units of the keypoint's size (3 times its radius)."""
+"""Width of a spatial bin in units of the keypoint's size (3 times its radius), as in OpenCV."""
 
 CONTRAST_THRESHOLDS = (0.04, 0.01, 0.0025)
-"""Of SIFT (Lowe: 0.04), in the order in which they are tried; the contrast of a keypoint is
-compared after multiplication by the number of layers."""
+"""SIFT's contrast thresholds (Lowe: 0.04), tried in this order until there are enough keypoints. A
+keypoint's contrast is multiplied by the number of layers first, as in OpenCV."""
 
 MIN_KEYPOINTS = 1000
-"""With fewer the next lower contrast threshold is tried."""
+"""The next lower contrast threshold is tried if there are fewer keypoints. Chosen by hand."""
 
 ROWS_AT_ONCE = 1024
-"""Descriptors that are converted together, so that they stay in the processor's cache."""
+"""Descriptors are converted in blocks of this many, which stay in the processor's cache."""
 
 
 def sift_descriptors(
@@ -47,9 +47,9 @@ def sift_descriptors(
     """Compute (N, 128) uint8 SIFT descriptors, by the fastest implementation for these keypoints.
 
     Many upright keypoints on whole pixels are described all at once, which differs from OpenCV's
-    result by 1 in one of ten thousand numbers; others by OpenCV. The size is a diameter in pixels,
-    the angle in degrees; -1 is OpenCV's "unset", which its SIFT takes for a rotation by one degree,
-    as the published code does.
+    result by 1 in one of ten thousand numbers; OpenCV describes all others. The size is a diameter
+    in pixels, the angle is in degrees. -1 is OpenCV's "unset", which its SIFT takes for a rotation
+    by one degree, as in the published code.
     """
     dense = len(xy) > MIN_DENSE_DENSITY * gray.size
     upright = angle == 0 and DENSE_SIZES_PX[0] <= size <= DENSE_SIZES_PX[1]
@@ -67,10 +67,10 @@ def dense_sift(
 ) -> np.ndarray:
     """Compute upright SIFT descriptors all at once, (N, 128) uint8; they equal OpenCV's.
 
-    OpenCV sums the gradients around each keypoint separately. Where all keypoints are upright and
-    of one size, the sums are a filter: bilinear times Gaussian, along rows and then along columns.
-    The positions are whole pixels within the image, on every `step_px`-th row and column, which
-    saves time; sizes within `DENSE_SIZES_PX`. The gradient is that of `sift_gradient`.
+    OpenCV sums the gradients around each keypoint separately. If all keypoints are upright and of
+    one size, the sums are a filter, bilinear times Gaussian, along rows and then along columns.
+    Positions are whole pixels inside the image. If they are on every `step_px`-th row and column,
+    that saves time. Sizes lie within `DENSE_SIZES_PX`; the gradient is that of `sift_gradient`.
     """
     from .kernels import TILE_COLUMNS, TILE_HEIGHT, describe_tiles
 
@@ -92,9 +92,9 @@ def dense_sift(
 
 
 def sift_gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the gradient of a (H, W) uint8 image that `dense_sift` describes.
+    """Compute the gradient of a (H, W) uint8 image for `dense_sift`.
 
-    Returns (H, W) float32: its magnitude, 0 on the border, and its orientation in 45 degrees.
+    Returns (H, W) float32 magnitudes, 0 on the border, and orientations in units of 45 degrees.
     """
     blur = float(np.sqrt(BASE_SIGMA_PX**2 - CAMERA_SIGMA_PX**2))
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), blur)
@@ -108,13 +108,12 @@ def sift_gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _taps(size: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights of the pixels around a keypoint, and where they are not 0.
 
-    (4, T) float32 weights for the four spatial bins, and (4, 3) int64 spans, as of
-    `describe_tiles`.
+    They are (4, T) float32 for the four spatial bins, and (4, 3) int64 spans for `describe_tiles`.
     """
     from .kernels import TAPS_AT_ONCE
 
     width = BIN_WIDTH * size
-    reach = int(np.ceil(2.5 * width)) - 1  # bins overlap: half of one beyond four
+    reach = int(np.ceil(2.5 * width)) - 1  # four bins, and half a bin of overlap at each end
     offsets = np.arange(-reach, reach + 1) / width
     bins = np.arange(4)[:, None] - 1.5
     bilinear = np.maximum(0, 1 - np.abs(offsets - bins))
@@ -130,7 +129,7 @@ def _taps(size: float) -> tuple[np.ndarray, np.ndarray]:
 def opencv_sift_descriptors(
     gray: np.ndarray, xy: np.ndarray, size: float = 3.0, angle: float = 0.0
 ) -> np.ndarray:
-    """Compute OpenCV's SIFT descriptors; arguments and result as of `sift_descriptors`."""
+    """Compute OpenCV's SIFT descriptors; arguments and result as in `sift_descriptors`."""
     if not len(xy):
         return np.empty((0, 128), np.uint8)
     keypoints = cv2.KeyPoint_convert(np.asarray(xy, np.float32), size=size)
@@ -145,23 +144,23 @@ def scaled_sift_descriptors(
 ) -> np.ndarray:
     """Compute (N, 128) uint8 SIFT descriptors of keypoints at their own sizes and angles.
 
-    The gradients are those of the image of the scale space that is nearest to the size, as of
-    keypoints that SIFT detects itself. (`sift_descriptors` takes the finest image for all.) Sizes
-    are diameters, twice sigma: a descriptor covers a square with six times this side.
+    Gradients are taken from the scale-space image nearest to the size, as for SIFT's own keypoints.
+    (`sift_descriptors` uses the finest image for all.) Sizes are diameters, twice sigma: a
+    descriptor covers a square of six times this side.
     """
     if not len(xy):
         return np.empty((0, 128), np.uint8)
     octaves = packed_octaves(sizes, gray.shape)
     size, scores = (gray.shape[1], gray.shape[0]), np.zeros(len(xy))
     keypoints = Keypoints(xy, scores, size, sizes=sizes, angles=angles, octaves=octaves)
-    # Without precise upscaling octave -1 is a quarter of a pixel off.
+    # Without precise upscaling, octave -1 is a quarter of a pixel off.
     sift = cv2.SIFT_create(nOctaveLayers=LAYERS, enable_precise_upscale=True)
     return _compute(sift, gray, keypoints.to_opencv())
 
 
 def _compute(sift: cv2.SIFT, gray: np.ndarray, keypoints: list[cv2.KeyPoint]) -> np.ndarray:
     described, descriptors = sift.compute(gray, keypoints)
-    if len(described) != len(keypoints):  # it would silently break the order of rows
+    if len(described) != len(keypoints):  # would silently break the order of rows
         raise AssertionError("cv2.SIFT left out keypoints that were given to it")
     return descriptors.astype(np.uint8)  # they are whole numbers from 0 to 255
 
@@ -169,12 +168,12 @@ def _compute(sift: cv2.SIFT, gray: np.ndarray, keypoints: list[cv2.KeyPoint]) ->
 def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
     """Return keypoints with RootSIFT descriptors.
 
-    Keypoints with sizes are described at these and at their angles, where they have none at the
-    dominant one; others all alike, with size 3 and upright, as in the paper.
+    Keypoints with sizes are described at their own sizes and angles, or at the dominant angle if
+    theirs is unset; others upright with size 3, as in the paper.
 
     Args:
-        gray: (H, W) uint8 luma of the image that they are keypoints of.
-        keypoints: of any detector; angles of -1 are unset.
+        gray: (H, W) uint8 luma of the image of the keypoints.
+        keypoints: keypoints of any detector; angles of -1 are unset.
 
     Raises:
         ImageError: the image has another type or size than the keypoints' own.
@@ -202,14 +201,14 @@ def describe_keypoints(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
 
 
 def describe_scaled(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
-    """Return keypoints that have sizes with SIFT descriptors at these and at their angles.
+    """Return keypoints with SIFT descriptors at their own sizes and angles.
 
     Unset angles become the dominant ones; a size that is not above 0 is an OptionError.
     """
     xy, sizes = keypoints.xy, keypoints.sizes
     assert sizes is not None
     if not (sizes > 0).all():
-        raise OptionError("keypoints need sizes above 0 to be described: give them some")
+        raise OptionError("keypoints need sizes above 0 to be described")
     angles = set_angles(gray, xy, sizes, keypoints.angles)
     descriptors = scaled_sift_descriptors(gray, xy, sizes, angles)
     return replace(keypoints, angles=angles, descriptors=descriptors, descriptor_type="sift")
@@ -218,15 +217,15 @@ def describe_scaled(gray: np.ndarray, keypoints: Keypoints) -> Keypoints:
 def root_sift_descriptors(
     gray: np.ndarray, xy: np.ndarray, size: float = 3.0, angle: float = 0.0
 ) -> np.ndarray:
-    """Compute RootSIFT descriptors (`to_root_sift`); arguments as of `sift_descriptors`."""
+    """Compute RootSIFT descriptors (`to_root_sift`); arguments as in `sift_descriptors`."""
     return to_root_sift(sift_descriptors(gray, xy, size, angle))
 
 
 def to_root_sift(descriptors: np.ndarray) -> np.ndarray:
     """Convert (N, 128) uint8 SIFT descriptors to RootSIFT, in place.
 
-    They (Arandjelovic and Zisserman, 2012) are the square roots of the L1-normalised ones times
-    512, at most 255: their Euclidean distance is the Hellinger distance of SIFT.
+    RootSIFT (Arandjelovic and Zisserman, 2012) is the square root of L1-normalised descriptors,
+    here times 512 and at most 255. Its Euclidean distance is the Hellinger distance of SIFT.
     """
     parallel_for(len(descriptors), _square_root, descriptors)
     return descriptors
@@ -253,8 +252,8 @@ def correlation_distance(
 ) -> np.ndarray:
     """Return 1 - correlation of pairs of descriptors about a (D,) float32 mean, (K,) float32.
 
-    The pairs are (K,) rows of (N, D) and (M, D) uint8 descriptors. 0 where both are equal, 1 where
-    one of them is the mean.
+    The pairs are (K,) rows of (N, D) and (M, D) uint8 descriptors. The result is 0 if both are
+    equal, 1 if one of them is the mean.
     """
     from .kernels import correlation_distances
 
@@ -274,12 +273,12 @@ DESCRIPTORS: dict[str, Descriptor] = {
 
 
 def detect_sift(gray: np.ndarray, max_keypoints: int = 4000) -> Keypoints:
-    """Detect SIFT keypoints, spread over a (H, W) uint8 image, and describe them by RootSIFT.
+    """Detect SIFT keypoints, spread over a (H, W) uint8 image, with RootSIFT descriptors.
 
-    They have sizes, angles and octaves; the descriptors are rotated to the keypoints' angles.
+    They have sizes, angles and octaves; descriptors are rotated to the keypoints' angles.
     """
     size = (gray.shape[1], gray.shape[0])
-    # Detected once: nearly all of the time goes into the pyramid, whatever the threshold.
+    # Detected once, with the lowest threshold: nearly all of the time goes into the pyramid.
     # Without precise upscaling OpenCV's positions are a quarter of a pixel off, right and down.
     sift = cv2.SIFT_create(
         nOctaveLayers=LAYERS,

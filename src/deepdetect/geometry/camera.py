@@ -31,7 +31,7 @@ from .transforms import outer_corners
 Size = tuple[int, int]
 
 MAX_OFFSET_ERROR_PX = 0.5
-"""By how much cx of both views and the disparity offset may contradict each other."""
+"""The disparity offset may differ by this from the difference of both cx. Chosen by hand."""
 
 
 @suggest_keywords
@@ -45,7 +45,7 @@ class Camera:
         centre: (cx, cy), the principal point; None is the middle of the image.
 
     Attributes:
-        size, focal_px, centre: the same, all as pairs.
+        size, focal_px, centre: the same values, all as pairs.
 
     Raises:
         ReconstructionError: a value is not finite or not positive.
@@ -86,7 +86,7 @@ class Camera:
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
     def scaled(self, size: Size) -> Camera:
-        """Return the camera of its image at another (width, height)."""
+        """Return the camera of its image scaled to another (width, height)."""
         ratio = np.divide(_numbers("the image size", size, 2), self.size)
         centre = (np.array(self.centre) + 0.5) * ratio - 0.5
         return Camera(size, (ratio * self.focal_px).tolist(), centre.tolist())
@@ -108,12 +108,12 @@ class Camera:
 @suggest_keywords
 @dataclass(frozen=True)
 class Calibration:
-    """Both cameras and, where it is known, their distance.
+    """Both cameras and, if it is known, their distance.
 
     Attributes:
-        camera0, camera1: of the left (first) and the right (second) image.
-        baseline_mm: distance of their centres, or None: then depths are in baselines.
-        source: where it comes from, as "calib.json", "focal_px" or "EXIF".
+        camera0, camera1: cameras of the left (first) and the right (second) image.
+        baseline_mm: distance of their centres; None if unknown: then depths are in baselines.
+        source: where the calibration comes from, such as "calib.json", "focal_px" or "EXIF".
 
     Raises:
         ReconstructionError: the baseline is not above 0.
@@ -143,20 +143,19 @@ class Calibration:
 
     @property
     def disparity_offset_px(self) -> float:
-        """What is added to a disparity to get depth: cx of the right minus cx of the left."""
+        """Offset added to a disparity to get depth: cx of the right camera minus cx of the left."""
         return self.camera1.centre[0] - self.camera0.centre[0]
 
     def depth_mm(self, disparity_px: np.ndarray) -> np.ndarray:
-        """Return the depth of a rectified pair's disparities.
+        """Return the depth for the disparities of a rectified pair.
 
-        depth = focal length * baseline / (disparity + offset), in mm, or in baselines where the
-        baseline is not known.
+        depth = focal length * baseline / (disparity + offset), in mm or, without it, in baselines.
 
         Args:
             disparity_px: x in the left minus x in the right image, any shape.
 
         Returns:
-            float64 of the same shape; infinite where disparity and offset cancel or are negative.
+            float64 of the same shape; infinite where disparity plus offset is not positive.
         """
         moved = numbers_of("disparity_px", disparity_px, np.float64) + self.disparity_offset_px
         baseline = 1.0 if self.baseline_mm is None else self.baseline_mm
@@ -174,26 +173,26 @@ class Calibration:
         *,
         views: tuple[int, int] | None = None,
     ) -> Calibration:
-        """Read a file of cameras: a calib.json, as above, or one of OpenCV, ROS, Kalibr and others.
+        """Read a camera file: a calib.json, as above, or one of OpenCV, ROS, Kalibr and others.
 
-        Formats are told by their content: https://github.com/deepdetect/deepdetect has a table of
-        them in docs/files.md.
+        The format is recognised by the content: https://github.com/deepdetect/deepdetect has a
+        table of formats in docs/files.md.
 
         Args:
-            path: of the file; or of a folder with the files of both cameras.
-            size0, size1: (width, height) of the images. None: as the file says.
-            views: numbers of the left and the right camera in a file of KITTI. None: those of the
-                colour cameras, 2 and 3, else 0 and 1.
+            path: the file; or a folder with the files of both cameras.
+            size0, size1: (width, height) of the images. None: as in the file.
+            views: numbers of the left and the right camera in a KITTI file. None: the colour
+                cameras, 2 and 3, or else 0 and 1.
 
         Raises:
-            ReconstructionError: it is missing, damaged, contradictory, of no known format, of
-                cameras that distort, or for images of another size.
+            ReconstructionError: the file is missing, damaged, contradictory or of unknown format,
+                or its cameras distort or have images of another size.
         """
         with _reading(path):
             return _calibration(read_camera_file(Path(path), views), size0, size1, str(path))
 
     def check_sizes(self, size0: Size, size1: Size) -> None:
-        """Raise `ReconstructionError` unless it is for images of these (width, height)."""
+        """Raise a `ReconstructionError` unless it is for images of these (width, height)."""
         for name, camera, size in (("left", self.camera0, size0), ("right", self.camera1, size1)):
             if camera.size != (other := _numbers("the image size", size, 2)):
                 wanted, actual = (f"{side[0]:g}x{side[1]:g}" for side in (camera.size, other))
@@ -204,7 +203,7 @@ class Calibration:
 
 
 def check_camera_file(path: str | Path) -> None:
-    """Raise a ReconstructionError where `Calibration.load` cannot read a file, for any image."""
+    """Raise a ReconstructionError if `Calibration.load` cannot read a file, whatever the images."""
     with _reading(path):
         read_camera_file(Path(path), None)
 
@@ -219,7 +218,7 @@ def _reading(path: str | Path) -> Iterator[None]:
         missing = isinstance(error, FileNotFoundError)
         kind = MissingCalibrationError if missing else ReconstructionError
         raise kind(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except Exception as error:  # readers of so many formats raise many kinds
+    except Exception as error:  # the readers of these formats raise many types
         raise ReconstructionError(
             f"{path} is damaged ({first_line(error)}): correct it, or give the focal length"
         ) from None
@@ -232,7 +231,7 @@ def _calibration(
     for name in ("left", "right"):
         of_view = values.get(name, {})
         if not isinstance(of_view, dict):
-            raise ReconstructionError(f'"{name}" must be an object, as {{"cx": 320}}')
+            raise ReconstructionError(f'"{name}" must be an object, such as {{"cx": 320}}')
         together = {**values, **of_view}
         views.append({key: value for key, value in together.items() if value is not None})
     left, right = views
@@ -257,7 +256,7 @@ def _calibration(
 
 def _size_of(view: dict[str, Any]) -> Size:
     if not {"width", "height"} <= {*view}:
-        raise ReconstructionError("it does not name the images' size: give `size0`")
+        raise ReconstructionError("it does not contain the size of the images: give `size0`")
     return view["width"], view["height"]
 
 
@@ -271,7 +270,7 @@ def _camera(view: dict[str, Any], size: Size) -> Camera:
 
 
 def _numbers(name: str, value: Any, count: int) -> tuple[float, ...]:
-    """Return so many finite numbers: those of a value, or one number for all."""
+    """Return `count` finite numbers: those of a value, or one number repeated."""
     try:
         numbers = np.broadcast_to(value, count).astype(np.float64, casting="same_kind")
     except (TypeError, ValueError):
@@ -298,20 +297,20 @@ def cross_matrix(vector: np.ndarray) -> np.ndarray:
 
 
 def angles_between(vectors0: np.ndarray, vectors1: np.ndarray) -> np.ndarray:
-    """Return the angles between vectors (N, 3) in radians, accurate for small ones, too."""
+    """Return the angles between vectors (N, 3) in radians, accurate also for small ones."""
     across = np.linalg.norm(np.cross(vectors0, vectors1), axis=1)
     return np.asarray(np.arctan2(across, np.einsum("ij,ij->i", vectors0, vectors1)))
 
 
 @dataclass(frozen=True, eq=False)
 class PosedView:
-    """An image whose camera is known.
+    """An image with a known camera pose.
 
     Attributes:
-        name: of the image.
+        name: name of the image.
         camera: its pinhole camera, centre of the first pixel (0, 0).
-        rotation, translation: (3, 3) and (3,) float64: a point X of the world is
-            rotation @ X + translation in the camera's frame, x right, y down, z forward.
+        rotation, translation: (3, 3) and (3,) float64: a point X of the world is rotation @ X +
+            translation in the camera's frame, x right, y down, z forward.
     """
 
     name: str
@@ -321,7 +320,7 @@ class PosedView:
 
     @property
     def centre(self) -> np.ndarray:
-        """(3,) float64, where the camera stands."""
+        """(3,) float64, the position of the camera."""
         return np.asarray(-self.rotation.T @ self.translation)
 
     def relative_to(self, first: PosedView) -> PosedView:
@@ -332,19 +331,19 @@ class PosedView:
         )
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions (N, 2) in pixels, and depths (N,), of points (N, 3) of the world."""
+        """Return (N, 2) positions in pixels and (N,) depths of points (N, 3) of the world."""
         seen = np.asarray(points, np.float64) @ self.rotation.T + self.translation
         return self.camera.project(seen), seen[:, 2]
 
     def corners(self, depth: float) -> np.ndarray:
-        """Return the (4, 3) corners of what it sees at a depth, around the image."""
+        """Return the (4, 3) corners of its field of view at a depth."""
         rays = self.camera.rays(outer_corners(self.camera.size)) * depth
         return np.asarray((rays - self.translation) @ self.rotation)
 
 
 def camera_spacing(centres: np.ndarray) -> float:
-    """Return the median distance from each of (V, 3) centres of cameras to the nearest other."""
-    blocks = np.array_split(centres, len(centres) // 500 + 1)  # all pairs would fill the memory
+    """Return the median distance from each of (V, 3) camera centres to the nearest other one."""
+    blocks = np.array_split(centres, len(centres) // 500 + 1)  # bounds the memory
     distances = (np.linalg.norm(block[:, None] - centres, axis=2) for block in blocks)
     second = min(1, len(centres) - 1)  # the nearest is the camera itself
     nearest = [np.partition(each, second, axis=1)[:, second] for each in distances]

@@ -1,8 +1,8 @@
-"""Robust estimation of the geometry between two images, and how far chance explains it.
+"""Robust estimation of the geometry between two images, and the chance that it is random.
 
 Moisan and Stival, "A probabilistic criterion to detect rigid point matches between two images and
-estimate the fundamental matrix", 2004. The number of false alarms (NFA) of a geometry is how many
-models with as many inliers at this threshold are expected among random matches.
+estimate the fundamental matrix", 2004. The number of false alarms (NFA) of a geometry is the number
+of models with as many inliers at this threshold that are expected among random matches.
 """
 
 from __future__ import annotations
@@ -22,32 +22,33 @@ from .transforms import epipolar_errors, transfer_errors, transform_points
 MODEL_NAMES = ("auto", "homography", "fundamental", "essential")
 
 MIN_MATCHES = {"homography": 4, "fundamental": 15, "essential": 6}
-"""With fewer than 15 matches OpenCV's RANSAC ignores the threshold of a fundamental matrix."""
+"""Fewest matches; below 15 OpenCV's RANSAC ignores the threshold of a fundamental matrix."""
 
 MAX_LOG10_NFA = -6.0
-"""A geometry is accepted below this decimal logarithm of its number of false alarms."""
+"""A geometry is accepted below this log10 of its number of false alarms. Chosen by hand."""
 
 MINIMAL_SAMPLE_SIZE = {"homography": 4, "fundamental": 7, "essential": 5}
-"""Matches that determine a model."""
+"""Number of matches that determine a model."""
 
 MIN_PARALLAX_PX = 3.0
-"""Matches whose transfer error is at least this are off the plane."""
+"""Matches with at least this transfer error are off the plane. This value and the next three were
+chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MAX_EPIPOLE_DISTANCE_PX = 1.5
-"""By which one of them may miss the line through the epipole."""
+"""Maximum distance of such a match from the line through the epipole."""
 
 MIN_FRACTION_OF_PLANE = 0.2
-"""As many of them must agree, relative to the matches on the plane, to show depth: a repeated
-pattern, or a thing that moved, gives few."""
+"""Matches show depth if this many agree on an epipole, relative to those on the plane: repeated
+patterns or moved objects give fewer."""
 
 MIN_FRACTION_OF_REST = 0.5
-"""This fraction of all matches off the plane must agree, where the matches alone decide."""
+"""If matches alone decide, this fraction of those off the plane must also agree."""
 
 MAX_MATCHES = 2000
-"""Off the plane; of more, so many are drawn at random."""
+"""Maximum number of matches off the plane; more are sampled at random. Chosen by hand."""
 
 SAMPLES = 1000
-"""Pairs of matches whose lines are intersected."""
+"""Number of random pairs of matches whose lines are intersected. Chosen by hand."""
 
 
 @suggest_keywords
@@ -56,11 +57,11 @@ class GeometryOptions:
     """How a geometry is estimated.
 
     Attributes:
-        inlier_threshold: a match is an inlier when its error is below this, in pixels: the
-            transfer error of a homography, else the Sampson distance (in a rectified pair an
-            error of d rows counts as d / sqrt(2)).
-        homography: a given (3, 3) homography: nothing is estimated, the inliers are the matches
-            whose transfer error is below the threshold.
+        inlier_threshold: a match is an inlier if its error is below this, in pixels: the transfer
+            error of a homography, else the Sampson distance (in a rectified pair an error of d rows
+            counts as d / sqrt(2)).
+        homography: a known (3, 3) homography: nothing is estimated, and the inliers are the matches
+            with a transfer error below the threshold.
         camera0, camera1: (3, 3) camera matrices, for the model "essential".
         confidence: desired probability that the model is the best one.
         iterations: maximum number of iterations.
@@ -105,9 +106,8 @@ class Geometry:
 
     Attributes:
         model: "homography", "fundamental" or "essential".
-        matrix: (3, 3) float64, or None when nothing could be estimated. A homography
-            maps the first image to the second; for the others x1^T M x0 = 0 (essential:
-            in normalised coordinates).
+        matrix: (3, 3) float64, or None if the estimation failed. A homography maps the first image
+            to the second; for the others x1^T M x0 = 0 (essential: in normalised coordinates).
         inliers: (M,) bool, the matches that agree with it.
     """
 
@@ -122,7 +122,7 @@ class Geometry:
 
 @runtime_checkable
 class MatchedPoints(Protocol):
-    """What has (M, 2) matched positions in two images, as `Matches`."""
+    """Anything with (M, 2) matched positions in two images, such as `Matches`."""
 
     @property
     def points0(self) -> np.ndarray:
@@ -147,19 +147,19 @@ def estimate_geometry(
     Args:
         matches: `Matches`, or (M, 2) positions in the first image, centre of the first pixel
             (0, 0).
-        points1: the (M, 2) positions that they match in the second image; None with `Matches`.
-        model: "homography" (planes, pure rotation), "fundamental" (any static scene), "auto"
-            (one of these two; `measure_parallax`), or "essential" (known cameras).
+        points1: (M, 2) matching positions in the second image; None with `Matches`.
+        model: "homography" (planes, pure rotation), "fundamental" (any static scene), "auto" (one
+            of these two, by the parallax of the matches), or "essential" (known cameras).
         seed: seed of the random samples.
-        options: how.
+        options: threshold, cameras and limits of the estimation.
 
     Returns:
-        The geometry; its inliers are the matches with an error below the threshold. With too few
-        matches, or when estimation fails, the matrix is None and no match is an inlier.
+        The geometry; its inliers are the matches with an error below the threshold. If there are
+        too few matches or the estimation fails, the matrix is None and there are no inliers.
 
     Raises:
-        OptionError: the model is unknown, or needs cameras that are not in the options, or the
-            positions are not as many.
+        OptionError: the model is unknown or needs cameras that are not in the options, or the
+            numbers of positions differ.
 
     Example:
         >>> a = np.array([[0, 0], [9, 0], [9, 9], [0, 9], [4, 5]], float)
@@ -173,15 +173,15 @@ def estimate_geometry(
     points0: Any = matches
     if isinstance(matches, MatchedPoints):
         if points1 is not None:
-            raise OptionError("`points1` goes with positions: leave it out where matches are given")
+            raise OptionError("`points1` is for positions: leave it out if you give `Matches`")
         points0, points1 = matches.points0, matches.points1
     elif points1 is None:
-        raise OptionError("positions in one image are no matches: give `points1`, or `Matches`")
+        raise OptionError("positions in one image are not matches: give `points1`, or `Matches`")
     points0 = numbers_of("points0", points0, np.float64, 2)
     points1 = numbers_of("points1", points1, np.float64, 2)
     if len(points0) != len(points1):
         counts = f"{len(points0)} and {len(points1)}"
-        raise OptionError(f"matches need as many positions in both images, not {counts}")
+        raise OptionError(f"matches need equally many positions in both images, not {counts}")
     if options.homography is not None:
         errors = transfer_errors(points0, points1, options.homography)
         return Geometry("homography", options.homography, errors < options.inlier_threshold)
@@ -197,11 +197,11 @@ def estimate_geometry(
     nothing = Geometry(model, None, np.zeros(len(points0), bool))
     if len(points0) < MIN_MATCHES[model]:
         return nothing
-    # OpenCV draws the same samples every time; another order of the matches draws others.
+    # OpenCV always draws the same samples; shuffled matches make them depend on the seed.
     order = np.random.default_rng(seed).permutation(len(points0))
     try:
         matrix = _fit(points0[order], points1[order], model, options)
-    except cv2.error:  # degenerate input, as all points in one place
+    except cv2.error:  # degenerate input, such as coinciding points
         return nothing
     if matrix is None or matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return nothing
@@ -216,7 +216,7 @@ def estimate_geometry(
 
 
 def check_model(model: str, seed: int, options: GeometryOptions) -> None:
-    """Raise an OptionError where `estimate_geometry` would, whatever the matches."""
+    """Raise the OptionErrors of `estimate_geometry` that do not depend on the matches."""
     check_name("model", model, MODEL_NAMES)
     check_seed(seed)
     if model == "essential":
@@ -224,7 +224,7 @@ def check_model(model: str, seed: int, options: GeometryOptions) -> None:
 
 
 def check_seed(seed: int) -> None:
-    """Raise an OptionError where a seed is not one that OpenCV takes, too."""
+    """Raise an OptionError for a seed that OpenCV does not accept."""
     if not (isinstance(seed, Integral) and 0 <= seed < 2**31):
         raise OptionError(f"the seed must lie in [0, 2147483647] and be whole, not {seed}")
 
@@ -232,7 +232,7 @@ def check_seed(seed: int) -> None:
 def _fit(
     points0: np.ndarray, points1: np.ndarray, model: str, options: GeometryOptions
 ) -> np.ndarray | None:
-    """Fit a model by MAGSAC; None, or an odd matrix, where that fails."""
+    """Fit a model by MAGSAC; None, or a malformed matrix, if that fails."""
     threshold, confidence = options.inlier_threshold, options.confidence
     iterations = int(options.iterations)
     if model == "homography":
@@ -264,10 +264,9 @@ def fit_essential(
     confidence: float,
     iterations: int,
 ) -> np.ndarray | None:
-    """Fit an essential matrix to (N, 3) directions (x, y, 1); None, or an odd one, where it fails.
+    """Fit an essential matrix to (N, 3) directions (x, y, 1); None or malformed if that fails.
 
-    As points of one camera in pixels: in normalised coordinates MAGSAC of OpenCV 5 is far less
-    accurate.
+    They are passed as pixels of one camera: MAGSAC of OpenCV 5 is less accurate in normalised ones.
     """
     matrix, _ = cv2.findEssentialMat(
         np.ascontiguousarray(rays0[:, :2] * focal_px),
@@ -299,8 +298,8 @@ def log10_nfa(
 ) -> float:
     """Return the decimal logarithm of the number of false alarms, infinite with too few inliers.
 
-    The (M,) inliers are the matches within the threshold in pixels of the second image, of a size
-    (width, height); so many models were tried for each minimal sample.
+    `inliers` is (M,) bool: the matches within the threshold, in pixels of the second image, whose
+    size is (width, height). `models_per_sample` models were tried for each minimal sample.
     """
     width, height = image_size
     if model == "homography":
@@ -330,10 +329,10 @@ def _log_binomial(count: int, chosen: int) -> float:
 class Parallax:
     """How many matches lie off a plane, and how many of them agree on an epipole.
 
-    What a homography leaves of the matches of a static scene moves along lines through the epipole
-    (Chum, Werner and Matas, "Two-view geometry estimation unaffected by a dominant plane", 2005).
-    Wrong matches move anywhere, and those of a repeated pattern in one direction, but they are few
-    beside what lies on the plane. `log10_nfa` is of the agreement.
+    Matches of a static scene that a homography does not explain move along lines through the
+    epipole (Chum, Werner and Matas, "Two-view geometry estimation unaffected by a dominant plane",
+    2005). Wrong matches move anywhere, and those of a repeated pattern in one direction, but they
+    are few compared with those on the plane. `log10_nfa` is that of the agreement.
     """
 
     on_plane: int
@@ -347,7 +346,7 @@ class Parallax:
         return self.log10_nfa < MAX_LOG10_NFA
 
     def exceeds(self, fraction_of_plane: float) -> bool:
-        """Whether more agree than chance explains, and as many relative to those on the plane."""
+        """Whether more agree than chance explains, and than this fraction of those on the plane."""
         return self.significant and self.agreeing >= fraction_of_plane * self.on_plane
 
     @property
@@ -359,11 +358,11 @@ class Parallax:
 
 @dataclass(frozen=True, eq=False)
 class TwoViewModel(Geometry):
-    """A geometry, and the evidence for it: its model is "none" where none could be estimated.
+    """A geometry with its evidence; its model is "none" if none could be estimated.
 
     Attributes:
         log10_nfa: decimal logarithm of its number of false alarms.
-        parallax: of a homography that was chosen, not asked for: what it leaves.
+        parallax: what a homography leaves, if the model was chosen automatically.
     """
 
     log10_nfa: float
@@ -378,7 +377,7 @@ class TwoViewModel(Geometry):
 def measure_parallax(
     points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, seed: int = 0
 ) -> Parallax:
-    """Look for an epipole among the (M, 2) matches that a homography leaves, some of them wrong."""
+    """Look for an epipole among the (M, 2) matches that a homography does not explain."""
     points0, points1 = (np.asarray(points, np.float64) for points in (points0, points1))
     off = transfer_errors(points0, points1, homography) >= MIN_PARALLAX_PX
     on_plane = len(off) - int(np.count_nonzero(off))

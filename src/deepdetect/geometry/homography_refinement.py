@@ -1,10 +1,10 @@
 """Refinement of a homography on the images in a fraction of a second, each step cross-validated.
 
 Corners are tracked between the first image and the warped second one, forth and back, and a
-homography is fitted to them; then all pixels of a smaller copy are aligned (Evangelidis and
+homography is fitted to them. Then all pixels of a smaller copy are aligned (Evangelidis and
 Psarakis, "Parametric image alignment using enhanced correlation coefficient maximization", 2008).
-The image is divided into squares, in turn of two halves. A step is kept only if, on each half, what
-it finds *without* that half correlates the images better than the homography before.
+The squares of a chessboard divide the image into two halves. A step is kept only if, on each half,
+the correction fitted *without* that half correlates the images better than before.
 """
 
 from __future__ import annotations
@@ -31,47 +31,47 @@ from .images import (
 from .transforms import scaled_homography, transform_points
 
 TRACKING_ROUNDS = ((31, 1500, 3), (15, 3000, 1))
-"""Side of the tracked windows in pixels, corners, and levels of the pyramid, for each round. The
-first one starts the furthest off: its tracks move further, and half as many corners do."""
+"""Side of the tracked windows in pixels, number of corners, and levels of the pyramid, for each
+round. In the first one tracks move further, and half as many corners suffice. Chosen by hand."""
 
 MIN_TRACKS = 15
-"""That a homography is fitted to."""
+"""Minimum number of tracks to which a homography is fitted. Chosen by hand."""
 
 TRACKING_ITERATIONS = 15
 TRACKING_STEP_PX = 0.02
-"""A track that moves by less than this has arrived."""
+"""A track that moves by less than this has converged. Chosen by hand."""
 
 MAX_ROUND_TRIP_PX = 0.3
-"""A track counts when it ends this near to its start, forth and back."""
+"""A track counts if it ends this near to its start, forth and back. Chosen by hand."""
 
 CAUCHY_SCALE_PX = 1.0
-"""A track with this residual has half the weight of an exact one."""
+"""A track with this residual has half the weight of an exact one. Chosen by hand."""
 
 IRLS_ITERATIONS = 30
 
 ALIGNMENT_SIDE_PX = 480
-"""Longer side of the copies on which all pixels are aligned, where the images are larger."""
+"""Images are reduced to this longer side for the alignment of all pixels. Chosen by hand."""
 
 ALIGNMENT_SIGMA_PX = 1.0
-"""Of the blur of these copies."""
+"""Sigma of the blur of these copies. Chosen by hand."""
 
 ALIGNMENT_ITERATIONS = 15
 
 SQUARES = 8
-"""Along the longer side of the image."""
+"""Number of squares along the longer side of the image. Chosen by hand."""
 
 STEP_PX = WINDOW_PX // 3
-"""Between the windows in which images are compared."""
+"""Distance between the windows in which images are compared. Chosen by hand."""
 
 Fit = Callable[[np.ndarray], "np.ndarray | None"]
-"""From the (H, W) bool mask of the pixels that may be used to a correction, (3, 3)."""
+"""Maps the (H, W) bool mask of the pixels that may be used to a correction, (3, 3), or None."""
 
 
 def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
-    """Refine a homography, keeping what holds on parts of the image that it was not fitted to.
+    """Refine a homography, keeping only what holds on parts of the image that it was not fitted to.
 
-    The images are (H, W) uint8, the homography is right within some ten pixels. It is returned with
-    1 as its last element, and as it was where nothing better was found.
+    The images are (H, W) uint8, and the homography is accurate to some ten pixels. The last element
+    of the result is 1; it is the same homography if nothing better was found.
     """
     size = (gray0.shape[1], gray0.shape[0])
     blurred = gaussian_blur(gray0, BLUR_SIGMA_PX)
@@ -88,7 +88,7 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
     steps.append(partial(_fit_to_pixels, gray0))
     current = np.asarray(homography, np.float64)
     for step in steps:
-        # Corners need detail, which is lost by linear reading where scales differ.
+        # Corners need detail, which linear interpolation loses if scales differ.
         warp = partial(warp_to_reference, exact=step is steps[-1])
         warped, valid_mask = warp(gray1, current, size)
         fit = step(warped, valid_mask)
@@ -100,8 +100,8 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
         np.copyto(mixed, other, where=half)
         np.copyto(mixed_mask, other_mask, where=half)
         gain = correlation(mixed, mixed_mask) - correlation(warped, valid_mask)
-        # On how many more windows it is better than worse. Not the mean: a compromise between a
-        # plane and what lies off it raises that, too.
+        # Counts windows that improve minus those that get worse. The mean would also rise for a
+        # compromise between a plane and what lies off it.
         gain = gain[inner & np.isfinite(gain)]
         correction = fit(valid_mask) if np.sign(gain).sum() > 0 else None
         if correction is not None:
@@ -112,7 +112,7 @@ def refine_homography(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarr
 def most_alike(
     gray0: np.ndarray, gray1: np.ndarray, homographies: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """Return the homography under which two images, small copies of them, correlate best."""
+    """Return the homography under which small copies of two images correlate best."""
     (first, scale0), (second, scale1) = (downscale(g, ALIGNMENT_SIDE_PX) for g in (gray0, gray1))
 
     def correlation(homography: np.ndarray) -> float:
@@ -131,8 +131,8 @@ def _fit_to_corners(
 ) -> Fit:
     """Track corners, and return the fit to those in a part of the image.
 
-    Weighted least squares: right on most of an image that no single homography fits (a lens that
-    bends lines, a wall that is not quite flat), where a consensus is another one each time.
+    It is weighted least squares, which is accurate on most of an image that no single homography
+    fits (lens distortion, a wall that is not quite flat); a consensus would differ each time.
     """
     margin = np.ones((window_px, window_px), np.uint8)
     inside = cv2.erode(valid_mask.astype(np.uint8), margin, borderValue=0)
@@ -178,7 +178,7 @@ def _fit_to_pixels(gray0: np.ndarray, warped: np.ndarray, valid_mask: np.ndarray
             correction = cv2.findTransformECC(
                 *normalised, start, cv2.MOTION_HOMOGRAPHY, criteria, mask, 1
             )[1]
-        except cv2.error:  # it does not converge, or there is nothing to correlate
+        except cv2.error:  # no convergence, or nothing to correlate
             return None
         return scaled_homography(correction.astype(np.float64), 1 / scale, 1 / scale)
 
@@ -188,7 +188,7 @@ def _fit_to_pixels(gray0: np.ndarray, warped: np.ndarray, valid_mask: np.ndarray
 def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray | None:
     """Fit a homography by iteratively reweighted least squares with Cauchy weights.
 
-    Its last element is 1; None when the points do not determine it.
+    Its last element is 1; None if the points do not determine it.
     """
     middle = points0.mean(axis=0)
     spread = float(np.abs(points0 - middle).mean())
@@ -222,7 +222,7 @@ def fit_homography_irls(points0: np.ndarray, points1: np.ndarray) -> np.ndarray 
 
 
 def _halves(size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Divide an image of (width, height) into squares, as those of a chessboard.
+    """Divide an image of (width, height) into the squares of a chessboard.
 
     Returns which pixels lie on squares of the second colour, (H, W) bool, and whether the blurred
     windows of `local_zncc` lie within their squares, (H // STEP_PX, W // STEP_PX) bool.

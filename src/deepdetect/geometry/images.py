@@ -1,4 +1,4 @@
-"""Images scaled, warped, correlated and tracked, and sums over windows of them."""
+"""Images scaled, warped, correlated and tracked, and sums over their windows."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from .._shared.opencv import cv2
 from .transforms import scaling_matrix
 
 ANTIALIASING_SIGMA = 0.5
-"""Of the blur before an image is downscaled, in units of sqrt(1 / scale^2 - 1) pixels."""
+"""Blur before downscaling, as sigma in units of sqrt(1 / scale^2 - 1) px. Chosen by hand."""
 
 WINDOW_PX = 15
 BLUR_SIGMA_PX = 1.25
-"""Of a blur before images are compared: noise and resampling must not count."""
+"""Sigma of the blur before images are compared, against noise and resampling. Chosen by hand."""
 
 NOISE_STD = 2.0
-"""Grey levels that are added to a window's standard deviation, so that noise is not amplified."""
+"""Grey levels added to a window's deviation, so that noise is not amplified. Chosen by hand."""
 
 MAX_UNKNOWN_WEIGHT = 1e-3
-"""Of pixels without data in what is interpolated."""
+"""Maximum weight of pixels without data in an interpolated pixel. Chosen by hand."""
 
 MIN_VARIANCE = 1.0
-"""Of a window's grey levels: flatter windows are not compared."""
+"""Windows with a lower variance of grey levels are too flat to be compared. Chosen by hand."""
 
 
 def downscale(gray: np.ndarray, max_side: int) -> tuple[np.ndarray, float]:
@@ -32,22 +32,27 @@ def downscale(gray: np.ndarray, max_side: int) -> tuple[np.ndarray, float]:
     scale = min(1.0, max_side / max(gray.shape))
     if scale == 1:
         return gray, 1.0
-    # The sides are seldom whole numbers of pixels: blur and sample by the scale itself, so that
-    # one number holds for both.
+    # Sides are seldom whole numbers of pixels. Sampling by the scale itself keeps it exact for
+    # both sides.
     size = (max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale)))
-    smooth = cv2.GaussianBlur(gray, (0, 0), ANTIALIASING_SIGMA * np.sqrt(1 / scale**2 - 1))
+    smooth = antialiased(gray, scale)
     affine = scaling_matrix(scale)[:2]
     return cv2.warpAffine(smooth, affine, size, borderMode=cv2.BORDER_REPLICATE), scale
+
+
+def antialiased(image: np.ndarray, scale: float) -> np.ndarray:
+    """Blur an image that will be sampled at a scale below 1."""
+    return cv2.GaussianBlur(image, (0, 0), ANTIALIASING_SIGMA * np.sqrt(1 / scale**2 - 1))
 
 
 def warp_to_reference(
     image1: np.ndarray, homography: np.ndarray, size: tuple[int, int], *, exact: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Warp the second image by the homography from the first to it, into the frame of the first.
+    """Warp the second image into the frame of the first, by the homography from the first to it.
 
     Returns the (H, W) or (H, W, 3) image, uint8 or uint16, and the (H, W) bool mask of its valid
-    pixels. OpenCV's cubic kernel keeps detail and moves it by up to .05 px; where it must be in
-    its `exact` place, the image is read linearly.
+    pixels. OpenCV's cubic kernel keeps detail but shifts it by up to 0.05 px; if positions must be
+    `exact`, the interpolation is linear.
     """
     flags = (cv2.INTER_LINEAR if exact else cv2.INTER_CUBIC) | cv2.WARP_INVERSE_MAP
     warped = cv2.warpPerspective(image1, homography, size, flags=flags)
@@ -62,9 +67,9 @@ def warp_bands(
     size: tuple[int, int],
     no_data: float | None = None,
 ) -> np.ndarray:
-    """Warp (H, W, C) of any type as `warp_to_reference`; where there is nothing it is `no_data`.
+    """Warp (H, W, C) of any type as `warp_to_reference` does; pixels without data are `no_data`.
 
-    So is what depends on pixels that are `no_data`; None stands for 0, and for no such pixels.
+    So are pixels that depend on these. None means that all pixels have data, and fills with 0.
     """
     whole = np.iinfo(bands.dtype) if bands.dtype.kind in "iu" else None
     if whole and no_data is not None and not whole.min <= no_data <= whole.max:
@@ -93,9 +98,8 @@ def local_zncc(
 ) -> np.ndarray:
     """Compute the zero-mean normalised cross-correlation of the windows around each pixel.
 
-    The windows must lie within the mask, and have an odd multiple of `step_px` as their side; they
-    are centred on the squares of that side. (H // step_px, W // step_px) float32 in [-1, 1], NaN
-    where a window is not valid or is flat.
+    The side of the windows is an odd multiple of `step_px`, on squares of which they are centred.
+    Returns (H // step_px, W // step_px) float32 in [-1, 1], NaN for flat or partly masked windows.
     """
     side = window_px // step_px
     shape = (first.shape[0] // step_px, first.shape[1] // step_px)
@@ -127,14 +131,14 @@ def local_zncc(
 
 
 def warped_zncc(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> np.ndarray:
-    """Return `local_zncc` of an image and of one that a homography warps to it."""
+    """Return the `local_zncc` of an image and another one that a homography warps to it."""
     warped, valid = warp_to_reference(gray1, homography, gray0.shape[::-1])
     first, second = (gaussian_blur(gray, BLUR_SIGMA_PX) for gray in (gray0, warped))
     return local_zncc(first, second, erode_mask(valid, BLUR_SIGMA_PX))
 
 
 def median_local_zncc(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> float:
-    """Return the median local ZNCC of two images over their overlap, -1 without any."""
+    """Return the median local ZNCC of two images over their overlap, -1 without overlap."""
     values = warped_zncc(gray0, gray1, homography)
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else -1.0
@@ -146,14 +150,14 @@ def gaussian_blur(gray: np.ndarray, sigma_px: float) -> np.ndarray:
 
 
 def erode_mask(mask: np.ndarray, blur_sigma_px: float) -> np.ndarray:
-    """Leave out the pixels that a blur mixes with pixels outside the mask; (H, W) bool."""
+    """Remove the pixels that a blur mixes with pixels outside the mask; (H, W) bool."""
     return _erode(mask, 2 * int(np.ceil(3 * blur_sigma_px)) + 1)
 
 
 def normalise_local_contrast(gray: np.ndarray) -> np.ndarray:
     """Subtract the mean of the window around each pixel and divide by its standard deviation.
 
-    Of two images like this, (H, W) float32, the correlation is that of all their windows at once.
+    The correlation of two such images, (H, W) float32, is that of all their windows at once.
     """
     window = (WINDOW_PX, WINDOW_PX)
     values = gray.astype(np.float32)
@@ -178,9 +182,9 @@ def window_sums(
 ) -> np.ndarray:
     """Sum the values of the pixels in the square window around each pixel, (M,).
 
-    There are (N, 2) int64 pixels (x, y), each once, with a value each or one for all, in an image
-    of a shape (H, W, ...). The windows are centred `at` (M, 2) pixels, or at the pixels themselves.
-    The sums have the `dtype` of the values unless another is given.
+    The (N, 2) int64 `pixels` (x, y) are all different; `values` has one for each, or one for all.
+    `shape` is that of the image, (H, W, ...). The windows are centred at the (M, 2) pixels `at`, or
+    at the pixels themselves. The sums have the `dtype` of the values unless another is given.
     """
     image = _scatter(pixels, values, shape, dtype)
     window = (window_px, window_px)
@@ -225,11 +229,11 @@ def track_round_trip(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Track (N, 2) points from one (H, W) uint8 image to the other and back (Lucas-Kanade).
 
-    Each of the `levels` of the pyramid above the image doubles how far a track can move; one that
-    moves by less than `step_px` has arrived. The search begins at the `expected` (N, 2) positions,
-    or in the same place; on the way back at the start itself, if asked for. Returns (N, 2) float32
-    positions in the second image, and (N,) distances from the start after the way back, infinite
-    where a track was lost.
+    Each of the `levels` of the pyramid above the image doubles how far a track can move. A track
+    that moves by less than `step_px` has converged. The search begins at the `expected` (N, 2)
+    positions, or at the same position; the way back begins at the start itself if `back_to_start`.
+    Returns (N, 2) float32 positions in the second image, and (N,) distances from the start after
+    the way back, infinite for lost tracks.
     """
     settings = {
         "winSize": (window_px, window_px),
@@ -254,12 +258,12 @@ def track_round_trip(
 
 
 def equalise(gray: np.ndarray) -> np.ndarray:
-    """Equalise an image locally, so that changes of light are not taken for motion."""
+    """Equalise an image locally, so that changes of light are not mistaken for motion."""
     return cv2.createCLAHE(clipLimit=3.0, tileGridSize=(8, 8)).apply(gray)
 
 
 WINDOWS_AT_ONCE = 4096
-"""Of `zncc_at_points`: `cv2.remap` takes up to 32,766, and many would fill the memory."""
+"""Number of windows that `zncc_at_points` processes at once, which bounds memory."""
 
 
 def zncc_at_points(
@@ -282,13 +286,13 @@ def zncc_at_points(
 
 
 EDGE_SIGMA_PX, EDGE_QUANTILE = 1.0, 0.99
-"""Of the blur before the gradient, and of its length at white."""
+"""Sigma of the blur before the gradient, and quantile of its length for white. Chosen by hand."""
 
 
 def edge_strength(gray: np.ndarray) -> np.ndarray:
     """Return the length of the gradient of (H, W) uint8 luma, (H, W) uint8.
 
-    It does not tell which side of an edge is bright: so images of different sensors are alike.
+    It is the same whichever side of an edge is bright, so images of different sensors look alike.
     """
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), EDGE_SIGMA_PX)
     length = np.hypot(cv2.Scharr(smooth, -1, 1, 0), cv2.Scharr(smooth, -1, 0, 1))

@@ -1,4 +1,4 @@
-"""Coloured 3D points, and the box that most of them lie in."""
+"""Coloured 3D points, and the box that contains most of them."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ UNITS = {
     "baseline": "baselines (1 = the distance of the two cameras)",
     "spacing": "spacings (1 = the median distance from a camera to the nearest other one)",
 }
-"""Of lengths, as files explain them; with the last two the scale is not known."""
+"""Units of length, as files explain them; with the last two the scale is unknown."""
 
 EAST_NORTH_UP = "x east, y north, z up"
-"""Frame of a cloud whose place on the Earth is known; others are frames of cameras."""
+"""Frame of a georeferenced cloud; other frames are those of cameras."""
 
 BOX_PERCENTILE = 1.0
-"""Percent of the points that lie beyond each side of the robust box."""
+"""Percentage of the points beyond each side of the robust box. Chosen by hand."""
 
 MAX_ANGULAR_SPACING = 0.02
-"""In radians: no point is drawn wider than this (1 degree)."""
+"""Maximum width at which a point is drawn, in radians (1 degree). Chosen by hand."""
 
 
 @suggest_keywords
@@ -33,18 +33,18 @@ class PointCloud:
     """Coloured points in the frame of a camera: x right, y down, z forward; or `EAST_NORTH_UP`.
 
     Attributes:
-        points: (N, 3) float32 or float64 positions, the camera's centre at (0, 0, 0).
+        points: (N, 3) float32 or float64 positions; the camera's centre is (0, 0, 0).
         colors: (N, 3) uint8 sRGB.
-        unit: "mm" or "m"; or lengths are multiples of the distance of the two cameras ("baseline"),
-            or of the median distance from one of many cameras to the nearest other ("spacing").
-        frame: which camera that is, or `EAST_NORTH_UP`.
+        unit: "mm", "m", "baseline" (the distance of the two cameras) or "spacing" (the median
+            distance from one of many cameras to the nearest other).
+        frame: name of the camera, or `EAST_NORTH_UP`.
         normals: (N, 3) float32 of length 1, towards the cameras, or None.
 
     `len` and indexing by slices, masks and index arrays work.
 
     Raises:
-        OptionError: a shape or type is wrong, a coordinate is not finite (or beyond float32,
-            which files hold), or the unit is unknown.
+        OptionError: a shape or type is wrong, a coordinate is not finite (or exceeds float32, which
+            files use), or the unit is unknown.
 
     Example:
         >>> cloud = PointCloud([[0.0, 0.0, 900.0], [8.0, 2.0, 950.0]], [[9, 9, 9], [7, 7, 7]], "mm")
@@ -76,9 +76,9 @@ class PointCloud:
         if self.normals is not None:
             normals = np.asarray(self.normals, np.float32)
             if normals.shape != points.shape:
-                raise OptionError(f"normals must be {points.shape} as points, not {normals.shape}")
+                raise OptionError(f"normals must be {points.shape}, not {normals.shape}")
             object.__setattr__(self, "normals", normals)
-        # Written so that NaN fails too.
+        # This form also rejects NaN.
         if not (np.abs(points) < np.finfo(np.float32).max).all():
             raise OptionError("every coordinate of a point cloud must be finite: remove the others")
         object.__setattr__(self, "points", points)
@@ -106,7 +106,7 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class RobustBox:
-    """The axis-aligned box that holds all but the outermost points, by two (3,) corners."""
+    """The axis-aligned box of all points except the outermost, by two (3,) corners."""
 
     low: np.ndarray
     high: np.ndarray
@@ -118,14 +118,14 @@ class RobustBox:
 
     @property
     def radius(self) -> float:
-        """Half the diagonal; 1 where the box is a point."""
+        """Half the diagonal; 1 if the box is a point."""
         return float(np.linalg.norm(self.high - self.low)) / 2 or 1.0
 
 
 def robust_box(cloud: PointCloud) -> RobustBox:
     """Find the box from the 1st to the 99th percentile of each coordinate.
 
-    A few outliers very far away do not change it much. An empty cloud is an OptionError.
+    A few distant outliers hardly change it. An empty cloud is an OptionError.
     """
     require_points(cloud)
     low, high = np.percentile(
@@ -135,10 +135,10 @@ def robust_box(cloud: PointCloud) -> RobustBox:
 
 
 def angular_spacing(cloud: PointCloud) -> float:
-    """Return the angle between neighbouring points as the left camera sees them, in radians.
+    """Return the angle between neighbouring points as seen by the left camera, in radians.
 
-    It is the width of a point over its depth, as if all points were spread evenly; points drawn at
-    this size make a closed surface of a dense cloud. An empty cloud is an OptionError.
+    It is the width of a point divided by its depth, as if all points were spread evenly. Points of
+    a dense cloud that are drawn in this size look closed. An empty cloud is an OptionError.
     """
     require_points(cloud)
     ahead = cloud.points[cloud.points[:, 2] > 0]

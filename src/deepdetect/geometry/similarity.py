@@ -1,7 +1,7 @@
-"""Similarities between points in two frames, robust to wrong ones: a model's place and scale.
+"""Similarities between points in two frames, robust to outliers: the place and scale of a model.
 
-Least median of squares finds where most points agree; Gauss-Newton with Huber's weights fits all of
-them, and what is known to be level.
+Least median of squares finds the similarity on which most points agree. Gauss-Newton with Huber's
+weights then fits all of them, and directions that are known to be horizontal.
 """
 
 from __future__ import annotations
@@ -15,31 +15,32 @@ from .._shared.opencv import cv2
 from .camera import cross_matrix
 
 MIN_POINTS = 3
-"""That agree."""
+"""Minimum number of points that must agree: they determine a similarity."""
 
 MAX_SAMPLES = 500
-"""Pairs and triples of points, each, that the search for most agreement tries."""
+"""Number of pairs, and of triples, of points that the search tries. Chosen by hand."""
 
 MAX_START_TILT_DEG = 60.0
-"""Between what a triple says and what is known of up: a triple on a line may turn all over."""
+"""A triple's upward direction may differ from the known one by this: near a line it may be any."""
 
 MIN_AREA_POINTS, MIN_AREA = 8, 0.2
-"""From so many points on, spread across by so much of their spread along, they need no up."""
+"""The known upward direction can be overruled by this many points with this spread across, relative
+to that along. Chosen by hand."""
 
 MUCH_BETTER = 0.5
-"""Share of the median distance with what is known of up, below which that was wrong."""
+"""The known up is wrong if the median distance falls by this factor without it. Chosen by hand."""
 
 HUBER_STDS = 2.0
-"""Standard deviations from which on a residual has less weight."""
+"""Residuals above this many standard deviations get less weight. Chosen by hand."""
 
 WRONG_STDS = 5.0
-"""A point beyond it is wrong, and has no weight."""
+"""A point beyond this many standard deviations is wrong, and gets no weight. Chosen by hand."""
 
 PRIOR_COUNT = 6.0
-"""Coordinates that the stated accuracy counts for: few residuals say little of their spread."""
+"""The stated accuracy counts as this many coordinates: few residuals say little. Chosen by hand."""
 
 MAD_STD = 1.4826
-"""Standard deviation over the median of absolute values."""
+"""Standard deviation of a normal distribution, divided by the median of absolute values."""
 
 MAX_ITERATIONS, MIN_STEP = 50, 1e-9
 
@@ -59,16 +60,16 @@ class Similarity:
 
 @dataclass(frozen=True, eq=False)
 class SimilarityFit:
-    """A similarity, and how far it can be trusted.
+    """A similarity, and how reliable it is.
 
     Attributes:
         similarity: from the points to the targets.
         residuals: (N, 3) target minus transformed point.
         wrong: (N,) bool, points that do not agree with the others.
-        scale_std: relative standard deviation of the scale; 0 where it was given.
+        scale_std: relative standard deviation of the scale; 0 if it was given.
         axes_std_deg: (3,) standard deviations of the rotation about the x, y and z axis.
-        axis_std_deg_of_targets: that about the least certain axis by the targets alone; 180 where
-            they leave it open.
+        axis_std_deg_of_targets: that about the least certain axis, from the targets alone; 180 if
+            they do not determine it.
     """
 
     similarity: Similarity
@@ -90,20 +91,20 @@ def fit_similarity(
     scale: float | None = None,
     seed: int = 0,
 ) -> SimilarityFit:
-    """Fit the similarity that most of the points agree on.
+    """Fit the similarity on which most of the points agree.
 
     Args:
         points: (N, 3), three or more.
-        targets: (N, 3) where they are, z up; z may be NaN where it is unknown.
-        accuracy: of the targets, as far as it is known beforehand: a standard deviation.
-        up: (3,) upward direction in the frame of the points, roughly.
+        targets: (N, 3) target positions, z up; z may be NaN where it is unknown.
+        accuracy: standard deviation of the targets, as far as it is known beforehand.
+        up: (3,) approximate upward direction in the frame of the points.
         level, level_stds: (L, 3) directions in this frame that are horizontal, and (L,) their
             standard deviations in radians.
-        scale: what the scale is, where it is known.
+        scale: the scale, if it is known.
         seed: seed of the random choices.
 
     Raises:
-        ReconstructionError: the points are in one place, or too few of them agree.
+        ReconstructionError: the points coincide, or too few of them agree.
     """
     points, targets = (np.asarray(values, np.float64) for values in (points, targets))
     targets = targets.copy()
@@ -112,7 +113,7 @@ def fit_similarity(
     found = _search(points, targets, known, up, scale, seed)
     if found is None:
         raise ReconstructionError("the points are in one place")
-    middle = points.mean(axis=0)  # turning and scaling about it leaves the translation alone
+    middle = points.mean(axis=0)  # rotation and scale about it do not change the translation
     own, free = points - middle, 7 if scale is None else 6
     current = Similarity(found.scale, found.rotation, found.apply(middle[None])[0])
     distances = np.linalg.norm((targets - current.apply(own)) * known, axis=1)
@@ -134,7 +135,7 @@ def fit_similarity(
         weighted = jacobian * weights[:, None, None]
         of_targets = np.einsum("nai,naj->ij", weighted, jacobian)
         right = np.einsum("nai,na->i", weighted, residuals / stds)
-        # e_z . exp(w) R v = 0, robust as the points are: some photographs are held askew.
+        # e_z . exp(w) R v = 0, robust like the points: some photographs are tilted.
         seen = level @ current.rotation.T
         errors = seen[:, 2] / level_stds
         rows = np.zeros((len(level), 7))
@@ -173,7 +174,7 @@ def _search(
     scale: float | None,
     seed: int,
 ) -> Similarity | None:
-    """Find the similarity of three points, or of two and up, with the least median of distances."""
+    """Find the similarity of three points, or of two and up, with the least median distance."""
     random = np.random.default_rng(seed)
     best: dict[bool, tuple[float, Similarity | None]] = dict.fromkeys((True, False), (np.inf, None))
     for size in [3] * MAX_SAMPLES + [2] * (0 if up is None else MAX_SAMPLES):
@@ -189,7 +190,7 @@ def _search(
             best[bool(upright)] = median, found
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     sure = len(points) >= MIN_AREA_POINTS and spread[1] > MIN_AREA * spread[0]
-    # Where all cameras look straight down, what is taken for up may be far off.
+    # If all cameras look straight down, the assumed upward direction may be far off.
     return best[not (sure and best[False][0] < MUCH_BETTER * best[True][0])][1]
 
 
@@ -199,9 +200,9 @@ def least_squares_similarity(
     up: np.ndarray | None = None,
     scale: float | None = None,
 ) -> Similarity | None:
-    """Fit a similarity by least squares (Umeyama, 1991), about the vertical alone with `up`.
+    """Fit a similarity by least squares (Umeyama, 1991); with `up` it only rotates about it.
 
-    None where all points are in one place.
+    None if all points coincide.
     """
     middle, middle_of_targets = points.mean(axis=0), targets.mean(axis=0)
     own, other = points - middle, targets - middle_of_targets
@@ -225,9 +226,9 @@ def least_squares_similarity(
 
 
 def _spread(residuals: np.ndarray, known: np.ndarray, accuracy: float) -> np.ndarray:
-    """Return the (3,) standard deviations of targets: across, twice, and of heights."""
+    """Return the (3,) standard deviations of targets: one for x and y, and one for heights."""
     stds = []
-    for axes, lost in (([0, 1], 5), ([2], 2)):  # parameters that fit these
+    for axes, lost in (([0, 1], 5), ([2], 2)):  # `lost`: parameters that are fitted to them
         values = np.abs(residuals[:, axes][known[:, axes]])
         squares = len(values) * (MAD_STD * np.median(values)) ** 2 if len(values) else 0.0
         free = PRIOR_COUNT + max(len(values) - lost, 0)
@@ -236,6 +237,6 @@ def _spread(residuals: np.ndarray, known: np.ndarray, accuracy: float) -> np.nda
 
 
 def _covariance(normal: np.ndarray) -> np.ndarray:
-    """Return the inverse, with large values where the parameters are open."""
+    """Return the inverse, with large values for parameters that are not determined."""
     values, vectors = np.linalg.eigh(normal)
     return np.asarray(vectors / np.maximum(values, 1e-12 * values[-1]) @ vectors.T)

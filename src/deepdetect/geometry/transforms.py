@@ -1,4 +1,4 @@
-"""Points under homographies and fundamental matrices, and their errors in pixels."""
+"""Homographies and fundamental matrices applied to points, and their errors in pixels."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def epipolar_errors(
 def signed_epipolar_errors(
     points0: np.ndarray, points1: np.ndarray, fundamental: np.ndarray
 ) -> np.ndarray:
-    """Return `epipolar_errors` with a sign that says on which side a match lies."""
+    """Return `epipolar_errors` with a sign: the side of the line on which a match lies."""
     points0, points1 = np.asarray(points0, np.float64), np.asarray(points1, np.float64)
     across1, down1, algebraic = _apply(fundamental, points0)
     across0, down0 = _apply(fundamental.T[:2], points1)
@@ -74,7 +74,7 @@ def signed_epipolar_errors(
 def _apply(matrix: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     """Return the coordinates of the points (x, y, 1) times a matrix of three columns.
 
-    One after the other: with so few columns a product of matrices takes several times as long.
+    They are computed one by one: a matrix product with three columns takes several times as long.
     """
     x, y = points[:, 0], points[:, 1]
     coordinates = []
@@ -87,7 +87,7 @@ def _apply(matrix: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
 
 
 TOLERANCE_PX = 1.0
-"""A match is correct up to this distance from the truth, as Middlebury counts."""
+"""A match is correct within this distance of the ground truth, as in Middlebury's evaluation."""
 
 
 def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.ndarray) -> np.ndarray:
@@ -96,7 +96,7 @@ def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.nda
     Args:
         points0: (N, 2) positions in the left image; the nearest pixel is read.
         points1: (N, 2) matched positions in the right image.
-        disparity: (H, W) true disparity of the left image in pixels: the true match of
+        disparity: (H, W) ground-truth disparity of the left image in pixels: the true match of
             (x, y) is (x - d, y). Not finite where it is unknown.
 
     Returns:
@@ -110,10 +110,10 @@ def disparity_errors(points0: np.ndarray, points1: np.ndarray, disparity: np.nda
 
 
 def score_errors(errors: np.ndarray) -> dict[str, float]:
-    """Score the (N,) errors of `disparity_errors`, NaN where the truth is unknown.
+    """Score the (N,) errors of `disparity_errors`, NaN where the ground truth is unknown.
 
-    Returns the number of "matches", those of them that can be "evaluated", those of these that are
-    "correct" within `TOLERANCE_PX`, and the fraction that is, the "precision".
+    Returns the number of "matches", of those that can be "evaluated", of those that are "correct"
+    within `TOLERANCE_PX`, and the "precision", the correct fraction of the evaluated ones.
     """
     evaluated = int(np.isfinite(errors).sum())
     correct = int((errors <= TOLERANCE_PX).sum())
@@ -145,7 +145,7 @@ def scaled_points(points: np.ndarray, scale: float) -> np.ndarray:
 
 
 def scaled_homography(homography: np.ndarray, scale0: float, scale1: float) -> np.ndarray:
-    """Return the homography between both images at other scales, its last element 1."""
+    """Return the homography between both images at other scales, with 1 as its last element."""
     matrix = scaling_matrix(scale1) @ homography @ scaling_matrix(1 / scale0)
     return matrix / matrix[2, 2]
 

@@ -1,4 +1,4 @@
-"""Matching two images, and what follows from it: registration, panoramas."""
+"""Matching of two images, registration, panoramas, and disparity maps of rectified pairs."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Matching two images: keypoints, descriptors, ratio test, geometry (paper, Section III-C)."""
+"""Matching of two images: keypoints, descriptors, ratio test, geometry (paper, Section III-C)."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from .guided import TentativeMatches, guided_matches, guiding_geometry
 from .guided.tentative_matches import checked_positions
 
 GUIDED_STAGES = ("initial geometry", "keypoints", "guided matching", "geometry")
-"""A `PointDetector` has no first of them: its points give the geometry."""
+"""A `PointDetector` skips the first stage: its points give the geometry in the third."""
 
 MAX_RETURN_ERROR_PX = 2.0
-"""Of a match that is also found the other way: from the match nearest to its end, up to 1.5 px
-away, the way back ends this near to its start."""
+"""A match counts as found both ways if the reverse match that starts nearest to its end, up to 1.5
+px away, ends this near to its start. Chosen by hand."""
 
 Points = tuple[np.ndarray, np.ndarray]
 
@@ -65,32 +65,32 @@ def match_images(
 
     Args:
         image0, image1: anything `load_image` takes.
-        detector: a `DeepDetect` or a `PointDetector`, or anything with a method `heatmap` or
-            `detect`, as these have; default `DeepDetect()`.
-        channels: order of the colours in arrays, as of `load_image`: "bgr" for OpenCV's.
-        selection: which pixels of a heat map become keypoints; None: those over 0.5. A
-            `PointDetector` has none.
+        detector: a `DeepDetect` or a `PointDetector`, or any object with a method `heatmap` or
+            `detect` like theirs; default `DeepDetect()`.
+        channels: order of the colours in arrays: "rgb", or "bgr" as in OpenCV.
+        selection: which pixels of a heat map become keypoints; None: those above 0.5. Not for a
+            `PointDetector`.
         ignore: a mask for each image, or None, in a tuple; or one array for both: true where no
             keypoint is wanted.
-        model: the geometry, which also guides: "homography" (planes, pure rotation), "fundamental"
-            (any static scene), "essential" (with both cameras in the options), or "auto": the one
+        model: the geometry, which also guides the matching: "homography" (planes, pure rotation),
+            "fundamental" (any static scene), "essential" (needs both cameras), or "auto": the one
             of the first two that fits the images.
-        mutual: keep only one-to-one matches that are found from either image, the same ones
-            whichever image comes first, in twice the time.
-        tentative_matches: a few matches of any other matcher (LightGlue, LoFTR, a person's clicks),
-            two (K, 2) arrays of positions, row by row; they take the place of our own SIFT matches
-            that guide, and some may be wrong. Or what `find_tentative_matches` has made already.
+        mutual: keep only one-to-one matches that are found from either image, in twice the time.
+            The order of the images then does not matter.
+        tentative_matches: a few matches from another matcher (LightGlue, LoFTR, clicks), two (K, 2)
+            arrays of positions, row by row, some of which may be wrong; or the result of
+            `find_tentative_matches`. They replace our own SIFT matches for the first geometry.
         seed: seed of all random choices.
-        options: how the geometry is estimated in the end.
+        options: how the final geometry is estimated.
         progress: called with the name of each stage when it ends.
 
     Returns:
-        The matches, the geometry, and which agree with it. Where no geometry can be trusted there
-        are none (`Matches.success` is False), and the keypoints are found when they are first asked
-        for.
+        The matches, their geometry, and which of them agree with it. If no geometry can be trusted,
+        there are no matches (`Matches.success` is False), and keypoints are only detected when they
+        are accessed.
 
     Raises:
-        ImageError: an image cannot be read or is not fit.
+        ImageError: an image cannot be read or is unsuitable.
         OptionError: an option is unknown or out of its range.
 
     Example:
@@ -115,8 +115,8 @@ def match_images(
         cache(partial(find_keypoints, detector, image, selection, mask))
         for image, mask in zip(rgb, masks, strict=True)
     ]
-    # Keypoints of the network take no part in the first geometry, and finding them cannot fail:
-    # where no geometry can be trusted nobody may ever ask for them.
+    # The network's keypoints take no part in the first geometry, and finding them cannot fail. If
+    # no geometry can be trusted, they may never be needed.
     keypoints_last = isinstance(detector, DeepDetect) and all(mask is None for mask in masks)
     settings = guiding, model, seed, options, keypoints_last, timer
     matches = _match_guided(grays, (find[0], find[1]), source, *settings)
@@ -139,29 +139,31 @@ def match_features(
     mutual: bool = True,
     seed: int = 0,
 ) -> Matches:
-    """Match the descriptors of two images, as `extract` returns them: by these alone.
+    """Match two images by the descriptors of their keypoints alone, as `extract` returns them.
 
     Args:
         features0, features1: keypoints with descriptors of one type.
-        matcher: "auto" ("exact" for few keypoints, else "patchmatch" for dense ones and "flann" for
-            others), "flann", "exact", "patchmatch", or "hamming" for binary descriptors.
-        filter_by: which nearest neighbours are matches: "ratio" (Lowe's test), or "neighbours":
-            those that move, turn and grow as the matches around them do, by a small network: more
-            right ones, and fewer wrong. It needs nine mutual neighbours at least, of learned
-            descriptors (not cross-modal) or RootSIFT, at keypoints with sizes and angles.
-        ratio: the distance of the best over that of the second-best must be below this. None: 0.85,
-            of learned descriptors 0.88, which is as strict.
+        matcher: "flann", "exact", "patchmatch", "hamming" for binary descriptors, or "auto":
+            "exact" for few keypoints, otherwise "patchmatch" for dense ones and "flann" for others.
+        filter_by: which nearest neighbours are matches: "ratio" keeps those that pass Lowe's test,
+            "neighbours" those that move, rotate and grow as the matches around them do. The latter
+            is decided by a small network and gives more correct matches and fewer wrong ones. It
+            needs at least nine mutual neighbours, learned descriptors (not cross-modal) or
+            RootSIFT, and keypoints with sizes and angles.
+        ratio: upper limit of the distance to the best descriptor over that to the second-best.
+            None: 0.85, or for learned descriptors 0.88, which is equally strict.
         mutual: keep only mutual nearest neighbours.
         seed: seed of a matcher that is random.
 
     Returns:
-        The matches, without a geometry (`estimate_geometry` finds it); their scores are 1 - ratio;
-        by neighbours the network's, above 0.5, higher ones being more often right.
+        The matches, without a geometry (see `estimate_geometry`). Their scores are 1 - ratio; with
+        "neighbours" they are those of the network, above 0.5, and higher ones are more often
+        correct.
 
     Raises:
-        OptionError: an option is unknown or out of its range or does not suit the others, keypoints
-            have no descriptors, or those of the two images are of unlike types or lengths, or too
-            many for the memory.
+        OptionError: an option is unknown, out of its range, or incompatible with the others;
+            keypoints have no descriptors, descriptors of two types or lengths, or too many for the
+            memory.
 
     Example:
         >>> from deepdetect import PointDetector
@@ -173,12 +175,12 @@ def match_features(
         True
     """
     if features0.descriptors is None or features1.descriptors is None:
-        raise OptionError("these keypoints have no descriptors: find them by `extract`")
+        raise OptionError("these keypoints have no descriptors: use the detector's `extract`")
     length0, length1 = features0.descriptors.shape[1], features1.descriptors.shape[1]
     if (features0.descriptor_type, length0) != (features1.descriptor_type, length1):
         raise OptionError(
             f"descriptors of the types {features0.descriptor_type} ({length0} numbers) and "
-            f"{features1.descriptor_type} ({length1}) cannot be compared: extract both alike"
+            f"{features1.descriptor_type} ({length1}) cannot be compared: extract the same type"
         )
     check_seed(seed)
     learned = is_learned(features0.descriptor_type)
@@ -191,7 +193,7 @@ def match_features(
     if not 0 < ratio <= 1:
         raise OptionError(f"the ratio must be above 0 and at most 1, not {ratio}")
     check_memory([len(features0), len(features1)])
-    alike = features0.sizes is None and features1.sizes is None  # all of one scale and angle
+    alike = features0.sizes is None and features1.sizes is None  # all have one scale and angle
     nearest = partial(
         match_descriptors,
         matcher=get_matcher(matcher),
@@ -232,7 +234,7 @@ def _match_guided(
     keypoints_last: bool,
     timer: StageTimer,
 ) -> Matches:
-    """Match the keypoints of the first image where a geometry says."""
+    """Match the keypoints of the first image where a geometry predicts their partners."""
     first = None
     if keypoints_last:
         with timer.stage("initial geometry"):
@@ -249,8 +251,8 @@ def _match_guided(
         guide, matched = guided_matches(grays, pixels, first, seed)
     if matched is None:
         return _no_matches(*keypoints, guide, timer)
-    # Where a keypoint of the second image is none of a match, its end is where the pixel of the
-    # first one is seen.
+    # If a match ends at no keypoint of the second image, it ends where the pixel of the first one
+    # is seen.
     points = matched.starts(pixels[0]).astype(np.float32), matched.points1.astype(np.float32)
     if matched.indices1 is not None:
         points = keypoints[0].xy[matched.indices0], keypoints[1].xy[matched.indices1]
@@ -269,7 +271,7 @@ def _match_guided(
         replace(guide, model=geometry.model, matrix=geometry.matrix),
         matched.subpixel,
         matched.indices0,
-        matched.indices1,  # type: ignore[arg-type]  # looked up where there are none
+        matched.indices1,  # type: ignore[arg-type]  # None: looked up later
     )
 
 
@@ -291,10 +293,10 @@ def _found_both_ways(matches: Matches, back: Matches) -> Matches:
 
 
 def check_memory(keypoints: Sequence[int]) -> None:
-    """Raise an OptionError where descriptors and their search trees would fill the memory."""
+    """Raise an OptionError if descriptors and their search trees would fill the memory."""
     require_memory(
         f"matches of {' and '.join(f'{count:,}' for count in keypoints)} keypoints",
-        "make them fewer with max_keypoints, density, or a smaller resolution",
+        "reduce them by max_keypoints, density, or a smaller resolution",
         matched_keypoint=sum(keypoints),
     )
 
@@ -309,7 +311,7 @@ def _no_matches(
 def _final_geometry(
     points: Points, model: str, seed: int, options: GeometryOptions, guide: TwoViewGeometry
 ) -> Geometry:
-    """Return the geometry that guided where that is asked for, else estimate one."""
+    """Return the geometry that guided if the caller asked for that model, or else estimate one."""
     if options.homography is None and guide.matrix is not None and model in ("auto", guide.model):
         errors_of = transfer_errors if guide.model == "homography" else epipolar_errors
         errors = errors_of(*points, guide.matrix)

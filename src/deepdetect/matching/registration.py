@@ -1,4 +1,4 @@
-"""Registering one image to another by a homography."""
+"""Registration of one image to another by a homography."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from .pipeline import match_images
 Extent = Literal["reference", "union"]
 
 MAX_UNION = 4
-"""Times the pixels of both images that a union of them may have."""
+"""A union may have this many times the pixels of both images together. Chosen by hand."""
 
 SQUARES = 8
-"""Squares of the checkerboard along the shorter side."""
+"""Number of the checkerboard's squares along the shorter side. Chosen by hand."""
 
 SHIFTS = (1 / 6, 1 / 4)
-"""Of the second image, over the shorter side of the first, in eight directions: what images of
-different things correlate like."""
+"""The second image is shifted by these fractions of the shorter side, in eight directions, to
+measure how well unrelated content correlates. Chosen by hand."""
 
 MIN_DEVIATIONS = 4.0
-"""By which the correlation must exceed the mean of the shifted ones, in their standard deviations.
-Of eight scenes of Oxford, images 1 with 4 and 6: 9 to 70; with images of others at most 1.8."""
+"""Images agree if their correlation exceeds the mean of the shifted ones by this many standard
+deviations: 9 to 70 on images 1 with 4 and 6 of eight scenes of Oxford, up to 1.8 between scenes."""
 
 COMPARED_SIDE_PX = 480
-"""Longer side to which images are reduced before."""
+"""Images are reduced to this longer side before they are compared. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,14 +53,14 @@ class Registration:
     Attributes:
         homography: (3, 3) from the first image to the second.
         first: (H, W, 3) uint8 RGB, the first image; with the extent "union" black around it.
-        warped: (H, W, 3) RGB, the second in its frame, black where it has nothing: uint8, or
-            uint16 where the second has more than 8 bits.
-        valid: (H, W) bool, where the second image was warped to.
-        matches: number of dense matches that hold.
-        zncc: median local ZNCC of the two over what both show, in [-1, 1].
-        origin: (x, y) of the frame's first pixel in the first image: (0, 0), but for "union".
+        warped: (H, W, 3) RGB, the second image warped into the frame, black where it has no
+            content: uint8, or uint16 if the second image has more than 8 bits.
+        valid: (H, W) bool, where the warped image has content.
+        matches: number of dense matches that were kept.
+        zncc: median local ZNCC of both images over their overlap, in [-1, 1].
+        origin: (x, y) of the frame's first pixel in the first image; (0, 0) except for "union".
         applied: the images of `apply_to` in the same frame, (H, W, C) with all their bands, in
-            their own type, 0 or their value of no data where they have nothing.
+            their own type, and 0 or their no-data value where they have no content.
     """
 
     homography: np.ndarray
@@ -81,7 +81,7 @@ class Registration:
         )
 
     def checkerboard(self) -> np.ndarray:
-        """Return both images in turn, in squares: edges go on where they fit; (H, W, 3) uint8."""
+        """Return a checkerboard of both images: edges continue if they fit; (H, W, 3) uint8."""
         height, width = self.valid.shape
         side = max(1, min(height, width) // SQUARES)
         row, column = np.indices((height, width)) // side
@@ -89,7 +89,7 @@ class Registration:
         return np.where(second[..., None], to_8_bits(self.warped), self.first)
 
     def difference(self) -> np.ndarray:
-        """Return how far apart the colours are, 0 where only one has something; (H, W, 3) uint8."""
+        """Return the absolute colour difference, 0 outside the overlap; (H, W, 3) uint8."""
         return np.where(self.valid[..., None], cv2.absdiff(self.first, to_8_bits(self.warped)), 0)
 
 
@@ -110,24 +110,24 @@ def register(
 ) -> Registration:
     """Find the homography between two images and warp the second into the frame of the first.
 
-    For planes, and for photographs from one place. The homography comes from a few matches, is
-    refined on the images and verified by the dense matches.
+    For planes, and for photographs taken from one place. The homography comes from a few matches,
+    is refined on the images, and is verified by dense matches.
 
     Args:
         image0, image1: anything `load_image` takes.
-        detector, channels, selection, ignore, progress: as for `match_images`.
+        detector, channels, selection, ignore, progress: see `match_images`.
         mutual: use only matches that are found from either image, in twice the time.
-        seed: seed of all random choices.
-        extent: the frame: "reference", that of the first image, or "union", all that either
+        extent: the frame: "reference" is the first image, "union" everything that either image
             shows.
         apply_to: further images of the second camera, or its own file for all its bands, which are
-            moved by the same homography.
+            warped by the same homography.
+        seed: seed of all random choices.
 
     Raises:
-        ImageError: an image cannot be read or is not fit.
+        ImageError: an image cannot be read or is unsuitable.
         OptionError: an option is unknown or out of its range.
-        RegistrationError: no homography can be trusted, or the images contradict it, or the second
-            image reaches the horizon of a union.
+        RegistrationError: no homography can be trusted, the images contradict it, or the second
+            image is too oblique for a union.
 
     Example:
         >>> from deepdetect import PointDetector
@@ -135,12 +135,12 @@ def register(
         >>> scene = cv2.GaussianBlur(rng.integers(0, 256, (160, 200)).astype(np.uint8), (0, 0), 2)
         >>> scene = cv2.normalize(scene, None, 0, 255, cv2.NORM_MINMAX)
         >>> registration = register(scene[:, :180], scene[:, 12:], PointDetector())
-        >>> registration.homography[:2, 2].round(1).tolist()
+        >>> (registration.homography[:2, 2].round(1) + 0.0).tolist()
         [-12.0, 0.0]
     """
     check_name("extent", extent, get_args(Extent))
     if isinstance(apply_to, str | bytes) or not isinstance(apply_to, Sequence):
-        raise OptionError('`apply_to` must be a list of images, as ["thermal.tif"]')
+        raise OptionError('`apply_to` must be a list of images, such as ["thermal.tif"]')
     first, deep = load_image(image0, channels=channels), load_deep(image1, channels)
     second = to_8_bits(deep)
     matches = match_images(
@@ -158,13 +158,13 @@ def register(
     homography = None if geometry is None else geometry.matrix
     if homography is None:
         raise RegistrationError(
-            "no homography can be trusted: both images must show a plane, or be from one place"
+            "no homography can be trusted: both images must show a plane or be taken from one place"
         )
     grays = luma(first), luma(second)
     if not agree(*grays, homography):
         raise RegistrationError(
-            "the images contradict the homography that their matches agree with: where they would "
-            "overlap they are no more alike than images of different things"
+            "the images contradict the homography of their matches: warped, they are no more alike "
+            "than unrelated images; check that both show the same plane"
         )
     zncc = median_local_zncc(*grays, homography)
     left, top, right, bottom = 0, 0, first.shape[1], first.shape[0]
@@ -179,7 +179,7 @@ def register(
         bands = load_deep(each, channels, raw=True)
         if bands.shape[:2] != deep.shape[:2]:
             raise OptionError(
-                f"{file_name(each)} has another size than the second image: leave it out"
+                f"{file_name(each)} and the second image differ in size: leave it out"
             )
         no_data = read_metadata(each).no_data if is_file(each) else None
         applied.append(warp_bands(bands, moved, size, no_data))
@@ -190,21 +190,19 @@ def register(
 def _union(
     shape0: tuple[int, ...], shape1: tuple[int, ...], homography: np.ndarray
 ) -> tuple[int, int, int, int]:
-    """Return left, top, right and bottom of what two images show, in pixels of the first."""
+    """Return left, top, right and bottom of the union of two images, in pixels of the first."""
     height, width = shape1[:2]
     corners = outer_corners((width, height))
     back = np.linalg.inv(homography)
     ends, depths = transform_points(corners, back), corners @ back[2, :2] + back[2, 2]
-    # A pixel belongs to an image when its centre does.
+    # A pixel belongs to an image if its centre does.
     low = np.minimum(0, np.ceil(ends.min(axis=0)))
     high = np.maximum([shape0[1], shape0[0]], np.floor(ends.max(axis=0)) + 1)
     pixels = float(np.prod(high - low))
     if depths.min() * depths.max() <= 0 or pixels > MAX_UNION * (
         width * height + np.prod(shape0[:2])
     ):
-        raise RegistrationError(
-            "the second image is seen too much from the side for a union: leave `extent` out"
-        )
+        raise RegistrationError("the second image is too oblique for a union: leave `extent` out")
     return (*low.astype(int).tolist(), *high.astype(int).tolist())
 
 
@@ -219,6 +217,6 @@ def agree(gray0: np.ndarray, gray1: np.ndarray, homography: np.ndarray) -> bool:
             length = radius * min(first.shape)
             move = translation_matrix(length * np.cos(angle), length * np.sin(angle))
             shifted.append(median_local_zncc(first, second, matrix @ move))
-    known = [value for value in shifted if value > -1]  # where both are seen
+    known = [value for value in shifted if value > -1]  # -1: no overlap
     least = np.mean(known) + MIN_DEVIATIONS * np.std(known) if known else 1.0
     return bool(median_local_zncc(first, second, matrix) > least)

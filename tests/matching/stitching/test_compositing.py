@@ -85,14 +85,15 @@ def test_brightness_becomes_equal(scene: np.ndarray) -> None:
     assert factor[:150].mean() / factor[-150:].mean() == pytest.approx(1, abs=0.03)
 
 
-def test_all_around_is_one_strip() -> None:
-    """Twelve views of 45 degrees."""
+@pytest.mark.parametrize(("focal_px", "scale"), [(480.0, 0.5), (343.0, 2.0)])
+def test_all_around_is_one_strip(focal_px: float, scale: float) -> None:
+    """Twelve views of 45 degrees, and of 60: some go on behind the end by two pixels only."""
     cameras = {
-        k: RotatingCamera(480.0, cv2.Rodrigues(np.radians([0.0, 30 * k - 165, 0]))[0])
+        k: RotatingCamera(focal_px, cv2.Rodrigues(np.radians([0.0, 30 * k - 165, 0]))[0])
         for k in range(12)
     }
-    canvas = plan_curved("cylindrical", dict.fromkeys(cameras, SIZE), cameras, 5, 0.5)
-    assert canvas.size[0] == pytest.approx(2 * np.pi * 240, abs=3)
+    canvas = plan_curved("cylindrical", dict.fromkeys(cameras, SIZE), cameras, 5, scale)
+    assert canvas.size[0] == pytest.approx(2 * np.pi * focal_px * scale, abs=3)
     plain = {k: np.full((300, 400, 3), 100, np.uint8) for k in cameras}
     panorama, valid, *_ = put_together(plain, canvas)
     assert (np.abs(panorama[valid].astype(int) - 100) < 3).all()

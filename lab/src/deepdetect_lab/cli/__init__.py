@@ -32,6 +32,10 @@ DEVELOPMENT = {
     "Weights": {
         "shards": ("deepdetect_lab.cli.train", "pack images for training on large sets"),
         "train-points": ("deepdetect_lab.cli.train", "train the ranker of keypoints on images"),
+        "train-match-filter": (
+            "deepdetect_lab.cli.train",
+            "train the network that tells right matches from wrong ones",
+        ),
         "average": ("deepdetect_lab.cli.train", "the mean of several weights"),
     },
 }

@@ -1,4 +1,4 @@
-"""`deepdetect train`, `train-points`, `train-descriptor`, `label`, `shards` and `average`."""
+"""`deepdetect train` and its kinds, `label`, `shards` and `average`."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from ..training import (
     PRESETS,
     DescriptorTrainingOptions,
     DeviceOptions,
+    MatchFilterTrainingOptions,
     PointsTrainingOptions,
     Stage,
     TrainingOptions,
@@ -30,6 +31,7 @@ from ..training import (
 )
 from ..training import train as train_network
 from ..training import train_descriptor as train_descriptor_network
+from ..training import train_match_filter as train_filter
 from ..training import train_points as train_ranker
 
 Folder = Annotated[Path, Parameter(help="Folder of images; `train` also takes shards.")]
@@ -70,6 +72,7 @@ SHARDS = replace(RECIPE, common="max_images augmentations", more="short_sides sq
 SHARD_SIZE = cli.From(write_shards, "shard_size", more="")
 ENGINE = replace(EXTRACTION, common="")
 POINTS_RUN = cli.From(train_ranker, "validation num_workers", more="", types={"validation": Path})
+FILTER_RUN = cli.From(train_filter, "validation", more="", types={"validation": Path})
 DESCRIPTOR_RUN = cli.From(
     train_descriptor_network,
     "validation init_weights device num_workers",
@@ -204,6 +207,25 @@ def train_descriptor(images: Folder, /, *, output: cli.Output, **values: Any) ->
     """
     run = {**DESCRIPTOR_RUN.take(values), "output": output, "log": cli.say}
     result = train_descriptor_network(images, options=DescriptorTrainingOptions(**values), **run)
+    files = {"weights": result.weights, "onnx": result.onnx}
+    return cli.Result({**files, "best": result.best, "points": result.points})
+
+
+@cli.command(FILTER_RUN, cli.From(MatchFilterTrainingOptions, "steps drawn val_pairs seed"))
+def train_match_filter(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
+    """Train the network that tells right matches from wrong ones by their neighbours.
+
+    Pairs of views are made of single images. The run's folder gets match_filter.onnx and
+    match_filter.safetensors (the weights of the lowest validation loss), MODEL_CARD.md, curves.csv,
+    curves.png and checkpoint.safetensors.
+
+        deepdetect dev train-match-filter photos/train --validation photos/val -o run
+
+    Args:
+        output: Folder of the run.
+    """
+    run = {**FILTER_RUN.take(values), "output": output, "log": cli.say}
+    result = train_filter(images, options=MatchFilterTrainingOptions(**values), **run)
     files = {"weights": result.weights, "onnx": result.onnx}
     return cli.Result({**files, "best": result.best, "points": result.points})
 

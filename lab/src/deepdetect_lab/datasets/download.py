@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from deepdetect._shared.errors import DeepDetectError, first_line, require_packages
+import requests
+
+from deepdetect._shared.errors import DeepDetectError, first_line
 from deepdetect._shared.opencv import cv2
 from deepdetect._shared.progress import progress
 from deepdetect._shared.records import file_state
@@ -111,11 +113,9 @@ def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = Tru
         The folder.
 
     Raises:
-        MissingExtraError: requests is not installed.
         DeepDetectError: the download fails, a checksum is wrong, the disk is full, or the
             folder holds something else.
     """
-    require_packages("downloading data sets", "requests")
     final = Path(folder)
     if final.is_dir() and any(final.iterdir()):
         _check(dataset, final, f"{final} exists and")
@@ -156,8 +156,6 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
     Until then the bytes are in `path` with ".part" added, where the next call resumes. Where every
     host fails, the error is that of the last one.
     """
-    from requests import RequestException
-
     part = _part(path)
     for k, url in enumerate(file.urls):
         if k and file.checksum is None:
@@ -173,7 +171,7 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
             return
         except DeepDetectError as error:
             failure = error
-        except RequestException as error:
+        except requests.RequestException as error:
             what, advice = type(error).__name__, "give the same command again to resume"
             if error.response is not None:
                 what, advice = f"the server answers {error.response.status_code}", "try again later"
@@ -214,8 +212,6 @@ def _part(path: Path) -> Path:
 
 
 def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> None:
-    import requests
-
     have = file_state(part)[0]
     headers = {"Range": f"bytes={have}-"} if have else {}
     with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT_SECONDS) as response:

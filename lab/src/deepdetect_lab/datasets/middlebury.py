@@ -18,8 +18,9 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from skimage import data
 
-from deepdetect._shared.errors import ImageError, MissingImageError, require_packages
+from deepdetect._shared.errors import ImageError, MissingImageError
 from deepdetect.geometry.camera import Calibration
 from deepdetect.io.image import load_image
 from deepdetect.io.image_file import open_image
@@ -87,9 +88,6 @@ def load_motorcycle() -> StereoPair:
 
     It is part of the scikit-image wheel, so nothing is downloaded.
     """
-    require_packages("the Motorcycle pair", "skimage")
-    from skimage import data
-
     left, right, disparity = data.stereo_motorcycle()
     disparity = np.asarray(disparity, np.float32).squeeze()
     unknown = ~np.isfinite(disparity)

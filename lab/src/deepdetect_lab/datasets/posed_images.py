@@ -118,7 +118,6 @@ def load_posed_scenes(
 
     Raises:
         ImageError: there is no scene, or a file of one is missing or damaged.
-        MissingExtraError: pycolmap, which reads COLMAP's layout, is not installed.
     """
     root = Path(folder).resolve()
     below = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []

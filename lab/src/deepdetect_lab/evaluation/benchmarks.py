@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
-from deepdetect._shared.errors import ImageError, MissingExtraError, require_packages
+from deepdetect._shared.errors import ImageError
 from deepdetect._shared.options import look_up
 from deepdetect._shared.records import file_digest
 from deepdetect.detector.pretrained import resolve_weights
@@ -44,11 +44,10 @@ def run_benchmarks(
     """Run benchmarks of `BENCHMARKS` and collect their report.
 
     The folder of the data has one for each data set, or is the only one; without a folder for the
-    cache nothing is kept. Missing data or packages are an error of one benchmark alone.
+    cache nothing is kept. Missing data are an error of one benchmark alone.
     """
     started = time.monotonic()
     entries = [look_up("benchmark", name, BENCHMARKS) for name in names]
-    require_packages("a benchmark", "matplotlib", "scipy")  # before hours of work
     run = Run(Path(data), None if cache is None else Path(cache), quiet)
     sections: list[Section] = []
     for name, (module, function) in zip(names, entries, strict=True):
@@ -58,7 +57,7 @@ def run_benchmarks(
             if not found:
                 run.skipped.append(f"{name}: it has no protocol {' or '.join(options.protocols)}")
             sections += found
-        except (ImageError, MissingExtraError) as error:
+        except ImageError as error:
             if len(names) == 1:
                 raise
             run.fail(f"the benchmark {name}: {error}")

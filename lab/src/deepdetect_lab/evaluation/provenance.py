@@ -14,7 +14,7 @@ from deepdetect._shared.machine import processor_count
 from deepdetect._shared.opencv import DISTRIBUTIONS
 
 RUNTIMES = ("onnxruntime", "openvino", "torch")
-PACKAGES = ("numpy", *DISTRIBUTIONS, "pillow", *RUNTIMES, "lightning-fabric")
+PACKAGES = ("numpy", *DISTRIBUTIONS, "pillow", *RUNTIMES)
 
 
 def provenance() -> dict[str, str]:

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from deepdetect._shared.atomic import atomic_path
-from deepdetect._shared.errors import require_packages
 from deepdetect._shared.opencv import cv2
 
 Cell = str | int | float | None
@@ -243,14 +242,8 @@ def line_chart(
     lines: Mapping[str, tuple[Sequence[float], Sequence[float]]],
     x_label: str,
     y_label: str,
-    *,
-    logarithmic: bool = False,
-    ticks: Sequence[float] = (),
 ) -> bytes:
-    """Draw lines of (x, y) values, with their names in a legend; one of one value is a point.
-
-    The x axis may be logarithmic, and have ticks of its own.
-    """
+    """Draw lines of (x, y) values, with their names in a legend; one of one value is a point."""
     figure = _figure(11, max(4.5, 0.27 * len(lines) + 0.5))
     axes = figure.subplots()
     axes.set_xlabel(x_label)
@@ -260,13 +253,6 @@ def line_chart(
         # Ten colours, and other marks and lines each time round.
         marker, dash = MARKERS[k // 10 % len(MARKERS)], DASHES[k // 10 % len(DASHES)]
         axes.plot(x, y, label=name, color=f"C{k % 10}", marker=marker, linestyle=dash)
-    if logarithmic:
-        axes.set_xscale("log")
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter("{x:g}")
-    if ticks:
-        axes.set_xticks(ticks, [f"{tick:,g}" for tick in ticks], minor=False)
-        axes.set_xticks([], minor=True)
     if lines:
         axes.legend(fontsize="small", loc="center left", bbox_to_anchor=(1.01, 0.5))
     return _saved(figure)
@@ -281,7 +267,6 @@ def picture(rgb: np.ndarray) -> bytes:
 
 
 def _figure(width: float, height: float) -> Any:
-    require_packages("a chart of the report", "matplotlib")
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from deepdetect._shared.errors import ImageError, OptionError, require_packages
+from deepdetect._shared.errors import ImageError, OptionError
 from deepdetect._shared.options import suggest_keywords
 from deepdetect._shared.progress import progress
 from deepdetect.detector.detector import DeepDetect
@@ -125,7 +125,6 @@ def evaluate(
     Raises:
         ImageError: no sample, scene or photograph can be read, or a file of one is missing.
         OptionError: a scale is not above 0, or `scales` or `equal_density` has no images.
-        MissingExtraError: `oxford` needs the extra `train`.
 
     Example:
         >>> import tempfile
@@ -145,8 +144,6 @@ def evaluate(
         raise OptionError(
             "`equal_density` needs keypoints: name a folder as `oxford` or `foreground`, too"
         )
-    if oxford is not None:  # what is missing is said before hours of work
-        require_packages("the Oxford protocol", "scipy")
     scenes = None if oxford is None else load_oxford(oxford)
     masked = None if foreground is None else load_foreground(foreground)
     detector = DeepDetect() if detector is None else detector

@@ -3,6 +3,7 @@ from .recipe import (
     PRESETS as PRESETS,
     DescriptorTrainingOptions as DescriptorTrainingOptions,
     DeviceOptions as DeviceOptions,
+    MatchFilterTrainingOptions as MatchFilterTrainingOptions,
     PointsTrainingOptions as PointsTrainingOptions,
     Stage as Stage,
     TrainingOptions as TrainingOptions,
@@ -12,6 +13,7 @@ from .run import (
     profile as profile,
     train as train,
     train_descriptor as train_descriptor,
+    train_match_filter as train_match_filter,
     train_points as train_points,
 )
 from .sampler import CropSampler as CropSampler, Schedule as Schedule

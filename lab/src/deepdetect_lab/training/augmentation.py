@@ -11,6 +11,8 @@ from PIL import Image, ImageEnhance
 from deepdetect._shared.opencv import cv2
 from deepdetect.io.image import luma
 
+from .synthetic import WHITE, Camera, Effect, Light, blur, record, relight
+
 RED, GREEN, BLUE = 0.299, 0.587, 0.114  # of the luma (BT.601)
 
 AUGMENTATION_VERSION = 3
@@ -42,14 +44,14 @@ CROP_SCALE = (0.7, 1.0)
 INTERPOLATIONS = ("NEAREST", "LINEAR", "CUBIC", "AREA", "LANCZOS4")
 """What views that are not turned are made smaller by, as OpenCV names it."""
 
-RELIGHT_PROBABILITY = 0.5
-MAX_LOG_GAMMA = 0.5
-RELIGHT_CONTRAST, MAX_BRIGHTNESS_SHIFT = (0.5, 1.2), 0.15
-"""Of values in [0, 1], around 0.5."""
-
-BLUR_PROBABILITY, BLUR_SIGMA_PX = 0.3, (0.5, 2.5)
-NOISE_PROBABILITY, NOISE_SIGMA_LEVELS = 0.25, (1, 8)
-JPEG_PROBABILITY, JPEG_QUALITY = 0.35, (20, 95)
+LIGHT = Light(
+    share=0.5,
+    log_gamma=Effect(1, -0.5, 0.5),
+    contrast=Effect(1, 0.5, 1.2),
+    shift=(-0.15, 0.15),
+)
+CAMERA = Camera(blur=Effect(0.3, 0.5, 2.5), noise=(Effect(0.25, 1, 8),), jpeg=Effect(0.35, 20, 95))
+"""The recipe of the views."""
 
 MAX_JITTER_SATURATION = 1.2
 """Largest factor of the saturation of rotated colours."""
@@ -118,16 +120,9 @@ def augment(rgb: np.ndarray, side: int, seed: int) -> np.ndarray:
     generator = np.random.default_rng([AUGMENTATION_VERSION, seed])
     turned = generator.random() < TURN_PROBABILITY
     view = (_rotated_crop if turned else _upright_crop)(rgb, side, generator)
-    if generator.random() < RELIGHT_PROBABILITY:
-        view = _relight(view, generator)
-    if generator.random() < BLUR_PROBABILITY:
-        view = cv2.GaussianBlur(view, (0, 0), generator.uniform(*BLUR_SIGMA_PX))
-    if generator.random() < NOISE_PROBABILITY:
-        noise = generator.normal(0, generator.uniform(*NOISE_SIGMA_LEVELS), view.shape)
-        view = np.clip(np.rint(view + noise), 0, 255).astype(np.uint8)
-    if generator.random() < JPEG_PROBABILITY:
-        view = _compress(view, int(generator.integers(*JPEG_QUALITY)))
-    return view
+    levels = relight(generator, np.arange(WHITE + 1) / WHITE, LIGHT)
+    view = np.clip(np.rint(WHITE * levels), 0, WHITE).astype(np.uint8)[view]
+    return record(generator, blur(generator, view, CAMERA).astype(np.float64), CAMERA)
 
 
 def _rotated_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) -> np.ndarray:
@@ -171,17 +166,3 @@ def _upright_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) ->
         name = INTERPOLATIONS[int(generator.integers(len(INTERPOLATIONS)))]
         interpolation = getattr(cv2, f"INTER_{name}")
     return cv2.resize(np.ascontiguousarray(view), (side, side), interpolation=interpolation)
-
-
-def _relight(rgb: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    levels = np.arange(256) / 255
-    levels = levels ** math.exp(generator.uniform(-MAX_LOG_GAMMA, MAX_LOG_GAMMA))
-    levels = 0.5 + (levels - 0.5) * generator.uniform(*RELIGHT_CONTRAST)
-    levels = levels + generator.uniform(-MAX_BRIGHTNESS_SHIFT, MAX_BRIGHTNESS_SHIFT)
-    return np.clip(np.rint(255 * levels), 0, 255).astype(np.uint8)[rgb]
-
-
-def _compress(rgb: np.ndarray, quality: int) -> np.ndarray:
-    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)  # OpenCV's order, so that luma is luma
-    _, stored = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return cv2.cvtColor(cv2.imdecode(stored, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)

@@ -189,21 +189,19 @@ class CropDataset(Dataset[tuple[Tensor, Tensor]]):
 
 
 class ValidationDataset(Dataset[tuple[Tensor, Tensor]]):
-    """This process's part of the whole images: (H, W, 3) uint8 RGB, and (H, W) bool label.
+    """The whole images: (H, W, 3) uint8 RGB, and (H, W) bool label.
 
     Those in normal light come first, then the darkened ones.
     """
 
-    def __init__(self, source: ImageSource, rank: int = 0, world_size: int = 1) -> None:
+    def __init__(self, source: ImageSource) -> None:
         self.source = source
-        self.indices = range(rank, len(source), world_size)
 
     def __len__(self) -> int:
-        return 2 * len(self.indices)
+        return 2 * len(self.source)
 
     def __getitem__(self, index: int) -> tuple[Tensor, Tensor]:
-        light, place = divmod(index, len(self.indices))
-        number = self.indices[place]
+        light, number = divmod(index, len(self.source))
         image, mask = self.source.load(number, self.source[number].validation_views[light])
         return torch.tensor(image), torch.tensor(mask)
 
@@ -226,7 +224,6 @@ def prepare_data(
     labels: str | Path | None = None,
     workers: int | None = None,
     processes: int = 1,
-    make_labels: bool = True,
     quiet: bool = True,
 ) -> TrainingData:
     """List the images of a run and make the missing labels of their views; arguments of `train`.
@@ -247,10 +244,9 @@ def prepare_data(
     memory = available_memory() // 2 // processes
     training = FolderSource(listed, folder, options.labels, memory)
     held = FolderSource(held_out, folder, options.labels, memory // 8)
-    if make_labels:
-        views = [i.normal + i.dark if options.dark_fraction > 0 else i.normal for i in listed]
-        training.make_labels(views, workers, quiet)
-        held.make_labels([image.validation_views for image in held_out], workers, quiet)
+    views = [i.normal + i.dark if options.dark_fraction > 0 else i.normal for i in listed]
+    training.make_labels(views, workers, quiet)
+    held.make_labels([image.validation_views for image in held_out], workers, quiet)
     digests = [[image.digest for image in part] for part in (listed, held_out)]
     if shards is None:
         return TrainingData(training, held, key(digests)[:16])

@@ -1,26 +1,16 @@
-"""The training of the network: crops with labels, the loss of each pixel, the validation.
-
-Lightning Fabric runs it on several GPUs, whose processes `torchrun` starts.
-"""
+"""The training of the network: crops with labels, the loss of each pixel, the validation."""
 
 from __future__ import annotations
 
 import copy
 import dataclasses
-import datetime
-import logging
 import math
-import os
 import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from lightning_fabric import Fabric
-from lightning_fabric.plugins.environments.lightning import LightningEnvironment
-from lightning_fabric.plugins.environments.torchelastic import TorchElasticEnvironment
-from lightning_fabric.strategies.ddp import DDPStrategy
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, pad
 from torch.utils.data import DataLoader
@@ -48,9 +38,6 @@ from .sampler import CropSampler, Schedule, milestones
 from .trainer import Trainer
 
 ONNX = "deepdetect.onnx"
-
-LABELS_TIMEOUT = datetime.timedelta(hours=24)
-"""While the first process makes the labels, the others wait."""
 
 
 def initial_network(
@@ -80,44 +67,6 @@ def initial_network(
         return dataclasses.replace(options, frozen_batch_norm=False), make()
 
 
-def launch(device: DeviceOptions, options: TrainingOptions) -> Any:
-    """Join the processes that `torchrun` has started, or be the only one; return the `Fabric`.
-
-    Raises:
-        OptionError: the processes cannot train by these options.
-    """
-    kind = device.accelerator
-    if kind == "cpu":
-        disable_malloc_trim()
-    alone = "TORCHELASTIC_RUN_ID" not in os.environ
-    local, world = (1 if alone else int(os.environ[f"{n}WORLD_SIZE"]) for n in ("LOCAL_", ""))
-    if kind == "cuda" and local > torch.cuda.device_count():
-        raise OptionError(
-            f"there are {torch.cuda.device_count()} CUDA devices on this machine for {local} "
-            "processes: use `device=cpu`, or lower torchrun's --nproc-per-node"
-        )
-    if world > 1 and kind == "cpu" and not options.frozen_batch_norm:
-        raise OptionError(
-            "several processes need GPUs, or `frozen_batch_norm`: there is no batch normalisation "
-            "over several CPUs"
-        )
-    CropSampler(Schedule(options, images=1), world_size=world)  # which refuses uneven batches
-    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
-    fabric = Fabric(
-        accelerator=kind,
-        devices=local,
-        num_nodes=world // local,
-        # Buffers are the same everywhere: the batch normalisation sees to it.
-        strategy="auto" if alone else DDPStrategy(broadcast_buffers=False, timeout=LABELS_TIMEOUT),
-        # Named, so that a batch system's variables in the environment change nothing.
-        plugins=[LightningEnvironment() if alone else TorchElasticEnvironment()],
-    )
-    fabric.launch()
-    if device.threads is not None:
-        torch.set_num_threads(int(device.threads))  # launching sets its own
-    return fabric
-
-
 class DenseTrainer(Trainer):
     """A network that maps images to heat maps, with its initial weights, and labelled images."""
 
@@ -130,11 +79,14 @@ class DenseTrainer(Trainer):
         options: TrainingOptions,
         data: TrainingData,
         device: DeviceOptions,
-        fabric: Any,
     ) -> None:
         self.options, self.data, self.device_options = options, data, device
-        self.fabric, self.device, self.is_main = fabric, fabric.device, fabric.is_global_zero
-        kind, alone = device.accelerator, fabric.world_size == 1
+        kind = device.accelerator
+        self.device = torch.device(kind)
+        if kind == "cpu":
+            disable_malloc_trim()
+        if device.threads is not None:
+            torch.set_num_threads(device.threads)
         initial_weights = weights_digest(network)
         self.bfloat16 = device.precision == "bfloat16" or (
             device.precision == "auto" and _computes_bfloat16(kind)
@@ -142,14 +94,11 @@ class DenseTrainer(Trainer):
         # channels_last is faster by 40 % on CPUs, and what tensor cores want.
         self.network = network.to(self.device)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        if not alone and kind == "cuda":
-            nn.SyncBatchNorm.convert_sync_batchnorm(self.network)
         self.average = copy.deepcopy(self.network).eval()
         self.average_decay = options.average_decay
         self.max_gradient_norm = options.max_gradient_norm or math.inf
         has_compiler = kind == "cuda" or any(map(shutil.which, ("g++", "clang++")))
-        # Sums over processes, inside the batch normalisation, break the graph.
-        self.compiled = has_compiler and alone if device.compile is None else device.compile
+        self.compiled = has_compiler if device.compile is None else device.compile
         self._forward = self._set_up()
         self.optimizers = make_optimizers(options.optimizer, network)
         self.schedule = Schedule(options, len(data.training))
@@ -166,11 +115,10 @@ class DenseTrainer(Trainer):
             )
 
     def _set_up(self) -> nn.Module:
-        network: Any = self.network
-        if self.compiled:
-            # Not dynamic: there are only as many shapes as stages, and each gets its own code.
-            network = torch.compile(network, dynamic=False)
-        return self.fabric.setup_module(network, move_to_device=False)
+        if not self.compiled:
+            return self.network
+        # Not dynamic: there are only as many shapes as stages, and each gets its own code.
+        return torch.compile(self.network, dynamic=False)  # type: ignore[return-value]
 
     def to_device(self, values: Tensor) -> Tensor:
         """Copy a tensor to the device, without waiting where it is pinned."""
@@ -183,7 +131,6 @@ class DenseTrainer(Trainer):
     def logits(self, images: Tensor) -> Tensor:
         """Run the network for training; logits are float32."""
         try:
-            # Not Fabric's own precision, which would round the images to bfloat16 as well.
             with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
                 return self._forward(images).float()
         except torch._dynamo.exc.TorchDynamoException as error:
@@ -199,16 +146,11 @@ class DenseTrainer(Trainer):
     def describe(self) -> str:
         """Say in words how the network is run."""
         precision = "bfloat16" if self.bfloat16 else "float32"
-        words = [self.device.type, precision, "compiled" if self.compiled else "eager"]
-        if self.fabric.world_size > 1:
-            words.append(f"{self.fabric.world_size} processes")
-        return ", ".join(words)
+        return f"{self.device.type}, {precision}, {'compiled' if self.compiled else 'eager'}"
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
         """Return the loader of the batches of some steps: (images, masks), see `CropDataset`."""
-        rank, world = self.fabric.global_rank, self.fabric.world_size
-        steps = self.schedule, self.data.training.shard_sizes, first, last
-        sampler = CropSampler(*steps, rank=rank, world_size=world)
+        sampler = CropSampler(self.schedule, self.data.training.shard_sizes, first, last)
         return self._loader(CropDataset(self.data.training, self.options), batch_sampler=sampler)
 
     def _loader(self, dataset: Any, **batches: Any) -> DataLoader[Any]:
@@ -221,7 +163,7 @@ class DenseTrainer(Trainer):
         )
 
     def pixels(self, batch: tuple[Tensor, Tensor]) -> int:
-        return batch[1].numel() * self.fabric.world_size
+        return batch[1].numel()
 
     def learning_rate(self, step: int) -> float:
         return self.schedule.learning_rate(step)
@@ -236,10 +178,6 @@ class DenseTrainer(Trainer):
         logits = self.logits(self.to_float(images))
         return binary_cross_entropy_with_logits(logits, truth, pos_weight=self._pos_weight(images))
 
-    def backward(self, loss: Tensor) -> float:
-        self.fabric.backward(loss)
-        return float(self.fabric.all_reduce(loss.detach(), reduce_op="mean").item())
-
     def _pos_weight(self, images: Tensor) -> Tensor | None:
         """Return the weights of the images' marked pixels, (B, 1, 1, 1) or (1,); None: all 1."""
         normal, dark = self.options.pos_weight, self.options.low_light_pos_weight
@@ -251,17 +189,11 @@ class DenseTrainer(Trainer):
 
     def validate(self, step: int) -> dict[str, float]:
         """Return the losses and the intersections over union on the validation images."""
-        rank, world = self.fabric.global_rank, self.fabric.world_size
-        dataset = ValidationDataset(self.data.validation, rank, world)
-        sums = torch.zeros(2, 3, device=self.device, dtype=torch.float64)
+        dataset = ValidationDataset(self.data.validation)
         with loading(self._loader(dataset, batch_size=None)) as pairs:
-            for number, (image, mask) in enumerate(pairs):
-                loss, iou = score_heatmap(self.heatmap(image), mask.numpy())
-                sums[int(number >= len(dataset) // 2)] += torch.tensor(
-                    [loss, iou, 1.0], dtype=torch.float64
-                )
-        sums = self.fabric.all_reduce(sums, reduce_op="sum")
-        (normal_loss, normal_iou), (dark_loss, dark_iou) = (sums[:, :2] / sums[:, 2:]).tolist()
+            scores = [score_heatmap(self.heatmap(image), mask.numpy()) for image, mask in pairs]
+        by_light = np.reshape(scores, (2, -1, 2)).mean(axis=1)
+        (normal_loss, normal_iou), (dark_loss, dark_iou) = by_light.tolist()
         fraction, crops = self.options.dark_fraction, self.schedule.crops_until(step)
         return {
             "epoch": crops / self.schedule.images,

@@ -1,15 +1,12 @@
-"""Train the network that tells right matches from wrong ones by their neighbours.
+"""The training of the match filter: right matches from wrong ones by their neighbours.
 
-    python -m deepdetect_lab.training.match_filter photos/train photos/val match_filter.onnx
-
-Keypoints of two views of a photograph, as `draw_layers` makes them, and now and then of unrelated
-views, are described in one of two ways and matched; which matches are right is known. It takes a
-quarter of an hour on two processors.
+Keypoints of two views of a synthetic scene, and now and then of unrelated scenes, are described in
+one of two ways and matched; which matches are right is known.
 """
 
 from __future__ import annotations
 
-import argparse
+import copy
 import math
 import warnings
 from collections.abc import Sequence
@@ -21,51 +18,76 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, relu
+from torch.utils.data import DataLoader, Dataset
 
 from deepdetect._shared.atomic import atomic_path
-from deepdetect._shared.errors import OptionError
 from deepdetect._shared.machine import map_in_processes
 from deepdetect._shared.progress import progress
+from deepdetect._shared.records import key
 from deepdetect.detector.point_detector import PointDetector
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.features.learned import LEARNED, LEARNED_RATIO, RATIO, match_learned
 from deepdetect.features.match_filter import AROUND, filter_inputs, nearest_rows
 from deepdetect.features.matchers import DescriptorMatches, exact_neighbours, match_descriptors
 from deepdetect.features.sift import ROOT_SIFT
-from deepdetect.io.image import find_images
 
 from ..evaluation.report import Table
 from ..networks.export import OPSET
-from .descriptor.task import ATTEMPTS
-from .descriptor.views import correspond, draw_layers, relight, render_layers
+from ..networks.weights import load_network
+from .checkpoint import Point
+from .descriptor.views import photograph_view
+from .recipe import MatchFilterTrainingOptions
+from .sampler import milestones
+from .scenes import correspond, draw_layers, draw_until_seen, render_layers
+from .synthetic import rotation
+from .trainer import Trainer
+
+ONNX = "match_filter.onnx"
 
 WIDTH, ROUNDS = 32, 3
-"""Numbers that describe a match, and how often those around it change them."""
+"""Numbers that describe a match, and how often those around it change them. Both were set once."""
 
 OF_A_MATCH, OF_TWO = 4, 11
-"""Numbers that the network begins with, of a match, and of one around another."""
+"""Numbers that the network begins with, for a match, and for one around another."""
+
+RATIO_RANGE, RATIO_SCALE, RATIO_OFFSET = (0.05, 1.2), 3, 0.5
+"""The logarithm of a ratio, kept within this range, is scaled and shifted to a mean near 0 and a
+deviation near 1. Ratios above 1 are possible: the nearest keypoint is not always the mutual one."""
+
+MEAN_COSINE = 0.7
+"""About the mean of the cosines of how far keypoints are turned, which is taken off."""
+
+LEAST_TRUST = 0.5
+"""It is added to the sum of the trusts, so that the mean around a match that nobody near is trusted
+for is near 0."""
 
 SIDE_PX, KEYPOINTS, LEAST_MATCHES = 512, 2048, 9
-"""Of the views, of each at most, and of a pair."""
+"""Side of the views in pixels; the most keypoints in each; and the fewest matches of a pair, one
+more than each is compared with."""
 
 UNRELATED = 7
 """One pair in this many shows two photographs; odd, so that both descriptors have some."""
 
 RIGHT_PX, WRONG_PX = 3.0, 5.0
-"""From the truth; what is between is neither."""
+"""Matches are right below the first distance from the truth and wrong above the second; what is
+between is neither, as places in the truth are known to a pixel or two."""
 
-PAIRS, VALIDATION_PAIRS, STEPS, PAIRS_PER_STEP = 3600, 480, 2400, 8
-"""Pairs of views, and the steps of the training, each of some of them, varied anew."""
+WARM_UP_STEPS, DECAY_SHARE = 50, 0.7
+"""The learning rate rises over these steps, and falls linearly to 0 over this share of all, the
+last."""
 
-LEARNING_RATE, WARM_UP_STEPS, DECAY_SHARE = 4e-3, 50, 0.7
-WEIGHT_DECAY, MAX_GRADIENT_NORM = 0.01, 1.0
-"""Of AdamW; the rate falls linearly to 0 in the last steps, this share of all."""
+WEIGHT_DECAY = 0.01
+"""The default of AdamW."""
 
-FEWEST_SHARE = 0.02
-"""Of the matches of a pair, the fewest that are left, of half of the pairs."""
+LEFT_OUT_SHARE, FEWEST_SHARE = 0.5, 0.02
+"""Share of the pairs of which matches are left out, and the fewest that stay: down to 2 %, since
+pairs of few matches are what a filter is for."""
 
 TURNED_SHARE = 0.3
-"""Of the pairs, those that are turned as a whole."""
+"""Share of the pairs that are turned as a whole, by any angle."""
+
+VALIDATION_SEED = 1
+"""Seed of the pairs that weights are measured on, whatever the seed of the run."""
 
 Sample = tuple[dict[str, np.ndarray], np.ndarray]
 """What the network is given, and each match's distance from the truth in pixels."""
@@ -99,15 +121,15 @@ class MatchFilter(nn.Module):
     ) -> Tensor:
         """Map (M, 2) pixels, (M,) sizes, turns in radians and ratios, (M, 2 K) rows of others."""
         growth, cosine, sine = (sizes1 / sizes0).log(), turns.cos(), turns.sin()
-        distinct = 3 * ratios.clamp(0.05, 1.2).log() + 0.5
-        own = torch.stack([distinct, growth, cosine - 0.7, sine], 1)
+        distinct = RATIO_SCALE * ratios.clamp(*RATIO_RANGE).log() + RATIO_OFFSET
+        own = torch.stack([distinct, growth, cosine - MEAN_COSINE, sine], 1)
         pairs = self._compare(xy0, xy1, growth, cosine, sine, around)
         x = self.second(relu(self.first(own)))
         for k in range(ROUNDS):
             seen = self.of_two[k](pairs) + self.of_other[k](x)[around] + self.of_own[k](x)[:, None]
             seen = relu(self.message[k](relu(seen)))
             trust = self.trust[k](seen).sigmoid()
-            mean = (seen * trust).sum(1) / (trust.sum(1) + 0.5)
+            mean = (seen * trust).sum(1) / (trust.sum(1) + LEAST_TRUST)
             joined = self.joined[k](torch.cat([x, mean, seen.amax(1)], 1))
             x = self.norm[k](x + self.change[k](relu(joined)))
         return self.output(x)[:, 0]
@@ -135,23 +157,22 @@ class MatchFilter(nn.Module):
 def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
     """Draw a pair of views, described and matched, by a seed and the number of the pair."""
     rng = np.random.default_rng([seed, number])
-    descriptor = (LEARNED, ROOT_SIFT)[number % 2]
-    detector = PointDetector(KEYPOINTS, descriptor=descriptor)
-    for _ in range(ATTEMPTS):
+    detector = PointDetector(KEYPOINTS, descriptor=(LEARNED, ROOT_SIFT)[number % 2])
+
+    def draw() -> Sample | None:
         layers, scales, _ = draw_layers(rng, files, SIDE_PX)
         views, tops = zip(*(render_layers(layers, k, scales[k]) for k in range(2)), strict=True)
-        features0, features1 = (detector.extract(relight(rng, view / 255)) for view in views)
-        related = number % UNRELATED > 0
-        if not related:
+        features0, features1 = (detector.extract(photograph_view(rng, v / 255)) for v in views)
+        if number % UNRELATED == 0:
             others, scales, _ = draw_layers(rng, files, SIDE_PX)
             view = render_layers(others, 0, scales[0])[0]
-            features1 = detector.extract(relight(rng, view / 255))
+            features1 = detector.extract(photograph_view(rng, view / 255))
         matches = mutual_matches(features0, features1)
         if len(matches) < LEAST_MATCHES:
-            continue
+            return None
         xy0, xy1 = features0.xy[matches.indices0], features1.xy[matches.indices1]
         errors = np.full(len(matches), np.inf, np.float32)
-        if related:
+        if number % UNRELATED:
             there, _, seen = correspond(layers, tops, xy0)
             errors[seen] = np.linalg.norm(there - xy1, axis=1)[seen]
             # What is mirrored at the border of a photograph may match rightly, or not.
@@ -162,7 +183,18 @@ def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
                 beyond = ~((place >= 0) & (place <= last)).all(1)
                 errors[beyond & (tops[0][row, column] == k)] = (RIGHT_PX + WRONG_PX) / 2
         return filter_inputs(features0, features1, matches), errors
-    raise OptionError("the images show too little for pairs of views: use photographs with detail")
+
+    return draw_until_seen(draw)
+
+
+def draw_samples(files: Sequence[Path], seed: int, count: int, quiet: bool = True) -> list[Sample]:
+    """Draw pairs in all processors; each is a function of the seed and its number."""
+    made = []
+    with progress(count, "drawing pairs", "pair", quiet) as bar:
+        for sample in map_in_processes(partial(draw_sample, files, seed), range(count)):
+            made.append(sample)
+            bar.update()
+    return made
 
 
 def mutual_matches(features0: Keypoints, features1: Keypoints) -> DescriptorMatches:
@@ -179,7 +211,7 @@ def vary(rng: np.random.Generator, sample: Sample) -> Sample:
     """Leave out matches, and mirror, turn and swap the images of a pair."""
     values, errors = sample
     values = {name: each for name, each in values.items() if name != "around"}
-    if rng.random() < 0.5:
+    if rng.random() < LEFT_OUT_SHARE:
         count = max(LEAST_MATCHES, int(len(errors) * FEWEST_SHARE ** rng.random()))
         kept = np.sort(rng.permutation(len(errors))[:count])
         values, errors = {name: each[kept] for name, each in values.items()}, errors[kept]
@@ -188,9 +220,7 @@ def vary(rng: np.random.Generator, sample: Sample) -> Sample:
         values |= {"xy0": values["xy0"] * mirror, "xy1": values["xy1"] * mirror}
         values["turns"] = -values["turns"]
     if rng.random() < TURNED_SHARE:
-        angle = rng.uniform(0, 2 * math.pi)
-        c, s = math.cos(angle), math.sin(angle)
-        turned = np.array([[c, s], [-s, c]], np.float32)
+        turned = rotation(rng.uniform(0, 2 * math.pi)).T.astype(np.float32)
         values |= {"xy0": values["xy0"] @ turned, "xy1": values["xy1"] @ turned}
     if rng.random() < 0.5:
         for name in ("xy", "sizes"):
@@ -212,70 +242,149 @@ def join(samples: Sequence[Sample]) -> tuple[list[Tensor], Tensor]:
     return joined, torch.from_numpy(np.concatenate([errors for _, errors in samples]))
 
 
-def train(samples: Sequence[Sample], steps: int) -> MatchFilter:
-    """Train on some pairs, in a random order."""
-    torch.manual_seed(0)
-    network, rng = MatchFilter(), np.random.default_rng(0)
-    optimizer = torch.optim.AdamW(network.parameters(), weight_decay=WEIGHT_DECAY)
-    bar = progress(steps, "training", "step")
-    for step in range(steps):
-        rate = min(1, (step + 1) / WARM_UP_STEPS, (1 - step / steps) / DECAY_SHARE)
-        optimizer.param_groups[0]["lr"] = LEARNING_RATE * rate
-        rows = rng.integers(0, len(samples), PAIRS_PER_STEP)
-        values, errors = join([vary(rng, samples[row]) for row in rows])
-        known = (errors < RIGHT_PX) | (errors > WRONG_PX)
-        right = (errors[known] < RIGHT_PX).float()
-        loss = binary_cross_entropy_with_logits(network(*values)[known], right)
-        optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT_NORM)
-        optimizer.step()
-        bar.update()
-    bar.close()
-    return network.eval()
+def known(errors: Tensor) -> Tensor:
+    """Return which matches are right or wrong, by their distances from the truth."""
+    return (errors < RIGHT_PX) | (errors > WRONG_PX)
 
 
-def draw_samples(files: Sequence[Path], seed: int, count: int) -> list[Sample]:
-    """Draw pairs in all processors; each is a function of the seed and its number."""
-    made = []
-    with progress(count, "drawing pairs", "pair") as bar:
-        for sample in map_in_processes(partial(draw_sample, files, seed), range(count)):
-            made.append(sample)
-            bar.update()
-    return made
+class BatchDataset(Dataset[tuple[list[Tensor], Tensor]]):
+    """Batches by step: pairs out of all, varied anew; a function of the seed and the step."""
+
+    def __init__(self, samples: Sequence[Sample], options: MatchFilterTrainingOptions) -> None:
+        self.samples, self.options = samples, options
+
+    def __getitem__(self, step: int) -> tuple[list[Tensor], Tensor]:
+        rng = np.random.default_rng([self.options.seed, 3, step])
+        rows = rng.integers(0, len(self.samples), self.options.pairs)
+        return join([vary(rng, self.samples[row]) for row in rows])
 
 
-STYLES = {"descriptors": "", "matches kept": "", "right": ",d", "precision": ".3f"}
-STYLES |= {"of unrelated views": ",d"}
+class MatchFilterTrainer(Trainer):
+    """The match filter, and the images whose views it is trained on."""
+
+    objective, sign = "validation_loss", 1
+    weights_file = "match_filter.safetensors"
+    max_gradient_norm = 1.0
+    average_decay = 0.0
+    network: MatchFilter
+    average: MatchFilter
+
+    def __init__(
+        self,
+        images: Sequence[Path],
+        validation: Sequence[Path],
+        options: MatchFilterTrainingOptions,
+        quiet: bool = True,
+    ) -> None:
+        self.options = options
+        self.samples = draw_samples(images, options.seed, options.drawn, quiet)
+        self.held_out = draw_samples(validation, VALIDATION_SEED, options.val_pairs, quiet)
+        with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
+            torch.default_generator.manual_seed(options.seed)
+            self.network = MatchFilter()
+        self.average = copy.deepcopy(self.network).eval()
+        parameters = self.network.parameters()
+        self.optimizers = [torch.optim.AdamW(parameters, weight_decay=WEIGHT_DECAY)]
+        self.steps = options.steps
+        self.milestones = milestones(options.steps, options.val_count)
+        self.origin = {
+            "images_digest": key(images)[:16],
+            "validation_digest": key(validation)[:16],
+        }
+        self.notes = {"images": str(len(images))}
+
+    def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
+        """Return the loader of the batches of some steps, as of `join`."""
+        steps = range(first, self.steps if last is None else last)
+        dataset = BatchDataset(self.samples, self.options)
+        return DataLoader(dataset, batch_size=None, sampler=steps, generator=torch.Generator())
+
+    def pixels(self, batch: Any) -> int:
+        return 2 * self.options.pairs * SIDE_PX**2
+
+    def loss(self, batch: tuple[list[Tensor], Tensor]) -> Tensor:
+        values, errors = batch
+        counted = known(errors)
+        right = (errors[counted] < RIGHT_PX).float()
+        return binary_cross_entropy_with_logits(self.network(*values)[counted], right)
+
+    def learning_rate(self, step: int) -> float:
+        """Return the learning rate of a step: a warm-up, a plateau, a linear decay to 0."""
+        warm_up, decay = (step + 1) / WARM_UP_STEPS, (1 - step / self.steps) / DECAY_SHARE
+        return self.options.learning_rate * min(1, warm_up, decay)
+
+    def validate(self, step: int) -> dict[str, float]:
+        """Measure the weights so far."""
+        return measure(self.average, self.held_out)
+
+    def export(self, folder: Path) -> Path:
+        best: Any = load_network(folder / self.weights_file, MatchFilter)
+        export_match_filter(best, self.held_out[0], folder / ONNX)
+        return folder / ONNX
+
+    def card(self, best: Point) -> tuple[str, list[str]]:
+        count = sum(parameter.numel() for parameter in self.network.parameters())
+        rows = [
+            {
+                "descriptors": name,
+                "matches kept": way.format(ratio),
+                **{title: best[f"{name}, {way}: {title}"] for title in MEASURES},
+            }
+            for name, ratio in RATIOS.items()
+            for way in WAYS
+        ]
+        styles = {"descriptors": "", "matches kept": "", **MEASURES}
+        return f"a network of {count:,} parameters that tells right matches from wrong ones.", [
+            f"Matches of {len(self.held_out):,} pairs of views of the validation images, by whose",
+            "loss this step was chosen; as precise: as the ratio test is.",
+            "",
+            Table("measures", "", styles, rows).to_markdown(),
+            "",
+            f"Loss {best['validation_loss']:.4f} at step {best['step']:,}.",
+        ]
+
+
+RATIOS = {LEARNED: LEARNED_RATIO, ROOT_SIFT: RATIO}
+"""The ratio test that each kind of descriptors is compared with."""
+
+WAYS = ("ratio under {}", "filter", "filter, as precise")
+MEASURES = {"right": ",.0f", "precision": ".3f", "of unrelated views": ",.0f"}
 
 
 @torch.no_grad()
-def measure(network: MatchFilter, samples: Sequence[Sample]) -> Table:
-    """Compare the ratio test, the filter, and the filter where it is as precise as that."""
-    rows = []
-    for offset, (name, limit) in enumerate(((LEARNED, LEARNED_RATIO), (ROOT_SIFT, RATIO))):
-        numbers = range(offset, len(samples), 2)
-        values, errors = join([samples[number] for number in numbers])
-        logits, ratios = network(*values), values[[*samples[0][0]].index("ratios")]
-        parts = [torch.full((len(samples[k][1]),), k % UNRELATED == 0) for k in numbers]
-        unrelated = torch.cat(parts)
-        right, known = errors < RIGHT_PX, (errors < RIGHT_PX) | (errors > WRONG_PX)
+def measure(network: MatchFilter, samples: Sequence[Sample]) -> dict[str, float]:
+    """Return the loss, and compare the ratio test, the filter, and the filter made as precise."""
+    found, losses = {}, []
+    for offset, (name, limit) in enumerate(RATIOS.items()):
+        own = samples[offset::2]
+        parts = [join([sample]) for sample in own]
+        logits = torch.cat([network(*values) for values, _ in parts])
+        errors = torch.cat([errors for _, errors in parts])
+        ratios = torch.from_numpy(np.concatenate([values["ratios"] for values, _ in own]))
+        counts = torch.tensor([len(errors) for _, errors in own])
+        numbers = torch.arange(offset, len(samples), 2).repeat_interleave(counts)
+        unrelated, counted, right = numbers % UNRELATED == 0, known(errors), errors < RIGHT_PX
+        losses.append((logits[counted], right[counted].float()))
         by_ratio = ratios < limit
-        precision = right[by_ratio & known].float().mean()
-        order = logits[known].argsort(descending=True)
-        share = right[known][order].cumsum(0) / torch.arange(1, len(order) + 1)
-        reached = logits[known][order][share >= precision]
+        precision = right[by_ratio & counted].float().mean()
+        order = logits[counted].argsort(descending=True)
+        share = right[counted][order].cumsum(0) / torch.arange(1, len(order) + 1)
+        reached = logits[counted][order][share >= precision]
         lowest = reached[-1] if len(reached) else math.inf
-        how = {f"ratio under {limit}": by_ratio, "filter": logits > 0}
-        how["filter, as precise"] = logits >= lowest
-        for title, kept in how.items():
-            row = {"descriptors": name, "matches kept": title, "right": int(right[kept].sum())}
-            row["precision"] = float(right[kept & known].float().mean())
-            rows.append({**row, "of unrelated views": int((kept & unrelated).sum())})
-    return Table("match_filter", "Matches of validation views", STYLES, rows)
+        for way, kept in zip(WAYS, (by_ratio, logits > 0, logits >= lowest), strict=True):
+            values = (
+                right[kept].sum(),
+                right[kept & counted].float().mean(),
+                (kept & unrelated).sum(),
+            )
+            for title, value in zip(MEASURES, values, strict=True):
+                found[f"{name}, {way}: {title}"] = value.item()
+    found_logits, truth = (torch.cat(each) for each in zip(*losses, strict=True))
+    loss = binary_cross_entropy_with_logits(found_logits, truth)
+    return {"validation_loss": loss.item(), **found}
 
 
-def export(network: MatchFilter, sample: Sample, path: Path) -> None:
+def export_match_filter(network: MatchFilter, sample: Sample, path: Path) -> None:
     """Write the network as `filter_matches` reads it."""
     names = list(sample[0])
     values = tuple(torch.from_numpy(each) for each in sample[0].values())
@@ -286,21 +395,3 @@ def export(network: MatchFilter, sample: Sample, path: Path) -> None:
         torch.onnx.export(
             network, values, temporary, input_names=names, output_names=["logits"], **how
         )
-
-
-def main() -> None:
-    """Draw pairs, train, measure, and write the network."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("images", type=Path, help="folder of photographs")
-    parser.add_argument("validation", type=Path, help="folder of others, for the measures")
-    parser.add_argument("output", type=Path, help="ONNX file")
-    arguments = parser.parse_args()
-    samples = draw_samples(find_images(arguments.images), 0, PAIRS)
-    network = train(samples, STEPS)
-    validation = draw_samples(find_images(arguments.validation), 1, VALIDATION_PAIRS)
-    print(measure(network, validation).to_markdown())
-    export(network, validation[0], arguments.output)
-
-
-if __name__ == "__main__":
-    main()

@@ -303,6 +303,42 @@ class DescriptorTrainingOptions:
         )
 
 
+@suggest_keywords
+@dataclass(frozen=True)
+class MatchFilterTrainingOptions:
+    """A training of the match filter.
+
+    Attributes:
+        steps: optimiser steps.
+        pairs: pairs of views in each step, each varied anew.
+        drawn: pairs of views that are drawn before the first step, to be taken from.
+        learning_rate: highest learning rate, after the warm-up; it falls linearly to 0.
+        val_count: number of times that the weights are measured.
+        val_pairs: pairs that they are measured on.
+        seed: seed of the weights and the pairs.
+
+    Raises:
+        OptionError: a value is out of its range.
+    """
+
+    steps: int = 2400
+    pairs: int = 8
+    drawn: int = 3600
+    learning_rate: float = 4e-3
+    val_count: int = 12
+    val_pairs: int = 480
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_ranges(
+            self,
+            positive=("learning_rate",),
+            not_negative=("seed",),
+            counts=("steps", "pairs", "drawn", "val_count"),
+            between={"val_pairs": (4, math.inf)},
+        )
+
+
 _ESPNET = TrainingOptions(
     network="espnet",
     stages=(Stage(240, 16, 44), Stage(480, 8, 10)),

@@ -1,6 +1,6 @@
-"""`train`, `train_points`, `train_descriptor`, and `profile`: how fast a run would be.
+"""The trainings, and `profile`: how fast a run would be.
 
-Their module imports no torch, so that the package can offer them where it is missing.
+Torch is imported by a run, not with this module: commands that do not train start without it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from deepdetect._shared.errors import require_packages
 from deepdetect._shared.options import suggest_keywords
 from deepdetect._shared.progress import progress
 from deepdetect.io.image import find_images
@@ -21,6 +20,7 @@ from .recipe import (
     DescriptorTrainingOptions,
     DeviceOptions,
     InitWeights,
+    MatchFilterTrainingOptions,
     PointsTrainingOptions,
     Stage,
     TrainingOptions,
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from .trainer import TrainingResult
 
 Log = Callable[[str], None]
-
-TRAINING_PACKAGES = ("torch", "lightning_fabric", "matplotlib", "safetensors", "onnx")
 
 
 @suggest_keywords
@@ -71,7 +69,6 @@ def train(
         The weights' files and the loss curves.
 
     Raises:
-        MissingExtraError: a package of the extra `train` is not installed.
         ImageError: a folder is missing or empty.
         OptionError: the folder holds a run with other options, the initial weights are of another
             network, or the batch statistics of random weights are to be frozen.
@@ -115,11 +112,9 @@ def train_points(
         The weights' file and the curves.
 
     Raises:
-        MissingExtraError: a package of the extra `train` is not installed.
         ImageError: a folder is missing or empty.
         OptionError: the folder holds a run with other options or images.
     """
-    require_packages("training", *TRAINING_PACKAGES)
     from .points.task import RankerTrainer
 
     trainer = RankerTrainer(*_files(images, validation, output), options, num_workers)
@@ -165,12 +160,44 @@ def train_descriptor(
         >>> result = train_descriptor("photos/train", "photos/val", "run")  # doctest: +SKIP
         >>> PointDetector(descriptor=result.onnx).extract("a.png")  # doctest: +SKIP
     """
-    require_packages("training", *TRAINING_PACKAGES)
     from .descriptor.task import DescriptorTrainer
 
     where = DeviceOptions(device=device, num_workers=num_workers)
     initial = None if init_weights is None else Path(init_weights)
     trainer = DescriptorTrainer(*_files(images, validation, output), options, initial, where)
+    return trainer.fit(Path(output), log)
+
+
+@suggest_keywords
+def train_match_filter(
+    images: str | Path,
+    validation: str | Path,
+    output: str | Path,
+    options: MatchFilterTrainingOptions = MatchFilterTrainingOptions(),
+    *,
+    log: Log | None = None,
+) -> TrainingResult:
+    """Train the match filter on pairs of views that are made of single images.
+
+    Pairs are drawn, described and matched before the first step, by the bundled descriptors; an
+    interrupted run draws the same again. On two processors it takes a quarter of an hour.
+
+    Args:
+        images: folder of images.
+        validation: folder of other images, which choose the best weights.
+        output: folder for checkpoint.safetensors, match_filter.safetensors, match_filter.onnx,
+            MODEL_CARD.md and the curves.
+        options, log: as of `train_points`.
+
+    Returns:
+        The weights' files and the curves.
+
+    Raises:
+        The errors of `train_points`; an OptionError, too, where the images show nothing.
+    """
+    from .match_filter import MatchFilterTrainer
+
+    trainer = MatchFilterTrainer(*_files(images, validation, output), options, log is None)
     return trainer.fit(Path(output), log)
 
 
@@ -192,23 +219,13 @@ def _dense_trainer(
     data: Mapping[str, Any],
 ) -> DenseTrainer:
     """Make the labels, and what is trained on them; `data` are further arguments of `train`."""
-    require_packages("training", *TRAINING_PACKAGES)
     from .dataset import prepare_data
-    from .dense import DenseTrainer, initial_network, launch
+    from .dense import DenseTrainer, initial_network
 
     options, network = initial_network(options, init_weights)  # before the labels, for its errors
-    fabric = launch(device, options)
-    prepared = prepare_data(
-        images,
-        options,
-        output,
-        **data,
-        processes=fabric.world_size * max(1, device.worker_count),
-        make_labels=fabric.local_rank == 0,
-        quiet=log is None or not fabric.is_global_zero,
-    )
-    fabric.barrier()
-    return DenseTrainer(network, options, prepared, device, fabric)
+    loading = max(1, device.worker_count)
+    prepared = prepare_data(images, options, output, **data, processes=loading, quiet=log is None)
+    return DenseTrainer(network, options, prepared, device)
 
 
 TIMED_STEPS = 30
@@ -220,16 +237,16 @@ WARM_UP_STEPS = 5
 
 @dataclass(frozen=True)
 class StageProfile:
-    """The speed of one stage, over all processes.
+    """The speed of one stage.
 
     Attributes:
         stage: the stage.
         steps: steps that were timed.
         images_per_second: crops per second.
         full_images_per_second: the same in 480x480 images' worth of pixels.
-        waiting_fraction: fraction of the time in which the main process waited for data.
-        memory_bytes: peak resident memory of the main process so far, 0 where unknown.
-        device_memory_bytes: peak memory of torch on the main process's GPU, or None.
+        waiting_fraction: fraction of the time in which the training waited for data.
+        memory_bytes: peak resident memory of the process so far, 0 where unknown.
+        device_memory_bytes: peak memory of torch on the GPU, or None.
     """
 
     stage: Stage
@@ -274,7 +291,6 @@ def profile(
     trainer = _dense_trainer(images, output, options, init_weights, device, log, data)
     steps_of_stage = trainer.schedule.steps_of_stage
     lengths = [min(n, TIMED_STEPS + WARM_UP_STEPS) for n in steps_of_stage]
-    log = log if trainer.is_main else None
     if log is not None:
         log(f"timing {trainer.describe()}")
     profiles, first = [], 0

@@ -13,8 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from torch.utils.data import Sampler
 
-from deepdetect._shared.errors import OptionError
-
 from .recipe import Stage, TrainingOptions
 
 FINAL_LEARNING_RATE = 1e-6
@@ -93,10 +91,6 @@ class CropSampler(Sampler[list[CropIndex]]):
         shard_sizes: number of images in each shard, whose images are read together; None if
             images can be read in any order.
         first_step, last_step: from which step on, and before which; default: all.
-        rank, world_size: number of this process, for its part of each batch, and of all.
-
-    Raises:
-        OptionError: a batch cannot be divided evenly among the processes.
 
     Example:
         >>> schedule = Schedule(TrainingOptions(stages=(Stage(240, 2, 1),)), images=4)
@@ -110,17 +104,8 @@ class CropSampler(Sampler[list[CropIndex]]):
         shard_sizes: Sequence[int] | None = None,
         first_step: int = 0,
         last_step: int | None = None,
-        *,
-        rank: int = 0,
-        world_size: int = 1,
     ) -> None:
-        for stage in schedule.options.stages:
-            if stage.batch % world_size:
-                raise OptionError(
-                    f"a batch of {stage.batch} cannot be divided evenly among {world_size} "
-                    "processes: choose `stages` whose batches are multiples of that number"
-                )
-        self.schedule, self.rank, self.world_size = schedule, rank, world_size
+        self.schedule = schedule
         self.shard_sizes = None if shard_sizes is None else tuple(shard_sizes)
         self.steps = range(first_step, schedule.steps if last_step is None else last_step)
 
@@ -131,12 +116,11 @@ class CropSampler(Sampler[list[CropIndex]]):
         return map(self.batch, self.steps)
 
     def batch(self, step: int) -> list[CropIndex]:
-        """Return the crops of a step, or this process's part of them."""
+        """Return the crops of a step."""
         position, count = self.schedule.position(step), self.schedule.images
         stage = position.stage
         batch = []
-        part = stage.batch // self.world_size
-        for sample in range(self.rank * part, (self.rank + 1) * part):
+        for sample in range(stage.batch):
             epoch, place = divmod(position.sample + sample, count)
             epoch += position.first_epoch
             order = epoch_order(self.schedule.options.seed, epoch, count, self.shard_sizes)

@@ -85,7 +85,6 @@ class Trainer(abc.ABC):
         sign: 1 if its lowest value is the best, -1 if the highest.
         weights_file: name of the file of the best weights.
         max_gradient_norm: larger gradients are scaled down to it.
-        is_main: whether this process writes the files.
     """
 
     network: nn.Module
@@ -102,7 +101,6 @@ class Trainer(abc.ABC):
     sign: int
     weights_file: str
     max_gradient_norm = math.inf
-    is_main: bool = True
 
     @abc.abstractmethod
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
@@ -110,7 +108,7 @@ class Trainer(abc.ABC):
 
     @abc.abstractmethod
     def pixels(self, batch: Any) -> int:
-        """Return the number of pixels in a batch, over all processes."""
+        """Return the number of pixels in a batch."""
 
     @abc.abstractmethod
     def learning_rate(self, step: int) -> float:
@@ -118,7 +116,7 @@ class Trainer(abc.ABC):
 
     @abc.abstractmethod
     def loss(self, batch: Any) -> Tensor:
-        """Return the loss of a batch, or of this process's part of it."""
+        """Return the loss of a batch."""
 
     @abc.abstractmethod
     def validate(self, step: int) -> dict[str, float]:
@@ -136,17 +134,12 @@ class Trainer(abc.ABC):
     def card(self, best: Point) -> tuple[str, list[str]]:
         """Say in the model card what the network is, and how good it is."""
 
-    def backward(self, loss: Tensor) -> float:
-        """Compute the gradients, and return the loss over all processes."""
-        loss.backward()
-        return loss.item()
-
     def export(self, folder: Path) -> Path | None:
         """Write the best weights in another form; return the file."""
         return None
 
     def training_step(self, batch: Any, step: int) -> float:
-        """Make one optimiser step after `step` others, and return the loss over the whole batch.
+        """Make one optimiser step after `step` others, and return the loss.
 
         Raises:
             OptionError: the loss or its gradients are not finite.
@@ -155,7 +148,9 @@ class Trainer(abc.ABC):
             optimizer.zero_grad(set_to_none=True)
             for group in optimizer.param_groups:
                 group["lr"] = self.learning_rate(step) * group.get("rate_factor", 1)
-        value = self.backward(self.loss(batch))
+        loss = self.loss(batch)
+        loss.backward()
+        value = loss.item()
         norm = clip_grad_norm_(self.network.parameters(), self.max_gradient_norm)
         # A finite loss can have gradients that are not, in bfloat16.
         if not (math.isfinite(value) and norm.isfinite()):
@@ -183,8 +178,7 @@ class Trainer(abc.ABC):
             WeightsError: its checkpoint is damaged, or its best weights are missing.
         """
         state = self._resume(folder)
-        quiet = log is None or not self.is_main
-        if log is not None and self.is_main and state.step < self.steps:
+        if log is not None and state.step < self.steps:
             for line in self.introduction:
                 log(line)
         measured = {point["step"] for point in state.points}
@@ -192,7 +186,7 @@ class Trainer(abc.ABC):
             self._validate(state, folder)  # the start, or a validation that was interrupted
         started, pixels = time.monotonic(), 0
         saved = started
-        bar = progress(self.steps, "training", "step", quiet, state.step)
+        bar = progress(self.steps, "training", "step", log is None, state.step)
         with bar, loading(self.loader(state.step)) as batches:
             for batch in batches:
                 state.loss_sum += self.training_step(batch, state.step)
@@ -214,10 +208,8 @@ class Trainer(abc.ABC):
                     saved = time.monotonic()
         speed = pixels / FULL_IMAGE_PIXELS / max(time.monotonic() - started, 1e-9)
         best, weights = self._best(state), folder / self.weights_file
-        onnx = None
-        if self.is_main:
-            onnx = self.export(folder)
-            self._write_card(folder, state.points, best)
+        onnx = self.export(folder)
+        self._write_card(folder, state.points, best)
         return TrainingResult(weights, onnx, state.points, best, speed)
 
     def _best(self, state: TrainingState) -> Point:
@@ -229,18 +221,16 @@ class Trainer(abc.ABC):
         point = {"step": state.step, "training_loss": loss, **self.validate(state.step)}
         state.loss_sum, state.loss_count = 0.0, 0
         state.points.append(point)
-        if self.is_main:
-            if self._best(state) is point:
-                notes = {**self._all_notes(), "point": json.dumps(point)}
-                self.save(folder / self.weights_file, notes)
-            save_curves(state.points, folder)
+        if self._best(state) is point:
+            notes = {**self._all_notes(), "point": json.dumps(point)}
+            self.save(folder / self.weights_file, notes)
+        save_curves(state.points, folder)
         self._save(state, folder)
 
     def _save(self, state: TrainingState, folder: Path) -> None:
-        if self.is_main:
-            metadata = {**dataclasses.asdict(state), "inputs": self._inputs(), **self._all_notes()}
-            modules = self.network, self.average
-            save_checkpoint(folder / CHECKPOINT, *modules, self.optimizers, metadata)
+        metadata = {**dataclasses.asdict(state), "inputs": self._inputs(), **self._all_notes()}
+        modules = self.network, self.average
+        save_checkpoint(folder / CHECKPOINT, *modules, self.optimizers, metadata)
 
     def _resume(self, folder: Path) -> TrainingState:
         if not (folder / CHECKPOINT).exists():

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 from scipy.ndimage import map_coordinates
 
@@ -27,6 +28,7 @@ from deepdetect_lab.evaluation.run import MatchSettings, Run
 NUMBERS = itertools.count()
 CORNERS = """
 import numpy as np
+import onnx
 def find(rgb):
     assert rgb.dtype == np.uint8 and rgb.ndim == 3
     height, width = rgb.shape[:2]
@@ -137,7 +139,6 @@ Make = Callable[..., Path]
 @pytest.fixture
 def make(tmp_path: Path) -> Make:
     """Write a network whose keypoints are the pixels with a red over 0.5."""
-    onnx = pytest.importorskip("onnx", reason="needs onnx to make networks")
     helper, types = onnx.helper, onnx.TensorProto
 
     def write(
@@ -255,8 +256,6 @@ def test_descriptors_of_the_network_are_kept_and_count_as_learned(
 def test_maxima_of_a_map_of_logits_are_described_between_the_cells(
     tmp_path: Path, backend: str
 ) -> None:
-    onnx = pytest.importorskip("onnx", reason="needs onnx to make networks")
-    pytest.importorskip(backend)
     helper, kind = onnx.helper, onnx.TensorProto.FLOAT
     # Logits from -10 to 10 of the grey image, and per 4x4 pixels their mean and its square.
     nodes = [

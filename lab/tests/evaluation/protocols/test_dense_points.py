@@ -7,6 +7,7 @@ import struct
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from tests.command_line import run_command
 
@@ -22,7 +23,6 @@ SIZE, FOCAL_PX, DEPTH = (320, 240), 250.0, 4.0
 @pytest.fixture
 def model(tmp_path: Path) -> Path:
     """Two cameras that see the same, 1,000 pixels apart in what they look at."""
-    pycolmap = pytest.importorskip("pycolmap", reason="needs pycolmap")
     made = pycolmap.Reconstruction()
     camera = CameraIntrinsics.of_camera(Camera(SIZE, FOCAL_PX)).colmap_camera()
     camera.camera_id = 1
@@ -127,7 +127,6 @@ def test_clouds_of_other_kinds(model: Path, text_format: str) -> None:
 
 
 def test_models_of_other_kinds(model: Path) -> None:
-    pycolmap = pytest.importorskip("pycolmap", reason="needs pycolmap")
     save(wall(DEPTH, 320), model / "model.ply")
     sparse = model / "sparse" / "0"
     made = pycolmap.Reconstruction(sparse)

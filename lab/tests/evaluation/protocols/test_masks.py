@@ -162,7 +162,6 @@ def test_samples_without_a_mask_are_an_error(tmp_path: Path, photo: np.ndarray) 
 
 
 def bundled_scores(shared: Path, backend: str) -> dict[str, MaskScore]:
-    pytest.importorskip(backend, reason=f"needs {backend}")
     weights = pretrained_weights()
     if backend == "torch":
         weights = weights.with_suffix(".safetensors")

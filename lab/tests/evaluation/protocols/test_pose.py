@@ -22,7 +22,6 @@ from deepdetect_lab.evaluation.options import BenchmarkOptions
 from deepdetect_lab.evaluation.protocols.pose import (
     STRAIGHT_AHEAD,
     PoseMethod,
-    distance_table,
     estimate_pose,
     pose_methods,
     pose_row,
@@ -150,14 +149,6 @@ def test_pairs_that_were_skipped_are_in_no_count(scene: PosedScene, found: Rows)
     assert (ours["worse than SIFT"], ours["better than SIFT"], ours["failed"]) == (1, 0, 0)
     nothing = rows(scene_table([scene], METHODS, []))["DeepDetect"]
     assert (nothing["pairs"], nothing["AUC at 5°"], nothing["seconds"]) == (0, None, None)
-
-
-def test_each_frame_distance_has_its_pairs(scene: PosedScene, found: Rows) -> None:
-    table = distance_table(scene, METHODS, found)
-    assert [(row["frame distance"], row["method"], row["pairs"]) for row in table.rows] == [
-        (distance, title, count) for distance, count in ((1, 3), (3, 1)) for title in TITLES
-    ]
-    assert table.rows[3]["failed"] == 1  # of ours, the one that failed
 
 
 def test_a_second_run_reads_what_the_first_has_kept(folder: Path, tmp_path: Path) -> None:

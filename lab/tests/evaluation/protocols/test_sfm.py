@@ -87,9 +87,6 @@ def test_cameras_are_compared_after_the_alignment(rows: list) -> None:
     assert ours["centres, unit of the truth"] == pytest.approx(0, abs=1e-9)
     assert ours["rotations, °"] == pytest.approx(0, abs=1e-4)
     assert (ours["sparse points"], ours["track length"]) == (1000, 3.5)
-    *exact, missing = sfm.image_table(rows).values()[:5]
-    assert max(row["rotation, °"] for row in exact) < 1e-4
-    assert [missing["image"], missing["rotation, °"]] == ["000004.png", None]
     nothing = table.values()[2]
     assert nothing["AUC at 5°"] == 0
     assert nothing["centres, ‰ of the extent"] is nothing["rotations, °"] is None
@@ -132,7 +129,6 @@ def test_what_cannot_be_reconstructed_is_a_result(
     write_posed_fountain, tmp_path: Path, monkeypatch
 ) -> None:
     """Without matches no images hang together: none is registered."""
-    pytest.importorskip("pycolmap", reason="needs pycolmap")
     folder = write_posed_fountain(tmp_path / "fountain", ("0004", "0005", "0006"), 128)
 
     def nothing(stages, pairs):
@@ -148,7 +144,6 @@ def test_what_cannot_be_reconstructed_is_a_result(
 
 @pytest.mark.slow
 def test_a_whole_run_on_small_images(write_posed_fountain, tmp_path: Path) -> None:
-    pytest.importorskip("pycolmap", reason="needs pycolmap")
     names = [f"{number:04}" for number in range(2, 8)]
     folder = write_posed_fountain(tmp_path / "fountain", names)
     options = BenchmarkOptions(DeepDetect())

@@ -25,8 +25,6 @@ MAX_KEYPOINTS = 800
 
 @pytest.fixture(scope="module")
 def scene(write_posed_fountain, tmp_path_factory):
-    pytest.importorskip("h5py", reason="needs h5py")
-    pytest.importorskip("pycolmap", reason="needs pycolmap")
     folder = write_posed_fountain(tmp_path_factory.mktemp("scene") / "fountain", NAMES)
     (found,) = load_posed_scenes(folder)
     return found

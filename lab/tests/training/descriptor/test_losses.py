@@ -11,7 +11,8 @@ from deepdetect_lab.training.descriptor import losses
 from deepdetect_lab.training.descriptor.losses import contrastive_loss, mirror, shares_right
 from deepdetect_lab.training.descriptor.network import DescriptorNetwork, turn
 from deepdetect_lab.training.descriptor.task import stack
-from deepdetect_lab.training.descriptor.views import KEYPOINTS, SIDE_PX, Pair
+from deepdetect_lab.training.descriptor.views import KEYPOINTS, Pair
+from deepdetect_lab.training.scenes import SIDE_PX
 
 
 @pytest.fixture(autouse=True)

@@ -96,7 +96,7 @@ def test_the_files_hold_the_weights_that_were_measured(
     shares = shares_right(network, validation_batches(find_images(textures), OPTIONS))
     assert np.mean(list(shares.values())) == pytest.approx(whole.best["score"], abs=1e-6)
     notes = read_notes(whole.weights)
-    assert (notes["images"], notes["run_on"]) == ("3", "cpu")
+    assert (notes["images"], notes["run_on"]) == ("4", "cpu")
     assert json.loads(notes["point"]) == whole.best
 
 
@@ -161,9 +161,9 @@ def test_pairs_are_drawn_once_and_seen_four_times(monkeypatch: pytest.MonkeyPatc
 
 def test_images_without_detail_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cv2.imwrite(str(tmp_path / "grey.png"), np.full((480, 480), 90, np.uint8))
-    monkeypatch.setattr("deepdetect_lab.training.descriptor.task.ATTEMPTS", 2)
+    monkeypatch.setattr("deepdetect_lab.training.scenes.ATTEMPTS", 1)
     with pytest.raises(OptionError, match="detail"):
-        draw_numbered([tmp_path / "grey.png"], False, 0)
+        draw_numbered([tmp_path / "grey.png"], False, 2)
 
 
 def test_cross_modal_weights_are_told_from_others(textures: Path, tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from deepdetect_lab.training.points.views import KINDS, degrade, draw_pair, render, view_homography
+from deepdetect_lab.training.points.views import KINDS, degrade, draw_pair, render, tilted_view
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -25,7 +25,7 @@ def test_views_are_in_place_to_a_tenth_of_a_pixel(scale: float) -> None:
     """A blob between pixels lies where the matrix takes its centre."""
     row, column = np.indices((200, 200))
     blob = np.exp(-((column - 103.3) ** 2 + (row - 95.6) ** 2) / (2 * 9.0**2))
-    matrix = view_homography(96, np.array([100.0, 100.0]), scale, rotation=0.4, tilt=0.3)
+    matrix = tilted_view(96, np.array([100.0, 100.0]), scale, angle=0.4, tilt=0.3)
     view, _ = render(np.uint8(200 * blob), matrix, 96)
     x, y, w = matrix @ [103.3, 95.6, 1]
     # The mean of a tilted blob is not its centre: only its peak.

@@ -1,4 +1,4 @@
-"""Running the network: ONNX Runtime or OpenVINO."""
+"""Backends that run the network: ONNX Runtime and OpenVINO."""
 
 from .interface import Network, RuntimeOptions
 from .registry import BACKENDS, open_network

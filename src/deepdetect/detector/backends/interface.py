@@ -1,4 +1,4 @@
-"""What the backends share: options, and what a network must answer."""
+"""What the backends share: options, and checks of a network's output."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..._shared.options import suggest_keywords
 from ..pretrained import LOGITS
 
 PROBE_SHAPE = (24, 32)
-"""Height and width of the image that a network is tried on."""
+"""Height and width of the image on which a network is tested. Chosen by hand."""
 
 
 class Network(Protocol):
@@ -23,7 +23,7 @@ class Network(Protocol):
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Map (N, 3, H, W) float32 in [0, 1] to (N, 1, H, W) float32 logits, all finite.
 
-        H and W are multiples of 8. Lack of memory is a MemoryError, wrong answers WeightsErrors.
+        H and W are multiples of 8. Lack of memory is a MemoryError, a wrong output a WeightsError.
         """
 
 
@@ -39,16 +39,16 @@ class RuntimeOptions:
 
 
 def output_to_read(names: Sequence[str]) -> str:
-    """Choose the output to read: the logits, or the first where there are none."""
+    """Return the name of the output to read: the logits, or else the first."""
     return LOGITS if LOGITS in names else names[0]
 
 
 def as_logits(
     output: np.ndarray, name: str, image_shape: tuple[int, ...], path: Path
 ) -> np.ndarray:
-    """Check the output of this name, and turn it into (N, 1, H, W) float32 logits.
+    """Check the output of this name, and convert it to (N, 1, H, W) float32 logits.
 
-    Probabilities that float32 rounds to 0 or 1 become the logits of the nearest number it holds.
+    Probabilities that float32 rounds to 0 or 1 become the logits of the nearest float32 number.
     """
     wanted = (image_shape[0], 1, *image_shape[2:])
     if output.shape != wanted or output.dtype != np.float32:
@@ -56,7 +56,7 @@ def as_logits(
             f"{path} does not fit: it gives a {output.dtype} map of shape {output.shape} for an "
             f"image that needs float32 {wanted}; use other weights"
         )
-    low, high = float(output.min()), float(output.max())  # NaN where there is one
+    low, high = float(output.min()), float(output.max())  # NaN if there is any
     if not (np.isfinite(low) and np.isfinite(high)):
         raise WeightsError(
             f"{path} gives values that are not finite: it is damaged, or its training diverged; "
@@ -66,7 +66,7 @@ def as_logits(
         return output
     if low < 0 or high > 1:
         raise WeightsError(
-            f"{path} gives values from {low:g} to {high:g}, which are no "
+            f"{path} gives values from {low:g} to {high:g}, which are not "
             f"probabilities: name the output {LOGITS!r} if it holds logits, or use other weights"
         )
     probability = np.clip(output.astype(np.float64), 1e-38, 1 - 2.0**-25)
@@ -74,14 +74,14 @@ def as_logits(
 
 
 def unreadable(path: Path, error: Exception) -> WeightsError:
-    """Return the error for a file that a runtime refuses."""
+    """Return the error for a file that a runtime cannot read."""
     return WeightsError(
         f"{path} is not an ONNX file that can be read ({_reason(error)}): download it again"
     )
 
 
 def failed_run(error: Exception, image_shape: tuple[int, ...]) -> Exception:
-    """Return the error of a run on (N, 3, H, W) that failed, a MemoryError for lack of memory."""
+    """Return the error for a failed run on (N, 3, H, W); a MemoryError for lack of memory."""
     if any(word in f"{type(error).__name__} {error}" for word in ("MemoryError", "alloc")):
         return MemoryError(str(error))
     height, width = image_shape[2:]
@@ -92,6 +92,6 @@ def failed_run(error: Exception, image_shape: tuple[int, ...]) -> Exception:
 
 
 def _reason(error: Exception) -> str:
-    """Return the line of a runtime's message that says most: OpenVINO's begin with places."""
+    """Return the most telling line of a runtime's message: OpenVINO's start with file names."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[-1] if lines[0].startswith("Exception from") else lines[0]

@@ -1,7 +1,7 @@
-"""Parts of a network that is an ONNX file, cut out at named tensors.
+"""Parts of a network in an ONNX file, cut out at named tensors.
 
-The package `onnx` could do it, but is not needed to run a network. Protobuf, which comes with ONNX
-Runtime, copies the fields that are not declared here as they are.
+The package `onnx` could do this, but running a network does not need it. Protobuf, which comes with
+ONNX Runtime, copies fields that are not declared here unchanged.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ FIELDS: dict[str, dict[str, tuple[int, str]]] = {
     "Type": {"array": (1, "Array")},
     "Array": {"element": (1, "int32")},
 }
-"""Numbers and types of fields in onnx.proto3, by messages. All are declared as repeated: one value
-is written the same."""
+"""Numbers and types of the fields in onnx.proto3, by message. All are declared as repeated, because
+a single value is written the same way."""
 
 FLOAT = 1
 
 
 def cut_onnx(model: bytes, inputs: Collection[str], outputs: Collection[str]) -> bytes:
-    """Cut out of an ONNX file what computes some tensors from others, which are float32.
+    """Cut out of an ONNX file the part that computes some tensors from others, all float32.
 
-    A KeyError says which tensor is not there, or needs more than the inputs.
+    A KeyError names a tensor that is missing or needs more than the inputs.
     """
     part = _model_class()()
     part.ParseFromString(model)

@@ -1,4 +1,4 @@
-"""ONNX Runtime: the backend that is always installed."""
+"""The backend ONNX Runtime, which is always installed."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class OnnxRuntimeNetwork:
         settings = import_onnxruntime().RunOptions()
         settings.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
         smallest = np.zeros((1, 3, *PROBE_SHAPE), np.float32)
-        # Where there is nothing of the processor's to be given back, it raises an error.
+        # It raises an error if there is no memory of the processor to release.
         with contextlib.suppress(Exception):
             self._session.run([self._output_name], {self._input_name: smallest}, settings)
 
@@ -69,7 +69,7 @@ def open_onnxruntime(path: Path, options: RuntimeOptions) -> OnnxRuntimeNetwork:
         session = start_session(_logits_only(path), options.threads, provider)
     except Exception as error:  # its exceptions share no base class
         raise unreadable(path, error) if provider == CPU else _not_started(device, error) from None
-    # It goes on with the CPU when a provider cannot start, and says so in a log only.
+    # If a provider cannot start, ONNX Runtime silently continues on the CPU.
     if provider not in session.get_providers():
         raise _not_started(device, "no reason given")
     return OnnxRuntimeNetwork(session, path, options.threads)
@@ -83,9 +83,9 @@ def _not_started(device: str, reason: object) -> OptionError:
 
 
 def _logits_only(path: Path) -> str | bytes:
-    """Return the content of a file that gives keypoints, too, without them; else its path.
+    """Return the content of a file without its keypoints, if it gives any, else its path.
 
-    ONNX Runtime computes all outputs of a file, asked for or not.
+    ONNX Runtime computes all outputs of a file, requested or not.
     """
     model = path.read_bytes()
     if all(name.encode() in model for name in (LOGITS, *POINTS)):

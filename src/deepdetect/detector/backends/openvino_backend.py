@@ -1,4 +1,4 @@
-"""OpenVINO: 1.5 times as fast as ONNX Runtime on CPUs, an extra."""
+"""The backend OpenVINO, an extra: 1.5 times as fast as ONNX Runtime on CPUs."""
 
 from __future__ import annotations
 
@@ -21,16 +21,14 @@ from .interface import (
 )
 
 COMPILED_LAYERS = 100
-"""Layers compiled for one size of image that are kept, the least recently used are dropped first.
-
-OpenVINO's own limit is 5000, which images of ever new sizes fill with half a gigabyte.
-"""
+"""Number of compiled layers that are kept; the least recently used are dropped first. A layer is
+compiled for each image size. OpenVINO's own limit of 5000 fills half a gigabyte if sizes vary."""
 
 
 class OpenVinoNetwork:
     """A network run by OpenVINO on the CPU.
 
-    After memory was short it is read and compiled again: the answers of the old model are wrong,
+    After memory was short, the file is read and compiled again: the old model gives wrong results,
     and one compiled from the same graph crashes.
     """
 
@@ -41,10 +39,10 @@ class OpenVinoNetwork:
         self._model = compile_model()
         self._output_name = output_to_read([v.get_any_name() for v in self._model.outputs])
         self._path = path
-        # Tiles are computed in float32.
+        # Tiles are only computed in float32.
         self.onnx_path = path if options.precision == "float32" else None
         self.threads = options.threads
-        self._works = False  # it has given a right answer
+        self._works = False  # whether it has given a correct result
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         try:
@@ -56,7 +54,7 @@ class OpenVinoNetwork:
         except Exception as error:  # its exceptions share no base class
             self._model = None
             raise failed_run(error, image.shape) from None
-        # Where memory is short it may also answer with nothing, or with the map of the last image.
+        # If memory is short, it may also return nothing, or the map of the previous image.
         if self._works and output.shape[2:] != image.shape[2:]:
             self._model = None
             raise MemoryError("OpenVINO gave a map of another size")
@@ -66,13 +64,13 @@ class OpenVinoNetwork:
 
     def release_memory(self) -> None:
         """Release the memory that is kept between runs."""
-        # It refuses while another thread runs it, and versions before 2025 do not have it.
+        # It fails while another thread runs the model, and is missing in versions before 2025.
         with contextlib.suppress(Exception):
             self._model.release_memory()
 
 
 def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
-    """Load an ONNX file; an OptionError says that the processor does not have the precision."""
+    """Load an ONNX file; a precision that the processor does not support is an OptionError."""
     openvino = import_openvino()
     from openvino.frontend import FrontEndManager
 
@@ -82,7 +80,7 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
             raise OptionError(
                 "this processor has no instructions for bfloat16: leave `precision` out"
             )
-    # Its default on newer CPUs is bfloat16, which moves keypoints.
+    # The default on newer CPUs is bfloat16, which moves keypoints.
     settings: dict[str, object] = {
         "INFERENCE_PRECISION_HINT": "bf16" if options.precision == "bfloat16" else "f32",
         "CPU_RUNTIME_CACHE_CAPACITY": COMPILED_LAYERS,
@@ -91,11 +89,11 @@ def open_openvino(path: Path, options: RuntimeOptions) -> OpenVinoNetwork:
         settings["INFERENCE_NUM_THREADS"] = options.threads
 
     def compile_model() -> Any:
-        # Named, not guessed: guessing tries all formats and prints each one's complaint.
+        # The format is named, because guessing tries all formats and prints an error for each.
         reader = FrontEndManager().load_by_framework("onnx")
         graph = reader.convert(reader.load(str(path)))
         _keep_what_is_read(graph)
-        # A new core: one that memory was short for crashes.
+        # A new core, because one that ran out of memory crashes.
         return openvino.Core().compile_model(graph, "CPU", settings)
 
     try:
@@ -109,9 +107,9 @@ def _keep_what_is_read(graph: Any) -> None:
     unread = names - {LOGITS} if LOGITS in names else set(POINTS)
     for result in graph.get_results():
         own = result.output(0).get_names()
-        if own & unread and LOGITS not in own:  # versions before 2025 have several names for one
+        if own & unread and LOGITS not in own:  # versions before 2025 give several names to one
             graph.remove_result(result)
     for node in graph.get_ordered_ops():
         for value in node.outputs():
             if PADDED_IMAGE in value.get_names():
-                value.replace(graph.input(0))  # a copy would take 12 bytes a pixel
+                value.replace(graph.input(0))  # a copy would take 12 bytes per pixel

@@ -1,7 +1,7 @@
-"""The backends that can run the network: one line each.
+"""The registry of the backends that can run the network, one line each.
 
-To add a backend, write its module beside this one with a function
-`open_NAME(path, options) -> Network`, and add its line.
+To add a backend, write a module in this folder with a function `open_NAME(path, options) ->
+Network`, and add its line here.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ BACKENDS: dict[str, Callable[[Path, RuntimeOptions], Network]] = {
     "onnxruntime": open_onnxruntime,
     "openvino": open_openvino,
 }
-"""The function that opens a file, by the backend's name, which is that of its package."""
+"""Functions that open a file, by the name of the backend, which is also that of its package."""
 
 PRECISIONS = ("float32", "bfloat16")
 
 
 def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
-    """Load weights with the backend that fits, and return its name; a few networks are kept."""
+    """Load weights with a suitable backend, and return its name; a few networks are cached."""
     check_name("backend", options.backend, ("auto", *BACKENDS))
     check_name("precision", options.precision, PRECISIONS)
     check_ranges(options, counts=("threads",))
     if path.suffix.lower() != ".onnx":
         raise WeightsError(
-            f"{path} is no ONNX file: give one; `deepdetect dev average` of deepdetect-lab makes "
-            "one of safetensors"
+            f"{path} is not an ONNX file: convert safetensors by `deepdetect dev average` of "
+            "deepdetect-lab"
         )
     name = options.backend
     if name == "auto":
@@ -63,15 +63,15 @@ def open_network(path: Path, options: RuntimeOptions) -> tuple[Network, str]:
 
 @functools.lru_cache(maxsize=4)
 def _open(backend: str, path: Path, options: RuntimeOptions, state: tuple[object, ...]) -> Network:
-    """Load a file; one whose state has changed since is loaded again."""
+    """Load a file; it is loaded again if its state has changed."""
     network = BACKENDS[backend](path, options)
     _check_answer(network, path)
     return network
 
 
 def _check_answer(network: Network, path: Path) -> None:
-    """Run a network on a small image of noise, so that a wrong one is refused when it is loaded."""
-    # Noise enough for this; importing NumPy's generators takes 6 MB.
+    """Run a network on a small image of noise, to reject a wrong one when it is loaded."""
+    # This is noise enough; importing NumPy's generators would take 6 MB.
     numbers = np.arange(3 * math.prod(PROBE_SHAPE), dtype=np.uint16) * np.uint16(40503)
     noise = numbers.reshape(1, 3, *PROBE_SHAPE).astype(np.float32) * np.float32(2**-16)
     try:
@@ -80,7 +80,7 @@ def _check_answer(network: Network, path: Path) -> None:
         raise
     except DeepDetectError as error:
         raise WeightsError(
-            f"{path} does not fit: it must map one image (1, 3, height, width) of any size to one "
+            f"{path} does not fit: it must map an image (1, 3, height, width) of any size to a "
             f"map (1, 1, height, width), but {error}"
         ) from None
     if logits.min() == logits.max():

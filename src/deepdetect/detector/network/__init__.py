@@ -1,1 +1,1 @@
-"""The network as ONNX files for other programs: of one size, with points, with metadata."""
+"""The network as ONNX files for other programs: with a fixed size, with points, with metadata."""

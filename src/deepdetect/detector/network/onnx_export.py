@@ -1,6 +1,6 @@
-"""ONNX files for other programs: any size or one, with or without points.
+"""ONNX files for other programs: for any size or one, with or without points.
 
-Their input is `image`; outputs are `probability`, `logits` and those of `add_points`.
+Their input is `image`; their outputs are `probability`, `logits` and those of `add_points`.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ ANY_SIZE = {"size": "any", "batch": "any"}
 @suggest_keywords
 @dataclass(frozen=True)
 class OnnxOptions:
-    """What an exported ONNX file is like.
+    """Options of an exported ONNX file.
 
     Attributes:
-        size: height and width in pixels of a file that takes this size only, for OpenCV 4 and other
+        size: height and width in pixels of a file for this size only, for OpenCV 4 and other
             runtimes without dynamic shapes. None: any height and width.
-        batch: number of images that a file with a size takes; without a size it is free.
-        maps: the file gives the network's probability and logits of all pixels.
-        max_keypoints: the file also gives this many points, those of `PointDetector`. 0: none;
-            OpenCV refuses files with points.
+        batch: number of images of a file with a size; without a size any number.
+        maps: include the network's probability and logits of all pixels.
+        max_keypoints: include this many points, those of `PointDetector`; 0 for none, as OpenCV
+            refuses files with points.
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -65,7 +65,7 @@ class OnnxOptions:
 
     @property
     def metadata(self) -> dict[str, str]:
-        """What the file says of its options."""
+        """The file's metadata on its options."""
         values = dict(ANY_SIZE)
         if self.size is not None:
             height, width = self.size
@@ -82,10 +82,10 @@ def write_onnx(
     *,
     licence: str | None = None,
 ) -> dict[str, str]:
-    """Write weights as an ONNX file for other programs, whole or not at all; return its metadata.
+    """Write weights as an ONNX file for other programs, all or nothing; return its metadata.
 
-    The weights are named, or an ONNX file that this package has written for any size. Without a
-    licence the file says that of the given one.
+    The weights are a name, or an ONNX file that this package has written for any size. Without a
+    licence the file keeps that of the given one.
     """
     if Path(path).suffix.lower() != ".onnx":
         raise OptionError(f"the name of an ONNX file ends in .onnx, not {Path(path).name}")
@@ -114,12 +114,12 @@ def write_model(
 
 
 def _load(path: Path) -> tuple[ModelProto, dict[str, str]]:
-    """Return weights as a network for any size, and where they come from."""
+    """Return weights as a network for any size, and notes on their origin."""
     import onnx
 
     try:
         model = onnx.load_model_from_string(path.read_bytes())
-    except Exception as error:  # protobuf's, which onnx hands on
+    except Exception as error:  # protobuf's errors, passed on by onnx
         raise WeightsError(
             f"{path} is not an ONNX file that can be read ({error}): download it again"
         ) from None
@@ -127,13 +127,13 @@ def _load(path: Path) -> tuple[ModelProto, dict[str, str]]:
     tensors = [value.name for value in (*model.graph.input, *model.graph.output)]
     if tensors != [IMAGE, PROBABILITY, LOGITS]:
         raise WeightsError(
-            f"{path} is no network of deepdetect (it has {', '.join(tensors)}): give a file that "
-            "deepdetect has written"
+            f"{path} is not a network of deepdetect (it has {', '.join(tensors)}): give a file "
+            "that deepdetect has written"
         )
     found = read_metadata(model)
     if any(found.get(name, value) != value for name, value in ANY_SIZE.items()):
         raise WeightsError(
-            f"{path} has the size {found.get('size')}: give the file that it was made from"
+            f"{path} has the fixed size {found.get('size')}: give the file that it was made from"
         )
     kept = {name: value for name, value in found.items() if name in ("weights", "licence")}
     return model, {"weights": path.name, **kept}

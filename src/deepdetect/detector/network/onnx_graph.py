@@ -1,6 +1,6 @@
-"""The graph of an ONNX file: padding and cropping inside it, a fixed size, metadata.
+"""The graph of an ONNX file: padding and cropping, a fixed size, metadata.
 
-The package `onnx` is needed, torch is not: files are made from files.
+It needs the package `onnx` but not torch: files are made from files.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from onnx import GraphProto, ModelProto, NodeProto
 
 IMAGE, PROBABILITY, PADDED_LOGITS = "image", "probability", "padded_logits"
-"""Names of tensors: the network itself maps `PADDED_IMAGE` to `PADDED_LOGITS`."""
+"""Names of tensors; the network itself maps `PADDED_IMAGE` to `PADDED_LOGITS`."""
 
 _OUTSIDE = {"shape", "sides", "minus_sides", "missing", "padding", PADDED_IMAGE}
 _OUTSIDE |= {"sigmoid", PROBABILITY, LOGITS}
-"""Names of tensors that are made outside of the network itself."""
+"""Names of tensors that are computed outside the network itself."""
 
 METADATA = {
     "channels": "RGB",
@@ -31,17 +31,17 @@ METADATA = {
     "pixel_origin": "x right, y down, the centre of the first pixel is (0, 0)",
     "producer": "deepdetect",
 }
-"""What every file says of itself, beside version, weights, licence and size."""
+"""Metadata of every file, in addition to version, weights, licence and size."""
 
 _FACTOR_SHAPES = {"Conv": (-1, 1, 1, 1), "ConvTranspose": (-1, 1, 1)}
-"""What a number for each output channel is multiplied with a kernel as."""
+"""Shape of a factor per output channel that scales a kernel, by type of convolution."""
 
 
 def add_padding(model: ModelProto) -> None:
-    """Let a network, `image` to `logits`, take any size, and give probabilities of at most 1.
+    """Let a network, `image` to `logits`, take any size, and output probabilities of at most 1.
 
-    The image is padded by its last row and column to multiples of 8, and the maps are cropped, as
-    `compute_maps` does it. Batch normalisation is folded.
+    The last row and column are repeated up to multiples of 8, and the maps are cropped, as in
+    `compute_maps`. Batch normalisation is folded.
     """
     from onnx import helper
 
@@ -69,7 +69,7 @@ def add_padding(model: ModelProto) -> None:
 
 
 def fix_size(model: ModelProto, height: int, width: int, batch: int) -> None:
-    """Give a network with padding one size, and no node that asks for the size."""
+    """Give a network with padding one size, and remove the nodes that compute it."""
     from onnx import helper
 
     graph = model.graph
@@ -87,12 +87,12 @@ def fix_size(model: ModelProto, height: int, width: int, batch: int) -> None:
 
 
 def write_metadata(model: ModelProto, values: Mapping[str, str]) -> None:
-    """Write values, `METADATA` and this package's version in place of a file's metadata."""
+    """Replace a file's metadata by these values, `METADATA` and the version of this package."""
     from onnx import helper
 
     written = {**METADATA, "version": __version__, **values}
     helper.set_model_props(model, dict(sorted(written.items())))
-    # OpenCV 4 divides averages at the border as it should only where this name is here.
+    # OpenCV 4 averages correctly at the border only with this producer name.
     model.producer_name = "pytorch"
     model.graph.name = "deepdetect"
 
@@ -114,7 +114,7 @@ def _ending(graph: GraphProto, crop: bool = True) -> list[NodeProto]:
     return [
         *([cropping] if crop else []),
         helper.make_node("Sigmoid", [LOGITS], ["sigmoid"]),
-        # Some runtimes approximate the sigmoid, up to 1.0000001.
+        # Some runtimes approximate the sigmoid by up to 1.0000001.
         helper.make_node("Clip", ["sigmoid", "least", "most"], [PROBABILITY]),
     ]
 
@@ -128,17 +128,17 @@ def _set_sides(graph: GraphProto, kind: str, **sides: str | int) -> None:
 
 
 def fold_normalisation(graph: GraphProto) -> None:
-    """Fold batch normalisation into the convolution before it, or into a factor and an offset.
+    """Fold batch normalisation into the preceding convolution, or into a factor and an offset.
 
-    Computed in float64, so that the same weights give the same numbers everywhere: PyTorch's
-    exporter rounds differently by processor. Convolutions have no bias before.
+    It is computed in float64, so that the same weights give the same numbers everywhere: PyTorch's
+    exporter rounds differently on different processors. Convolutions must not have a bias yet.
     """
     from onnx import helper, numpy_helper
 
     values = {one.name: one for one in graph.initializer}
     made = {name: node for node in graph.node for name in node.output}
     for node in graph.node:
-        if node.op_type == "Identity" and node.input[0] in values:  # equal weights, written once
+        if node.op_type == "Identity" and node.input[0] in values:  # equal weights stored once
             values[node.output[0]] = values[node.input[0]]
     folded: list[NodeProto] = []
     for node in graph.node:
@@ -159,7 +159,7 @@ def fold_normalisation(graph: GraphProto) -> None:
             kernel = numpy_helper.to_array(values[name]) * factor.reshape(shape)
             arrays = {f"{name}.folded": kernel, f"{name}.bias": offset}
             before.input[:] = [before.input[0], *arrays]
-            for other in graph.node:  # `tiling` knows the names that PyTorch's exporter gives
+            for other in graph.node:  # `tiling` uses the names of PyTorch's exporter
                 rename(other, target, source)
         else:
             both = {f"{target}.factor": factor, f"{target}.offset": offset}
@@ -172,10 +172,10 @@ def fold_normalisation(graph: GraphProto) -> None:
 
 
 def give_four_dimensions(graph: GraphProto) -> None:
-    """Write numbers for each channel as (1, C, 1, 1), not as (C, 1, 1), which means the same.
+    """Store numbers per channel as (1, C, 1, 1) instead of the equivalent (C, 1, 1).
 
-    OpenVINO would otherwise turn the image around before and after each sum, product or PReLU with
-    one of them, which took a third of the time.
+    Otherwise OpenVINO transposes the image before and after each sum, product or PReLU with one of
+    them, which took a third of the time.
     """
     from onnx import numpy_helper
 
@@ -208,7 +208,7 @@ def rename(node: NodeProto, old: str, new: str) -> None:
 
 
 def add_constants(graph: GraphProto, values: Mapping[str, Any], kind: type = np.int64) -> None:
-    """Add small constants; one whose name is there already is replaced."""
+    """Add small constants, replacing those of the same name."""
     from onnx import numpy_helper
 
     others = [one for one in graph.initializer if one.name not in values]

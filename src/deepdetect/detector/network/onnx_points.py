@@ -1,4 +1,4 @@
-"""The points of `PointDetector` as outputs of an ONNX file, found in its graph.
+"""The points of `PointDetector` as outputs of an ONNX file, computed in its graph.
 
 `tools/points_graph.py` makes the graph.
 """
@@ -16,17 +16,17 @@ if TYPE_CHECKING:
     from onnx import ModelProto
 
 PREFIX = "points/"
-"""Of the names of its tensors, but for input and outputs."""
+"""Prefix of the names of its tensors, except for input and outputs."""
 
 MAX_KEYPOINTS = f"{PREFIX}max_keypoints"
-"""Name of the initializer that says how many points are given."""
+"""Name of the initializer that sets the number of points."""
 
 
 def add_points(model: ModelProto, max_keypoints: int) -> None:
-    """Let a model with the input `image` give points, too.
+    """Let a model with the input `image` also output points.
 
     `keypoints` are (batch, N, 2) float32, x and y in pixels, best first; `scores`, `sizes` and
-    `angles` (batch, N) float32. Behind the last point of an image they are -1, 0, 0 and 0.
+    `angles` are (batch, N) float32. If an image has fewer points, the rest is -1, 0, 0 and 0.
     """
     import onnx
 

@@ -1,7 +1,7 @@
-"""What the ranker knows about a candidate: measurements relative to its own scale and strength.
+"""The ranker's input for a candidate: measurements relative to its own scale and strength.
 
-They hardly change when the image is turned, zoomed or lit otherwise, so a ranking by them holds in
-both images of a pair.
+They hardly change if the image is rotated, zoomed or lit differently, so a ranking by them agrees
+in both images of a pair.
 """
 
 from __future__ import annotations
@@ -12,24 +12,24 @@ from ..._shared.machine import parallel_for
 from .hessian_scales import SIGMAS_PX, VARIANCES, Candidates, ScaleSpace
 
 RING_RADII = (1.0, 2.0, 3.5, 6.0)
-"""Of the rings around a candidate that are looked at, in sigmas."""
+"""Radii of the rings that are sampled around a candidate, in sigmas. Chosen by hand."""
 
 RING_POINTS = 8
-"""Of each ring: in the directions of a compass rose."""
+"""Number of points on each ring, at equal angles. Chosen by hand."""
 
 FEATURES = 23 + 8 * len(RING_RADII)
 DETERMINANT_FLOOR, GRADIENT_FLOOR, STRENGTH_FLOOR = map(np.float32, (1e-7, 1e-6, 1e-8))
-"""Added before logarithms and divisions: responses of noise and rounding look like nothing."""
+"""Values added before logarithms and divisions, so that noise and rounding have no effect."""
 
 
 def ring_offsets() -> np.ndarray:
-    """Return (2, L, 2, P) int64 offsets in x and in y: to the first points of all rings, and so on.
+    """Return (2, L, 2, P) int64 offsets in x and y: of the first points of all rings, and so on.
 
-    By the level, and by whether the column, or the row, of the candidate is odd.
+    They depend on the level, and on whether the column (or row) of the candidate is odd.
     """
     angle = np.arange(RING_POINTS)[:, None] * (2 * np.pi / RING_POINTS)
     reach = SIGMAS_PX[:, None, None, None] * RING_RADII
-    odd = np.arange(2)[:, None, None]  # halves are rounded to even columns and rows
+    odd = np.arange(2)[:, None, None]  # halves round to even columns and rows
     rings = [np.rint(reach * turn(angle) + odd) - odd for turn in (np.cos, np.sin)]
     return np.array(rings, np.int64).reshape(2, len(SIGMAS_PX), 2, -1)
 
@@ -37,11 +37,11 @@ def ring_offsets() -> np.ndarray:
 def describe_candidates(space: ScaleSpace, candidates: Candidates) -> np.ndarray:
     """Compute the (N, `FEATURES`) float32 features of candidates.
 
-    The first is the logarithm of |det Hessian|, scaled. The others are: the same at neighbouring
-    scales, of one level less, one and two more; whether the candidate is a blob or a saddle; trace
-    and gradient there and in its own level, and its grey value; the largest |det Hessian| nearby at
-    neighbouring scales, relative to it; mean, largest and smallest of |det Hessian|, grey value and
-    gradient on rings; its rank among all candidates per pixel; its level.
+    The first is the scaled logarithm of |det Hessian|. The others are: the same at neighbouring
+    scales (one level finer, one and two coarser); blob or saddle; trace and gradient at these
+    scales and its own, and its grey value; the largest |det Hessian| nearby at neighbouring scales,
+    relative to it; mean, maximum and minimum of |det Hessian|, grey value and gradient on rings;
+    its rank among all candidates per pixel; its level.
     """
     from .kernels import measure_candidates
 

@@ -1,4 +1,4 @@
-"""The learned descriptor of keypoints: a network of the whole image, read at their positions."""
+"""The learned descriptor of keypoints: a network of the whole image, sampled at their positions."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ DESCRIPTOR_GRAPHS = {
     LEARNED_FREE: RANKER.with_name("descriptor_free.onnx"),
     CROSS_MODAL: RANKER.with_name("descriptor_cross_modal.onnx"),
 }
-"""Map `luma` (1, 1, H, W) in [0, 1], `xy` (1, N, 2) in pixels and `sizes` (1, N), diameters in
-pixels, to `descriptors` (1, N, 64) of length 1, all float32."""
+"""ONNX files that map `luma` (1, 1, H, W) in [0, 1], `xy` (1, N, 2) in pixels and `sizes` (1, N),
+diameters in pixels, to `descriptors` (1, N, 64) of length 1; all are float32."""
 
 DIGEST_LENGTH = 16
-"""Characters of the SHA-256 of one's own file."""
+"""Number of characters of the SHA-256 in the type of a user's own descriptor file."""
 
 STRIDE = 128
 """The network halves an image seven times, so its sides must be multiples of 128."""
@@ -47,9 +47,9 @@ def describe_learned(
 ) -> Keypoints:
     """Return keypoints with learned descriptors at their own sizes and angles.
 
-    The image, (H, W) uint8 luma, may be a smaller one than that of the keypoints. Angles of -1, or
-    none, become the dominant ones. The descriptor is a name of `DESCRIPTOR_GRAPHS`, or such a file.
-    An OptionError says that the keypoints have no sizes.
+    The image, (H, W) uint8 luma, may be a scaled-down one. Missing angles, or -1, become the
+    dominant ones. The descriptor is a name in `DESCRIPTOR_GRAPHS` or an ONNX file like them.
+    Keypoints without sizes are an OptionError.
     """
     kind = descriptor_type(descriptor)
     if not len(keypoints):
@@ -57,7 +57,7 @@ def describe_learned(
         return replace(keypoints, descriptors=none, descriptor_type=kind)
     if keypoints.sizes is None or not (keypoints.sizes > 0).all():
         raise OptionError(
-            "learned descriptors need keypoints with sizes above 0: take points, or RootSIFT"
+            "learned descriptors need keypoints with sizes above 0: use points, or RootSIFT"
         )
     height, width = gray.shape
     factor = np.divide((width, height), keypoints.image_size).astype(np.float32)
@@ -78,7 +78,7 @@ def describe_learned(
 
 
 def descriptor_type(descriptor: str | Path) -> str:
-    """Return the `Keypoints.descriptor_type` of a name, or of a file, which has its digest."""
+    """Return the `Keypoints.descriptor_type` of a name, or of a file, by its digest."""
     if str(descriptor) in (*DESCRIPTOR_GRAPHS, ROOT_SIFT):
         return str(descriptor)
     path = resolve_weights(descriptor)
@@ -89,12 +89,12 @@ def descriptor_type(descriptor: str | Path) -> str:
 
 @functools.cache
 def _session(path: Path, content: str, threads: int | None) -> Any:
-    """Start a session of a file, once for each content that it has had and number of threads."""
+    """Start the session of a file, once for each content and number of threads."""
     try:
         session = start_session(str(path), threads)
         names = [each.name for each in (*session.get_inputs(), *session.get_outputs())]
         if names != ["luma", "xy", "sizes", "descriptors"]:
-            raise ValueError("it is no descriptor")
+            raise ValueError("it is not a descriptor")
     except Exception as error:  # its exceptions share no base class
         raise WeightsError(
             f"{path} does not describe keypoints ({first_line(error)}): "

@@ -10,25 +10,25 @@ from ..._shared.opencv import cv2
 from ...features.selection import descending_order, peak_offset
 
 NMS_RADIUS = 2
-"""A candidate is the maximum of a window of 5x5 in its level."""
+"""A candidate is the maximum of a window of 5x5 pixels in its level. Chosen by hand."""
 
 SIGMAS_PX = 1.5 * 1.35 ** np.arange(-1.0, 9)
-"""Of the Gaussians of all levels, in pixels: seven that have candidates, and one finer and two
-coarser ones, which only the ranking looks at."""
+"""Sigmas of the Gaussians of all levels, in pixels: seven levels with candidates, and one finer and
+two coarser ones, which only the ranking uses. Chosen by hand."""
 
 VARIANCES = (SIGMAS_PX**2).astype(np.float32)
-"""Of these Gaussians, by which derivatives are normalised."""
+"""Variances of these Gaussians, which normalise derivatives."""
 
 LEAST_RESPONSE = 1e-8
-"""Of a candidate, in an image with values in [0, 1]: less is rounding."""
+"""Minimum response of a candidate, in an image with values in [0, 1]: anything less is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScaleSpace:
     """Smoothed copies of an image in [0, 1], with derivatives normalised by their scale.
 
-    `smooth` and the Hessian's `determinant` are (L, H, W) float32; `gray`, the mean of the image in
-    whole levels, is taken off.
+    `smooth` and the Hessian's `determinant` are (L, H, W) float32. `gray`, the mean of the image in
+    whole grey levels, is subtracted from `smooth`.
     """
 
     gray: np.float32
@@ -43,8 +43,8 @@ class Candidates:
     Attributes:
         level, row, column: (N,) int64 pixels.
         xy: (N, 2) float64 sub-pixel positions.
-        sigma_px: (N,) float64 of their levels.
-        rank: (N,) int64 places in the order of |det Hessian| sigma^4, from 0, of the whole image.
+        sigma_px: (N,) float64 sigmas of their levels.
+        rank: (N,) int64 ranks by |det Hessian| sigma^4 over the whole image, from 0.
     """
 
     level: np.ndarray
@@ -67,12 +67,12 @@ def build_scale_space(gray: np.ndarray) -> ScaleSpace:
     from .kernels import differentiate
 
     smooth, determinant = (np.empty((len(SIGMAS_PX), *gray.shape), np.float32) for _ in range(2))
-    # Around 0 the least is rounded away: other implementations of the filters find the same maxima.
+    # Values around 0 are rounded least, so other implementations find the same maxima.
     mean = np.float32(np.rint(gray.mean()))
     space = ScaleSpace(mean / np.float32(255), smooth, determinant)
     current, reached = (gray - mean) / np.float32(255), 0.0
     for k, sigma in enumerate(SIGMAS_PX):
-        # Gaussians add up by their variances: each level smooths the one before.
+        # The variances of Gaussians add up: each level smooths the previous one.
         step = float(np.sqrt(sigma**2 - reached**2))
         current, reached = cv2.GaussianBlur(current, (0, 0), step, dst=smooth[k]), sigma
         differentiate(smooth[k], VARIANCES[k], determinant[k])
@@ -80,10 +80,9 @@ def build_scale_space(gray: np.ndarray) -> ScaleSpace:
 
 
 def find_candidates(space: ScaleSpace) -> Candidates:
-    """Find the maxima of |det Hessian| of each level but the finest and the two coarsest.
+    """Find the maxima of |det Hessian| in each level except the finest and the two coarsest.
 
-    Their positions are refined by a parabola in x and in y. There are none in the outermost rows
-    and columns.
+    Positions are refined by parabolas in x and y. The outermost rows and columns have no maxima.
     """
     pixels, positions, strengths = [], [], []
     window = np.ones((2 * NMS_RADIUS + 1,) * 2, np.uint8)

@@ -1,6 +1,6 @@
 """Compiled parts of the detection of points: derivatives, measurements of candidates.
 
-Loops over neighbours in memory are written so that the compiler does several at once.
+Loops over neighbours in memory are written so that the compiler vectorises them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _POINTS = RINGS * RING_POINTS
 def differentiate(smooth, variance, determinant):  # type: ignore[no-untyped-def]
     """Compute the determinant of the Hessian, normalised by the variance.
 
-    By central differences in a (H, W) float32 image that is mirrored at its outermost pixels.
+    It uses central differences of a (H, W) float32 image that is mirrored at its outermost pixels.
     """
     height, width = smooth.shape
     scale = variance * variance
@@ -30,7 +30,7 @@ def differentiate(smooth, variance, determinant):  # type: ignore[no-untyped-def
         above1, above2, here1, here2 = above[1:], above[2:], here[1:], here[2:]
         below1, below2, inner = below[1:], below[2:], out[1:]
         for x in range(width - 2):
-            # In this order: the differences are small, so that little is rounded.
+            # This order keeps the differences small, so that little is rounded.
             double = np.float32(2) * here1[x]
             xx, yy = (here[x] - double) + here2[x], (above1[x] - double) + below1[x]
             xy = (below2[x] - below[x]) - (above2[x] - above[x])
@@ -43,7 +43,7 @@ def differentiate(smooth, variance, determinant):  # type: ignore[no-untyped-def
 
 @compiled(nogil=True, error_model="numpy")
 def _arctangents(values):  # type: ignore[no-untyped-def]
-    """Replace float32 numbers by their arctangents, several at once (Cephes)."""
+    """Replace float32 numbers by their arctangents, vectorised (Cephes)."""
     for k in range(len(values)):
         x = abs(values[k])
         steep, medium = x > np.float32(2.41421356), x > np.float32(0.41421356)
@@ -64,11 +64,11 @@ def _arctangents(values):  # type: ignore[no-untyped-def]
 def measure_candidates(  # type: ignore[no-untyped-def]
     first, last, shape, smooth, determinant, variances, rings, candidates, floors, features
 ):
-    """Compute the features, but those that `describe_candidates` adds, of some candidates.
+    """Compute the features of some candidates, except those that `describe_candidates` adds.
 
-    The maps are flat, of a `shape` (L, H, W). `rings` are (2, L, 2, R P) offsets in x and y of the
-    first points of all rings, then of their second points and so on, by the level and by whether
-    the column, or row, is odd; `candidates` (N, 3): level, row and column.
+    The maps are flat, with `shape` (L, H, W). `rings` holds (2, L, 2, R P) offsets in x and y: of
+    the first points of all rings, then of their second points and so on, by level and by whether
+    the column (or row) is odd. `candidates`, (N, 3), holds level, row and column.
     """
     levels, height, width = shape
     floor, slope_floor, strength_floor = floors
@@ -76,7 +76,7 @@ def measure_candidates(  # type: ignore[no-untyped-def]
     steps, values = np.empty((3, _POINTS), np.int64), np.empty((3, _POINTS), np.float32)
     places, right, down = steps[0], steps[1], steps[2]
     response, slope, light = values[0], values[1], values[2]
-    # Of these: itself; three neighbours, the highest there; four gradients; the rings.
+    # In this order: itself; three neighbours, the highest there; four gradients; the rings.
     logs, bent = np.empty(11 + 7 * RINGS, np.float32), np.empty(4 + 3 * RINGS, np.float32)
     for n in range(first, last):
         level, row, column = candidates[n, 0], candidates[n, 1], candidates[n, 2]
@@ -109,7 +109,7 @@ def measure_candidates(  # type: ignore[no-untyped-def]
             y = row + rings[1, level, row & 1, k]
             x, y = min(max(x, 0), width - 1), min(max(y, 0), height - 1)
             places[k] = start + y * width + x
-            # A gradient has no part across the border.
+            # The gradient across the border is 0.
             right[k] = 1 if 0 < x < width - 1 else 0
             down[k] = width if 0 < y < height - 1 else 0
         for k in range(_POINTS):

@@ -1,4 +1,4 @@
-"""The ranker: a small network that orders candidates by how surely they are found again."""
+"""The ranker: a small network that orders candidates by how likely they are to be found again."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from ..pretrained import RANKER
 from .candidate_features import FEATURES
 
 MAX_DEVIATIONS = 6.0
-"""Features further from their mean are taken as this many standard deviations away."""
+"""Features are clipped at this many standard deviations from their mean. Chosen by hand."""
 
 _CHUNK = 2048
-"""Candidates at a time: their features stay in the processor's cache."""
+"""Candidates are ranked in chunks of this many, whose features stay in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ranker:
-    """Weights of the ranker: a logit is the first feature plus a perceptron of all of them.
+    """Weights of the ranker: a logit is the first feature plus a perceptron of all features.
 
-    Features are normalised by mean and deviation; layers are weights (outputs, inputs) and biases,
+    Features are normalised by mean and deviation. Layers are weights (outputs, inputs) and biases,
     with ReLU between them.
     """
 
@@ -33,7 +33,7 @@ class Ranker:
     notes: str = ""
 
     def rank(self, features: np.ndarray) -> np.ndarray:
-        """Compute the (N,) float32 logits of (N, F) float32 features, the higher the better."""
+        """Compute the (N,) float32 logits of (N, F) float32 features; higher is better."""
         logits = np.empty(len(features), np.float32)
         for start in range(0, len(features), _CHUNK):
             part = features[start : start + _CHUNK]
@@ -50,7 +50,7 @@ class Ranker:
 
 
 def load_ranker(path: Path = RANKER) -> Ranker:
-    """Load an npz file, as `deepdetect dev train-points` writes it."""
+    """Load an npz file that `deepdetect dev train-points` has written."""
     if not path.is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")
     try:
@@ -61,7 +61,7 @@ def load_ranker(path: Path = RANKER) -> Ranker:
                 (file[f"weight{k}"].astype(np.float32), file[f"bias{k}"].astype(np.float32))
                 for k in range(3)
             )
-    except Exception as error:  # NumPy's readers raise many kinds
+    except Exception as error:  # NumPy's readers raise many types
         raise WeightsError(
             f"{path} does not hold weights of the ranker ({first_line(error)})"
         ) from None

@@ -1,8 +1,8 @@
-"""Simulated views, for pairs whose viewpoints differ too much for descriptors as they are.
+"""Simulated views, for pairs whose viewpoints differ too much for descriptors alone.
 
-Yu and Morel, "ASIFT: A New Framework for Fully Affine Invariant Image Comparison", 2009. One image
-is seen from the side, in several directions, and compared with the other as it is; then the other
-way round. The views stay upright, as learned descriptors are, which bear what lies between them.
+Yu and Morel, "ASIFT: A New Framework for Fully Affine Invariant Image Comparison", 2009. Oblique
+views of one image are simulated in several directions and compared with the other image; then the
+other way round. The views stay upright: learned descriptors tolerate the rotations in between.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from ...features.learned import LEARNED
 from ...io.image import MINIMUM_SIDE
 
 BLUR = 0.8
-"""Sigma of the blur before an image is shortened, in units of sqrt(tilt^2 - 1)."""
+"""Sigma of the blur before an image is compressed, in units of sqrt(tilt^2 - 1): the paper's."""
 
 ROUNDING = 1e-9
-"""Pixels: more is no further row or column of a view."""
+"""A view gets no further row or column for a fraction of a pixel below this, which is rounding."""
 
 OUTSIDE: dict[str, Any] = {"borderValue": 128}
 
 TILT, DIRECTIONS = 4.0, 8
-"""How many times shorter one direction is seen in the simulated views, and of how many of them.
-Learned descriptors bear tilts up to two or three alone; of 60 pairs seen from the side at tilts of
-2 to 6 that nothing else decided, all showed a geometry then, with a tilt of 3 and five directions
-55, with SIFT and tilts of 2 and 4 in 30 views 33."""
+"""Compression of one direction in the simulated views, and the number of directions. Learned
+descriptors alone tolerate tilts of two or three. All of 60 oblique pairs with tilts of 2 to 6 that
+were lost otherwise showed a geometry then; with a tilt of 3 and five directions 55 did, with SIFT
+and tilts of 2 and 4 in 30 views 33."""
 
 
 def learned_points(gray: np.ndarray, max_keypoints: int) -> Keypoints:
-    """Return points with learned descriptors; of a view that is too small for them, none."""
+    """Return points with learned descriptors; none if the view is too small."""
     height, width = gray.shape
     if min(height, width) < MINIMUM_SIDE:
         return describe_learned(gray, Keypoints.empty((width, height)))
@@ -54,9 +54,9 @@ def _detector(max_keypoints: int) -> PointDetector:
 def simulated_views(
     grays: tuple[np.ndarray, np.ndarray], max_keypoints: int
 ) -> Iterator[tuple[int, Keypoints]]:
-    """Yield the described points of views from the side, at their positions in an image.
+    """Yield the described points of oblique views, at their positions in the image itself.
 
-    First those of the first image, each with the number of the image.
+    The number of the image, 0 or 1, comes with each view; those of the first image come first.
     """
 
     def see(side: int, rotation_deg: float) -> tuple[int, Keypoints]:
@@ -77,7 +77,7 @@ def simulated_views(
 def simulate_view(
     gray: np.ndarray, tilt: float, rotation_deg: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Shorten an image in one direction, blurred before as by a camera.
+    """Compress an image in one direction, after an anti-aliasing blur.
 
     Returns the view, gray outside the image, and the (2, 3) affine map from the image to it.
     """
@@ -95,7 +95,7 @@ def simulate_view(
 
 
 def _fitting(gray: np.ndarray, linear: np.ndarray) -> tuple[tuple[int, int], np.ndarray]:
-    """Return the size that just holds the image under a linear map, and the (2, 3) affine map."""
+    """Return the smallest size to hold the image under a linear map, and the (2, 3) affine map."""
     height, width = gray.shape
     corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) @ linear.T
     low = corners.min(0)

@@ -1,7 +1,7 @@
 """Sparse matches along known epipolar lines.
 
-A ratio test over the whole image rejects what is repeated anywhere. Once a fundamental matrix is
-known, a partner can only lie near a line; what is elsewhere tells how alike wrong partners are.
+A ratio test over the whole image rejects everything that recurs. With a known fundamental matrix, a
+partner can only lie near a line, and keypoints elsewhere show how similar wrong partners are.
 """
 
 from __future__ import annotations
@@ -15,27 +15,26 @@ from ...features.keypoints import Keypoints
 from ...geometry.transforms import translation_matrix
 
 MAX_DISTANCE_PX = 3.0
-"""Of each keypoint from the other's line."""
+"""Both keypoints of a match lie this near to each other's epipolar line. Chosen by hand."""
 
 MAX_RATIO_ELSEWHERE = 0.95
-"""Of the distance of both descriptors to that of the most similar keypoint far from the line, which
-is wrong for sure."""
+"""The descriptor distance of a match may be this fraction of that to the most similar keypoint far
+from the line, which is certainly wrong. Chosen by hand."""
 
 MAX_RATIO_NEAR = 0.85
-"""The same for the second-best near the line."""
+"""The same ratio, to the second-best keypoint near the line. Chosen by hand."""
 
 MIN_SEPARATION_PX = 5.0
-"""Keypoints nearer than this to the best show the same, and are no second-best."""
+"""Keypoints this near to the best one show the same place and are no rivals. Chosen by hand."""
 
 NULL_SHIFTS = (0.05, 0.1)
-"""By how much lines are moved, right, left, down and up, to count what matches by chance, in units
-of the longer side of the image."""
+"""Shifts of lines that count chance matches, as fractions of the longer side. Chosen by hand."""
 
 
 def epipolar_search(
     first: Keypoints, second: Keypoints, fundamental: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match described keypoints near each other's epipolar lines, mutually.
+    """Match keypoints with descriptors near each other's epipolar lines, mutually.
 
     Returns (M, 2) float64 positions in both images.
     """
@@ -43,7 +42,7 @@ def epipolar_search(
 
 
 def _squared_distances(first: Keypoints, second: Keypoints) -> np.ndarray:
-    """Return (N, M) float32 squared distances of descriptors."""
+    """Return (N, M) float32 squared distances between the descriptors."""
     assert first.descriptors is not None
     assert second.descriptors is not None
     described0 = first.descriptors.astype(np.float32)
@@ -77,11 +76,12 @@ def _search(
 
 @compiled(nogil=True)
 def _nearest_on_lines(distances, ones0, lines1, ones1, lines0, max_distance, separation):  # type: ignore[no-untyped-def]
-    """Find the most similar keypoint near the line of each, and what is to be compared with it.
+    """Find the most similar keypoint near the line of each keypoint, and its rivals.
 
-    Returns, of the first image's keypoints, the partner's index, its squared distance, that of the
-    most similar one near the line but apart from it, and far from the line; of the second image's
-    keypoints the partner's index, and the squared distance of the most similar far from the line.
+    For each keypoint of the first image, returns the partner's index, its squared distance, that of
+    the most similar other keypoint near the line, and that of the most similar one far from it. For
+    each keypoint of the second image, returns the partner's index and the squared distance of the
+    most similar keypoint far from the line.
     """
     count0, count1 = distances.shape
     partner0, partner1 = np.zeros(count0, np.int64), np.zeros(count1, np.int64)
@@ -117,7 +117,7 @@ def _nearest_on_lines(distances, ones0, lines1, ones1, lines0, max_distance, sep
 
 
 def _points_and_lines(points: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return homogeneous points and their epipolar lines, whose products are distances."""
+    """Return homogeneous points, and epipolar lines whose products with points are distances."""
     homogeneous = np.column_stack([points, np.ones(len(points))])
     lines = homogeneous @ matrix.T
     length = np.maximum(np.hypot(lines[:, 0], lines[:, 1]), 1e-300)
@@ -129,9 +129,9 @@ def log10_p_value(
 ) -> float:
     """Return the log10 probability that chance explains further matches along epipolar lines.
 
-    `used` are the positions in the first image of those that the matrix was estimated from, right
-    or wrong: they are no evidence. Lines at wrong places, the same but moved, find matches by
-    chance alone; as many as the right lines find are unlikely among them (a Poisson distribution).
+    `used` are the positions in the first image of all matches that the matrix was estimated from,
+    correct or wrong: they are not new evidence. The same lines, moved elsewhere, only find matches
+    by chance. Their mean is that of a Poisson distribution, which gives the probability.
     """
     distances = _squared_distances(first, second)
     known = {(float(x), float(y)) for x, y in np.asarray(used, np.float32)}
@@ -152,11 +152,11 @@ def log10_p_value(
 
 def _poisson_tail(count: int, mean: float) -> float:
     """Return the probability that a Poisson variable is at least `count`."""
-    # The terms e^-mean mean^k / k!, as far as they count.
+    # The terms e^-mean mean^k / k! that are not negligible.
     first = count if count > mean else 0
     last = int(max(count, mean) + 40 * math.sqrt(max(count, mean)) + 40)
     steps = np.log(mean) - np.log(np.arange(first + 1, last + 1))
     start = first * math.log(mean) - mean - math.lgamma(first + 1)
     terms = np.exp(start + np.concatenate([[0.0], np.cumsum(steps)]))
-    # Small ones are added up directly, as one less the others would be rounded off.
+    # A small tail is summed directly: 1 minus the other terms would round it off.
     return float(terms.sum()) if count > mean else float(max(0.0, 1 - terms[:count].sum()))

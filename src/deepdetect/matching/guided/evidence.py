@@ -1,15 +1,15 @@
-"""Evidence beside the matches themselves: repeated patterns, and windows that are held out.
+"""Evidence for or against matches: repeated patterns, held-out windows, and neighbours.
 
-**Repeated patterns** (windows, tiles, fences). Patches cannot tell: they are as much alike one
-period further on. So the aligned images are correlated at all shifts, and where one of these is
-nearly as good, the places that only one of the two homographies explains decide; or sparse matches
-off both planes, which agree on an epipole with the right one.
+**Repeated patterns** (windows, tiles, fences). Patches look as similar one period further on, so
+they cannot tell a homography from a shifted copy. So the aligned images are correlated at all
+shifts. If one of these is nearly as good, two things decide: the places that only one of the two
+homographies explains, and sparse matches off the plane, which only agree on an epipole with the
+correct homography.
 
-**Held-out windows.** The matches of the windows around one predict, by an affine map, where it is
-seen in the second image. Right matches predict what looks alike there; what was matched by chance
-does not.
+**Held-out windows.** The matches around a window predict, by an affine map, where the second image
+shows it. Correct matches predict similar content; chance matches predict unrelated content.
 
-**Neighbours** of a sparse match move as it does.
+**Neighbours** of a correct sparse match move as it does.
 """
 
 from __future__ import annotations
@@ -39,58 +39,58 @@ from ...geometry.transforms import (
 from .tentative_matches import Pair
 
 COMPARED_SIDE_PX = 320
-"""Longer side to which images are reduced for shifts: periods of a pattern are many pixels."""
+"""Images are reduced to this longer side to compare shifts: periods are many pixels long."""
 
 MIN_SHIFT_PX = 10
-"""Of the reduced images: nearer the correlation is that of what is aligned."""
+"""Shorter shifts of the reduced images are ignored: aligned images correlate there anyway."""
 
 MAX_SHIFTS = 4
-"""That are compared, the best."""
+"""Only the best shifts are compared, up to this number. Chosen by hand."""
 
 MIN_RELATIVE_CORRELATION = 0.4
-"""Of a shift, relative to that without one, for it to be compared. Planes of Oxford have up to
-0.27, those of Strecha's entry up to 0.40, made facades of one window from 0.48 on."""
+"""A shift is compared if it correlates at least this well, relative to no shift. Planes of Oxford
+have up to 0.27, Strecha's entry up to 0.40, synthetic facades of one window 0.48 or more."""
 
 MIN_OVERLAP = 0.6
-"""Of the overlap without a shift, that there is after it: else what tells them apart is hidden."""
+"""A shift must keep this fraction of the overlap: what distinguishes both places may be hidden."""
 
 MIN_ZNCC, MIN_ZNCC_GAIN = 0.5, 0.2
-"""A place is explained with this correlation, and by one homography alone where that of the other
-is lower by this."""
+"""A homography explains a place if the ZNCC there is above the first, and explains it alone if that
+of the other homography is lower by the second. Chosen by hand."""
 
 MIN_OWN_FRACTION, MIN_OWN_RATIO = 0.02, 2.0
-"""Of the explained places, those that a homography explains alone, and how many times those that
-its shifted copy explains alone."""
+"""The places that a homography explains alone must be this fraction of all explained places, and
+this many times those that its shifted copy explains alone. Chosen by hand."""
 
 MIN_EXPLAINED_FRACTION = 0.25
-"""Of the places of sparse matches, those that a homography explains: of right ones that few places
-can confirm from 0.44 on, of two unrelated photographs none."""
+"""A homography must explain this fraction of the places of sparse matches if few places can be
+compared. Correct matches have 0.44 or more, two unrelated photographs 0."""
 
 OFF_PLANE_PX = 6.0
-"""Matches that end this far from where the homography takes them are off the plane."""
+"""A match with a larger transfer error under the homography is off the plane. Chosen by hand."""
 
 HELD_OUT_SIDE_PX = 640
-"""Longer side to which images are reduced for held-out windows."""
+"""Images are reduced to this longer side before held-out windows are compared. Chosen by hand."""
 
 WINDOW_PX = 16
-"""Side of the windows, which divide the first image."""
+"""Side of the windows that divide the reduced first image, in pixels. Chosen by hand."""
 
 MIN_AROUND = 5
-"""Of the eight windows around one, those with matches, for them to predict where it is seen."""
+"""A window is predicted if this many of its eight neighbours have matches. Chosen by hand."""
 
 MIN_COMPARED = 20
-"""With fewer places, or windows, that can be compared nothing is known."""
+"""Fewer comparable places or windows decide nothing. Chosen by hand."""
 
 FALSE_POSITIVE_RATE = 0.05
-"""Fraction of the unrelated windows that are as much alike, with those around them, as those of
-matches that the images do not contradict."""
+"""Matches pass if their window, averaged with those around it, is more similar than all but this
+fraction of unrelated windows. Chosen by hand."""
 
 NEIGHBOURS = 8
-"""Sparse matches around one that are compared with it."""
+"""Each sparse match is compared with this many of the nearest ones. Chosen by hand."""
 
 MAX_MOVE_DIFFERENCE, MOVE_NOISE_PX = 0.35, 2.0
-"""By which turn and scale of two steps between matches may differ, relative to the scale: what is
-tilted or has depth moves so; and by which a step may be wrong."""
+"""Steps between matches agree if rotation and scale differ by at most the first, relative to the
+scale, as tilt and depth allow; the second is the error of a step in pixels. Chosen by hand."""
 
 
 def is_repeated(
@@ -103,9 +103,9 @@ def is_repeated(
 ) -> bool:
     """Return whether a shifted copy of a homography explains (N, 2) points as well as it does.
 
-    The points are of dense matches, or of `distinct` ones: sparse matches by the ratio test.
-    And the `sparse` matches, (M, 2) in both images, of all that is seen, many of them wrong: what
-    does not recur off a plane moves towards an epipole where its homography is the right one.
+    The points are those of dense matches, or `distinct` ones: of sparse matches by the ratio test.
+    `sparse` are all tentative matches, (M, 2) in both images, many of them wrong: relative to the
+    correct homography, what lies off the plane moves towards an epipole.
     """
     (first, scale0), (second, scale1) = (downscale(gray, COMPARED_SIDE_PX) for gray in grays)
     matrix = scaled_homography(homography, scale0, scale1)
@@ -120,9 +120,9 @@ def is_repeated(
         step = np.linalg.inv(matrix) @ other
         middle = np.array([last / 2])
         if transfer_errors(middle, middle, step)[0] < MIN_SHIFT_PX:
-            continue  # it is the first one again
-        # Where the pattern ends in both images, the rest of it may be hidden: only what does not
-        # recur in the first image tells both places apart.
+            continue  # refined back to the first homography
+        # If the pattern ends in both images, its rest may be hidden. So only what does not recur
+        # in the first image distinguishes both places.
         recurring = [warped_zncc(first, first, move) for move in (step, np.linalg.inv(step))]
         recurs = np.fmax(*recurring)[places] > MIN_ZNCC
         explained = np.fmax(own, others) > MIN_ZNCC  # not for NaN in both
@@ -132,7 +132,7 @@ def is_repeated(
         other_alone = np.sum(gain < -MIN_ZNCC_GAIN)
         least = max(MIN_OWN_FRACTION * len(gain), MIN_OWN_RATIO * other_alone)
         if len(gain) < MIN_COMPARED:
-            # Descriptors that occur once are enough if what they match looks alike, and no place
+            # Distinctive descriptors suffice if most of their matches look alike and no place
             # contradicts them.
             alike = np.mean(own > MIN_ZNCC) > MIN_EXPLAINED_FRACTION
             least = 0 if distinct and alike and not other_alone else np.inf
@@ -148,13 +148,13 @@ def is_repeated(
 def _parallax_decides(
     first: np.ndarray, scale0: float, sparse: Pair, plane: np.ndarray, copy: np.ndarray, seed: int
 ) -> bool:
-    """Whether what lies off a plane, and off its copy, agrees on an epipole with it alone."""
+    """Return whether matches off the plane agree on an epipole with it, but not with its copy."""
     points0, points1 = sparse
     on_plane = transform_points(points1, np.linalg.inv(plane))
     starts, ends = (scaled_points(points, scale0) for points in (points0, on_plane))
     shown = ((ends > 0) & (ends < np.array(first.shape[::-1]) - 1)).all(axis=1)
     ends[~shown] = 0
-    # Where the plane shows the same in the first image, further on, the match is of the pattern.
+    # A match is of the pattern if the place where the plane maps its end looks like its start.
     alike = zncc_at_points((first, first), (starts, ends), WINDOW_PX) > MIN_ZNCC
     recurs = ~shown | (alike & (np.linalg.norm(ends - starts, axis=1) > MIN_SHIFT_PX))
     errors = [transfer_errors(points0, points1, each) for each in (plane, copy)]
@@ -166,7 +166,7 @@ def _parallax_decides(
 
 
 def _similar_shifts(first: np.ndarray, warped: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """Return the shifts (dx, dy) after which aligned images correlate nearly as without one."""
+    """Return the shifts (dx, dy) at which aligned images correlate nearly as well as unshifted."""
     size = [cv2.getOptimalDFTSize(2 * side) for side in first.shape]
 
     def correlate(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -188,10 +188,10 @@ def _similar_shifts(first: np.ndarray, warped: np.ndarray, valid: np.ndarray) ->
 def compare_held_out(
     grays: Pair, points0: np.ndarray, points1: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Compare windows of two images where the matches around them, (M, 2) each, say.
+    """Compare each window of the first image with where the matches around it predict it.
 
-    Returns their median correlation, 0 where too few can be compared, and (M,) bool: false for the
-    matches whose own window is no more alike than unrelated ones.
+    The matches are (M, 2) in both images. Returns the median correlation of the windows, 0 if too
+    few can be compared, and (M,) bool: False for matches whose window looks like unrelated ones.
     """
     (first, scale0), (second, scale1) = (downscale(gray, HELD_OUT_SIDE_PX) for gray in grays)
     points0, points1 = scaled_points(points0, scale0), scaled_points(points1, scale1)
@@ -217,12 +217,12 @@ def compare_held_out(
     if min(np.isfinite(own).sum(), np.isfinite(unrelated).sum()) < MIN_COMPARED:
         return 0.0, everything
     bound = np.nanquantile(_mean_around(unrelated), 1 - FALSE_POSITIVE_RATE)
-    alike = ~(_mean_around(own) <= bound)  # or not known
+    alike = ~(_mean_around(own) <= bound)  # True for unknown windows (NaN)
     return float(np.nanmedian(own)), alike[row, column]
 
 
 def _mean_around(values: np.ndarray) -> np.ndarray:
-    """Average windows with those around them, (rows, columns); NaN where one is not known."""
+    """Average each window with those around it, (rows, columns); NaN where it is unknown itself."""
     known = np.isfinite(values)
     total, count = (
         cv2.boxFilter(part, cv2.CV_64F, (3, 3), borderType=cv2.BORDER_CONSTANT)
@@ -236,7 +236,7 @@ def _affine_maps(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit an affine map, (3, 2), to the matches of the windows around each of (rows, columns).
 
-    By the number of the window of each match. Returns where there is one, too, (rows, columns).
+    `windows` has the number of the window of each match. Also returns where there is a map.
     """
     size = shape[0] * shape[1]
 
@@ -259,15 +259,16 @@ def _affine_maps(
 
 
 def moving_alike(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
-    """Return the fraction of the matches nearest to each of (M, 2) that move as it does.
+    """Return the fraction of the nearest matches that move as each of (M, 2) matches does.
 
-    Each of them and the match itself give a turn and a scale; those count that agree with one.
+    Each neighbour and the match itself give a rotation and a scale. The largest group of neighbours
+    that agree with one of them is counted.
     """
     neighbours = min(NEIGHBOURS, len(points0) - 1)
     if neighbours < 1:
         return np.zeros(len(points0))
     first, second = points0 @ [1, 1j], points1 @ [1, 1j]
-    blocks = np.array_split(first, len(first) // 500 + 1)  # all distances of many fill the memory
+    blocks = np.array_split(first, len(first) // 500 + 1)  # bounds the memory of the distances
     distances = (np.abs(block[:, None] - first) for block in blocks)
     nearest = np.concatenate(
         [np.argpartition(each, neighbours)[:, : neighbours + 1] for each in distances]

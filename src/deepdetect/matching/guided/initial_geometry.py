@@ -1,10 +1,10 @@
-"""The initial geometry that tentative matches of a pair show, or that none can be trusted.
+"""The initial geometry of a pair from tentative matches, or the answer that none can be trusted.
 
-A coarse pass on small copies first, which is enough where the pair is clearly a plane or clearly
-has depth; then plain SIFT on larger ones; learned descriptors, and simulated views (`asift`), only
-when that gives nothing, or little of images of different sensors.
-Which model it is decides `geometry.two_view`; its thresholds and those here were chosen on all of
-Oxford and Middlebury, Strecha's fountain and a KITTI clip.
+A coarse pass on small copies comes first. It suffices if the pair is clearly a plane or clearly has
+depth. SIFT on larger copies follows. If it finds nothing, or little between images of different
+sensors, learned descriptors and simulated views (`asift`) are used. `geometry.two_view` chooses the
+model. Its thresholds, and those here if nothing else is said, were chosen on all of Oxford and
+Middlebury, Strecha's fountain and a KITTI clip.
 """
 
 from __future__ import annotations
@@ -42,60 +42,61 @@ from .tentative_matches import (
 )
 
 LEARNED_KEYPOINTS = 2048
-"""Of points with learned descriptors, which are asked where SIFT's keypoints show nothing."""
+"""Points with learned descriptors, used if SIFT's keypoints show no geometry. Chosen by hand."""
 
 COARSE_SIDE_PX, COARSE_KEYPOINTS = 640, 2000
-"""Longer side of the copies of the coarse pass, and keypoints of each."""
+"""Longer side and keypoints of the copies for the coarse pass. Chosen on the data named above."""
 
 MIN_COARSE_INLIERS = 50
-"""Matches of the coarse pass that agree with a homography, for it to decide; points as well."""
+"""The coarse pass, or given points, decide if this many matches agree with a homography."""
 
 MIN_COARSE_DEPTH_INLIERS = 200
-"""The same of a fundamental matrix."""
+"""The same number for a fundamental matrix. Chosen on the data named above."""
 
 MIN_COARSE_FRACTION = 0.5
-"""Of the matches of the coarse pass that must agree as well."""
+"""Fraction of the coarse matches that must also agree. Chosen on the data named above."""
 
 SIMULATED_SIDE_PX, SIMULATED_KEYPOINTS = 320, 1000
-"""Longer side and keypoints of images of which views are simulated; each view gets half as many."""
+"""Longer side and keypoints of the images to be tilted; views get half as many. Chosen by hand."""
 
 WINDOW_PX = 16
-"""Side of the windows around matches that are correlated."""
+"""Side of the windows around matches that are checked for inverted brightness. Chosen by hand."""
 
 MIN_GAIN = 1.2
-"""Tentative matches of cross-modal descriptors per one of the others, for images of two sensors: of
-visible and infrared light 1.5 to 30, of photographs in any light, and of wide pairs, up to 1.17."""
+"""Images are from two sensors if cross-modal descriptors give this many times the tentative matches
+of learned ones: visible and infrared light 1.5 to 30, photographs and wide pairs up to 1.17."""
 
 MIN_INVERTED = 0.05
-"""Fraction of what agrees with their geometry that is dark in one image and bright in the other,
-which says the same; of wide pairs of the clips up to .04 are, by wrong matches."""
+"""Images are also from two sensors if this fraction of the inliers is dark in one and bright in the
+other. Wide pairs of the KITTI clips have up to 0.04, from wrong matches."""
 
 MAX_LEARNED_LOG10_NFA, MAX_CROSS_MODAL_LOG10_NFA = -10.0, -22.0
-"""Of what nothing but descriptors of a network shows: they see the borders of an image, too, which
-lie in the same places. Unrelated photographs have down to -8; by cross-modal descriptors noise of
-320x240 has down to -20, visible and infrared light -24 and less."""
+"""The log10 number of false alarms must be below these if only learned, or only cross-modal,
+descriptors show a geometry: networks also see the borders of images, which lie in the same places.
+Unrelated photographs reach -8 with learned ones; with cross-modal ones noise of 320x240 reaches
+-20, visible and infrared light -24 or less."""
 
 MAX_MATCHES_TO_SEARCH = 200
-"""With fewer that agree with a fundamental matrix, more are searched for along its lines."""
+"""A fundamental matrix with fewer inliers leads to a search for more along its lines."""
 
 MAX_HINT_LOG10_NFA = 0.0
-"""Where the logarithm of the number of false alarms of the best geometry so far is below this, it
-may be more than chance: further matches along epipolar lines are counted."""
+"""If the log10 number of false alarms of the best geometry is below this, it may be more than
+chance: further matches along epipolar lines are counted."""
 
 
 Source = TentativeMatches | Pair | tuple[Keypoints, Keypoints] | None
-"""What a geometry is found from: matches that have been made already, (K, 2) positions in both
-images of another matcher, or keypoints: these make the matches where they are points of all scales
-and enough. Else SIFT does."""
+"""What a geometry is found from: tentative matches, positions of another matcher's matches ((K, 2)
+in both images), or keypoints of both images. Keypoints are only matched themselves if they are
+enough points of all scales; otherwise, and for None, SIFT's keypoints are."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class InitialGeometry(TwoViewModel):
-    """A model of tentative matches, at the images' own size; "none" when none can be trusted.
+    """A model of tentative matches, at the images' own size; "none" if none can be trusted.
 
-    `points0` and `points1` are the matches that agree with it, `others` those that do not, None
-    where the model was asked for; `num_views` were simulated for them. Another model would be found
-    from the `source`. A `learned` one is of points; a `cross_modal` one of images of two sensors.
+    `points0` and `points1` are its inliers, `others` the outliers, or None if the caller prescribed
+    the model. `num_views` views were simulated. Another model would be found from the same
+    `source`. A `learned` geometry comes from learned points, a `cross_modal` one from two sensors.
     """
 
     points0: np.ndarray
@@ -110,7 +111,7 @@ class InitialGeometry(TwoViewModel):
     def of(
         cls, model: TwoViewModel, points0: np.ndarray, points1: np.ndarray, asked: str
     ) -> InitialGeometry:
-        """Return a model with the matches that agree with it, and the others."""
+        """Return a model with its inliers and outliers; `asked` is the caller's `model`."""
         agreeing, rest = model.inliers, ~model.inliers
         others = (points0[rest], points1[rest]) if asked == "auto" else None
         return cls(
@@ -119,22 +120,22 @@ class InitialGeometry(TwoViewModel):
 
     @property
     def all_points(self) -> Pair:
-        """Positions of all matches, those that agree with the model first."""
+        """Positions of all matches, inliers first."""
         assert self.others is not None
         points0, points1 = self.others
         return np.concatenate([self.points0, points0]), np.concatenate([self.points1, points1])
 
     def untrusted(self) -> InitialGeometry:
-        """Return that there is none, and how near it was."""
+        """Return that no geometry can be trusted, keeping its number of false alarms."""
         nowhere = np.empty((0, 2))
         return replace(self, model="none", matrix=None, points0=nowhere, points1=nowhere)
 
     def only_below(self, max_log10_nfa: float) -> InitialGeometry:
-        """Return it, or that there is none that can be trusted."""
+        """Return the geometry itself if it can be trusted, otherwise an untrusted one."""
         return self if self.log10_nfa < max_log10_nfa else self.untrusted()
 
     def rescaled(self, scale0: float, scale1: float) -> InitialGeometry:
-        """Return a geometry of images at other scales as one of the images themselves."""
+        """Convert the geometry of scaled images to that of the images themselves."""
         assert self.matrix is not None
         convert = scaled_homography if self.model == "homography" else scaled_fundamental
         return replace(
@@ -150,7 +151,7 @@ class InitialGeometry(TwoViewModel):
         )
 
     def as_two_view_geometry(self) -> TwoViewGeometry:
-        """Return what the user is told of it."""
+        """Return the geometry in its public form."""
         counts = len(self.inliers), len(self.points0)
         evidence = Evidence(*counts, float(self.log10_nfa), self.num_views)
         return TwoViewGeometry(self.model, self.matrix, evidence=evidence)
@@ -159,7 +160,7 @@ class InitialGeometry(TwoViewModel):
 def guiding_geometry(
     grays: Pair, model: str = "auto", seed: int = 0, source: Source = None
 ) -> InitialGeometry:
-    """Find the geometry to begin with, by the least effort that it takes."""
+    """Find the geometry that guides the matching, trying the cheapest way first."""
     if isinstance(source, TentativeMatches):
         geometry = replace(estimate_initial_geometry(source, model, seed), source=source)
     elif isinstance(source, tuple) and not isinstance(source[0], Keypoints):
@@ -183,7 +184,7 @@ def guiding_geometry(
 def _geometry_of_keypoints(
     grays: Pair, model: str, seed: int, source: tuple[Keypoints, Keypoints] | None
 ) -> InitialGeometry:
-    """Find the geometry that SIFT's keypoints show, or else points with learned descriptors."""
+    """Find the geometry from SIFT's keypoints, or from points with learned descriptors."""
     longest, learned = max(max(gray.shape) for gray in grays), None
     if longest > COARSE_SIDE_PX and model != "fundamental":
         coarse = find_tentative_matches(
@@ -195,7 +196,7 @@ def _geometry_of_keypoints(
         if geometry.log10_nfa >= MAX_HINT_LOG10_NFA:
             learned = _learned_geometry(grays, model, seed)
             if learned.log10_nfa >= MAX_HINT_LOG10_NFA:
-                # Nor do larger copies show anything where small ones do not even hint at it.
+                # If small copies show not even a hint, larger ones show nothing either.
                 return learned
     tentative = find_tentative_matches(*grays)
     geometry = estimate_initial_geometry(tentative, model, seed)
@@ -208,11 +209,11 @@ def _geometry_of_keypoints(
 
 
 def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
-    """Find the geometry that points with learned descriptors show, of other sensors, too.
+    """Find the geometry from points with learned descriptors, also between different sensors.
 
-    In unlike light, the dark, blur, or from another side two to fifteen times as many of them agree
-    as of SIFT's keypoints; where one image is four times as large, SIFT's are more. SIFT's lie more
-    exactly where they belong, which tells depth from a plane.
+    In different light, in the dark, under blur or from another side two to fifteen times as many of
+    them agree as of SIFT's keypoints; SIFT has more if one image is four times as large. SIFT's
+    positions are more exact, which helps to tell depth from a plane.
     """
     as_it_is = _learned_matches(grays, COARSE_SIDE_PX, LEARNED_KEYPOINTS)
     seen = as_it_is.views, as_it_is.features
@@ -228,7 +229,7 @@ def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
 
 
 def _is_inverted(tentative: TentativeMatches, geometry: InitialGeometry) -> bool:
-    """Whether some of what agrees with a geometry is dark in one image and bright in the other."""
+    """Return whether some inliers are dark in one image and bright in the other."""
     scale0, scale1 = tentative.scales
     agreeing = scaled_points(geometry.points0, scale0), scaled_points(geometry.points1, scale1)
     correlations = zncc_at_points(tentative.views, agreeing, WINDOW_PX)
@@ -243,7 +244,7 @@ def _learned_matches(grays: Pair, side_px: int, keypoints: int) -> TentativeMatc
 
 
 def _is_clear(geometry: InitialGeometry) -> bool:
-    """Whether most matches of the coarse pass, and enough, agree with a model that fits alone."""
+    """Return whether enough matches of the coarse pass, and most of them, agree with the model."""
     depth = geometry.model == "fundamental"
     least = MIN_COARSE_DEPTH_INLIERS if depth else MIN_COARSE_INLIERS
     most = len(geometry.points0) >= max(least, MIN_COARSE_FRACTION * len(geometry.inliers))
@@ -252,7 +253,7 @@ def _is_clear(geometry: InitialGeometry) -> bool:
 
 def _geometry_of_positions(grays: Pair, points: Pair, model: str, seed: int) -> InitialGeometry:
     """Estimate the geometry from sparse matches of another matcher, some of them wrong."""
-    # The thresholds hold for images of this size.
+    # The thresholds were chosen for images of this size.
     scale0, scale1 = (min(1.0, MAX_SIDE_PX / max(gray.shape)) for gray in grays)
     size0, size1 = (
         (round(gray.shape[1] * scale), round(gray.shape[0] * scale))
@@ -272,9 +273,9 @@ def estimate_initial_geometry(
     semi_calibrated: bool = True,
     view_keypoints: int = 0,
 ) -> InitialGeometry:
-    """Estimate the geometry of a pair from its tentative matches, and those of simulated views.
+    """Estimate the geometry of a pair from its tentative matches and those of simulated views.
 
-    Each view has `view_keypoints`; with 0 none is simulated. The other arguments are those of
+    Each view has `view_keypoints` keypoints; 0 simulates no views. For the other arguments see
     `choose_model`.
     """
     sizes = tentative.views[0].shape[::-1], tentative.views[1].shape[::-1]
@@ -302,7 +303,7 @@ def estimate_initial_geometry(
 def _matches_of_views(
     tentative: TentativeMatches, view_keypoints: int
 ) -> tuple[Pair, np.ndarray, int]:
-    """Return positions and ratios, those of simulated views too, and how many views these are."""
+    """Return all matches with those of simulated views: positions, ratios, number of views."""
     found = [(*tentative.matched, tentative.ratios)]
     for side, seen in simulated_views(tentative.views, view_keypoints):
         further = match_sparse(seen, tentative.features[1 - side])
@@ -314,7 +315,7 @@ def _matches_of_views(
 def _with_further_evidence(
     geometry: InitialGeometry, used: np.ndarray, tentative: TentativeMatches
 ) -> InitialGeometry:
-    """Let keypoints that no match was made of decide where a fundamental matrix is in doubt."""
+    """Let keypoints that are not yet matched decide if a fundamental matrix is in doubt."""
     doubtful = not geometry.trusted and geometry.log10_nfa < MAX_HINT_LOG10_NFA
     if geometry.model != "fundamental" or not doubtful:
         return geometry
@@ -326,7 +327,7 @@ def _with_further_evidence(
 def _with_further_matches(
     geometry: InitialGeometry, tentative: TentativeMatches
 ) -> InitialGeometry:
-    """Search along the lines of a fundamental matrix that few matches agree with, and refit it."""
+    """Search along the lines of a fundamental matrix that has few inliers, and refit it."""
     if geometry.model != "fundamental" or len(geometry.points0) >= MAX_MATCHES_TO_SEARCH:
         return geometry
     assert geometry.matrix is not None

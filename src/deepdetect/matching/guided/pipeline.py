@@ -1,7 +1,7 @@
-"""Guided matching: an initial geometry, refined, then all keypoints where it predicts them.
+"""Guided matching: an initial geometry is refined and predicts the partner of every keypoint.
 
-Geometry only proposes. A pair is kept when its patches are the same once the geometry is taken out
-(`verification`), or when it is the best on its row in both images (`rectified`).
+The geometry only proposes matches. A match is kept if both patches are the same once the geometry
+is removed (`verification`), or if it is the best on its row in both images (`rectified`).
 """
 
 from __future__ import annotations
@@ -36,83 +36,85 @@ from .tentative_matches import Pair
 from .verification import dissimilarity
 
 MIN_VERIFIED_FRACTION = 0.5
-"""Of what a homography proposes, this must be the same patches for the scene to be its plane."""
+"""A homography is the plane of the scene if this fraction of the matches that it proposes is
+verified. Chosen on Oxford, Middlebury, Strecha's fountain and a KITTI clip."""
 
 MIN_UNMATCHED_FRACTION = 0.5
-"""Of the matches of a further plane, those that nothing else matches: a repeated pattern that is
-shifted by a period is matched already."""
+"""This fraction of a further plane's matches must be new, unlike those of a shifted pattern."""
 
 MATCHED_PX = 9
-"""Side of the window around a match in which the first image counts as matched."""
+"""Side of the window around a match in which the first image counts as matched. Chosen by hand."""
 
 MIN_OFF_PLANE_FRACTION = 0.02
-"""As many dense matches, of keypoints whose patches the plane does not explain, relative to those
-on the plane, show depth where as many of the sparse ones do, too: the planes of Oxford, which are
-not quite flat, have up to 0.013, facades from 0.032 on."""
+"""A scene has depth if this many dense matches are off the plane, relative to those on it, and
+equally many of the sparse ones. Their patches must not fit the plane. The planes of Oxford, which
+are not quite flat, have up to 0.013, facades 0.032 or more."""
 
 MAX_MOVING_PLANES = 3
-"""Planes that are asked whether they move on their own: the first ones may be of the scene."""
+"""Planes that are tested for independent motion: the first ones may be part of the static scene."""
 
 MIN_ON_LINES = 0.33
-"""Of the matches of a plane on the epipolar lines of all else, where both stand still: planes put
-into scenes with depth have up to 0.3."""
+"""A plane is static if this fraction of its matches lies on the epipolar lines of the rest. Planes
+that were pasted into scenes with depth have up to 0.3."""
 
 MIN_REST_FRACTION, MIN_REST_RATIO = 0.5, 1.05
-"""Of the matches off a plane that moves on its own, those that agree with their own matrix; and
-how many times those that agree with the matrix of both: else that one will do."""
+"""The rest of a scene with a moving plane needs a matrix of its own if that has this fraction of
+its matches as inliers, and this many times those of the common matrix. Chosen by hand."""
 
 MAX_REST_LOG10_NFA = -20.0
-"""Of their agreement on an epipole: another plane in place of a scene has -7."""
+"""The rest must agree on an epipole with this log10 number of false alarms; a plane has -7."""
 
 MAX_PARALLAX_LOG10_NFA = -40.0
-"""Or sparse matches off the plane agree this clearly on an epipole: planes of Oxford have at least
--22, entry, of which nearly all is a wall, -84."""
+"""Sparse matches off the plane also prove depth if they agree on an epipole this clearly. Planes of
+Oxford have -22 or more; Strecha's entry, which is nearly all wall, has -84."""
 
 SCENE_MATCHES = 1000
-"""Of the dense matches, drawn at random, say what a scene is like."""
+"""Number of random dense matches that the type of a scene is judged by. Chosen by hand."""
 
 DOMINANT_FRACTION, MIN_PLANE_FRACTION = 0.5, 0.2
-"""Of them on one plane: a dominant one; one that is looked at for repeated patterns."""
+"""A plane is dominant with the first fraction of these matches, and tested for repeated patterns
+from the second on. Chosen by hand."""
 
 MAX_CLEAR_LOG10_NFA, MIN_CLEAR_CORRELATION = -12.0, 0.5
-"""Of matches of high confidence."""
+"""Confidence is "high" if the log10 number of false alarms is below the first and the correlation
+of held-out windows above the second. Chosen by hand."""
 
 MIN_OWN_FRACTION = 0.67
-"""Of these, the geometry's own: of two that move otherwise one may be no scene but what is put
-over it, as the round edge of a microscope's or fundus camera's view, which stands still."""
+"""High confidence also needs this fraction of the matches to agree with the geometry. What moves
+differently may be an overlay that stands still, such as the round rim of a microscope."""
 
 MIN_MATCHED_FRACTION = 0.02
-"""With a smaller fraction of the keypoints of a scene with depth matched, only the sparse matches
-that agree with its geometry are taken."""
+"""If a smaller fraction of the keypoints of a scene with depth is matched, the result is the sparse
+matches that agree with its geometry. Chosen by hand."""
 
 MIN_MATCHES = 8
-"""With fewer the geometry is not trusted after all."""
+"""A geometry with fewer matches is rejected after all. Chosen by hand."""
 
 MIN_MOVING_ALIKE = 0.6
-"""Fraction of the sparse matches around one that must move as it does, for it to be verified."""
+"""A sparse match is verified if this fraction of its neighbours moves alike. Chosen by hand."""
 
 MIN_ALIKE_FRACTION = 0.3
-"""Of the sparse matches, that must be verified: at random places up to a tenth is."""
+"""This fraction of the sparse matches must be verified: at random places up to a tenth is."""
 
 MAX_DISTANCE_PX = 1.0
-"""From where the homography takes a keypoint to its partner."""
+"""A partner lies this near to where the homography maps the keypoint. Chosen by hand."""
 
 MIN_PROPOSED_FRACTION = 0.25
-"""Where fewer of the keypoints that the second image shows under the homography have a partner
-there, keypoints are few, and all of them are verified."""
+"""If a smaller fraction of the visible keypoints has a partner under the homography, keypoints are
+few and all of them are verified. Chosen by hand."""
 
 MAX_VERIFIED_PIXELS = 6e6
-"""Larger images are compared at this size, which bounds memory and time."""
+"""Larger images are scaled down to this for verification, which bounds memory and time."""
 
 MAX_REFINED_SIDE_PX = 1600
-"""Longer sides are scaled down to this while the homography is refined."""
+"""Images are reduced to this longer side while the homography is refined. Chosen by hand."""
 
 MAX_SCALE_RATIO = 1.5
-"""Of the two images; where one shows the scene finer by more than this, it is scaled down to the
-other for the refinement: corners of different scales are not at the same place."""
+"""If the scale of both images differs by more than this, the finer one is scaled down for the
+refinement: corners of different scales lie at different places."""
 
 MIN_SCALE = 1 / 16
-"""Of one image in the other; beyond it a homography shows nothing that could be refined."""
+"""An image is not scaled down below this: at larger differences there is nothing to refine."""
 
 
 def guided_matches(
@@ -120,7 +122,7 @@ def guided_matches(
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
     """Match keypoints on whole pixels, (N, 2) and (M, 2), of two images by their `first` geometry.
 
-    Returns the geometry that guided, and the matches; None when no geometry could be trusted.
+    Returns the geometry that guided, and the matches; None if no geometry can be trusted.
     """
     enough = MIN_MATCHED_FRACTION * min(len(xy) for xy in pixels)
     if first.cross_modal:
@@ -153,9 +155,9 @@ def guided_matches(
 def _with_scene(
     grays: Pair, xy0: np.ndarray, geometry: TwoViewGeometry, matches: GuidedMatches, seed: int
 ) -> tuple[TwoViewGeometry, Pair | None]:
-    """Say what the dense matches show, by the homography that most of some of them agree with.
+    """Classify the scene by the homography that most of a sample of the dense matches agree with.
 
-    Returns the matched points of the first image that lie on its plane, and it, too.
+    Also returns the matched points of the first image on its plane, and the homography.
     """
     sizes = grays[0].shape[::-1], grays[1].shape[::-1]
     points0, points1 = matches.starts(xy0).astype(np.float64), matches.points1
@@ -183,22 +185,22 @@ def _with_scene(
 def _plane_or_depth(
     grays: Pair, pixels: Pair, first: InitialGeometry, enough: float, seed: int
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
-    """Match by the homography, and by epipolar lines where matches off its plane agree on them."""
+    """Match by the homography, or by epipolar lines if matches off its plane agree on them."""
     assert first.matrix is not None
-    # Of a surface that is not quite flat, what most points agree with can be the better plane.
+    # On a surface that is not quite flat, the plain consensus can be the better plane.
     consensus = estimate_geometry(first.points0, first.points1, "homography", seed=seed).matrix
     refined = _refine_homography(grays, first.matrix)
     known = [refined, first.matrix, *([] if consensus is None else [consensus])]
     matrix = most_alike(*grays, known)
     on_plane, verified = match_by_homography(grays, pixels, matrix, seed)
     planar = first.parallax is None or verified >= MIN_VERIFIED_FRACTION
-    # Points with learned descriptors lie where they belong less exactly, which looks like parallax.
+    # Points with learned descriptors have less exact positions, which looks like parallax.
     off_plane = first.parallax is not None and first.parallax.significant and not first.learned
     plane = _trusted(first, matrix, on_plane, enough)
     evidence = replace(plane[0].evidence, verified=verified)
     plane = replace(plane[0], evidence=evidence), plane[1]
     if first.cross_modal:
-        # What patches of different sensors do not show is no evidence of depth.
+        # Patches of different sensors that differ are no evidence of depth.
         if plane[1] is None:
             plane = _sparsely(grays[0], pixels[0], first)
         if plane[1] is not None:
@@ -220,7 +222,7 @@ def _plane_or_depth(
             yield apart, None
         yield joint, matrix if planar else None
         if not planar and first.others:
-            # What moves otherwise can spoil a matrix that explains a part of it, too.
+            # Independent motion can spoil a matrix that also explains a part of it.
             yield guiding_geometry(grays, "fundamental", seed, first.others), None
 
     depth, geometry, matches = _first_that_matches(grays, pixels[0], ways(), enough)
@@ -240,7 +242,7 @@ def _plane_or_depth(
 def _fit(
     points0: np.ndarray, points1: np.ndarray, model: str, gray1: np.ndarray, seed: int = 0
 ) -> TwoViewModel:
-    """Fit a model that guides to (M, 2) matches, trusted or not."""
+    """Fit a model to (M, 2) matches with the guiding thresholds, trusted or not."""
     size1, threshold_px = gray1.shape[::-1], GUIDING_THRESHOLDS_PX[model]
     return fit_model(points0, points1, model, size1, threshold_px, seed)
 
@@ -248,9 +250,9 @@ def _fit(
 def _apart_from_plane(
     grays: Pair, first: InitialGeometry, depth: InitialGeometry, seed: int
 ) -> InitialGeometry | None:
-    """Return the geometry of all but a plane that moves on its own; None if none does.
+    """Return the geometry of everything except a plane that moves on its own; None if none does.
 
-    The fundamental matrix `depth` of both would fit one of them, and cut through the other.
+    The common fundamental matrix `depth` would fit one of the two and cut through the other.
     """
     if first.others is None or depth.matrix is None:
         return None
@@ -275,7 +277,7 @@ def _apart_from_plane(
         errors = epipolar_errors(points0[on], points1[on], rest.matrix)
         if np.mean(errors < GUIDING_THRESHOLDS_PX["homography"]) >= MIN_ON_LINES:
             continue
-        # Any matrix of many fits a plane: what tells of depth is off the plane of the rest, too.
+        # A plane fits many fundamental matrices: evidence of depth is also off the rest's plane.
         rest0, rest1 = points0[~on][rest.inliers], points1[~on][rest.inliers]
         another = _fit(rest0, rest1, "homography", grays[1], seed)
         if another.matrix is None or (
@@ -295,7 +297,7 @@ def _with_further_planes(
     enough: float,
     seed: int,
 ) -> GuidedMatches:
-    """Add the matches of planes that move otherwise, by sparse matches that nothing explains."""
+    """Add the matches of planes that move differently, by sparse matches left unexplained."""
     if first.others is None or matches.points0 is not None:
         return matches
     assert geometry.matrix is not None
@@ -332,9 +334,9 @@ def _first_that_matches(
     ways: Iterable[tuple[InitialGeometry, np.ndarray | None]],
     enough: float,
 ) -> tuple[InitialGeometry, TwoViewGeometry, GuidedMatches | None]:
-    """Match by geometries, each with a plane where one is known, until one gives enough matches.
+    """Match by geometries, each with its plane if known, until one gives enough matches.
 
-    Returns the one that gives most, with its result; of equal ones the first.
+    Returns the geometry with most matches, the first of equal ones, with its result.
     """
     best, most = None, -1
     for first, plane in ways:
@@ -355,19 +357,19 @@ def _match_depth(
     enough: float,
     plane: np.ndarray | None = None,
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
-    """Match keypoints of a scene with depth, of which a plane may be known."""
+    """Match keypoints of a scene with depth; `plane` is a known homography."""
     if first.matrix is None:
         return first.untrusted().as_two_view_geometry(), None
     sparse = first.points0, first.points1
     dense = match_by_rectification(grays, xy0, sparse, first.matrix, plane=plane)
     if plane is None and (dense is None or len(dense[1]) < enough):
-        # Wide pairs, if what they show is mostly a plane.
+        # Wide pairs can be rectified if they mostly show a plane.
         seen = _fit(*sparse, "homography", grays[1])
         if seen.matrix is not None and seen.trusted:
             plane = _refine_homography(grays, seen.matrix)
             dense = match_by_rectification(grays, xy0, sparse, first.matrix, plane=plane)
     if dense is None or len(dense[1]) < enough:
-        # Too little around the sparse matches is alike, but they are distinct, and agree.
+        # The surroundings of the sparse matches differ, but they are distinctive and agree.
         return _sparsely(grays[0], xy0, first)
     return _trusted(first, *dense, enough)
 
@@ -375,7 +377,7 @@ def _match_depth(
 def _trusted(
     first: InitialGeometry, matrix: np.ndarray, matches: GuidedMatches, least: float
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
-    """Return a geometry with its matches; with fewer than `least` it is not trusted after all."""
+    """Return a geometry with its matches, or an untrusted one if there are fewer than `least`."""
     if len(matches) < max(least, MIN_MATCHES):
         return first.untrusted().as_two_view_geometry(), None
     return replace(first, matrix=matrix).as_two_view_geometry(), matches
@@ -384,7 +386,7 @@ def _trusted(
 def _sparsely(
     gray0: np.ndarray, xy0: np.ndarray, first: InitialGeometry
 ) -> tuple[TwoViewGeometry, GuidedMatches | None]:
-    """Return the sparse matches that move as those around them do, where they are, if enough do."""
+    """Return the sparse matches that move as their neighbours do, if enough of them do."""
     assert first.matrix is not None
     scores = moving_alike(first.points0, first.points1)
     kept = scores >= MIN_MOVING_ALIKE
@@ -401,9 +403,9 @@ def match_by_homography(
 ) -> tuple[GuidedMatches, float]:
     """Match keypoints by a homography, and keep those whose patches are the same.
 
-    Each keypoint of the first image is matched once at most, with the score 1 - `dissimilarity`.
-    Returns the fraction with the same patches, too: of the pairs that the homography proposes, or,
-    where keypoints are few, of all keypoints that the second image shows under it.
+    Each keypoint of the first image is matched at most once, with the score 1 - `dissimilarity`.
+    Also returns the fraction with the same patches: of the pairs that the homography proposes, or,
+    if keypoints are few, of all keypoints that the second image shows under it.
     """
     size1 = grays[1].shape[::-1]
     predicted = transform_points(pixels[0], homography)
@@ -413,7 +415,7 @@ def match_by_homography(
     near = distances < MAX_DISTANCE_PX
     indices0 = np.flatnonzero(shown.all(axis=1))
     proposed = np.flatnonzero(near)
-    # Where keypoints are few it is chance which of them have another there: all are judged.
+    # If keypoints are few, it is chance which of them have a partner: all are verified.
     if len(proposed) >= MIN_PROPOSED_FRACTION * len(indices0):
         indices0 = proposed
     ratios = _compare(grays, pixels[0][indices0], homography, seed)
@@ -427,7 +429,7 @@ def match_by_homography(
 
 
 def _compare(grays: Pair, pixels0: np.ndarray, homography: np.ndarray, seed: int) -> np.ndarray:
-    """Return the `dissimilarity` of keypoints, of large images on smaller copies."""
+    """Return the `dissimilarity` of keypoints; large images are compared on smaller copies."""
     (gray0, scale0), (gray1, scale1) = (
         downscale(gray, round(max(gray.shape) * min(1, np.sqrt(MAX_VERIFIED_PIXELS / gray.size))))
         for gray in grays
@@ -441,7 +443,7 @@ def _compare(grays: Pair, pixels0: np.ndarray, homography: np.ndarray, seed: int
 
 
 def _refine_homography(grays: Pair, homography: np.ndarray) -> np.ndarray:
-    """Refine a homography on the images, scaled down to what that needs; (3, 3)."""
+    """Refine a homography, (3, 3), on scaled copies of the images."""
     scales = _scales_at_centre(homography, grays[0].shape)
     (small0, scale0), (small1, scale1) = (
         downscale(gray, min(MAX_REFINED_SIDE_PX, round(max(gray.shape) * scale)))
@@ -454,7 +456,8 @@ def _refine_homography(grays: Pair, homography: np.ndarray) -> np.ndarray:
 def _scales_at_centre(homography: np.ndarray, shape: tuple[int, ...]) -> tuple[float, float]:
     """Return the scales of both images at which the finer one is as coarse as the other.
 
-    Finer: in every direction, by more than `MAX_SCALE_RATIO`, in the middle of the first image.
+    An image is finer if its scale is larger in every direction, by more than `MAX_SCALE_RATIO`, at
+    the centre of the first image.
     """
     centre = np.array([shape[1] / 2, shape[0] / 2])
     around = transform_points(centre + [[0, 0], [1, 0], [0, 1]], homography)

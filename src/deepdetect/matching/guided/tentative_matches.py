@@ -1,4 +1,4 @@
-"""Tentative matches of a pair: of sparse keypoints by their descriptors, before any geometry."""
+"""Tentative matches of a pair: sparse keypoints, matched by descriptors before any geometry."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from ...geometry.transforms import scaled_points, transfer_errors
 from ...geometry.two_view import GUIDING_THRESHOLDS_PX
 
 Pair = tuple[np.ndarray, np.ndarray]
-"""Something of both images: themselves, (H, W) uint8 luma, or (M, 2) matched positions."""
+"""One array per image: both images, (H, W) uint8 luma, or matched positions, (M, 2) each."""
 
 MAX_SIDE_PX = 1200
-"""Longer sides are scaled down to this: the initial geometry need not be fine."""
+"""Images are reduced to this longer side: the initial geometry need not be fine. Chosen by hand."""
 
 MAX_KEYPOINTS = 4000
-"""Of SIFT in each image."""
+"""Maximum number of keypoints of each image. Chosen by hand."""
 
 MIN_POINTS = 1000
-"""Where both images have at least so many points of all scales (a budget was asked for), these take
-the place of SIFT's keypoints."""
+"""Points of all scales replace SIFT's keypoints if both images have at least this many, because the
+user asked for a number of points. Chosen by hand."""
 
 MAX_RATIOS = (0.85, 0.8)
-"""Of the ratio test, in the order in which they are tried: fewer matches, with fewer wrong ones
-among them, may show what more do not."""
+"""Bounds of the ratio test, tried in this order: the second gives fewer matches, but fewer wrong
+ones, and may show a geometry that the first does not show. Chosen by hand."""
 
 MIN_SEPARATION_PX = 2.0
-"""Matches that begin or end nearer together than this count as one."""
+"""Matches that begin or end nearer together than this count as one. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,11 +45,11 @@ class TentativeMatches:
     """Sparse matches of two images, before any geometry.
 
     Attributes:
-        views: both images as uint8 luma, scaled down where they are large.
-        scales: of the views, at most 1.
+        views: both images as uint8 luma, scaled down if they are large.
+        scales: scales of the views, at most 1.
         features: keypoints of the views, with their descriptors.
         matched: (M, 2) positions in both views.
-        ratios: (M,) of the ratio test.
+        ratios: (M,) ratios of the distances to the best and to the second-best descriptor.
     """
 
     views: tuple[np.ndarray, np.ndarray]
@@ -74,7 +74,7 @@ class TentativeMatches:
         return TentativeMatches(views, scales, features, self.matched[::-1], self.ratios)
 
     def apart_from(self, homography: np.ndarray) -> TentativeMatches:
-        """Return those that do not agree with a homography of the whole images."""
+        """Return the matches that do not agree with a homography between the whole images."""
         errors = transfer_errors(self.points0, self.points1, homography)
         left = errors > GUIDING_THRESHOLDS_PX["homography"] / self.scales[1]
         matched = self.matched[0][left], self.matched[1][left]
@@ -93,10 +93,10 @@ def find_tentative_matches(
 
     Args:
         gray0, gray1: (H, W) uint8 luma.
-        features: keypoints of both images, scaled down where they are large, with their
-            descriptors; None: they are detected.
+        features: keypoints of both images, scaled down if these are large, with descriptors; None
+            detects SIFT's keypoints.
         max_side_px: longer sides are scaled down to this.
-        max_keypoints: that are detected in each image.
+        max_keypoints: maximum number of keypoints that are detected in each image.
 
     Example:
         >>> image = np.random.default_rng(0).integers(0, 256, (99, 99)).astype(np.uint8)
@@ -115,10 +115,10 @@ def find_tentative_matches(
 
 
 def matches_of_points(grays: Pair, points: tuple[Keypoints, Keypoints]) -> TentativeMatches | None:
-    """Match points of all scales, best first, at their own sizes and angles, as sparse keypoints.
+    """Match the best points of all scales, at their own sizes and angles, as sparse keypoints.
 
-    Of two images in unlike light, or of which one is blurred, they give two to five times as many
-    correct matches as SIFT's. None where there are too few, or they have no sizes and angles.
+    If the light of both images differs, or one is blurred, they give two to five times as many
+    correct matches as SIFT's keypoints. None if there are too few, or they have no sizes or angles.
     """
     if min(len(each) for each in points) < MIN_POINTS:
         return None
@@ -135,7 +135,7 @@ def matches_of_points(grays: Pair, points: tuple[Keypoints, Keypoints]) -> Tenta
 
 
 def match_sparse(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, ...]:
-    """Return matched positions in both images, and the ratios of the ratio test."""
+    """Return matched positions in both images, and their ratios from the ratio test."""
     assert first.descriptors is not None
     assert second.descriptors is not None
     match = partial(match_descriptors, matcher=exact_neighbours, ratio=max(MAX_RATIOS), mutual=True)
@@ -149,7 +149,7 @@ def match_sparse(first: Keypoints, second: Keypoints) -> tuple[np.ndarray, ...]:
 def separate(*matches: np.ndarray) -> tuple[np.ndarray, ...]:
     """Keep each place once in each image: one corner in many views is no further evidence.
 
-    The first two arrays are the positions in both images; others are kept like them.
+    The first two arrays are the positions in both images; the other arrays are filtered with them.
     """
     for side in (0, 1):
         cells = np.rint(matches[side] / MIN_SEPARATION_PX)
@@ -160,7 +160,7 @@ def separate(*matches: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def checked_positions(points: Any) -> Pair:
-    """Return sparse matches of another matcher, two (K, 2) arrays of finite numbers, as float64."""
+    """Return another matcher's sparse matches, two (K, 2) arrays of finite numbers, as float64."""
     try:
         points0, points1 = (np.array(each, np.float64) for each in points)
     except (TypeError, ValueError):

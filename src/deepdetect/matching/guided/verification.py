@@ -1,11 +1,11 @@
-"""Whether the patches around matched points are the same, once the geometry is taken out.
+"""Verification of matches: whether both patches look the same once the geometry is removed.
 
-The second image is warped into the frame of the first, and descriptors of two sizes are compared
-by their correlation about the mean descriptor, which all have in common. What unrelated patches
-look like is measured on the pair itself, by null pairs: the warped image, shifted by a third of its
-size and more. A point passes when its descriptors, averaged with those of its neighbours, are more
-similar than nearly all null pairs, and when most points around it pass, too. Only places on a
-lattice are described, those nearest to the points.
+The second image is warped into the frame of the first, and SIFT descriptors of two sizes are
+compared by their correlation, after the mean descriptor, which all have in common, is subtracted.
+Null pairs, from the warped image shifted by a third of its size or more, show how similar unrelated
+patches of this pair are. A point passes if its descriptors, averaged with those of its neighbours,
+are more similar than nearly all null pairs, and if most points around it pass. Only points of a
+lattice are described, those nearest to the keypoints.
 """
 
 from __future__ import annotations
@@ -19,51 +19,52 @@ from ...features.sift import correlation_distance, dense_sift, sift_gradient, to
 from ...geometry.images import gaussian_means, window_sums
 
 DESCRIPTOR_REACH = 36
-"""Pixels that the largest descriptors see, with their gradient and blur. Further from all edges the
-descriptors of a shifted image are those of the image itself, described once for all shifts."""
+"""Radius in pixels of what the largest descriptors see, with gradient and blur. Further from all
+edges a shifted image has the descriptors of the image itself, which are computed once."""
 
 KEYPOINT_SIZES_PX = (3.0, 8.0)
-"""Diameters of the keypoints of the descriptors that are compared."""
+"""Descriptors are compared at these keypoint diameters. Chosen by hand."""
 
 LATTICE_PX = 3
-"""Between the points that are described, along rows and columns."""
+"""Spacing of the described points, in pixels: neighbours have nearly the same descriptors."""
 
 FALSE_POSITIVE_RATE = 0.01
 """Fraction of null pairs (unrelated patches of the two images) that pass. This bound and the sizes
-of the windows were chosen on nine pairs of Oxford, with parts of their second images covered."""
+of the windows were chosen on nine pairs of Oxford with parts of their second images covered."""
 
 SMOOTHING_SIGMA_PX = 2.5
-"""Of the Gaussian mean over neighbouring points."""
+"""Sigma of the Gaussian mean over neighbouring points, in pixels. Chosen by hand."""
 
 WINDOWS_PX = (101, 31)
-"""Sides of the windows around a point in each of which most points must pass. The smaller one, for
-chance matches around what is a small plane, was chosen on six made pairs."""
+"""A point passes if most points in windows of both sides around it do. The smaller one, against
+chance matches around a small plane, was chosen on six synthetic pairs."""
 
 MIN_SUPPORT = 0.5
-"""Fraction of the points in the window that must pass."""
+"""Fraction of the points in a window that must pass: most of them."""
 
 NULL_SHIFTS = ((1 / 2, 0), (0, 1 / 2), (1 / 3, 1 / 3))
-"""Between the patches of a null pair, in shares of width and height."""
+"""Shifts between the patches of a null pair, as fractions of width and height."""
 
 NULL_BLOCK_PX = 64
-"""Side of the blocks of the image that null pairs are taken from."""
+"""Null pairs are taken from blocks of the image with this side. Chosen by hand."""
 
 MAX_NULL_BLOCKS = 256
-"""At most this many for each shift, chosen at random: all of them up to a megapixel."""
+"""Each shift uses up to this many random blocks: all of them up to a megapixel."""
 
 MIN_POINTS_OF_MEAN = 100
-"""With fewer points no mean descriptor is subtracted: it would be close to their own."""
+"""The mean descriptor is subtracted only from this many points on: that of few is close to each."""
 
 MIN_NULL_DISTANCE = 1e-6
-"""Rounding: the distance of equal descriptors is at most this."""
+"""The distance of equal descriptors is at most this, by rounding."""
 
 
 @dataclass(frozen=True, eq=False)
 class NullPairs:
-    """Pairs of points, (N,) `rows`, with unrelated `partners`, (N, 2), by one shift of the image.
+    """Pairs of points, (N,) `rows`, and unrelated `partners`, (N, 2), for one shift of the image.
 
-    `interior` ones see no edge: their descriptors are the same with and without the shift. Of the
-    others the first image's edge cuts both. `shifted` is the second image, shifted cyclically.
+    For `interior` pairs no descriptor reaches an edge, so it is the same with and without the
+    shift. In all other pairs the edge of the first image cuts both patches. `shifted` is the second
+    image, shifted cyclically.
     """
 
     rows: np.ndarray
@@ -77,10 +78,10 @@ def dissimilarity(
 ) -> np.ndarray:
     """Compare the patches around (N, 2) whole pixels of the first image, `gray0`.
 
-    `warped` is the second one in its frame, with content where `valid`. Returns (N,) float32: 1 -
-    correlation, averaged over neighbours, relative to the bound below which the fraction
-    `FALSE_POSITIVE_RATE` of null pairs is. Infinite where there is no content, where most points
-    around are dissimilar, and everywhere when all null pairs look the same.
+    `warped` is the second image in the frame of the first, with content where `valid`. Returns (N,)
+    float32: 1 - correlation, averaged over neighbours, divided by the bound below which the
+    fraction `FALSE_POSITIVE_RATE` of the null pairs lies. Infinite where there is no content, where
+    most points around are dissimilar, and everywhere if all null pairs look the same.
     """
     pixels = np.asarray(pixels).astype(np.int64)
     result = np.full(len(pixels), np.inf, np.float32)
@@ -117,12 +118,12 @@ def sample_null_pairs(
 ) -> list[NullPairs]:
     """Pair points of some blocks with unrelated places of the second image, for each shift.
 
-    Arguments are those of `dissimilarity`; partners lie where the second image has content. Up to
-    a megapixel all blocks are taken, whatever the seed.
+    For the arguments see `dissimilarity`. Partners lie where the second image has content. Up to a
+    megapixel all blocks are taken, whatever the seed.
     """
     size = np.array(warped.shape[::-1])
-    # Shifts by whole steps, also around the edge: most partners lie on the lattice, too, where a
-    # descriptor is one for all shifts.
+    # Shifts are multiples of the step, also across the edge: most partners then lie on the lattice,
+    # where one descriptor serves all shifts.
     step = LATTICE_PX
     period = np.maximum(size // step, 1) * step
     rows_and_columns = [np.arange(length) for length in warped.shape]
@@ -134,7 +135,7 @@ def sample_null_pairs(
             (np.minimum(xy, end - 1 - xy) >= DESCRIPTOR_REACH).all(axis=1)
             for xy, end in ((points[rows], size), (partners, period))
         )
-        # Where only the partner is at an edge: a seam in the shifted image, which no warped has.
+        # If only the partner is near an edge, the shifted image has a seam that `warped` lacks.
         kept = valid[partners[:, 1], partners[:, 0]] & (whole | ~inner)
         y, x = (
             (line - by) % end
@@ -149,7 +150,7 @@ def _distances(
     gray0: np.ndarray, warped: np.ndarray, points: np.ndarray, null_pairs: Sequence[NullPairs]
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """Return 1 - correlation of the points and of the null pairs, summed over the sizes."""
-    # Each place of the second image is described once, however often it is part of a null pair.
+    # Each place of the second image is described once, even if it is in several null pairs.
     used = [points, *(null.partners[null.interior] for null in null_pairs)]
     index = np.full(warped.shape, -1, np.int32)
     for x, y in (each.T for each in used):
@@ -184,7 +185,7 @@ def _distances(
 
 
 def _lattice_near(pixels: np.ndarray, shape: Sequence[int]) -> np.ndarray:
-    """Return the pixels of the lattice that are nearest to some points."""
+    """Return the points of the lattice that are nearest to some pixels."""
     last = (np.array(shape[1::-1]) - 1 - LATTICE_PX // 2) // LATTICE_PX
     index = np.clip(pixels // LATTICE_PX, 0, np.maximum(last, 0))
     used = np.zeros(index.max(axis=0) + 1, bool)
@@ -194,11 +195,11 @@ def _lattice_near(pixels: np.ndarray, shape: Sequence[int]) -> np.ndarray:
 
 
 def _sample_blocks(pixels: np.ndarray, seed: int) -> list[np.ndarray]:
-    """Choose the points of some blocks for each shift: whole blocks, as neighbours are averaged."""
+    """Choose the points of whole blocks for each shift, because neighbours are averaged."""
     block = pixels // NULL_BLOCK_PX
     number = block[:, 1] * 1_000_000 + block[:, 0]
     order = np.random.default_rng(seed).permutation(np.unique(number))
-    # Other blocks for each shift where there are enough, the same ones where there are not.
+    # Each shift gets blocks of its own if there are enough.
     most, shifts = MAX_NULL_BLOCKS, range(len(NULL_SHIFTS))
     chosen = [np.roll(order, -shift * most)[:most] for shift in shifts]
     return [np.flatnonzero(np.isin(number, blocks)) for blocks in chosen]

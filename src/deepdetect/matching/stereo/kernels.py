@@ -1,7 +1,7 @@
 """The compiled parts of stereo matching. Importing them takes numba; the first call compiles.
 
-Kernels named `..._rows` work on the rows `first` to `last - 1` of their arrays. Disparities or the
-pixels of a row are innermost, processed many at once in vector registers, sums in 16 bits.
+Kernels named `..._rows` process the rows `first` to `last - 1` of their arrays. The innermost axis
+is the disparity or the pixel of a row, so that vector registers process many; sums have 16 bits.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import numpy as np
 from ..._shared.kernels import compiled
 
 END = np.uint16(30000)
-"""Cost beyond both ends of a path's disparities: more than any sum, and room to add a step."""
+"""Cost beyond both ends of a path's disparities: above any sum, with room to add a step."""
 
 BLOCK = 128
-"""Pixels of a row that are processed together, so that the sums stay in the nearest cache."""
+"""Number of pixels of a row processed together, so that the sums stay in the L1 cache."""
 
 
 @compiled(nogil=True)
@@ -95,11 +95,11 @@ def cost_rows(first, last, left, right_mirrored, min_disparity, outside, cost): 
 
 @compiled(nogil=True, inline="always")
 def _step(before, least, cost, total, after, p1, p2):  # type: ignore[no-untyped-def]
-    """Go one pixel along a path; return the least cost there.
+    """Advance one pixel along a path, and return the lowest cost there.
 
-    `before` and `after`, (D + 2,) uint16, are the costs of the path with an end each side, `least`
-    is the least before, `cost` (D,) uint8 this pixel's. `total`, the sum over the paths, grows.
-    `p1` and `p2` are the penalties of a disparity one apart and of any other.
+    `before` and `after`, (D + 2,) uint16, are the costs of the path, with one end on each side;
+    `least` is the lowest of `before`, and `cost`, (D,) uint8, are those of this pixel. The path is
+    added to `total`. `p1` and `p2` are the penalties for a disparity that changes by one or more.
     """
     count = cost.shape[0]
     jump = np.uint16(least + p2)
@@ -117,12 +117,12 @@ def _step(before, least, cost, total, after, p1, p2):  # type: ignore[no-untyped
 
 @compiled(nogil=True)
 def sum_along_paths(first, last, gray, cost, total, down, right, p1, p2):  # type: ignore[no-untyped-def]
-    """Add the paths of some rows, or of some columns where they go `down` (1) or up (-1).
+    """Add the costs along paths of some rows, or of some columns if they go `down` (1) or up (-1).
 
-    They go to the `right` (1) or to the left (-1) by a pixel per step. A slanting path that leaves
-    at one side starts again at the other, in its next row: so there are as many paths as columns,
-    and each belongs to one call. `p2` holds the penalty of a larger change of disparity for each
-    change of the grey level.
+    Each step goes one pixel to the `right` (1), to the left (-1), or straight (0). A diagonal path
+    that leaves at one side continues at the other, in its next row: there are as many paths as
+    columns, and each belongs to one call. `p2` is the penalty of a larger change, for each
+    difference of grey levels.
     """
     height, width, count = cost.shape
     paths, steps = last - first, height if down else width
@@ -130,7 +130,7 @@ def sum_along_paths(first, last, gray, cost, total, down, right, p1, p2):  # typ
     lines[:, :, 0] = lines[:, :, count + 1] = END
     leasts = np.zeros(paths, np.uint16)
     tones = np.zeros(paths, np.uint8)
-    for k in range(paths * steps):  # in the order of the memory
+    for k in range(paths * steps):  # in memory order
         if down:
             step, path = k // paths, k % paths
             y = step if down == 1 else height - 1 - step
@@ -153,11 +153,11 @@ def sum_along_paths(first, last, gray, cost, total, down, right, p1, p2):  # typ
 
 @compiled(nogil=True)
 def best_of_rows(first, last, total, min_disparity, count, disparity, consistent, uniqueness_ratio):  # type: ignore[no-untyped-def]
-    """Choose the disparity of least cost for each pixel, in both views.
+    """Choose the disparity of lowest cost for each pixel, in both views.
 
-    `total` is (H, W, D) uint16 from `min_disparity` on, of which the first `count` may be chosen.
-    Written are the fields of `sgm.SGMResult`: the disparity with what a parabola through the least
-    cost and its two neighbours adds, whether both views agree on it within one, and its uniqueness.
+    `total` is (H, W, D) uint16 from `min_disparity` on; the first `count` disparities may be
+    chosen. The outputs are the fields of `sgm.SGMResult`. A parabola through the lowest cost and
+    its two neighbours makes the disparity sub-pixel; views are consistent if they agree within one.
     """
     width = total.shape[1]
     best = np.empty(width, np.int64)
@@ -174,7 +174,7 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
                 inside = min(inside, sums[d])
             for d in range(count):
                 least = min(least, sums[d])
-            # Where both are as good, the place that can be seen.
+            # A match inside is preferred to one outside with the same cost.
             seen = low < high and inside == least
             at = low if seen else 0
             while sums[at] != least:
@@ -208,10 +208,10 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
 
 @compiled(nogil=True, fastmath=True)
 def smooth_rows(first, last, disparity, radius, max_difference, out):  # type: ignore[no-untyped-def]
-    """Write the mean disparity of the same surface around each pixel.
+    """Write the mean disparity over the same surface around each pixel.
 
-    `disparity` is padded by `radius`. Pixels of the window count in pairs, one on each side of its
-    centre, so that the mean of a slanted plane is its disparity there, also beside an edge.
+    `disparity` is padded by `radius`. Pixels of the window count in pairs, one on each side of the
+    centre, so that a slanted plane keeps its disparity, also next to an edge.
     """
     width = out.shape[1]
     total, weight = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
@@ -239,9 +239,9 @@ def smooth_rows(first, last, disparity, radius, max_difference, out):  # type: i
 
 @compiled(nogil=True, fastmath=True)
 def sample_rows(first, last, right, disparity, values, slopes):  # type: ignore[no-untyped-def]
-    """Read the right image at x - disparity by cubic interpolation (Catmull-Rom).
+    """Sample the right image at x - disparity by cubic interpolation (Catmull-Rom).
 
-    All are (H, W) float32; `slopes` is the change of the grey per pixel to the right.
+    All arrays are (H, W) float32; `slopes` is the gradient along the row, in grey levels per pixel.
     """
     width = right.shape[1]
     for y in range(first, last):
@@ -264,11 +264,11 @@ def sample_rows(first, last, right, disparity, values, slopes):  # type: ignore[
 def step_rows(  # type: ignore[no-untyped-def]
     first, last, left, values, slopes, disparity, radius, max_difference, noise, min_gain, out
 ):
-    """Write the disparity after one step of Lucas-Kanade along the row.
+    """Write the disparity after one Lucas-Kanade step along the row.
 
-    In each window the left grey is fitted by gain * (values - change * slopes) + offset, over the
-    pixels of the same surface. Inputs are padded by `radius`. The step shrinks where slopes are no
-    stronger than `noise`; there is none where the right contrast fits with less than `min_gain`.
+    In each window, gain * (values - change * slopes) + offset is fitted to the left grey values,
+    over the pixels of the same surface. Inputs are padded by `radius`. The step is damped where
+    slopes are below `noise`, and zero where the gain is below `min_gain`.
     """
     width = out.shape[1]
     n, p, v, s, vv, ss, vs, pv, ps = np.empty((9, BLOCK), np.float32)
@@ -277,7 +277,7 @@ def step_rows(  # type: ignore[no-untyped-def]
             count = min(BLOCK, width - start)
             row, column = y + radius, start + radius
             here = disparity[row, column : column + count]
-            # Less the greys at the centre: the sums stay small, and exact.
+            # The grey level of the centre is subtracted: sums stay small and exact.
             middle = left[row, column : column + count]
             other = values[row, column : column + count]
             # Sums over the window: pixels, left grey, right grey, slope, and their products.
@@ -321,9 +321,9 @@ def step_rows(  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, inline="always")
 def _line_at(sums, first, last, x):  # type: ignore[no-untyped-def]
-    """Return the value at x of the line through points first to last - 1.
+    """Return the value at x of the line fitted to points first to last - 1.
 
-    Column i of `sums` holds the sums of x, x * x, value and x * value of the points before i.
+    Column i of `sums` holds the sums of x, x * x, value and x * value over the points before i.
     """
     count = np.float64(last - first)
     sx, sxx = sums[0, last] - sums[0, first], sums[1, last] - sums[1, first]
@@ -337,10 +337,11 @@ def _line_at(sums, first, last, x):  # type: ignore[no-untyped-def]
 def extrapolate_rows(  # type: ignore[no-untyped-def]
     first, last, disparity, known, carried, sign, min_support, max_difference, out
 ):
-    """Extrapolate the first known surface to the left, where it is not seen.
+    """Extrapolate the first known surface to the left, where it is not visible.
 
-    `carried` are whole disparities that the surfaces around suggest; the other view shows x at
-    x - sign * disparity, with -1 for mirrored views. `out` is written where it is extrapolated.
+    `carried` holds whole disparities that the surfaces around suggest. The other view shows x at
+    x - sign * disparity, with -1 for mirrored views. `out` is only written where it is
+    extrapolated.
     """
     width = disparity.shape[1]
     sums = np.zeros((4, width + 1), np.float64)
@@ -348,7 +349,7 @@ def extrapolate_rows(  # type: ignore[no-untyped-def]
         start = 0
         while start < width and not known[y, start]:
             start += 1
-        # Of the surface no more is used than twice the distance that it is extrapolated.
+        # At most twice the extrapolated distance of the surface is used.
         wanted = 2 * max(start, min_support)
         support = 0
         before = np.float32(0)
@@ -372,7 +373,7 @@ def extrapolate_rows(  # type: ignore[no-untyped-def]
             predicted = _line_at(sums, reach, 2 * reach, 0.0)
             if abs(predicted - _line_at(sums, 0, reach, 0.0)) > max_difference:
                 break
-            # Half a pixel for the rounding.
+            # `carried` is rounded by up to half a pixel.
             if abs(carried[y, x] - disparity[y, start]) > max_difference + np.float32(0.5):
                 continue
             continued = _line_at(sums, 0, 2 * reach, np.float64(x - start))

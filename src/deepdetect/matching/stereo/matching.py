@@ -1,4 +1,4 @@
-"""Dense disparity maps of rectified pairs: what can be trusted of them, and how gaps are filled.
+"""Dense disparity maps of rectified pairs: which disparities are reliable, and how gaps are filled.
 
 Maps are (H, W): `disparity` float32 in pixels, `known` bool.
 """
@@ -27,36 +27,37 @@ from .sgm import (
 )
 
 MAX_SPECKLE_AREA_PX = 100
-"""Patches of one surface up to this size are not kept."""
+"""Patches of one surface up to this size are dropped. Chosen by hand."""
 
 SPECKLE_SUBDIVISIONS = 4
-"""Parts of a pixel in which OpenCV's speckle filter counts."""
+"""Steps per pixel of the integer disparities for OpenCV's speckle filter. Chosen by hand."""
 
 BORDER_PX = 4
-"""Matches this near to the border of the right image are not kept: windows there give what it just
-does not show the disparity of what it does."""
+"""Matches this near to the border of the right image are dropped: windows there give what lies just
+outside the disparity of what lies inside. Chosen by hand."""
 
 OCCLUDING_EDGE_PX = 1
-"""Outermost pixels of a nearer surface that are left out where occlusions are filled."""
+"""Outermost pixels of a nearer surface that are dropped if occlusions are filled."""
 
 OCCLUSION_SLACK_PX = 8
-"""By which a gap may be wider than the step of disparity explains: the windows on both sides."""
+"""A gap may be this much wider than the disparity step: windows reach over both ends."""
 
 MIN_SUPPORT_PX = 5
-"""Fewest known pixels that a line is fitted to."""
+"""A line is fitted to at least this many known pixels. Chosen by hand."""
 
-# The search for the range of disparities, on a small copy of the pair: the range holds all of the
-# Motorcycle pair and of the Middlebury scenes of the benchmark, without being much wider.
+# The range of disparities is searched on a small copy of the pair. With these values it covers all
+# of the Motorcycle pair and of the Middlebury scenes of the benchmark, and is not much wider.
 SEARCH_WIDTH_PX, SEARCH_MAX_SPECKLE_AREA_PX = 160, 50
 SEARCH_UNIQUENESS_RATIO = 1.3
-"""Least ratio of the cost of any other place on the row: what has no match is rarely so clear."""
+"""Minimum cost of any other match on the row, relative to the best: rarely met by false matches."""
 
 TAIL_FRACTION = 0.01
-"""Of the disparities at each end, which may be wrong."""
+"""This fraction of the disparities at each end may be wrong and is ignored. Chosen by hand."""
 
 SEARCH_MARGIN_PX = 1.5
 SEARCH_MARGIN_FRACTION = 0.2
-"""Of the small copy, and of the range, added at both ends for what is too small to be seen."""
+"""Both ends are extended by these pixels of the small copy, and this fraction of the range, for
+objects too small to be seen there."""
 
 
 @suggest_keywords
@@ -66,17 +67,17 @@ class DisparityOptions:
 
     Attributes:
         disparity_range: smallest and largest disparity in whole pixels; None: found from the pair.
-        uniqueness_ratio: least cost of any other place on the row, over that of the match.
-        discontinuity_margin_px: pixels this near to a disparity discontinuity are left out: the
-            windows that are compared extend so far, and give what lies beside a near object its
-            disparity. Objects up to twice as wide vanish. 0 keeps them.
-        fill_occlusions: give what the right image does not show the disparity of the surface
-            beside it: between two surfaces that of the farther one, if those above and below give
-            the same; where the counterpart lies outside the right image that of the first surface
-            in sight, extrapolated along a line as far as this predicts the surface itself, unless
-            the surfaces above and below suggest another. Such pixels have no match
-            (`DisparityMap.matched`), and the outermost of a nearer surface, which windows give its
-            disparity too often, are left out.
+        uniqueness_ratio: lowest cost of any other match on the row, divided by that of the best
+            one.
+        discontinuity_margin_px: distance from disparity discontinuities, in pixels, within which
+            disparities are dropped: windows reach that far and give what lies beside a near object
+            its disparity. Objects up to twice as wide vanish. 0 keeps them.
+        fill_occlusions: give pixels that the right image does not show the disparity of the surface
+            next to them. Between two surfaces it is that of the farther one, if row and column
+            agree. Outside the right image the first visible surface is extrapolated along a line,
+            as far as the line predicts the surface itself and nothing above or below contradicts.
+            Filled pixels have no match (`DisparityMap.matched`). The outermost pixels of nearer
+            surfaces are dropped, because windows give them the nearer disparity too often.
 
     Raises:
         OptionError: a value is out of its range.
@@ -100,7 +101,7 @@ class DisparityOptions:
 
 
 DENSE = DisparityOptions(uniqueness_ratio=1.0, discontinuity_margin_px=0, fill_occlusions=True)
-"""Many pixels: those near discontinuities too, and what is hidden is filled where that is sure."""
+"""Options for many pixels: discontinuities are kept, occlusions are filled where that is safe."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +109,8 @@ class RectifiedMatches:
     """Keypoints of the left view of a rectified pair with their disparities.
 
     Attributes:
-        indices: (K,) int64 of the keypoints that have a disparity, rising.
-        disparity, matched: (K,) as of `DisparityMap`.
+        indices: (K,) int64, ascending: the keypoints that have a disparity.
+        disparity, matched: (K,) values of the `DisparityMap`.
     """
 
     indices: np.ndarray
@@ -126,11 +127,11 @@ class DisparityMap:
 
     Attributes:
         disparity: (H, W) float32 in pixels: the match of the left (x, y) is the right
-            (x - disparity, y). NaN where there is none that can be trusted.
-        matched: (H, W) bool: seen in both views, so that (x - disparity, y) lies in the right one;
-            False where the disparity is NaN or filled in from the surface beside: hidden in the
-            right view, or outside of it.
-        disparity_range: smallest and largest disparity tried; None where the views do not agree.
+            (x - disparity, y). NaN if no disparity is reliable.
+        matched: (H, W) bool: seen in both views, so that (x - disparity, y) lies in the right one.
+            False if the disparity is NaN, or filled in from a surface next to it: hidden in the
+            right view, or outside it.
+        disparity_range: smallest and largest disparity tried; None if the views do not agree.
     """
 
     disparity: np.ndarray
@@ -143,10 +144,10 @@ class DisparityMap:
         return f"DisparityMap({width}x{height}, {known:.1%} known, {matched:.1%} matched)"
 
     def at(self, keypoints: Keypoints | np.ndarray) -> RectifiedMatches:
-        """Return the disparities of keypoints: the map is only sampled, nothing is matched again.
+        """Return the disparities at keypoints: the map is only sampled, nothing is matched again.
 
         Args:
-            keypoints: of the left view, on whole pixels; or their (N, 2) positions.
+            keypoints: keypoints of the left view, on whole pixels; or their (N, 2) positions.
 
         Raises:
             OptionError: they are not (N, 2), or not on pixels of the left view.
@@ -176,20 +177,19 @@ def disparity_map(
 ) -> DisparityMap:
     """Find the disparity of every pixel of the left view of a rectified pair.
 
-    Census transform and semi-global matching; both views must agree, no other place on the row may
-    be as good, small patches apart from all around are left out, and so is what lies near a
-    disparity discontinuity. Then the disparities are refined to sub-pixel accuracy. The light may
-    differ between the views. No detector takes part: for rectified pairs `reconstruct` takes its
-    points from this map, at the keypoints of the left image.
+    Census transform and semi-global matching. A disparity is kept if both views agree, no other
+    place on the row is as good, and it is neither in a small isolated patch nor near a disparity
+    discontinuity. It is then refined to sub-pixel accuracy. The light may differ between the views.
+    No detector is used; for rectified pairs `reconstruct` samples this map at keypoints.
 
     Args:
         image0, image1: the left and the right image, of the same size, anything `load_image` takes;
             only their luma is used.
         options: what is matched and kept; `DENSE` gives as many pixels as possible.
-        channels: order of the colours in images that are arrays, as of `load_image`.
+        channels: order of the colours in arrays: "rgb", or "bgr" as in OpenCV.
 
     Returns:
-        The disparities, the same for any number of threads.
+        The disparities, which do not depend on the number of threads.
 
     Raises:
         ImageError: the images cannot be read, or differ in size.
@@ -214,7 +214,7 @@ def compute_disparity(
     """Compute the `disparity_map` of (H, W) uint8 luma."""
     if left.shape != right.shape:
         sizes = " and ".join(f"{view.shape[1]}x{view.shape[0]}" for view in (left, right))
-        raise ImageError(f"the views of a rectified pair must have one size, not {sizes}")
+        raise ImageError(f"the images of a rectified pair must have the same size, not {sizes}")
     disparities = options.disparity_range or find_disparity_range(left, right)
     if disparities is None:
         nowhere = np.zeros(left.shape, bool)
@@ -248,7 +248,7 @@ def compute_disparity(
 
 
 def _leads_inside(disparity: np.ndarray, margin_px: float) -> np.ndarray:
-    """Return where disparities lead to a column of the right image, less a margin; (H, W) bool."""
+    """Return where disparities lead inside the right image, minus a margin; (H, W) bool."""
     width = disparity.shape[1]
     place = np.arange(width, dtype=np.float32) - disparity
     return (place >= margin_px - 0.5) & (place <= width - 0.5 - margin_px)
@@ -257,8 +257,8 @@ def _leads_inside(disparity: np.ndarray, margin_px: float) -> np.ndarray:
 def find_disparity_range(left: np.ndarray, right: np.ndarray) -> DisparityRange | None:
     """Find the disparities of a rectified pair, of both signs and up to half its width.
 
-    A small copy is matched over all of them; what both views agree on, in patches of some size,
-    gives the range. None where they agree on nothing.
+    A small copy is matched over all of them. The range is that of patches where both views agree,
+    or None.
     """
     height, width = left.shape
     scale = max(width / SEARCH_WIDTH_PX, 1.0)
@@ -288,9 +288,9 @@ def range_with_margin(
 
 
 def filter_speckles(disparity: np.ndarray, known: np.ndarray, max_area_px: int) -> np.ndarray:
-    """Return the known pixels without patches of at most so many pixels: most of these are wrong.
+    """Return the known pixels without patches of at most `max_area_px`, which are mostly wrong.
 
-    A patch is connected by steps of at most twice `MAX_DIFFERENCE_PX`.
+    Neighbours in a patch differ by at most twice `MAX_DIFFERENCE_PX`.
     """
     invalid = np.iinfo(np.int16).min
     steps = np.where(known, np.rint(disparity * SPECKLE_SUBDIVISIONS), invalid).astype(np.int16)
@@ -302,8 +302,8 @@ def filter_speckles(disparity: np.ndarray, known: np.ndarray, max_area_px: int) 
 def near_discontinuity(disparity: np.ndarray, known: np.ndarray, distance_px: int) -> np.ndarray:
     """Find the pixels this near to a disparity discontinuity, along rows, columns or both.
 
-    The window of a match there sees both surfaces, and gives a pixel beside the nearer one its
-    disparity. Where nothing is known, the farther of both sides is assumed to continue.
+    A window there sees both surfaces, and gives pixels next to the nearer one its disparity. Where
+    nothing is known, the farther of both sides is assumed to continue.
     """
     filled = fill_occlusions(disparity, known)[0]
     beside = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
@@ -313,10 +313,10 @@ def near_discontinuity(disparity: np.ndarray, known: np.ndarray, distance_px: in
 
 
 def on_occluding_edge(disparity: np.ndarray, known: np.ndarray, distance_px: int) -> np.ndarray:
-    """Find the outermost known pixels of surfaces in front of others, as wide as `distance_px`.
+    """Find the outermost known pixels of surfaces in front of others, `distance_px` wide.
 
-    The windows of the match give the nearer disparity also to what lies just beside it, so these
-    are the least sure. Where nothing is known, the farther of both sides is assumed to continue.
+    Windows also give the nearer disparity to pixels just outside the surface, so these are the
+    least reliable. Where nothing is known, the farther of both sides is assumed to continue.
     """
     filled = fill_occlusions(disparity, known)[0]
     farthest = cv2.erode(filled, _square(distance_px))
@@ -330,9 +330,9 @@ def _square(radius_px: int) -> np.ndarray:
 def fill_occlusions(disparity: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Fill unknown pixels with the farther of the nearest known ones on both sides of their row.
 
-    What the right view does not see lies behind what occludes it. The disparity is 0 in rows where
-    nothing is known. The second array is true where both sides are known and the gap is no wider
-    than what the nearer surface can occlude.
+    What the right view does not show lies behind the surface that occludes it. The disparity is 0
+    in rows where nothing is known. The second array is true if both sides are known and the gap is
+    no wider than the nearer surface can occlude.
     """
     width = disparity.shape[1]
     column = np.arange(width)
@@ -354,10 +354,10 @@ def extrapolate_disparity(
 ) -> np.ndarray:
     """Extrapolate the first and the last known surface of each row to the border; else NaN.
 
-    Only to pixels whose place would lie outside the right image, as a surface in sight has matches
-    of its own; and only where `carried`, what semi-global matching chooses there, suggests it, too.
-    It follows a line, as far as that can be trusted: at a distance of n pixels the line through the
-    n known pixels from the nth on must predict those before, to `MAX_DIFFERENCE_PX`.
+    Only pixels whose match would lie outside the right image are extrapolated, because visible
+    surfaces have matches of their own, and only where `carried`, the choice of semi-global
+    matching, agrees. The line is trusted n pixels beyond the known ones if the line through the n
+    known pixels from the nth on predicts those before to within `MAX_DIFFERENCE_PX`.
     """
     from .kernels import extrapolate_rows
 

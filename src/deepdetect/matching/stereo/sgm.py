@@ -1,9 +1,9 @@
-"""Semi-global matching, and the refinement of its disparities to sub-pixels.
+"""Semi-global matching, and sub-pixel refinement of its disparities.
 
 Hirschmüller, "Stereo processing by semi-global matching and mutual information" (PAMI 2008), with
-census transforms (Zabih and Woodfill, ECCV 1994), which the light does not change. The parabola
-through the costs of three disparities pulls towards whole pixels, so it only starts a fit of the
-grey values along the row (Lucas and Kanade, 1981): `benchmarks/row_matching.py` measures both.
+census transforms (Zabih and Woodfill, ECCV 1994), which are invariant to the light. A parabola
+through the costs of three disparities is biased towards whole pixels. So it only starts a fit of
+the grey values along the row (Lucas and Kanade, 1981); `benchmarks/row_matching.py` measures both.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from ..._shared.opencv import cv2
 
 CENSUS_RADIUS_X = 4
 CENSUS_RADIUS_Y = 3
-"""The census window is 9 x 7 pixels: 62 comparisons, which fit a 64-bit word."""
+"""The census window has 9 x 7 pixels: 62 comparisons, which fit into a 64-bit word."""
 
 CENSUS_BITS = (2 * CENSUS_RADIUS_X + 1) * (2 * CENSUS_RADIUS_Y + 1) - 1
 
 WRONG_PLACE_BITS = CENSUS_BITS // 2
-"""Distance of a wrong place on average: half of the comparisons differ."""
+"""Average distance of a wrong match: half of the comparisons differ."""
 
 COST_PER_BIT = 9 / 4
-"""Costs are sums over 3 x 3 pixels, divided by four to fit a byte."""
+"""A cost is the sum over 3 x 3 pixels, divided by four to fit into a byte."""
 
 LANES = 16
 """The number of disparities is rounded up to a multiple of this, for vector registers."""
@@ -35,49 +35,50 @@ VOLUME_BYTES = 400_000_000
 """Larger cost volumes are processed in bands of rows, one after the other."""
 
 SAMPLED_ROW_STEP = 48
-"""One row of so many says how distant matches are."""
+"""One row in this many is sampled for the typical distance of matches. Chosen by hand."""
 
 BAND_OVERLAP_PX = 32
-"""Rows above and below a band from which paths enter it."""
+"""Paths enter a band from this many rows above and below it. Chosen by hand."""
 
-# The penalties are the best of a few tried on the Motorcycle pair; noisy images of full size would
-# take larger ones.
+# The penalties are the best of a few that were tried on the Motorcycle pair; noisy images of full
+# size would need larger ones.
 P1_BITS = 20
-"""Penalty of a disparity that changes by one pixel along a path, in census bits per pixel."""
+"""Penalty for a disparity that changes by one pixel along a path, in census bits per pixel."""
 
 P2_BITS = 100
-"""Penalty of a larger change, where the grey level does not change."""
+"""Penalty for a larger change where the grey level is constant, in the same unit."""
 
 P2_HALF_GRADIENT_LEVELS = 8
-"""Change of the grey level that halves P2."""
+"""Difference of grey levels at which P2 is halved."""
 
 MIN_P2_BITS = 1.25 * P1_BITS
 
 OUTSIDE_COST = 0.6
-"""Cost of a place outside the right image: 0 is that of the pair's matches (their median), 1 that
-of a wrong place. Between them a surface that leaves the image is carried on by its neighbours; with
-less, more of what is seen at the border is lost where views are noisy."""
+"""Cost of a match outside the right image, between 0, the median of the pair's matches, and 1, a
+wrong place. Between them a surface that leaves the image is continued from its neighbours; with
+less, more of what is seen at the border is lost in noisy views."""
 
 MAX_DIFFERENCE_PX = 1.0
-"""A disparity that differs by more from its neighbour's belongs to another surface."""
+"""Neighbouring disparities that differ by more are on different surfaces. Chosen by hand."""
 
 WINDOW_RADIUS_PX = 2
-"""Windows of 5 pixels a side are fitted."""
+"""Radius of the fitted windows. Chosen on the Motorcycle pair, as the next five values."""
 
 SMOOTHING_RADIUS_PX = 4
-"""Of the mean of the same surface before each iteration: it undoes most of the parabola's pull."""
+"""Radius of the mean over one surface before each iteration, against the parabola's bias."""
 
 FINAL_SMOOTHING_RADIUS_PX = 2
-"""Of the mean taken at the end."""
+"""Radius of the mean over one surface at the end."""
 
 ITERATIONS = 2
-"""Of the fit."""
+"""Number of iterations of the fit."""
 
 NOISE_LEVELS = 2.0
-"""Grey levels; where the image has no stronger gradients the smoothed surface stays."""
+"""Gradients below this are noise, in grey levels per pixel: the smoothed surface is then kept."""
 
 MIN_GAIN = 0.2
-"""Least contrast of the right view over the left: below, it shows something else: no refinement."""
+"""Minimum contrast of the right view relative to the left. Below it the right view shows something
+else, and the disparity is not refined."""
 
 UNKNOWN = np.float32(1e9)
 """An unknown disparity, so far from any other that it is never on the same surface."""
@@ -90,10 +91,10 @@ searched from the right x - largest to x - smallest."""
 
 
 class SGMResult(NamedTuple):
-    """Raw disparities of the left view, (H, W) each: float32 in pixels, and how sure they are.
+    """Raw disparities of the left view, (H, W) each: float32 in pixels, and how certain they are.
 
-    `consistent`: it leads inside the right image, and both views agree on it within a pixel.
-    `uniqueness_ratio`: the least cost elsewhere inside over the cost of this place; 1 outside.
+    `consistent`: the match lies inside the right image, and both views agree on it within a pixel.
+    `uniqueness_ratio`: lowest cost of any other match inside over that of this match; 1 outside.
     """
 
     disparity: np.ndarray
@@ -106,7 +107,7 @@ def semi_global_matching(
 ) -> SGMResult:
     """Match every pixel of the left view, (H, W) uint8 luma, along its row.
 
-    The disparities are sub-pixel by a parabola, and still cluster around whole pixels.
+    A parabola makes the disparities sub-pixel, but they still cluster around whole pixels.
     """
     height, width = left.shape
     count = -(-(disparities[1] - disparities[0] + 1) // LANES) * LANES
@@ -128,7 +129,7 @@ def semi_global_matching(
 
 
 def _least_costs(total: np.ndarray, disparities: DisparityRange) -> SGMResult:
-    """Choose the disparities of the least (H, W, D) uint16 sums of costs."""
+    """Choose the disparities of lowest cost from the sums of costs, (H, W, D) uint16."""
     from .kernels import best_of_rows
 
     disparity, ratio = np.empty((2, *total.shape[:2]), np.float32)
@@ -152,37 +153,37 @@ def census(gray: np.ndarray) -> np.ndarray:
 def matching_cost(
     censuses: Pair, min_disparity: int, count: int, outside: int = WRONG_PLACE_BITS
 ) -> np.ndarray:
-    """Return the cost of so many disparities of each pixel of two censuses, (H, W, count) uint8.
+    """Return the costs of `count` disparities for each pixel of two censuses, (H, W, count) uint8.
 
-    A quarter of the sum over 3 x 3 pixels; `outside` is the distance to places off the right view.
+    A cost is a quarter of the sum over 3 x 3 pixels; `outside` is the distance of matches outside.
     """
     from .kernels import cost_rows
 
     left, right = censuses
     cost = np.empty((*left.shape, count), np.uint8)
-    # Mirrored, growing disparities lie at growing addresses.
+    # In the mirrored view, larger disparities are at higher addresses.
     mirrored = np.ascontiguousarray(right[:, ::-1])
     parallel_for(len(left), cost_rows, left, mirrored, min_disparity, np.uint8(outside), cost)
     return cost
 
 
 def is_textured(gray: np.ndarray) -> np.ndarray:
-    """Return the pixels whose census window holds more than one grey level; (H, W) bool.
+    """Return the pixels whose census window has more than one grey level; (H, W) bool.
 
-    Others have nothing to be matched by: they are saturated, black, or drawn.
+    All other pixels, which are saturated, black or drawn, cannot be matched.
     """
     window = np.ones((2 * CENSUS_RADIUS_Y + 1, 2 * CENSUS_RADIUS_X + 1), np.uint8)
     return cv2.dilate(gray, window) > cv2.erode(gray, window)
 
 
 def match_distance(censuses: Pair, disparities: DisparityRange) -> float:
-    """Return the median distance in bits of a pair's matches, from the censuses of some rows.
+    """Return the median distance of a pair's matches in bits, from the censuses of some rows.
 
-    Matches are what both views find nearest without any path. Noise makes them more distant.
+    A match is what both views find nearest without any path. Noise increases its distance.
     """
     height = len(censuses[0])
     centres = np.arange(min(SAMPLED_ROW_STEP // 2, height // 2), height, SAMPLED_ROW_STEP)
-    # Costs are sums over three rows. Places outside are the most distant.
+    # Costs are sums over three rows. Matches outside get the largest distance.
     rows = np.clip(centres[:, None] + [-1, 0, 1], 0, height - 1).ravel()
     tried = disparities[0], disparities[1] - disparities[0] + 1
     sampled = censuses[0][rows], censuses[1][rows]
@@ -195,7 +196,7 @@ def match_distance(censuses: Pair, disparities: DisparityRange) -> float:
 
 
 def aggregate(gray: np.ndarray, cost: np.ndarray) -> np.ndarray:
-    """Return (H, W, D) uint8 costs summed over the eight paths, uint16."""
+    """Sum (H, W, D) uint8 costs over the eight paths; uint16."""
     from .kernels import sum_along_paths
 
     height, width = gray.shape
@@ -212,9 +213,9 @@ def aggregate(gray: np.ndarray, cost: np.ndarray) -> np.ndarray:
 def refine_disparity(
     left: np.ndarray, right: np.ndarray, disparity: np.ndarray, known: np.ndarray
 ) -> np.ndarray:
-    """Refine disparities that are accurate to a pixel, where they are known, to sub-pixels.
+    """Refine disparities that are accurate to a pixel to sub-pixel accuracy where they are known.
 
-    The views are (H, W) uint8 luma; `disparity` is (H, W) float32, unchanged where not known.
+    The views are (H, W) uint8 luma; `disparity` is (H, W) float32 and unchanged where unknown.
     """
     from .kernels import sample_rows, step_rows
 
@@ -238,7 +239,7 @@ def refine_disparity(
 
 
 def _smoothed(disparity: np.ndarray, known: np.ndarray, radius: int) -> np.ndarray:
-    """Return the mean disparity of the same surface around each known pixel, 0 elsewhere."""
+    """Return the mean disparity over the same surface around each known pixel, 0 elsewhere."""
     from .kernels import smooth_rows
 
     out = np.empty_like(disparity)
@@ -248,7 +249,7 @@ def _smoothed(disparity: np.ndarray, known: np.ndarray, radius: int) -> np.ndarr
 
 
 def _padded(values: np.ndarray, radius: int, known: np.ndarray | None = None) -> np.ndarray:
-    """Pad an image; disparities that are not known are marked, those of the border too."""
+    """Pad an image; unknown disparities and those of the border become `UNKNOWN`."""
     border = 0.0
     if known is not None:
         border, values = float(UNKNOWN), np.where(known, values, UNKNOWN)

@@ -15,10 +15,11 @@ from ..._shared.errors import OptionError, RegistrationError
 from ..._shared.machine import require_memory
 from ..._shared.opencv import cv2
 from ...geometry.camera import Camera
-from ...geometry.images import downscale
+from ...geometry.images import antialiased
 from ...geometry.transforms import (
     outer_corners,
     scaled_homography,
+    scaling_matrix,
     transform_points,
     translation_matrix,
 )
@@ -32,7 +33,11 @@ MAX_DEPTH_RATIO = 5.0
 another: near the horizon an image is stretched without bound."""
 
 MIN_WARP_SCALE = 0.67
-"""An image that the canvas shows smaller than this is downscaled first, against aliasing."""
+"""An image that the canvas shows smaller than this is blurred first, against aliasing."""
+
+MIN_SHOWN_PX = 16
+"""Images shown still smaller are blurred as if their longer side had this many pixels: wider blurs
+take minutes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,13 +136,11 @@ def plan_plane(
         middle = np.array([(rgb.shape[1] - 1) / 2, (rgb.shape[0] - 1) / 2])
         around = transform_points(middle + [[0, 0], [1, 0], [0, 1]], homography)
         shown = float(np.sqrt(abs(np.linalg.det(around[1:] - around[0]))))
-        rgb, smaller = _downscaled(rgb, shown)
-        if smaller < 1:
-            homography = scaled_homography(homography, smaller, 1)
         homography = translation_matrix(-left, -top) @ homography
         size = (right - left, bottom - top)
+        smooth = _smooth(rgb, shown)
         drawn = cv2.warpPerspective(
-            rgb, homography, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
+            smooth, homography, size, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT
         )
         whole = np.full(rgb.shape[:2], 255, np.uint8)
         mask = cv2.warpPerspective(whole, homography, size, flags=cv2.INTER_NEAREST)
@@ -157,8 +160,8 @@ def plan_curved(
     turn = round(2 * np.pi * cameras[reference].focal_px * scale)
     angles = {n: float(np.arctan2(*one.rotation[[0, 2], 2])) for n, one in cameras.items()}
 
-    def warp(number: int, start: float, canvas_scale: float) -> tuple[Any, Any, int]:
-        """Return a warper, its arguments, and the column that is 0 for it.
+    def aimed(number: int, start: float, canvas_scale: float, image_scale: float) -> Any:
+        """Return a warper, the matrices of its camera, and the column that is 0 for it.
 
         It draws each image ahead, where it is in one piece.
         """
@@ -166,15 +169,15 @@ def plan_curved(
         middle = round((angles[number] - start) % (2 * np.pi) * radius)
         ahead = cv2.Rodrigues(np.array([0, -middle / radius - start, 0]))[0]
         camera = cameras[number]
-        matrices = Camera(sizes[number], camera.focal_px).matrix, ahead @ camera.rotation
-        arguments = sizes[number], *(matrix.astype(np.float32) for matrix in matrices)
-        return cv2.PyRotationWarper(projection, radius), arguments, middle
+        matrix = scaling_matrix(image_scale) @ Camera(sizes[number], camera.focal_px).matrix
+        matrices = [one.astype(np.float32) for one in (matrix, ahead @ camera.rotation)]
+        return cv2.PyRotationWarper(projection, radius), matrices, middle
 
     def find_boxes(start: float) -> dict[int, Box]:
         boxes = {}
         for number in cameras:
-            warper, arguments, middle = warp(number, start, 1)
-            left, top, width, height = warper.warpRoi(*arguments)
+            warper, camera, middle = aimed(number, start, 1, 1)
+            left, top, width, height = warper.warpRoi(sizes[number], *camera)
             boxes[number] = (left + middle, top, left + middle + width, top + height)
         return boxes
 
@@ -201,25 +204,18 @@ def plan_curved(
 
     def draw(place: int, rgb: np.ndarray, image_scale: float, canvas_scale: float) -> WarpedImage:
         number = image_of(place)
-        warper, arguments, middle = warp(number, start, canvas_scale)
-        (left, up, _, _), *maps = warper.buildMaps(*arguments)
+        shown = turn * canvas_scale / (2 * np.pi * cameras[number].focal_px * image_scale)
+        smooth = _smooth(rgb, shown)
+        warper, camera, middle = aimed(number, start, canvas_scale, image_scale)
+        (left, up, _, _), *maps = warper.buildMaps(rgb.shape[1::-1], *camera)
+        drawn = cv2.remap(smooth, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        mask = cv2.remap(np.full(rgb.shape[:2], 255, np.uint8), *maps, cv2.INTER_NEAREST)
         left += middle
         if closed:
             around = round(turn * canvas_scale)
             left += 0 if place == number else around if left < 0 else -around
-            first, last = max(-left, 0), min(around - left, maps[0].shape[1])
-            maps = [np.ascontiguousarray(one[:, first:last]) for one in maps]
-            left += first
-        size = sizes[number]
-        inside = [(one > -0.5) & (one < side - 0.5) for one, side in zip(maps, size, strict=True)]
-        radius = turn * canvas_scale / (2 * np.pi)
-        rgb, smaller = _downscaled(rgb, radius / (cameras[number].focal_px * image_scale))
-        for one in maps:  # to pixels of the image that is drawn
-            one += np.float32(0.5)
-            one *= np.float32(image_scale * smaller)
-            one -= np.float32(0.5)
-        drawn = cv2.remap(rgb, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-        mask = np.logical_and(*inside).astype(np.uint8) * np.uint8(255)
+            part = slice(max(-left, 0), min(around - left, mask.shape[1]))
+            drawn, mask, left = drawn[:, part], mask[:, part], left + part.start
         corner = left - round(origin * canvas_scale), up - round(top * canvas_scale)
         return WarpedImage(drawn, mask, corner)
 
@@ -231,11 +227,11 @@ def image_of(place: int) -> int:
     return max(place, ~place)
 
 
-def _downscaled(rgb: np.ndarray, shown: float) -> tuple[np.ndarray, float]:
-    """Make an image smaller that is shown much smaller; return its scale, too."""
+def _smooth(rgb: np.ndarray, shown: float) -> np.ndarray:
+    """Blur an image that is shown much smaller."""
     if shown >= MIN_WARP_SCALE:
-        return rgb, 1.0
-    return downscale(rgb, max(16, int(np.ceil(shown * max(rgb.shape[:2])))))
+        return rgb
+    return antialiased(rgb, max(shown, MIN_SHOWN_PX / max(rgb.shape)))
 
 
 def _depths(size: tuple[int, int], homography: np.ndarray) -> np.ndarray:

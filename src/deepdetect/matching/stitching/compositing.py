@@ -50,23 +50,24 @@ def composite(
     width, height = canvas.size
     scale = min(1.0, float(np.sqrt(SEAM_MEGAPIXELS * 1e6 / (width * height))))
     low = {place: canvas.draw(place, *small[image_of(place)], scale) for place in canvas.boxes}
+    low = {place: one for place, one in low.items() if one.mask.size}  # rests are too narrow there
     gains = _gains(low)
     seams = _seams(low, gains)
     parallax = {pair: px / scale for pair, px in _parallax(low, gains, seams).items()}
     blender = _Blender(width, height)
     kind: type = np.uint8
-    for place, box in canvas.boxes.items():
+    for place in low:
         number = image_of(place)
         drawn = canvas.draw(place, load(number), 1.0, 1.0)
-        mask = drawn.mask & _upscale_mask(seams[place], low[place].corner, scale, box)
+        mask = drawn.mask & _upscale_mask(seams[place], drawn.mask.shape)
         kind = np.uint16 if drawn.image.dtype == np.uint16 else kind
         top = np.iinfo(drawn.image.dtype).max
-        blender.feed(drawn.image, gains[number] / top, mask, box[:2])
+        blender.feed(drawn.image, gains[number] / top, mask, drawn.corner)
     del drawn, mask
-    blended, valid = blender.blend()
-    panorama: np.ndarray = np.empty(blended.shape, kind)
-    for row, values in zip(panorama, blended, strict=True):  # of all at once the copies are large
-        row[:] = np.rint(values.clip(0, 1) * np.iinfo(kind).max)
+    valid = blender.weights[0][:height, :width] > 0
+    blended = blender.blend()[:height, :width]
+    depth = cv2.CV_16U if kind is np.uint16 else cv2.CV_8U
+    panorama = cv2.multiply(blended, (float(np.iinfo(kind).max),) * 4, dtype=depth)
     panorama[~valid] = 0
     return panorama, valid, gains, parallax
 
@@ -80,14 +81,12 @@ class _Blender:
         shapes = [(sides[0] >> k, sides[1] >> k) for k in range(NUM_BANDS + 1)]
         self.sums = [np.zeros((*shape, 3), np.float32) for shape in shapes]
         self.weights = [np.zeros(shape, np.float32) for shape in shapes]
-        self.valid = np.zeros((height, width), bool)
 
     def feed(
         self, image: np.ndarray, factor: float, mask: np.ndarray, corner: tuple[int, int]
     ) -> None:
         """Add an image, times a factor, where its mask is 255."""
         (height, width), (x, y), step = mask.shape, corner, 1 << NUM_BANDS
-        self.valid[y : y + height, x : x + width] |= mask > 0
         # To whole pixels of the coarsest band, and as far as the mask is spread there.
         rows, columns = self.weights[0].shape
         top, left = (max(0, (start // step - 2) * step) for start in (y, x))
@@ -109,8 +108,8 @@ class _Blender:
             weights[part] += weight
             band, weight = coarse, cv2.pyrDown(weight)
 
-    def blend(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the (H, W, 3) float32 image, and where there is one; the sums are used up."""
+    def blend(self) -> np.ndarray:
+        """Return a float32 image, of whole pixels of the coarsest band; the sums are used up."""
         image: np.ndarray | None = None
         while self.sums:
             band, weight = self.sums.pop(), self.weights.pop()
@@ -119,8 +118,7 @@ class _Blender:
                 band += cv2.pyrUp(image, dstsize=band.shape[1::-1])
             image = band
         assert image is not None
-        height, width = self.valid.shape
-        return image[:height, :width], self.valid
+        return image
 
 
 def _gains(low: Mapping[int, WarpedImage]) -> dict[int, float]:
@@ -176,17 +174,15 @@ def _parallax(
     found: dict[tuple[int, int], float] = {}
     for places in combinations(low, 2):
         parts = _overlap(*(low[place] for place in places))
+        if min(low[places[0]].mask[parts[0]].shape) < MIN_FLOW_PX:
+            continue
         seam = np.uint8(255)
         grays = []
         for place, part in zip(places, parts, strict=True):
-            if not low[place].mask[part].size:
-                break
             seam = seam & cv2.dilate(seams[place][part], np.ones((5, 5), np.uint8))
             seam = seam & cv2.erode(low[place].mask[part], np.ones((9, 9), np.uint8))
             gray = cv2.cvtColor(low[place].image[part], cv2.COLOR_RGB2GRAY)
             grays.append(cv2.convertScaleAbs(gray, alpha=gains[image_of(place)]))
-        if len(grays) < 2 or min(grays[0].shape) < MIN_FLOW_PX:
-            continue
         forward, backward = flow.calc(*grays, None), flow.calc(*grays[::-1], None)
         y, x = np.indices(grays[0].shape, np.float32)
         ends = forward + np.dstack([x, y])
@@ -213,19 +209,10 @@ def _seams(low: Mapping[int, WarpedImage], gains: Mapping[int, float]) -> dict[i
     }
 
 
-def _upscale_mask(seam: np.ndarray, corner: tuple[int, int], scale: float, box: Box) -> np.ndarray:
-    """Return a mask of the small canvas in a box of the canvas, with a margin: no gaps."""
-    wide = cv2.dilate(seam, np.ones((3, 3), np.uint8))
-    left, top, right, bottom = box
-    shift = 0.5 * scale - 0.5
-    x, y = scale * left + shift - corner[0], scale * top + shift - corner[1]
-    large = cv2.warpAffine(
-        wide,
-        np.array([[scale, 0, x], [0, scale, y]]),
-        (right - left, bottom - top),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+def _upscale_mask(seam: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a mask of the small canvas in the shape of the large one, with a margin: no gaps."""
+    wide = cv2.dilate(seam, np.ones((5, 5), np.uint8))
+    large = cv2.resize(wide, shape[::-1], interpolation=cv2.INTER_LINEAR)
     return np.where(large > 127, np.uint8(255), np.uint8(0))
 
 

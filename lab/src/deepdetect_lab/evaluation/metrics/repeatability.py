@@ -12,8 +12,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from scipy.spatial import KDTree
 
-from deepdetect._shared.errors import require_packages
 from deepdetect.geometry.transforms import transform_points
 
 from .homography import Sizes, project_visible
@@ -86,9 +86,6 @@ def _in_overlap(
 
 
 def _kd_tree(points: np.ndarray) -> Any:
-    require_packages("repeatability", "scipy")
-    from scipy.spatial import KDTree
-
     return KDTree(np.asarray(points, np.float64).reshape(-1, 2))
 
 

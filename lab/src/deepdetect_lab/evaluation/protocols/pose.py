@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,13 +29,11 @@ from ..metrics.pose import (
 from ..options import BenchmarkOptions, without_repeats
 from ..report import (
     Columns,
-    Figure,
     Row,
     Rows,
     Section,
     Table,
     average,
-    line_chart,
     median,
     tabulate,
     where,
@@ -56,9 +53,6 @@ BUDGET = 8192
 RATIO = 0.8
 GOOD_DEG = 5.0
 """Under which a pose counts as right where methods are compared pair by pair."""
-
-CURVE_DEG = tuple(0.5 * step for step in range(41))
-"""Errors at which the figure is drawn."""
 
 STRAIGHT_AHEAD = "no matches: straight ahead"
 
@@ -120,20 +114,8 @@ def pose(run: Run, options: BenchmarkOptions) -> list[Section]:
         return row | pose_row(run, method, pair)
 
     rows = run.rows("pose of ", methods, items, measure)
-    sequences = [scene for scene in scenes if scene.pairs[0].frame_distance is not None]
-    tables = [
-        scene_table(scenes, methods, rows),
-        *(distance_table(scene, methods, rows) for scene in sequences),
-        pair_table(list(items), methods, rows),
-    ]
-    figures = []
-    for scene in scenes:
-        own = where(rows, scene=scene.name)
-        errors = {m.title: [r[ERROR] for r in where(own, method=m.name)] for m in methods}
-        title = f"Relative poses in {scene.name}: fraction of the pairs up to each error"
-        png = error_chart(errors, CURVE_DEG, "pose error up to, °")
-        figures.append(Figure(f"pose_{file_name(scene.name)}", title, png))
-    return [Section("Relative poses", TEXT, tables, figures)]
+    tables = [scene_table(scenes, methods, rows), pair_table(list(items), methods, rows)]
+    return [Section("Relative poses", TEXT, tables)]
 
 
 def pose_methods(run: Run, options: BenchmarkOptions) -> list[PoseMethod]:
@@ -306,15 +288,6 @@ def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], row
     return tabulate("pose", "Relative poses", methods, rows, columns, note, groups)
 
 
-def distance_table(scene: PosedScene, methods: Sequence[PoseMethod], rows: Rows) -> Table:
-    """Tabulate each method at each frame distance of a sequence."""
-    distances = sorted({pair.frame_distance or 0 for pair in scene.pairs})
-    title = f"Relative poses in {scene.name}, by frame distance"
-    key = f"pose_{file_name(scene.name)}_distances"
-    groups = [{DISTANCE: distance} for distance in distances]
-    return tabulate(key, title, methods, where(rows, scene=scene.name), SUMMARY, NOTE, groups)
-
-
 PAIR_COLUMNS = {
     "pair": "",
     "method": "",
@@ -340,20 +313,3 @@ def pair_table(items: Sequence[str], methods: Sequence[PoseMethod], rows: Rows) 
     ]
     title = "Relative poses, all pairs"
     return Table("pose_pairs", title, PAIR_COLUMNS, lines, NOTE, in_text=False)
-
-
-def error_chart(
-    errors: Mapping[str, Sequence[float]], limits: Sequence[float], x_label: str
-) -> bytes:
-    """Draw the fraction of the pairs up to each error, of each method that has any."""
-    lines = {
-        title: (limits, [float((np.array(own) <= limit).mean()) for limit in limits])
-        for title, own in errors.items()
-        if len(own)
-    }
-    return line_chart(lines, x_label, "fraction of the pairs")
-
-
-def file_name(scene: str) -> str:
-    """Return the name of a scene as a part of a file's name."""
-    return re.sub(r"\W+", "_", scene)

@@ -36,18 +36,14 @@ from ..metrics.homography import area_under_curve
 from ..metrics.pose import camera_errors, relative_pose_errors
 from ..options import BenchmarkOptions
 from ..profiling import peak_memory, run_in_child
-from ..report import Figure, Row, Rows, Section, Table, where
+from ..report import Row, Rows, Section, Table, where
 from ..run import Run
 from .dense_points import DENSE_COLUMNS, DENSE_NOTE, SGBM, measure_dense_points
-from .pose import error_chart, file_name
 
 MIN_IMAGES = 3
 
 POSE_THRESHOLDS_DEG = (0.5, 1.0, 5.0)
 """Of the AUC: adjusted cameras are more accurate than those of two images."""
-
-CURVE_DEG = tuple(0.05 * step for step in range(61))
-"""Errors at which the figure is drawn."""
 
 DATABASE = "sift.db"
 
@@ -66,9 +62,6 @@ CAMERA_COLUMNS = {
     "rotations, °": ".3f",
     **MODEL_COLUMNS,
 }
-
-IMAGE_COLUMNS = dict.fromkeys(("scene", "keypoints", "intrinsics", "image"), "")
-IMAGE_COLUMNS |= {"centre, unit of the truth": ".5f", "rotation, °": ".4f"}
 
 MAPPING_CPU = "mapping, {} intrinsics, CPU s"
 
@@ -173,21 +166,8 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
     ]
     found = [row for rows in dense for row in rows or ()]
     dense_table = Table("sfm_dense", "Dense points", DENSE_COLUMNS, found, DENSE_NOTE)
-    tables = [camera_table(rows), image_table(rows), cost_table, dense_table]
-    figures = []
-    for name, scene in chosen.items():
-        if scene.located_only:
-            continue
-        errors = {
-            f"{row['method']}, {kind} intrinsics": relative_pose_errors(views, true_views(scene))
-            for row in where(rows, item=name)
-            for kind in KINDS
-            for views in [row[kind]["views"]]
-        }
-        title = f"Relative poses of all pairs of {name}: fraction up to each error"
-        png = error_chart(errors, CURVE_DEG, "error of the relative pose up to, °")
-        figures.append(Figure(f"sfm_{file_name(name)}", title, png))
-    return [Section("Many images", TEXT, tables, figures)]
+    tables = [camera_table(rows), cost_table, dense_table]
+    return [Section("Many images", TEXT, tables)]
 
 
 def choose_images(scene: PosedScene, most: int) -> PosedScene:
@@ -296,25 +276,6 @@ def camera_table(rows: Rows) -> Table:
                 line["from the first row's, unit of the truth"] = apart
             lines.append(line)
     return Table("sfm", "Cameras and sparse points", CAMERA_COLUMNS, lines, CAMERA_NOTE)
-
-
-def image_table(rows: Rows) -> Table:
-    """Tabulate the errors of each camera."""
-    lines = []
-    for row in rows:
-        truth = true_views(row["scene"])
-        for kind in KINDS:
-            views, errors = row[kind]["views"], {}
-            if len(views) >= MIN_IMAGES:
-                found = camera_errors(list(views.values()), [truth[name] for name in views])
-                turned = [None] * len(views) if row["scene"].located_only else found[1]
-                errors = dict(zip(views, zip(found[0], turned, strict=True), strict=True))
-            for image in truth:
-                cells = row["scene"].name, row["method"], kind, image
-                cells += errors.get(image, (None, None))
-                lines.append(dict(zip(IMAGE_COLUMNS, cells, strict=True)))
-    note = "After the alignment of all centres; a dash: not registered, or not known."
-    return Table("sfm_images", "All images", IMAGE_COLUMNS, lines, note, in_text=False)
 
 
 Views = Mapping[str, PosedView]

@@ -27,14 +27,12 @@ from ..options import BenchmarkOptions
 from ..report import (
     Cell,
     Columns,
-    Figure,
     Measure,
     Row,
     Rows,
     Section,
     Table,
     average,
-    line_chart,
     mean,
     tabulate,
     where,
@@ -78,8 +76,7 @@ def standard_sections(
     rows = standard_rows(run, features, pairs)
     what = f"{title} ({len(pairs)} pairs)"
     tables = standard_tables(features, rows, key, what)
-    figures = standard_figures(features, rows, key, what)
-    return [Section(f"{title}, the standard protocol", (text,), tables, figures)]
+    return [Section(f"{title}, the standard protocol", (text,), tables)]
 
 
 def standard_rows(run: Run, features: Sequence[LocalFeature], pairs: Sequence[PlanarPair]) -> Rows:
@@ -311,33 +308,3 @@ ACCURACY_NOTE = (
 )
 
 COVERAGE_NOTE = "Fraction of the cells of 32x32 px that hold a keypoint of the first image."
-
-
-def standard_figures(
-    features: Sequence[LocalFeature], rows: Rows, key: str, what: str
-) -> list[Figure]:
-    """Draw accuracy and repeatability; their numbers are in the tables."""
-    measured = [(feature, own) for feature in features if (own := where(rows, method=feature.name))]
-    accuracy = {
-        feature.title: (
-            MATCH_THRESHOLDS_PX,
-            [mean(own, ("accuracy", px)) or 0.0 for px in MATCH_THRESHOLDS_PX],
-        )
-        for feature, own in measured
-    }
-    png = line_chart(accuracy, "error up to, px", "mean matching accuracy")
-    figures = [Figure(f"{key}_accuracy", f"Mean matching accuracy, {what}", png)]
-    budgets = [budget for budget in BUDGETS if budget is not None]
-    # Of rows with the same keypoints, which differ in their descriptors, the first one is drawn.
-    first = {feature.detection: feature for feature in reversed(features)}
-    for radius in (RADII_PX[0], RADII_PX[-1]):
-        lines = {}
-        for feature, own in measured:
-            values = [repeated(own, budget, radius) for budget in budgets]
-            if first[feature.detection] is feature and any(v is not None for v in values):
-                lines[feature.title] = budgets, [math.nan if v is None else v for v in values]
-        label = f"mutual-NN repeatability within {radius:g} px"
-        png = line_chart(lines, "keypoints per image", label, logarithmic=True, ticks=budgets)
-        title = f"Repeatability within {radius:g} px against the number of keypoints, {what}"
-        figures.append(Figure(f"{key}_repeatability_{radius:g}px", title, png))
-    return figures

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import cross_entropy
 
+from ..scenes import SIDE_PX
 from .network import DescriptorNetwork, turn
-from .views import SIDE_PX, Pair
+from .views import Pair
 
 NEAR_PX = 3.0
 """From the right keypoint: in the loss nearer ones are not wrong, in the measure they are right."""

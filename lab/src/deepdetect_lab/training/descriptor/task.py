@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from deepdetect._shared.errors import OptionError
 from deepdetect._shared.records import key
 from deepdetect.features.learned import CROSS_MODAL, LEARNED, angles_counted
 
@@ -22,11 +21,12 @@ from ..checkpoint import Point
 from ..optim import Muon
 from ..recipe import DescriptorTrainingOptions, DeviceOptions
 from ..sampler import milestones
+from ..scenes import SIDE_PX, draw_until_seen
 from ..trainer import Trainer
 from .export import export_descriptor
 from .losses import KINDS, contrastive_loss, kind_of, shares_right
 from .network import DescriptorNetwork
-from .views import SIDE_PX, Pair, draw_pair
+from .views import Pair, draw_pair
 
 ONNX = "descriptor.onnx"
 
@@ -42,9 +42,6 @@ DECAY_SHARE = 0.65
 
 VECTOR_RATE = 0.4
 """Learning rate of AdamW, which trains what Muon does not, in that of Muon."""
-
-ATTEMPTS = 200
-"""Of drawing a pair: images in which so many show too little have no detail."""
 
 
 def pairs_of_step(options: DescriptorTrainingOptions, step: int) -> np.ndarray:
@@ -68,10 +65,7 @@ def pairs_to_draw(
 def draw_numbered(files: Sequence[Path], cross_modal: bool, *seed: int) -> Pair:
     """Draw a pair by a seed; an OptionError where the images show too little."""
     generator = np.random.default_rng(seed)
-    for _ in range(ATTEMPTS):
-        if (pair := draw_pair(generator, files, cross_modal)) is not None:
-            return pair
-    raise OptionError("the images show too little for pairs of views: use photographs with detail")
+    return draw_until_seen(lambda: draw_pair(generator, files, cross_modal))
 
 
 def stack(pairs: Sequence[Pair]) -> Pair:

@@ -7,24 +7,116 @@ also gets a little of the others. A pair is a pure function of photograph, kind,
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from deepdetect._shared.opencv import cv2
 
+from ..synthetic import (
+    WHITE,
+    Camera,
+    Effect,
+    Light,
+    blur,
+    happens,
+    record,
+    relight,
+    rotation,
+    scaled_along,
+    view_homography,
+)
+
 KINDS = ("zoom", "blur", "viewpoint", "light")
 
 BORDER_PX = 4
-"""Places this close to the photograph's border are not valid."""
+"""Places this close to the photograph's border are not valid: their candidates see what is
+mirrored."""
 
 SUPERSAMPLING = 2
+"""Views are rendered with twice the pixels along each side, so that nothing is aliased."""
+
 MAX_ENLARGEMENT = 2.2
-"""Of the photograph's pixels in a view that is zoomed in."""
+"""Pixels of a view that is zoomed in to one of the photograph, at most: more shows only blur."""
 
 SUBTLE = 0.25
-"""Probability of blur, light or JPEG in a view whose kind does not ask for it."""
+"""Share of the views with blur, light or JPEG, where the kind does not ask for it."""
+
+CAMERA = Camera(
+    blur=Effect(SUBTLE, 0.3, 1.0),
+    noise=(Effect(0.5, 0, 0.02 * WHITE), Effect(1, 0, 0.005 * WHITE)),
+    jpeg=Effect(SUBTLE, 60, 95),
+)
+CAMERAS = {
+    "blur": replace(CAMERA, blur=Effect(1, 0.5, 4.5)),
+    "light": replace(CAMERA, jpeg=Effect(0.5, 5, 60)),
+}
+"""Blur, noise and JPEG of every view, and of the worse view by its kind. Oxford's JPEGs are of
+quality 40 to 2, but below 5 little is left of a view of 224 pixels."""
+
+LIGHT = Light(
+    log_gamma=Effect(1, -0.8, 0.8),
+    log_gain=Effect(1, -1.6, 0.35),
+    ramp=Effect(1, 0, 0.8),
+    shift=(-0.05, 0.1),
+)
+SUBTLE_LIGHT = Light(
+    share=SUBTLE,
+    log_gamma=Effect(1, -0.24, 0.24),
+    log_gain=Effect(1, -0.48, 0.105),
+    ramp=Effect(1, 0, 0.24),
+    shift=(-0.015, 0.03),
+)
+"""Light of the worse view of its kind, with a gain down to a fifth; and of other views, 0.3 of
+that."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """How the second view of a kind lies to the first one.
+
+    Attributes:
+        log_zoom: range of the logarithm of the zoom.
+        turn_deg: the largest rotation, either way.
+        shift: the largest distance of the middles along each axis, in sides of the first view.
+        any_turn: share of the pairs that are rotated by any angle.
+        tilt_deg: range of the tilt.
+        still: share of the pairs with neither zoom nor rotation nor tilt.
+        scales: how far first views go, on the logarithmic way from the scale that shows all of the
+            photograph to the largest.
+    """
+
+    log_zoom: tuple[float, float]
+    turn_deg: float
+    shift: float
+    any_turn: float = 0
+    tilt_deg: tuple[float, float] = (0, 0)
+    still: float = 0
+    scales: float = 1
+
+
+CHANGES = {
+    # Small first views, so that the second ones, anywhere in them, are not blurred.
+    "zoom": Change((math.log(1.2), math.log(4.0)), 180, 0.3, tilt_deg=(0, 15), scales=0.3),
+    "blur": Change((-0.1, 0.1), 6, 0.08),
+    "viewpoint": Change((-0.25, 0.25), 25, 0.15, any_turn=0.35, tilt_deg=(15, 60)),
+    "light": Change((-0.03, 0.03), 2, 0.08, still=0.3),
+}
+"""Changes up to the largest that Oxford's scenes are described with: a viewpoint of 60 degrees, a
+zoom of 4."""
+
+LEAST_LOG_ZOOM = math.log(1.3)
+"""A zoom may be this large even where the second view then is enlarged by more than it should
+be."""
+
+ROTATED_SHARE = 0.2
+"""Share of the pairs that are rotated as a whole, by any angle."""
+
+FOCAL_SIDES = (1.2, 3.0)
+"""Focal length in sides of the view: fields of view from 45 to 19 degrees."""
+
+SHRUNK_SCALE, LEAST_SIDE_PX = 0.9, 8
+"""Below this scale a photograph is shrunk by area first, to at least this many pixels a side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +132,11 @@ class ViewPair:
     kind: str
 
 
-def view_homography(
+def tilted_view(
     side: int,
     center: np.ndarray,
     scale: float,
-    rotation: float = 0.0,
+    angle: float = 0.0,
     tilt: float = 0.0,
     azimuth: float = 0.0,
     focal: float = 2.0,
@@ -54,23 +146,9 @@ def view_homography(
     The view has the place `center` in its centre, and `scale` pixels per pixel of the photograph.
     The tilt is about an axis in the direction `azimuth`; the focal length is in sides.
     """
-    turn = scale * _rotation(rotation)[:2, :2]
-    axis = _rotation(azimuth)
-    c, s = math.cos(tilt), math.sin(tilt)
-    tilted = axis @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ axis.T
-    focal_px = focal * side
-    plane = np.vstack([focal_px * tilted[:2, :2], tilted[2, :2]])
-    projection = np.column_stack([plane, [0, 0, focal_px]])
-    similarity = np.eye(3)
-    similarity[:2, :2] = turn
-    similarity[:2, 2] = -turn @ center
-    middle = (side - 1) / 2
-    return np.array([[1, 0, middle], [0, 1, middle], [0, 0, 1]]) @ projection @ similarity
-
-
-def _rotation(angle: float) -> np.ndarray:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    linear = rotation(-angle) @ scaled_along(azimuth, 1, 1 / math.cos(tilt)) / scale
+    perspective = -math.tan(tilt) / (focal * side) * rotation(-azimuth)[1]
+    return np.linalg.inv(view_homography(side, center, linear, perspective))
 
 
 def draw_pair(photo: np.ndarray, kind: str, side: int, generator: np.random.Generator) -> ViewPair:
@@ -92,41 +170,29 @@ def _draw_homographies(
     shape: tuple[int, ...], kind: str, side: int, generator: np.random.Generator
 ) -> list[np.ndarray]:
     """Draw where both views are taken from: the homographies from the photograph."""
-    height, width = shape
-    smallest = side / min(height, width)  # shows all of the photograph's shorter side
-    uniform = generator.uniform
-    zoom, angle, tilt = math.exp(uniform(-0.1, 0.1)), math.radians(uniform(-6, 6)), 0.0
-    if kind == "zoom":
-        highest = min(4.0, MAX_ENLARGEMENT / smallest)
-        zoom = math.exp(uniform(math.log(1.2), math.log(max(highest, 1.3))))
-        angle, tilt = uniform(-math.pi, math.pi), math.radians(uniform(0, 15))
-    elif kind == "viewpoint":
-        zoom = math.exp(uniform(-0.25, 0.25))
-        turned = generator.random() < 0.35
-        angle = uniform(-math.pi, math.pi) if turned else math.radians(uniform(-25, 25))
-        tilt = math.radians(uniform(15, 60))
-    elif kind == "light":
-        zoom, angle = math.exp(uniform(-0.03, 0.03)), math.radians(uniform(-2, 2))
-        if generator.random() < 0.3:
-            zoom, angle = 1.0, 0.0
+    change, uniform = CHANGES[kind], generator.uniform
+    size = np.array(shape[::-1])
+    smallest = side / size.min()  # shows all of the photograph's shorter side
+    least, most = change.log_zoom
+    largest_zoom = max(math.log(MAX_ENLARGEMENT / smallest), LEAST_LOG_ZOOM)
+    zoom = math.exp(uniform(least, min(most, largest_zoom)))
+    most_deg = 180 if happens(generator, change.any_turn) else change.turn_deg
+    angle = math.radians(uniform(-most_deg, most_deg))
+    tilt = math.radians(uniform(*change.tilt_deg))
+    if happens(generator, change.still):
+        zoom, angle, tilt = 1.0, 0.0, 0.0
     largest = max(smallest, min(1.0, MAX_ENLARGEMENT / zoom))
-    scale = math.exp(uniform(math.log(smallest), math.log(largest)))
-    if kind == "zoom":  # small first views, so that the second ones are not blurred
-        scale = smallest * math.exp(uniform(0, 0.3) * math.log(largest / smallest))
-    reach_x, reach_y = (max(0.0, (full - side / scale) / 2) for full in (width, height))
-    middle = np.array([(width - 1) / 2, (height - 1) / 2])
-    first = middle + uniform(-1, 1, 2) * (reach_x, reach_y)
-    away = 0.08 if kind in ("blur", "light") else 0.15
-    second = first + uniform(-away, away, 2) * side / scale
-    if kind == "zoom":  # anywhere in the first view
-        second = first + uniform(-0.3, 0.3, 2) * side / scale
-    base = uniform(-math.pi, math.pi) if generator.random() < 0.2 else 0.0
-    azimuth, focal = uniform(0, 2 * math.pi), uniform(1.2, 3)
+    scale = smallest * (largest / smallest) ** uniform(0, change.scales)
+    reach = np.maximum(0, (size - side / scale) / 2)
+    first = (size - 1) / 2 + uniform(-1, 1, 2) * reach
+    second = first + uniform(-change.shift, change.shift, 2) * side / scale
+    base = uniform(-math.pi, math.pi) if happens(generator, ROTATED_SHARE) else 0.0
+    azimuth, focal = uniform(0, 2 * math.pi), uniform(*FOCAL_SIDES)
     matrices = [
-        view_homography(side, first, scale, base),
-        view_homography(side, second, scale * zoom, base + angle, tilt, azimuth, focal),
+        tilted_view(side, first, scale, base),
+        tilted_view(side, second, scale * zoom, base + angle, tilt, azimuth, focal),
     ]
-    return matrices[::-1] if generator.random() < 0.5 else matrices
+    return matrices[::-1] if generator.integers(2) else matrices
 
 
 def render(photo: np.ndarray, matrix: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
@@ -138,8 +204,8 @@ def render(photo: np.ndarray, matrix: np.ndarray, side: int) -> tuple[np.ndarray
     mapped = cv2.perspectiveTransform(steps[None], matrix)[0]
     scale = float(np.linalg.norm(np.stack([mapped[1] - mapped[0], mapped[2] - mapped[0]]), 2))
     source, to_source = photo, np.eye(3)
-    if scale < 0.9:
-        size = (max(8, round(width * scale)), max(8, round(height * scale)))
+    if scale < SHRUNK_SCALE:
+        size = tuple(max(LEAST_SIDE_PX, round(full * scale)) for full in (width, height))
         source = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
         fx, fy = width / size[0], height / size[1]
         to_source = np.array([[fx, 0, fx / 2 - 0.5], [0, fy, fy / 2 - 0.5], [0, 0, 1]])
@@ -165,37 +231,7 @@ def degrade(image: np.ndarray, kind: str, generator: np.random.Generator) -> np.
 
     The kind is "" where the view, (H, W) uint8, is the better one of its pair.
     """
-    uniform, chance = generator.uniform, generator.random
-    values = image.astype(np.float32) / 255
-    if kind == "blur":
-        values = cv2.GaussianBlur(values, (0, 0), uniform(0.5, 4.5))
-    elif chance() < SUBTLE:
-        values = cv2.GaussianBlur(values, (0, 0), uniform(0.3, 1.0))
-    if kind == "light" or chance() < SUBTLE:
-        strength = 1.0 if kind == "light" else 0.3
-        values = _relight(values, strength, generator)
-    noise = uniform(0, 0.02 if chance() < 0.5 else 0.005)
-    values = values + np.float32(noise) * generator.standard_normal(values.shape, np.float32)
-    quality: Any = None
-    if kind == "light":
-        quality = uniform(5, 60) if chance() < 0.5 else None
-    elif chance() < SUBTLE:
-        quality = uniform(60, 95)
-    result: np.ndarray = np.rint(255 * np.clip(values, 0, 1)).astype(np.uint8)
-    if quality is not None:
-        _, coded = cv2.imencode(".jpg", result, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])
-        result = cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE)
-    return result
-
-
-def _relight(values: np.ndarray, strength: float, generator: np.random.Generator) -> np.ndarray:
-    """Change gamma, gain and offset, by a ramp across the image as well."""
-    uniform = generator.uniform
-    gamma = math.exp(strength * uniform(-0.8, 0.8))
-    gain = math.exp(strength * uniform(-1.6, 0.35))
-    direction = uniform(0, 2 * math.pi)
-    row, column = np.indices(values.shape, np.float32) / max(values.shape) - 0.5
-    ramp = math.cos(direction) * column + math.sin(direction) * row
-    light = gain * (1 + strength * uniform(0, 0.8) * ramp)
-    changed = values**gamma * light + strength * uniform(-0.05, 0.1)
-    return changed.astype(np.float32)
+    camera = CAMERAS.get(kind, CAMERA)
+    values = blur(generator, image.astype(np.float32) / WHITE, camera)
+    values = relight(generator, values, LIGHT if kind == "light" else SUBTLE_LIGHT)
+    return record(generator, values * WHITE, camera)
