@@ -2,9 +2,9 @@
 
     python benchmarks/costs.py PHOTOGRAPH PHOTOGRAPH [--rounds 3]
 
-Two photographs of one scene are scaled to each size. Everything runs on one thread and with its
-defaults, each cell in a process of its own: the fastest round after one that compiles, and the most
-memory that the process held, with Python and all libraries.
+Two photographs of one scene are scaled to each size. Everything runs on one thread with default
+options. Each cell is measured in a separate process: the time of the fastest round after one that
+compiles, and the peak memory of the process, including Python and all libraries.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from deepdetect_lab.evaluation.profiling import peak_memory, run_in_child
 from deepdetect_lab.evaluation.report import Table
 
 SIDES_PX = (640, 1600, 6000)
-"""Of the longer side: a frame of a video, near the two megapixels of the network, a camera's."""
+"""Longer sides of the images: of a video frame, of about the two megapixels up to which the network
+works at full resolution, and of a camera."""
 
 POINTS = 2048
 
@@ -30,23 +31,23 @@ Images = list[np.ndarray]
 
 
 def dense(images: Images, backend: str) -> Callable[[], object]:
-    """Return what finds the dense keypoints of the first image."""
+    """Return a function that detects dense keypoints in the first image."""
     return partial(DeepDetect(backend=backend, threads=1).detect, images[0])
 
 
 def points(images: Images) -> Callable[[], object]:
-    """Return what finds and describes the points of the first image."""
+    """Return a function that detects and describes points in the first image."""
     return partial(PointDetector(POINTS).extract, images[0])
 
 
 def matched_points(images: Images) -> Callable[[], object]:
-    """Return what matches the points of both images by their descriptors."""
+    """Return a function that matches the points of both images by their descriptors."""
     detector = PointDetector(POINTS)
     return partial(match_features, *(detector.extract(image) for image in images))
 
 
 def guided(images: Images) -> Callable[[], object]:
-    """Return what matches both images from the pixels to the guided matches."""
+    """Return a function that matches both images, from pixels to guided matches."""
     return partial(match_images, *images, DeepDetect(threads=1))
 
 
@@ -60,7 +61,7 @@ WORK: dict[str, Callable[[Images], Callable[[], object]]] = {
 
 
 def measure(name: str, photographs: list[str], side_px: int, rounds: int) -> dict[str, object]:
-    """Measure one of `WORK` with photographs scaled to a longer side."""
+    """Measure an entry of `WORK` with photographs scaled to a longer side."""
     images = [scaled(load_image(path), side_px) for path in photographs]
     work = WORK[name](images)
     seconds = []
@@ -74,7 +75,7 @@ def measure(name: str, photographs: list[str], side_px: int, rounds: int) -> dic
 
 
 def scaled(image: np.ndarray, side_px: int) -> np.ndarray:
-    """Scale an image to a longer side."""
+    """Scale an image so that its longer side has the given length."""
     ratio = side_px / max(image.shape)
     way = cv2.INTER_AREA if ratio < 1 else cv2.INTER_CUBIC
     return cv2.resize(image, None, fx=ratio, fy=ratio, interpolation=way)

@@ -1,23 +1,30 @@
-"""Right matches by descriptors alone: RootSIFT and the learned descriptors on the same points.
+"""Correct matches by descriptors alone: RootSIFT and the learned descriptors on the same points.
 
     python benchmarks/descriptors.py DATA [--method edgepoint2_t32.onnx ...]
 
-DATA holds the folders oxford, hpatches, hdr, fountain, entry and the clips of KITTI, and, if you
-like, roadscene: crop_LR_visible and cropinfrared of the public photographs of that name. 2,048
-keypoints of an image, mutual nearest neighbours without a ratio test; SIFT (with RootSIFT, and
-weaker keypoints where there are few) and files of other methods bring their own keypoints. Right
-matches are within 3 px of the truth (hdr: 2 px, roadscene, whose photographs in visible and
-infrared light lie upon each other less exactly: 5 px), means over pairs. Dark copies have 1/8 of
-the light and noise of one grey level, blurred copies a Gaussian of 2 px, both of the first image of
-each Oxford scene; turned ones, of three of them, are square windows in steps of 15 degrees, which
-show as much of the image at each (worst over best, without quarter turns, which nothing blurs).
-hdr: the exposure of middle grey with each darker one, in all. Poses: area under the curve to 5
-degrees, with the default ratio, a mean over five orders of the matches, by which MAGSAC's result
-varies; of fountain also with 512 keypoints; clips: 30 pairs of each, 1 to 25 frames apart. Lost: of
-the homographies of Oxford within 3 px, and poses of fountain and entry within 10 degrees in most
-orders, those that RootSIFT on our points has and the row has not. Time: of keypoints and
-descriptors of an image of 640x480, processor time on one processor, in that of OpenCV's SIFT with
-its descriptors; medians of rounds in turn.
+DATA contains the folders oxford, hpatches, hdr, fountain, entry and the clips of KITTI. It may also
+contain roadscene, with crop_LR_visible and cropinfrared of the public photographs of that name.
+
+Images have 2,048 keypoints, matched as mutual nearest neighbours without a ratio test. SIFT (with
+RootSIFT, and a lower contrast threshold if there are few keypoints) and files of other methods have
+their own keypoints. The columns are:
+
+- Correct matches: means over pairs of matches within 3 px of ground truth; 2 px for hdr, and 5 px
+  for roadscene, whose photographs in visible and infrared light are aligned less exactly.
+- dark, blurred: the first image of each Oxford scene with a copy of 1/8 of the light and noise of
+  one grey level, and with a copy blurred by a Gaussian of 2 px.
+- worst turn: three of these images with rotated copies, in steps of 15 degrees, as square windows
+  that show equal areas: the worst angle relative to the best one. Quarter turns are left out, since
+  interpolation does not blur them.
+- hdr: the exposure of middle grey with each darker one; a sum over all.
+- fountain, entry, clips: area under the curve of pose errors up to 5 degrees, with the default
+  ratio test. It is a mean over five orders of the matches, on which MAGSAC's result depends.
+  Fountain is also measured with 512 keypoints. Clips have 30 pairs each, 1 to 25 frames apart.
+- lost: problems that RootSIFT on our points solves and this method fails to solve. Solved are
+  homographies of Oxford within 3 px, and poses of fountain and entry within 10 degrees in most
+  orders.
+- time: processor time of keypoints and descriptors for an image of 640x480, relative to OpenCV's
+  SIFT with descriptors, on one processor; medians over rounds in which methods take turns.
 """
 
 from __future__ import annotations
@@ -52,12 +59,13 @@ KEYPOINTS, FEW, RIGHT_PX, RIGHT_DARK_PX, ORDERS, AUC_DEG = 2048, 512, 3.0, 2.0, 
 RIGHT_INFRARED_PX = 5.0
 FOUND_DEG, CLIPS, CLIP_PAIRS, ROUNDS = 10.0, ("kitti-clip", "kitti-clip2"), 30, 15
 MIDDLE_GREY, TURNED = 118, ("boat", "graf", "wall")
+"""The text at the top explains these numbers. Chosen by hand."""
 
 Extract = Callable[[np.ndarray], Keypoints]
 
 
 def methods(files: list[str]) -> dict[str, Extract]:
-    """Return what extracts keypoints with descriptors, by name; others' files too."""
+    """Return the functions that extract keypoints with descriptors, by name of the method."""
     found: dict[str, Extract] = {
         kind: PointDetector(KEYPOINTS, descriptor=kind).extract
         for kind in ("rootsift", "learned", "learned-free", "cross-modal")
@@ -72,7 +80,7 @@ def _extract_other(file: str) -> Extract:
 
 
 def copies(rgb: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Return changed copies of an image by kind, each with the homography to it."""
+    """Return modified copies of an image by kind, each with the homography that maps to it."""
     noise = np.random.default_rng(3).normal(0, 1, rgb.shape[:2])
     dark = np.clip(np.rint(luma(rgb) / 8 + noise), 0, 255).astype(np.uint8)
     dark = cv2.cvtColor(dark, cv2.COLOR_GRAY2RGB)
@@ -88,7 +96,7 @@ def copies(rgb: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 def measure(extract: Extract, data: Path) -> tuple[Row, set[str]]:
-    """Return the columns of the table, and the names of pairs that were solved."""
+    """Return the columns of the table, and the names of the solved pairs."""
 
     @cache
     def features(path: Path) -> Keypoints:
@@ -155,7 +163,7 @@ def measure(extract: Extract, data: Path) -> tuple[Row, set[str]]:
 
 
 def relative_time(extract: Extract, rgb: np.ndarray) -> float:
-    """Return the processor time of an image, in that of OpenCV's SIFT."""
+    """Return the processor time for an image, relative to OpenCV's SIFT."""
     image, sift = cv2.resize(rgb, (640, 480)), cv2.SIFT_create(KEYPOINTS)
     seconds = []
     for _ in range(ROUNDS):
@@ -169,7 +177,7 @@ def relative_time(extract: Extract, rgb: np.ndarray) -> float:
 
 
 def auc(by_pair: dict[str, list[float]]) -> float:
-    """Return the area under the curve of pose errors, a mean over orders of the matches."""
+    """Return the area under the curve of pose errors, averaged over the orders of the matches."""
     orders = zip(*by_pair.values(), strict=True)
     return float(np.mean([area_under_curve(list(errors), AUC_DEG) for errors in orders]))
 
@@ -188,7 +196,7 @@ def _pose_errors(
 
 
 def errors_in_orders(found: Matches, pair: PosedPair) -> list[float]:
-    """Return the errors of the pose, in each order of the matches."""
+    """Return the pose error for each order of the matches."""
     cameras = pair.first.intrinsics, pair.second.intrinsics
     errors = []
     for order in range(ORDERS):
@@ -204,7 +212,7 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--method", action="append", default=[], help="an ONNX file")
     given = parser.parse_args()
-    # Runtimes take as many threads as there are processors.
+    # Runtimes start one thread per available processor.
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[-1:])
     cv2.setNumThreads(1)
     rows: list[Row] = []

@@ -1,16 +1,21 @@
-"""How often matches are right, by their confidence: of photographs, and of pairs made of them.
+"""How often matches of each confidence are wrong, for real and for synthetic pairs.
 
     python benchmarks/made_pairs.py DATA [--only photographs|planes|refusal|hard] [--every N]
 
-DATA holds oxford, middlebury, foreground, and the scenes of `deepdetect dev benchmark pose`. A line
-for each kind of pair: how many pairs, how many were answered with high and with fair confidence,
-and how many of these answers are wrong: less than half of their matches are right, and the pose is
-not right either (the true lines of a moving car are off by pixels). Photographs: all pairs whose
-truth is known. Planes: a photograph covers 10, 20 or 40 % of both images, seen from two places; the
-rest is unrelated, or a rectified pair of a scene with depth. Refusal: unrelated photographs, and
-facades of one window that repeats, of which the second image begins a window later, so that it
-looks as if nothing had moved; alone, between unrelated things, or with a window that occurs once
-between things that both images show: only these can be answered.
+DATA contains oxford, middlebury, foreground, and the scenes of `deepdetect dev benchmark pose`. The
+table has a line for each kind of pair: the number of pairs, the numbers answered with high and with
+fair confidence, and how many of these answers are wrong. An answer is wrong if fewer than half of
+its matches are correct and its pose is wrong. (Matches alone do not suffice: in images from a
+moving car the ground-truth epipolar lines are off by pixels.) The kinds are:
+
+- photographs: all pairs with known ground truth;
+- planes: two views of one photograph, which covers 10, 20 or 40 % of both images; the rest is
+  unrelated, or a rectified pair of a scene with depth;
+- refusal: unrelated photographs, and facades with one repeated window. The second image of a facade
+  begins a window later, so that nothing seems to have moved. The facade is alone, or surrounded by
+  unrelated content, or has one unique window and surroundings that both images show. Only pairs of
+  the last kind can be answered.
+- hard: views from the side, from a larger distance, or with other tones.
 """
 
 from __future__ import annotations
@@ -32,29 +37,31 @@ from deepdetect_lab.datasets.posed_images import PosedPair, load_posed_scenes
 from deepdetect_lab.evaluation.protocols.pose import ERROR, GOOD_DEG, estimate_pose, pose_errors
 
 PAIRS = 60
-"""Made pairs of planes, and of facades; the number of a pair is its seed."""
+"""Numbers of synthetic pairs of planes and of facades. The index of a pair is its seed."""
 
 HARD_PAIRS = 200
-"""Made pairs of views that differ much."""
+"""Number of synthetic pairs of views that differ much."""
 
 SIZE = (720, 600)
-"""Width and height of a made image."""
+"""Width and height of synthetic images in pixels."""
 
 RIGHT_PX = 3.0
-"""Matches on a plane end within this of where it is, others of their epipolar lines."""
+"""A correct match has a smaller transfer error on a plane, or distance to its epipolar line
+otherwise. Chosen by hand."""
 
 ROWS = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0.0]])
 """Fundamental matrix of a rectified pair."""
 
 NOISE = 3.0
-"""Standard deviation of the noise of made images, in grey values."""
+"""Standard deviation of the noise of synthetic images, in grey levels. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
 class MadePair:
-    """Two images, and what is right: (3, 3) homography of what the (H, W) bool mask shows.
+    """Two images and their ground truth.
 
-    Beside it what fits the (3, 3) fundamental matrix, or nothing without one.
+    Inside the (H, W) bool mask it is the (3, 3) homography, outside the (3, 3) fundamental matrix.
+    Without that, matches outside the mask are wrong.
     """
 
     kind: str
@@ -65,7 +72,7 @@ class MadePair:
     posed: PosedPair | None = None
 
     def right(self, points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
-        """Say which of (M, 2) matches are right; (M,) bool."""
+        """Return which of (M, 2) matches are correct, (M,) bool."""
         x, y = np.rint(points0).astype(np.int64).T
         right = self.mask[y, x] & (transfer_errors(points0, points1, self.homography) < RIGHT_PX)
         if self.fundamental is None:
@@ -74,7 +81,7 @@ class MadePair:
         return np.where(self.mask[y, x], right, near)
 
     def is_right(self, points0: np.ndarray, points1: np.ndarray) -> bool:
-        """Say whether half of the matches are right, or the pose that they tell."""
+        """Return whether at least half of the matches are correct, or else their pose."""
         half = bool(self.right(points0, points1).mean() >= 0.5)
         if half or self.posed is None:
             return half
@@ -84,7 +91,7 @@ class MadePair:
 
 
 class Photographs:
-    """The photographs of a data folder that pairs are made of."""
+    """The photographs of a data folder from which synthetic pairs are made."""
 
     def __init__(self, data: Path) -> None:
         self.planes = sorted(data.glob("oxford/*/img1.*"))
@@ -92,27 +99,27 @@ class Photographs:
         self.others = sorted(data.glob("foreground/*.jpg"))
 
     def any(self, rng: np.random.Generator, size: tuple[int, int] = SIZE) -> np.ndarray:
-        """Return one of the others in this size."""
+        """Return a random one of the other photographs, scaled to this size."""
         return resized(load_image(self.others[rng.integers(len(self.others))]), size)
 
     def unlike(self, rng: np.random.Generator) -> list[np.ndarray]:
-        """Return two different ones of the others."""
+        """Return two different ones of the other photographs."""
         two = rng.choice(len(self.others), 2, replace=False)
         return [resized(load_image(self.others[number]), SIZE) for number in two]
 
 
 def resized(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return a smaller or larger copy."""
+    """Return a copy of the given size."""
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
 
 def corners(width: float, height: float) -> np.ndarray:
-    """Return the (4, 2) corners of a rectangle from the origin on."""
+    """Return the (4, 2) corners of a rectangle that begins at the origin."""
     return np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
 
 
 def photographs_of(data: Path) -> Iterator[MadePair]:
-    """Return the pairs of photographs of which the truth is known."""
+    """Yield the pairs of photographs with known ground truth."""
     for scene in load_oxford(data / "oxford", "refined"):
         for planar in scene.pairs:
             images = load_image(planar.first), load_image(planar.second)
@@ -130,7 +137,7 @@ def photographs_of(data: Path) -> Iterator[MadePair]:
 
 
 def planes(photographs: Photographs) -> Iterator[MadePair]:
-    """Put a plane into two images, seen from two places."""
+    """Yield pairs with a plane that is seen from two places."""
     for number in range(PAIRS):
         rng = np.random.default_rng([0, number])
         share, rectified = (0.1, 0.2, 0.4)[number % 3], number % 2 == 1
@@ -162,7 +169,7 @@ def planes(photographs: Photographs) -> Iterator[MadePair]:
 
 
 def unrelated(photographs: Photographs) -> Iterator[MadePair]:
-    """Pair all photographs of planes and scenes with each other."""
+    """Yield all pairs of different photographs of planes and scenes."""
     for first, second in combinations([*photographs.planes, *photographs.scenes], 2):
         images = load_image(first), load_image(second)
         nothing = np.zeros(images[0].shape[:2], bool)
@@ -170,7 +177,7 @@ def unrelated(photographs: Photographs) -> Iterator[MadePair]:
 
 
 def facades(photographs: Photographs) -> Iterator[MadePair]:
-    """Look at a facade of one window twice, the second time one window further to the right."""
+    """Yield two views of a facade with one repeated window, the second one window to the right."""
     kinds = "facade alone", "facade between unrelated things", "facade with what occurs once"
     for number in range(PAIRS):
         rng = np.random.default_rng([1, number])
@@ -225,7 +232,7 @@ def facades(photographs: Photographs) -> Iterator[MadePair]:
 
 
 def hard_views(photographs: Photographs) -> Iterator[MadePair]:
-    """See a photograph from the side, from further away, or in other tones."""
+    """Yield photographs with a view from the side, from further away, or in other tones."""
     for number in range(HARD_PAIRS):
         rng = np.random.default_rng([2, number])
         kind = ("seen from the side", "seen from the side", "zoomed", "other tones")[number % 4]
@@ -260,7 +267,7 @@ def hard_views(photographs: Photographs) -> Iterator[MadePair]:
 
 
 def main() -> None:
-    """Match all pairs and print a table of them by their kinds."""
+    """Match all pairs and print a table with a row for each kind."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--only", choices=("photographs", "planes", "refusal", "hard"))

@@ -1,11 +1,12 @@
-"""Cameras and points of photographs made of facades, whose cameras are known exactly.
+"""Errors of cameras and points reconstructed from synthetic facades with exactly known cameras.
 
     python benchmarks/made_scenes.py DATA [--scenes FOLDER]
 
-A wall of photographs of DATA/photos/train with bumps and boxes on it, seen from 11 places along an
-arc of 56 degrees, 8 m away: 1152x768 pixels with noise, light of their own and JPEG. Runs
-`deepdetect dev benchmark sfm` on three of them, by seeds, and prints the mean errors of centres, in
-mm, and of rotations after the alignment of all centres.
+A scene is a wall with bumps and boxes, textured with photographs of DATA/photos/train. It is seen
+from 11 places along an arc of 56 degrees, 8 m away, in images of 1152x768 pixels with noise,
+varying brightness and JPEG compression. The script runs `deepdetect dev benchmark sfm` on three
+such scenes with different seeds. It prints the mean errors of camera centres, in mm, and of
+rotations, after the alignment of all centres.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ SCENES, PLACES, ARC_DEG, DISTANCE_M = 3, 11, 56, 8.0
 WALL_M, TILE_PX, PIXELS_PER_M, CELLS_PER_M = (14, 9), 480, 240, 60
 WIDTH, HEIGHT, FOCAL_PX, SAMPLING = 1152, 768, 1209.6, 2
 NEAREST_M, FARTHEST_M, STEPS, BISECTIONS = -1.5, 1.2, 140, 14
-"""Of the wall, which is at 0, and of the search for it along each line of sight."""
+"""Range of depths relative to the plane of the wall, and steps of the search for the surface along
+each ray. All numbers of the scene are chosen by hand."""
 
 
 def make_wall(rng: np.random.Generator, files: list[Path]) -> tuple[np.ndarray, np.ndarray]:
@@ -58,7 +60,7 @@ def make_wall(rng: np.random.Generator, files: list[Path]) -> tuple[np.ndarray, 
 
 
 def look(grid: np.ndarray, x: np.ndarray, y: np.ndarray, per_m: int, border: int) -> np.ndarray:
-    """Return the values of a grid at places of the wall in metres."""
+    """Interpolate a grid at positions on the wall, in metres."""
     at = [(each * per_m - 0.5).astype(np.float32) for each in (x, y)]
     return cv2.remap(grid, *at, cv2.INTER_LINEAR, borderMode=border)
 
@@ -66,7 +68,7 @@ def look(grid: np.ndarray, x: np.ndarray, y: np.ndarray, per_m: int, border: int
 def photograph(
     wall: tuple[np.ndarray, np.ndarray], matrix: np.ndarray, axes: np.ndarray, centre: np.ndarray
 ) -> np.ndarray:
-    """Return what a camera sees of a wall, (H, W, 3) float32."""
+    """Render the (H, W, 3) float32 image of a wall by ray casting."""
     colours, heights = wall
     sides = [(np.arange(n * SAMPLING) + 0.5) / SAMPLING - 0.5 for n in (WIDTH, HEIGHT)]
     u, v = np.meshgrid(*sides)
@@ -95,7 +97,7 @@ def photograph(
 
 
 def make_scene(seed: int, files: list[Path], folder: Path) -> None:
-    """Write the photographs and their cameras, in Strecha's files."""
+    """Write the images and their cameras, in the file format of Strecha's data sets."""
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng([18, seed])
     wall = make_wall(rng, files)
@@ -125,7 +127,7 @@ def main() -> None:
     """Make the scenes, reconstruct them, and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("data", type=Path)
-    parser.add_argument("--scenes", type=Path, help="folder for them, and for the report")
+    parser.add_argument("--scenes", type=Path, help="folder for the scenes and the report")
     given = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         folder = given.scenes or Path(temporary)

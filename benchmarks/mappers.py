@@ -1,11 +1,11 @@
-"""COLMAP's two mappers on made flights of more and more images.
+"""COLMAP's two mappers on synthetic drone flights with growing numbers of images.
 
     python benchmarks/mappers.py [COUNT ...]
 
-Each flight passes a relief in lines, as a drone does, overlapping by 70 and 60 %. Keypoints are the
-relief's points seen with noise; matches are those of the 20 images nearest to each, some of them
-lost and others wrong. Both mappers get the same verified pairs, and the last adjustment follows.
-Memory is all that a process held, with Python.
+Each flight covers a relief in parallel lines; images overlap by 70 % along lines and 60 % across.
+Keypoints are noisy projections of the relief's points. Each image is matched with the 20 nearest
+ones; some matches are lost and others are wrong. Both mappers get the same verified pairs, and a
+final bundle adjustment follows. Memory is the peak of the whole process, including Python.
 """
 
 from __future__ import annotations
@@ -30,17 +30,20 @@ from deepdetect_lab.evaluation.profiling import peak_memory, run_in_child
 COUNTS = (60, 120, 250, 500, 1000)
 SIZE, FOCAL_PX, WRONG_FOCAL = (640, 480), 600.0, 1.03
 STEP, APART = 0.3 * SIZE[1], 0.4 * SIZE[0]
-"""Between images of a line, and between lines, in pixels of an image on the ground."""
+"""Distance between images of a line, and between lines. The unit of length is the size of an
+image's pixel on the ground. Chosen for overlaps of 70 and 60 %."""
 
 RELIEF, PLACE_NOISE, TILT_DEG, NOISE_PX = 36.0, 12.0, 4.0, 0.4
-"""Standard deviations: of heights of the ground, places and angles of cameras, keypoints."""
+"""Standard deviations of heights of the ground, positions and angles of cameras, and keypoints.
+Chosen by hand."""
 
 SEEN_POINTS, LOST, WRONG = 1500, 0.4, 0.4
-"""In an image; of the matches of a pair, the share that is lost and that is wrong."""
+"""Number of points that an image shows; fractions of the matches of a pair that are lost, and of
+the others that are wrong. Chosen by hand."""
 
 
 def fly(count: int, rng: Generator) -> tuple[list[PosedView], list[np.ndarray], list[np.ndarray]]:
-    """Return the true views, and of each the rows of the points it sees, and where."""
+    """Return the true views, and for each the indices of visible points and their positions."""
     each = -(-count // max(2, round((0.8 * count) ** 0.5)))
     line, place = np.divmod(np.arange(count), each)
     place = np.where(line % 2, each - 1 - place, place)
@@ -90,10 +93,10 @@ def write_flight(path: Path, count: int, rng: Generator) -> list[PosedView]:
 def measure(
     name: str, database: Path, truth: list[PosedView], verified: dict[Pair, int]
 ) -> tuple[object, ...]:
-    """Map a flight; to be called in a process of its own.
+    """Map a flight; must be called in a separate process.
 
-    Returns how many images were registered, the mean and the largest error of their centres in
-    pixels on the ground, CPU seconds, and the megabytes that the process held at most.
+    Returns the number of registered images, the mean and the largest error of their centres in
+    pixels on the ground, CPU seconds, and the peak memory of the process in megabytes.
     """
     start = time.process_time()
     if name == "global":

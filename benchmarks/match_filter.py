@@ -1,15 +1,18 @@
-"""Right matches by neighbours and by the ratio test, of the same points.
+"""Correct matches by the learned match filter and by the ratio test, on the same points.
 
     python benchmarks/match_filter.py DATA
 
-DATA holds the folders oxford, hpatches, fountain, entry and the clips of KITTI. 2,048 keypoints of
-an image, mutual nearest neighbours. Right: within 3 px of the homography, of the others within
-1.5 px of the true lines, on which a wrong match may lie by chance; of all pairs, in sums. As
-precise: by the ratio test of whatever limit finds most and is as precise as the filter, or more.
-Poses: area under the curve to 5 degrees, a mean over five orders of the matches; clips: 30 pairs of
-each. Unrelated: the first images of neighbouring scenes of HPatches, where all matches are wrong.
-Time: of the matches of one pair, processor time on one processor, in that of the ratio test;
-medians.
+DATA contains the folders oxford, hpatches, fountain, entry and the clips of KITTI. Images have
+2,048 keypoints, matched as mutual nearest neighbours. Counts are sums over all pairs.
+
+- A match is correct within 3 px of the homography (Oxford, HPatches), or within 1.5 px of the
+  ground-truth epipolar line (others), on which a wrong match may lie by chance.
+- "as precise by ratio": the most correct matches by a ratio test that is at least as precise as the
+  filter.
+- "pose": area under the curve of pose errors up to 5 degrees, a mean over five orders of the
+  matches; 30 pairs of each clip.
+- "unrelated": matches between the first images of successive scenes of HPatches, all wrong.
+- "time": median processor time of matching one pair on one processor, relative to the ratio test.
 """
 
 from __future__ import annotations
@@ -36,15 +39,17 @@ from deepdetect_lab.evaluation.protocols.planar import pairs_of
 from deepdetect_lab.evaluation.report import Row, Table
 
 NEAR_LINE_PX = 1.5
+"""A correct match lies within this distance of its epipolar line, in pixels. Chosen by hand."""
+
 RATIOS = np.arange(0.4, 0.99, 0.02)
-"""Limits of the ratio test that are tried; few matches pass lower ones."""
+"""Limits of the ratio test that are tried. Few matches would pass lower ones."""
 
 Errors = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""Of (M, 2) matched positions of both images, in pixels."""
+"""A function that returns the errors of (M, 2) matched positions in both images, in pixels."""
 
 
 def compare(pairs: Sequence[tuple[Keypoints, Keypoints, Errors]], right_px: float) -> Row:
-    """Return right matches and precisions of the filter and of ratio tests, over all pairs."""
+    """Return correct matches and precisions of the filter and of ratio tests, over all pairs."""
 
     def right(**how: Any) -> np.ndarray:
         parts = []
@@ -131,7 +136,7 @@ def main() -> None:
 
 
 def times(first: Keypoints, second: Keypoints) -> tuple[float, float]:
-    """Return the processor time of both ways."""
+    """Return the processor seconds of the ratio test and of the filter."""
     begin = time.process_time()
     match_features(first, second)
     middle = time.process_time()

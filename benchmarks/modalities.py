@@ -1,13 +1,14 @@
-"""Pairs of different sensors, seasons and maps: what is answered, and how often rightly.
+"""Matching of images from different sensors and seasons, and of maps: answers and errors.
 
     python benchmarks/modalities.py FOLDER [--method xfeat_2048_600x800.onnx ...]
 
 FOLDER is Multimodal_Image_Matching_Datasets of the repository StaRainJ/Multi-modality-image-
-matching-database-metrics-methods on GitHub: both images, their homography, and landmarks marked by
-hand in each of its `*/*/*.mat`. A match is right within 5 px, or three times what the homography
-leaves of the landmarks where that is more. Answered: pairs that `match_images` matches; wrong:
-those of which fewer than half of the matches are right. The other columns are the right matches of
-all pairs, of 2,048 keypoints, mutual nearest neighbours without a ratio test.
+matching-database-metrics-methods on GitHub. Each of its `*/*/*.mat` has two images, their
+homography and landmarks marked by hand. A match is correct within 5 px, or within three times the
+median error of the homography at the landmarks if that is more. "Answered" counts pairs for which
+`match_images` finds matches, "wrong" those of them with fewer than half of the matches correct. The
+other columns count the correct matches of all pairs, from 2,048 keypoints per image, matched as
+mutual nearest neighbours without a ratio test.
 """
 
 from __future__ import annotations
@@ -25,17 +26,19 @@ from deepdetect.geometry.transforms import transfer_errors, transform_points, tr
 from deepdetect_lab.evaluation.report import Row, Table
 
 RIGHT_PX, LANDMARK_ERRORS = 5.0, 3.0
+"""Limits of correct matches: in pixels, and in errors of landmarks. Chosen by hand."""
+
 OWN = "learned", "cross-modal"
 
 
 class ModalPair:
-    """Two (H, W, 3) uint8 images, the homography from the first to the second, what is right."""
+    """Two (H, W, 3) uint8 images, their homography, and the error limit of correct matches."""
 
     def __init__(self, path: Path) -> None:
         found = loadmat(path)
         self.images = to_bytes(found["I_fix"]), to_bytes(found["I_move"])
         landmarks = [found["Landmarks"][name][0, 0] - 1.0 for name in ("LMfix", "LMmov")]
-        # MATLAB's: from the second to the first, for row vectors, pixels counted from 1.
+        # MATLAB's matrix maps the second image to the first, as row vectors, with pixels from 1.
         matrix = np.linalg.inv(found["T"].astype(np.float64).T)
         self.homography = translation_matrix(-1, -1) @ matrix @ translation_matrix(1, 1)
         off = np.median(
@@ -44,7 +47,7 @@ class ModalPair:
         self.right_px = max(RIGHT_PX, LANDMARK_ERRORS * float(off))
 
     def right(self, matches: Matches) -> int:
-        """Count right matches."""
+        """Count correct matches."""
         if not len(matches):
             return 0
         errors = transfer_errors(matches.points0, matches.points1, self.homography)
@@ -52,14 +55,14 @@ class ModalPair:
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:
-    """Return an image as uint8; some are fractions."""
+    """Convert an image to uint8; some are floats in [0, 1]."""
     if image.dtype != np.uint8:
         image = np.rint(image * (255 if image.max() <= 1 else 1)).clip(0, 255)
     return np.ascontiguousarray(image.astype(np.uint8))
 
 
 def measure(paths: Sequence[Path], files: Sequence[str]) -> Row:
-    """Return the columns of pairs of one kind."""
+    """Return the columns of the table for pairs of one kind."""
     others = {Path(file).stem for file in files}
     extractors = {n: e for n, e in methods([*files]).items() if n in {*OWN, *others}}
     detector, answers, right = DeepDetect(), [], dict.fromkeys(extractors, 0)

@@ -1,9 +1,10 @@
-"""Matching of the Motorcycle pair by several options: how many matches, how many right.
+"""Matches of the Motorcycle pair with several options, and their precision.
 
     python benchmarks/motorcycle_matching.py [--weights FILE]
 
-The pair lies inside scikit-image. Right: within 1 px of the true disparity, of those where it is
-known; of all matches, and of those that fit the geometry. Last, as many random points as keypoints.
+The pair comes with scikit-image. Precision is the share of matches within 1 px of the ground-truth
+disparity, where that is known; for all matches and for inliers of the geometry. The last row has as
+many random points as keypoints, for comparison.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ UNGUIDED: dict[str, dict[str, Any]] = {
 
 
 def main() -> None:
-    """Print a row of a table for each way."""
+    """Print a table with a row for each set of options."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--weights", default="default")
     detector = DeepDetect(parser.parse_args().weights)

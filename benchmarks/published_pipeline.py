@@ -1,13 +1,14 @@
-"""The pipeline as the authors' notebooks run it, and ours: seconds, memory and correct matches.
+"""Time, memory and correct matches of the pipeline in the authors' notebooks and of ours.
 
     python benchmarks/published_pipeline.py DATA [--geometry-weights dense] [--rounds 5]
 
-DATA holds oxford/ and middlebury/. End to end, from two images in memory to the count of correct
-matches (wall 1-6, graf 1-3, cones). `deepdetect dev benchmark middlebury` has the points of both.
+DATA contains oxford/ and middlebury/. Both run end to end, from two images in memory to the count
+of correct matches (wall 1-6, graf 1-3, cones). For the points of both see `deepdetect dev benchmark
+middlebury`.
 
 Published: torch without compilation, lists of `cv2.KeyPoint`, OpenCV's SIFT, FLANN, loops in
-Python. Ours: the default backend, dense RootSIFT, patchmatch, descriptors alone. Both sides run the
-same weights in turn, on images squashed to 480x480; the first round compiles and is not counted.
+Python. Ours: the default backend, dense RootSIFT, patchmatch, descriptors alone. Both use the same
+weights and take turns, on images squashed to 480x480; the first round compiles and is not counted.
 """
 
 from __future__ import annotations
@@ -44,10 +45,11 @@ SIDES = ("published", "ours")
 RATIO = 0.99
 TREES = 5
 CHECKS = 50
+"""Limit of the ratio test and FLANN's settings, as in the authors' notebooks."""
 
 Images = Sequence[np.ndarray]
 Judge = Callable[[float, float, float, float], bool]
-"""Returns whether the match of (x, y) and (u, v) is correct."""
+"""A function that returns whether the match of (x, y) and (u, v) is correct."""
 
 
 def main() -> None:
@@ -78,7 +80,7 @@ def table(rows: Sequence[Row]) -> Table:
 
 
 def compare(published: Callable[[], int], ours: Callable[[], int], rounds: int) -> Row:
-    """Run both sides in turn; return medians of seconds, their ratios, counts, largest memory."""
+    """Run both in turn; return median seconds, their ratios, median counts and peak memory."""
     profiles: list[list[tuple[float, float]]] = []
     counts: list[list[int]] = []
     for turn in range(rounds + 1):
@@ -104,7 +106,7 @@ def compare(published: Callable[[], int], ours: Callable[[], int], rounds: int) 
 def planar_sides(
     pair: PlanarPair, detector: DeepDetect
 ) -> tuple[Callable[[], int], Callable[[], int]]:
-    """Return both sides' counts of correct matches of a pair with a homography."""
+    """Return functions that count correct matches of a pair with a homography, for both sides."""
     matrix = pair.homography
 
     def one(x: float, y: float, u: float, v: float) -> bool:
@@ -120,7 +122,7 @@ def planar_sides(
 def stereo_sides(
     pair: StereoPair, detector: DeepDetect
 ) -> tuple[Callable[[], int], Callable[[], int]]:
-    """Return both sides' counts of correct matches of a rectified pair."""
+    """Return functions that count correct matches of a rectified pair, for both sides."""
     disparity = pair.disparity
 
     def one(x: float, y: float, u: float, v: float) -> bool:
@@ -152,17 +154,17 @@ def _sides(
 
 
 def published_detector(detector: DeepDetect) -> DeepDetect:
-    """Return a detector of the same weights run by torch without compilation.
+    """Return a detector with the same weights, run by torch without compilation.
 
     Raises:
-        WeightsError: there is no safetensors file beside the weights.
+        WeightsError: the folder of the weights has no safetensors file of the same name.
         MissingExtraError: torch is not installed.
     """
     weights = detector.weights.with_suffix(".safetensors")
     if not weights.is_file():
         raise WeightsError(
-            f"the published pipeline runs in torch and needs {weights}, which is not there: name "
-            f"a safetensors file, or one of {', '.join(PRETRAINED)}"
+            f"the published pipeline runs in torch and needs {weights}, which is missing: give a "
+            f"safetensors file, or one of {', '.join(PRETRAINED)}"
         )
     try:
         found = DeepDetect(weights, backend="torch")

@@ -2,11 +2,11 @@
 
     python benchmarks/refine_oxford.py OXFORD OUTPUT
 
-Writes OUTPUT/SCENE/H1toKp.refined where they are clearly better than the published ones, and prints
-a table; OUTPUT may be OXFORD itself. The published ones are up to 26 px off. No
-keypoint detector that the benchmark evaluates is in the loop at the end: Lucas-Kanade on the warped
-images (`geometry.homography_refinement`) starts from the published homography and from one by SIFT
-and MAGSAC, and what correlates best is taken.
+Writes OUTPUT/SCENE/H1toKp.refined for homographies that are clearly better than the published ones,
+which are off by up to 26 px, and prints a table. OUTPUT may be OXFORD itself. Lucas-Kanade on the
+warped images (`geometry.homography_refinement`) starts from the published homography and from one
+by SIFT and MAGSAC, and the result with the highest correlation is taken. So no detector that the
+benchmark evaluates determines the result.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from deepdetect_lab.evaluation.metrics.homography import project_visible
 from deepdetect_lab.evaluation.report import Row, Table
 
 CLEAR_GAIN = 0.01
-"""Gain in the median correlation that is clear by itself."""
+"""A larger gain in the median correlation suffices to accept a homography. Chosen by hand."""
 
 CLEAR_MAJORITY = 0.6
-"""Fraction of the windows in which the correlation must rise where the gain is smaller. Blurred or
-flat images correlate nearly as well when they are a pixel off, so their gain is small; and a gain
-can come from a part of the image at the cost of the rest, as under a lens that bends lines."""
+"""The correlation must rise in more than this fraction of the windows if the gain is smaller.
+Blurred or flat images gain little, since they correlate nearly as well when they are a pixel off. A
+gain can also come from a part of the image at the cost of the rest, as with lens distortion."""
 
 MAX_APART = 0.5
-"""Distance of what was found from both starts over the distance that it moved from the published
-homography, medians over the overlap: up to this both starts found the same."""
+"""Both starts count as converged to the same homography if their results differ by less than this
+fraction of the distance to the published one (medians over the overlap). Chosen by hand."""
 
 COLUMNS = {
     "pair": "",
@@ -54,25 +54,26 @@ COLUMNS = {
     "two starts apart, median px": ".3f",
     "written": "",
 }
-"""Correlation: median of the local ones over the overlap; moved: from where the published
-homography takes its pixels."""
+"""Columns with their number formats. "Correlation" is the median of local correlations over the
+overlap. "Moved" is the distance between the mappings of a pixel by both homographies."""
 
 START_RATIO = 0.85
 START_KEYPOINTS = 8000
+"""Limit of the ratio test and number of SIFT keypoints for the second start. Chosen by hand."""
 
 
 def main() -> None:
     """Refine the pairs, write files and print a table."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("oxford", type=Path, help="the data set")
-    parser.add_argument("output", type=Path, help="where the files go")
+    parser.add_argument("output", type=Path, help="folder for the files")
     arguments = parser.parse_args()
     rows = refine_oxford(arguments.oxford, arguments.output, quiet=False)
     print(Table("refined", "", COLUMNS, rows).to_markdown())
 
 
 def refine_oxford(folder: Path, output: Path, *, quiet: bool = True) -> list[Row]:
-    """Refine all pairs, and write SCENE/H1toKp.refined where it is better than the published."""
+    """Refine all pairs, and write SCENE/H1toKp.refined if it is better than the published one."""
     rows = []
     pairs = [pair for scene in load_oxford(folder) for pair in scene.pairs]
     with progress(len(pairs), "refining", "pair", quiet) as bar:
@@ -106,17 +107,17 @@ def _refine(pair: PlanarPair, path: Path) -> Row:
 
 
 def is_better(gain: float, moved: float, risen: float, apart: float | None) -> bool:
-    """Whether a refined homography is clearly better than the published one.
+    """Return whether a refined homography is clearly better than the published one.
 
-    It gains much correlation; or the correlation rises in a clear majority of the windows, and both
-    starts lead to the same place. Lengths are medians in pixels.
+    It is if its correlation is much higher, or if the correlation rises in a clear majority of the
+    windows and both starts converge to the same homography. Lengths are medians in pixels.
     """
     same = apart is not None and apart < MAX_APART * moved
     return gain > CLEAR_GAIN or (same and risen > CLEAR_MAJORITY)
 
 
 def sift_homography(gray0: np.ndarray, gray1: np.ndarray) -> np.ndarray | None:
-    """Estimate a homography by SIFT, ratio test and MAGSAC; None where that fails."""
+    """Estimate a homography by SIFT, ratio test and MAGSAC; None if that fails."""
     sift = cv2.SIFT_create(nfeatures=START_KEYPOINTS)
     found = [sift.detectAndCompute(gray, None) for gray in (gray0, gray1)]
     if any(descriptors is None for _, descriptors in found):
@@ -132,16 +133,16 @@ def sift_homography(gray0: np.ndarray, gray1: np.ndarray) -> np.ndarray | None:
 def risen_fraction(
     gray0: np.ndarray, gray1: np.ndarray, before: np.ndarray, after: np.ndarray
 ) -> float:
-    """Return the fraction of the windows in which the images correlate more than before.
+    """Return the fraction of the windows whose correlation rises.
 
-    The windows lie side by side. Those that correlate equally are left out.
+    Windows do not overlap. Those with equal correlation are left out.
 
     Args:
         gray0, gray1: (H, W) uint8 luma.
         before, after: (3, 3) homographies from the first to the second.
 
     Returns:
-        In [0, 1]; 0 where nothing changed.
+        A fraction in [0, 1]; 0 if nothing changed.
     """
     values = []
     for homography in (before, after):
@@ -157,7 +158,7 @@ def displacement(
     size0: tuple[int, int],
     size1: tuple[int, int],
 ) -> tuple[float, float]:
-    """Return how far two homographies take the pixels of the overlap apart.
+    """Return the distances between the pixels of the overlap when mapped by two homographies.
 
     Returns:
         The median and the largest distance in pixels; NaN without an overlap.

@@ -1,15 +1,16 @@
-"""Writes the tables that README.md and the pages quote, and puts them into these.
+"""Compute the result tables of README.md and the pages, and insert them there.
 
     python benchmarks/results.py DATA [--published FOLDER] [--only NAME ...] [--work build/results]
     python benchmarks/results.py [--check]
 
-The first line (`make results DATA=... ONLY=...`) runs the benchmarks that the results are made of,
-each with a cache, so that what was interrupted goes on, and writes `docs/results/NAME.csv` with the
-command, commit, versions and machine of each in `docs/results/index.json`. The second one fills the
-blocks of the pages between `<!-- results:NAME -->` and `<!-- /results -->` from these
-files; `<!-- results:NAME first|second -->` names the columns, and one cell in a sentence stands
-between `<!-- result:NAME|row|column -->` and `<!-- /result -->`. With --check it only says whether
-the blocks are as the files have them. Some results need the authors' weights.
+The first line (`make results DATA=... ONLY=...`) runs the benchmarks, each with a cache, so that an
+interrupted run can continue. It writes `docs/results/NAME.csv`, and the command, commit, versions
+and machine of each result to `docs/results/index.json`. Some results need the authors' weights.
+
+The second line fills the blocks of the pages between `<!-- results:NAME -->` and
+`<!-- /results -->` from these files. `<!-- results:NAME first|second -->` chooses columns. A single
+cell in a sentence stands between `<!-- result:NAME|row|column -->` and `<!-- /result -->`. With
+--check it only reports whether the blocks agree with the files.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ PAGES = [
     for folder in (".", "docs", "src/deepdetect/detector/weights")
     for page in sorted((ROOT / folder).glob("*.md"))
 ]
-"""In which blocks are filled."""
+"""Pages whose blocks are filled."""
 STAGES = {
     **{
         name: BENCHMARK.format(words)
@@ -83,13 +84,13 @@ STAGES = {
     "modalities": f"benchmarks/modalities.py {{data}}/multimodal{XFEAT}{E64}",
     "made-scenes": "benchmarks/made_scenes.py {data} --scenes {output}/scenes",
 }
-"""Arguments of Python by the stage's name. What writes no report prints its tables, or JSON."""
+"""Arguments of Python by the name of the stage. Stages without a report print tables or JSON."""
 
 TITLES: dict[str, str] = json.loads((RESULTS_FOLDER / "titles.json").read_text("utf-8"))
-"""Shorter titles of rows."""
+"""Shorter titles of rows, by their full titles."""
 
 OWN = ", own size and angle"
-"""End of the titles of rows that become a column."""
+"""Rows whose titles end like this become a column."""
 
 CLASSICAL = ("SIFT", "ORB", "BRISK", "FAST", "AGAST", "Harris", "Shi-Tomasi")
 
@@ -99,13 +100,14 @@ class Result:
     """A table of docs/results.
 
     Attributes:
-        stage: of `STAGES`.
-        table: key of the report's table, or its number where it is printed. With a * in it: the
-            rows of all that fit, after what the * stands for.
-        columns: the table's columns by their titles in the result, each with the digits that are
-            printed, and with the key of the table, if it is another one, with rows of that name, or
-            of that name with this behind it. Empty: all columns, with four digits.
-        rows: only those of which the first or the second cell begins with this.
+        stage: key of `STAGES`.
+        table: key of the report's table, or the number of a printed table. A key that ends in *
+            means the rows of all tables whose keys begin like this; the rest of the key becomes a
+            cell of the row.
+        columns: by the title in the result: the title in the table, the number format, and
+            optionally the key of another table that has the column, and a suffix that names of
+            rows have there. Empty: all columns, with four digits.
+        rows: only rows whose first or second cell begins with this text.
     """
 
     stage: str
@@ -323,13 +325,13 @@ RESULTS = {
 
 
 def main() -> None:
-    """Run what is asked for, then fill the blocks."""
+    """Run the chosen benchmarks, then fill the blocks."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("data", nargs="?", type=Path, help="folder of the data sets")
     parser.add_argument("--published", type=Path, help="folder of others' weights")
     parser.add_argument("--only", nargs="+", choices=sorted(RESULTS), default=sorted(RESULTS))
     parser.add_argument("--work", type=Path, default=ROOT / "build" / "results")
-    parser.add_argument("--check", action="store_true", help="fill no block, compare them")
+    parser.add_argument("--check", action="store_true", help="compare the blocks, fill none")
     arguments = parser.parse_args()
     if arguments.data is not None:
         for stage in dict.fromkeys(RESULTS[name].stage for name in arguments.only):
@@ -344,10 +346,10 @@ def main() -> None:
 
 
 def run_stage(stage: str, data: Path, published: Path | None, work: Path) -> None:
-    """Run what makes a report; of a benchmark what its cache holds is not made again."""
+    """Run a stage and write its report; benchmarks continue from their cache."""
     folder = work / stage
     if published is None and "{published}" in STAGES[stage]:
-        raise SystemExit(f"the stage {stage} needs weights of others: give --published")
+        raise SystemExit(f"the stage {stage} needs the authors' weights: give --published")
     places = {"data": data, "output": folder, "published": published}
     words = [word.format(**places) for word in STAGES[stage].split()]
     print(shlex.join(words), flush=True)
@@ -356,14 +358,14 @@ def run_stage(stage: str, data: Path, published: Path | None, work: Path) -> Non
         return
     made = subprocess.run([sys.executable, *words], check=True, stdout=subprocess.PIPE, text=True)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "printed.txt").write_text(made.stdout)  # what took hours, whatever follows
+    (folder / "printed.txt").write_text(made.stdout)  # saves hours of work if parsing fails
     found = [evaluated(made.stdout)] if "--json" in words else printed_tables(made.stdout)
     tables = {str(k): {"rows": rows} for k, rows in enumerate(found)}
     (folder / "report.json").write_text(json.dumps({"metadata": {}, "tables": tables}))
 
 
 def evaluated(text: str) -> list[dict[str, Any]]:
-    """Return the rows of what `deepdetect dev evaluate --json` prints, one for each weights."""
+    """Convert the output of `deepdetect dev evaluate --json` to rows, one for each weights."""
     report = json.loads(text)
     rows = []
     for of in (report, *report["compare"]):
@@ -393,7 +395,7 @@ def printed_tables(text: str) -> list[list[dict[str, str]]]:
 
 
 def write_result(name: str, work: Path) -> None:
-    """Write a table of a report as docs/results/NAME.csv, and how it was made."""
+    """Write a table of a report as docs/results/NAME.csv, and its provenance to index.json."""
     result = RESULTS[name]
     report = json.loads((work / result.stage / "report.json").read_text())
     tables = {key: table["rows"] for key, table in report["tables"].items()}
@@ -430,13 +432,13 @@ def write_result(name: str, work: Path) -> None:
 
 
 def read_result(name: str) -> list[list[str]]:
-    """Read a table of docs/results, its heads first."""
+    """Read a table of docs/results, with its header first."""
     with (RESULTS_FOLDER / f"{name}.csv").open(newline="", encoding="utf-8") as file:
         return list(csv.reader(file))
 
 
 def fill_blocks(write: bool) -> list[str]:
-    """Fill the blocks of all pages, or say which pages have blocks that are out of date."""
+    """Return the names of pages with outdated blocks, which are filled if `write`."""
     stale = []
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
@@ -463,7 +465,7 @@ def block(name: str, columns: str | None) -> str:
 
 
 def shown(cell: str) -> str:
-    """Write a cell for a page: thousands apart, zeros as is usual, a dash for nothing.
+    """Format a cell for a page: commas between thousands, leading zeros, a dash if empty.
 
     Example:
         >>> shown("192540 (.971)"), shown("-0.000"), shown("")
@@ -477,15 +479,15 @@ def shown(cell: str) -> str:
 def composed_table(name: str) -> list[list[str]]:
     """Return the table of docs/results/NAME.json, where {result|row|column} is a cell of a result.
 
-    The row is known by its first cell, or the first two; as "best" it is that of the classical
-    detector with the highest number.
+    A row is identified by its first cell or its first two. The row "best" is the classical detector
+    with the highest number.
     """
     rows: list[list[str]] = json.loads((RESULTS_FOLDER / f"{name}.json").read_text("utf-8"))
     return [[re.sub(r"{(.*?)}", lambda m: cell(m[1]), text) for text in row] for row in rows]
 
 
 def cell(place: str) -> str:
-    """Return a cell of a result by its place, as result|row|column."""
+    """Return the cell of a result at a place such as result|row|column."""
     (name, _, row), column = place.rpartition("|")[0].partition("|"), place.rpartition("|")[2]
     head, *lines = read_result(name)
     k = head.index(column)

@@ -2,28 +2,29 @@
 
     python benchmarks/row_matching.py DATA
 
-DATA holds the Middlebury scenes, as SCENE/left.png, right.png, disparity.png and calib.json. The
-rows of each scene:
+DATA contains the Middlebury scenes, as SCENE/left.png, right.png, disparity.png and calib.json. The
+rows of each scene are:
 
 - keypoints: the disparity map at the keypoints of the `dense` weights;
-- every: at every pixel, as it is by default;
-- edges: at every pixel, also near disparity discontinuities;
-- parabola: the same before `refine_disparity`: a parabola through the costs of three whole
+- every: the disparity map at every pixel, with default options;
+- edges: every pixel, also near disparity discontinuities;
+- parabola: as edges, but before `refine_disparity`: a parabola through the costs of three integer
   disparities;
-- dense: the same, with occlusions filled;
-- matched: those of them that are not filled in;
-- SGBM: OpenCV's, with the range of the truth made a multiple of 16;
-- SGBM, framed: both views continued to the left by that range, so that OpenCV gives values
-  also where the right view shows nothing.
+- dense: as edges, with occlusions filled;
+- matched: the pixels of dense that are not filled;
+- SGBM: OpenCV's, with the range of the ground truth, rounded up to a multiple of 16;
+- SGBM, framed: the same with both views padded on the left by that range, so that OpenCV also
+  gives values where the right view shows nothing.
 
-Printed are the number of points; which fraction of those whose true disparity is known is within
-0.25, 0.5, 1, 2 and 4 px of it; completeness, the fraction of the pixels with known truth, occluded
-ones too, that have a point within 1 px of it; how often the rarest and the most frequent tenth of a
-pixel is met among the fractions of the disparities, as multiples of how often it is met among those
-of a truth that is not rounded (far from 1 where there are terraces); and seconds.
+The columns are: the number of points; the fraction of those with known ground truth that is within
+0.25, 0.5, 1, 2 and 4 px of it; completeness, which is the fraction of the pixels with known ground
+truth, including occluded ones, that have a point within 1 px; "tenths of a pixel"; and seconds. For
+"tenths of a pixel", the fractional parts of disparities are counted in ten bins, relative to the
+ground truth if that is not rounded. The smallest and the largest ratio are given; they are far from
+1 if the disparity map has terraces.
 
-The true disparity of dolls is of another view than its photographs: two baselines aside. Its rows
-are given as the file says, and with the truth moved to the photographs' view.
+The ground truth of dolls belongs to another view than its photographs, two baselines away. Its rows
+are given with the file's ground truth, and with the ground truth moved to the photographs' view.
 """
 
 from __future__ import annotations
@@ -48,6 +49,8 @@ from deepdetect_lab.evaluation.report import Row, Table
 TOLERANCES = (0.25, 0.5, 1.0, 2.0, 4.0)
 AT_EDGES = DisparityOptions(uniqueness_ratio=1.0, discontinuity_margin_px=0)
 SEARCH_WITHOUT_TRUTH = 64
+"""Number of disparities that OpenCV tries without ground truth. Chosen by hand."""
+
 COLUMNS = {
     **{"scene": "", "way": "", "points": ",d"},
     **{f"within {tolerance:g} px": ".4f" for tolerance in TOLERANCES},
@@ -81,7 +84,7 @@ def main() -> None:
 def ways(
     left: np.ndarray, right: np.ndarray, keypoints: np.ndarray, count: int
 ) -> dict[str, Callable[[], np.ndarray]]:
-    """Return what computes a map of disparities, by the name of the way."""
+    """Return the functions that compute disparity maps, by the names of the rows."""
     row, column = np.indices(left.shape[:2])
     every = np.column_stack([column.ravel(), row.ravel()])
     return {
@@ -99,7 +102,7 @@ def ways(
 def scenes(
     data: Path,
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray, dict[str, np.ndarray | None]]]:
-    """Yield name, both views and the truths of the Motorcycle pair and of the scenes in DATA."""
+    """Yield name, both views and ground truths of the Motorcycle pair and the scenes in DATA."""
     pair = load_motorcycle()
     yield pair.name, pair.left, pair.right, {"": pair.disparity}
     for folder in sorted(path.parent for path in data.glob("*/left.png")):
@@ -122,7 +125,7 @@ def ours(
     options: DisparityOptions = DisparityOptions(),
     filled: bool = True,
 ) -> np.ndarray:
-    """Return a map of the matches' disparities, NaN where there is none."""
+    """Return a map of our disparities at (N, 2) positions, NaN elsewhere."""
     found = disparity_map(left, right, options).at(xy)
     kept = found.matched | filled
     out = np.full(left.shape[:2], np.nan, np.float32)
@@ -132,7 +135,7 @@ def ours(
 
 
 def by_parabola(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return a map of the disparities that `refine_disparity` starts from, where they are kept."""
+    """Return the map from which `refine_disparity` starts, at the pixels that it keeps."""
     kept = disparity_map(left, right, AT_EDGES)
     assert kept.disparity_range is not None
     found = semi_global_matching(luma(left), luma(right), kept.disparity_range)
@@ -140,7 +143,7 @@ def by_parabola(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def search_count(known: dict[str, np.ndarray | None]) -> int:
-    """Return how many disparities OpenCV tries."""
+    """Return the number of disparities that OpenCV tries."""
     truth = known[""]
     if truth is None:
         return SEARCH_WITHOUT_TRUTH
@@ -148,7 +151,7 @@ def search_count(known: dict[str, np.ndarray | None]) -> int:
 
 
 def scores(found: np.ndarray, truth: np.ndarray | None) -> Row:
-    """Return points, shares within the tolerances, completeness and tenths of a pixel."""
+    """Return the number of points, fractions within tolerances, completeness, tenths of a pixel."""
     points = int(np.isfinite(found).sum())
     if truth is None:
         return {"points": points}
@@ -163,9 +166,9 @@ def scores(found: np.ndarray, truth: np.ndarray | None) -> Row:
 
 
 def tenths(found: np.ndarray, truth: np.ndarray) -> str | None:
-    """Return how often the rarest and the most frequent tenth is met, over that of the truth.
+    """Return the least and the largest frequency of a tenth of a pixel, relative to ground truth.
 
-    A truth that is rounded to parts of a pixel says nothing about it.
+    None if the ground truth is rounded to parts of a pixel.
     """
     both = np.isfinite(found) & np.isfinite(truth)
     counts, expected = (

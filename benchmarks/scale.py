@@ -1,12 +1,12 @@
-"""Features, pairs and matches of made collections of more and more images, on a Ray cluster.
+"""Cost of features, pairs and matches for growing synthetic collections, on a Ray cluster.
 
     python benchmarks/scale.py PHOTOGRAPHS [COUNT ...] [--work FOLDER]
 
-Each photograph below a folder is a place that 34 images show: it is seen through random
-perspectives, brighter or darker. These are small and have few keypoints, so that 100,000 of them
-take two hours on two cores. Then `extract_features`, the most similar pairs, and `match_pairs`, on
-a cluster that is started here. CPU time is of all processes, Ray's own too; memory of the one that
-asks, and of the largest other one, a worker. Needs the group `ray`.
+Each photograph below a folder stands for a place, of which 34 synthetic images are made: with
+random perspective and brightness, small and with few keypoints, so that 100,000 of them take two
+hours on two cores. Then `extract_features`, the search for similar pairs and `match_pairs` run on a
+cluster that is started here. CPU time is that of all processes, including Ray's own. Memory is
+given for the calling process and for the largest of the others, a worker. Needs the group `ray`.
 """
 
 from __future__ import annotations
@@ -36,12 +36,13 @@ from deepdetect_lab.evaluation.report import Table
 
 COUNTS = (1000, 10_000, 100_000)
 VIEWS = 34
-"""Images of one place: more than the similar ones that each is matched with."""
+"""Number of images of one place, which must exceed the number of similar images to match with."""
 
 SIZE = (320, 240)
 POINTS = 256
 SHRUNK, SHIFTED = 0.8, 0.1
-"""A view's frame, of the photograph's smaller side, and how far each of its corners is moved."""
+"""The frame of a view has the first fraction of the photograph's shorter side. Each corner is moved
+by up to the second fraction of the frame. Chosen by hand."""
 
 COLUMNS = {
     "images": ",d",
@@ -57,7 +58,7 @@ COLUMNS = {
 
 
 def make_images(task: tuple[Path, Path, int]) -> None:
-    """Write so many views of a photograph into a folder."""
+    """Write a number of views of a photograph to a folder."""
     photograph, folder, count = task
     rng = np.random.default_rng(int(folder.name))
     image = load_image(photograph)[..., ::-1]
@@ -76,7 +77,7 @@ def make_images(task: tuple[Path, Path, int]) -> None:
 
 
 class Watch(threading.Thread):
-    """Sums the CPU seconds of this process and of those that it starts; the most memory of one."""
+    """Measures the CPU seconds of this process and its children, and the largest child's memory."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -85,7 +86,7 @@ class Watch(threading.Thread):
         self.ended = threading.Event()
 
     def run(self) -> None:
-        """Look at all processes, until it is over."""
+        """Sample all processes until `ended` is set."""
         own = psutil.Process()
         while True:
             over = self.ended.wait(0.5)
@@ -102,7 +103,7 @@ class Watch(threading.Thread):
 
 
 def watched(work: Callable[..., Any], *arguments: Any) -> dict[str, Any]:
-    """Run something; to be called in a process of its own."""
+    """Run a function and measure it; must be called in a separate process."""
     watch, before = Watch(), time.process_time()
     watch.start()
     found = work(*arguments)
@@ -122,7 +123,7 @@ def find_features(folder: Path, path: Path) -> None:
 
 
 def find_pairs(path: Path) -> list[tuple[str, str]]:
-    """Return the pairs of images that are alike."""
+    """Return the pairs of similar images."""
     with open_hdf5(path) as file:
         names = sorted(feature_names(file))
     return similar_pairs(path, names, SIMILAR, quiet=False)[0]
@@ -134,7 +135,7 @@ def find_matches(features: Path, pairs: list[tuple[str, str]], path: Path) -> No
 
 
 def measure(photographs: list[Path], count: int, work: Path) -> dict[str, Any]:
-    """Make so many images and return the row of the table."""
+    """Make `count` images, process them, and return the row of the table."""
     tasks = [
         (photographs[k], work / "images" / f"{k:05}", min(VIEWS, count - VIEWS * k))
         for k in range(-(-count // VIEWS))
@@ -165,12 +166,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("photographs", type=Path)
     parser.add_argument("counts", type=int, nargs="*", default=COUNTS)
-    parser.add_argument("--work", type=Path, help="where there is space for the files")
+    parser.add_argument("--work", type=Path, help="folder with enough space for the files")
     arguments = parser.parse_args()
     photographs = sorted(arguments.photographs.rglob("*.jpg"))
     if len(photographs) * VIEWS < max(arguments.counts):
         raise SystemExit(f"{max(arguments.counts) // VIEWS + 1} photographs are needed")
-    os.environ["RAY_ADDRESS"] = "local"  # processes of another cluster would not be seen
+    os.environ["RAY_ADDRESS"] = "local"  # processes of another cluster could not be measured
     rows = []
     if arguments.work is not None:
         arguments.work.mkdir(parents=True, exist_ok=True)

@@ -1,11 +1,12 @@
-"""Time of keypoints with descriptors, beside how often they are found again and matched.
+"""Time, repeatability and matches of keypoints with descriptors, for many methods.
 
     python benchmarks/times.py DATA --cache FOLDER [--method xfeat.onnx --method edgepoint2.onnx]
 
-Time: an image of 800x600 (the only size that XFeat's file takes) in memory, to at most 2,048
-keypoints with descriptors; medians of rounds in turn, in a process of one or two processors.
-SIFT and ORB with their own descriptors find and describe at once. Repeatability and right matches:
-means of the 40 pairs of Oxford, as in the standard protocol; the cache keeps them.
+Time: from an image of 800x600 in memory (the only size that XFeat's file takes) to at most 2,048
+keypoints with descriptors. It is the median over rounds, in which all methods take turns, in a
+process with one or two processors. SIFT and ORB with their own descriptors detect and describe in
+one call. Repeatability and correct matches are means over the 40 pairs of Oxford, as in the
+standard protocol; the cache keeps them.
 """
 
 from __future__ import annotations
@@ -44,14 +45,16 @@ from deepdetect_lab.evaluation.run import Run
 
 SIZE_PX = (800, 600)
 ROUNDS = 15
+"""Number of timed rounds. Chosen by hand."""
+
 WEIGHTS = ("default", "espnet")
-"""Of our networks."""
+"""Weights of our networks that are measured."""
 
 TOGETHER = {"SIFT": "SIFT_create", "ORB": "ORB_create"}
-"""What finds keypoints and their own descriptors at once."""
+"""Methods of OpenCV that compute keypoints and their own descriptors in one call."""
 
 RUNTIMES = {"openvino": "", "onnxruntime": ", ONNX Runtime"}
-"""By their names, what titles say of them."""
+"""What the titles of columns add for each runtime."""
 
 THREADS = {1: "1 thread", 2: "2 threads"}
 
@@ -62,11 +65,11 @@ MEASURES = {
     "right at 1 px": (("correct", 1), ",.0f"),
     "right at 3 px": (("correct", 3), ",.0f"),
 }
-"""Columns by their titles: names in the rows of the standard protocol, and styles."""
+"""Columns, each with its name in the rows of the standard protocol and its number format."""
 
 
 def networks(files: Sequence[str], runtime: str, threads: int | None) -> list[LocalFeature]:
-    """Return what a runtime runs: others' files, and ours, of which the best pixels are taken."""
+    """Return the networks of others, from files, and ours, whose best pixels are the keypoints."""
     selection = SelectionOptions(max_keypoints=MATCHING_BUDGET, nms_radius=1, subpixel=True)
     ours = []
     for weights in WEIGHTS:
@@ -78,7 +81,7 @@ def networks(files: Sequence[str], runtime: str, threads: int | None) -> list[Lo
 
 
 def classical() -> list[LocalFeature]:
-    """Return what needs no runtime."""
+    """Return the methods that need no runtime."""
     detector = PointDetector(MATCHING_BUDGET, resolution="native")
     version = str(detector.settings)
     points = replace(points_feature(), detect=detector.detect, version=version, detection="")
@@ -87,7 +90,7 @@ def classical() -> list[LocalFeature]:
 
 
 def described(features: Sequence[LocalFeature]) -> list[LocalFeature]:
-    """Return the features with each of their descriptors, which the titles name."""
+    """Return the features once with each of their descriptors, which are named in the titles."""
     rows = []
     for feature in features:
         if feature.learned or feature.title in TOGETHER:
@@ -100,7 +103,7 @@ def described(features: Sequence[LocalFeature]) -> list[LocalFeature]:
 
 
 def measure_times(photograph: Path, files: Sequence[str], threads: int) -> Row:
-    """Return the milliseconds of each feature, by the title and what is said of the runtime."""
+    """Return the milliseconds of each feature, by its title with the name of the runtime."""
     image = cv2.resize(load_image(photograph), SIZE_PX, interpolation=cv2.INTER_AREA)
     work = {feature.title: partial(extract, feature, image) for feature in classical()}
     for name, factory in TOGETHER.items():
@@ -112,7 +115,7 @@ def measure_times(photograph: Path, files: Sequence[str], threads: int) -> Row:
     milliseconds: dict[str, list[float]] = {name: [] for name in work}
     for _ in range(ROUNDS):
         for name, function in work.items():
-            function()  # it compiles, fills the cache, and waits for threads of the one before
+            function()  # compiles, fills the cache, and waits for threads of the previous method
             begin = time.perf_counter()
             function()
             milliseconds[name].append(1000 * (time.perf_counter() - begin))
@@ -125,7 +128,7 @@ def extract(feature: LocalFeature, image: np.ndarray) -> np.ndarray:
 
 
 def on_processors(count: int, function: Callable[..., Row], *arguments: object) -> Row:
-    """Call a module's function in a process that has so many processors when it is started."""
+    """Call a module's function in a process that may use `count` processors from its start."""
     all_of_them = os.sched_getaffinity(0)
     os.sched_setaffinity(0, sorted(all_of_them)[:count])
     context = multiprocessing.get_context("spawn")

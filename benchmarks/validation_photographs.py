@@ -1,10 +1,10 @@
-"""Print the scores of weights on a training's validation photographs, and how calibrated they are.
+"""Score weights and their calibration on the validation photographs of a training.
 
     python benchmarks/validation_photographs.py PHOTOS --weights default [--weights espnet ...]
 
 The views, the darkening and the labels are those of `deepdetect train --validation PHOTOS`: in
-normal light, and darkened, with the labels of low visibility. BCE and IoU are means over
-photographs; calibration error (Naeini et al., 2015) and densities are of all pixels together.
+normal light, and darkened with the labels of low visibility. BCE and IoU are means over
+photographs; calibration error (Naeini et al., 2015) and densities are computed over all pixels.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def options_of(short_side_px: int) -> TrainingOptions:
-    """Return the options of a training that is validated at a size."""
+    """Return the options of a training that is validated at a given size."""
     return TrainingOptions(stages=(Stage(16, 1, 1),), short_sides=(short_side_px,))
 
 
@@ -68,7 +68,7 @@ def score(image: SourceImage, weights: str, labels: LabelOptions) -> list[Measur
 
 @cache
 def detector(weights: str) -> DeepDetect:
-    """Return a detector that sees images as they are."""
+    """Return a detector that does not scale images."""
     return DeepDetect(weights, resolution="native", threads=1)
 
 

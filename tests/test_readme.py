@@ -80,7 +80,7 @@ def test_make_demo_runs(tmp_path: Path) -> None:
         ["make", "demo", f"DEMO_OUTPUT={tmp_path}"], cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    for word in ("keypoints", "matches", "of the truth", "seconds"):
+    for word in ("keypoints", "matches", "of ground truth", "seconds"):
         assert word in done.stdout
     pictures = {path.name.removeprefix("motorcycle_") for path in tmp_path.glob("*.jpg")}
     assert pictures == {

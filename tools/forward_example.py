@@ -1,9 +1,9 @@
-"""The second picture of the page's example of forward motion.
+"""Render the second image of the page's example of forward motion.
 
     python tools/forward_example.py
 
-It is the left view of the motorcycle (Middlebury 2014, in scikit-image), seen from a camera that
-moved ahead: each pixel goes where its measured depth says, and what nothing shows is filled in.
+It shows the left view of the motorcycle (Middlebury 2014, in scikit-image) from a camera that moved
+forward. Each pixel is moved according to its measured depth; pixels that stay empty are inpainted.
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ from deepdetect_lab.datasets import load_motorcycle
 OUTPUT = Path("src/deepdetect/app/static/examples/motorcycle-ahead.jpg")
 
 AHEAD = 0.16
-"""The way of the camera, as a fraction of the depth of the nearest point."""
+"""The camera moves forward by this fraction of the depth of the nearest point. Chosen by hand."""
 
 FOCAL_PX, CENTRE, OFFSET_PX = 994.978, (311.193, 254.877), 31.086
-"""Of the left camera, and the difference of cx: Middlebury's calibration at this size."""
+"""Middlebury's calibration at this size: the left camera, and the difference of cx."""
 
 SCALE = 4
-"""Pixels are moved as squares of 1/4 px, so that what comes nearer has no gaps."""
+"""The image is enlarged by this factor before pixels are moved, so that magnified parts have no
+gaps. Chosen by hand."""
 
 
 def main() -> None:
-    """Write the picture."""
+    """Write the image."""
     pair = load_motorcycle()
     unknown = np.isnan(pair.disparity).astype(np.uint8)
     known_ones = np.nan_to_num(pair.disparity).astype(np.float32)
@@ -43,12 +44,12 @@ def main() -> None:
     xy = [np.rint((v - c) * depth / nearer + c) for v, c in zip((x, y), CENTRE, strict=True)]
     column, row = (each.astype(int) for each in xy)
     seen = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    order = np.argsort(-nearer[seen])  # the nearest last: of several the last one stays
+    order = np.argsort(-nearer[seen])  # the nearest come last and overwrite the others
     picture, known = np.zeros((height, width, 3), np.uint8), np.zeros((height, width), np.uint8)
     picture[row[seen][order], column[seen][order]] = rgb[seen][order]
     known[row[seen], column[seen]] = 1
     save_picture(cv2.inpaint(picture, 1 - known, 3, cv2.INPAINT_TELEA), OUTPUT)
-    print(f"{OUTPUT}: {1 - known.mean():.1%} filled in")
+    print(f"{OUTPUT}: {1 - known.mean():.1%} inpainted")
 
 
 if __name__ == "__main__":

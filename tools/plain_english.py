@@ -1,11 +1,11 @@
-"""Phrases that must be read twice: in pages, notebooks, help texts, and in the sources' own words.
+"""Find phrases that are hard to read in pages, notebooks, help texts and source files.
 
-python tools/plain_english.py    # `make lint` runs it; it ends with 1 and names each place
+python tools/plain_english.py    # `make lint` runs it; it prints each place and exits with 1
 python tools/plain_english.py src/deepdetect/io    # only these files and folders
 
-Of Python files it reads docstrings, notes under constants, comments and the texts of messages.
+In Python files it reads docstrings, notes under constants, comments and the texts of messages.
 
-codespell knows words; this knows phrases. To add one, write a line of `PHRASES`.
+codespell finds words, this tool finds phrases. To add one, add a line to `PHRASES`.
 """
 
 from __future__ import annotations
@@ -61,17 +61,17 @@ PHRASES = {
     r"\bso (?:many|few|much) (?:as|for)\b|\b(?:of more|of these), so many\b": "name the number",
     r"\bas of `": "'as in `...`'",
 }
-"""Patterns of phrases, with what to write."""
+"""Patterns of phrases, each with a suggestion what to write."""
 
 NOTE_BEGINNINGS = re.compile(
     r"(?:Of|To|For|From|In|With|By|At|On|Up|Over|Under|Below|Above|Around|Between|Beyond|Along|"
     r"Until|Through|After|Before|Within|Beside|As|So|Than|Relative|Also|Least|Largest|Smallest|Most)"
     r"\b(?! is\b)"
 )
-"""How a note under a constant begins that continues the constant's name in place of a sentence."""
+"""Beginnings of notes that continue the name of their constant instead of being a sentence."""
 
 PYTHON = ("src", "lab/src", "benchmarks", "tools", "examples")
-"""The folders whose Python files are read."""
+"""Folders whose Python files are read."""
 
 NOT_PROSE = re.compile(
     r"<!-- results?:.*?<!-- /results? -->|^ *```.*?^ *```$|`[^`\n]*`|\]\([^)]*\)",
@@ -80,7 +80,7 @@ NOT_PROSE = re.compile(
 
 
 def texts() -> dict[str, str]:
-    """Return what users read, by its name."""
+    """Return the texts that users read, by their names."""
     pages = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
     found = {page.name: page.read_text("utf-8") for page in pages}
     for notebook in sorted((ROOT / "docs/notebooks").glob("*.ipynb")):
@@ -91,9 +91,9 @@ def texts() -> dict[str, str]:
 
 
 def python_texts(path: Path) -> Iterator[tuple[int, str, bool]]:
-    """Yield the line, the text, and whether it is a note under a constant, of all prose in a file.
+    """Yield all prose of a file: the line, the text, and whether it is a note under a constant.
 
-    Strings of one word or two are names; examples in docstrings are code.
+    Strings of one or two words are skipped as names, and examples in docstrings as code.
     """
     source = path.read_text("utf-8")
     tree = ast.parse(source)
@@ -128,7 +128,7 @@ def python_texts(path: Path) -> Iterator[tuple[int, str, bool]]:
 
 
 def python_problems(path: Path) -> list[str]:
-    """Return a line for each phrase in the words of a Python file."""
+    """Return a line for each phrase in the prose of a Python file."""
     found = []
     name = path.relative_to(ROOT).as_posix() if path.is_relative_to(ROOT) else str(path)
     for line, text, is_note in python_texts(path):
@@ -141,7 +141,7 @@ def python_problems(path: Path) -> list[str]:
 
 
 def problems(name: str, text: str) -> list[str]:
-    """Return a line for each phrase in a text, with its place and what to write.
+    """Return a line for each phrase in a text, with its place and a suggestion.
 
     Example:
         >>> problems("a.md", "It is fast, too.")
@@ -158,7 +158,7 @@ def problems(name: str, text: str) -> list[str]:
 
 
 def main() -> None:
-    """Print all problems, and end with 1 if there are any."""
+    """Print all problems; exit with 1 if there are any."""
     chosen = [Path(word).resolve() for word in sys.argv[1:]]
     found = []
     if not chosen:

@@ -1,11 +1,11 @@
-"""The graph of the points in ONNX files.
+"""Write the ONNX graph that detects points.
 
     python tools/points_graph.py
     python tools/points_graph.py --candidates web/points.onnx
 
-The first command makes the file of the package that `deepdetect export onnx` adds to a network, the
-second one what the page in the browser runs. Steps, constants and weights are those of
-`deepdetect.detector.points`: after a change there, make the file of the package again.
+The first command writes the package's file that `deepdetect export onnx` adds to a network. The
+second one writes the file that the page in the browser runs. Steps, constants and weights are those
+of `deepdetect.detector.points`: after a change there, write the package's file again.
 """
 
 from __future__ import annotations
@@ -55,40 +55,41 @@ from deepdetect.features.scale_space import SIZE_PER_SIGMA as SIFT_SIZE_PER_SIGM
 from deepdetect.features.selection import MAX_OFFSET_PX
 
 OPSET, IR_VERSION = 17, 8
-"""Those of the network's file."""
+"""Versions of the operators and of the format, as in the network's file."""
 
 LUMA, LUMA_UNIT = (9798.0, 19235.0, 3735.0), 32768.0
-"""Red, green and blue in OpenCV's grey: in whole numbers, whose sums are exact."""
+"""Weights of red, green and blue in OpenCV's luma, as integers over a unit: their sums are
+exact."""
 
 REACH_PER_SIGMA = 4
-"""Of OpenCV's Gaussian filters of float32."""
+"""Radius of OpenCV's float32 Gaussian filters, in sigmas."""
 
 FIRST, LAST = 1, len(SIGMAS_PX) - 3
-"""Levels that have candidates."""
+"""First and last level that has candidates."""
 
 MARGIN = NMS_RADIUS + 1
-"""Pixels around a candidate that are looked at: a window, and one more to differentiate."""
+"""Radius of the patch around a candidate that is read: a window and one pixel for derivatives."""
 
 NEAR, OTHERS = np.arange(-1, 3), [0, 2, 3]
-"""Levels that are looked at, from that of a candidate, and which of them are others."""
+"""Levels that are read, relative to a candidate's own; indices of those that are not its own."""
 
 CHUNK = 2048
-"""Candidates that are measured at a time: all the pixels around them would take 70 MB and more."""
+"""Number of candidates measured at once: all their patches would take 70 MB and more."""
 
 OCTAVES, REACH = 3, 15
-"""Of SIFT's scale space and the windows of gradients in it that points' sizes ask for."""
+"""Octaves of SIFT's scale space, and radius of gradient windows, that the sizes of points need."""
 
 TOGETHER = 16
-"""Neighbours that are smoothed at a time."""
+"""Number of neighbours that a convolution smooths at once, as channels of its result."""
 
 BLOCK = 256
-"""Points that are compared with each other at a time."""
+"""Number of points that are compared with each other at once. Chosen by hand."""
 
 END = 1 << 40
-"""Of any axis."""
+"""A slice to this index reaches the end of any axis."""
 
 FLOAT, UINT8, INT64, BOOL = 1, 2, 7, 9
-"""As ONNX numbers the types of elements."""
+"""ONNX's codes of element types."""
 
 
 def main() -> None:
@@ -101,7 +102,7 @@ def main() -> None:
 
 
 def points_model() -> onnx.ModelProto:
-    """Make the graph that maps images to their best points, as many as an initializer says."""
+    """Make the graph that maps images to their best points; an initializer holds their number."""
     graph = Graph(PREFIX)
     count = graph.constant([2048], MAX_KEYPOINTS)
     gray = gray_of(Tensor(graph, "image"))
@@ -115,7 +116,7 @@ def points_model() -> onnx.ModelProto:
 
 
 def candidates_model() -> onnx.ModelProto:
-    """Make the graph that maps grey images to their candidates, at most a limit, ranked."""
+    """Make the graph that maps grey images to ranked candidates, at most an input `limit`."""
     graph = Graph(PREFIX)
     gray, limit = Tensor(graph, "gray").Cast(to=FLOAT), Tensor(graph, "limit")
     x, y, level, logits = rank_candidates(gray, limit)
@@ -130,7 +131,7 @@ def _operator(kind: str) -> Callable[[Tensor, Any], Any]:
 
 
 class Tensor:
-    """A tensor of a graph: `tensor.Kind(...)` is a node that reads it, and so is an operator."""
+    """A tensor of a graph: `tensor.Kind(...)` and Python's operators add nodes that read it."""
 
     def __init__(self, graph: Graph, name: str) -> None:
         self.graph, self.name = graph, name
@@ -142,7 +143,7 @@ class Tensor:
 
 
 class Graph:
-    """Nodes and constants, of a model or of the body of a loop; a prefix begins their names."""
+    """Nodes and constants of a model or a loop body; their names start with the prefix."""
 
     def __init__(self, prefix: str) -> None:
         self.prefix, self.nodes = prefix, []
@@ -150,7 +151,7 @@ class Graph:
         self.constants: dict[Any, onnx.TensorProto] = {}
 
     def constant(self, value: Any, name: str | None = None) -> Tensor:
-        """Return a constant of float32, int64 or bool; equal ones without a name are one."""
+        """Return a constant of float32, int64 or bool; equal ones without a name are shared."""
         array = np.asarray(value)
         array = array.astype({"f": np.float32, "b": np.bool_}.get(array.dtype.kind, np.int64))
         key = name or (array.dtype, array.shape, array.tobytes())
@@ -160,11 +161,11 @@ class Graph:
         return Tensor(self, self.constants[key].name)
 
     def tensor(self, value: Any) -> Tensor:
-        """Return a tensor of this graph: a constant, or one of the graph around it."""
+        """Return a tensor of this graph: a constant, or a tensor of the enclosing graph."""
         return Tensor(self, value.name) if isinstance(value, Tensor) else self.constant(value)
 
     def add(self, kind: str, *inputs: Any, outputs: int = 1, **values: Any) -> Any:
-        """Return the output of a node, or a list of several; equal nodes are one."""
+        """Add a node, unless an equal one exists; return its output, or a list of several."""
         read = [self.tensor(value).name for value in inputs]
         key = kind, *read, repr(values)
         if key not in self.made:
@@ -178,10 +179,11 @@ class Graph:
         return self.add("Concat", *inputs, axis=axis)
 
     def loop(self, count: Any, step: Callable[..., Sequence[Any]], *state: Any) -> list[Any]:
-        """Repeat a step; return its last state, and what it has found each time, stacked.
+        """Repeat a step; return its last state and the stacked results of all steps.
 
-        It maps the number of the step, whether the loop goes on, and the int64 state, tensors of
-        its own graph, to: whether it goes on, the state, and float32 that it has found.
+        `step` is called with tensors of the body's graph: the index of the step, whether the loop
+        continues, and the int64 state. It returns whether the loop continues, the new state, and
+        float32 results.
         """
         body = Graph(f"{self.prefix}loop{len(self.nodes)}/")
         given = [Tensor(body, f"{body.prefix}given{k}") for k in range(2 + len(state))]
@@ -201,7 +203,7 @@ class Graph:
         outputs: Sequence[tuple[Any, ...]],
         tensors: Sequence[Tensor],
     ) -> onnx.ModelProto:
-        """Return the model with inputs and outputs of names, types and shapes."""
+        """Return the model; inputs and outputs are given by name, type and shape."""
         for output, tensor in zip(outputs, tensors, strict=True):
             self.nodes.append(helper.make_node("Identity", [tensor.name], [output[0]]))
         ends = [[helper.make_tensor_value_info(*one) for one in end] for end in (inputs, outputs)]
@@ -212,17 +214,17 @@ class Graph:
 
 
 def gray_of(image: Any) -> Any:
-    """Return the grey levels of (B, 3, H, W) images in [0, 1], (B, 1, H, W), as OpenCV has them."""
+    """Convert (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W) grey levels, equal to OpenCV's."""
     gray = (image * 255.0).Round().Conv(np.reshape(LUMA, (1, 3, 1, 1)))
     return ((gray + LUMA_UNIT / 2) / LUMA_UNIT).Floor()
 
 
 def rank_candidates(gray: Any, limit: Any) -> tuple[Any, Any, Any, Any]:
-    """Find the strongest candidates of (B, 1, H, W) grey images, at most so many, and rank them.
+    """Find the strongest candidates of (B, 1, H, W) grey images, at most `limit`, and rank them.
 
     Returns:
-        x, y, level and logit, (B, K) each, the strongest first. Behind the last candidate of an
-        image there is at least one more, whose logit is -infinity.
+        x, y, level and logit, (B, K) each, the strongest first. The candidates of an image are
+        followed by at least one padding entry, whose logit is -infinity.
     """
     graph = gray.graph
     height, width = (gray.Shape(start=axis, end=axis + 1) for axis in (2, 3))
@@ -257,9 +259,9 @@ def rank_candidates(gray: Any, limit: Any) -> tuple[Any, Any, Any, Any]:
 
 
 def _levels(smooth: Any, height: Any, width: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield levels with a frame of `MARGIN`, and (B, H W) strengths: of maxima, else 0; or None.
+    """Yield levels, padded by `MARGIN`, and (B, H W) strengths of maxima, 0 elsewhere, or None.
 
-    The frame is mirrored at the outermost rows and columns, as the filters see the image.
+    The padding mirrors the image at its outermost rows and columns, as the filters do.
     """
     inner = []
     for side in (height, width):
@@ -267,7 +269,7 @@ def _levels(smooth: Any, height: Any, width: Any) -> Iterator[tuple[Any, Any]]:
         inner.append(place.Greater(0).And(place.Less(side - 1)))
     inside = inner[0].Unsqueeze([1]).And(inner[1])
     for k, step in enumerate(np.sqrt(np.diff(SIGMAS_PX**2, prepend=0.0))):
-        # Gaussians add up by their variances: each level smooths the one before.
+        # The variances of Gaussians add up, so each level smooths the previous one.
         smooth = _blur(smooth, step, height, width)
         frame = _framed(_framed(smooth, MARGIN, 2, height), MARGIN, 3, width)
         if not FIRST <= k <= LAST:
@@ -281,21 +283,21 @@ def _levels(smooth: Any, height: Any, width: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def _framed(values: Any, radius: int, axis: int, side: Any, more: Any = 0) -> Any:
-    """Return images with more rows (axis 2) or columns (3), mirrored at the outermost ones.
+    """Pad images by mirrored rows (axis 2) or columns (axis 3).
 
-    `more` is how many more come behind the last one.
+    `more` is the number of additional ones at the end.
     """
     graph, period = values.graph, (side * 2 - 2).Max([1])
     ends = (-radius, 0), (side.Squeeze(), (side + radius + more).Squeeze())
     places = (graph.add("Range", *end, 1).Mod(period) for end in ends)
     before, after = (values.Gather(each.Min(period - each), axis=axis) for each in places)
-    return graph.join([before, values, after], axis=axis)  # most are copied in long rows
+    return graph.join([before, values, after], axis=axis)  # copies most values in long rows
 
 
 def _blur(values: Any, sigma: float, height: Any, width: Any) -> Any:
-    """Return images smoothed as `cv2.GaussianBlur` does it.
+    """Smooth images as `cv2.GaussianBlur` does.
 
-    A convolution with one channel is slow: `TOGETHER` neighbours are channels of its result.
+    Convolutions with one channel are slow, so `TOGETHER` neighbours are channels of the result.
     """
     graph, radius = values.graph, round(2 * REACH_PER_SIGMA * sigma + 1) // 2
     kernel = cv2.getGaussianKernel(2 * radius + 1, float(sigma), cv2.CV_32F)[:, 0]
@@ -317,23 +319,23 @@ def _blur(values: Any, sigma: float, height: Any, width: Any) -> Any:
 def _measure(
     flat: Any, height: Any, width: Any, mean: Any, level: Any, row: Any, column: Any, ranks: Any
 ) -> tuple[Any, Any, Any]:
-    """Return x, y and logits of candidates, as `describe_candidates` and the ranker find them.
+    """Return x, y and logits of candidates, as `describe_candidates` and the ranker compute them.
 
-    `flat` has all levels of an image with their frames in a row. Candidates are the last axis of
-    all tensors, so that what is beside them can be cut out in long rows.
+    `flat` contains all padded levels of an image in one row. Candidates are the last axis of all
+    tensors, so that slices along other axes copy long rows.
     """
     graph, variances = level.graph, level.graph.tensor(VARIANCES)
     down = width + 2 * MARGIN
     deeper = down * (height + 2 * MARGIN)
 
     def look(level: Any, row: Any, column: Any, steps: Sequence[Any], *shape: int) -> Any:
-        """Return the smoothed image at pixels and at steps in levels, rows and columns."""
+        """Return the smoothed image at pixels shifted by steps in level, row and column."""
         steps = [each.reshape(-1, 1) for each in np.meshgrid(*steps, indexing="ij")]
         pixels = deeper * level + down * (row + MARGIN) + (column + MARGIN)
         pixels = pixels.Unsqueeze([2]) + (deeper * steps[0] + down * steps[1] + steps[2])
         return flat.GatherElements(pixels.Reshape([0, -1]), axis=1).Reshape([0, *shape, -1])
 
-    # Windows around each candidate in its own and in other levels, (B, 4, 7, 7, K).
+    # Windows around each candidate in its own level and others, (B, 4, 7, 7, K).
     side = np.arange(-MARGIN, MARGIN + 1)
     values = look(level, row, column, (NEAR, side, side), len(NEAR), len(side), len(side))
     scale = variances.Gather(level + NEAR[:, None]).Unsqueeze([2, 3])
@@ -350,7 +352,7 @@ def _measure(
     trace = (((xx + yy) * scale).Squeeze([2, 3]) / strength / 2.0).Atan()
     own, others = _log(own_determinant), _log(determinant).Gather(OTHERS, axis=1)
 
-    # Rings around it in its own level, (B, 32, 3, 3, K).
+    # Rings around each candidate in its own level, (B, 32, 3, 3, K).
     right, below = (
         (
             graph.tensor(table)
@@ -413,7 +415,7 @@ def _measure(
 
 
 def _at(values: Any, margin: int, down: int, right: int) -> Any:
-    """Return the neighbours of all pixels, axes 2 and 3, but those in the margins."""
+    """Return the neighbours, in axes 2 and 3, of all pixels that are not in the margins."""
     start, stop = np.add(margin, (down, right)), np.subtract((down, right), margin)
     return values.Slice(start, np.where(stop, stop, END), [2, 3])
 
@@ -427,7 +429,7 @@ def _bends(values: Any, margin: int) -> tuple[Any, Any]:
 
 
 def _determinant(values: Any, margin: int, variance: Any) -> Any:
-    """Return the determinant of the Hessian, in the order of `kernels.differentiate`."""
+    """Return the determinant of the Hessian, by the same operations as `kernels.differentiate`."""
     xx, yy = _bends(values, margin)
     below = _at(values, margin, 1, 1) - _at(values, margin, 1, -1)
     xy = below - (_at(values, margin, -1, 1) - _at(values, margin, -1, -1))
@@ -447,7 +449,7 @@ def _log_slope(values: Any, margin: int, variance: Any) -> Any:
 
 
 def _peak_offset(response: Any, down: int, right: int) -> Any:
-    """Return where the maximum of a parabola is, from the middle of windows along an axis."""
+    """Return the offset of a parabola's maximum from the centre of windows, along an axis."""
     before, middle, after = (
         _at(response, NMS_RADIUS, step * down, step * right) for step in (-1, 0, 1)
     )
@@ -469,7 +471,7 @@ def _rank(graph: Graph, features: dict[tuple[int, ...], Any]) -> Any:
 
 
 def choose(x: Any, y: Any, level: Any, logits: Any, count: Any) -> list[Any]:
-    """Go through candidates from the best, and drop those that a kept one is near.
+    """Keep candidates, best first, that are not near a better kept one.
 
     Returns x, y, scores and sizes of the first kept ones, (B, `count`) each.
     """
@@ -491,7 +493,7 @@ def choose(x: Any, y: Any, level: Any, logits: Any, count: Any) -> list[Any]:
     last = x.Shape(start=1) - 1
 
     def suppress(number: Any, _: Any, rows: Any, found: Any) -> tuple[Any, Any, Any]:
-        """Add those of a block that no better one is near, as `suppress_neighbors` does."""
+        """Add the candidates of a block without better neighbours, as `suppress_neighbors` does."""
         start, numbers = number.Reshape([1]) * BLOCK, np.arange(BLOCK)
         places = [number.graph.tensor(each) for each in (x, y, radii)]
         here = [each.Slice(start, start + BLOCK, [1]) for each in places]
@@ -503,7 +505,7 @@ def choose(x: Any, y: Any, level: Any, logits: Any, count: Any) -> list[Any]:
         better = better * _near(here, here)
 
         def settle(_: Any, __: Any, kept: Any) -> tuple[Any, Any]:
-            """Suppress none any longer that are near suppressed ones only, until that is all."""
+            """Keep those whose better neighbours are all suppressed, until nothing changes."""
             first, near = (kept.graph.tensor(each) for each in (free, better))
             settled = near.MatMul(kept.Cast(to=FLOAT)).Greater(0.0).Where(0.0, first)
             settled = settled.Cast(to=INT64)
@@ -517,7 +519,7 @@ def choose(x: Any, y: Any, level: Any, logits: Any, count: Any) -> list[Any]:
         found = (found + kept.ReduceSum([1])).Min(count)
         return found.Less(count).Cast(to=FLOAT).ReduceMax(keepdims=0).Cast(to=BOOL), rows, found
 
-    # Rows of the kept ones, and behind them the last, which is none; how many are kept.
+    # Rows of the kept candidates, padded by the last row, which is padding; and their number.
     images = x.Shape(end=1)
     rows = last.Expand(graph.join([images, count + 1], axis=0))
     found = graph.tensor([[0]]).Expand(graph.join([images, [1]], axis=0))
@@ -569,7 +571,7 @@ def _turn(
 ) -> Any:
     """Return the orientations (B, K) of points, (B, 1, 1, 1, K), as `strongest_directions` does.
 
-    `flat` has the layers of SIFT's scale space of an image in a row.
+    `flat` contains the layers of an image's SIFT scale space in one row.
     """
     graph, reach = flat.graph, np.arange(-REACH - 1, REACH + 2)
     step = ((size / (SIFT_SIZE_PER_SIGMA * BASE_SIGMA_PX)).Log() * (LAYERS / np.log(2))).Round()
@@ -625,7 +627,7 @@ def _turn(
 
 
 def _near(one: list[Any], other: list[Any]) -> Any:
-    """Return 1 where the first points are near the second ones, else 0: (B, K, L)."""
+    """Return (B, K, L): 1 where the first points are near the second ones, otherwise 0."""
     x, y, radius = ((a.Unsqueeze([2]), b.Unsqueeze([1])) for a, b in zip(one, other, strict=True))
     dx, dy, least = x[0] - x[1], y[0] - y[1], radius[0].Min(radius[1])
     return (dx * dx + dy * dy).Less(least * least).Cast(to=FLOAT)

@@ -1,4 +1,4 @@
-"""The ONNX files of one node that matchers multiply descriptors by.
+"""Write the ONNX files of one node with which matchers multiply descriptors.
 
     python tools/product_graphs.py
 
@@ -20,7 +20,7 @@ GRAPHS = {
     "signed": ("MatMulInteger", TensorProto.UINT8, TensorProto.INT8, TensorProto.INT32),
     "unsigned": ("MatMulInteger", TensorProto.UINT8, TensorProto.UINT8, TensorProto.INT32),
 }
-"""Operator, and types of a, b and y, by the names of files."""
+"""Operator, and types of a, b and y, by file name."""
 
 
 def product_graph(name: str) -> ModelProto:
@@ -37,7 +37,7 @@ def product_graph(name: str) -> ModelProto:
 
 
 def main() -> None:
-    """Write all graphs into the package, or a folder."""
+    """Write all graphs to the package or a given folder."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("output", nargs="?", type=Path, default=PRODUCTS)
     output = parser.parse_args().output

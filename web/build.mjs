@@ -1,4 +1,4 @@
-// Makes web/dist: the page with ONNX Runtime, the networks and the graph of the points, for any web server.
+// Builds web/dist: the page with ONNX Runtime, the networks and the graph of the points, for any web server.
 import { createHash } from "node:crypto";
 import { cpSync, mkdirSync, readFileSync, readdirSync, rmSync, writeFileSync } from "node:fs";
 import { basename, dirname, join, relative } from "node:path";
@@ -10,7 +10,7 @@ const dist = join(here, "dist");
 const packaged = join(here, "../src/deepdetect");
 const runtime = join(here, "node_modules/onnxruntime-web/dist");
 
-// The second line is for WebGPU only: nobody else loads it.
+// The second list is loaded with WebGPU only.
 const RUNTIME_FILES = ["ort.wasm.min.mjs", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm"];
 const WEBGPU_FILES = ["ort.webgpu.min.mjs", "ort-wasm-simd-threaded.asyncify.mjs",
                       "ort-wasm-simd-threaded.asyncify.wasm"];
@@ -18,8 +18,8 @@ const WEBGPU_FILES = ["ort.webgpu.min.mjs", "ort-wasm-simd-threaded.asyncify.mjs
 rmSync(dist, { recursive: true, force: true });
 cpSync(join(packaged, "app/static"), dist, { recursive: true });
 mkdirSync(join(dist, "ort"));
-// Not every web server compresses WebAssembly and models, so the page unpacks them. Servers know no
-// files of these endings: they leave them as they are.
+// Not every web server compresses WebAssembly and models, so the page unpacks them itself. Servers do
+// not know these file endings and serve the files unchanged.
 const packedName = (name) => name.replace(/\.wasm$/, ".wasm.packed");
 for (const name of [...RUNTIME_FILES, ...WEBGPU_FILES]) {
   const content = readFileSync(join(runtime, name));

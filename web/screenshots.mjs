@@ -1,4 +1,4 @@
-// Makes the pictures of docs/app.md: npm run screenshots. DEEPDETECT_PYTHON names the Python.
+// Takes the screenshots of docs/app.md: npm run screenshots. DEEPDETECT_PYTHON is the Python to use.
 import { chromium as playwright } from "@playwright/test";
 import { spawn } from "node:child_process";
 import { readFileSync } from "node:fs";
@@ -10,7 +10,7 @@ const QUALITY = 78;
 
 const counted = (page, id, word) => page.locator(id).filter({ hasText: word }).waitFor({ timeout: 120_000 });
 
-/** Each view: what leads to it, and under which name it is saved. */
+/** The views: the name of the file, and the steps that lead to the view. */
 const VIEWS = [
   { name: "start", go: async (page) => page.locator("#examples img").last().waitFor() },
   { name: "keypoints", go: async (page) => {
@@ -57,7 +57,7 @@ async function take(browser, address, width, height, colorScheme) {
     await go(page);
     await page.locator("#busy").waitFor({ state: "hidden" });
     await page.evaluate(() => scrollTo(0, 0));
-    await page.waitForTimeout(800); // pictures are drawn
+    await page.waitForTimeout(800); // until all images are drawn
     pictures.push({ name, content: await page.screenshot({ type: "jpeg", quality: QUALITY,
                                                             path: width > 500 ? join(folder, `app-${name}.jpg`) : undefined }) });
   }

@@ -1,4 +1,4 @@
-// Serves web/dist at 127.0.0.1, to look at it and for the tests: node serve.mjs [PORT]
+// Serves web/dist at 127.0.0.1, for viewing and for the tests: node serve.mjs [PORT]
 import { readFile } from "node:fs/promises";
 import { createServer } from "node:http";
 import { dirname, extname, join, normalize } from "node:path";

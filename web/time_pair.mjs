@@ -1,5 +1,5 @@
-// How long the page takes for two pictures of 640x480, from the files to their matches, on one thread
-// of WebAssembly, once all is loaded: node time_pair.mjs [PICTURE PICTURE], after npm run build.
+// Times the page on two images of 640x480, from the files to their matches, on one thread of
+// WebAssembly, after everything is loaded: node time_pair.mjs [IMAGE IMAGE], after npm run build.
 import { chromium as playwright } from "@playwright/test";
 import { spawn } from "node:child_process";
 import { once } from "node:events";
@@ -25,7 +25,7 @@ const page = await browser.newPage();
 await page.goto(`http://127.0.0.1:${PORT}/`);
 await page.locator("#examples button").first().waitFor();
 const times = [];
-for (let run = 0; run <= RUNS; run++) { // the first loads what is needed
+for (let run = 0; run <= RUNS; run++) { // the first run loads everything and is not counted
   await page.locator("#file").setInputFiles(files);
   times.push(await page.evaluate(() => new Promise((resolve) => {
     const start = performance.now();
@@ -40,4 +40,4 @@ await browser.close();
 server.kill();
 times.sort((a, b) => a - b);
 const [median, fastest] = [times[RUNS >> 1], times[0]].map((time) => `${(time / 1000).toFixed(2)} s`);
-console.log(`two pictures of 640x480, ${RUNS} runs: median ${median}, fastest ${fastest}`);
+console.log(`two images of 640x480, ${RUNS} runs: median ${median}, fastest ${fastest}`);

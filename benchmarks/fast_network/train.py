@@ -1,21 +1,22 @@
-"""Train the network `fast` on views that `views.py` makes meanwhile, for CPU seconds.
+"""Train the network `fast` for some CPU seconds, on views that `views.py` makes at the same time.
 
     python benchmarks/fast_network/train.py VIEWS OUTPUT SECONDS [--init WEIGHTS] [--rate 0.002]
 
-SOAP, bfloat16, batches of 16 views of 480 pixels or as many pixels of others, one cosine; the
-weights are an exponential average: the recipe of `deepdetect train` without files of labels. It
-prints steps, images' worth of 480x480, seconds, rate, loss, BCE and IoU of every fourth
-photograph of the validation in normal light and darkened, and the views made so far.
+The recipe is that of `deepdetect train` without files of labels: SOAP, bfloat16, batches of 16
+views of 480 pixels or the same number of pixels in other sizes, and one cosine. The weights are an
+exponential average. It prints steps, seen pixels in images of 480x480, seconds, learning rate,
+loss, BCE and IoU over every fourth validation photograph in normal light and darkened, and the
+number of views made so far.
 
-The weights `default` are those of two runs on 2,705 photographs (29,703 views).
-(Their first kernels were trained as 3x3 of the four pixels of each 2x2, which is the same,
-and their thresholds with the other sign.) The first, 5,400 s of one thread (AMD EPYC with bfloat16,
-beside other work), began with weights of the network before, which had a convolution at a quarter
-of the size in place of one at half of it (60c01c10, 465 s of a third of an NVIDIA H100, from random
-numbers), fitted to the new form by least squares. The second, 2,400 s, began with the first, at a
-rate of 0.0014, seed 4. `dense` began with the first run: 1,800 s, labels `dense`, rate 0.0015.
-`free` is one run of 2,000 s from random numbers. Their scores: `docs/results/validation.csv` and
-`label-prediction.csv`.
+The weights `default` come from two runs on 2,705 photographs (29,703 views). The first run took
+5,400 s of one thread (AMD EPYC with bfloat16, shared with other work). It began with the weights of
+the previous network, fitted to the new form by least squares. That network had a convolution at a
+quarter of the image size in place of the one at half of it; it was trained from random weights
+(60c01c10, 465 s on a third of an NVIDIA H100). The second run took 2,400 s and began with the first
+one, with a rate of 0.0014 and seed 4. `dense` also began with the first run: 1,800 s, labels
+`dense`, rate 0.0015. `free` is one run of 2,000 s from random weights. In these runs the first
+kernels were trained as 3x3 of the four pixels of each 2x2, which is equivalent, and the thresholds
+had the opposite sign. For scores see `docs/results/validation.csv` and `label-prediction.csv`.
 """
 
 from __future__ import annotations
@@ -37,16 +38,21 @@ from deepdetect_lab.training.optim import Soap
 
 BATCHES = {"S": 64, "T": 30, "M": 16, "L": 4}
 SHARES = {"S": 0.14, "T": 0.12, "M": 0.62, "L": 0.12}
+"""Batch size, and share of the batches, for each size of views. Chosen by hand."""
+
 KINDS = np.array([0.26, 0.20, 0.32, 0.22])
-"""Shares of: as it is, darkened, augmented, augmented and darkened, of those that there are."""
+"""Shares of views that are unchanged, darkened, augmented, and both; missing kinds get none. Chosen
+by hand."""
 
 WARM_UP, DECAY = 0.04, 0.999
-"""Fraction of the training in which the rate rises; of the average of the weights."""
+"""Fraction of the training over which the rate rises, and decay of the average of the weights in
+each step. Chosen by hand."""
 
 BIAS = 0.1
-"""Added to the logits at the end. Calibrated weights mark fewer pixels over .5 than labels do; with
-this more at the same loss: on every second of photos/val .0851 and .1121 (.0851 and .1120 without),
-densities .296 and .203 (.294 and .199; labels .300 and .214)."""
+"""This number is added to the logits at the end. Calibrated weights mark fewer pixels than the
+labels do; with the bias they mark more at the same loss. On every second photograph of photos/val
+the loss is 0.0851 in normal light and 0.1121 darkened (without bias 0.0851 and 0.1120), and the
+densities are 0.296 and 0.203 (0.294 and 0.199; labels 0.300 and 0.214)."""
 
 
 class Views:
@@ -57,7 +63,7 @@ class Views:
         self.views: dict[str, list[list[np.ndarray]]] = {size: [[], [], [], []] for size in BATCHES}
 
     def take(self) -> None:
-        """Load chunks that are new."""
+        """Load new chunks."""
         for path in self.folder.glob("[STML][0-3]-*.npy"):
             if path.name not in self.seen:
                 views = list(np.load(path))
@@ -66,7 +72,7 @@ class Views:
                 self.count += len(views)
 
     def batch(self, rng: np.random.Generator) -> Tensor:
-        """Return (N, 2, S, S) uint8 of one size, half of the times transposed."""
+        """Return (N, 2, S, S) uint8 views of one random size, transposed in half of the cases."""
         size = str(rng.choice(list(SHARES), p=list(SHARES.values())))
         of_size = self.views[size]
         shares = KINDS * [len(views) > 0 for views in of_size]
@@ -83,13 +89,13 @@ class Views:
 
 
 def images(views: Tensor) -> Tensor:
-    """Return (B, 3, H, W) grey RGB in [0, 1], whose luma is that of the views."""
+    """Return grey (B, 3, H, W) RGB images in [0, 1] with the luma of the views."""
     return (views[:, :1].float() / 255).expand(-1, 3, -1, -1)
 
 
 @torch.no_grad()
 def scores(network: nn.Module, lights: list[Tensor]) -> list[float]:
-    """Return BCE and IoU, means over every fourth photograph, of each light."""
+    """Return BCE and IoU for each light, as means over every fourth photograph."""
     result = []
     for light in lights:
         losses, overlaps = [], []
@@ -104,7 +110,7 @@ def scores(network: nn.Module, lights: list[Tensor]) -> list[float]:
 
 
 def learning_rate(highest: float, progress: float) -> float:
-    """Return the rate at a fraction of the training."""
+    """Return the learning rate at a fraction of the training."""
     if progress < WARM_UP:
         return highest * progress / WARM_UP
     cosine = math.cos(math.pi * (progress - WARM_UP) / (1 - WARM_UP))

@@ -1,9 +1,10 @@
-"""Make labelled views for ever, beside the training that takes them: chunks of (N, 2, S, S) uint8.
+"""Make labelled views until it is stopped, for a training that runs at the same time.
 
     views.py PHOTOS VALIDATION OUTPUT WORKERS [--labels dense]
 
-Luma and label of whole views of four sizes, since the thresholds of a label depend on the whole
-image. `dense` labels are of normal light only. `free` learns `photographs-free`.
+It writes chunks of (N, 2, S, S) uint8: luma and label of whole views of four sizes, since the
+thresholds of a label depend on the whole image. `dense` labels are for normal light only. The
+weights `free` are trained on the data set `photographs-free`.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ CHUNKS = {"S": 16, "T": 16, "M": 8, "L": 2}
 SMALL = (0.2, 0.1, 0.4, 0.3)
 KINDS = {"S": SMALL, "T": SMALL, "M": (0, 0.3, 0.42, 0.28), "L": (0.45, 0.25, 0.18, 0.12)}
 NORMAL_KINDS = (0.4, 0, 0.6, 0)
-"""Shares of: as it is, darkened, augmented, augmented and darkened."""
+"""Shares of views that are unchanged, darkened, augmented, and both. All shares and sizes are
+chosen by hand."""
 
 
 def labelled(rgb: np.ndarray, dense: bool) -> np.ndarray:
@@ -42,7 +44,7 @@ def labelled(rgb: np.ndarray, dense: bool) -> np.ndarray:
 def view(
     rgb: np.ndarray, size: str, kind: int, rng: np.random.Generator, dense: bool
 ) -> np.ndarray | None:
-    """Return luma and label of a view, None for an image that is no square."""
+    """Return luma and label of a view, or None if it is not square."""
     side = SIDES_PX[size]
     shown = (
         augment(rgb, side, int(rng.integers(2**32))) if kind >= 2 else scale_short_side(rgb, side)
@@ -53,14 +55,14 @@ def view(
 
 
 def write(path: Path, views: list[np.ndarray]) -> None:
-    """Write a chunk, whole or not at all."""
+    """Write a chunk atomically."""
     temporary = path.with_name(f"new-{path.name}")
     np.save(temporary, np.stack(views))
     temporary.rename(path)
 
 
 def work(given: argparse.Namespace, worker: int) -> None:
-    """Label one worker's part of the validation photographs, then views of its others for ever."""
+    """Label this worker's part of the validation photographs, then views of its part of PHOTOS."""
     cv2.setNumThreads(1)
     dense = given.labels == "dense"
     photos, held_out = (sorted(folder.iterdir()) for folder in (given.photos, given.validation))
@@ -77,7 +79,7 @@ def work(given: argparse.Namespace, worker: int) -> None:
     rng.shuffle(paths)  # type: ignore[arg-type]  # a list, in place
     for number in count():
         fresh = paths[4 * number : 4 * number + 8] if number % 2 == 0 else []
-        size, kind, chosen = "M", 0, fresh  # every photograph as it is, once
+        size, kind, chosen = "M", 0, fresh  # every photograph occurs once unchanged
         if not fresh:
             size = str(rng.choice(list(SHARES), p=list(SHARES.values())))
             kind = int(rng.choice(4, p=NORMAL_KINDS if dense else KINDS[size]))

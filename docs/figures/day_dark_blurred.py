@@ -1,11 +1,11 @@
-"""The picture of the README: one pair in daylight, dark and blurred, from photograph to 3D.
+"""Draw the README's figure: one pair in daylight, dark and blurred, from photograph to 3D.
 
 python docs/figures/day_dark_blurred.py           # writes docs/images/day-dark-blurred.jpg
 python docs/figures/day_dark_blurred.py motion-9  # another degradation, to three-lights.jpg
 
 The photographs are the Motorcycle pair of Middlebury 2014 (Scharstein et al., GCPR 2014; free to
 use and publish with citation), which comes with scikit-image. Darkness and blur are those of
-`deepdetect dev benchmark --protocol degraded`; the numbers are counted here, by the true disparity.
+`deepdetect dev benchmark --protocol degraded`; the numbers are counted here, by ground truth.
 """
 
 from __future__ import annotations
@@ -43,21 +43,23 @@ COLUMNS = (
 )
 FOCAL_PX, CENTRE_LEFT_PX, CENTRE_RIGHT_PX = 994.978, (311.193, 254.877), (342.279, 254.877)
 BASELINE_MM = 193.001
-"""Of the Motorcycle pair, as `help(skimage.data.stereo_motorcycle)` says."""
+"""Calibration of the Motorcycle pair, from `help(skimage.data.stereo_motorcycle)`."""
 
 AZIMUTH, ELEVATION = -14, 12
-"""Degrees, of the view of the 3D points."""
+"""Direction of the view of the 3D points, in degrees. Chosen by hand."""
 
 POINTS, LINES = 300, 80
+"""Numbers of points and of matches that are drawn. Chosen by hand."""
+
 CELL = (368, 248)
 ROWS_SHOWN = slice(140, 390)
-"""Of both photographs in the picture of matches: the motorcycle."""
+"""Pixel rows of both photographs that the panel of matches shows: those of the motorcycle."""
 
 QUALITY = 66
 
 
 def main() -> None:
-    """Write the picture."""
+    """Write the figure."""
     others = {DEGRADATIONS[name].title: name for name in sys.argv[1:]}
     pair = load_motorcycle()
     detector = DeepDetect()
@@ -101,7 +103,7 @@ def row(
 
 
 def draw_points(rgb: np.ndarray, points: Keypoints) -> np.ndarray:
-    """Draw points as circles of their size, the best in yellow, the last in blue."""
+    """Draw points as circles of their size, coloured from yellow (best) to blue (last)."""
     canvas = rgb.copy()
     rank = np.argsort(np.argsort(-points.scores))
     colors = draw_heatmap(1 - 0.75 * rank[None] / len(points))[0].tolist()
@@ -115,7 +117,7 @@ def draw_points(rgb: np.ndarray, points: Keypoints) -> np.ndarray:
 def stacked(
     left: np.ndarray, right: np.ndarray, first: np.ndarray, second: np.ndarray, good: np.ndarray
 ) -> np.ndarray:
-    """Draw a part of both views above one another, with lines between a sample of the matches."""
+    """Draw a part of the left view above the right one, with lines for a sample of the matches."""
     from deepdetect._shared.opencv import cv2
 
     upper, lower = left[ROWS_SHOWN] // 2, right[ROWS_SHOWN] // 2
@@ -137,7 +139,7 @@ def stacked(
 
 
 def draw_model(model: Reconstruction) -> np.ndarray:
-    """Draw a cloud from the right and from above."""
+    """Draw the points of a model from the right and from above."""
     cloud = model.cloud
     size = (CELL[0] * 2, CELL[1] * 2)
     return render(cloud, orbit_camera(cloud, AZIMUTH, ELEVATION, size))

@@ -1,11 +1,11 @@
-"""The moving picture of the README: a pair of which one image fades from day to dark and back.
+"""Draw the README's animation: a pair whose right image fades from day to dark and back.
 
 python docs/figures/day_to_dark.py    # writes docs/images/day-to-dark.webp
 
-Each frame is matched anew. The lines are those of one fixed set of keypoints of the left image, in
-the frames in which they have a match; the numbers are counted by the true disparity. The
-photographs are the Motorcycle pair of Middlebury 2014 (Scharstein et al., GCPR 2014; free to use
-and publish with citation), which comes with scikit-image.
+Every frame is matched from scratch. Lines are drawn for a fixed set of keypoints of the left image,
+in those frames in which they have a match. The caption gives the number of matches and the share
+within 1 px of ground truth. The photographs are the Motorcycle pair of Middlebury 2014 (Scharstein
+et al., GCPR 2014; free to use and publish with citation), which comes with scikit-image.
 """
 
 from __future__ import annotations
@@ -25,17 +25,19 @@ from deepdetect_lab.datasets.degradation import Degradation, darken, degrade
 
 OUTPUT = Path(__file__).parents[1] / "images" / "day-to-dark.webp"
 STEPS, DARKEST = 7, 1 / 8
-"""Frames from full light to the darkest, and its fraction of the light."""
+"""Number of frames from full light to the darkest, and the fraction of the light in the latter."""
 
 LINES, RIGHT_PX = 70, 1.0
+"""Number of lines, and the largest error of a correct match in pixels. Chosen by hand."""
+
 CELL = (800, 270)
 QUALITY = 62
 HOLD_MS, STEP_MS = 1400, 260
-"""How long the first and the darkest frame are shown, and the others."""
+"""Duration of the first and the darkest frame, and of the others. Chosen by hand."""
 
 
 def main() -> None:
-    """Write the picture."""
+    """Write the animation."""
     pair = load_motorcycle()
     lights = np.geomspace(1, DARKEST, STEPS)
     drawn: list[np.ndarray] = []
@@ -57,7 +59,7 @@ def draw(
     """Darken the right image, match, and draw the lines of the chosen keypoints.
 
     Returns:
-        The frame, and the chosen keypoints (N, 2): without any, a sample of this frame's.
+        The frame, and the chosen keypoints (N, 2); if none were given, a sample of this frame.
     """
     darker = Degradation("dark", "", partial(darken, fraction=light))
     right = degrade(pair.right, darker) if light < 1 else pair.right
@@ -73,7 +75,7 @@ def draw(
     picture = lines(pair.left, right, first[shown], second[shown], good[shown])
     text = (
         f"right image at {light:.0%} of the light: {len(matches):,} matches, "
-        f"{good.mean():.1%} within {RIGHT_PX:g} px of the truth"
+        f"{good.mean():.1%} within {RIGHT_PX:g} px of ground truth"
     )
     return caption(picture, text, CELL), chosen
 
@@ -81,7 +83,7 @@ def draw(
 def lines(
     left: np.ndarray, right: np.ndarray, first: np.ndarray, second: np.ndarray, good: np.ndarray
 ) -> np.ndarray:
-    """Draw both images side by side, with a line for each match; red: wrong."""
+    """Draw both images side by side, with a line for each match; wrong ones are red."""
     canvas = np.concatenate([left, right], axis=1)
     hues = np.stack([20 + 120 * first[:, 1] / len(left), *np.full((2, len(first)), 240.0)])
     colors = cv2.cvtColor(np.rint(hues.T).astype(np.uint8)[None], cv2.COLOR_HSV2RGB)[0].tolist()

@@ -1,4 +1,4 @@
-"""Panels with captions, and the file that they are written to."""
+"""Layout of figures: panels with captions, headers, and the JPEG file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BACKGROUND, TEXT = (255, 255, 255), (35, 35, 35)
 
 
 def caption(panel: np.ndarray, text: str, size: tuple[int, int]) -> np.ndarray:
-    """Scale a panel to (width, height), and write a line below it."""
+    """Scale a panel to (width, height), and add a line of text below it."""
     picture = Image.fromarray(panel).resize(size, Image.Resampling.LANCZOS)
     whole = Image.new("RGB", (size[0] + 2 * MARGIN_PX, size[1] + CAPTION_PX), BACKGROUND)
     whole.paste(picture, (MARGIN_PX, 0))
@@ -24,7 +24,7 @@ def caption(panel: np.ndarray, text: str, size: tuple[int, int]) -> np.ndarray:
 
 
 def header(titles: Sequence[str], width: int) -> np.ndarray:
-    """Return a line of titles above columns of this width."""
+    """Return a line of titles for columns of this width."""
     whole = Image.new("RGB", ((width + 2 * MARGIN_PX) * len(titles), CAPTION_PX), BACKGROUND)
     for k, title in enumerate(titles):
         _write(whole, title, ((width + 2 * MARGIN_PX) * k + MARGIN_PX + 2, 5), width)
@@ -32,7 +32,7 @@ def header(titles: Sequence[str], width: int) -> np.ndarray:
 
 
 def write_jpeg(picture: np.ndarray, path: Path, quality: int) -> None:
-    """Write a picture, and say how large it is."""
+    """Write a figure, and print its size."""
     Image.fromarray(picture).save(path, quality=quality, optimize=True, progressive=True)
     height, width = picture.shape[:2]
     print(f"{path}: {width}x{height}, {path.stat().st_size / 1000:.0f} kB")

@@ -1,4 +1,4 @@
-"""The pictures of docs/method.md.
+"""Draw the figures of docs/method.md.
 
 python docs/figures/method.py    # writes docs/images/method-*.jpg
 
@@ -31,7 +31,7 @@ QUALITY = 75
 
 
 def main() -> None:
-    """Write all pictures."""
+    """Write all figures."""
     from skimage import data
 
     photograph = data.astronaut()[:360, 60:420]
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def draw_labels(rgb: np.ndarray) -> np.ndarray:
-    """Draw what some detectors mark, the union of all nine, and what the network answers."""
+    """Draw the masks of some detectors, the union of all nine, and the network's heat map."""
     panels = [(rgb, "a photograph")]
     for name, title in DETECTORS.items():
         mask = fuse(rgb, LabelOptions(detectors=(name,))).mask
@@ -58,7 +58,7 @@ def draw_labels(rgb: np.ndarray) -> np.ndarray:
 
 
 def draw_kinds(rgb: np.ndarray) -> np.ndarray:
-    """Draw dense keypoints beside points."""
+    """Draw dense keypoints next to points."""
     detector = DeepDetect()
     dense = detector.detect(rgb)
     points = PointDetector(POINTS, spread="grid").detect(rgb)
@@ -70,7 +70,7 @@ def draw_kinds(rgb: np.ndarray) -> np.ndarray:
 
 
 def draw_guidance(pair: StereoPair) -> np.ndarray:
-    """Draw matches by descriptors alone above those that a geometry guided."""
+    """Draw matches by descriptors alone above matches that are guided by a geometry."""
     detector = DeepDetect()
     kinds = {
         "by descriptors alone": partial(match_unguided, descriptor=UPRIGHT_SIFT),

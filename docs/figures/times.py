@@ -1,4 +1,4 @@
-"""The pictures of times.csv and descriptors.csv in docs/results: what is matched, against the time.
+"""Plot repeatability and matches against time, from times.csv and descriptors.csv in docs/results.
 
 python docs/figures/times.py    # writes docs/images/times.png and, for the README, speed.png
 """
@@ -17,9 +17,9 @@ from matplotlib.ticker import LogLocator
 
 DOCS = Path(__file__).parents[1]
 PANELS = {
-    "@1": "found again within 1 px, one to one",
-    "@3": "found again within 3 px, one to one",
-    "right at 3 px": "right matches of a pair, within 3 px",
+    "@1": "repeatability within 1 px, one to one",
+    "@3": "repeatability within 3 px, one to one",
+    "right at 3 px": "correct matches of a pair, within 3 px",
 }
 MARKERS = {"own": "o", "RootSIFT": "s", "own size and angle": "^"}
 TIME = "1 thread, ms"
@@ -45,7 +45,7 @@ SHOWN = {
         "EdgePoint2 E64": "EdgePoint2 E64",
     },
 }
-"""Rows of the picture of the README, and what they are called there."""
+"""Rows that the README's figure shows, with their names there."""
 
 
 MOVED = {
@@ -54,19 +54,20 @@ MOVED = {
     "EdgePoint2 T32": {"xytext": (-7, 0), "ha": "right"},
     "|det Hessian|, seven scales": {"xytext": (0, -12), "ha": "center"},
 }
-"""Names that would lie on others, and where they are instead, in points."""
+"""Positions, in points, of names that would otherwise overlap others. Chosen by hand."""
 
 DESCRIBED = {
     "Oxford, no ratio test": ["zoom and rotation", "blur", "viewpoint", "light and JPEG"],
-    "HPatches, which had no say, no ratio test": ["HPatches"],
+    "HPatches (held out), no ratio test": ["HPatches"],
 }
-"""Panels, and the columns of descriptors.csv that they are the mean of: 10 pairs of Oxford each."""
+"""Panels, and the columns of descriptors.csv whose mean they show: 10 pairs of Oxford each."""
 
 SPEED_X = (0.04, 5)
+"""Range of the time axis, relative to OpenCV's SIFT. Chosen by hand."""
 
 
 def main() -> None:
-    """Draw both pictures."""
+    """Draw both figures."""
     draw_times(read("times"))
     draw_speed()
 
@@ -78,7 +79,7 @@ def read(name: str) -> list[dict[str, str]]:
 
 
 def draw_speed() -> None:
-    """Draw correct matches against the time in that of SIFT, on Oxford and on HPatches."""
+    """Plot correct matches against the time relative to SIFT, on Oxford and on HPatches."""
     oxford = {f"{row['method']}|{row['descriptors']}": row for row in read("times")}
     described = {row["descriptors"]: row for row in read("descriptors")}
     unit = float(oxford["SIFT|own"][TIME])
@@ -117,7 +118,7 @@ def draw_speed() -> None:
 
 
 def draw_times(rows: list[dict[str, str]]) -> None:
-    """Draw a panel for each measure, a colour for each method, a mark for each descriptor."""
+    """Plot a panel for each measure, with a colour per method and a marker per descriptor."""
     methods = list(dict.fromkeys(row["method"] for row in rows))
     figure, panels = pyplot.subplots(1, len(PANELS), figsize=(13, 4.6), layout="constrained")
     for axes, (measure, title) in zip(panels, PANELS.items(), strict=True):

@@ -1,4 +1,4 @@
-"""The small pictures of the README: what DeepDetect is used for.
+"""Draw the small figures of the README: uses of DeepDetect.
 
 python docs/figures/uses.py    # writes docs/images/use-*.jpg
 
@@ -43,18 +43,19 @@ QUALITY = 80
 LINES = 40
 
 TILTED = np.array([[0.86, 0.22, -20.0], [-0.16, 0.92, 60.0], [1e-4, 3e-4, 1.0]])
-"""Homography from the astronaut to a view of it from the side."""
+"""Homography that maps the astronaut to a view from the side. Chosen by hand."""
 
 TURNS_DEG = (-14, 0, 14)
-"""Of the camera that takes the parts of the panorama."""
+"""Rotations, in degrees, of the camera that takes the parts of the panorama. Chosen by hand."""
 
 FOCAL_CUP_PX = 700
 FRAMES, STEP_PX = 14, np.array([5.0, 2.0])
-"""Of the video, a window that moves over the cup."""
+"""Number of frames of the video, and shift per frame of the window that moves over the cup. Chosen
+by hand."""
 
 
 def main() -> None:
-    """Write all pictures."""
+    """Write all figures."""
     from skimage import data
 
     pair = load_motorcycle()
@@ -72,13 +73,13 @@ def main() -> None:
 
 
 def registered(rgb: np.ndarray) -> np.ndarray:
-    """Draw a photograph beside a view from the side, and a checkerboard of both registered."""
+    """Draw a view of a photograph from the side, and a checkerboard of both after registration."""
     side = cv2.warpPerspective(rgb, TILTED, rgb.shape[1::-1])
     return np.concatenate([side, register(rgb, side).checkerboard()], axis=1)
 
 
 def panorama(rgb: np.ndarray) -> np.ndarray:
-    """Draw the panorama of what a turning camera shows of a photograph."""
+    """Draw a panorama of the views that a rotating camera has of a photograph."""
     height, width = rgb.shape[:2]
     camera = np.array([[FOCAL_CUP_PX, 0, width / 2], [0, FOCAL_CUP_PX, height / 2], [0, 0, 1]])
     views = []
@@ -92,7 +93,7 @@ def panorama(rgb: np.ndarray) -> np.ndarray:
 
 
 def model_of(left: np.ndarray, right: np.ndarray) -> Reconstruction:
-    """Return the 3D points of the pair."""
+    """Reconstruct the pair."""
     size = (left.shape[1], left.shape[0])
     cameras = (Camera(size, FOCAL_PX, centre) for centre in (CENTRE_LEFT_PX, CENTRE_RIGHT_PX))
     return reconstruct(left, right, calibration=Calibration(*cameras, BASELINE_MM))
@@ -110,7 +111,7 @@ def tracked(rgb: np.ndarray) -> np.ndarray:
 
 
 def fitted(picture: np.ndarray) -> np.ndarray:
-    """Scale a picture to the cell: what is much wider is put on white, else its edges are cut."""
+    """Scale an image to the cell: pad it with white if it is much wider, otherwise crop it."""
     image = Image.fromarray(picture)
     if image.width > 2.2 * image.height:
         return np.asarray(ImageOps.pad(image, SIZE, Image.Resampling.LANCZOS, color="white"))

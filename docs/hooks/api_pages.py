@@ -1,6 +1,6 @@
-"""The pages of the Python interface: which names are on which; mkdocstrings writes the rest.
+"""The pages of the Python interface: the names on each page; mkdocstrings writes the rest.
 
-A test demands that each name that `import deepdetect` exports is on one of them. Names of
+A test checks that each name that `import deepdetect` exports is on one of the pages. Names of
 deepdetect-lab begin with `LAB`.
 """
 
@@ -14,12 +14,12 @@ PACKAGE = Path(__file__).parents[2] / "src" / "deepdetect"
 LAB = "deepdetect_lab."
 
 WHOLE_NAME = "\n    options:\n      show_root_full_path: true"
-"""Of modules, which are imported by it."""
+"""Option of mkdocstrings that shows the full name of a module, by which it is imported."""
 
 
 @dataclass(frozen=True)
 class ApiPage:
-    """A page: its title, what it says first, and the names on it."""
+    """A page: its address, title, introduction, and the names that it documents."""
 
     uri: str
     title: str
@@ -37,7 +37,7 @@ class ApiPage:
 
 
 def is_module(name: str) -> bool:
-    """Return whether a name is that of a module or package, and not of what is in it."""
+    """Return whether a name belongs to a module or package, not to one of its members."""
     path = PACKAGE.joinpath(*name.split("."))
     return (path / "__init__.py").is_file() or path.with_suffix(".py").is_file()
 
@@ -46,7 +46,7 @@ _PAGES = (
     ApiPage(
         "api/detection.md",
         "Detection",
-        "Keypoints of photographs. In code that runs: [Python](../python.md#detect).",
+        "Keypoints of photographs. Example code: [Python](../python.md#detect).",
         (
             "DeepDetect",
             "PointDetector",
@@ -60,7 +60,7 @@ _PAGES = (
     ApiPage(
         "api/matching.md",
         "Matching",
-        "Matches between two photographs: [how](../matching.md).",
+        "Matches between two photographs. Guide: [matching](../matching.md).",
         (
             "match_images",
             "match_features",
@@ -75,7 +75,8 @@ _PAGES = (
     ApiPage(
         "api/registration.md",
         "Registration and panoramas",
-        "Images of a plane, or from one place: [how](../matching.md#registration-and-panoramas).",
+        "Images of a plane, or from one place. "
+        "Guide: [registration and panoramas](../matching.md#registration-and-panoramas).",
         (
             "register",
             "matching.Registration",
@@ -125,19 +126,19 @@ _PAGES = (
     ApiPage(
         "api/interchange.md",
         "Files of other programs",
-        "Keypoints and matches as other programs write and read them.",
+        "Keypoints and matches in the file formats of other programs.",
         ("interchange",),
     ),
     ApiPage(
         "api/files.md",
         "Files",
-        "What results are written to and read from; never pickles.",
+        "Functions that write and read results, never as pickles.",
         ("save_keypoints", "load_keypoints", "save_matches", "load_matches", "save_point_cloud"),
     ),
     ApiPage(
         "api/training.md",
         "Labels, training, evaluation",
-        "The masks that the network learns ([labels](../training.md#labels)), and how it does "
+        "The masks that the network learns ([labels](../training.md#labels)), and its training "
         "([training](../training.md)), in `deepdetect-lab`.",
         (
             LAB + "labels.fuse",
@@ -152,7 +153,7 @@ _PAGES = (
     ApiPage(
         "api/integrations.md",
         "Drop-ins for other programs",
-        "With snippets that run: [DeepDetect in other programs](../other-programs.md).",
+        "Example code: [DeepDetect in other programs](../other-programs.md).",
         (
             "integrations.opencv",
             "integrations.kornia",
@@ -163,7 +164,7 @@ _PAGES = (
     ApiPage(
         "api/errors.md",
         "Errors",
-        "Every error that you can cause is one sentence and a `DeepDetectError`: "
+        "Errors that users can cause are `DeepDetectError`s with a message of one sentence: "
         "[how to catch them](../python.md#errors).",
         (
             "DeepDetectError",
@@ -178,7 +179,7 @@ _PAGES = (
     ),
 )
 
-# Packages that are not there have no page.
+# Packages that are not installed have no page.
 WHOLE_PACKAGES = {"interchange"}
 PAGES = tuple(
     page for page in _PAGES if not WHOLE_PACKAGES & set(page.names) or is_module(page.names[0])

@@ -1,4 +1,4 @@
-"""The page of the command line, made from the commands themselves."""
+"""The page of the command line, generated from the commands."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ from typing import Any
 INTRODUCTION = """\
 # Command line
 
-Made from the commands: it says what `deepdetect COMMAND --help-all` says. How results are written,
-when a command continues where it stopped, and what the exit codes mean: [commands](commands.md).
+This page is generated from the commands and contains the same as `deepdetect COMMAND --help-all`.
+[Commands](commands.md) explains how results are written, when a command continues where it stopped,
+and what the exit codes mean.
 
 `-h` or `--help` shows the common options of a command, `--help-all` shows all, `--version` prints
 the version.
 
 ## Shared options
 
-Many commands take these. Each command below names those that it takes.
+Many commands have these options. Each command below lists those that it has.
 
 """
 
 TABLE_HEAD = "| option | what it does |\n|---|---|\n"
 
 SHARED_BY = 4
-"""An option that so many commands have, with the same words, is explained once for all of them."""
+"""Options with the same text in at least this many commands are explained once. Chosen by hand."""
 
 
 def make_page() -> str:
@@ -44,7 +45,7 @@ def make_page() -> str:
 
 
 def walk() -> Iterator[tuple[str, Any]]:
-    """Yield all commands that can be run, with their whole names."""
+    """Yield all commands that can be run, with their full names."""
     from deepdetect.cli._app import make_app
 
     yield from _within("deepdetect", make_app())
@@ -59,7 +60,7 @@ def _within(name: str, app: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _help(app: Any) -> str:
-    """Return what a command says of itself, without its arguments."""
+    """Return the description of a command, without its arguments."""
     doc = inspect.getdoc(app.default_command) or ""
     return doc.partition("\nArgs:\n")[0].strip()
 
@@ -69,7 +70,7 @@ def _arguments(app: Any) -> list[Any]:
 
 
 def _options(app: Any) -> dict[str, str]:
-    """Return what each argument of a command does, by its names."""
+    """Return the help of each argument of a command, by its names."""
     options = {}
     for each in _arguments(app):
         shown = f"  [default: {each.field_info.default}]" if _has_default(each) else ""
@@ -99,13 +100,13 @@ def _section(name: str, app: Any, options: dict[str, str], shared: dict[str, str
 
 def _has_default(argument: Any) -> bool:
     default = argument.field_info.default
-    if default is False:  # a switch is off unless it is given
+    if default is False:  # switches are off by default
         return False
     return isinstance(default, (str, int, float)) and "[default:" not in argument.parameter.help
 
 
 def _text(text: str) -> str:
-    """Return plain text as Markdown: outside of code, underscores and stars mean themselves."""
+    """Convert plain text to Markdown: escape special characters outside of code."""
     parts = re.split(r"(`[^`]+`)", " ".join(text.split()))
     parts[::2] = [re.sub(r"([*_<\[|])", r"\\\1", part) for part in parts[::2]]
     return "".join(parts)

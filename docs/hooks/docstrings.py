@@ -1,4 +1,4 @@
-"""Docstrings as griffe reads them: it knows a section `Examples:`, and ours say `Example:`."""
+"""Adapt docstrings to griffe, which knows the section `Examples:`, while ours say `Example:`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from griffe import Extension, Object
 
 
 class Examples(Extension):
-    """Names the section as griffe does, so that its lines are shown as code."""
+    """Renames the section, so that its lines are shown as code."""
 
     def on_object(self, *, obj: Object, **_: Any) -> None:
         """Change a docstring before it is parsed."""
@@ -18,5 +18,5 @@ class Examples(Extension):
 
 
 def plural(docstring: str) -> str:
-    """Name the section of examples in the plural."""
+    """Rename the sections `Example:` to `Examples:`."""
     return re.sub(r"^([ \t]*)Example:$", r"\1Examples:", docstring, flags=re.M)

@@ -1,7 +1,7 @@
-"""What mkdocs does not do by itself: pages made from the code, and from files beside `docs`.
+"""Extensions of mkdocs: pages generated from the code, and pages from files outside of `docs`.
 
-The pages of `docs` link each other and files of the repository, so that GitHub shows them right.
-For the site such links are turned to the page that a file has become, or to the file on GitHub.
+The pages of `docs` link to each other and to files of the repository, so that they work on GitHub.
+For the site these links are changed to the page made from a file, or to the file on GitHub.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ COPIED = {
     "src/deepdetect/detector/weights/FREE_CARD.md": "cards/free.md",
     "src/deepdetect/detector/points/MODEL_CARD.md": "cards/points.md",
 }
-"""Files of the repository that are pages of the site, by their paths."""
+"""Files of the repository that become pages of the site, with the paths of these pages."""
 
 APP = ROOT / "web" / "dist"
-"""The page that detects and matches in the browser, once it is built."""
+"""Folder of the page that detects and matches in the browser, if it is built."""
 
 API_BOOST = 0.5
-"""Weight of the pages of the interface in a search, of others 1."""
+"""Search weight of the API pages; other pages have 1, so that guides come first. Chosen by hand."""
 
 APP_FOLDER = "try"
 APP_MARK = "<!-- The page in the browser is embedded here. -->"
@@ -45,7 +45,7 @@ EMBEDDED = f"""\
 <iframe src="{APP_FOLDER}/index.html" class="app" title="DeepDetect in the browser" loading="lazy">
 </iframe>
 
-It runs in this page, on your computer: your pictures stay there. \
+It runs in this page, on your computer: your images stay there. \
 <a href="{APP_FOLDER}/index.html">The page by itself</a>.
 """
 
@@ -53,11 +53,11 @@ ORIGINS: dict[str, str] = {site: repository for repository, site in COPIED.items
 
 
 def on_config(config: Any) -> Any:
-    """Complete what mkdocs.yml says: the address, anchors, and the pages of the API."""
+    """Complete the configuration: the site's address, anchors, and the API pages."""
     from pymdownx.slugs import slugify
 
     config.site_url = os.environ.get("SITE_URL", "")
-    # Anchors as GitHub makes them, where the same pages are read.
+    # Anchors must be those of GitHub, where the same pages are read.
     config.mdx_configs["toc"]["slugify"] = slugify(case="lower")
     config.nav = _navigation(config.nav)
     return config
@@ -76,7 +76,7 @@ def _navigation(entries: list[Any]) -> list[Any]:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the pages that are made from the code or from files beside `docs`, and the app."""
+    """Add the pages generated from the code or from files outside of `docs`, and the app."""
     from mkdocs.structure.files import File
 
     for repository, site in COPIED.items():
@@ -94,9 +94,9 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Turn links, and put in the app."""
+    """Convert links, and embed the app."""
     uri = page.file.src_uri
-    if uri.startswith("api/"):  # a search finds the guides first
+    if uri.startswith("api/"):
         page.meta["search"] = {"boost": API_BOOST}
     embedded = EMBEDDED if (APP / "index.html").is_file() else ""
     markdown = markdown.replace(APP_MARK, embedded)
@@ -104,7 +104,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
-    """Leave scripts and badges out of notebooks: both are loaded from other servers."""
+    """Remove scripts and badges from notebooks: both are loaded from other servers."""
     if not page.file.src_uri.endswith(".ipynb"):
         return html
     html = re.sub(r'<img[^>]*src="https://[^>]*>', "Open in Colab", html)
@@ -112,12 +112,12 @@ def on_page_content(html: str, page: Any, **_: Any) -> str:
 
 
 def turn_links(markdown: str, origin: str, uri: str) -> str:
-    """Turn a page's links to files of the repository.
+    """Convert a page's links to files of the repository.
 
     Args:
-        markdown: of the page.
-        origin: its path in the repository, which its links are relative to.
-        uri: its path in the site.
+        markdown: text of the page.
+        origin: path of the page in the repository, to which its links are relative.
+        uri: path of the page in the site.
 
     Returns:
         The page with links to pages of the site, and to GitHub for all other files.
@@ -141,12 +141,12 @@ def turn_links(markdown: str, origin: str, uri: str) -> str:
         return f"{match['before']}{near}{hash_sign}{anchor}"
 
     link = re.compile(r"(?P<before>\]\(|^\[[^\]^]+\]: )(?P<target>[^)\s]+)", re.M)
-    # Code is left as it is.
+    # Code is not changed.
     parts = re.split(r"(^```.*?^```$|`[^`\n]+`)", markdown, flags=re.S | re.M)
     parts[::2] = [link.sub(turn, part) for part in parts[::2]]
     return "".join(parts)
 
 
 def without_badges(text: str) -> str:
-    """Leave out the badges of the README: their pictures are on another server."""
+    """Remove the badges of the README: their images are on another server."""
     return re.sub(r"^\[!\[.*\n", "", text, count=1, flags=re.M)

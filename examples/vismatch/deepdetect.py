@@ -1,4 +1,4 @@
-"""For vismatch: `vismatch/im_models/deepdetect.py`."""
+"""A matcher for vismatch, to be saved as `vismatch/im_models/deepdetect.py`."""
 
 from vismatch import BaseMatcher
 
@@ -6,14 +6,15 @@ from deepdetect import DeepDetect, PointDetector, match_images
 
 
 class DeepDetectMatcher(BaseMatcher):
-    """Guided matches of two images: the matching itself runs on the processor.
+    """Guided matcher of two images, which runs on the CPU.
 
-    The confidences are DeepDetect's scores; there are no descriptors, as patches are compared.
+    The confidences are DeepDetect's scores. There are no descriptors, because guided matching
+    compares patches.
 
     Args:
-        device: where the images are.
-        max_num_keypoints: at most this many, the best of all scales; None: dense keypoints.
-        **kwargs: of every matcher.
+        device: device of the images.
+        max_num_keypoints: number of keypoints, the best of all scales. None: dense keypoints.
+        **kwargs: arguments of every matcher.
     """
 
     def __init__(self, device="cpu", max_num_keypoints=2048, **kwargs):
@@ -22,7 +23,7 @@ class DeepDetectMatcher(BaseMatcher):
         self.detector = DeepDetect() if dense else PointDetector(max_num_keypoints)
 
     def _forward(self, img0, img1):
-        # Filters that scale images leave values a little beyond the range.
+        # Filters that scale images can exceed [0, 1] a little.
         found = match_images(img0.clamp(0, 1), img1.clamp(0, 1), self.detector)
         all0, all1 = found.keypoints0.xy, found.keypoints1.xy
         return found.points0, found.points1, all0, all1, None, None, found.scores

@@ -1,12 +1,12 @@
-"""The path of a car from the video of one camera: DeepDetect beside SIFT and ORB.
+"""Visual odometry of a car with one camera: DeepDetect compared with SIFT and ORB.
 
     python examples/visual_odometry ../shared/data/kitti-clip -o odometry/
 
-The folder holds frames, calib.txt or K.txt, and poses.txt as KITTI's odometry benchmark has them.
-All keypoints go the same roads: followed by Lucas-Kanade, or matched by descriptors (learned ones
-of DeepDetect, RootSIFT of SIFT), then `odometry`. The truth is used for one
-number, the scale of each path, and to measure the errors. Errors of one path differ by several per
-cent from one number of keypoints to the next: methods are compared by their means over several.
+The folder contains frames, calib.txt or K.txt, and poses.txt, as in KITTI's odometry benchmark. All
+keypoints are processed alike: they are tracked by Lucas-Kanade or matched by descriptors (learned
+ones for DeepDetect, RootSIFT for SIFT), then used by `odometry`. Ground truth determines one
+number, the scale of each path, and measures the errors. Errors of a path vary by several per cent
+with the number of keypoints, so methods are compared by their means over several numbers.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ from deepdetect.tracking import TrackedFrame, Tracker, TrackingOptions, point_ca
 from deepdetect.tracking.tracker import CANDIDATES
 from deepdetect_lab.datasets.posed_images import load_posed_scenes
 
-NUMBERS = (250, 500, 1000)  # of keypoints, without others
-SEGMENTS_M = (10.0, 20.0, 30.0, 40.0, 50.0)  # KITTI's own, 100 to 800 m, are longer than a clip
+NUMBERS = (250, 500, 1000)  # default numbers of keypoints
+SEGMENTS_M = (10.0, 20.0, 30.0, 40.0, 50.0)  # KITTI's segments, 100 to 800 m, exceed a clip
 FEATURES = ("DeepDetect", "SIFT", "ORB")
 HEADER = "    end %    mean %   end °/m    seg. %  seg. °/m     CPU s"
 
 
 def trackers(count: int) -> dict[str, Tracker | Matcher]:
-    """Return what makes tracks of keypoints, followed or matched, by name."""
+    """Return the trackers and matchers of keypoints, by name."""
     options = TrackingOptions(max_keypoints=count)
     sift, orb = (make(CANDIDATES * count) for make in (cv2.SIFT_create, cv2.ORB_create))
 
@@ -69,7 +69,7 @@ def trackers(count: int) -> dict[str, Tracker | Matcher]:
 
 
 class Matcher:
-    """Makes tracks of the keypoints that frames have in common by their descriptors."""
+    """A tracker that matches the descriptors of successive frames."""
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class Matcher:
         self.tracks, self.next_track, self.number = np.empty(0, np.int64), 0, 0
 
     def update(self, rgb: np.ndarray) -> TrackedFrame:
-        """Match the keypoints of the next frame with those of the frame before."""
+        """Match the keypoints of the next frame with those of the previous frame."""
         found = self.describe(rgb, self.detect(rgb))
         tracks = np.arange(len(found)) + self.next_track
         self.next_track += len(found)
@@ -90,31 +90,31 @@ class Matcher:
             tracks[matches.indices1] = self.tracks[matches.indices0]
         self.before, self.tracks, self.number = found, tracks, self.number + 1
         order = np.argsort(tracks)
-        ages = np.zeros(len(order), np.int64)  # odometry needs none
+        ages = np.zeros(len(order), np.int64)  # odometry does not use ages
         xy, scores = found.xy[order], found.scores[order]
         return TrackedFrame(self.number - 1, tracks[order], xy, scores, ages)
 
 
 def trajectory_errors(poses: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
-    """Compare a path with the true one, after both begin in one pose and have one scale.
+    """Compare a path with ground truth, after the alignment of the first pose and the scale.
 
-    The scale, which one camera cannot know, is the one with the least squared distances of all
-    positions. Segments are measured as by Geiger et al., "Are we ready for autonomous driving? The
-    KITTI vision benchmark suite", 2012.
+    The scale, which one camera cannot know, minimises the squared distances of all positions.
+    Segments are measured as in Geiger et al., "Are we ready for autonomous driving? The KITTI
+    vision benchmark suite", 2012.
 
     Args:
         poses, truth: (F, 3, 4), camera to world.
 
     Returns:
-        Errors of the last and of all positions in per cent of the path; of the last rotation in
-        degrees per metre; of the motion and of the rotation along all segments; and the (F, 3)
-        aligned positions.
+        Errors of the last position and of all positions in per cent of the path, of the last
+        rotation in degrees per metre, of translation and rotation along all segments, and the
+        (F, 3) aligned positions.
     """
     start = truth[0, :, :3] @ poses[0, :, :3].T
     turns, true_turns = start @ poses[..., :3], truth[..., :3]
     moved, true = ((each[..., 3] - each[0, :, 3]) for each in (poses, truth))
     moved = moved @ start.T
-    # Below 0 it would turn a path that goes the wrong way into a right one.
+    # A negative scale would make a path in the wrong direction look correct.
     moved *= max(0.0, (moved * true).sum() / (moved**2).sum())
     along = np.append(0.0, np.linalg.norm(np.diff(true, axis=0), axis=1).cumsum())
     moves, rotations = [], []
@@ -140,16 +140,16 @@ def trajectory_errors(poses: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
 
 
 def print_row(name: str, values: list[float]) -> None:
-    """Print one row of the table."""
+    """Print a row of the table."""
     columns = ("        -" if np.isnan(value) else f"{value:9.4f}" for value in values)
     print(f"{name:30} {' '.join(columns)}", flush=True)
 
 
 def plot(paths: dict[str, np.ndarray], truth: np.ndarray, file: Path) -> None:
-    """Draw trajectories from above against the truth."""
+    """Plot trajectories and ground truth from above."""
     figure = Figure(figsize=(8, 4), layout="constrained")
     axis = figure.subplots()
-    axis.plot(truth[:, 2], truth[:, 0], "k--", label="truth")
+    axis.plot(truth[:, 2], truth[:, 0], "k--", label="ground truth")
     for name, centres in paths.items():
         axis.plot(centres[:, 2], centres[:, 0], label=name)
     axis.set(xlabel="forward, m (other scale than across)", ylabel="right, m")
@@ -198,7 +198,7 @@ def compare(arguments: argparse.Namespace) -> None:
             poses = poses.reshape(-1, 12)  # KITTI's format
             np.savetxt(arguments.output / f"{path.lower()}.txt", poses, fmt="%.9e")
         for frame in odometry.lost:
-            print(f"{name} was LOST at {frame}: what follows has another scale")
+            print(f"{name} was LOST at frame {frame}: the path after it has another scale")
         if not paths:
             print(f"{name}: no path was found")
     for method, rows in whole.items():
@@ -209,7 +209,7 @@ def compare(arguments: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Read the words of the command line; what is wrong ends it with a sentence."""
+    """Parse the command line and run the comparison; report errors in one sentence."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("-o", "--output", type=Path, default=Path("odometry"))

@@ -1,9 +1,9 @@
-"""The path of a calibrated camera from the tracks of its video (monocular visual odometry).
+"""Monocular visual odometry of a calibrated camera, from tracks of points in its video.
 
-Two frames with enough motion give the first pose and points (essential matrix, triangulation). From
-then on each frame is placed by the points that it sees (PnP), keyframes add points, and the last
-keyframes are adjusted together with their points: that keeps the scale, which one camera cannot
-know. Poses and adjustment are COLMAP's.
+Two frames with enough motion give the first pose and points (essential matrix, triangulation). The
+pose of each later frame is estimated from the points that it sees (PnP), and keyframes add points.
+The last keyframes and their points are refined by bundle adjustment, which keeps the scale
+consistent. COLMAP estimates poses and adjusts.
 """
 
 from __future__ import annotations
@@ -19,23 +19,24 @@ from deepdetect.tracking import TrackedFrame
 
 pycolmap = import_pycolmap("visual odometry")
 
-MIN_MOTION_PX = 5.0  # median motion of the tracks from one keyframe to the next
-MIN_FIRST_MOTION_PX = 15.0  # the same of the two frames that make the first points
+# All of these numbers are chosen by hand.
+MIN_MOTION_PX = 5.0  # a new keyframe needs this median motion of the tracks
+MIN_FIRST_MOTION_PX = 15.0  # the two frames of the first points need this median motion
 MIN_TRACKED = 0.7  # a frame that sees a smaller share of the last keyframe's points is a keyframe
-MAX_ERROR_PX = 2.0  # of a position that agrees with a pose and a point
-MIN_INLIERS = 20  # points that must agree with a pose
-MIN_FIRST_POINTS = 50  # that two frames must give to begin with them
-MIN_ANGLE_DEG = 1.0  # between the rays to a new point
-WINDOW = 10  # keyframes that are adjusted together
-ANCHORS = 5  # keyframes before these, which stay where they are
-ROBUST_SCALE_PX = 0.5  # of the adjustment's loss (Cauchy)
-MAX_ITERATIONS = 10  # of the adjustment
-MAX_STRIKES = 2  # a track that has not agreed so often may be on something that moves: left out
+MAX_ERROR_PX = 2.0  # reprojection error of inliers
+MIN_INLIERS = 20  # a pose needs this many inliers
+MIN_FIRST_POINTS = 50  # the first two frames need this many points
+MIN_ANGLE_DEG = 1.0  # the rays to a new point must form this angle
+WINDOW = 10  # number of keyframes in an adjustment
+ANCHORS = 5  # number of fixed keyframes before them
+ROBUST_SCALE_PX = 0.5  # scale of the adjustment's Cauchy loss
+MAX_ITERATIONS = 10  # iterations of the adjustment
+MAX_STRIKES = 2  # a track that is an outlier this often may be on a moving object: it is left out
 
 
 @dataclass(eq=False)
 class Keyframe:
-    """A frame whose observations make the map, and its pose, world to camera."""
+    """A frame whose observations belong to the map, and its pose, world to camera."""
 
     frame: TrackedFrame
     pose: pycolmap.Rigid3d
@@ -44,15 +45,15 @@ class Keyframe:
 class VisualOdometry:
     """Estimates the path of a camera, frame by frame.
 
-    Its world is the camera of the first frame; its unit is the distance between the two frames that
-    made the first points. Where no pose can be found it begins again: what follows is another path,
-    in a world and a unit of its own.
+    The world frame is that of the first camera. The unit is the distance between the two frames of
+    the first points. If no pose can be found, it starts again with another path, which has a world
+    frame and a unit of its own.
 
     Args:
-        camera: of all frames, without distortion.
+        camera: camera of all frames, without distortion.
 
     Attributes:
-        lost: numbers of the frames for which no pose could be found by what was seen before.
+        lost: numbers of the frames whose pose could not be estimated from earlier points.
     """
 
     def __init__(self, camera: Camera) -> None:
@@ -63,14 +64,14 @@ class VisualOdometry:
         self._waiting: list[TrackedFrame] = []
         self._keyframes: list[Keyframe] = []
         self._placed: list[tuple[int, int, pycolmap.Rigid3d]] = []  # frame, keyframe, from it
-        self._before: list[tuple[np.ndarray, np.ndarray]] = []  # paths that were lost
-        self._points = np.empty((0, 3))  # by the number of the track, NaN where it has none
+        self._before: list[tuple[np.ndarray, np.ndarray]] = []  # paths before the camera was lost
+        self._points = np.empty((0, 3))  # by track number, NaN without a point
         self._strikes = np.empty(0, np.int64)
 
     def update(self, frame: TrackedFrame) -> bool:
         """Estimate the pose of the next frame; return whether it has one.
 
-        The first frames get theirs when the camera has moved enough.
+        The first frames get their poses once the camera has moved enough.
         """
         new = int(frame.tracks.max(initial=-1)) + 1 - len(self._points)
         if new > 0:
@@ -87,9 +88,9 @@ class VisualOdometry:
         return True
 
     def trajectories(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return (F,) numbers of frames and (F, 3, 4) float64 poses, camera to world, of each path.
+        """Return (F,) frame numbers and (F, 3, 4) float64 poses, camera to world, of each path.
 
-        There is one, or none, if the camera was never lost.
+        If the camera was never lost, there is at most one path.
         """
         poses = [
             (relative * self._keyframes[keyframe].pose).inverse().matrix()
@@ -99,13 +100,13 @@ class VisualOdometry:
         return [*self._before, (np.array(numbers), np.array(poses))] if poses else self._before
 
     def _begin(self) -> bool:
-        """Make the first points, where the last frame shows that the camera has moved enough."""
+        """Triangulate the first points if the camera has moved enough since the first frame."""
         last = self._waiting[-1]
         for first in tuple(self._waiting):
             tracks, rows0, rows1 = np.intersect1d(first.tracks, last.tracks, True, True)
             if len(tracks) >= MIN_FIRST_POINTS:
                 break
-            del self._waiting[0]  # too much has changed: begin later
+            del self._waiting[0]  # too few common tracks: start with a later frame
         else:
             return False
         xy0, xy1 = first.xy[rows0].astype(float), last.xy[rows1].astype(float)
@@ -138,7 +139,7 @@ class VisualOdometry:
         return True
 
     def _place(self, frame: TrackedFrame) -> bool:
-        """Estimate the pose of a frame by the points that it sees; make it a keyframe or not."""
+        """Estimate the pose of a frame from the points that it sees; add keyframes when needed."""
         pose = self._solve(frame)
         if pose is None:
             return False
@@ -168,11 +169,11 @@ class VisualOdometry:
         return True
 
     def _known(self, frame: TrackedFrame) -> np.ndarray:
-        """Return which tracks of a frame have a point."""
+        """Return whether each track of a frame has a point."""
         return np.isfinite(self._points[frame.tracks, 0])
 
     def _errors(self, frame: TrackedFrame, pose: pycolmap.Rigid3d) -> np.ndarray:
-        """Return reprojection errors of a frame's tracks; infinite behind it, NaN unknown."""
+        """Return reprojection errors of a frame's tracks: infinite behind it, NaN if unknown."""
         matrix = pose.matrix()
         seen = self._points[frame.tracks] @ matrix[:, :3].T + matrix[:, 3]
         with np.errstate(invalid="ignore"):
@@ -180,7 +181,7 @@ class VisualOdometry:
         return np.where(seen[:, 2] <= 0, np.inf, errors)
 
     def _solve(self, frame: TrackedFrame) -> pycolmap.Rigid3d | None:
-        """Return a frame's pose by the points that it sees, or None."""
+        """Return a frame's pose estimated from the points that it sees, or None."""
         known = self._known(frame)
         if known.sum() < MIN_INLIERS:
             return None
@@ -196,7 +197,7 @@ class VisualOdometry:
     def _triangulate(
         self, first: Keyframe, second: Keyframe, tracks: np.ndarray, max_error_px: float
     ) -> None:
-        """Give points to tracks that two keyframes see, where their rays agree."""
+        """Triangulate tracks that two keyframes see, and keep points whose rays agree."""
         if not len(tracks):
             return
         relative = second.pose * first.pose.inverse()
@@ -215,7 +216,7 @@ class VisualOdometry:
         self._points[tracks[good]] = found.points[good] @ matrix[:, :3].T + matrix[:, 3]
 
     def _adjust(self) -> None:
-        """Adjust the last keyframes and their points, and leave out what does not agree."""
+        """Adjust the last keyframes and their points, and remove outliers."""
         window = self._keyframes[-WINDOW - ANCHORS :]
         seen_by: dict[int, list[tuple[int, int]]] = {}
         for k, keyframe in enumerate(window, 1):

@@ -126,7 +126,7 @@ def test_images_without_a_match_have_an_exit_code_of_their_own(run, tmp_path: Pa
         Image.new("RGB", (64, 64), (90, 90, 90)).save(tmp_path / f"{name}.png")
     result = run("match", "a.png", "b.png", "-o", "out", "--unguided", "--json")
     assert result.exit_code == 3
-    assert "there are no matches: the images show too little" in result.stderr
+    assert "there are no matches: the images have too little texture" in result.stderr
     report = json.loads(result.stdout)
     assert (report["matches"], report["success"]) == (0, False)
 

@@ -199,7 +199,7 @@ def test_options_reach_the_detector_and_a_name_without_an_ending_is_a_folder(
     values = json.loads(run("reconstruct", *pair, *options).stdout)
     expected = DeepDetect("default").detect(folder / "left.png", threshold=0.7)
     assert values["keypoints"] == len(expected)
-    assert values["rectified_why"] == "as asked for"
+    assert values["rectified_why"] == "set by the caller"
     assert {path.name for path in Path("rec").glob("*.html")} == {"model.html"}
 
 

@@ -259,7 +259,7 @@ def test_without_rasterio_a_place_is_said_not_lost(
     assert read_metadata(tmp_path / "b.png", placed=True).to_world is None
     for name in ("a.tif", "c.jpg"):
         assert read_metadata(tmp_path / name).to_world is None
-        words = f"the place of {tmp_path / name} on the Earth needs the package rasterio: run pip"
+        words = f"the georeference of {tmp_path / name} needs the package rasterio: run pip"
         with pytest.raises(MissingExtraError, match=re.escape(words)):
             read_metadata(tmp_path / name, placed=True)
         for command in ("register", "stitch"):
@@ -371,7 +371,7 @@ def test_a_picture_too_large_for_its_format_is_refused(
 ) -> None:
     wide = np.zeros((2, 65_501, 3), np.uint8)
     for name in ("p.jpg", "p.JPEG"):
-        with pytest.raises(DeepDetectError, match="65501x2 pixels: give it a name") as error:
+        with pytest.raises(DeepDetectError, match="65501x2 pixels as JPEG: use a name") as error:
             save_picture(wide, tmp_path / name)
         one_line(error.value)
     assert not list(tmp_path.iterdir())

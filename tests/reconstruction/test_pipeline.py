@@ -307,7 +307,7 @@ def test_pairs_only_said_to_be_rectified_give_no_cloud(
     left, right = middle(level.left, level.right)
     noise = np.random.default_rng(0).normal(0, 6, left.shape)
     noisy = np.clip(left + noise, 0, 255).astype(np.uint8)
-    assert "one place" in refusal(left, noisy, **options)
+    assert "two different places" in refusal(left, noisy, **options)
     assert "exchanged" in refusal(right, left, **options)
     shifted = np.ascontiguousarray(left[:, 9:]), np.ascontiguousarray(left[:, :-9])
     assert "-9 px" in refusal(*shifted, **options)
@@ -341,7 +341,7 @@ def test_what_is_wrong_is_said(level: Any) -> None:
     pair = left, right = middle(level.left, level.right)
     again = cv2.imdecode(cv2.imencode(".jpg", left)[1], cv2.IMREAD_COLOR)
     refusal(left, again)
-    assert "one place" in refusal(left, again, rectified=True)
+    assert "two different places" in refusal(left, again, rectified=True)
     assert "exchanged" in refusal(right, left)
     assert "EXIF" in refusal(*pair, focal_px=None)
     with pytest.raises(OptionError):

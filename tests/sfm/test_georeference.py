@@ -165,7 +165,7 @@ def test_fixes_that_say_nothing_give_no_place(pycolmap, tmp_path: Path, hidden: 
     random = np.random.default_rng(0)
     centres = random.normal(0, 0.5, (10, 3))  # a statue: a metre across, fixes of 3 m
     sparse = made_model(centres, [NORTH_LEVEL] * 10, np.zeros((1, 3)), hidden)
-    assert "0 of its images" in str(georeference(sparse, sparse.points, tmp_path))
+    assert "0 of the images" in str(georeference(sparse, sparse.points, tmp_path))
     write_fixes(tmp_path, random.normal(0, 3, (10, 3)))
     assert "too close together" in str(georeference(sparse, sparse.points, tmp_path))
     write_fixes(tmp_path, np.zeros((10, 3)))

@@ -1,9 +1,9 @@
-"""Folders of the weights, as model hubs take them: each with its card, config, ONNX, safetensors.
+"""Write folders of the weights for model hubs: card, config, ONNX and safetensors of each.
 
     python tools/hub dist/hub
 
-`DeepDetect.from_pretrained(folder)` reads those of networks, and so does transformers with
-`trust_remote_code`, by modeling_deepdetect.py beside this file. Nothing is uploaded.
+`DeepDetect.from_pretrained(folder)` reads the folders of networks. So does transformers with
+`trust_remote_code`, by the code in modeling_deepdetect.py. Nothing is uploaded.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ PREPROCESSOR = {
 
 
 def write_folder(folder: Path, card: Path, files: dict[str, Path], config: dict[str, Any]) -> None:
-    """Write one model's folder; links of its card lead to the repository."""
+    """Write the folder of a model; the links in its card are made absolute."""
     hook = importlib.util.spec_from_file_location("hatch_build", ROOT / "hatch_build.py")
     assert hook is not None
     assert hook.loader is not None
@@ -65,7 +65,7 @@ def write_folder(folder: Path, card: Path, files: dict[str, Path], config: dict[
 
 
 def add_transformers(folder: Path, name: str) -> None:
-    """Add the code by which transformers loads a network."""
+    """Add the code with which transformers loads a network."""
     file, network = ("espnet", "ESPNet") if name == "espnet" else ("fast", "FastNetwork")
     source = (LAB / f"networks/{file}.py").read_text("utf-8")
     (folder / "network.py").write_text(f"{source}\n\nNetwork = {network}\n", "utf-8")
@@ -78,7 +78,7 @@ def _write_json(path: Path, values: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    """Write all folders into a new one."""
+    """Write all folders to a new folder."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("output", type=Path, help="a folder that does not exist")
     output = parser.parse_args().output

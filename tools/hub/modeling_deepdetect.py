@@ -17,19 +17,19 @@ from transformers.utils import ModelOutput
 from .network import Network
 
 STRIDE = 8
-"""Sides in pixels of what the network is given are multiples of it."""
+"""The network's input has sides that are multiples of this many pixels."""
 
 LOGIT_OUTSIDE = -100.0
-"""Pixels outside of an image, beside larger ones, have this logit: their probability is 0."""
+"""Logit of padding next to smaller images of a batch: the probability is 0."""
 
 
 class DeepDetectConfig(PreTrainedConfig):
-    """Which pixels become keypoints.
+    """The selection of pixels as keypoints.
 
     Args:
-        keypoint_threshold: pixels with a probability above it.
-        max_keypoints: at most this many, the best ones; None: all.
-        nms_radius: of non-maximum suppression in pixels (0: none).
+        keypoint_threshold: pixels with a higher probability become keypoints.
+        max_keypoints: number of keypoints, the best ones. None: all.
+        nms_radius: radius of non-maximum suppression in pixels (0: none).
     """
 
     model_type = "deepdetect"
@@ -41,15 +41,15 @@ class DeepDetectConfig(PreTrainedConfig):
 
 @dataclass
 class DeepDetectKeypointOutput(ModelOutput):
-    """What the model returns for a batch of images.
+    """The model's output for a batch of images.
 
     Attributes:
-        loss: the binary cross-entropy, where labels were given.
-        logits: (B, H, W) of the probability of a keypoint at each pixel.
-        keypoints: (B, N, 2) relative positions (x, y): (0, 0) is the upper left corner of the image
-            and (1, 1) its lower right one; `post_process_keypoint_detection` gives pixels.
+        loss: the binary cross-entropy, if labels were given.
+        logits: (B, H, W) logits of the probability of a keypoint at each pixel.
+        keypoints: (B, N, 2) relative positions (x, y), where (0, 0) is the upper left corner of the
+            image and (1, 1) the lower right; `post_process_keypoint_detection` gives pixels.
         scores: (B, N) probabilities.
-        mask: (B, N), 1 for keypoints, 0 for what fills the rows of images with fewer.
+        mask: (B, N), 1 for keypoints, 0 for padding of images with fewer keypoints.
     """
 
     loss: torch.Tensor | None = None
@@ -60,7 +60,7 @@ class DeepDetectKeypointOutput(ModelOutput):
 
 
 class DeepDetectForKeypointDetection(PreTrainedModel):
-    """The network with the selection of keypoints."""
+    """The network, followed by the selection of keypoints."""
 
     config_class = DeepDetectConfig
     base_model_prefix = "network"
@@ -83,16 +83,17 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
 
         Args:
             pixel_values: (B, 3, H, W) RGB in [0, 1].
-            pixel_mask: (B, H, W), 1 for pixels of the image, at the upper left; None: all are.
-            labels: (B, H, W), 1 for keypoints, to train on.
-            return_dict: False for a tuple in place of the output by names.
+            pixel_mask: (B, H, W), 1 for pixels of the image, which is at the upper left. None: no
+                padding.
+            labels: (B, H, W), 1 for keypoints, for training.
+            return_dict: False returns a tuple instead of `DeepDetectKeypointOutput`.
         """
         if pixel_mask is None:
             pixel_mask = torch.ones_like(pixel_values[:, 0], dtype=torch.bool)
         inside = pixel_mask > 0
         sizes = [(int(one[:, 0].sum()), int(one[0].sum())) for one in inside]
         logits = pixel_values.new_full(inside.shape, LOGIT_OUTSIDE)
-        for height, width in set(sizes):  # each image gets what it gets alone
+        for height, width in set(sizes):  # padding must not change the result of an image
             rows = [row for row, size in enumerate(sizes) if size == (height, width)]
             image = pixel_values[rows, :, :height, :width]
             padded = pad(image, (0, -width % STRIDE, 0, -height % STRIDE), mode="replicate")
@@ -110,7 +111,7 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
         return output.to_tuple() if return_dict is False else output
 
     def _select(self, logits: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return relative positions, scores and ones of the keypoints of (H, W) logits."""
+        """Return relative positions, scores and a mask of ones for keypoints of (H, W) logits."""
         most, radius = self.config.max_keypoints, self.config.nms_radius
         kept = logits.sigmoid() > self.config.keypoint_threshold
         if radius:
@@ -125,23 +126,23 @@ class DeepDetectForKeypointDetection(PreTrainedModel):
 
 
 class DeepDetectImageProcessor(BaseImageProcessor):
-    """Turns images to the tensors that the model takes, and its output to pixels.
+    """Converts images to input tensors of the model, and its output to pixels.
 
     Args:
-        max_pixels: images with more are scaled down to that; None: none are.
+        max_pixels: larger images are scaled down to this number of pixels. None: never.
     """
 
-    model_input_names = ["pixel_values", "pixel_mask"]  # noqa: RUF012  # as transformers has it
+    model_input_names = ["pixel_values", "pixel_mask"]  # noqa: RUF012  # as in transformers
 
     def __init__(self, max_pixels: int | None = 2_000_000, **keywords: Any) -> None:
         super().__init__(**keywords)
         self.max_pixels = max_pixels
 
     def preprocess(self, images: Any, return_tensors: Any = None, **_: Any) -> BatchFeature:
-        """Turn one image or a list of them, of any sizes, to tensors.
+        """Convert an image or a list of images, of any sizes, to tensors.
 
-        They are paths, PIL images, or arrays or tensors: bytes or [0, 1], grey or RGB, channels
-        first or last.
+        Images are paths, PIL images, arrays or tensors. Arrays and tensors are uint8 or floats in
+        [0, 1], grey or RGB, with channels first or last.
         """
         several = isinstance(images, (list, tuple)) or getattr(images, "ndim", 0) == 4
         planes = [self._shrunk(_planes(image)) for image in (images if several else [images])]
@@ -169,10 +170,10 @@ class DeepDetectImageProcessor(BaseImageProcessor):
         outputs: DeepDetectKeypointOutput,
         target_sizes: torch.Tensor | Sequence[tuple[int, int]],
     ) -> list[dict[str, torch.Tensor]]:
-        """Turn the model's output to keypoints in pixels.
+        """Convert the model's output to keypoints in pixels.
 
         Args:
-            outputs: of the model.
+            outputs: output of the model.
             target_sizes: (height, width) of each image, before any processing.
 
         Returns:
@@ -188,7 +189,7 @@ class DeepDetectImageProcessor(BaseImageProcessor):
 
 
 def _planes(image: Any) -> np.ndarray:
-    """Return an image as (3, H, W) float32 RGB in [0, 1]."""
+    """Convert an image to (3, H, W) float32 RGB in [0, 1]."""
     if not hasattr(image, "ndim"):
         image = load_image(image if hasattr(image, "convert") else str(image))
     array = np.asarray(image)
@@ -201,7 +202,7 @@ def _planes(image: Any) -> np.ndarray:
 
 
 def _averaged(planes: np.ndarray, axis: int, count: int) -> np.ndarray:
-    """Return so many means along an axis, each over an equal part of the length."""
+    """Scale an axis to `count` by averaging over equal parts of its length."""
     planes = np.moveaxis(planes, axis, 0)
     ends = np.linspace(0, len(planes), count + 1)
     whole = np.minimum(ends.astype(int), len(planes) - 1)

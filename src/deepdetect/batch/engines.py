@@ -1,8 +1,8 @@
-"""What runs the tasks of a collection: the processes of this machine, or a cluster by Ray Data.
+"""Engines that run the tasks of a collection: processes of this machine, or a Ray cluster.
 
-To add an engine, write a function of the signature of `map_in_processes` and add it to `ENGINES`.
-Ray starts a worker that dies again, and repeats its tasks: each outcome arrives once, but a
-function may run twice. So a function must write files under temporary names, and rename them.
+To add an engine, write a function with the signature of `map_in_processes` and add it to `ENGINES`.
+Ray restarts a worker that dies, and repeats its tasks: each outcome arrives once, but a function
+may run twice. So a function must write files under temporary names, and rename them.
 """
 
 from __future__ import annotations
@@ -28,19 +28,20 @@ from .._shared.machine import (
 )
 
 MAX_BLOCKS = 4096
-"""Parts of the work that Ray schedules: each costs milliseconds, and is redone if a worker dies."""
+"""The work has at most this number of parts, as scheduling one costs Ray milliseconds. A part is
+repeated if its worker dies."""
 
 PROCESSORS_PER_WORKER = 0.5
-"""That are reserved. A worker uses one; when half of the machines are lost, those that are left
-have room for all workers. (Tasks wait for their worker, and would wait for ever.)"""
+"""A worker reserves this share of a processor, though it uses a whole one: after the loss of half
+the machines, the rest can hold all workers. Tasks would else wait forever for a lost worker."""
 
 OBJECT_STORE_BYTES = 200_000_000
-"""Shared memory of a cluster that is started here: outcomes are small, results go to files."""
+"""Shared memory of a cluster that is started here. It can be small: results go to files."""
 
 SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_BACKEND_LOG_LEVEL": "fatal",
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # else it warns
+    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",  # avoids a warning
 }
 
 DATA_SETTINGS = {"enable_progress_bars": False, "print_on_execution_start": False}
@@ -51,17 +52,17 @@ def map_on_ray(
 ) -> Iterator[Outcome]:
     """Apply a function to every task on a Ray cluster, in workers of one processor each.
 
-    The cluster is the one to which this process is connected, else the one that RAY_ADDRESS names
-    or that runs on this machine (`ray start`), else, or with RAY_ADDRESS=local, one that is started
-    here and ends with the work. All its machines need this package, and the files under the same
-    paths. A DeepDetectError says that the cluster failed, or is what the function raised.
+    The cluster is the one that this process is connected to, that RAY_ADDRESS names, or that runs
+    on this machine (`ray start`). Without one, or with RAY_ADDRESS=local, a cluster is started for
+    the duration of the work. All its machines need this package, and the files under the same
+    paths. A DeepDetectError comes from the function, or says that the cluster failed.
     """
     if workers is not None and workers < 1:
         raise OptionError(f"`workers` must be at least 1, not {workers}")
     ray = _import_ray()
     if not len(tasks):
         return
-    # Ray prints what befalls its workers, up to its end: standard output is for results.
+    # Ray prints messages about its workers, but standard output is for results.
     with contextlib.redirect_stdout(sys.stderr), _connected(ray, workers):
         count = min(workers or int(ray.cluster_resources().get("CPU", 1)), len(tasks))
         rows = ray.data.from_items(
@@ -82,14 +83,14 @@ def map_on_ray(
                 yield outcome
         except (ray.exceptions.RayActorError, ray.exceptions.RaySystemError) as error:
             raise DeepDetectError(
-                f"the Ray cluster failed ({first_line(error)}): look at it, then run this again"
+                f"the Ray cluster failed ({first_line(error)}): check it, then run this again"
             ) from error
 
 
 class _Worker:
     def __init__(self, function: Callable[[Any], Any], folder: str) -> None:
         self.function = function
-        with contextlib.suppress(OSError):  # relative paths mean what they mean to the caller
+        with contextlib.suppress(OSError):  # relative paths are the caller's
             os.chdir(folder)
         use_one_thread()
         disable_malloc_trim()
@@ -97,7 +98,7 @@ class _Worker:
     def __call__(self, row: dict[str, Any]) -> dict[str, Any]:
         try:
             outcome = self.function(pickle.loads(row["task"]))
-        except DeepDetectError as error:  # Ray would wrap it in a traceback
+        except DeepDetectError as error:  # Ray would add a traceback
             outcome = error
         return {"outcome": pickle.dumps(outcome)}
 
@@ -122,16 +123,16 @@ def _start_cluster(ray: Any, processors: int, quiet: dict[str, Any]) -> None:
             object_store_memory=OBJECT_STORE_BYTES,
             **quiet,
         )
-    except Exception as error:  # it waits half a minute for its parts, and raises many kinds
+    except Exception as error:  # after half a minute, Ray raises errors of many types
         ray.shutdown()
         raise DeepDetectError(
-            f"Ray does not start ({first_line(error)}): try later, or use the engine processes"
+            f"Ray cannot start ({first_line(error)}): try later, or use the engine processes"
         ) from error
 
 
 @contextmanager
 def _connected(ray: Any, workers: int | None) -> Iterator[None]:
-    """Connect to a cluster unless this process is, or start one; and make Ray Data quiet."""
+    """Connect to a cluster, or start one, unless this is done; and silence Ray Data."""
     before = ray.is_initialized()
     quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
     if not before:

@@ -1,6 +1,6 @@
-"""Features of all images below a folder, in a file of hloc's layout.
+"""Extraction of the features of all images below a folder, into a file in hloc's layout.
 
-https://github.com/cvg/Hierarchical-Localization stores them so; its pixels are ours.
+See https://github.com/cvg/Hierarchical-Localization; pixel coordinates are the same as here.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ..io.image_file import ReadingOptions, reading_options
 from .hdf5 import SETTINGS, BatchReport, Group, Item, State, damaged, fill_file
 
 ROOT_SIFT_NORM = 512
-"""Length of these as bytes."""
+"""RootSIFT descriptors stored as bytes have this length."""
 
 
 @suggest_keywords
@@ -45,39 +45,37 @@ def extract_features(
     overwrite: bool = False,
     quiet: bool = True,
 ) -> BatchReport:
-    """Extract the features of all images below a folder into an HDF5 file of hloc's layout.
+    """Extract the features of all images below a folder into an HDF5 file in hloc's layout.
 
-    Each image has a group with its path below the folder as name, as "db/1.jpg". In it are
+    The group of an image is named by its path below the folder, such as "db/1.jpg". It holds
     `keypoints` (N, 2) float32, x right and y down in pixels, centre of the first pixel (0, 0), with
-    the attribute `uncertainty` in pixels; `descriptors` (D, N) float32 of length 1, 64 learned
-    numbers, or 128 of RootSIFT, which `DeepDetect` has;
-    `scores` (N,) float32, the higher the better; `colors` (N, 3) uint8 sRGB; `image_size` (width,
-    height) int32; and of keypoints with sizes and angles `scales` (N,) float32, sigma in pixels
-    (half the size), and `oris` (N,) float32 in degrees.
+    the attribute `uncertainty` in pixels; `descriptors` (D, N) float32 of length 1, D = 64 learned
+    ones or 128 of RootSIFT for `DeepDetect`; `scores` (N,) float32, higher is better; `colors`
+    (N, 3) uint8 sRGB; `image_size` (width, height) int32; and, for keypoints with sizes and angles,
+    `scales` (N,) float32, sigma in pixels (half the size), and `oris` (N,) float32 in degrees.
 
-    A call that is interrupted or killed goes on when it is made again; images that are done and
-    have not changed are skipped, new ones are added, and features of images that are no longer
-    there, or can no longer be read, are removed: one file is for one folder. A script must call
-    this under `if __name__ == "__main__":`, since processes are started.
+    The same call continues an interrupted run. It skips unchanged images, adds new ones, and
+    removes those that are missing or can no longer be read: a file is for one folder. It starts
+    processes, so a script must call it under `if __name__ == "__main__":`.
 
     Args:
-        folder: of the images.
+        folder: folder of the images.
         path: the file.
-        detector: a `PointDetector`, the default, or a `DeepDetect` (with `threads=1`: every process
-            has one).
-        selection: which pixels of a `DeepDetect`; None: those over 0.5.
-        max_megapixels: of an image, as of `load_image`; larger ones are failures.
+        detector: a `PointDetector`, the default, or a `DeepDetect` (with `threads=1`, because every
+            process has one).
+        selection: which pixels of a `DeepDetect` become keypoints; None: those over 0.5.
+        max_megapixels: limit for an image, as in `load_image`; larger ones are failures.
         engine: "processes" of this machine, or "ray" for a cluster.
         workers: number of processes; default one per processor.
         overwrite: replace the file.
         quiet: show no progress bar.
 
     Returns:
-        What was done. An image that cannot be read does not stop the others: see `failures`.
+        Counts of keypoints, and `failures`: an image that cannot be read does not stop the others.
 
     Raises:
         ImageError: the folder is missing, or holds no image.
-        OptionError: an option is unknown; or the file exists, made with other settings.
+        OptionError: an option is unknown, or the file exists with other settings.
         MissingExtraError: h5py, or what the engine needs, is not installed.
         DeepDetectError: the file cannot be written.
 
@@ -111,7 +109,7 @@ def extract_features(
             root=root,
             selection=selection,
             detector=detector,
-            reading=reading,  # other processes do not know that of the command
+            reading=reading,  # other processes do not have the command's
         ),
         of="images",
         others_stay=lambda _: False,
@@ -142,7 +140,7 @@ def _extract(
                 keypoints = detector.describe(rgb, keypoints)
             else:
                 keypoints = describe_keypoints(gray, keypoints)
-            # Of a pixel of the image that they were found on.
+            # Keypoints are as uncertain as a pixel of the scaled image in which they were found.
             seen = seen_size(gray.shape, HeatmapOptions(detector.settings["resolution"]))
             uncertainty = max(gray.shape[1] / seen[0], gray.shape[0] / seen[1])
             column, row = np.rint(keypoints.xy).astype(np.int64).T
@@ -154,7 +152,7 @@ def _extract(
 def feature_group(
     name: str, keypoints: Keypoints, state: State = (), uncertainty: float = 1.0
 ) -> Group:
-    """Return hloc's group of an image, of a state, whose positions are uncertain by so many pixels.
+    """Return hloc's group of the keypoints of an image; `uncertainty` is in pixels.
 
     Example:
         >>> keypoints = Keypoints([[3, 4]], [0.9], (8, 6), descriptors=np.full((1, 128), 45, "u1"))
@@ -177,13 +175,13 @@ def feature_group(
 def read_keypoints(file: Any, name: str) -> Keypoints:
     """Return the keypoints of an image in a file; RootSIFT descriptors become bytes again.
 
-    Of what type they are, files of other programs do not say. An InvalidFileError says that they
-    are damaged.
+    Files of other programs do not give the type of descriptors. Raises an InvalidFileError for
+    damaged keypoints.
     """
     try:
         settings = json.loads(file.attrs.get(SETTINGS, "{}"))
         return _keypoints_of(file[name], settings.get("descriptor"))
-    # h5py raises any of these, by what is damaged; a wrong shape asks for too much memory.
+    # h5py raises any of these for damaged files; a wrong shape can need too much memory.
     except (
         OSError,
         RuntimeError,
@@ -200,7 +198,7 @@ def _keypoints_of(group: Any, descriptor_type: str | None) -> Keypoints:
     arrays = {name: group[name][()] for name in group if name != "colors"}
     xy = np.asarray(arrays["keypoints"], np.float32)
     size, scales = arrays.get("image_size"), arrays.get("scales")
-    if size is None:  # the smallest that holds them
+    if size is None:  # the smallest image that contains the keypoints
         size = np.ceil(xy.max(axis=0, initial=0)) + 1
     angles = arrays.get("oris")
     if angles is not None:

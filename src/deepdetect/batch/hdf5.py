@@ -1,9 +1,8 @@
-"""HDF5 files that many processes fill, and that survive being killed.
+"""HDF5 files that many processes fill, and that survive a killed process.
 
-HDF5 has one writer, and a file whose writer is killed may be lost. So each task writes a small file
-of its own, a shard, whole or not at all. At the end one process merges the shards into a copy of
-the file, which takes the file's place when it is whole. What is in shards or in the file stays,
-whatever is killed.
+An HDF5 file has one writer, and may be lost if this is killed. So each task writes a small file of
+its own, a shard, whole or not at all. At the end one process merges the shards into a copy of the
+file, which replaces the file when it is complete.
 """
 
 from __future__ import annotations
@@ -39,33 +38,32 @@ from .._shared.records import check_same, key, lock, plain
 from .engines import ENGINES
 
 SETTINGS = "deepdetect"
-"""Attribute of the file: what its content depends on besides the inputs, as JSON."""
+"""Attribute of the file: JSON of everything except the inputs that the content depends on."""
 
 STATE = "source_state"
-"""Attribute of a group."""
+"""Attribute of a group: the state of its input."""
 
 FORMAT = ("v110", "v110")
-"""Of the files: read by HDF5 1.10 (2016) and later; groups of a million members stay fast."""
+"""Files can be read by HDF5 1.10 (2016) and later; groups of a million members stay fast."""
 
 MIN_SHARDS = 256
-"""Of as many inputs, so that all workers have something to do."""
+"""There are at least this number of shards if there are as many inputs, so that all workers have
+something to do. Chosen by hand."""
 
 LARGEST_SHARD = 32
-"""Inputs of one: what a killed worker loses, against the number of files."""
+"""A shard has at most this number of inputs, which a killed worker loses; smaller shards are more
+files. Chosen by hand."""
 
 State = tuple[int, ...]
-"""Of an input of a group: whole numbers that change when it does."""
+"""State of an input: whole numbers that change if the input changes."""
 
 Item = tuple[Any, State]
-"""An input by its name, with its state."""
+"""An input: its name and its state."""
 
 
 @dataclass(frozen=True)
 class Group:
-    """A group of an HDF5 file: its path, its datasets and their attributes by name.
-
-    `state` is that of its input.
-    """
+    """A group of an HDF5 file: path, datasets, state of its input, and attributes of datasets."""
 
     name: str
     arrays: Mapping[str, np.ndarray]
@@ -74,18 +72,18 @@ class Group:
 
 
 MakeGroups = Callable[[Sequence[Item], dict[Any, int], list[str]], Iterator[Group]]
-"""Makes the groups of inputs one by one; notes a count or a failure for each input."""
+"""Function that yields the groups of inputs, and notes a count or a failure for each input."""
 
 
 @dataclass(frozen=True)
 class BatchReport:
-    """What was extracted or matched.
+    """What an extraction or matching did.
 
     Attributes:
         path: the file.
-        counts: keypoints of each image, or matches of each pair, that was done now.
-        skipped: number of images or pairs that had been done before.
-        failures: a sentence on each that could not be worked on.
+        counts: numbers of keypoints of the processed images, or of matches of the processed pairs.
+        skipped: number of images or pairs that an earlier run had processed.
+        failures: a sentence on each image or pair that could not be processed.
         of: "images" or "pairs".
     """
 
@@ -96,7 +94,7 @@ class BatchReport:
     of: str
 
     def check(self) -> None:
-        """Raise a BatchError where something failed."""
+        """Raise a BatchError if something failed."""
         if self.failures:
             total = len(self.counts) + self.skipped + len(self.failures)
             raise BatchError(
@@ -115,25 +113,25 @@ def import_h5py() -> Any:
 
 @contextmanager
 def open_hdf5(path: Path) -> Iterator[Any]:
-    """Open an HDF5 file to read it; that it is damaged may be found while it is read."""
+    """Open an HDF5 file to read it; also handle errors of damaged files inside the block."""
     h5py = import_h5py()
     if path.is_dir():
         raise InvalidFileError(f"{path} is a folder: name a file of features or matches")
     if not path.is_file():
         raise MissingFileError(f"there is no file {path}: check the path")
     try:
-        # Nobody writes to a file under its final name, and network folders may know no locks.
+        # No process writes to a file under its final name, and network folders may lack locks.
         file = h5py.File(path, "r", locking=False)
     except OSError as error:
         raise DeepDetectError(
-            f"{path} is no HDF5 file, or is damaged ({first_line(error)}): write it again"
+            f"{path} is not an HDF5 file, or is damaged ({first_line(error)}): write it again"
         ) from error
     with file:
         try:
             yield file
         except DeepDetectError:
             raise
-        except (OSError, RuntimeError, KeyError) as error:  # what h5py raises, by what is damaged
+        except (OSError, RuntimeError, KeyError) as error:  # h5py's errors for damaged files
             raise damaged(path, error) from error
 
 
@@ -145,17 +143,17 @@ def feature_names(file: Any) -> list[str]:
 
 
 def damaged(path: Path, error: Exception) -> InvalidFileError:
-    """Return the error of a file, or of a part of it, that cannot be read."""
+    """Return the error for a file, or a part of it, that cannot be read."""
     return InvalidFileError(f"{path} is damaged ({first_line(error)}): write it again")
 
 
 @contextmanager
 def _written(path: Path, mode: str) -> Iterator[Any]:
-    """Open a temporary file to write it; what the system refuses is an OSError with its number."""
+    """Open a temporary file to write it; turn errors of the system into an OSError with number."""
     try:
         with import_h5py().File(path, mode, libver=FORMAT) as file:
             yield file
-    except (OSError, RuntimeError) as error:  # HDF5 raises both, with pages of text
+    except (OSError, RuntimeError) as error:  # HDF5 raises both, with a long text
         number = re.search(r"errno = (\d+)", str(error))
         if number is None:
             raise
@@ -163,9 +161,9 @@ def _written(path: Path, mode: str) -> Iterator[Any]:
 
 
 def write_groups(path: Path, groups: Iterable[Group]) -> None:
-    """Write a file of groups, whole or not at all; without any there is no file.
+    """Write a file of groups, whole or not at all; without groups, write no file.
 
-    They are written one by one: an iterator needs the memory of one.
+    Groups are written one by one, so that an iterator needs the memory of one.
     """
     groups = iter(groups)
     first = next(groups, None)
@@ -181,7 +179,7 @@ def write_groups(path: Path, groups: Iterable[Group]) -> None:
 
 
 def state_of(group: Any) -> State:
-    """Return the state of a group's input; empty where another program has written it."""
+    """Return the state of a group's input, or an empty one for files of other programs."""
     return tuple(int(number) for number in group.attrs.get(STATE, ()))
 
 
@@ -198,15 +196,16 @@ def fill_file(
     overwrite: bool,
     quiet: bool,
 ) -> BatchReport:
-    """Make the groups that are wanted and not in the file yet, in the processes of an engine.
+    """Make the wanted groups that are not in the file yet, in the processes of an engine.
 
-    The settings are all that the content depends on besides the inputs; shards of others are not
-    used. Of an input any of its groups will do, if it has the named state; else the first is made.
-    `others_stay` says which groups of other inputs, and of inputs that fail, stay in the file.
+    The content depends on the settings and the inputs; shards of other settings are not used.
+    `wanted` gives the possible groups of each input: if none of them exists in the given state, the
+    first one is made. `others_stay` decides for each group of another input, or of an input that
+    fails, whether it stays in the file.
     """
     import_h5py()
     map_tasks, work = look_up("engine", engine, ENGINES), partial(_write_shard, make=make)
-    list(map_tasks(work, [], workers))  # what the engine lacks is said before a file is made
+    list(map_tasks(work, [], workers))  # raises an error for a missing engine before the work
     target, settings = Path(path).absolute(), plain(settings)
     if target.is_dir():
         raise OptionError(f"{target} is a folder: name a file in it with -o")
@@ -262,13 +261,13 @@ def fill_file(
                         bar.update(1)
                     for name in filter(merged.__contains__, gone):
                         del merged[name]
-        with contextlib.suppress(OSError):  # what stays is merged again, to no effect
+        with contextlib.suppress(OSError):  # remaining shards are merged again, to no effect
             shutil.rmtree(folder)
     return BatchReport(Path(path), dict(sorted(counts.items())), skipped, (*sorted(failures),), of)
 
 
 def _shard_files(folder: Path) -> list[Path]:
-    """List the shards, older ones first: newer ones replace what they hold."""
+    """List the shards, oldest first, because newer ones replace their groups."""
     shards = [path for path in folder.glob("*.h5") if not path.name.startswith(".")]
     return sorted(shards, key=lambda path: (path.stat().st_mtime_ns, path.name))
 
@@ -291,7 +290,7 @@ def _write_shard(
 
 
 def _copy_groups(shard: Path, merged: Any) -> None:
-    """Copy the groups of a shard, in the place of those of the same name."""
+    """Copy the groups of a shard, replacing groups of the same name."""
     with open_hdf5(shard) as file:
         for name, group in _leaves(file):
             if name in merged:
@@ -300,8 +299,8 @@ def _copy_groups(shard: Path, merged: Any) -> None:
 
 
 def _leaves(group: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the groups that this package has written, with their paths."""
-    for name, member in group.items():  # None: a link that leads nowhere, of a damaged file
+    """Yield the paths and groups that this package has written."""
+    for name, member in group.items():  # None: a dangling link in a damaged file
         if member is not None and STATE in member.attrs:
             yield prefix + name, member
         elif hasattr(member, "items"):

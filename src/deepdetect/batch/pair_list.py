@@ -1,4 +1,4 @@
-"""Which images are matched with which: lists of pairs, and the names of their groups in files."""
+"""Lists of pairs of images to match, and the names of their groups in files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Pair = tuple[str, str]
 
 
 def pair_name(name0: str, name1: str) -> str:
-    """Return the path of a pair's group in a file of matches, as hloc makes it.
+    """Return the path of a pair's group in a file of matches, as in hloc.
 
     Example:
         >>> pair_name("db/1.jpg", "query/2.jpg")
@@ -24,21 +24,21 @@ def pair_name(name0: str, name1: str) -> str:
 
 
 def read_pairs(path: str | Path) -> list[Pair]:
-    """Read a list of pairs: two names of images on each line, with a blank or a tab between.
+    """Read a list of pairs: two image names on each line, separated by a blank or a tab.
 
-    A pair that is listed twice, in either order, is taken once, as it is listed first.
+    If a pair is listed twice, in either order, only the first one counts.
 
     Raises:
-        DeepDetectError: the file is missing or empty, or a line is something else.
+        DeepDetectError: the file is missing or empty, or a line does not name two images.
     """
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise MissingFileError(
-            f"there is no file {path}: give one, or exhaustive, or sequential:10"
+            f"there is no file {path}: give a file, exhaustive, sequential:10 or similar:20"
         ) from None
     except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text in UTF-8"
+        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
         raise DeepDetectError(f"{path} cannot be read ({reason}): check the file") from None
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     if not lines:
@@ -55,26 +55,26 @@ def write_pairs(path: Path, pairs: Sequence[Pair]) -> None:
 
 
 SIMILAR = 20
-"""Most similar images that each one is matched with, where no number is told."""
+"""The choice "similar" alone matches each image with this number of others. Chosen by hand."""
 
 
 def similar(pairs: object) -> int | None:
-    """Return with how many of the most similar each image is matched; None where not by these."""
+    """Return N of "similar:N", or None for another choice of pairs."""
     match = isinstance(pairs, str) and re.fullmatch("similar(?::([1-9][0-9]{0,8}))?", pairs)
     return int(match[1] or SIMILAR) if match else None
 
 
 def following(pairs: object) -> int | None:
-    """Return with how many that follow each image is matched; None where it is told otherwise."""
+    """Return N of "sequential:N", unlimited for "exhaustive", or None for another choice."""
     match = isinstance(pairs, str) and re.fullmatch("sequential:([1-9][0-9]{0,8})", pairs)
     return sys.maxsize if pairs == "exhaustive" else int(match[1]) if match else None
 
 
 def list_pairs(pairs: str | Path | Sequence[Sequence[str]], names: Sequence[str]) -> list[Pair]:
-    """Return the pairs that are asked for, of images of these names.
+    """Return the chosen pairs of the named images.
 
-    "exhaustive": all; "sequential:N": each image with the N that follow it; or a list of pairs of
-    names, or a text file with a pair on each line.
+    The choice is "exhaustive" (all), "sequential:N" (each image with the N that follow it), a list
+    of pairs of names, or a text file with a pair on each line.
 
     Example:
         >>> list_pairs("sequential:2", ["a", "b", "c", "d"])
@@ -87,16 +87,13 @@ def list_pairs(pairs: str | Path | Sequence[Sequence[str]], names: Sequence[str]
 
 
 def check_pairs(pairs: Sequence[Sequence[str]], place: str = "`pairs`") -> list[Pair]:
-    """Return pairs, each once: one that is listed before, in either order, is left out.
-
-    An OptionError says which is no pair.
-    """
+    """Return pairs without repetitions, in either order; raise an OptionError for a wrong pair."""
     kept: dict[Pair, None] = {}
     for pair in pairs:
         if isinstance(pair, str) or len(pair) != 2 or pair[0] == pair[1] or not all(pair):
             raise OptionError(
-                f"{pair!r} in {place} is no pair: give the names of two images, in a text file on "
-                "a line with a blank between, or a tab where they have blanks themselves"
+                f"{pair!r} in {place} is not a pair: give the names of two images; in a text file, "
+                "on one line with a blank between them, or a tab if the names have blanks"
             )
         if (pair[1], pair[0]) not in kept:
             kept[pair[0], pair[1]] = None

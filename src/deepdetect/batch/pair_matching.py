@@ -1,4 +1,4 @@
-"""Matches of many pairs of images, in a file of hloc's layout."""
+"""Matching of many pairs of images, into a file in hloc's layout."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ class PairMatchingOptions:
 
     Attributes:
         ratio: limit of the ratio test: the best distance must be below this share of the
-            second-best. None: as of `match_features`.
+            second-best. None: the default of `match_features`.
         mutual: keep only mutual nearest neighbours.
-        filter_by: which nearest neighbours are matches: "ratio" (Lowe's test), or "neighbours":
-            those that move as the matches around them do, as of `match_features`.
+        filter_by: which nearest neighbours are matches: those that pass Lowe's test ("ratio"), or
+            that move as the matches around them do ("neighbours").
         matcher: name of the matcher: "auto", "exact", "patchmatch" or "flann".
-        verify: keep only the matches that agree with a geometry that is estimated from them:
+        verify: keep only the inliers of a geometry that is estimated from the matches:
             "fundamental", "homography" or "auto". None keeps all.
-        inlier_threshold: largest error under this geometry, in pixels.
+        inlier_threshold: largest error of an inlier in pixels.
         seed: seed of random choices.
 
     Raises:
@@ -77,7 +77,7 @@ class PairMatchingOptions:
         check_filter(self.filter_by, self.ratio, self.mutual)
         check_name("matcher", self.matcher, MATCHERS_OF_NUMBERS)
         if self.verify == "essential":
-            raise OptionError("`verify` knows no cameras: use fundamental, homography or auto")
+            raise OptionError("`verify` must be fundamental, homography or auto without cameras")
         check_model(self.verify or "auto", self.seed, GeometryOptions())
 
 
@@ -93,38 +93,36 @@ def match_pairs(
     overwrite: bool = False,
     quiet: bool = True,
 ) -> BatchReport:
-    """Match the features of pairs of images, into an HDF5 file of hloc's layout.
+    """Match the features of pairs of images into an HDF5 file in hloc's layout.
 
-    Each pair has a group NAME0/NAME1, with "-" for each "/" in the names. In it are
-    `matches0` (N0,) int32, for each keypoint of the first image its match in the second, -1 where
-    it has none; and `matching_scores0` (N0,) float32 in [0, 1], 1 - Lowe's ratio, or by neighbours
-    how likely the match is right. Where pairs are told by a word, PATH.pairs.txt lists them, as
-    hloc wants it.
+    Each pair has a group NAME0/NAME1, with "-" for each "/" in the names. It holds `matches0` (N0,)
+    int32, the match in the second image of each keypoint of the first, or -1; and
+    `matching_scores0` (N0,) float32 in [0, 1], which is 1 - Lowe's ratio or, with the filter by
+    neighbours, the probability that the match is correct. If a word chooses the pairs,
+    PATH.pairs.txt lists them, as hloc needs it.
 
-    A call that is interrupted or killed goes on when it is made again; pairs that are done and
-    whose features have not changed are skipped, new ones are added. A script must call this under
-    `if __name__ == "__main__":`, since processes are started.
+    The same call continues an interrupted run: it skips pairs with unchanged features and adds new
+    ones. It starts processes, so a script must call it under `if __name__ == "__main__":`.
 
     Args:
         features: file of `extract_features`, or of hloc.
-        pairs: "exhaustive": all; "sequential:10": each image with the 10 that follow it by name;
-            "similar:20" or "similar": with the 20 that are most like it (VLAD of the best 512
-            keypoints), which new images may change: pairs of before stay; or a list of pairs of
-            names, or a text file with a pair on each line. A pair that is listed twice, in either
-            order, is taken once.
+        pairs: "exhaustive" (all), "sequential:10" (each image with the 10 that follow it by name),
+            "similar:20" or "similar" (with the 20 most similar ones, by VLAD of the best 512
+            keypoints; earlier pairs stay if new images change them), a list of pairs of names, or a
+            text file with a pair on each line. A pair listed twice, in either order, counts once.
         path: the file.
-        options: how they are matched.
+        options: how pairs are matched.
         engine: "processes" of this machine, or "ray" for a cluster.
         workers: number of processes; default one per processor.
         overwrite: replace the file.
         quiet: show no progress bar.
 
     Returns:
-        What was done. A pair without features, or whose features do not fit together, does not
-        stop the others: see `failures`.
+        Counts of matches, and `failures`: a pair without features, or with descriptors of different
+        types, does not stop the others.
 
     Raises:
-        OptionError: an option is unknown, a pair is none, or the file has other settings.
+        OptionError: an option is unknown, a pair is wrong, or the file has other settings.
         MissingExtraError: h5py, or what the engine needs, is not installed.
         DeepDetectError: a file cannot be read or written.
 
@@ -134,7 +132,7 @@ def match_pairs(
     """
     source = Path(features).absolute()
     if not (alike := similar(pairs)):
-        list_pairs(pairs, ())  # what is wrong with them is said first
+        list_pairs(pairs, ())  # raises an error for wrong pairs before the work
     if source == Path(path).absolute():
         raise OptionError(f"{path} holds the features: give the matches another file with -o")
     if options.filter_by == "neighbours" and (first := first_keypoints(source)):
@@ -165,7 +163,7 @@ def match_pairs(
 
 
 def first_keypoints(features: Path) -> Keypoints | None:
-    """Return those of the first image in a file that are not damaged: the others are alike."""
+    """Return the first undamaged keypoints in a file: all images have the same kind."""
     with open_hdf5(features) as file:
         for name in feature_names(file):
             with suppress(InvalidFileError):
@@ -176,11 +174,11 @@ def first_keypoints(features: Path) -> Keypoints | None:
 def _find_pairs(
     features: Path, pairs: Sequence[Pair]
 ) -> tuple[dict[Pair, dict[str, State]], list[str], set[str], str]:
-    """Look for the features of pairs.
+    """Look up the features of pairs.
 
-    Return the groups that will do for each pair that can be matched, with the states of its
-    features; a sentence on each other; groups of pairs without features, whose matches would point
-    nowhere; and a digest of the settings of the features.
+    Returns the possible groups of each pair that can be matched, with the states of its features; a
+    sentence on each other pair; the groups of pairs without features, whose matches are obsolete;
+    and a digest of the settings of the features.
     """
     wanted: dict[Pair, dict[str, State]] = {}
     failures: list[str] = []
@@ -198,7 +196,7 @@ def _find_pairs(
                 gone |= {name, reversed_name}
             elif taken.setdefault(name, pair) != pair:
                 failures.append(
-                    f"{' '.join(pair)}: {name} is of {' '.join(taken[name])}, too: rename an image"
+                    f"{' '.join(pair)}: {' '.join(taken[name])} has the same group: rename an image"
                 )
             else:
                 wanted[pair] = {name: state0 + state1, reversed_name: state1 + state0}
@@ -206,12 +204,13 @@ def _find_pairs(
 
 
 def _state(file: Any, name: str) -> State | None:
-    """Return what changes when the features of an image do, None where there are none."""
+    """Return numbers that change if the features of an image do, or None without features."""
     try:
         group = file[name]
         if state := state_of(group):
             return state
-        digest = key(group["keypoints"][()], group["descriptors"][()])  # other programs note none
+        # Files of other programs have no state.
+        digest = key(group["keypoints"][()], group["descriptors"][()])
     except (KeyError, TypeError, ValueError, IndexError):
         return None
     return (int(digest[:15], 16),)
@@ -233,7 +232,7 @@ def _match_pairs(
                 features0, features1 = first[1], read_keypoints(file, name1)
                 both = features0.descriptors, features1.descriptors
                 if len({np.asarray(each).shape[-1:] for each in both}) > 1:
-                    raise InvalidFileError("their descriptors differ: extract both alike")
+                    raise InvalidFileError("their descriptors differ in type: extract both anew")
                 rows, scores = _match(features0, features1, options)
                 counts[name0, name1] = len(rows)
                 yield match_group((name0, name1), len(features0), rows, scores, state)
@@ -242,7 +241,7 @@ def _match_pairs(
 def match_group(
     pair: Pair, count: int, rows: np.ndarray, scores: np.ndarray, state: State = ()
 ) -> Group:
-    """Return hloc's group of (K, 2) matched rows, where the first image has `count` keypoints."""
+    """Return hloc's group of (K, 2) matched rows for a first image with `count` keypoints."""
     matches0, scores0 = np.full(count, -1, np.int32), np.zeros(count, np.float32)
     matches0[rows[:, 0]], scores0[rows[:, 0]] = rows[:, 1], scores
     return Group(pair_name(*pair), {"matches0": matches0, "matching_scores0": scores0}, state)

@@ -1,7 +1,7 @@
-"""Which images of a collection are most alike, by their features.
+"""Search for the most similar images of a collection, by their features.
 
-By VLAD (Jégou et al., "Aggregating local descriptors into a compact image representation", 2010) of
-the best keypoints, with a vocabulary of the collection itself.
+Images are compared by VLAD (Jégou et al., "Aggregating local descriptors into a compact image
+representation", 2010) of their best keypoints, with a vocabulary of the collection itself.
 """
 
 from __future__ import annotations
@@ -22,26 +22,27 @@ from .hdf5 import open_hdf5
 from .pair_list import Pair
 
 COMPARED_KEYPOINTS = 512
-"""The best ones of each image, by which images are compared."""
+"""Images are compared by this number of their best keypoints. Chosen by hand."""
 
 WORDS, DESCRIPTORS_OF_WORD = 64, 8
-"""Of the vocabulary; of few descriptors there are fewer, each of so many."""
+"""The vocabulary has this number of words, or fewer if each would have fewer than the second number
+of descriptors. Chosen by hand."""
 
 KMEANS_ITERATIONS = 10
 TRAINING_IMAGES, TRAINING_DESCRIPTORS = 500, 50_000
-"""At most so many tell the vocabulary."""
+"""The vocabulary is trained on at most these numbers of images and descriptors, to save time."""
 
 COMPARED_ROWS = 256
-"""Images that are compared with all others at once: of 100,000 these are 300 MB."""
+"""This number of images is compared with all others at once, which takes 300 MB for 100,000."""
 
 
 def similar_pairs(
     features: Path, names: Sequence[str], count: int, seed: int = 0, quiet: bool = True
 ) -> tuple[list[Pair], list[str]]:
-    """Find for each image the `count` that are most like it.
+    """Find the `count` most similar images of each image.
 
-    Returns every pair once; and a sentence on each image that is in none, since its descriptors are
-    missing, damaged, or not those of the others. Images without keypoints are in none either.
+    Returns every pair once, and a sentence on each image whose descriptors are missing, damaged, or
+    of another type than the others. Images without keypoints are left out silently.
     """
     failures: dict[str, str] = {}
     blank: set[str] = set()
@@ -64,7 +65,7 @@ def similar_pairs(
 
         vectors, rows = vlad_vectors(len(names), descriptors, seed, bar.update)
     for name in {*names} - blank - {names[row] for row in rows}:
-        failures.setdefault(name, f"{name}: its descriptors differ from others: extract all alike")
+        failures.setdefault(name, f"{name}: its descriptors differ from others: extract all anew")
     pairs: set[tuple[int, int]] = set()
     with progress(len(rows), "comparing", "image", quiet) as bar:
         for k, alike in enumerate(most_alike(vectors, count)):
@@ -79,11 +80,11 @@ def vlad_vectors(
     seed: int = 0,
     done: Callable[[], object] = lambda: None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Describe each image by one vector: VLAD with the sum of each word at length 1.
+    """Describe each image by one vector: VLAD with the sum of each word normalised to length 1.
 
-    `descriptors` returns those of an image, (N_i, D) float32 of length 1. Returns the vectors (M,
-    WORDS * D), of length 1, and the rows (M,) of their images: those that have some, with the D
-    that most have.
+    `descriptors` returns those of an image, (N_i, D) float32 of length 1. Returns vectors (M,
+    WORDS * D) of length 1, and the rows (M,) of their images. Images without descriptors, or with
+    another D than most images, are left out.
     """
     rng = np.random.default_rng(seed)
     described = (own for k in rng.permutation(count).tolist() if len(own := descriptors(k)))
@@ -108,7 +109,7 @@ def vlad_vectors(
 
 
 def most_alike(vectors: np.ndarray, count: int) -> Iterator[np.ndarray]:
-    """Yield for each of some vectors the rows of the `count` others with the largest products."""
+    """Yield, for each vector, the rows of the `count` others with the largest dot products."""
     last = min(count, len(vectors) - 1)
     for start in range(0, len(vectors), COMPARED_ROWS):
         apart = -vectors[start : start + COMPARED_ROWS] @ vectors.T

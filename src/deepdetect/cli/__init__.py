@@ -1,4 +1,4 @@
-"""The command line `deepdetect`: its commands, some of them together in a module."""
+"""The command line `deepdetect`: its commands, grouped in modules, and their options."""
 
 from ._app import main
 

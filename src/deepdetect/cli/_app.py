@@ -1,4 +1,4 @@
-"""The command `deepdetect`: its subcommands, their help, and how errors are reported."""
+"""The program `deepdetect`: its commands, their help, and the report of errors."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from .._shared.errors import (
 from .._shared.progress import STDERR, fails, say
 
 NOTHING_FOUND = 3
-"""Exit code where all went well and nothing was found."""
+"""Exit code if there was no error, but nothing was found."""
 
 MORE = Group("More options")
-"""Shown by --help-all."""
+"""The group of options that only --help-all shows."""
 
 INTRODUCTION = """\
-Dense keypoints from a tiny network, and their matches.
+Detect and match dense keypoints with a tiny network, and reconstruct scenes in 3D.
 
 `deepdetect COMMAND --help` shows the common options of a command, --help-all shows all.
 
@@ -43,43 +43,43 @@ Dense keypoints from a tiny network, and their matches.
 
 COMMANDS = {
     "Images": {
-        "detect": ("detect", "keypoints of images"),
-        "match": ("match", "matches between two images"),
-        "register": ("match", "one image registered to another"),
-        "stitch": ("match", "a panorama of overlapping images"),
-        "pose": ("reconstruct", "the pose of one camera relative to another"),
-        "reconstruct": ("reconstruct", "a 3D reconstruction of two images, or of many"),
+        "detect": ("detect", "Detect keypoints in images."),
+        "match": ("match", "Match the keypoints of two images."),
+        "register": ("match", "Register one image to another."),
+        "stitch": ("match", "Stitch overlapping images to a panorama."),
+        "pose": ("reconstruct", "Estimate the pose of one camera relative to another."),
+        "reconstruct": ("reconstruct", "Reconstruct 3D points from two or more images."),
     },
     "Many images": {
-        "extract": ("features", "features of a collection of images"),
-        "match-many": ("features", "matches of many pairs of images"),
-        "track": ("track", "points followed through a video"),
-        "export": ("export", "files for other programs"),
-        "view": ("view", "a result in the browser"),
+        "extract": ("features", "Extract the features of many images."),
+        "match-many": ("features", "Match the features of many pairs of images."),
+        "track": ("track", "Track points through a video."),
+        "export": ("export", "Write files for other programs."),
+        "view": ("view", "Show a result in the browser."),
     },
     "DeepDetect itself": {
-        "app": ("app", "a page in the browser, on this computer"),
-        "demo": ("demo", "match a real stereo pair, and evaluate the matches"),
-        "doctor": ("doctor", "check the installation, and say what to do about it"),
-        "completion": ("_app", "completion of commands and options by Tab"),
+        "app": ("app", "Serve a page for the browser on this computer."),
+        "demo": ("demo", "Match a real stereo pair, and evaluate the matches."),
+        "doctor": ("doctor", "Check the installation, and suggest repairs."),
+        "completion": ("_app", "Print a script that completes commands and options by Tab."),
     },
 }
-"""The commands of this package by their group: the function's module, and what it does."""
+"""The commands of this package by group: the module of the function, and a summary."""
 
 LAB_ENTRY_POINTS = "deepdetect.commands"
-"""The group of entry points by which deepdetect-lab adds commands: tables such as `COMMANDS`.
+"""Group of the entry points by which deepdetect-lab adds commands, as tables such as `COMMANDS`.
 
-One named `dev` holds those after the word `dev`. Their modules are named in full.
+The entry point `dev` is the table of commands below `dev`. The tables have full module names.
 """
 
 LAB_COMMANDS = ("label", "train", "train-descriptor", "dev")
-"""The names that deepdetect-lab adds, for the sentence that says where it is missing."""
+"""Commands of deepdetect-lab, for the error if it is not installed."""
 
 Commands = Mapping[str, Mapping[str, tuple[str, str]]]
 
 
 class HelpFormatter(DefaultFormatter):
-    """Help of cyclopts; of the group `MORE` the number, unless all options are asked for."""
+    """The help of cyclopts, but only the number of options in the group `MORE` by default."""
 
     shows_all = False
 
@@ -90,7 +90,7 @@ class HelpFormatter(DefaultFormatter):
             super().__call__(console, options, panel)
 
     def render_description(self, console: Any, options: Any, description: Any) -> None:
-        console.print(description, soft_wrap=True)  # in the lines of the docstring
+        console.print(description, soft_wrap=True)  # keeps the line breaks of the docstring
 
 
 FORMATTER = HelpFormatter()
@@ -98,9 +98,9 @@ FORMATTER = HelpFormatter()
 
 @functools.cache
 def make_app(summaries: bool = False) -> App:
-    """Return the application, whose commands are imported when they are called.
+    """Return the application, which imports the module of a command when it is called.
 
-    With summaries it lists them without; else each says itself what it does.
+    With `summaries`, commands are listed with those of `COMMANDS`, otherwise with docstrings.
     """
     commands, development = _all_commands()
     app = App(
@@ -109,10 +109,10 @@ def make_app(summaries: bool = False) -> App:
         help_format="plaintext",
         help_formatter=FORMATTER,
         version=f"deepdetect {__version__}",
-        # Of an option that is repeated the last one counts.
+        # If an option is repeated, the last value counts.
         default_parameter=Parameter(allow_repeating=True, negative_iterable=()),
     )
-    dev = App("dev", help="Benchmarks, data sets, and what else makes DeepDetect itself.")
+    dev = App("dev", help="Develop DeepDetect: benchmarks, data sets, training of its parts.")
     for parent, groups in ((app, commands), (dev, development)):
         for title, members in groups.items():
             group = Group.create_ordered(title)
@@ -127,7 +127,7 @@ def make_app(summaries: bool = False) -> App:
 
 
 def _all_commands() -> tuple[Commands, Commands]:
-    """Return the commands of this package and of deepdetect-lab, and those after `dev`."""
+    """Return the commands of this package and deepdetect-lab, and those below `dev`."""
     commands = {
         title: {name: (f"{__package__}.{module}", does) for name, (module, does) in group.items()}
         for title, group in COMMANDS.items()
@@ -140,9 +140,9 @@ def _all_commands() -> tuple[Commands, Commands]:
 
 
 def _module_of(words: Sequence[str]) -> str | None:
-    """Return the module of the command that is called, if any.
+    """Return the module of the called command, if any.
 
-    Entry points are only read where it is no command of this package: that takes time.
+    Entry points are read only if this package has no such command, because that takes time.
     """
     name = next((word for word in words if word != "dev"), "")
     if words[:1] != ["dev"]:
@@ -153,7 +153,7 @@ def _module_of(words: Sequence[str]) -> str | None:
     if words[:1] and words[0] in LAB_COMMANDS and not development:
         raise MissingExtraError(
             f"`deepdetect {words[0]}` belongs to deepdetect-lab, which is not installed: run "
-            "pip install ./lab in the folder of the sources"
+            "pip install ./lab in the folder of DeepDetect's sources"
         )
     groups = development if words[:1] == ["dev"] else commands
     return next((group[name][0] for group in groups.values() if name in group), None)
@@ -165,22 +165,22 @@ def completion(
     ],
     /,
 ) -> None:
-    """Print what makes a shell complete commands, options and choices.
+    """Print a script that completes commands, options and choices in a shell.
 
-    deepdetect completion bash > ~/.local/share/bash-completion/completions/deepdetect
-    deepdetect completion zsh > ~/.zsh/completions/_deepdetect
-    deepdetect completion fish > ~/.config/fish/completions/deepdetect.fish
+    Save it where the shell looks for completions:
+
+        deepdetect completion bash > ~/.local/share/bash-completion/completions/deepdetect
+        deepdetect completion zsh > ~/.zsh/completions/_deepdetect
+        deepdetect completion fish > ~/.config/fish/completions/deepdetect.fish
     """
     print(make_app().generate_completion(shell=shell))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command, and return the exit code that docs/commands.md documents."""
+    """Run a command and return its exit code; docs/commands.md lists the codes."""
     from .._shared.kernels import announce_compilation
 
-    announce_compilation(
-        lambda: say("compiling what this needs for the first time, about 10 seconds; it is kept")
-    )
+    announce_compilation(lambda: say("compiling (first use only, cached): about 10 seconds"))
     words = list(sys.argv[1:] if arguments is None else arguments)
     warn = warnings.showwarning
 
@@ -212,14 +212,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _failed(f"{name} cannot be used ({error.strerror}): check the path", 2)
         if isinstance(error, BrokenPipeError):
             return 1
-        text = f"cannot write to standard output ({error.strerror}): what is in files stays"
+        text = f"cannot write to standard output ({error.strerror}): written files are kept"
         return _failed(text, 2)
 
 
 def _call(words: Sequence[str]) -> int:
     module = _module_of(words)
     if module is not None:
-        importlib.import_module(module)  # with its own errors
+        importlib.import_module(module)  # cyclopts would hide errors of the import
     FORMATTER.shows_all = "--help-all" in words
     meant = {"--help-all": "--help", "-": "/dev/stdin"}
     words = [meant.get(word, word) for word in words]
@@ -237,9 +237,9 @@ def _failed(text: str, code: int) -> int:
 
 
 def with_flags(message: str, words: Sequence[str]) -> str:
-    """Name a command's options where a message of the library names parameters.
+    """Replace the names of parameters in a message of the library by a command's options.
 
-    These are words with an underscore, or words between backticks, alone or with a value.
+    Parameters are words with an underscore, or words in backticks, alone or with a value.
 
     Example:
         >>> with_flags("set nms_radius, or `pictures=False`", ["detect"])

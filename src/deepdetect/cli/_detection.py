@@ -1,4 +1,4 @@
-"""Options that choose and set a detector."""
+"""Options that choose and configure a detector."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ._options import From
 
 Kind = Literal["network", "points"]
 Detector = Annotated[
-    Kind, Parameter(help="Pixels of the network's heat map, or ranked points of all scales.")
+    Kind, Parameter(help="network: pixels of its heat map; points: ranked points of all scales.")
 ]
 
 NETWORK = From(
@@ -28,7 +28,7 @@ NETWORK = From(
 )
 POINTS = From(PointDetector, more="spread ranker")
 ONE_THREAD = replace(NETWORK, defaults={"threads": "1"})
-"""Of commands that run a detector in each process."""
+"""Options of the network for commands that run a detector in each process."""
 
 DESCRIBED_POINTS = From(PointDetector, more="spread ranker descriptor")
 SELECTION = From(
@@ -46,10 +46,10 @@ def chosen_detector(
     options: From = POINTS,
     **defaults: Any,
 ) -> tuple[DeepDetect | PointDetector, SelectionOptions | None]:
-    """Make the detector that is chosen, and its selection, taking their options out of the values.
+    """Make the chosen detector and its selection; their options are removed from the values.
 
-    The number of points and the defaults of the network are used where nothing else is given;
-    `options` are those of points.
+    `options` are the options of points. `max_keypoints` points and the `defaults` of the network
+    apply where the values give nothing else.
     """
     network, points, selection = (source.take(values) for source in (NETWORK, options, SELECTION))
     if kind == "points":

@@ -1,4 +1,4 @@
-"""Options of commands, made from the library's signatures, and ways to print results."""
+"""Options of commands, generated from the library's signatures, and the output of results."""
 
 from __future__ import annotations
 
@@ -29,25 +29,25 @@ from ._app import MORE
 from ._app import NOTHING_FOUND as NOTHING_FOUND
 
 CELL_WIDTH = 18
-"""Least characters of a cell of a table."""
+"""A cell of a table has at least this many characters. Chosen by hand."""
 
 TEXT_WIDTH = 100
-"""Characters of a line of a wrapped table, at most; only words may be longer."""
+"""A line of a wrapped table has at most this many characters, unless a word is longer."""
 
 
 @dataclass(frozen=True)
 class From:
-    """Parameters of a function or class that are options of a command.
+    """Parameters of a function or class that become options of a command.
 
-    Name, type, default and help of an option are those of the parameter and of its docstring.
+    An option has the parameter's name, type and default, and the docstring's first sentence on it.
 
     Attributes:
         target: the function or class.
-        common: names of those that --help shows, with blanks between.
-        more: of those that --help-all shows; None: all others.
-        flags: flags that are not the name, as {"focal_px": "--focal"}, or "--flag/--negative".
-        types: types of parameters that are wider than what can be typed.
-        defaults: what the help says of the default, where the value does not say it.
+        common: names of the options that --help shows, separated by blanks.
+        more: names of those that only --help-all shows. None: all others.
+        flags: flags that differ from the name, such as {"focal_px": "--focal"}, or "--on/--off".
+        types: types of options whose parameter accepts more than can be typed.
+        defaults: texts that the help shows in place of the default value.
     """
 
     target: Callable[..., Any]
@@ -63,7 +63,7 @@ class From:
         return dict.fromkeys([*self.common.split(), *more])
 
     def parameters(self) -> Iterator[inspect.Parameter]:
-        """Make the options as keyword parameters."""
+        """Yield the options as keyword parameters."""
         parameters = inspect.signature(self.target).parameters
         helps = attribute_helps(inspect.getdoc(self.target) or "")
         scope = vars(sys.modules[self.target.__module__])
@@ -81,7 +81,7 @@ class From:
             )
 
     def take(self, values: dict[str, Any]) -> dict[str, Any]:
-        """Take these options out of those that were given."""
+        """Remove these options from the given values and return them."""
         return {name: values.pop(name) for name in self.names() if name in values}
 
 
@@ -101,14 +101,14 @@ JSON = inspect.Parameter("as_json", inspect.Parameter.KEYWORD_ONLY, default=Fals
 
 @dataclass(frozen=True)
 class Result:
-    """What a command has found, which is printed when it returns.
+    """The result of a command, which is printed when it returns.
 
     Attributes:
-        values: for --json, and as a table for the terminal unless there is a text.
-        text: for the terminal: what a user wants to know first, at most a dozen lines.
-        failures: a sentence on each input that could not be worked on: exit code 1.
-        total, what: number and name of the inputs; what is wrong with a single one is the error.
-        exit_code: where nothing failed.
+        values: printed by --json; without a text the terminal shows them as a table.
+        text: output for the terminal: the most important facts, at most a dozen lines.
+        failures: a sentence about each input that failed; they give exit code 1.
+        total, what: number and kind of the inputs; the failure of a single one is the error.
+        exit_code: exit code if nothing failed.
     """
 
     values: Any
@@ -119,8 +119,8 @@ class Result:
     exit_code: int = 0
 
     def show(self, as_json: bool) -> int:
-        """Print it; return the exit code, or raise what failed."""
-        if os.environ.get("RANK", "0") != "0":  # of the processes of torchrun the first one prints
+        """Print the result; return the exit code, or raise the failures as an error."""
+        if os.environ.get("RANK", "0") != "0":  # only the first process of torchrun prints
             return self.exit_code
         if as_json:
             print(json.dumps(self.values, indent=2, default=str))
@@ -130,16 +130,16 @@ class Result:
             raise DeepDetectError(self.failures[0])
         if self.failures:
             number = f"{len(self.failures)} of {self.total or 'the'} {self.what}"
-            raise BatchError(f"{number} failed, the others are done", self.failures)
+            raise BatchError(f"{number} failed; the others are done", self.failures)
         return self.exit_code
 
 
 def command(
     *sources: From, prints: bool = True
 ) -> Callable[[Callable[..., Result | None]], Callable[..., int]]:
-    """Make a command of a function: its result is printed, and it has the option --json.
+    """Turn a function into a command, which prints its result and has the option --json.
 
-    The options of the sources that are given are its `**values`.
+    The function receives the given options of the sources as its `**values`.
     """
 
     def decorate(function: Callable[..., Result | None]) -> Callable[..., int]:
@@ -161,17 +161,17 @@ def command(
 
 
 def attribute_helps(doc: str) -> dict[str, str]:
-    """Return the first sentence on each attribute or argument of a Google style docstring.
+    """Return the first sentence about each attribute or argument of a Google style docstring.
 
     Example:
         >>> helps = attribute_helps('''Options.
         ...
         ... Attributes:
-        ...     ratio, mutual: of the ratio test, which
-        ...         is Lowe's. More text.
+        ...     ratio, mutual: settings of the
+        ...         ratio test. More text.
         ... ''')
         >>> helps["mutual"]
-        "Of the ratio test, which is Lowe's."
+        'Settings of the ratio test.'
     """
     match = re.search(r"^(?:Attributes|Args):\n((?:[ \t]+.*\n?|\n)*)", doc, flags=re.MULTILINE)
     section = textwrap.dedent(match.group(1)) if match else ""
@@ -188,55 +188,55 @@ Image = Annotated[Path, Parameter(help="Image file.")]
 Output = Annotated[Path, Parameter(name=("--output", "-o"))]
 Folder = Annotated[Path, Parameter(name=("--output", "-o"), help="Folder for the results.")]
 Overwrite = Annotated[
-    bool, Parameter(negative="", help="Replace existing files, and do everything again.")
+    bool, Parameter(negative="", help="Replace existing files, and repeat all work.")
 ]
 Format = Annotated[Literal["npz", "csv"], Parameter("--format", help="Format of the data files.")]
 
 
 def output_file(output: Path, name: str) -> Path:
-    """Return the file that -o names: itself where it has an ending, else one of a folder."""
+    """Return the output file: -o itself if it has an ending, otherwise `name` in that folder."""
     return output if output.suffix and not output.is_dir() else output / name
 
 
 def output_files(output: Path, stem: str, endings: Mapping[str, str]) -> dict[str, Path]:
-    """Return files by their kind, in the folder that -o names; or itself, where it is the only."""
+    """Return output files by kind: in the folder -o, or -o itself if there is only one file."""
     if len(endings) == 1 and output.suffix in (".npz", ".csv"):
         return dict.fromkeys(endings, output)
     return {kind: output_folder(output) / f"{stem}{ending}" for kind, ending in endings.items()}
 
 
 def output_folder(output: Path) -> Path:
-    """Return the folder that -o names, unless it has the ending of a file."""
+    """Return the folder that -o names; raise an OptionError if it looks like a file."""
     if re.fullmatch(r"\.(npz|csv|json|txt|png|jpe?g|tiff?|webp)", output.suffix.lower()):
-        raise OptionError(f"-o names the folder for all results: {output} looks like one file")
+        raise OptionError(f"{output} looks like a file: give a folder for all results with -o")
     return output
 
 
 def expand_images(paths: Sequence[Path], output: Path) -> dict[str, Path]:
-    """Return the images that are named, and those below folders, as `name_images`.
+    """Return the given images and those below given folders by name, as `name_images` does.
 
-    Those in the folder of the results are none, nor pictures that were made of others of them.
+    Files in the output folder are left out, and visualisations of other given images.
     """
     given = {str(path.resolve()) for path in paths}
     kept = []
     for path in paths:
-        if given & {*inputs_of(path)}:  # as where all *.jpg are named
-            say(f"{path} was made of others of the images, and is left out")
+        if given & {*inputs_of(path)}:  # happens if a user gives *.jpg
+            say(f"{path} is a result from other given images, and is left out")
         else:
             kept.append(path)
     return name_images(kept, [output])
 
 
 def result_stems(images: Mapping[str, Path]) -> dict[Path, str]:
-    """Return what results of images are called: their names, with a suffix that tells two apart."""
+    """Return the names of the images' results: without suffix, unless two would be the same."""
     stems = {name: name.removesuffix(path.suffix) for name, path in images.items()}
     count = Counter(stems.values())
     return {path: stems[n] if count[stems[n]] == 1 else n for n, path in images.items()}
 
 
 def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
-    """Check that no file is written twice, or over one that is read, under whatever name."""
-    # Not by name: links, and capitals on some systems, give one file several.
+    """Raise an OptionError if a file would be written twice, or would replace an input."""
+    # Names do not suffice: by links, or capitals on some systems, one file has several.
     files = {(path.stat().st_dev, path.stat().st_ino) for path in inputs if path.exists()}
     seen: set[Path] = set()
     for output in outputs:
@@ -251,14 +251,14 @@ def check_outputs(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
 
 @contextmanager
 def claimed(outputs: Outputs) -> Iterator[dict[str, Any]]:
-    """Write outputs, as `Outputs.writing`; signals that end the process leave no trace either."""
+    """Write outputs as `Outputs.writing` does; signals that end the process also undo them."""
     with handle_signals(exit_by_signal), outputs.writing() as values:
         yield values
 
 
 @contextmanager
 def whole(files: Mapping[Any, Path]) -> Iterator[dict[Any, Path]]:
-    """Give temporary paths for files; all of them appear when the block succeeds, else none."""
+    """Yield temporary paths for files: all files appear if the block succeeds, otherwise none."""
     with ExitStack() as stack:
         yield {name: stack.enter_context(atomic_path(path)) for name, path in files.items()}
 
@@ -267,9 +267,9 @@ def whole(files: Mapping[Any, Path]) -> Iterator[dict[Any, Path]]:
 def writing(
     files: Mapping[Any, Path], inputs: Sequence[Path], overwrite: bool
 ) -> Iterator[dict[Any, Path]]:
-    """Give temporary paths for files, as `whole`, and record what they are made of.
+    """Yield temporary paths for files, as `whole` does, and record the inputs.
 
-    No input is written over, nor what was made of others.
+    Inputs and the results of other inputs are never replaced.
     """
     check_outputs(files.values(), inputs)
     with claimed(Outputs([*files.values()], inputs, overwrite=overwrite)), whole(files) as made:
@@ -277,9 +277,9 @@ def writing(
 
 
 def headed(sentence: str, values: Mapping[str, Any], names: str) -> str:
-    """Return what was found in a sentence, and the few values that are named in a table below it.
+    """Return a sentence and, below it, a table of the values whose names are given.
 
-    Times of stages are added up.
+    The times of stages are summed.
     """
     shown = {name: values.get(name) for name in names.split()}
     if isinstance(seconds := shown.get("seconds"), Mapping):
@@ -288,9 +288,9 @@ def headed(sentence: str, values: Mapping[str, Any], names: str) -> str:
 
 
 def table(*columns: Mapping[str, Any], title: str = "", wrapped: bool = False) -> str:
-    """Return names with their value in each column; tables and matrices are left to JSON.
+    """Return a text table of names and their value in each column, without nested lists.
 
-    Long values of one column are `wrapped`, or left as they are, to be copied.
+    Long values are wrapped if `wrapped`; otherwise they stay on a line, for copying.
     """
     texts = [dict(_table_rows(values)) for values in columns]
     names = dict.fromkeys(name for column in texts for name in column)
@@ -310,7 +310,7 @@ def _wrapped(text: str, indent: int) -> str:
 
 def _table_rows(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
     for name, value in values.items():
-        if name == "failures":  # listed at the end
+        if name == "failures":  # `Result.show` lists them at the end
             continue
         title = prefix + str(name).replace("_", " ")
         if isinstance(value, Mapping):

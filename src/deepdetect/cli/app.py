@@ -1,4 +1,4 @@
-"""`deepdetect app`: the page in a browser, on this computer."""
+"""`deepdetect app`: a page in the browser that runs on this computer."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from ._options import From, command
 def app(
     *, open_browser: Annotated[bool, Parameter("--open", negative="")] = False, **values: Any
 ) -> None:
-    """Serve a page at 127.0.0.1: keypoints, matches, registration, panoramas and 3D models.
+    """Serve a page at 127.0.0.1 for keypoints, matches, registration, panoramas and 3D models.
 
-    It prints the address to open, which ends in a key that is new at each start. Images stay
-    on this computer, and are removed after each task. Ctrl+C ends it.
+    Prints the address to open, which ends in a key that is new at each start. Images stay on this
+    computer and are deleted after each task. Ctrl+C ends the server.
 
         deepdetect app
         deepdetect app --port 0 --open
@@ -32,7 +32,7 @@ def app(
     require_packages("deepdetect app", "starlette", "uvicorn")
     from ..app.server import AppServer
 
-    # Any signal to end is Ctrl+C, so that tasks are ended and their files removed.
+    # Any signal to end acts as Ctrl+C, so that tasks are stopped and their files deleted.
     with endings_interrupt(), AppServer(AppOptions(**values)) as server:
         try:
             print(f"DeepDetect is at {server.address}", flush=True)

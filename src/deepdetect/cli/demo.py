@@ -1,4 +1,4 @@
-"""`deepdetect demo`: the matches of a real stereo pair, evaluated by its true disparity."""
+"""`deepdetect demo`: matches of a real stereo pair, evaluated against ground truth."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from ._detection import NETWORK
 
 @cli.command(NETWORK)
 def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Result:
-    """Detect and match the Motorcycle stereo pair; evaluate the matches by its true disparity.
+    """Match the Motorcycle stereo pair, and evaluate the matches by its ground-truth disparity.
 
-    The images (Middlebury 2014) come with the package scikit-image. Random points of the same
-    number are shown for comparison: a match by chance is not to be mistaken for skill.
+    The images (Middlebury 2014) come with the package scikit-image. The same number of random
+    points is matched for comparison, to show how many matches are correct by chance.
     """
     require_packages("the Motorcycle pair", "skimage")
     from skimage import data
@@ -38,12 +38,12 @@ def demo(*, output: cli.Folder = Path("demo-output"), **values: Any) -> cli.Resu
     values = {"weights": detector.weights, "backend": detector.runtime, **numbers}
     found, random = numbers["all_matches"], numbers["random"]
     sentence = f"{found['matches']:,} matches, {found['precision']:.0%} of them within "
-    sentence += f"{TOLERANCE_PX:g} px of the truth (of random pixels {random['precision']:.0%})"
+    sentence += f"{TOLERANCE_PX:g} px of ground truth (random pixels: {random['precision']:.0%})"
     return cli.Result(values, cli.headed(sentence, values, "keypoints seconds pictures"))
 
 
 def random_pixels(image: np.ndarray, count: int, generator: np.random.Generator) -> Keypoints:
-    """Draw pixels of an image, each as good as another: the baseline of chance."""
+    """Draw random pixels of an image with equal probability, for comparison."""
     height, width = image.shape[:2]
     drawn = generator.choice(height * width, min(count, height * width), replace=False)
     xy = np.column_stack([drawn % width, drawn // width])
@@ -57,15 +57,15 @@ def run_demo(
     detector: HeatmapDetector,
     folder: Path,
 ) -> dict[str, Any]:
-    """Detect and match a stereo pair; evaluate the matches; write pictures; return the numbers.
+    """Match a stereo pair, evaluate the matches, write visualisations, and return the numbers.
 
-    As many random points as there are keypoints are matched, too, by descriptors alone.
+    The same number of random points is matched by descriptors alone.
 
     Args:
         left, right: (H, W, 3) uint8 RGB, rectified.
-        disparity: (H, W) true disparity of the left view in pixels; not finite where unknown.
+        disparity: (H, W) ground truth of the left view in pixels; not finite where unknown.
         detector: the network.
-        folder: where the pictures are written.
+        folder: folder of the visualisations.
     """
     matches = match_images(left, right, detector)
     both = matches.keypoints0, matches.keypoints1
@@ -85,8 +85,8 @@ def run_demo(
     points = matches.points0[known], matches.points1[known]
     lines = draw_matches(left, right, *points, errors[known] <= TOLERANCE_PX)
     caption = (
-        f"{len(matches):,} matches, a random sample drawn; green: within {TOLERANCE_PX:g} px of "
-        f"the true disparity ({scores['all_matches']['precision']:.1%}), red: not"
+        f"{len(matches):,} matches, a random sample shown; green: within {TOLERANCE_PX:g} px of "
+        f"ground truth ({scores['all_matches']['precision']:.1%}), red: wrong"
     )
     heatmap = draw_heatmap(detector.heatmap(left))
     pictures = {

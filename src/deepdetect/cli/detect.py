@@ -41,15 +41,15 @@ def detect(
     overwrite: cli.Overwrite = False,
     **values: Any,
 ) -> cli.Result:
-    """Detect the keypoints of images (files or folders).
+    """Detect keypoints in images (files or folders).
 
-    Writes for each image STEM.npz (or .csv) with the positions and scores, and the pictures
-    STEM_keypoints.jpg (the best of all parts of the image, coloured by score), and of the network
-    STEM_dense.jpg (all keypoints) and STEM_heatmap.jpg (logits). Subfolders stay as they are.
+    Writes for each image STEM.npz (or .csv) with the positions and scores, and the visualisations
+    STEM_keypoints.jpg (the best in all parts of the image, coloured by score) and, for the network,
+    STEM_dense.jpg (all keypoints) and STEM_heatmap.jpg (logits). Subfolders are kept.
 
-    Images that are done are skipped when the same command runs again, and done again with other
-    options. What was made from other images of the same name, or by something else, is replaced
-    with --overwrite only. If no image has any keypoint the exit code is 3.
+    Run again, the command skips finished images, and repeats them if its options differ. Results
+    of other images with the same name, and files of unknown origin, are replaced only with
+    --overwrite. If no image has any keypoint the exit code is 3.
 
         deepdetect detect photo.jpg
         deepdetect detect photos/ -o keypoints --detector points --spread grid
@@ -57,9 +57,9 @@ def detect(
 
     Args:
         ignore: Mask image of the same size: no keypoints where it is bright.
-        pictures: Also write pictures.
+        pictures: Also write visualisations.
     """
-    import_opencv()  # what is missing is said before anything is written
+    import_opencv()  # fails before anything is written if it is missing
     stems = cli.result_stems(cli.expand_images(images, output))
     paths = [*stems]
     drawn = ("keypoints", "dense", "heatmap") if detector == "network" else ("keypoints",)
@@ -68,7 +68,7 @@ def detect(
     cli.check_outputs([file for files in outputs.values() for file in files.values()], paths)
     mask = None if ignore is None else load_mask(ignore)
     if detector == "network" and "max_keypoints" in values:
-        cli.say("these are the best pixels of the heat map: --detector points finds better points")
+        cli.say("these are the best pixels of the heat map; --detector points finds better points")
     work = _Work(*chosen_detector(detector, values), mask, overwrite)
     work.say_what_is_replaced(outputs)
     results: list[dict[str, Any]] = []
@@ -80,7 +80,7 @@ def detect(
             bar.update(1)
     nothing = not failures and not any(result["keypoints"] for result in results)
     if nothing:
-        cli.say("no keypoint was found: the image is uniform, or the options leave none")
+        cli.say("no keypoint was found: the image is uniform, or the options allow none")
     backend = getattr(work.detector, "runtime", None)
     return cli.Result(
         {"backend": backend, "images": results, "failures": failures},
@@ -100,7 +100,7 @@ def _line(result: dict[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class _Work:
-    """Detects keypoints in images, each unless it is done."""
+    """Detection of keypoints in those images that have no results yet."""
 
     detector: DeepDetect | PointDetector
     selection: SelectionOptions | None
@@ -114,7 +114,7 @@ class _Work:
         return dict(plain(self.detector.settings | options | noted | reading_options().settings))
 
     def say_what_is_replaced(self, outputs: dict[Path, dict[str, Path]]) -> None:
-        """Refuse outputs of other images; name the options in which earlier ones differ."""
+        """Raise an OptionError for results of other images; print options that have changed."""
         changed, names = [], set()
         for path, files in outputs.items():
             Outputs([*files.values()], [path], overwrite=self.overwrite).find()
@@ -132,7 +132,7 @@ class _Work:
     def detect(self, path: Path, files: dict[str, Path]) -> dict[str, Any]:
         shown = {"file": files["file"], "pictures": {n: files[n] for n in files if n != "file"}}
         outputs = Outputs([*files.values()], [path], overwrite=self.overwrite)
-        done = outputs.find()  # another command may have done it meanwhile
+        done = outputs.find()  # another command may have finished the image meanwhile
         if done is not None and done["settings"] == self.settings:
             return {"image": path, **done["numbers"], **shown, "skipped": True}
         earlier = None if self.overwrite else Outputs([files["file"]], [path]).find()
@@ -161,9 +161,9 @@ class _Work:
                 save_picture(draw_logits(logits), made["heatmap"])
             written = [file.name for file in outputs.paths]
             noted |= {"numbers": numbers, "settings": self.settings, "files": written}
-        for name in (earlier or {}).get("files", ()):  # of other options
+        for name in (earlier or {}).get("files", ()):  # files that these options do not write
             old = files["file"].with_name(name)
-            with contextlib.suppress(OptionError):  # it has been changed since
+            with contextlib.suppress(OptionError):  # keeps a file that was changed since
                 if old not in outputs.paths and Outputs([old], [path]).find():
                     old.unlink()
         return {"image": path, **numbers, **shown, "skipped": False}

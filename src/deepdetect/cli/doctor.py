@@ -1,4 +1,4 @@
-"""`deepdetect doctor`: what is installed, what works, what is missing for what."""
+"""`deepdetect doctor`: checks of the installed packages, a self-test and a benchmark."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from ._options import Result, command, table
 PURPOSES = {
     "all": "the fast back end, ONNX files, the demo, HEIC, raw and compressed TIFF images",
     "app": "the page in a browser",
-    "sfm": "reconstruct of three images and more, extract, match-many, export, places on the Earth",
+    "sfm": "reconstruct of three images and more, extract, match-many, export, georeferences",
 }
 MAX_BACKEND_DIFFERENCE = 5e-3
-"""Between the probabilities of two back ends; five times what is usual."""
+"""Probabilities of two back ends may differ by this much, which is five times the usual value."""
 TIMED_ROUNDS = 5
-"""Of the benchmark, after one that loads and compiles."""
+"""The benchmark measures this many rounds, after one that loads and compiles. Chosen by hand."""
 NEAR_SHIFT_PX = 16
-"""By which a part of the self-test's image moves before the rest."""
+"""Disparity of the foreground in the self-test's second pair. Chosen by hand."""
 MIN_PRECISION = 0.95
-"""Of the self-test's matches within 1 px of the truth; all of them where nothing is wrong."""
+"""The self-test needs this share of correct matches, which is 1 if all is well. Chosen by hand."""
 
 
 class Finding(NamedTuple):
-    """What a check found, and what to do about it."""
+    """The result of a check, and a remedy if there is a problem."""
 
     name: str
     status: Literal["ok", "missing", "problem"]
@@ -50,8 +50,8 @@ def doctor(
 ) -> Result:
     """Check the installation: versions, OpenCV, back ends, and a self-test with a known answer.
 
-    Ends with exit code 1 if something that is installed does not work. Nothing is sent anywhere;
-    please add what --json prints to a report of a problem.
+    Ends with exit code 1 if an installed package does not work. Nothing is sent anywhere. Please
+    add the output of --json to a report of a problem.
 
         deepdetect doctor
         deepdetect doctor --benchmark
@@ -73,20 +73,20 @@ def doctor(
     remedies = {each.name: each.remedy for each in findings if each.remedy}
     rows = {each.name: marks[each.status] + each.value for each in findings}
     text = table(rows, wrapped=True) + "\n\n"
-    text += table(remedies, title="what to do") if remedies else "all that is installed works"
+    text += table(remedies, title="what to do") if remedies else "everything installed works"
     values = {"ok": healthy, "findings": [finding._asdict() for finding in findings]}
     return Result(values, text, exit_code=0 if healthy else 1)
 
 
 def packages() -> Iterator[Finding]:
-    """Say which packages are there, which are too old, and what extras lack."""
+    """Report installed and outdated packages, and those that extras need."""
     yield Finding("deepdetect", "ok", f"{importlib.metadata.version('deepdetect')}, {__file__}")
     yield Finding("Python", "ok", f"{platform.python_version()} on {platform.platform()}")
     lacking: dict[str, list[str]] = {}
     for text in importlib.metadata.requires("deepdetect") or []:
         requirement, _, marker = text.partition(";")
         name, lowest = re.findall(r"^[\w.-]+|(?<=>=)[\d.]+", requirement + " >=0")[:2]
-        if name == "deepdetect" or name.startswith("opencv"):  # any OpenCV will do
+        if name == "deepdetect" or name.startswith("opencv"):  # any package of OpenCV works
             continue
         extra = re.sub(r"\W|extra", "", marker)
         absent = lacking.setdefault(extra, [])
@@ -107,11 +107,11 @@ def packages() -> Iterator[Finding]:
 
 
 def opencv() -> Iterator[Finding]:
-    """Say which OpenCV is imported: packages of it install over one another."""
+    """Report which OpenCV is imported: its packages overwrite each other's files."""
     module, names = import_opencv(), installed_distributions()
     contrib = hasattr(module, "xfeatures2d") or hasattr(module, "AgastFeatureDetector_create")
-    value = f"{module.__version__} ({', '.join(names) or 'of no package'}), "
-    value += "with contrib modules" if contrib else "without contrib modules, as labels need"
+    value = f"{module.__version__} ({', '.join(names) or 'from no package'}), "
+    value += "with contrib modules" if contrib else "without the contrib modules that labels need"
     last = max(names, key=lambda name: "contrib" in name, default="")
     installed = importlib.metadata.version(last) if last else module.__version__
     same = version_numbers(installed)[:3] == version_numbers(module.__version__)[:3]
@@ -123,9 +123,9 @@ def opencv() -> Iterator[Finding]:
 
 
 def self_test() -> Iterator[Finding]:
-    """Detect by each back end, and match, two images whose shift is known: a plane, then depth.
+    """Detect with each back end, and match two pairs of known shifts: a plane, then two depths.
 
-    What other commands need is compiled then.
+    This also compiles the functions that other commands need.
     """
     import numpy as np
 
@@ -141,13 +141,13 @@ def self_test() -> Iterator[Finding]:
     maps = {
         name: DeepDetect("default", backend=name).heatmap(first)
         for name in BACKENDS
-        if importlib.util.find_spec(name) and name != "torch"  # it has weights of its own
+        if importlib.util.find_spec(name)
     }
     for name, heatmap in maps.items():
         difference = float(abs(heatmap - next(iter(maps.values()))).max())
         agrees = difference <= MAX_BACKEND_DIFFERENCE
         value = f"probabilities within {difference:.0e} of the first"
-        remedy = "" if agrees else "Choose another one by --backend"
+        remedy = "" if agrees else "choose another one with --backend"
         yield Finding(f"back end {name}", "ok" if agrees else "problem", value, remedy)
     points = PointDetector(256).detect(first)
     near = np.zeros(first.shape, bool)
@@ -167,12 +167,12 @@ def self_test() -> Iterator[Finding]:
     if len(points) > 100 and count > 5_000 and precision > MIN_PRECISION:
         yield Finding("self-test", "ok", value)
     else:
-        remedy = "Try another --backend, and report what `deepdetect doctor --json` prints"
+        remedy = "try another --backend, and report the output of `deepdetect doctor --json`"
         yield Finding("self-test", "problem", f"wrong results: {value}", remedy)
 
 
 def speeds() -> dict[str, object]:
-    """Time detection and matching of images of 640x480 pixels, and OpenCV's SIFT beside them."""
+    """Time detection and matching of images of 640x480 pixels, and OpenCV's SIFT for comparison."""
     import numpy as np
 
     from .._shared.machine import processor_count
@@ -181,7 +181,7 @@ def speeds() -> dict[str, object]:
     from ..detector.point_detector import PointDetector
     from ..matching.pipeline import match_features, match_images
 
-    # Structure of all sizes, so that there are as many keypoints as in a photograph.
+    # Noise of all scales gives about as many keypoints as a photograph.
     rng, whole = np.random.default_rng(0), np.zeros((512, 672), np.float32)
     for octave in range(6):
         cells = rng.random((16 << octave, 21 << octave), np.float32)
@@ -214,7 +214,7 @@ def speeds() -> dict[str, object]:
 
 
 def processor_name() -> str:
-    """Return the name of the processor as people know it, where the system tells."""
+    """Return the marketing name of the processor if the system knows it."""
     with contextlib.suppress(OSError, IndexError):
         return re.findall(r"model name\s*: (.+)", Path("/proc/cpuinfo").read_text())[0]
     return platform.processor() or platform.machine()

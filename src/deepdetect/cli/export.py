@@ -1,4 +1,4 @@
-"""`deepdetect export`: files for other programs, one command for each kind."""
+"""`deepdetect export`: files for other programs, with one command per format."""
 
 from __future__ import annotations
 
@@ -49,21 +49,21 @@ CAMERAS = cli.From(
     more="",
     flags={"focal_px": "--focal"},
     types={"calibration": Path | None},
-    defaults={"focal_px": "of EXIF, or a guess"},
+    defaults={"focal_px": "from EXIF, or a guess"},
 )
 SHARED_CAMERA = replace(MANY, more="single_camera")
 ONNX = cli.From(
     OnnxOptions,
     "size",
     types={"size": str | None},
-    defaults={"size": "any; else as 480x640"},
+    defaults={"size": "any; otherwise such as 480x640"},
 )
 Sources = Annotated[
     Path,
     Parameter(
         required=True,
         help="File of `deepdetect extract` (with --matches), npz files of `detect` and `match` "
-        "(with --images), or a folder of images, which are matched first.",
+        "(with --images), or a folder of images, which are then matched.",
     ),
 ]
 
@@ -78,7 +78,7 @@ def colmap(
 ) -> cli.Result:
     """Write keypoints, descriptors and matches as a database of COLMAP 4.
 
-    With a folder as -o, the text files of colmap feature_importer and matches_importer are written.
+    If -o is a folder, writes text files for colmap feature_importer and matches_importer instead.
 
         deepdetect export colmap photos/ -o database.db
         deepdetect export colmap features.h5 --matches matches.h5 --images photos/ -o database.db
@@ -97,7 +97,7 @@ def colmap(
             raise OptionError(f"text files hold no cameras: leave out `{name}`, or write a .db")
         marker = _new_folder(output, "matches.txt", overwrite)
         return _export(write_colmap_text, sources, output, marker, overwrite, values)
-    import_pycolmap("a database of COLMAP")  # what is missing is said before the work
+    import_pycolmap("a database of COLMAP")  # fails before the work if it is missing
     calibration, focal_px = cameras.get("calibration"), cameras.get("focal_px")
     if calibration is not None and focal_px is not None:
         raise OptionError("give --calibration or --focal, not both")
@@ -110,7 +110,7 @@ def colmap(
         sizes = {name: points.image_size for name, points in collection.keypoints.items()}
         known = {} if calibration is None else known_cameras(calibration, sizes)
         for name in sorted(sizes.keys() - known.keys()) if known else ():
-            raise OptionError(f"{name} has another size than the calibration: leave it out")
+            raise OptionError(f"{name} and the calibration differ in size: leave --calibration out")
         folder = collection.folder or Path("no-such-folder")
         shared = cameras.get("single_camera")
         intrinsics = initial_intrinsics(folder, sizes, known, focal_px, shared)
@@ -128,7 +128,9 @@ def hloc(
     overwrite: cli.Overwrite = False,
     **values: Any,
 ) -> cli.Result:
-    """Write features.h5, matches.h5 and pairs.txt, the arguments of hloc.reconstruction.main.
+    """Write features.h5, matches.h5 and pairs.txt for hloc.
+
+    These files are the arguments of hloc.reconstruction.main.
 
         deepdetect export hloc photos/ -o hloc/
         deepdetect export hloc out/*.npz --images photos/ -o hloc/
@@ -144,7 +146,7 @@ def hloc(
 
 
 def _new_folder(folder: Path, marker: str, overwrite: bool) -> Path:
-    """Return the file that marks a folder as ours; refuse a folder that holds other files."""
+    """Return the file that marks a folder as ours; raise an OptionError for folders of others."""
     known = overwrite or (folder / marker).exists() or not folder.is_dir()
     if not known and any(not path.name.startswith(".") for path in folder.iterdir()):
         raise OptionError(f"{folder} is not empty: choose another folder with -o, or --overwrite")
@@ -160,9 +162,9 @@ def _export(
     values: dict[str, Any],
     describe: bool = True,
 ) -> cli.Result:
-    """Read or make a collection, and write it.
+    """Read a collection, or compute it from a folder, and write it.
 
-    The marker is the file whose record says what the output was made of; the values are those of
+    The inputs of the output are recorded for the file `marker`. The values are the options of
     `SAVED`, `FOLDER` and `MAX_KEYPOINTS`.
     """
     named = [Path(values[name]) for name in ("matches", "pairs") if name in values]
@@ -198,10 +200,10 @@ def _export(
 
 
 def size_of(text: str) -> tuple[int, int]:
-    """Read height and width, as 480x640."""
+    """Parse height and width from a text such as 480x640."""
     match = re.fullmatch(r"(\d{1,6})[xX](\d{1,6})", text)
     if match is None:
-        raise OptionError(f"{text!r} is no height and width, as 480x640")
+        raise OptionError(f"{text!r} is not a size: give height and width, such as 480x640")
     return int(match[1]), int(match[2])
 
 
@@ -217,10 +219,10 @@ def onnx(
 ) -> cli.Result:
     """Write weights as an ONNX file, for ONNX Runtime, OpenVINO, OpenCV and others.
 
-    WEIGHTS are default, dense, free, espnet, an ONNX file that this package has written for any
-    size, or a .safetensors file, which needs torch. Input `image`: RGB from 0 to 1; outputs
-    `probability` and `logits` for each pixel, and the points of PointDetector: `keypoints`,
-    `scores`, `sizes`, `angles`. docs/other-programs.md says which file is for which runtime.
+    WEIGHTS are default, dense, free, espnet, an ONNX file that this command wrote without --size,
+    or a .safetensors file, which needs torch. The input `image` is RGB from 0 to 1. The outputs are
+    `probability` and `logits` of each pixel, and the points of --detector points: `keypoints`,
+    `scores`, `sizes`, `angles`. docs/other-programs.md says which file suits which runtime.
 
         deepdetect export onnx -o deepdetect.onnx
         deepdetect export onnx dense -o dense-480x640.onnx --size 480x640 --max-keypoints 0
@@ -231,7 +233,7 @@ def onnx(
     Args:
         weights: Name or file of the weights.
         output: The .onnx file, or a folder for deepdetect.onnx.
-        licence: What the file says of the licence of the weights.
+        licence: Licence of the weights, to be stated in the file.
     """
     file = cli.output_file(output, "deepdetect.onnx")
     if "size" in values:

@@ -1,4 +1,4 @@
-"""`deepdetect extract` and `match-many`: features and matches of a collection of images."""
+"""`deepdetect extract` and `match-many`: features and matches of many images."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def extract(
 ) -> cli.Result:
     """Extract the keypoints and descriptors of all images below a folder.
 
-    Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. When it is
-    interrupted or killed, the same command continues; new and changed images are added later, and
-    the features of images that are gone are removed.
+    Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. After an
+    interruption the same command continues. Run again, it adds new and changed images, and removes
+    the features of deleted images.
 
         deepdetect extract photos/ -o features.h5
         deepdetect extract photos/ -o features.h5 --engine ray --workers 64
@@ -50,7 +50,7 @@ def extract(
     """
     file = cli.output_file(output, "features.h5")
     how = EXTRACTION.take(values)
-    chosen, selection = chosen_detector(  # one a process
+    chosen, selection = chosen_detector(  # each process has one
         detector, values, options=DESCRIBED_POINTS, threads=1
     )
     report = extract_features(folder, file, chosen, selection=selection, quiet=False, **how)
@@ -69,8 +69,8 @@ def match_many(
 ) -> cli.Result:
     """Match the descriptors in a file of features, pair by pair.
 
-    Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. When it is
-    interrupted or killed, the same command continues; new pairs are added later.
+    Writes one HDF5 file in the layout of hloc, with float32 and int32 numbers. After an
+    interruption the same command continues. Run again, it adds new pairs.
 
         deepdetect match-many features.h5 --pairs exhaustive
         deepdetect match-many features.h5 --pairs similar --verify fundamental
@@ -78,8 +78,8 @@ def match_many(
 
     Args:
         pairs: exhaustive (all), sequential:10 (each image with the 10 that follow it by name),
-            similar:20 (with the 20 most like it), or a text file with the names of two images on
-            each line, as hloc writes it.
+            similar:20 (each with the 20 most similar), or a text file with the names of two images
+            on each line, as hloc writes it.
         output: File for the matches, or a folder for it.
     """
     file = cli.output_file(output, "matches.h5")

@@ -1,4 +1,4 @@
-"""`deepdetect match`, `register` and `stitch`: images that show the same."""
+"""`deepdetect match`, `register` and `stitch`: overlapping images."""
 
 from __future__ import annotations
 
@@ -74,13 +74,13 @@ def match(
     overwrite: cli.Overwrite = False,
     **values: Any,
 ) -> cli.Result:
-    """Match the keypoints of two images, or of the pairs of a folder or of more images.
+    """Match the keypoints of two images, or of pairs of more images.
 
     Writes STEM0_STEM1_matches.npz (or .csv) with the matched positions, their scores, the
-    estimated geometry and which matches agree with it, and a picture of them. The options
-    --descriptor, --matcher, --filter-by and --ratio are for --unguided.
+    estimated geometry and its inliers, and a visualisation. The options --descriptor, --matcher,
+    --filter-by and --ratio are for --unguided.
 
-    Ends with exit code 3 where no geometry between the images can be trusted, or nothing matches.
+    Ends with exit code 3 if no geometry between the images can be trusted, or nothing matches.
 
         deepdetect match left.jpg right.jpg
         deepdetect match page1.jpg page2.jpg --model homography --mutual
@@ -88,14 +88,14 @@ def match(
         deepdetect match frames/ --pairs sequential:1
 
     Args:
-        pairs: Which of more than two images: exhaustive (all), sequential:1 (each with the next by
+        pairs: Pairs of more than two images: exhaustive (all), sequential:1 (each with the next by
             name), or a text file with the names of two images on each line.
-        unguided: Match by descriptors alone, of the whole image, and estimate a geometry of these
-            matches.
-        homography: Text file of a known 3x3 homography to evaluate matches by.
-        camera0: Text file of the 3x3 camera matrix, for the model essential.
-        camera1: The same of the second image.  [default: camera0]
-        pictures: Also write a picture.
+        unguided: Match by descriptors alone, over the whole image, and estimate a geometry from
+            these matches.
+        homography: Text file with a known 3x3 homography, which determines the inliers.
+        camera0: Text file with the 3x3 matrix of the first camera, for the model essential.
+        camera1: Text file with that of the second camera.  [default: camera0]
+        pictures: Also write a visualisation.
     """
     many = len(images) != 2 or any(path.is_dir() for path in images)
     endings = {"file": f".{file_format}"} | ({"picture": ".jpg"} if pictures else {})
@@ -120,7 +120,7 @@ def match(
     if unguided:
         match_pair = partial(_match_unguided, **by_descriptors)
     stages = UNGUIDED_STAGES if unguided else _guided_stages(detector)
-    load = lru_cache(2)(load_image)  # pairs that follow each other share one
+    load = lru_cache(2)(load_image)  # successive pairs share an image
     found: list[dict[str, Any]] = []
     failures: list[str] = []
     with progress(len(outputs), "matching", "pair", quiet=not many) as bar:
@@ -165,7 +165,7 @@ def _match_unguided(
     seed: int = 0,
     **values: Any,
 ) -> Matches:
-    """Match by descriptors alone, and estimate a geometry of these matches."""
+    """Match by descriptors alone, and estimate a geometry from these matches."""
     timer = StageTimer(progress)
     with timer.stage("keypoints"):
         chosen = {} if selection is None else vars(selection)
@@ -197,15 +197,15 @@ def _line(found: dict[str, Any]) -> str:
 def _choose_pairs(
     images: Sequence[Path], pairs: str | None, output: Path
 ) -> dict[tuple[Path, Path], str]:
-    """Return the pairs that are asked for, each with what its results are called."""
+    """Return the chosen pairs, each with the name of its results."""
     if pairs is None:
         return {(images[0], images[1]): f"{images[0].stem}_{images[1].stem}"}
     paths = cli.expand_images(images, output)
     wanted = list_pairs(pairs, [*paths])
     for name in {name for pair in wanted for name in pair} - paths.keys():
-        raise OptionError(f"{name} of {pairs} is none of the images: name it as below the folder")
+        raise OptionError(f"{name} in {pairs} is not one of the images: use its relative path")
     if not wanted:
-        raise OptionError("one image has no pair: give two images, or more, or a folder of them")
+        raise OptionError("one image makes no pair: give two or more images, or a folder")
     stems = {path: stem.replace("/", "-") for path, stem in cli.result_stems(paths).items()}
     chosen = [(paths[name0], paths[name1]) for name0, name1 in wanted]
     return {pair: f"{stems[pair[0]]}_{stems[pair[1]]}" for pair in chosen}
@@ -214,14 +214,14 @@ def _choose_pairs(
 def _why_none(matches: Matches, unguided: bool) -> str | None:
     """Say why there are no matches, or no geometry."""
     if not len(matches) and (matches.success or unguided):
-        return "there are no matches: the images show too little, or the options leave none"
+        return "there are no matches: the images have too little texture, or the options allow none"
     if matches.success:
         return None
     if len(matches):
         return "no geometry can be trusted: most of these matches by descriptors may be wrong"
     return (
-        "no geometry between these images can be trusted, so there are no matches: if they "
-        "show the same scene, --unguided matches by descriptors alone"
+        "no geometry between these images can be trusted, so there are no matches: if they show "
+        "the same scene, try --unguided, which matches by descriptors alone"
     )
 
 
@@ -254,7 +254,7 @@ def _geometry_values(geometry: TwoViewGeometry | None) -> dict[str, Any] | None:
     if geometry is None:
         return None
     evidence = vars(geometry.evidence)
-    if not math.isfinite(geometry.evidence.log10_nfa):  # which JSON has not
+    if not math.isfinite(geometry.evidence.log10_nfa):  # JSON has no infinity
         evidence = evidence | {"log10_nfa": None}
     matrix = None if geometry.matrix is None else geometry.matrix.tolist()
     return vars(geometry) | {"matrix": matrix, "evidence": evidence}
@@ -274,17 +274,17 @@ def register(
 ) -> cli.Result:
     """Register the second image to the first: for planes, and for images from one place.
 
-    Writes STEM1_on_STEM0.png (the second image in the frame of the first), the same as
-    _checkerboard.png and _difference.png with the first, and _homography.txt (3x3, from the
-    first image to the second). What the first carries is kept: its place on the Earth, its colour
-    profile, its EXIF. Where it is a GeoTIFF, or the second has other bands than RGB, the second is
-    a GeoTIFF with all its bands as they are.
+    Writes STEM1_on_STEM0.png (the second image warped into the frame of the first), both images
+    combined as _checkerboard.png and _difference.png, and _homography.txt (3x3, from the first
+    image to the second). The results keep the georeference, the colour profile and the EXIF of the
+    first image. If that is a GeoTIFF, or the second has other bands than RGB, the warped image is a
+    GeoTIFF with all its bands, unchanged.
 
         deepdetect register map.jpg photo-of-the-map.jpg -o registered
         deepdetect register ortho.tif drone.tif --bands 3 2 1 --extent union --apply-to thermal.tif
 
     Args:
-        apply_to: More files of the second camera, moved by the same homography.
+        apply_to: More files of the second camera, to be warped by the same homography.
     """
     reference, folder = read_metadata(image0, placed=True), cli.output_folder(output)
     own = {path: read_metadata(path) for path in (image1, *apply_to)}
@@ -335,22 +335,22 @@ def stitch(
     overwrite: cli.Overwrite = False,
     **values: Any,
 ) -> cli.Result:
-    """Make a panorama of overlapping images from one place, or of a plane.
+    """Stitch overlapping images from one place, or of a plane, to a panorama.
 
-    They may be in any order. Those that overlap with no other, or cannot be read, are named. A flat
-    panorama shows 100 to 120 degrees at the most, a cylindrical or spherical one all around.
+    They may be in any order. Images that do not overlap with others, or cannot be read, are listed.
+    A flat panorama covers at most 100 to 120 degrees, a cylindrical or spherical one up to 360.
 
         deepdetect stitch left.jpg middle.jpg right.jpg -o panorama.jpg
         deepdetect stitch photos/ --projection cylindrical --crop -o panorama.jpg
 
     Args:
-        output: The panorama's file, or a folder for it.
-        reference: The image that is not distorted, or in the middle of a curved panorama.
+        output: File of the panorama, or a folder for it.
+        reference: Image that is not distorted, or in the middle of a curved panorama.
             [default: the one in the middle]
     """
     file = cli.output_file(output, "panorama.jpg")
     paths = [*cli.expand_images(sources, file).values()]
-    picture_suffix(file)  # before the work, which would else be lost
+    picture_suffix(file)  # fails before the work, not after it
     if reference is not None and reference not in paths:
         raise OptionError(f"--reference {reference} must be one of the images: name it there")
     if detector == "network" and "max_keypoints" in values:
@@ -368,7 +368,7 @@ def stitch(
             images.append(path)
     if len(images) < min(len(paths), 2) or (reference is not None and reference not in images):
         what = "too few images, or not the reference, can be read"
-        raise ImageError(f"there is no panorama, as {what}: {'; '.join(failures)}")
+        raise ImageError(f"there is no panorama, because {what}: {'; '.join(failures)}")
     cli.check_outputs([file], paths)
     with cli.writing({"file": file}, images, overwrite) as made:
         try:
@@ -381,7 +381,7 @@ def stitch(
                     progress=done,
                     **values,
                 )
-        except (OptionError, RegistrationError) as error:  # they name images by their number
+        except (OptionError, RegistrationError) as error:  # its message has indices of images
             text = str(error)
             for number, path in enumerate(images):
                 text = text.replace(f"images[{number}]", str(path))
@@ -391,12 +391,12 @@ def stitch(
         save_picture(panorama.image, made["file"], kept)
         kept.write_beside(file)
     for number, reason in panorama.unregistered.items():
-        cli.say(f"not in the panorama: {images[number]}, as {reason}")
+        cli.say(f"{images[number]} is not in the panorama: {reason}")
     if panorama.parallax:
         (first, second), distance = max(panorama.parallax.items(), key=lambda item: item[1])
         cli.say(
             f"{images[first]} and {images[second]} differ by {distance:.0f} pixels along their "
-            "seam, since the camera moved: turn it about its lens, or keep away from near things"
+            "seam, because the camera moved: rotate it about its lens, or avoid near objects"
         )
     height, width = panorama.valid.shape
     used = sorted(panorama.homographies)

@@ -1,4 +1,4 @@
-"""`deepdetect reconstruct`: two images, or a folder of them, to a 3D point cloud."""
+"""`deepdetect reconstruct` and `pose`: 3D points and camera poses from images."""
 
 from __future__ import annotations
 
@@ -50,24 +50,22 @@ MANY = cli.From(
     types={"control_points": Path | None},
 )
 WORKERS = cli.From(reconstruct_many, more="workers")
-"""Options that two images do not have."""
+"""Options that do not apply to two images."""
 
 CHOSEN = replace(
     SELECTION,
-    defaults={
-        "max_keypoints": f"{MAX_KEYPOINTS} of points; of two images 2048, of the network all"
-    },
+    defaults={"max_keypoints": f"{MAX_KEYPOINTS} points; for two images 2048, for the network all"},
 )
 DETECTOR = replace(
     NETWORK,
     defaults={
-        "weights": "default; of two images dense",
-        "threads": "1; of two images the backend's choice",
+        "weights": "default; for two images dense",
+        "threads": "1; for two images the backend's choice",
     },
 )
 
 MAX_UNREGISTERED = 4
-"""Images that are named with a reason on the terminal; model.json names all."""
+"""The terminal lists at most this many unregistered images. Chosen by hand."""
 
 
 @cli.command(CAMERAS, CHOSEN, MANY, WORKERS, DESCRIBED_POINTS, DETECTOR, cli.READING)
@@ -78,17 +76,17 @@ def reconstruct(
     overwrite: cli.Overwrite = False,
     **values: Any,
 ) -> cli.Result:
-    """Reconstruct a cloud of coloured 3D points from two images, or from a folder or more of them.
+    """Reconstruct coloured 3D points from two images, from more images, or from a folder.
 
     Two images, left and right: writes model.ply and model.glb (the points), model.html (an offline
-    viewer), model_depth.jpg (a coloured depth map to look at), model_depth.png (16 bits, with its
-    scale), model_depth.npz (floats; disparities too for rectified pairs), and model.json (counts,
-    times and quality). For rectified pairs the detector only chooses which pixels of a dense
-    disparity map become points; --density 1 takes all of them.
+    viewer), model_depth.jpg (a coloured depth map), model_depth.png (16 bits, with its scale),
+    model_depth.npz (floats, and disparities for rectified pairs), and model.json (counts, times
+    and quality). For rectified pairs the detector only chooses which pixels of a dense disparity
+    map become points; --density 1 takes all of them.
 
-    A folder, or three and more images: also estimates their cameras. Writes model.ply, model.glb,
+    A folder, or three and more images: also estimates the cameras. Writes model.ply, model.glb,
     model.html (with the cameras), model.json, transforms.json, and COLMAP's sparse/0 and
-    database.db. If the images carry GPS, the model is in metres east, north and up. After an
+    database.db. If the images have GPS, the model is in metres east, north and up. After an
     interruption the same command continues. Images that cannot be read, or show something else,
     are left out and listed.
 
@@ -101,16 +99,16 @@ def reconstruct(
         deepdetect reconstruct photos/ --scale-by 0.25 a.jpg:812,640 a.jpg:1290,655 -o model/
 
     Args:
-        output: Folder for all files; of two images also the model, .ply, .glb or .html: the other
-            files then have its name.
-        detector: Pixels of the network's heat map, or ranked points of all scales.  [default:
-            network; of more than two images points]
+        output: Folder for all files. For two images it may also be the model (.ply, .glb or .html),
+            whose name the other files then have.
+        detector: network: pixels of its heat map; points: ranked points of all scales.  [default:
+            network; for more than two images points]
     """
     folders = [path for path in images if path.is_dir()]
     if folders and len(images) > 1:
         raise OptionError("give one folder, or images: not both")
     if len(images) == 1 and not folders:
-        raise OptionError("give two images, or more, or a folder of them")
+        raise OptionError("give two or more images, or a folder")
     if len(images) > 2 or folders:
         folder = output / "model" if output == Path("deepdetect-output") else output
         return _reconstruct_many(images, folder, detector or "points", overwrite, values)
@@ -141,11 +139,11 @@ def reconstruct(
 
 @cli.command(POSE, NETWORK, cli.READING)
 def pose(first: Path, second: Path, /, **values: Any) -> cli.Result:
-    """Estimate how the second camera stands to the first, from one image of each.
+    """Estimate the pose of the second camera relative to the first, from one image of each.
 
-    A point X of the first camera's frame (x right, y down, z forward) is R X + t in that of the
-    second; the length of t cannot be known. Ends with exit code 3 where the images cannot tell it:
-    they show one plane, or the camera only turned.
+    A point X in the first camera's frame (x right, y down, z forward) is R X + t in the second's.
+    The scale of t is unknown. Ends with exit code 3 if the images do not determine the pose: they
+    show one plane, or the camera only rotated.
 
         deepdetect pose left.jpg right.jpg --focal 1250
         deepdetect pose left.jpg right.jpg --calibration calib.json --json
@@ -166,7 +164,7 @@ def pose(first: Path, second: Path, /, **values: Any) -> cli.Result:
     }
     rows = {f"R, row {k}": row for k, row in enumerate(numbers["R"], 1)}
     agree = f"{numbers['inliers']:,} of {numbers['matches']:,} matches agree"
-    sentence = f"the second camera is turned by {found.angle:.2f} degrees; {agree}"
+    sentence = f"the second camera is rotated by {found.angle:.2f} degrees; {agree}"
     return cli.Result(numbers, cli.table({**rows, "t": numbers["t"]}, title=sentence))
 
 
@@ -180,7 +178,7 @@ def _reconstruct_many(
     )
     source: Path | Sequence[Path] = images[0] if len(images) == 1 else images
     many = MANY.take(values)
-    # What is missing or wrong is said before anything is written.
+    # Missing packages and wrong options raise errors before anything is written.
     import_pycolmap()
     check_formats(many.get("formats", ()))
     check_output_folder(output)

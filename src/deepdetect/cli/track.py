@@ -1,4 +1,4 @@
-"""`deepdetect track`: points followed through a video."""
+"""`deepdetect track`: points tracked through a video."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ def track(
     overwrite: cli.Overwrite = False,
     **values: Any,
 ) -> cli.Result:
-    """Follow keypoints through a video file, a folder of frames, or the camera of this number.
+    """Track keypoints through a video file, a folder of frames, or the images of a camera.
 
-    Writes a video with the points, their last positions and the frames per second of the work, and
-    beside it a table of all tracks (.csv): frame, track, x, y, score. Ctrl-C, SIGTERM or SIGHUP on
-    a camera ends the recording, and both files are written. Images of another size than the first
-    one, or that cannot be read, are listed at the end, with exit code 1.
+    Writes a video that shows the points, their last positions and the frames processed per second,
+    and a table of all tracks (.csv): frame, track, x, y, score. Ctrl+C, SIGTERM or SIGHUP ends the
+    recording of a camera, and both files are written. Images that cannot be read, or differ in size
+    from the first one, are listed at the end, with exit code 1.
 
         deepdetect track drive.mp4 -o tracks.mp4
         deepdetect track frames/ -o tracks.mp4 --max-keypoints 500
         deepdetect track 0 -o webcam.mp4 --max-side 640
 
     Args:
-        output: Video (.mp4, .mov, .mkv, .avi), .csv for the tracks alone, or a folder for both.
+        output: Video (.mp4, .mov, .mkv, .avi), table (.csv) alone, or a folder for both.
     """
     file = cli.output_file(output, "tracks.mp4")
     files = [path for path in output_files(file) if path is not None]
@@ -57,7 +57,7 @@ def track(
     for path in files if live and not overwrite else ():
         if path.exists():
             raise OptionError(
-                f"{path} is of an earlier recording: choose another -o, or --overwrite it"
+                f"{path} is an earlier recording: choose another -o, or --overwrite it"
             )
     if Path(source).is_file():
         cli.check_outputs(files, [Path(source)])
@@ -66,7 +66,7 @@ def track(
         report = track_points(source, file, options=options, quiet=False, **frames)
     total = report.frames + len(report.failures)
     if report.expected is not None and total < report.expected:
-        cli.say(f"the file states {report.expected:,} frames, and may be cut off")
+        cli.say(f"the file should have {report.expected:,} frames: it may be truncated")
     code = 0 if report.tracks or live else cli.NOTHING_FOUND
     sentence = f"{report.tracks:,} tracks in {report.frames:,} frames"
     names = "tracks_per_frame frames_per_track fps seconds files"

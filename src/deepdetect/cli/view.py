@@ -16,7 +16,7 @@ from ..io.tables import load_keypoints, load_matches
 from . import _options as cli
 
 SHOWN = (".html", ".jpg", ".jpeg", ".png", ".webp", ".gif", ".svg", ".pdf")
-"""What browsers show as it is."""
+"""Suffixes of files that browsers can display."""
 
 
 @cli.command()
@@ -27,17 +27,15 @@ def view(
 ) -> cli.Result:
     """Show a result in the browser.
 
-    Pages and pictures are shown as they are, a point cloud or depth map by the page or picture of
-    its name beside it. Keypoints and matches are drawn on their images.
+    Pages and images are shown as they are. For a point cloud or a depth map, the page or image of
+    the same name in its folder is shown. Keypoints and matches are drawn on their images.
 
         deepdetect view model.ply
         deepdetect view left.npz left.png
         deepdetect view left_right_matches.npz left.png right.png
     """
     if not file.is_file():
-        raise MissingFileError(
-            f"there is no file {file}: give one that another command has written"
-        )
+        raise MissingFileError(f"there is no file {file}: give one that another command wrote")
     numbers: dict[str, object] = {}
     if images:
         result = load_keypoints(file) if len(images) == 1 else load_matches(file)
@@ -50,8 +48,8 @@ def view(
         found = [path for path in beside if path.suffix.lower() in SHOWN and path.is_file()]
         if not found:
             raise OptionError(
-                f"{file} is nothing that a browser shows, nor is there such a file of its name: "
-                "keypoints and matches need their images, deepdetect view FILE IMAGE ..."
+                f"a browser cannot display {file}: unknown type; for keypoints and matches give "
+                "their images, as in deepdetect view FILE IMAGE ..."
             )
         shown = found[0]
     if not webbrowser.open(shown.absolute().as_uri()):

@@ -42,7 +42,7 @@ class PointDetector:
     `DeepDetect` is not used. A few thousand of them beat the best pixels of its heat map.
 
     Args:
-        max_keypoints: maximum number of keypoints; None: all.
+        max_keypoints: maximum number of keypoints. None: all.
         spread: "none" takes the best, "grid" the best of each cell of a grid in turn, "anms" the
             best that lie as far apart as their number allows.
         resolution: "auto" (images over two megapixels are scaled down to that) or "native" (images

@@ -1,4 +1,4 @@
-"""What keypoints and matches show of themselves: pictures, and small tables for notebooks."""
+"""Drawing of keypoints and matches on their images, and their HTML tables for notebooks."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from .._shared.image_array import Channels, array_to_rgb, deep_values
 from .._shared.opencv import cv2
 
 MAX_SIDE_PX = 240
-"""Of the picture of one image in a table."""
+"""Longest side of the figure of an image in a table, in pixels: together they take about 10 kB."""
 
 MAX_LINES = 60
-"""Of matches in that picture."""
+"""Number of matches that are drawn in that figure as lines. Chosen by hand."""
 
 Points = tuple[np.ndarray, tuple[int, int]]
 
 
 def checked_image(image: Any, size: tuple[int, int], channels: Channels) -> np.ndarray:
-    """Return the image of keypoints of a (width, height), of any kind, as (H, W, 3) uint8 RGB."""
+    """Convert an image of any kind with this (width, height) to (H, W, 3) uint8 RGB."""
     if isinstance(image, (str, bytes)) or hasattr(image, "__fspath__"):
-        raise ImageError("a picture needs the image itself, not a path: give load_image(path)")
+        raise ImageError("drawing needs the image itself, not a path: give load_image(path)")
     if hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
-        deep = image.mode.startswith(("I", "F"))  # which Pillow would clip
+        deep = image.mode.startswith(("I", "F"))  # Pillow would clip these
         image, channels = deep_values(image) if deep else np.asarray(image.convert("RGB")), "rgb"
     rgb = array_to_rgb(image, channels)
     if rgb.shape[1::-1] != size:
         raise ImageError(
-            f"the image has {rgb.shape[1]}x{rgb.shape[0]} pixels, the keypoints are of "
-            f"one of {size[0]}x{size[1]}: give the image that they were found in"
+            f"the image has {rgb.shape[1]}x{rgb.shape[0]} pixels, but that of the keypoints has "
+            f"{size[0]}x{size[1]}: give the image in which they were detected"
         )
     return rgb
 
@@ -44,10 +44,10 @@ def html_summary(
     points: Sequence[Points],
     lines: np.ndarray | None = None,
 ) -> str:
-    """Return a small table in HTML, and a picture of positions, about ten kB.
+    """Return a small HTML table and a figure of the positions of keypoints, about 10 kB.
 
-    The positions are of one image or two, side by side; some of the (M, 4) `lines`, positions in
-    the first and in the second, are drawn.
+    The figure shows one image or two, side by side, and some of the (M, 4) `lines`, which connect
+    positions x0, y0 in the first and x1, y1 in the second.
     """
     cells = "".join(
         f"<tr><td>{html.escape(name)}</td><td>{html.escape(text)}</td></tr>"
@@ -63,7 +63,7 @@ def html_summary(
 
 
 def _position_picture(points: Sequence[Points], lines: np.ndarray | None) -> np.ndarray:
-    """Return a (H, W, 3) uint8 BGR picture of positions, dark where none is."""
+    """Draw positions on a black (H, W, 3) uint8 BGR figure."""
     scale = min(1.0, MAX_SIDE_PX / max(side for _, size in points for side in size))
     sizes = [[max(1, round(side * scale)) for side in size] for _, size in points]
     widths, heights = zip(*sizes, strict=True)
@@ -75,5 +75,5 @@ def _position_picture(points: Sequence[Points], lines: np.ndarray | None) -> np.
         chosen = np.sort(np.random.default_rng(0).permutation(len(lines))[:MAX_LINES])
         for x0, y0, x1, y1 in lines[chosen] * scale:
             start, end = (round(x0), round(y0)), (round(x1) + widths[0], round(y1))
-            cv2.line(picture, start, end, (90, 220, 255))  # smooth ones take five times the bytes
+            cv2.line(picture, start, end, (90, 220, 255))  # antialiasing makes PNG 5 times larger
     return picture

@@ -1,4 +1,4 @@
-"""Pictures of keypoints and matches with captions, as commands write them."""
+"""Visualisations of keypoints and matches with captions, which the commands write."""
 
 from __future__ import annotations
 
@@ -21,21 +21,22 @@ from .selection import spread_over_grid
 
 SHOWN_KEYPOINTS = 1000
 AREA_OF_KEYPOINT_PX = 200
-"""Pixels of a small picture for each keypoint that is drawn, so that all can be told apart."""
+"""The first limits the drawn keypoints. Small images get one per this many pixels, so that all can
+be told apart. Chosen by hand."""
 
 LEAST_LEVEL = 0.35
-"""Darker colours of the scale are not seen on a photograph."""
+"""Darker colours of the scale would be invisible on a photograph. Chosen by hand."""
 
 
 def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     """Draw the best keypoints of all parts of an image, coloured by score or logit, with a scale.
 
-    At most `SHOWN_KEYPOINTS`, fewer on small images: in turn the best of each cell of a grid. They
-    are circles of their size, or all alike where they have none. `fit_picture` sizes the picture.
+    They are chosen in turns as the best of each cell of a grid, `SHOWN_KEYPOINTS` or fewer. Circles
+    have the keypoints' sizes, or one size if these are unknown. `fit_picture` reduces the image.
     """
     shown = fit_picture(rgb)
     factor = shown.shape[1] / rgb.shape[1]
-    # A grey, darker copy, on which colours are seen.
+    # Colours stand out on a grey, darker copy.
     gray = cv2.convertScaleAbs(cv2.cvtColor(shown, cv2.COLOR_RGB2GRAY), alpha=0.6)
     canvas = cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB)
     values = keypoints.scores if keypoints.logits is None else keypoints.logits
@@ -43,7 +44,7 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     unit = line_scale(canvas)
     room = int(canvas.shape[0] * canvas.shape[1] / (AREA_OF_KEYPOINT_PX * unit**2))
     most = max(1, min(SHOWN_KEYPOINTS, room, len(keypoints)))
-    # No more cells than keypoints, or the dimmest parts would be left out.
+    # More cells than keypoints would leave the parts with the lowest scores empty.
     shorter, longer = sorted(canvas.shape[:2])
     cells = max(1, int((most * longer / shorter) ** 0.5))
     rows = spread_over_grid(keypoints.xy, values, keypoints.image_size, most, cells)
@@ -58,7 +59,7 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
     if keypoints.sizes is not None:
         radii = np.maximum(keypoints.sizes[rows] * factor / 2, 2 * unit)
     centres = scaled_points(keypoints.xy[rows], factor)
-    # The best on top, and a dark rim, so that each is seen before any colour.
+    # The best come last, on top; a dark rim makes them visible on any background.
     for k in np.argsort(values[rows]):
         draw_circle(canvas, centres[k], radii[k], (0, 0, 0), max(2, round(2.5 * unit)))
         draw_circle(canvas, centres[k], radii[k], colors[k], max(1, round(1.25 * unit)))
@@ -66,7 +67,7 @@ def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
 
 
 def draw_dense_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:
-    """Draw all keypoints, with a caption that counts them, as `fit_picture` sizes it."""
+    """Draw all keypoints, with a caption that counts them; `fit_picture` reduces the image."""
     caption = f"{_counted(keypoints)}, {keypoints.density:.1%} of the pixels"
     return add_caption(fit_picture(keypoints.draw(rgb)), caption)
 
@@ -76,7 +77,7 @@ def _counted(keypoints: Keypoints) -> str:
 
 
 def draw_all_matches(rgb0: np.ndarray, rgb1: np.ndarray, matches: Matches) -> np.ndarray:
-    """Draw matches of two images by their positions, with a caption that counts them."""
+    """Draw matches of two images, coloured by position, with a caption that counts them."""
     others = len(matches) - int(matches.inliers.sum())
     model = "none" if matches.geometry is None else matches.geometry.model
     caption = f"{len(matches):,} matches ({model}): matching points share a colour"

@@ -1,6 +1,7 @@
-"""Files of cameras as other programs write them, told by their content, as a calib.json.
+"""Readers of camera files of other programs, which are recognised by their content.
 
-`Calibration.load` says what a calib.json holds; docs/files.md lists the formats.
+They return the content of a calib.json, which `Calibration.load` documents; docs/files.md lists the
+formats.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ STEREO = (
     *(("P1", "P2", ""), ("M1", "M2", "D"), ("K1", "K2", "D")),
     ("cameraMatrix1", "cameraMatrix2", "distCoeffs"),
 )
-"""Keys of both matrices in files of OpenCV, and what those of their distortion begin with; the
-projections of rectified views come first."""
+"""Keys of both camera matrices in OpenCV's files, and the beginning of the keys of their distortion
+coefficients. The projections of rectified views come first."""
 
 MATRICES = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "k", "M1", "K1", "cameraMatrix1")
 PROJECTIONS = ("projection_matrix", "P", "p")
@@ -36,15 +37,16 @@ FILES_OF_PAIRS = (
     *(("left.yaml", "right.yaml"), ("intrinsics.yml", "extrinsics.yml")),
     *(("cam0/sensor.yaml", "cam1/sensor.yaml"), ("mav0/cam0/sensor.yaml", "mav0/cam1/sensor.yaml")),
 )
-"""In a folder: of ROS, OpenCV and EuRoC."""
+"""Names of the two files of a stereo pair that ROS, OpenCV and EuRoC write to a folder."""
 
 MM_PER_M = 1000.0
 
 MIN_BASELINE_MM = 10.0
-"""Files of OpenCV do not name the unit of lengths: smaller ones are taken as metres, else mm."""
+"""OpenCV's files state no unit of lengths. Baselines below this are taken as metres, others as mm.
+Chosen by hand."""
 
 COLMAP_CENTRE = 0.5
-"""Of the first pixel."""
+"""The centre of the first pixel in COLMAP; ours is 0."""
 
 NUMBERS = r"([-+.\deE \t;,\[\]]+)\r?$"
 COLMAP_LINE = re.compile(rf"^[ \t]*\d+[ \t]+([A-Z_]+)[ \t]{NUMBERS}", re.MULTILINE)
@@ -52,18 +54,18 @@ TEXT_LINE = re.compile(rf"^[ \t]*(\w+)[ \t]*[:=]{NUMBERS}", re.MULTILINE)
 
 KNOWN = (
     "give a file of OpenCV, ROS, Kalibr, EuRoC, KITTI, Middlebury or COLMAP, a matrix of 3x3 "
-    'numbers, or JSON as {"focal_px": 1000, "cx": 320, "cy": 240, "baseline_mm": 120}'
+    'numbers, or JSON such as {"focal_px": 1000, "cx": 320, "cy": 240, "baseline_mm": 120}'
 )
 
 
 def read_camera_file(path: Path, views: tuple[int, int] | None = None) -> dict[str, Any]:
-    """Read a file, or a folder of two, and return what its calib.json would hold.
+    """Read a camera file, or a folder with two, and return the content of a calib.json.
 
-    The views are the numbers of both cameras, where the images say them, in files of several.
+    If a file has several cameras, `views` are the numbers of the two that took the images.
 
     Raises:
-        ReconstructionError: it is of no known format, or its cameras distort.
-        OSError: it cannot be read. Other errors say that it is damaged.
+        ReconstructionError: the format is unknown, or the cameras have distortion.
+        OSError: the file cannot be read. Any other error means that it is damaged.
     """
     if not path.is_dir():
         return _calib_json(_parsed(path.read_bytes()), views)
@@ -79,10 +81,10 @@ def read_camera_file(path: Path, views: tuple[int, int] | None = None) -> dict[s
 
 
 def _parsed(content: bytes) -> Values:
-    """Return what a file says by key.
+    """Parse a camera file to values by key.
 
-    Files of OpenCV are not read by `cv2.FileStorage`: on damaged ones it hangs, and where they are
-    nested deeply it ends the process.
+    `cv2.FileStorage` is not used for OpenCV's files: it hangs on damaged ones, and deep nesting
+    crashes the process.
     """
     text = content.decode("utf-8", "replace").lstrip("\ufeff \r\n\t")
     if text.startswith("{"):
@@ -99,9 +101,9 @@ def _parsed(content: bytes) -> Values:
         return lines
     import yaml
 
-    Loader: Any = type("Loader", (yaml.SafeLoader,), {})  # of our own, for OpenCV's matrices
+    Loader: Any = type("Loader", (yaml.SafeLoader,), {})  # own class, to accept OpenCV's tags
     Loader.add_multi_constructor("", lambda loader, _, node: loader.construct_mapping(node, True))
-    # ROS ends what it prints by the beginning of another document.
+    # ROS ends its output with the start of another document, so only the first one is read.
     values = next(yaml.load_all(re.sub(r"\A%YAML[^\n]*\n", "", text), Loader), None)
     if not isinstance(values, dict):
         raise ReconstructionError(f"it holds no cameras: {KNOWN}")
@@ -123,7 +125,7 @@ def _xml_values(node: ElementTree.Element) -> Any:
 
 
 def _matrix(values: Values, keys: Iterable[str], *sizes: int) -> np.ndarray | None:
-    """Return the first matrix of three rows and one of these sizes, None where there is none."""
+    """Return the first matrix with three rows and one of these numbers of elements, or None."""
     for key in keys:
         value = values.get(key)
         data = value.get("data") if isinstance(value, Mapping) else value
@@ -133,7 +135,7 @@ def _matrix(values: Values, keys: Iterable[str], *sizes: int) -> np.ndarray | No
 
 
 NO_PINHOLES = "fisheye", "equidistant", "equirectangular"
-"""In names of models that map angles in another way, even without distortion."""
+"""Parts of the names of camera models that are no pinholes, even without distortion."""
 
 
 def _check_distortion(value: Any, model: Any) -> None:
@@ -143,14 +145,14 @@ def _check_distortion(value: Any, model: Any) -> None:
     numbers = np.array(0 if data is None else data, np.float64).ravel()
     if numbers.any():
         raise ReconstructionError(
-            f"its cameras distort ({model} {', '.join(f'{number:g}' for number in numbers)}), and "
-            "only pinhole cameras are read: undistort the images, as by cv2.undistort, and give "
-            "the matrix alone"
+            f"its cameras have distortion ({model} {', '.join(f'{n:g}' for n in numbers)}), which "
+            "is not supported: undistort the images, as with cv2.undistort, and give the matrix "
+            "alone"
         )
 
 
 def _both(left: np.ndarray, right: np.ndarray, size: Any, baseline_mm: Any) -> dict[str, Any]:
-    """Return the calib.json of two matrices."""
+    """Return the content of a calib.json for two camera matrices."""
     views = [
         {"focal_px": [float(m[0, 0]), float(m[1, 1])], "cx": float(m[0, 2]), "cy": float(m[1, 2])}
         for m in (left, right)
@@ -161,17 +163,17 @@ def _both(left: np.ndarray, right: np.ndarray, size: Any, baseline_mm: Any) -> d
 
 
 def _metres(left: np.ndarray, right: np.ndarray) -> float | None:
-    """Return the distance of the cameras of two projections."""
+    """Return the distance between the cameras of two projection matrices, or None."""
     if left.shape[1] < 4 or right.shape[1] < 4:
         return None
     distance = float(left[0, 3] / left[0, 0] - right[0, 3] / right[0, 0])
     if distance < 0:
-        raise ReconstructionError("its second camera is left of its first: exchange them")
+        raise ReconstructionError("its second camera is to the left of its first: swap them")
     return distance or None
 
 
 def _distance(first: Values, second: Values) -> float | None:
-    """Return the distance of two cameras of EuRoC, by their poses, or of ROS, in mm."""
+    """Return the distance between two cameras in mm, by poses (EuRoC) or projections (ROS)."""
     if "T_BS" in first and "T_BS" in second:
         left, right = (np.reshape(each["T_BS"]["data"], (4, 4))[:3, 3] for each in (first, second))
         return float(np.linalg.norm(left - right)) * MM_PER_M
@@ -188,7 +190,7 @@ def _calib_json(values: Values, views: tuple[int, int] | None) -> dict[str, Any]
         if (found := read(values, views)) is not None:
             return found
     keys = ", ".join(map(str, [*values][:5]))
-    raise ReconstructionError(f"it has no cameras that are known (it has {keys}): {KNOWN}")
+    raise ReconstructionError(f"it has no cameras in a known format, but {keys}: {KNOWN}")
 
 
 def _colmap(values: Values, _: Any) -> dict[str, Any] | None:
@@ -196,11 +198,11 @@ def _colmap(values: Values, _: Any) -> dict[str, Any] | None:
     if not cameras:
         return None
     if len(cameras) > 2:
-        raise ReconstructionError(f"it has {len(cameras)} cameras: keep those of left and right")
+        raise ReconstructionError(f"it has {len(cameras)} cameras: keep the left and the right one")
     made = []
     for model, (width, height, *numbers) in cameras:
         _check_distortion(0, model)
-        if model.startswith(("SIMPLE_", "RADIAL")):  # of one focal length
+        if model.startswith(("SIMPLE_", "RADIAL")):  # these have one focal length
             numbers.insert(0, numbers[0])
         fx, fy, cx, cy, *distortion = numbers
         _check_distortion(distortion, model)
@@ -211,7 +213,7 @@ def _colmap(values: Values, _: Any) -> dict[str, Any] | None:
 
 
 def _kitti(values: Values, views: tuple[int, int] | None) -> dict[str, Any] | None:
-    """Odometry has P0 to P3, raw data P_rect_00 to P_rect_03; 2 and 3 are the colour cameras."""
+    """Read KITTI's P0 to P3 (odometry) or P_rect_00 to _03 (raw data); 2 and 3 are in colour."""
     for start in ("P", "P_rect_0"):
         for pair in (views or (2, 3), (2, 3), (0, 1)):
             left, right = (_matrix(values, [f"{start}{view}"], 12) for view in pair)
@@ -232,7 +234,7 @@ def _middlebury(values: Values, _: Any) -> dict[str, Any] | None:
 
 
 def _kalibr(values: Values, _: Any) -> dict[str, Any] | None:
-    """A chain of cameras of Kalibr, or a single one, as a sensor.yaml of EuRoC."""
+    """Read a camera chain of Kalibr, or a single camera such as a sensor.yaml of EuRoC."""
     cameras = [each for key in ("cam0", "cam1") if isinstance(each := values.get(key), Mapping)]
     matrices = []
     for camera in cameras or [values]:
@@ -252,7 +254,7 @@ def _kalibr(values: Values, _: Any) -> dict[str, Any] | None:
 
 
 def _opencv(values: Values, _: Any) -> dict[str, Any] | None:
-    """Files of OpenCV and ROS; of cameras that distort those of the rectified images, if given."""
+    """Read files of OpenCV and ROS; cameras with distortion must have rectified ones, as well."""
     for first, second, distortion in STEREO:
         left, right = (_matrix(values, [key], 9, 12) for key in (first, second))
         if left is not None and right is not None:

@@ -1,4 +1,4 @@
-"""DeepDetect as a part of OpenCV, kornia, LightGlue, hloc.
+"""Drop-in replacements for parts of OpenCV, kornia, LightGlue and hloc.
 
-One module for each program, which is the only one that imports it; it cannot be imported without.
+Each program has its own module, which can only be imported if that program is installed.
 """

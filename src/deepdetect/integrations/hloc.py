@@ -1,6 +1,6 @@
-"""hloc (Hierarchical-Localization): an extractor, a matcher of its features, and a dense matcher.
+"""hloc (Hierarchical-Localization): an extractor, a matcher of features, and a dense matcher.
 
-`register()` makes hloc find them by the name "deepdetect".
+After `register()`, hloc knows them by the name "deepdetect".
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from torch import Tensor
 NAME = "deepdetect"
 
 MAX_KEYPOINTS = np.iinfo(np.int16).max
-"""Hloc writes the rows of matches as int16."""
+"""hloc stores the keypoint indices of matches as int16."""
 
 EXTRACTOR_CONF: dict[str, Any] = {
     "output": "feats-deepdetect-n4096",
     "model": {"name": NAME, "max_keypoints": 4096},
     "preprocessing": {"grayscale": False, "resize_max": 1600},
 }
-"""For `hloc.extract_features.main`."""
+"""Configuration for `hloc.extract_features.main`."""
 
 MATCHER_CONF: dict[str, Any] = {
     "output": "matches-deepdetect",
     "model": {"name": NAME, "descriptor": LEARNED},
 }
-"""For `hloc.match_features.main`."""
+"""Configuration for `hloc.match_features.main`."""
 
 DENSE_MATCHER_CONF: dict[str, Any] = {
     "output": "matches-deepdetect-dense",
@@ -53,16 +53,17 @@ DENSE_MATCHER_CONF: dict[str, Any] = {
     "max_error": 2,
     "cell_size": 8,
 }
-"""For `hloc.match_dense.main`: errors and cells, in pixels, of the keypoints that matches join."""
+"""Configuration for `hloc.match_dense.main`. hloc merges match positions in cells of `cell_size`
+pixels into keypoints, to which matches up to `max_error` pixels away are then assigned."""
 
 
 class DeepDetectExtractor(BaseModel):
-    """The best keypoints of all scales with descriptors, for `hloc.extract_features`.
+    """Extractor of the best keypoints of all scales with descriptors, for `hloc.extract_features`.
 
-    Its options in hloc's configuration: `max_keypoints`, `spread` and `descriptor` as of
-    `PointDetector`, of which hloc's LightGlue needs "rootsift"; and `angle_unit` of `oris`,
-    "degrees" as of hloc's own SIFT, or "radians" as LightGlue wants them. Positions are float64,
-    which hloc does not round to half precision.
+    The options `max_keypoints`, `spread` and `descriptor` are those of `PointDetector`; hloc's
+    LightGlue needs the descriptor "rootsift". `angle_unit` is the unit of `oris`: "degrees" as in
+    hloc's own SIFT, or "radians" as LightGlue needs. Positions are float64, because hloc rounds
+    float32 to half precision.
     """
 
     default_conf: dict[str, Any] = {  # noqa: RUF012  # hloc's way to declare it
@@ -101,12 +102,12 @@ class DeepDetectExtractor(BaseModel):
 
 
 class DeepDetectMatcher(BaseModel):
-    """Nearest neighbours of descriptors with the ratio test, for `hloc.match_features`.
+    """Nearest-neighbour matcher with the ratio test, for `hloc.match_features`.
 
-    Its options in hloc's configuration: `ratio` and `mutual`, as of `match_features`. It matches
-    the features of any extractor whose descriptors are compared by their Euclidean distance. With
-    `descriptor` "learned" these are of `DeepDetectExtractor`, with `oris` in degrees, and matched
-    turned as the images are, which finds more.
+    The options `ratio` and `mutual` are those of `match_features`. It matches the features of any
+    extractor whose descriptors are compared by Euclidean distance. With `descriptor` "learned",
+    features must be those of `DeepDetectExtractor` with `oris` in degrees; the rotation between
+    the images is then taken into account, which finds more matches.
     """
 
     default_conf: dict[str, Any] = {  # noqa: RUF012
@@ -127,14 +128,14 @@ class DeepDetectMatcher(BaseModel):
         described = [data[name][0].T.cpu().float().numpy() for name in self.required_inputs]
         if len(described[1]) > MAX_KEYPOINTS:
             raise OptionError(
-                f"hloc takes {MAX_KEYPOINTS} keypoints at most, not {len(described[1])}: use fewer"
+                f"hloc takes at most {MAX_KEYPOINTS} keypoints, not {len(described[1])}: use fewer"
             )
         features = []
         for side, descriptors in enumerate(described):
             count, oris = len(descriptors), data.get(f"oris{side}")
             features.append(
                 Keypoints(
-                    np.zeros((count, 2)),  # where they are does not matter
+                    np.zeros((count, 2)),  # the matcher does not use positions
                     np.ones(count),
                     (1, 1),
                     angles=None if oris is None else oris[0, :count].cpu().float().numpy() % 360,
@@ -153,10 +154,10 @@ class DeepDetectMatcher(BaseModel):
 
 
 class DeepDetectDenseMatcher(BaseModel):
-    """Dense guided matches of two images, for `hloc.match_dense`.
+    """Dense guided matcher of two images, for `hloc.match_dense`.
 
-    Its options in hloc's configuration: `max_keypoints` of a `PointDetector`, or None for the dense
-    ones of a `DeepDetect`, and its `weights`. Without a trusted geometry there are no matches.
+    With the option `max_keypoints`, a `PointDetector` is used, otherwise a `DeepDetect` with the
+    option `weights`. Without a trusted geometry there are no matches.
     """
 
     default_conf: dict[str, Any] = {"weights": "default", "max_keypoints": None}  # noqa: RUF012
@@ -170,7 +171,7 @@ class DeepDetectDenseMatcher(BaseModel):
         )
 
     def _forward(self, data: dict[str, Tensor]) -> dict[str, Tensor]:
-        # Hloc wants the positions in the first image to be the refined ones; ours are the second's.
+        # hloc expects refined positions in the first image; ours are refined in the second.
         second, first = (load_tensor(data[name][0]) for name in ("image1", "image0"))
         matches = match_images(second, first, self._detector)
         arrays = {
@@ -183,11 +184,11 @@ class DeepDetectDenseMatcher(BaseModel):
 
 
 def register() -> None:
-    """Make hloc find the extractor, the matcher and the dense matcher by their names.
+    """Register the extractor, the matcher and the dense matcher with hloc.
 
-    Call it once in the program that calls hloc; then `{"name": "deepdetect"}` is an extractor of
+    Call it once in the program that calls hloc. Then `{"name": "deepdetect"}` is an extractor of
     `hloc.extract_features` and a matcher of `hloc.match_features`, and `{"name":
-    "deepdetect_dense"}` a matcher of `hloc.match_dense`.
+    "deepdetect_dense"}` is a matcher of `hloc.match_dense`.
     """
     models = (
         (hloc.extractors, NAME, DeepDetectExtractor),
@@ -195,7 +196,7 @@ def register() -> None:
         (hloc.matchers, f"{NAME}_dense", DeepDetectDenseMatcher),
     )
     for package, name, model in models:
-        # Hloc imports a module by name, and takes the one model that says it is from there.
+        # hloc imports a module by name, and uses the one class whose `__module__` is that name.
         module = ModuleType(f"{package.__name__}.{name}", model.__doc__)
         model.__module__ = module.__name__
         setattr(module, model.__name__, model)

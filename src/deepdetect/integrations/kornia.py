@@ -1,4 +1,4 @@
-"""kornia: modules that find and describe keypoints as local affine frames (LAFs)."""
+"""kornia: modules that detect and describe keypoints as local affine frames (LAFs)."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from torch import Tensor
 from torch.nn import Module
 
 LAF_SCALE_PER_SIZE = 3.0
-"""A LAF's scale is half the side of the patch that is described: six sigma, as SIFT's."""
+"""A LAF's scale is half the side of the described patch: 6 sigma, or 3 diameters, as in SIFT."""
 
 
 class DeepDetectDetector(Module):
-    """Finds the best keypoints of all scales, for `kornia.feature.LocalFeature`.
+    """Detector of the best keypoints of all scales, for `kornia.feature.LocalFeature`.
 
-    It takes the place of `kornia.feature.ScaleSpaceDetector`; kornia describes the keypoints. No
-    gradients pass through it.
+    It replaces `kornia.feature.ScaleSpaceDetector`; kornia describes the keypoints. Gradients do
+    not pass through it.
 
     Args:
-        detector: of the points.
+        detector: the detector. Default: `PointDetector()`.
 
     Raises:
         OptionError: an option is unknown or out of its range.
@@ -38,19 +38,18 @@ class DeepDetectDetector(Module):
         self._detector = PointDetector() if detector is None else detector
 
     def forward(self, img: Tensor, mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Find keypoints.
+        """Detect keypoints.
 
         Args:
-            img: (B, 1, H, W) or (B, 3, H, W) in [0, 1], RGB.
-            mask: (B, 1, H, W), above 0 where keypoints are wanted.
+            img: (B, 1, H, W) or (B, 3, H, W) in [0, 1], grey or RGB.
+            mask: (B, 1, H, W), above 0 where keypoints are allowed.
 
         Returns:
-            (B, N, 2, 3) LAFs and (B, N) scores, best first, where N is that of the image with the
-            most keypoints; the others end with LAFs and scores of 0, as of kornia's detectors.
-            Where there are no keypoints N is 0.
+            (B, N, 2, 3) LAFs and (B, N) scores, best first. N is the largest number of keypoints of
+            an image; the others are padded with LAFs and scores of 0, as in kornia.
 
         Raises:
-            ImageError: an image is not fit.
+            ImageError: an image has a wrong shape, type or range, or is too small.
         """
         return self._frames(_found(self._detector.detect, img, mask), img)
 
@@ -64,30 +63,30 @@ class DeepDetectDetector(Module):
         if not len(points):
             return torch.zeros(0, 2, 3)
         scales = torch.from_numpy(LAF_SCALE_PER_SIZE * points.sizes).view(1, -1, 1, 1)
-        # Kornia's angles grow against the clock, OpenCV's and ours with it.
+        # Angles grow counterclockwise in kornia, clockwise in OpenCV and here.
         angles = torch.from_numpy(-points.angles).view(1, -1, 1)
         lafs: Tensor = laf_from_center_scale_ori(torch.from_numpy(points.xy)[None], scales, angles)
         return lafs[0]
 
 
 class DeepDetectFeature(DeepDetectDetector):
-    """Finds and describes the best keypoints, for `kornia.feature.LocalFeatureMatcher`.
+    """Detector of the best keypoints with descriptors, for `kornia.feature.LocalFeatureMatcher`.
 
-    It takes the place of `kornia.feature.LocalFeature`, and describes keypoints as the detector
-    does. Arguments and errors as of `DeepDetectDetector`.
+    It replaces `kornia.feature.LocalFeature`; the detector describes its keypoints. Arguments and
+    errors are those of `DeepDetectDetector`.
     """
 
     def forward(  # type: ignore[override]  # as kornia's features differ from its detectors
         self, img: Tensor, mask: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Find and describe keypoints.
+        """Detect and describe keypoints.
 
         Args:
-            img, mask: as of `DeepDetectDetector`.
+            img, mask: as in `DeepDetectDetector`.
 
         Returns:
-            (B, N, 2, 3) LAFs and (B, N) scores as of `DeepDetectDetector`, and (B, N, D)
-            descriptors of length 1, 64 learned numbers or 128 of RootSIFT.
+            (B, N, 2, 3) LAFs and (B, N) scores as in `DeepDetectDetector`, and (B, N, D)
+            descriptors of unit length, with 64 learned numbers or 128 of RootSIFT.
         """
         found = _found(self._detector.extract, img, mask)
         descriptors = [

@@ -1,7 +1,7 @@
-"""LightGlue: features of an image as its SIFT extractor gives them.
+"""LightGlue: an extractor that replaces its SIFT extractor.
 
-They fit `LightGlue(features="sift")` of the package lightglue, and of kornia, whose weights are not
-ours; see their licences.
+The features suit `LightGlue(features="sift")` of the packages lightglue and kornia. Its weights are
+not ours and have licences of their own.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from torch.nn import Module
 Scale = Literal["diameter", "sigma"]
 
 MAX_KEYPOINTS = 4096
-"""Its time and memory grow with the square of their number; so many its SIFT extractor takes."""
+"""LightGlue's time and memory grow with the square of this; its SIFT extractor has this limit."""
 
 
 class DeepDetectExtractor(Module):
-    """Takes the place of an extractor of LightGlue, as `lightglue.SIFT`.
+    """A replacement for an extractor of LightGlue such as `lightglue.SIFT`.
 
     Args:
-        detector: of the points, up to 4,096, with RootSIFT, which its weights are for.
-        scale: as of `Keypoints.to_lightglue`.
+        detector: detector of at most 4,096 points with RootSIFT, for which LightGlue has weights.
+        scale: as in `Keypoints.to_lightglue`.
 
     Raises:
         OptionError: an option is unknown or out of its range.
@@ -62,17 +62,17 @@ class DeepDetectExtractor(Module):
         self._detector = detector
 
     def extract(self, img: Any) -> dict[str, Tensor]:
-        """Find and describe keypoints.
+        """Detect and describe keypoints.
 
         Args:
-            img: (3, H, W), (1, H, W) or (1, C, H, W) tensor in [0, 1], RGB; or anything
-                `load_image` takes, as a path.
+            img: (3, H, W), (1, H, W) or (1, C, H, W) tensor in [0, 1], RGB; or anything that
+                `load_image` accepts, such as a path.
 
         Returns:
-            As of `Keypoints.to_lightglue`, on the device of the image.
+            The tensors of `Keypoints.to_lightglue`, on the device of the image.
 
         Raises:
-            ImageError: the image is not fit.
+            ImageError: the image has a wrong shape, type or range, or is too small.
         """
         one = img[0] if getattr(img, "ndim", 0) == 4 and len(img) == 1 else img
         features = self._detector.extract(load_tensor(one)).to_lightglue(scale=self._scale)
@@ -80,5 +80,5 @@ class DeepDetectExtractor(Module):
         return {name: value.to(device) for name, value in features.items()}
 
     def forward(self, data: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the features of data["image"], as of `extract`."""
+        """Return the features of data["image"], as `extract` does."""
         return self.extract(data["image"])

@@ -1,4 +1,4 @@
-"""OpenCV: an object with the methods of `cv2.Feature2D`."""
+"""OpenCV: a detector and descriptor with the methods of `cv2.Feature2D`."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from ..io.image import load_image
 
 
 class DeepDetectFeature2D:
-    """The best keypoints of all scales, with descriptors, as `cv2.SIFT` gives them.
+    """The best keypoints of all scales, with descriptors, by the interface of `cv2.SIFT`.
 
-    It has the methods of `cv2.Feature2D`, but does not derive from it: a Python class that does
-    crashes the interpreter. So functions of OpenCV that ask for a `cv2.Feature2D` refuse it.
+    It has the methods of `cv2.Feature2D` but is no subclass of it, since Python subclasses crash
+    the interpreter. Functions of OpenCV that need a `cv2.Feature2D` therefore reject it.
 
     Args:
-        detector: of the points and their descriptors.
-        channels: order of the colours in images: "bgr" as of `cv2.imread`, or "rgb".
+        detector: the detector, which also computes descriptors. Default: `PointDetector()`.
+        channels: order of the colours in images: "bgr" as in `cv2.imread`, or "rgb".
 
     Raises:
         OptionError: an option is unknown or out of its range.
@@ -55,31 +55,31 @@ class DeepDetectFeature2D:
 
         Args:
             image: (H, W) or (H, W, C) array.
-            mask: (H, W), not 0 where keypoints are wanted.
+            mask: (H, W), not 0 where keypoints are allowed.
 
         Returns:
-            The keypoints, best first: sizes are diameters in pixels, angles degrees, responses
-            scores; the octaves are those at which `cv2.SIFT` describes them.
+            The keypoints, best first. Sizes are diameters in pixels, angles are degrees, responses
+            are scores, and octaves are those at which `cv2.SIFT` describes the keypoints.
 
         Raises:
-            ImageError: the image is not fit.
-            OptionError: the mask has another size than the image.
+            ImageError: the image has a wrong shape or type, or is too small.
+            OptionError: the mask and the image differ in size.
         """
         return _to_opencv(self._detector.detect(self._load(image), ignore=_ignored(mask)))
 
     def compute(
         self, image: Any, keypoints: Sequence[cv2.KeyPoint], descriptors: None = None
     ) -> tuple[tuple[cv2.KeyPoint, ...], np.ndarray | None]:
-        """Describe keypoints, also of other detectors.
+        """Describe keypoints of this detector or others.
 
         Args:
-            image: as of `detect`.
-            keypoints: with sizes; angles of -1 are found.
+            image: as in `detect`.
+            keypoints: keypoints with sizes; angles of -1 are estimated.
             descriptors: not used; OpenCV has this argument.
 
         Returns:
-            The same keypoints, and (N, D) float32 descriptors: 64 learned numbers, or 128 of
-            RootSIFT, whole ones from 0 to 255 (None without keypoints, as OpenCV does).
+            The same keypoints and (N, D) float32 descriptors, or None without keypoints, as in
+            OpenCV. Descriptors are 64 learned numbers, or for RootSIFT 128 integers in [0, 255].
         """
         rgb = self._load(image)
         points = Keypoints.from_opencv(keypoints, (rgb.shape[1], rgb.shape[0]))
@@ -109,15 +109,15 @@ class DeepDetectFeature2D:
         return 128 if self._detector.descriptor_type == ROOT_SIFT else LENGTH
 
     def descriptorType(self) -> int:
-        """Return the type of descriptors, float32 as of `cv2.SIFT`."""
+        """Return the type of descriptors, float32 as in `cv2.SIFT`."""
         return cv2.CV_32F
 
     def defaultNorm(self) -> int:
-        """Return the norm to compare descriptors by, for `cv2.BFMatcher`."""
+        """Return the norm that compares descriptors, for `cv2.BFMatcher`."""
         return cv2.NORM_L2
 
     def empty(self) -> bool:
-        """Return False: it can detect."""
+        """Return False, which in OpenCV means that the detector is ready."""
         return False
 
     def getDefaultName(self) -> str:
@@ -129,12 +129,12 @@ class DeepDetectFeature2D:
 
 
 def _ignored(mask: np.ndarray | None) -> np.ndarray | None:
-    """Turn OpenCV's mask of what is wanted into one of what is not."""
+    """Convert OpenCV's mask, nonzero where keypoints are allowed, to one of ignored pixels."""
     return None if mask is None else np.asarray(mask) == 0
 
 
 def _to_opencv(points: Keypoints) -> tuple[cv2.KeyPoint, ...]:
-    """Convert keypoints with sizes, and note where in its scale space SIFT describes them."""
+    """Convert keypoints; add the octaves at which SIFT describes keypoints of their sizes."""
     assert points.sizes is not None
     octaves = packed_octaves(points.sizes, points.image_size)
     return tuple(dataclasses.replace(points, octaves=octaves).to_opencv())

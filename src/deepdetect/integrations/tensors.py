@@ -1,4 +1,4 @@
-"""Images from tensors, and tensors of arrays."""
+"""Conversion of tensors to images, and of arrays to tensors."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     import torch
 
 OVERSHOOT = 0.25
-"""Of the values of tensors beyond [0, 1] that is cut off: bicubic filters leave some."""
+"""Tensors may exceed [0, 1] by this much and are clipped: bicubic filters overshoot."""
 
 
 def load_tensor(image: Any) -> np.ndarray:
-    """Read an image as `load_image` does; tensors may overshoot [0, 1] a little."""
+    """Read an image as `load_image` does; tensors may exceed [0, 1] a little."""
     if hasattr(image, "detach") and image.is_floating_point():
         image = image.detach().float().cpu().numpy()
         if image.size and image.min() >= -OVERSHOOT and image.max() <= 1 + OVERSHOOT:
@@ -26,7 +26,7 @@ def load_tensor(image: Any) -> np.ndarray:
 
 
 def padded(rows: Sequence[Any], device: torch.device) -> torch.Tensor:
-    """Return arrays or tensors of unequal lengths as one tensor, filled with zeros."""
+    """Combine arrays or tensors of different lengths in one tensor, padded with zeros."""
     import torch
 
     tensors = [torch.as_tensor(values) for values in rows]

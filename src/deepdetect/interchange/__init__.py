@@ -1,4 +1,4 @@
-"""Keypoints and matches in the files of other programs: COLMAP, hloc."""
+"""Export of keypoints and matches to the files of other programs: COLMAP, hloc."""
 
 from .collection import Collection, PairMatches, describe_collection
 from .colmap import write_colmap, write_colmap_text

@@ -1,4 +1,4 @@
-"""Images with their keypoints and matches: what all formats are written from."""
+"""Images with their keypoints and matches, from which all formats are written."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class PairMatches:
     """Matches of two images.
 
     Attributes:
-        rows: (K, 2) int32 keypoints of the first and of the second; each at most once.
+        rows: (K, 2) int32 rows of keypoints of the first and second image, each at most once.
         scores: (K,) float32 in [0, 1], higher is better.
     """
 
@@ -31,7 +31,7 @@ class PairMatches:
 
     @classmethod
     def one_to_one(cls, rows: np.ndarray, scores: np.ndarray) -> PairMatches:
-        """Keep the best match of each keypoint; rows below 0 are no keypoints.
+        """Keep the best match of each keypoint; rows below 0 mean no keypoint.
 
         Example:
             >>> PairMatches.one_to_one([[0, 5], [1, 5], [2, -1], [3, 0]], [.2, .9, 1, .5]).rows
@@ -56,13 +56,13 @@ class Collection:
     """Images with their keypoints and matches.
 
     Attributes:
-        keypoints: by the name of the image: its path below their folder, with "/".
-        matches: by the names of two images.
-        folder: of the images, where it is known.
-        failures: a sentence on each image or pair that could not be worked on.
+        keypoints: keypoints by name of the image, which is its path below `folder`, with "/".
+        matches: matches by the names of two images.
+        folder: folder of the images, if known.
+        failures: a sentence on each image or pair that could not be processed.
 
     Raises:
-        OptionError: a match is of an image or a keypoint that is not there.
+        OptionError: a match refers to an image or a keypoint that does not exist.
     """
 
     keypoints: Mapping[str, Keypoints]
@@ -76,32 +76,33 @@ class Collection:
                 if name not in self.keypoints:
                     raise OptionError(
                         f"the matches of {pair[0]} and {pair[1]} need the keypoints of {name}, "
-                        "which are not there: give its features, too"
+                        "which are missing: also give its features"
                     )
                 most = int(found.rows[:, side].max(initial=-1))
                 if most >= len(self.keypoints[name]):
                     raise OptionError(
-                        f"the matches of {pair[0]} and {pair[1]} name keypoint {most} of {name}, "
-                        f"which has {len(self.keypoints[name])}: they are of other features"
+                        f"the matches of {pair[0]} and {pair[1]} refer to keypoint {most} of "
+                        f"{name}, which has {len(self.keypoints[name])}: give the features that "
+                        "were matched"
                     )
 
     def path(self, name: str) -> Path | None:
-        """Return the file of an image, or None where it is not known."""
+        """Return the file of an image, or None if it is unknown or missing."""
         path = None if self.folder is None else self.folder / name
         return path if path is not None and path.is_file() else None
 
 
 def describe_collection(collection: Collection, quiet: bool = True) -> Collection:
-    """Return a collection whose keypoints have RootSIFT descriptors, as far as images allow.
+    """Add RootSIFT descriptors to keypoints without descriptors, if their image is known.
 
-    Those without sizes and angles are described upright, with a diameter of 3 pixels.
+    Keypoints without sizes and angles are described upright, with a diameter of 3 pixels.
 
     Args:
-        collection: whose images without descriptors are read.
+        collection: the collection, which is not changed.
         quiet: show no progress bar.
 
     Raises:
-        ImageError: an image has another size than its keypoints.
+        ImageError: the size of an image differs from that of its keypoints.
     """
     described = dict(collection.keypoints)
     left = [name for name, points in described.items() if points.descriptors is None]
@@ -112,9 +113,9 @@ def describe_collection(collection: Collection, quiet: bool = True) -> Collectio
             gray = luma(load_image(path))
             if gray.shape[::-1] != points.image_size:
                 raise ImageError(
-                    f"{path} has {gray.shape[1]}x{gray.shape[0]} pixels, its keypoints are of an "
-                    f"image of {points.image_size[0]}x{points.image_size[1]}: name the folder of "
-                    "the images that they were found in"
+                    f"{path} has {gray.shape[1]}x{gray.shape[0]} pixels, but its keypoints are of "
+                    f"an image of {points.image_size[0]}x{points.image_size[1]}: name the folder "
+                    "of the images that they were found in"
                 )
             described[name] = describe_keypoints(gray, points)
             bar.update()
@@ -122,16 +123,16 @@ def describe_collection(collection: Collection, quiet: bool = True) -> Collectio
 
 
 def check_names(names: Iterable[str]) -> None:
-    """Refuse names with blanks, which a list of names with blanks between them cannot hold."""
+    """Raise an OptionError for names with blanks, which separate the names in a list."""
     for name in names:
         if len(name.split()) != 1:
             raise OptionError(f"lists of this format separate names by blanks: rename {name!r}")
 
 
 def check_upright(paths: Iterable[Path]) -> None:
-    """Refuse images that EXIF turns, for readers that take the size from the file as it is stored.
+    """Raise an OptionError for images that EXIF rotates, for programs that ignore this.
 
-    Those that cannot be read are not checked.
+    Images that cannot be read are not checked.
     """
     for path in paths:
         try:
@@ -141,6 +142,6 @@ def check_upright(paths: Iterable[Path]) -> None:
             continue
         if turned:
             raise OptionError(
-                f"{path} is turned by its EXIF orientation, which hloc does not do: save it "
-                "upright, without that tag (mogrify -auto-orient)"
+                f"{path} is rotated by its EXIF orientation, which hloc ignores: save it upright, "
+                "without that tag (mogrify -auto-orient)"
             )

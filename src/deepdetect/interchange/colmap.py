@@ -1,4 +1,4 @@
-"""COLMAP: a database, or its text files of features and matches; `sfm.colmap` has the units."""
+"""Files of COLMAP: a database, or text files of features and matches; for units, `sfm.colmap`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .collection import Collection, check_names
 
 MATCHES_NAME = "matches"
 DEFAULT_SIZE_PX = 3.0
-"""Diameter of keypoints without a size: that of dense keypoints."""
+"""Keypoints without a size get this diameter, that of dense keypoints."""
 
 
 @suggest_keywords
@@ -34,19 +34,19 @@ def write_colmap(
     intrinsics: Mapping[str, CameraIntrinsics],
     verify: bool = True,
 ) -> tuple[Path, ...]:
-    """Write COLMAP's database, whole or not at all; it is replaced where it exists.
+    """Write a COLMAP database, whole or not at all; an existing file is replaced.
 
     Args:
         collection: the images.
-        output: ending in .db.
-        intrinsics: of the camera of each image; those with the same object share one.
-        verify: estimate the two-view geometry of each pair, without which COLMAP maps nothing.
+        output: path that ends in .db.
+        intrinsics: camera of each image; images with the same object share a camera.
+        verify: estimate the two-view geometry of each pair, which COLMAP needs for mapping.
 
     Returns:
         The file.
 
     Raises:
-        OptionError: the ending is another, or an image has no camera.
+        OptionError: the output does not end in .db, or an image has no camera.
         MissingExtraError: pycolmap is not installed.
         DeepDetectError: the file cannot be written.
     """
@@ -67,7 +67,7 @@ def write_colmap(
 
 
 def write_colmap_text(collection: Collection, output: str | Path) -> tuple[Path, ...]:
-    """Write the text files of `colmap feature_importer` and `colmap matches_importer`.
+    """Write text files for `colmap feature_importer` and `colmap matches_importer`.
 
     Args:
         collection: the images, whose keypoints have SIFT descriptors.
@@ -77,14 +77,14 @@ def write_colmap_text(collection: Collection, output: str | Path) -> tuple[Path,
         The files.
 
     Raises:
-        OptionError: keypoints have no SIFT descriptors, which this format always has; a name in
-            the list of matches has a blank; or an image is named "matches", without an ending.
+        OptionError: keypoints have no SIFT descriptors, which this format requires; a name in the
+            list of matches has a blank; or an image is named "matches", without a suffix.
         DeepDetectError: a file cannot be written.
     """
     check_names(name for pair in collection.matches for name in pair)
     if MATCHES_NAME in collection.keypoints:
         raise OptionError(
-            f"the keypoints of {MATCHES_NAME!r} need the file of the matches: rename that image"
+            f"the keypoints of {MATCHES_NAME!r} would overwrite the matches: rename that image"
         )
     folder = Path(output)
     written = []

@@ -1,6 +1,6 @@
-"""hloc: features, matches and pairs, in float32 and int32.
+"""Files of hloc: features, matches and pairs, in float32 and int32.
 
-Its pixels are ours: hloc adds the half pixel of COLMAP itself.
+Pixel coordinates are the same as here: hloc itself adds the half pixel for COLMAP.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
     They are the arguments of `hloc.reconstruction.main`. Each file appears whole, or not at all.
 
     Args:
-        collection: the images; hloc needs their descriptors to match, not to map.
-        output: folder.
+        collection: the images; hloc needs descriptors for matching, not for mapping.
+        output: folder for the files.
 
     Returns:
-        The files. Without matches there are no matches.h5 and pairs.txt.
+        The files. Without matches, matches.h5 and pairs.txt are not written.
 
     Raises:
-        OptionError: two pairs would have one group in the file, a name in the list of pairs has a
-            blank, or an image is turned by EXIF.
+        OptionError: two pairs would have the same group in the file, a name in the list of pairs
+            has a blank, or an image is rotated by EXIF.
         DeepDetectError: a file cannot be written.
         MissingExtraError: h5py is not installed.
     """
@@ -45,7 +45,7 @@ def write_hloc(collection: Collection, output: str | Path) -> tuple[Path, ...]:
         other = taken.setdefault(pair_name(*pair), pair)
         if other != pair:
             raise OptionError(
-                f"hloc has one group for {' '.join(pair)} and {' '.join(other)}: rename an image"
+                f"{' '.join(pair)} and {' '.join(other)} have the same group: rename an image"
             )
     keypoints = collection.keypoints
     write_groups(features, (feature_group(name, points) for name, points in keypoints.items()))

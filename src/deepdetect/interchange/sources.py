@@ -22,10 +22,10 @@ from ..io.tables import load_keypoints, load_matches
 from .collection import Collection, PairMatches
 
 MAX_ALL_PAIRS = 50
-"""Images that are all matched with each other where no pairs are named."""
+"""If no pairs are given, all pairs of up to this number of images are matched. Chosen by hand."""
 
 MATCHES_SUFFIX = "_matches"
-"""With which names of files of `deepdetect match` end."""
+"""Files of `deepdetect match` have names that end so."""
 
 
 @suggest_keywords
@@ -39,16 +39,16 @@ def read_collection(
 
     Args:
         files: one HDF5 file of `deepdetect extract` or hloc; or npz files of `deepdetect detect`
-            (STEM.npz) and `deepdetect match` (STEM0_STEM1_matches.npz), which are read all.
+            (STEM.npz) and `deepdetect match` (STEM0_STEM1_matches.npz).
         matches: HDF5 file of `deepdetect match-many` or hloc.
-        images: folder of the images, which also completes the names of npz files.
+        images: folder of the images, which is also used to complete the names of npz files.
 
     Returns:
-        The collection. Matches of npz files are those that agree with their geometry, at the
-        keypoints' own positions, so that matches of several pairs hang together.
+        The collection. Matches of npz files are the inliers of their geometry, at the positions of
+        the keypoints, so that matches of several pairs form tracks.
 
     Raises:
-        DeepDetectError: a file is missing or holds something else, or names do not fit.
+        DeepDetectError: a file is missing or has other contents, or names do not agree.
         MissingExtraError: h5py is not installed.
     """
     paths = [Path(path) for path in files]
@@ -58,35 +58,35 @@ def read_collection(
         raise OptionError("give one HDF5 file of features, or npz files, or a folder of images")
     if archives:
         if matches is not None:
-            raise OptionError("npz files of matches are named with the others: leave out `matches`")
+            raise OptionError("npz files of matches belong to the `files`: leave out `matches`")
         return _read_archives(archives, folder)
     keypoints = read_features_file(paths[0])
     found = {} if matches is None else read_matches_file(Path(matches), keypoints)
     if folder is not None and not any((folder / name).is_file() for name in keypoints):
         raise OptionError(
-            f"none of the images of {paths[0]} is in {folder}, such as "
-            f"{next(iter(keypoints))}: name the folder that they were extracted from as `images`"
+            f"{folder} has none of the images of {paths[0]}, such as {next(iter(keypoints))}: name "
+            "the folder that they were extracted from as `images`"
         )
     return Collection(keypoints, found, folder)
 
 
 def read_features_file(path: Path) -> dict[str, Keypoints]:
-    """Read all features of an HDF5 file of hloc's layout, by the name of the image."""
+    """Read all features of an HDF5 file in hloc's layout, by name of the image."""
     with open_hdf5(path) as file:
         found = {name: read_keypoints(file, name) for name in sorted(feature_names(file))}
     if not found:
-        raise InvalidFileError(f"{path} holds no features: give a file of deepdetect extract")
+        raise InvalidFileError(f"{path} has no features: give a file of deepdetect extract")
     return found
 
 
 def read_matches_file(path: Path, keypoints: Mapping[str, Keypoints]) -> dict[Pair, PairMatches]:
-    """Read all matches of these keypoints from an HDF5 file of hloc's layout.
+    """Read all matches of these keypoints from an HDF5 file in hloc's layout.
 
-    The file writes "-" for "/" in the names of images.
+    The file has "-" for "/" in the names of images.
 
     Raises:
-        DeepDetectError: the file is missing or damaged, holds no matches, it is not known of which
-            images, or they are of other keypoints.
+        DeepDetectError: the file is missing, damaged or without matches, its names are ambiguous,
+            or its matches are of other keypoints.
     """
     known: dict[str, list[str]] = {}
     for name in keypoints:
@@ -103,8 +103,8 @@ def read_matches_file(path: Path, keypoints: Mapping[str, Keypoints]) -> dict[Pa
                     if len(known.get(written, ())) != 1:
                         reason = "several" if written in known else "none"
                         raise InvalidFileError(
-                            f"{path} has matches of {written}, and {reason} of the images with "
-                            "features have this name: give the features that were matched"
+                            f"{path} has matches of {written}, a name that {reason} of the images "
+                            "with features have: give the features that were matched"
                         )
                     pair.append(known[written][0])
                 rows1 = np.asarray(group["matches0"][()], np.int64)
@@ -120,12 +120,12 @@ def read_matches_file(path: Path, keypoints: Mapping[str, Keypoints]) -> dict[Pa
                 rows = np.column_stack([rows0, rows1[rows0]])
                 _add_matches(found, (pair[0], pair[1]), PairMatches.one_to_one(rows, kept))
     if not found:
-        raise InvalidFileError(f"{path} holds no matches: give a file of deepdetect match-many")
+        raise InvalidFileError(f"{path} has no matches: give a file of deepdetect match-many")
     return found
 
 
 def _add_matches(found: dict[Pair, PairMatches], pair: Pair, matches: PairMatches) -> None:
-    """Add the matches of a pair, to those of the pair the other way round where there are any."""
+    """Add the matches of a pair, also to those of the same pair in the other order."""
     other = found.get(pair[::-1])
     if other is None:
         found[pair] = matches
@@ -143,7 +143,7 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
         if not path.stem.endswith(MATCHES_SUFFIX):
             name = path.stem if names is None else _name_of(path, names)
             if name in keypoints:
-                raise OptionError(f"two files are of {name}: name the images' folder as `images`")
+                raise OptionError(f"two files belong to {name}: give the image folder as `images`")
             keypoints[name] = load_keypoints(path)
             continue
         loaded = load_matches(path)
@@ -152,7 +152,8 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
             before = keypoints.setdefault(name, own)
             if not (np.array_equal(before.xy, own.xy) and before.image_size == own.image_size):
                 raise InvalidFileError(
-                    f"{path} has other keypoints of {name} than others: use the same options"
+                    f"{path} differs from other files in the keypoints of {name}: use the same "
+                    "options for all"
                 )
         kept = loaded.inliers
         rows = np.column_stack([loaded.indices0[kept], loaded.indices1[kept]])
@@ -161,9 +162,9 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
 
 
 def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
-    """Return the names of the images below a folder by what npz files of them may be called.
+    """Return the names of the images below a folder, by the names that their npz files may have.
 
-    That is their path without a suffix, or their stem, where it is no other's, or their name.
+    These are the path with or without suffix, and the stem if it is unique.
     """
     if folder is None:
         return None
@@ -176,12 +177,12 @@ def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
 
 
 def _name_of(path: Path, names: Mapping[str, str]) -> str:
-    """Return which image an npz file is of: that with the longest common end of their paths."""
+    """Return the image of an npz file: the one whose path has the longest end in common with it."""
     parts = path.with_suffix("").parts
     for first in range(len(parts)):
         if (key := "/".join(parts[first:])) in names:
             return names[key]
-    raise OptionError(f"{path} is of no image in the folder of `images`, or of several: move it")
+    raise OptionError(f"{path} belongs to no image in the folder `images`, or to several: move it")
 
 
 def _pair_of_stem(stem: str, names: Mapping[str, str] | None, path: Path) -> Pair:
@@ -191,10 +192,10 @@ def _pair_of_stem(stem: str, names: Mapping[str, str] | None, path: Path) -> Pai
         joined = [(names[a], names[b]) for a, b in joined if a in names and b in names]
     if len(joined) != 1:
         raise OptionError(
-            f"it is not clear of which two images {path} is: name their folder as `images`"
+            f"it is unclear which two images {path} is for: name their folder as `images`"
             if names is None
-            else f"{path} is of no two images in the folder of `images`, or of several: name "
-            "another folder"
+            else f"{path} belongs to no two images in the folder `images`, or to several pairs: "
+            "name another folder"
         )
     return joined[0]
 
@@ -208,20 +209,20 @@ def match_folder(
     workers: int | None = None,
     quiet: bool = True,
 ) -> Collection:
-    """Find and match the keypoints of all images below a folder.
+    """Detect and match the keypoints of all images below a folder.
 
-    As `extract_features` and `match_pairs` do, which keep what they made for large collections. A
-    script must call this under `if __name__ == "__main__":`, since processes are started.
+    For large collections, use `extract_features` and `match_pairs`, which keep their results. This
+    starts processes, so a script must call it under `if __name__ == "__main__":`.
 
     Args:
-        folder: of the images.
-        detector: as of `extract_features`.
-        pairs: as for `match_pairs`; None: all pairs of up to 50 images.
+        folder: folder of the images.
+        detector: a detector as in `extract_features`.
+        pairs: pairs as in `match_pairs`; None: all pairs of up to 50 images.
         workers: number of processes; default one per processor.
         quiet: show no progress bars.
 
     Returns:
-        The collection. What cannot be read or matched does not stop the others: see its `failures`.
+        The collection. Its `failures` list the images and pairs that could not be processed.
 
     Raises:
         ImageError: the folder is missing, or holds no image.
@@ -233,10 +234,10 @@ def match_folder(
     names = [path.relative_to(root).as_posix() for path in find_images(root)]
     if pairs is None and len(names) > MAX_ALL_PAIRS:
         raise OptionError(
-            f"all pairs of {len(names)} images would take long: give `pairs`, as sequential:10"
+            f"all pairs of {len(names)} images would take long: give `pairs`, such as sequential:10"
         )
     pairs = "exhaustive" if pairs is None else pairs
-    list_pairs(pairs, ())  # what is wrong with them is said before the work
+    list_pairs(pairs, ())  # raises an error for wrong pairs before the work
     with tempfile.TemporaryDirectory(prefix="deepdetect-") as temporary:
         features, found = Path(temporary, "features.h5"), Path(temporary, "matches.h5")
         extracted = extract_features(root, features, detector, workers=workers, quiet=quiet)
@@ -244,7 +245,7 @@ def match_folder(
             extracted.check()
         keypoints = read_features_file(features)
         unread = set(names) - keypoints.keys()
-        # An image that cannot be read is one failure, its pairs are none.
+        # An image that cannot be read counts as one failure, without its pairs.
         wanted = list_pairs(pairs, [name for name in names if name in keypoints])
         wanted = [pair for pair in wanted if unread.isdisjoint(pair)]
         matched = match_pairs(features, wanted, found, workers=workers, quiet=quiet)

@@ -1,4 +1,4 @@
-"""Depth maps in files: 16-bit PNG that carries its scale, and npz with floats."""
+"""Depth maps in files: 16-bit PNG with its scale in the file, and npz with floats."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from .._shared.records import save_arrays
 MAX_UINT16 = 65535
 
 HEADROOM = 4.0
-"""The scale holds all depths up to this many times their 99th percentile."""
+"""The scale covers this many times the 99th percentile: outliers would make its steps coarse."""
 
 
 def save_depth_png(
     depth: np.ndarray, path: Path, unit: str, scale: float | None = None
 ) -> dict[str, str | float]:
-    """Write a depth map as a grey PNG of 16 bits, whole or not at all; return what is in it.
+    """Write a depth map as a 16-bit grey PNG, atomically; return a summary of its content.
 
     value = round(depth * value_per_unit), and 0 where the depth is unknown: not finite, 0 or less.
-    `value_per_unit` is `scale`, or the finest of 1, 2 or 5 times a power of ten that holds all
-    depths up to 4 times the 99th percentile; those that do not fit, `out_of_range`, are written as
-    unknown. Unit and scale are also in the PNG, as text chunks `unit` and `value_per_unit`.
+    `value_per_unit` is `scale`. By default it is the finest of 1, 2 or 5 times a power of ten that
+    covers depths up to 4 times the 99th percentile; larger depths, counted as `out_of_range`, are
+    written as unknown. The PNG also has text chunks `unit` and `value_per_unit`.
     """
     known = np.isfinite(depth) & (depth > 0)
     scale = scale or _scale(depth[known])
@@ -46,21 +46,21 @@ def save_depth_png(
 
 
 def save_depth_npz(depth: np.ndarray, path: Path, unit: str, **arrays: np.ndarray) -> None:
-    """Write `depth` (H, W) float32, NaN where it is unknown, its `unit`, and further arrays."""
+    """Write `depth` (H, W) float32, NaN where unknown, its `unit`, and further arrays as npz."""
     known = np.isfinite(depth) & (depth > 0)
     stored = np.where(known, depth, np.nan).astype(np.float32)
     save_arrays(path, {"depth": stored, "unit": unit, **arrays})
 
 
 def _scale(depths: np.ndarray) -> float:
-    """Choose the scale that holds all depths but outliers."""
+    """Choose the scale that covers all depths except for outliers."""
     if not len(depths):
         return 1.0
     return depth_scale(min(float(depths.max()), HEADROOM * float(np.percentile(depths, 99))))
 
 
 def depth_scale(furthest: float) -> float:
-    """Choose the finest scale of 1, 2 or 5 times a power of ten that holds a depth."""
+    """Choose the finest scale, 1, 2 or 5 times a power of ten, that covers a depth."""
     finest = MAX_UINT16 / furthest
     power = 10.0 ** np.floor(np.log10(finest))
     return float(max(step * power for step in (1, 2, 5) if step * power <= finest * (1 + 1e-12)))

@@ -12,38 +12,38 @@ from ..geometry.camera import Calibration, Camera, Size
 from .image_file import file_name, is_file, open_image
 
 DIAGONAL_35MM_MM = float(np.hypot(36, 24))
-"""Diagonal of a frame of 35 mm film, which the equivalent focal length refers to (CIPA)."""
+"""Diagonal of a 35 mm film frame in mm, which the equivalent focal length refers to (CIPA)."""
 
 MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-"""Of FocalPlaneResolutionUnit: inch, centimetre, and by custom millimetre and micrometre."""
+"""Length in mm of a FocalPlaneResolutionUnit: inch, cm; in common use also mm and micrometre."""
 
 TRANSPOSED = (5, 6, 7, 8)
-"""Orientations that exchange width and height."""
+"""EXIF orientations that exchange width and height."""
 
 MAX_FOCAL_DIFFERENCE = 0.1
-"""Relative difference up to which the focal length by the resolution of the sensor, which is finer
-but often wrong, is preferred to the one by the 35 mm equivalent."""
+"""The focal length computed from the sensor resolution is finer than the 35 mm equivalent but often
+wrong. It is used if both differ by less than this ratio. Chosen by hand."""
 
 MAX_ASPECT_DIFFERENCE = 0.01
-"""Relative difference of the aspect ratios above which a photograph counts as cropped."""
+"""Photographs count as cropped if EXIF's aspect ratio differs by more than this. Chosen by hand."""
 
 ADVICE = "give `focal_px` or `calibration`"
 
 
 def calibration_from_exif(image0: Any, image1: Any, size0: Size, size1: Size) -> Calibration:
-    """Read a calibration from two photographs; arguments and errors as of `camera_from_exif`."""
+    """Read a calibration from two photographs; arguments and errors as in `camera_from_exif`."""
     left, right = camera_from_exif(image0, size0), camera_from_exif(image1, size1)
     return Calibration(left, right, source="EXIF")
 
 
 def camera_from_exif(image: Any, size: Size) -> Camera:
-    """Read the camera of a photograph, a file or a PIL image, of (width, height) as it is loaded.
+    """Read the camera of a photograph, a file or PIL image that loads as (width, height) pixels.
 
-    Its focal length is that of FocalLength and the resolution of the sensor, where these agree with
-    FocalLengthIn35mmFilm or it is missing; else that of FocalLengthIn35mmFilm.
+    The focal length is computed from FocalLength and the sensor resolution if that agrees with
+    FocalLengthIn35mmFilm or the latter is missing; otherwise from FocalLengthIn35mmFilm.
 
     Raises:
-        ReconstructionError: it carries no usable focal length, or has been cropped since.
+        ReconstructionError: there is no usable focal length, or the photograph was cropped later.
     """
     name = file_name(image)
     tags, orientation = _tags(image)
@@ -62,12 +62,12 @@ def camera_from_exif(image: Any, size: Size) -> Camera:
     if focal is None or (film > 0 and abs(focal[0] / film - 1) > MAX_FOCAL_DIFFERENCE):
         focal = (film, film)
     if not min(focal) > 0:
-        raise ReconstructionError(f"{name} carries no focal length (EXIF): {ADVICE}")
+        raise ReconstructionError(f"{name} has no focal length in its EXIF: {ADVICE}")
     return Camera(size, focal[::-1] if turned else focal)
 
 
 def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None:
-    """Return (fx, fy) in pixels from the resolution of the sensor, or None."""
+    """Return (fx, fy) in pixels computed from the sensor resolution, or None."""
     length = _number(tags.get(Base.FocalLength))
     unit = MM_PER_UNIT.get(int(_number(tags.get(Base.FocalPlaneResolutionUnit))) or 2, 0.0)
     across = _number(tags.get(Base.FocalPlaneXResolution))
@@ -78,7 +78,7 @@ def _by_sensor(tags: dict[int, Any], scale: float) -> tuple[float, float] | None
 
 
 def _tags(image: Any) -> tuple[dict[int, Any], int]:
-    """Read the EXIF tags, and the orientation that `load_image` undoes; 1 for PIL images.
+    """Read the EXIF tags and the orientation that `load_image` undoes, 1 for PIL images.
 
     Unreadable tags count as missing.
     """
@@ -89,10 +89,10 @@ def _tags(image: Any) -> tuple[dict[int, Any], int]:
             return {}, 1
         with open_image(image) as opened:
             exif = opened.getexif()
-            # HEIF images are turned when they are opened.
+            # The HEIF plug-in turns images upright and resets the usual tag.
             orientation = opened.info.get("original_orientation") or exif.get(Base.Orientation, 1)
             return dict(exif.get_ifd(IFD.Exif)), int(orientation)
-    except Exception:  # Pillow's readers raise many kinds; broken tags are ignored
+    except Exception:  # Pillow raises many types; broken tags are ignored
         return {}, 1
 
 

@@ -1,8 +1,8 @@
 """Binary glTF 2.0 (GLB), which browsers, Blender, Windows and game engines read.
 
 Source: Khronos Group, glTF 2.0 specification, sections 3.4 (y up, z towards the viewer,
-metres), 3.6.2.4 (alignment), 3.7.2.1 (points, COLOR_0) and 4.4 (GLB). Our own writer, since
-the one of trimesh keeps 8 bits of linear colour, in which shadows become steps.
+metres), 3.6.2.4 (alignment), 3.7.2.1 (points, COLOR_0) and 4.4 (GLB). trimesh's writer is not
+used because it stores linear colour in 8 bits, which causes banding in shadows.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ def write_glb(
 ) -> None:
     """Write the points in glTF's frame with their colours, 20 bytes per point.
 
-    With (M, 3) `faces`, rows of points, it is a mesh of triangles.
+    With (M, 3) `faces`, indices of points, it writes a triangle mesh.
 
-    Colours become linear as glTF requires, with 16 bits, which keep each of the 256 sRGB levels
-    apart. The metadata are in the asset's extras, with unit and frame.
+    Colours become linear, as glTF requires, in 16 bits, which keep all 256 sRGB levels distinct.
+    The asset's extras contain the metadata, the unit and the frame.
     """
-    # A half turn about the x axis makes y point up and z backward, of what goes up already a
-    # quarter. Units of unknown length become metres, and the file says so.
+    # Rotation about the x axis makes y point up: by 180 degrees from a camera's frame, by 90 from
+    # one with z up. Units of unknown length are written as metres, and the extras say so.
     turned = cloud.points[:, [0, 2, 1]] if cloud.frame == EAST_NORTH_UP else cloud.points
     signs = [1, 1, -1] if cloud.frame == EAST_NORTH_UP else [1, -1, -1]
     unit = 1e-3 if cloud.unit == "mm" else 1.0
@@ -81,7 +81,7 @@ def _tree(
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "point cloud"}],
         "meshes": [{"primitives": [primitive]}],
-        # Points without normals are not lit; the extension says so to all viewers.
+        # Points have no normals to be lit by; this extension tells viewers not to try.
         "extensionsUsed": ["KHR_materials_unlit"],
         "materials": [
             {"pbrMetallicRoughness": rough, "extensions": {"KHR_materials_unlit": {}}}

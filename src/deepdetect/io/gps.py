@@ -1,4 +1,4 @@
-"""Where photographs were taken, and how they were held: EXIF, and the XMP of DJI's drones."""
+"""GPS position and gravity direction of photographs, from EXIF and from XMP of DJI drones."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from PIL.ExifTags import GPS, IFD, Base
 from .image_file import open_image
 
 XMP_OF_DRONES = re.compile(rb"(?<!/)drone-dji:(\w+)\s*(?:=\s*[\"']([^\"']*)|>([^<]*))")
-"""As attributes or as elements: DJI writes both."""
+"""XMP properties of DJI drones, which write them as attributes or as elements."""
 
 MAX_GRAVITY_TILT_DEG = 120.0
-"""A gimbal's angles beyond it are no angles."""
+"""Larger gimbal angles, in degrees, are treated as invalid. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
 class GpsFix:
-    """The place of a photograph by satellite, in WGS 84, and its gravity.
+    """The GPS position of a photograph in WGS 84, and the direction of gravity.
 
     Attributes:
         latitude, longitude: in degrees, north and east positive.
-        altitude: in metres as the camera gives it, mostly above the sea; NaN where it does not.
-        accuracy_m: standard deviation in metres, horizontally, as the camera says; None: unknown.
-        gravity: (3,) unit vector to the ground in the frame of the camera, x right, y down, z
-            forward, of a gimbal; None: unknown.
+        altitude: in metres as the camera states it, mostly above sea level; NaN if unknown.
+        accuracy_m: horizontal standard deviation in metres as the camera states it, or None.
+        gravity: (3,) unit vector towards the ground in the camera's frame (x right, y down, z
+            forward), computed from the gimbal's angles, or None.
     """
 
     latitude: float
@@ -39,16 +39,16 @@ class GpsFix:
 
 
 def read_gps(path: Path) -> GpsFix | None:
-    """Read the fix of a photograph; None where it carries none that can be.
+    """Read the GPS position of a photograph; None if it has no valid one.
 
-    What a drone writes to XMP has more digits than its EXIF, and is preferred.
+    XMP is preferred, since drones write it with more digits than EXIF.
     """
     try:
         with open_image(path) as image:
             exif, xmp = image.getexif(), image.info.get("xmp") or b""
             tags = dict(exif.get_ifd(IFD.GPSInfo))
         orientation = exif.get(Base.Orientation, 1)
-    except Exception:  # Pillow's readers raise many kinds; broken tags are ignored
+    except Exception:  # Pillow raises many types; broken tags are ignored
         return None
     found = XMP_OF_DRONES.findall(xmp if isinstance(xmp, bytes) else xmp.encode())
     drone = {name.decode(): _number(one or other) for name, one, other in found}
@@ -61,7 +61,7 @@ def read_gps(path: Path) -> GpsFix | None:
     )
     below_sea = tags.get(GPS.GPSAltitudeRef) in (1, b"\x01")
     altitude = _number(tags.get(GPS.GPSAltitude)) * (-1 if below_sea else 1)
-    # Older drones spell it Longtitude.
+    # Older drones misspell it as Longtitude.
     east = drone.get("GpsLongitude", drone.get("GpsLongtitude", np.nan))
     if np.isfinite(east) and np.isfinite(north := drone.get("GpsLatitude", np.nan)):
         latitude, longitude = (north, east) if north or east else (latitude, longitude)
@@ -81,7 +81,7 @@ def read_gps(path: Path) -> GpsFix | None:
 
 
 def _gravity(drone: dict[str, float]) -> np.ndarray | None:
-    """Return the direction to the ground by a gimbal's pitch, 0 is level, -90 down, and roll."""
+    """Return the direction to the ground from the gimbal's roll and pitch (0: level, -90: down)."""
     angles = drone.get("GimbalPitchDegree", np.nan), drone.get("GimbalRollDegree", np.nan)
     if not max(map(abs, angles)) <= MAX_GRAVITY_TILT_DEG:
         return None
@@ -90,7 +90,7 @@ def _gravity(drone: dict[str, float]) -> np.ndarray | None:
 
 
 def _degrees(value: Any, sign: Any, below: str) -> float:
-    """Return degrees, minutes and seconds as degrees; NaN where they are none."""
+    """Convert degrees, minutes and seconds to degrees; NaN for anything else."""
     try:
         degrees, minutes, seconds = (_number(part) for part in value)
     except (TypeError, ValueError):

@@ -1,6 +1,6 @@
 """An interactive viewer of a point cloud as one self-contained HTML page.
 
-The page is `viewer.html` beside this module: plain JavaScript and WebGL 1.
+The page's template is `viewer.html` in this folder: plain JavaScript and WebGL 1.
 """
 
 from __future__ import annotations
@@ -21,29 +21,30 @@ from ..geometry.camera import PosedView, camera_spacing
 from ..geometry.point_cloud import UNITS, PointCloud, RobustBox, angular_spacing, robust_box
 
 DEFAULT_SLOPE, SLOPES = 0.35, (0.05, 3.0)
-"""Tangent of half the field of view, and its range."""
+"""Tangent of half the field of view: default and allowed range. Chosen by hand."""
 
 MAX_LEVEL = 65535
 """Positions are stored in 16 bits per axis."""
 
 MARGIN = 1.0
-"""Points further outside the robust box than this many times its size are left out."""
+"""Points further outside the robust box than this many times its size are left out: a few very
+distant points would make the quantisation steps coarse for all. Chosen by hand."""
 
 CAMERA_SIZE = 0.35
-"""Depth of the pyramid that stands for a camera, over the distance to the nearest other one."""
+"""Depth of a camera's pyramid relative to the distance to the nearest camera. Chosen by hand."""
 
 OVERVIEW_RADIANS = (0.4, 0.5)
-"""Azimuth and elevation from which a page with cameras is first seen."""
+"""A page with cameras opens at this azimuth and elevation. Chosen by hand."""
 
 OVERVIEW_POINTS = 2000
-"""That are looked at to place it."""
+"""The opening view is fitted to about this many points, for speed. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
 class PagePoints:
-    """Points (N, 3) as the page stores them: position = offset + levels * step.
+    """Points as the page stores them: position = offset + levels * step, all (N, 3).
 
-    `left_out` is the number of points too far away for the page.
+    `left_out` is the number of points that are not stored because they are too far away.
     """
 
     levels: np.ndarray
@@ -61,8 +62,8 @@ def write_html_page(
 ) -> None:
     """Write the page: 12 bytes per point, as 16-bit positions and 8-bit colours in base64.
 
-    The metadata are added to the caption, which has the counts, the unit and the precision; the
-    entry "title" becomes the heading. Cameras are pyramids, with a line from each to the next.
+    The metadata are added to the caption, which states the counts, the unit and the precision;
+    the entry "title" becomes the heading. Cameras are drawn as pyramids, connected by lines.
     """
     stored = page_points(cloud)
     precision = f"{stored.step.max() / 2:.2g} {UNITS[cloud.unit].split()[0]}"
@@ -78,23 +79,20 @@ def write_html_page(
         "caption": "\n".join(
             f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in caption.items()
         ),
-        "cloud": json.dumps(_description(cloud, stored, cameras)),  # numbers and a known word only
+        "cloud": json.dumps(_description(cloud, stored, cameras)),  # has no text of users to escape
         "positions": _base64(stored.levels.astype("<u2")),
         "colors": _base64(stored.colors),
     }
     template = resources.files(__package__).joinpath("viewer.html").read_text("utf-8")
-    # In one pass, so that metadata with such a mark stays as it is.
+    # In one pass, so that metadata that contains a placeholder is not replaced.
     page = re.sub(r"\{\{(\w+)\}\}", lambda mark: values[mark[1]], template)
     path.write_text(page, encoding="utf-8")
 
 
 def page_points(cloud: PointCloud) -> PagePoints:
-    """Quantise positions to 16 bits per axis, without those far outside the robust box.
-
-    A few points very far away would make the steps coarse for all.
-    """
+    """Quantise positions to 16 bits per axis, without those far outside the robust box."""
     box = robust_box(cloud)
-    # Points on a line or a plane have a flat box: the margin is that of the box's radius.
+    # Points on a line or a plane have a flat box: its radius gives the least margin.
     margin = MARGIN * np.maximum(box.high - box.low, box.radius * 1e-3)
     near = ((cloud.points >= box.low - margin) & (cloud.points <= box.high + margin)).all(1)
     points = cloud.points[near].astype(np.float64)
@@ -105,7 +103,7 @@ def page_points(cloud: PointCloud) -> PagePoints:
 
 
 def camera_lines(cameras: Sequence[PosedView]) -> np.ndarray:
-    """Return the ends (N, 2, 3) of lines that draw cameras, and the path from each to the next."""
+    """Return the end points (N, 2, 3) of lines that draw cameras and the path between them."""
     if not len(cameras):
         return np.empty((0, 2, 3))
     centres = np.array([camera.centre for camera in cameras])
@@ -147,14 +145,14 @@ def _description(
 def _overview(
     cloud: PointCloud, box: RobustBox, lines: np.ndarray, slope: float
 ) -> dict[str, object]:
-    """Return the nearest view from behind and above that shows the cloud and all cameras."""
+    """Return the closest view, from behind and above, that shows the cloud and all cameras."""
     inside = ((cloud.points >= box.low) & (cloud.points <= box.high)).all(axis=1)
     near = cloud.points[inside][:: max(1, int(inside.sum()) // OVERVIEW_POINTS)]
     shown = np.concatenate([near.astype(np.float64), lines])
     (c, s), (d, t) = ((np.cos(angle), np.sin(angle)) for angle in OVERVIEW_RADIANS)
-    axes = np.array([[c, 0, s], [t * s, d, -t * c], [-d * s, t, d * c]])  # as of the page
+    axes = np.array([[c, 0, s], [t * s, d, -t * c], [-d * s, t, d * c]])  # as in viewer.html
     seen = shown @ axes.T
-    # A point is inside where both |x - x0| and |y - y0| are below slope * (z + distance).
+    # A point is visible if both |x - x0| and |y - y0| are below slope * (z + distance).
     right, left = ((sign * seen[:, :2] - slope * seen[:, 2:]).max(axis=0) for sign in (1, -1))
     across = (right - left) / 2
     depth = np.median(near @ axes[2])
@@ -168,7 +166,7 @@ def _overview(
 
 
 def _largest_slope(cloud: PointCloud) -> float:
-    """Return the tangent of half the field of view from the origin that shows nearly all points."""
+    """Return the tangent of half the field of view that shows nearly all points from the origin."""
     before = cloud.points[cloud.points[:, 2] > 0].astype(np.float64)
     if not len(before):
         return DEFAULT_SLOPE

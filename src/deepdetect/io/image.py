@@ -35,15 +35,15 @@ Images = list[Any] | tuple[Any, ...] | np.ndarray
 """Several images: a list, a tuple, or a batch in an array of four dimensions."""
 
 MINIMUM_SIDE = 16
-"""Smallest width and height of an image, in pixels."""
+"""Images must be at least this many pixels wide and high. Chosen by hand."""
 
 ORIENTATION_TAG = 0x0112
 HEADER_BYTES = 26
-"""Of a PNG file up to its bits and the type of its colours; `GREY_PNG` is one without alpha."""
+"""Length of a PNG file's header up to bit depth and colour type; `GREY_PNG` means no alpha."""
 GREY_PNG = 0
 
 STRIP_PIXELS = 1 << 20
-"""PIL images are converted by strips of about this size: whole copies take gigabytes."""
+"""PIL images are converted in strips of about this many pixels: whole copies take gigabytes."""
 
 UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     2: lambda image: cv2.flip(image, 1),
@@ -54,7 +54,7 @@ UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     7: lambda image: cv2.flip(cv2.transpose(image), -1),
     8: lambda image: cv2.rotate(image, cv2.ROTATE_90_COUNTERCLOCKWISE),
 }
-"""What undoes each orientation of EXIF."""
+"""Functions that turn images upright, by their EXIF orientation."""
 
 
 @suggest_keywords
@@ -74,33 +74,32 @@ def load_image(
         image: a path; the content of an image file as bytes, or a file opened in binary mode,
             which is read from its beginning; a PIL image; or an array or a PyTorch tensor
             (H, W), (H, W, C) or (C, H, W) of 1, 3 or 4 channels: uint8, uint16 or float in [0, 1].
-            The fourth channel, alpha, is dropped. Files, also as bytes, are turned upright by
-            their EXIF tag. Pixels of files and PIL images are of these types too.
-        channels: the order of the colours in an array or a tensor: "bgr" for the images of
-            `cv2.imread` and `cv2.VideoCapture`. Files and PIL images say theirs themselves.
-        max_megapixels: larger files are refused before they are decoded, as a file of few bytes
-            can hold billions of pixels. None: 200, or what `--max-megapixels` says.
-            One megapixel takes 3 MB, and up to 7 MB while it is read.
-            Of WebP, Pillow reads 178 megapixels at most (`PIL.Image.MAX_IMAGE_PIXELS`).
-        value_range: the numbers that are black and white, of any type: (0, 4095) of a sensor of 12
-            bits. None: what the file says; else 0 and 1 of floats, and of uint16 0 and the smallest
-            of 255, 1023, 4095, 16383 and 65535 that none exceeds. Of signed and 32-bit integers it
-            must be given.
-        bands: the three bands that become red, green and blue, numbered from 1, of TIFF files and
-            arrays: (4, 3, 2) of Landsat 8. None: the first three, of four bands without alpha and
-            more it must be given.
-        page: number of the image in a file with several, from 0 on, thumbnails not counted. None:
-            the first of the largest of TIFF, else the first.
+            The fourth channel, alpha, is dropped. Files, also given as bytes, are turned upright
+            according to their EXIF orientation.
+        channels: order of the colours in an array or a tensor: "bgr" for images of `cv2.imread`
+            and `cv2.VideoCapture`. It does not apply to files and PIL images.
+        max_megapixels: size limit of image files: larger ones are rejected before decoding, since
+            a file of few bytes can hold billions of pixels. None: 200, or `--max-megapixels` in a
+            command. One megapixel takes 3 MB, and up to 7 MB while it is read. Pillow itself reads
+            WebP files of at most 178 megapixels (`PIL.Image.MAX_IMAGE_PIXELS`).
+        value_range: values of black and white, such as (0, 4095) for a 12-bit sensor. None: those
+            that the file states. Otherwise: 0 and 1 for floats; for uint16 0 and the smallest of
+            255, 1023, 4095, 16383 and 65535 that no pixel exceeds. Other integers need it.
+        bands: numbers, from 1, of the three bands of a TIFF file or array that become red, green
+            and blue: (4, 3, 2) for Landsat 8. None: the first three. Four bands without alpha, or
+            more than four, need it.
+        page: number of the image in a file with several, from 0, thumbnails not counted. None: the
+            largest image of a TIFF file (the first of equals), otherwise the first image.
         allow_truncated: read truncated files; the missing part is black or grey.
 
     Returns:
         (H, W, 3) uint8 RGB.
 
     Raises:
-        ImageError: the file is missing, truncated, damaged (as far as its format lets one
-            see), too large or no image, the array has a wrong shape, type or range or holds
-            NaN, or a side is shorter than 16 pixels.
-        MissingExtraError: a package for files of its kind is not installed; it is named.
+        ImageError: the file is missing, truncated, damaged (where the format allows to detect it),
+            too large or not an image; the array has a wrong shape, type or range or contains
+            NaN; or a side is shorter than 16 pixels.
+        MissingExtraError: the format needs a package that is not installed; the message names it.
         OptionError: an option is out of its range, or the order of the colours is unknown.
 
     Example:
@@ -119,9 +118,9 @@ def load_image(
 
 
 def load_deep(image: Any, channels: Channels, *, raw: bool = False) -> np.ndarray:
-    """Read an image as `load_image`, but as uint16 where it has more than 8 bits.
+    """Read an image like `load_image`, but as uint16 if it has more than 8 bits per channel.
 
-    Where `raw`, arrays and files of TIFF have all their bands, in their own type; (H, W, C).
+    If `raw`, arrays and TIFF files keep all their bands, (H, W, C), in their own data type.
     """
     return _load(image, channels, reading_options(), deep=True, raw=raw)
 
@@ -133,13 +132,13 @@ def _load(
     *,
     deep: bool = False,
     raw: bool = False,
-    **for_arrays: Any,  # what a command is given is for files
+    **for_arrays: Any,  # `options` may come from a command, whose options apply to files only
 ) -> np.ndarray:
     if is_file(image):
         rgb = _read_file(image, options, deep, raw)
     elif hasattr(image, "convert") and hasattr(image, "getbands"):  # a PIL image
         if for_arrays.get("bands") is not None:
-            raise OptionError("`bands` are of TIFF files and arrays, and a PIL image is none")
+            raise OptionError("`bands` need a TIFF file or an array: leave them out")
         rgb = _from_pil(image, "the image", for_arrays.get("value_range"), deep)
     elif raw and isinstance(image, np.ndarray) and image.ndim in (2, 3):
         rgb = image.reshape(*image.shape[:2], -1)
@@ -155,7 +154,7 @@ def _load(
 
 
 def load_each(images: Images, channels: Channels) -> Iterator[tuple[int, np.ndarray]]:
-    """Load images when they are asked for, each with its place in the list, tuple or batch."""
+    """Load the images of a list, tuple or batch one by one, each with its index."""
     batch_length(images)
     for number, image in enumerate(images):
         with image_named(number):
@@ -165,7 +164,7 @@ def load_each(images: Images, channels: Channels) -> Iterator[tuple[int, np.ndar
 
 
 def batch_length(images: Images) -> int:
-    """Return how many images there are; refuse what is no batch."""
+    """Return the number of images of a batch; raise an OptionError for anything else."""
     if not isinstance(images, (list, tuple)) and getattr(images, "ndim", 0) != 4:
         raise OptionError(
             "a batch is a list or a 4-D array: give one image to the method without _batch"
@@ -175,7 +174,7 @@ def batch_length(images: Images) -> int:
 
 @contextmanager
 def image_named(number: int) -> Iterator[None]:
-    """Let errors of an image say which of a list it is."""
+    """Add the index of an image in its list to the errors of the block."""
     try:
         yield
     except (ImageError, OptionError) as error:
@@ -183,11 +182,11 @@ def image_named(number: int) -> Iterator[None]:
 
 
 def ignore_masks(ignore: Any, images: int) -> list[Any]:
-    """Return the ignore mask of each image: one for all, or as many as there are images."""
+    """Return the ignore mask of each image: one mask is used for all, a list has one for each."""
     if not (isinstance(ignore, (list, tuple)) or getattr(ignore, "ndim", 2) == 3):
         return [ignore] * images
     if len(ignore) != images:
-        raise OptionError(f"`ignore` holds {len(ignore)} masks for {images} images: give one each")
+        raise OptionError(f"`ignore` has {len(ignore)} masks for {images} images: give one each")
     return list(ignore)
 
 
@@ -211,10 +210,10 @@ def scale_short_side(rgb: np.ndarray, short_side: int) -> np.ndarray:
 def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     """List the image files below a folder in natural order: "2.png" comes before "10.png".
 
-    Pictures that commands of this package have made there are left out.
+    Visualisations that commands of this package have written there are left out.
 
     Raises:
-        ImageError: the folder is missing, is a file, or holds no image outside of `exclude`.
+        ImageError: the folder is missing, is a file, or has no image outside of `exclude`.
     """
     from natsort import natsorted, ns
 
@@ -237,18 +236,18 @@ def find_images(folder: str | Path, exclude: Sequence[Path] = ()) -> list[Path]:
     )
     if not found:
         raise ImageError(
-            f"there is no image in {root}: put files there that end in .jpg, .png, .tif or alike"
+            f"there is no image in {root}: it needs files that end in .jpg, .png, .tif or similar"
         )
     images = [path for path in found if not was_made(path, root)]
     if not images:
-        raise ImageError(f"all images in {root} are results of earlier runs: name them, or others")
+        raise ImageError(f"all images in {root} are results of earlier runs: give files by name")
     return images
 
 
 def name_images(paths: Sequence[Path], exclude: Sequence[Path] = ()) -> dict[str, Path]:
-    """Return image files, and those below folders, by their names below these folders.
+    """Return image files, given ones and those below given folders, by their relative names.
 
-    Where two would have one name, all are named below the folder that holds them all.
+    Names are relative to the given folder, or to their common parent if two would be the same.
     """
     names: dict[Path, Path] = {}
     for path in paths:
@@ -268,7 +267,7 @@ def _read_file(
         if start[:4] in TIFF_STARTS and not name.lower().endswith(RAW_SUFFIXES):
             rgb, orientation = read_tiff(file, name, options, deep, raw)
         elif options.bands is not None and not raw:
-            raise OptionError(f"`bands` are of TIFF files and arrays, and {name} is none")
+            raise OptionError(f"`bands` need a TIFF file or an array: leave them out for {name}")
         else:
             with open_image(file, options=options) as image:
                 if image.format == "PNG" and start[24] == 16 and start[25] != GREY_PNG:
@@ -276,12 +275,12 @@ def _read_file(
                 else:
                     rgb = _from_pil(image, name, value_range=options.value_range, deep=deep)
                 orientation = orientation_of(image)
-            del image  # its pixels, before they are needed once more
+            del image  # frees its pixels before turning makes another copy
     return UPRIGHT[orientation](rgb) if orientation in UPRIGHT else rgb
 
 
 def _deep_png(file: BinaryIO, name: str, options: ReadingOptions, deep: bool) -> np.ndarray:
-    """Read a PNG file of 16 bits and several channels, of which Pillow keeps 8."""
+    """Read a PNG file with several channels of 16 bits, which Pillow would reduce to 8."""
     file.seek(0)
     values = cv2.imdecode(np.frombuffer(file.read(), np.uint8), cv2.IMREAD_UNCHANGED)
     if values is None:
@@ -309,7 +308,7 @@ def _from_pil(
         raise damaged_image(name, error) from None
     if image.mode.startswith(("I", "F")):
         values = deep_values(image)
-        white = 65535 if image.format == "PPM" else None  # Pillow has scaled them to it
+        white = 65535 if image.format == "PPM" else None  # Pillow scales PPM to this white
         return array_to_rgb(values, name=name, value_range=value_range, white=white, deep=deep)
     width, height = image.size
     rgb = np.empty((height, width, 3), np.uint8)
@@ -323,7 +322,7 @@ def _from_pil(
 
 def _strip_to_rgb(image: Any) -> np.ndarray:
     if image.mode == "P" and isinstance(image.info.get("transparency"), bytes):
-        image = image.convert("RGBA")  # Pillow warns when it drops such an alpha at once
+        image = image.convert("RGBA")  # avoids a warning of Pillow about the alpha of palettes
     if image.mode == "La":
-        image = image.convert("LA")  # the only mode that Pillow converts it to
+        image = image.convert("LA")  # Pillow converts this mode to no other
     return np.asarray(image.convert("RGB"))

@@ -1,4 +1,4 @@
-"""Image files of any kind, opened in one place: which formats, how large, and what is damaged."""
+"""Opening image files of any kind: known formats, the size limit, and checks for damage."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ FORMATS = {
     "QOI": ".qoi",
     "SGI": ".sgi",
     "PCX": ".pcx",
-    "HEIF": ".heic .heif .hif",  # where a plug-in of Pillow registers it
-    "JXL": ".jxl",  # the same
+    "HEIF": ".heic .heif .hif",  # if a plug-in of Pillow registers it
+    "JXL": ".jxl",  # likewise
     "TGA": ".tga",  # has no signature, so it comes last
 }
-"""Formats that are read: all are decoded in this process, unlike EPS, which starts Ghostscript."""
+"""Formats that are read, all decoded in this process; EPS is missing as it starts Ghostscript."""
 
 _RAW = ".dng .cr2 .cr3 .crw .nef .nrw .arw .sr2 .srf .raf .orf .rw2 .pef .srw .3fr .iiq .erf"
 RAW_SUFFIXES = tuple(f"{_RAW} .mrw .kdc .dcr .mos .mef .x3f .rwl".split())
-"""Of what sensors have measured, which rawpy develops."""
+"""Suffixes of raw photographs, which rawpy develops."""
 
 UNREAD = {
     b"v/1\x01": ("an OpenEXR image", ".exr"),
@@ -62,31 +62,31 @@ UNREAD = {
     b"\x93NUMPY": ("a NumPy array", ""),
     b"DICM": ("a DICOM image", ".dcm"),
 }
-"""Formats whose values have no range of their own, by how they begin: they are named."""
+"""First bytes, name and suffixes of formats without a defined value range; the error names them."""
 
 _OTHERS = (suffixes for _, suffixes in UNREAD.values())
 IMAGE_SUFFIXES = (*" ".join([*FORMATS.values(), *_OTHERS]).split(), *RAW_SUFFIXES)
-"""What the names of images end in, which are read, or named with the reason why not."""
+"""Suffixes of image files that are read or rejected with a reason."""
 
 MAX_MEGAPIXELS = 200.0
-"""Largest images that are read unless more is asked for: the largest sensors of phones have 200."""
+"""Larger images are rejected by default: the largest sensors of phones have 200 megapixels."""
 
 SIGNATURE_BYTES = 132
-"""Length of the beginning of a file that formats are told by; DICOM has its own at the end."""
+"""Formats are recognised by this many first bytes; the signature of DICOM is the last four."""
 
 STANDARD_INPUT = "/dev/stdin"
-"""Its name on every system; commands take "-" for it."""
+"""Name of standard input on every system; commands accept "-" for it."""
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
-"""In bytes 8 to 12 of HEIF files, which telephones write (ISO/IEC 23008-12)."""
+"""HEIF files, which phones write, have one of these in bytes 8 to 11 (ISO/IEC 23008-12)."""
 
 
 @suggest_keywords
 @dataclass(frozen=True)
 class ReadingOptions:
-    """How image files are read; the fields are those of `load_image`."""
+    """How image files are read; the fields are parameters of `load_image`."""
 
     max_megapixels: float = MAX_MEGAPIXELS
     value_range: tuple[float, float] | None = None
@@ -116,17 +116,17 @@ class ReadingOptions:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the pixels depend on, of what is not as usual."""
+        """The options that change pixels and differ from their defaults."""
         values = {**vars(self), "max_megapixels": None}
         return {name: value for name, value in values.items() if value not in (None, False)}
 
     def check_size(self, name: str, size: tuple[int, int]) -> None:
-        """Raise an ImageError for an image of too many pixels."""
+        """Raise an ImageError if an image has too many pixels."""
         width, height = size
         if width * height > 1e6 * self.max_megapixels:
             raise ImageError(
                 f"{name} has {width}x{height} pixels, which is over {self.max_megapixels:g} "
-                "megapixels: make it smaller, or allow more by `max_megapixels`"
+                "megapixels: make it smaller, or raise `max_megapixels`"
             )
 
 
@@ -136,9 +136,9 @@ _reading: ContextVar[ReadingOptions] = ContextVar("reading", default=_USUAL)
 
 @contextmanager
 def read_with(options: ReadingOptions) -> Iterator[None]:
-    """Read image files with these options in the block, where a call gives none of its own.
+    """Read image files with these options in the block, unless a call has options of its own.
 
-    It is for commands, since images are read deep below them. Other processes do not know it.
+    Commands use it, because images are read deep below them. It does not reach other processes.
     """
     token = _reading.set(options)
     try:
@@ -148,7 +148,7 @@ def read_with(options: ReadingOptions) -> Iterator[None]:
 
 
 def reading_options(**given: Any) -> ReadingOptions:
-    """Return the options that are given and not None, and else those of the command."""
+    """Return the given options that are not None; the others are those of `read_with`."""
     return replace(_reading.get(), **{n: value for n, value in given.items() if value is not None})
 
 
@@ -158,13 +158,13 @@ def open_image(
 ) -> Iterator[Any]:
     """Open an image file as a PIL image; its pixels are decoded when it is loaded.
 
-    The source is a path; the content of a file, as bytes; or a binary file, which is read from its
-    beginning and stays open. Errors of Pillow in the block become those below; they call an image
-    without a name by `what`.
+    The source is a path, the content of a file as bytes, or a binary file, which is read from its
+    beginning and stays open. Pillow's errors in the block become those below. `what` is the name
+    of an image without a path.
 
     Raises:
-        ImageError: the file is missing, truncated, damaged (as far as its format lets one see),
-            larger than `max_megapixels` or no image.
+        ImageError: the file is missing, truncated, damaged (where the format allows to detect it),
+            larger than `max_megapixels`, or not an image.
         MissingExtraError: it is a HEIF or raw image, and the package for it is not installed.
     """
     options = options or reading_options()
@@ -183,7 +183,7 @@ def open_image(
 
 @contextmanager
 def _truncated(allowed: bool) -> Iterator[None]:
-    """Let Pillow read files that lack their end; meanwhile other threads do so, too."""
+    """Let Pillow read truncated files in the block; the setting affects all threads."""
     from PIL import ImageFile
 
     before = ImageFile.LOAD_TRUNCATED_IMAGES
@@ -196,9 +196,9 @@ def _truncated(allowed: bool) -> Iterator[None]:
 
 @contextmanager
 def open_file(source: Any, what: str = "image") -> Iterator[tuple[BinaryIO, str]]:
-    """Open a source of `open_image` as a binary file, and say what errors call it.
+    """Open a source of `open_image` as a binary file; yield it and its name for errors.
 
-    Errors of Pillow in the block become `ImageError`.
+    Pillow's errors in the block become `ImageError`.
     """
     name = file_name(source, what)
     try:
@@ -208,16 +208,16 @@ def open_file(source: Any, what: str = "image") -> Iterator[tuple[BinaryIO, str]
         raise
     except FileNotFoundError:
         raise MissingImageError(f"there is no file {name}: check the path") from None
-    except OSError as error:  # of the file system; Pillow's have no number
-        if error.errno is None:
+    except OSError as error:
+        if error.errno is None:  # from Pillow, not from the file system
             raise damaged_image(name, error) from None
         raise ImageError(f"{name} cannot be read ({error.strerror}): check the path") from None
-    except Exception as error:  # Pillow's decoders raise many kinds
+    except Exception as error:  # Pillow's decoders raise many types
         raise damaged_image(name, error) from None
 
 
 def file_name(source: Any, what: str = "image") -> str:
-    """Return what errors call a file: its path where it has one, else "the image"."""
+    """Return the name of a file for errors: its path if it has one, otherwise "the image"."""
     if is_path(source):
         return os.fsdecode(source)
     name = getattr(source, "name", None)
@@ -225,12 +225,12 @@ def file_name(source: Any, what: str = "image") -> str:
 
 
 def is_path(source: Any) -> bool:
-    """Whether it is a path: text or any `os.PathLike`."""
+    """Return whether the source is a path: text or any `os.PathLike`."""
     return isinstance(source, (str, os.PathLike))
 
 
 def is_file(source: Any) -> bool:
-    """Whether `open_image` takes it: a path, bytes or an open file."""
+    """Return whether `open_image` accepts the source: a path, bytes or an open file."""
     return is_path(source) or isinstance(source, (bytes, bytearray)) or hasattr(source, "read")
 
 
@@ -238,11 +238,11 @@ def damaged_image(name: str, error: Exception | str) -> ImageError:
     """Return the error for a file that cannot be decoded."""
     from PIL import Image
 
-    if isinstance(error, Image.DecompressionBombError):  # some decoders look once more
+    if isinstance(error, Image.DecompressionBombError):  # some decoders have their own limit
         limit = 2e-6 * (Image.MAX_IMAGE_PIXELS or 0)
         return ImageError(
-            f"{name} is over {limit:.0f} megapixels, the most that Pillow reads of its format: "
-            "save it as PNG or JPEG, or raise PIL.Image.MAX_IMAGE_PIXELS"
+            f"{name} has more than {limit:.0f} megapixels, Pillow's limit for its format: save it "
+            "as PNG or JPEG, or raise PIL.Image.MAX_IMAGE_PIXELS"
         )
     if isinstance(error, MemoryError):
         return ImageError(f"there is not enough memory to read {name}: use a smaller image")
@@ -251,22 +251,22 @@ def damaged_image(name: str, error: Exception | str) -> ImageError:
 
 @contextmanager
 def _binary_file(source: Any, name: str) -> Iterator[BinaryIO]:
-    """Open a path or bytes; rewind an open file, or read it whole where that cannot be done."""
+    """Open a path or bytes; rewind an open file, or read all of it if it cannot be rewound."""
     if isinstance(source, (bytes, bytearray)):
         yield io.BytesIO(source)
     elif name == STANDARD_INPUT:
         yield io.BytesIO(_standard_input())
     elif is_path(source):
         mode = os.stat(source).st_mode
-        pipe = stat.S_ISFIFO(mode) and name.startswith("/dev/fd/")  # of a shell's <(...)
+        pipe = stat.S_ISFIFO(mode) and name.startswith("/dev/fd/")  # from a shell's <(...)
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode) or pipe):
             raise ImageError(f"{name} is a pipe or a device: save the image as a file first")
-        # Pillow gets no path: it would map uncompressed TIFF into memory, and turn it wrongly.
+        # Given a path, Pillow maps uncompressed TIFF into memory and turns it the wrong way.
         with open(os.fspath(source), "rb") as file:
             yield io.BytesIO(file.read()) if pipe else file
     else:
         if getattr(source, "closed", False) or isinstance(source, io.TextIOBase):
-            raise ImageError(f'{name} is no open binary file: open it with the mode "rb"')
+            raise ImageError(f'{name} is not an open binary file: open it with the mode "rb"')
         try:
             source.seek(0)
         except (AttributeError, OSError):
@@ -276,14 +276,14 @@ def _binary_file(source: Any, name: str) -> Iterator[BinaryIO]:
 
 @functools.cache
 def _standard_input() -> bytes:
-    """Return all of it, which comes once and may be wanted several times."""
+    """Return the content of standard input, which can be read only once, from a cache."""
     if sys.stdin is None:
         raise ImageError("there is no standard input: give the file")
     return sys.stdin.buffer.read()
 
 
 def _check_png(file: BinaryIO, name: str) -> None:
-    """Check the checksums of a PNG file, if it is one: Pillow skips those of the pixels."""
+    """Verify the checksums of a PNG file, if it is one: Pillow skips those of the pixels."""
     if file.read(len(PNG_SIGNATURE)) == PNG_SIGNATURE:
         kind = b""
         while kind != b"IEND":
@@ -300,14 +300,14 @@ def _check_png(file: BinaryIO, name: str) -> None:
 
 
 def identify(file: BinaryIO, name: str) -> Any:
-    """Open a file with the first of the formats that takes it.
+    """Open a file with the first of `FORMATS` that accepts it.
 
-    As `PIL.Image.open`, which has a limit of its own that only the whole program can raise.
+    It replaces `PIL.Image.open`, whose size limit can only be changed for the whole program.
     """
     from PIL import Image
 
     _hide_warning_of_large_images()
-    Image.init()  # registers all formats; that of AVIF is not in every Pillow
+    Image.init()  # registers all formats; not every build of Pillow has AVIF
     file.seek(0)
     start = file.read(SIGNATURE_BYTES)
     heif = start[4:8] == b"ftyp" and start[8:12] in HEIF_BRANDS
@@ -319,8 +319,8 @@ def identify(file: BinaryIO, name: str) -> Any:
     for beginning, (what, _) in UNREAD.items():
         if beginning in (start[: len(beginning)], start[128:]):
             raise ImageError(
-                f"{name} is {what}, whose values have a range that images have not: load it with "
-                "a program of its own, and give an array or a PNG file"
+                f"{name} is {what}, which has no defined value range: load it with another "
+                "program, and give an array or a PNG file"
             )
     if name.lower().endswith(RAW_SUFFIXES):
         return develop(file, name)
@@ -330,7 +330,7 @@ def identify(file: BinaryIO, name: str) -> Any:
         factory, accept = Image.OPEN[key]
         try:
             accepted = accept is None or accept(start)
-            if accepted and not isinstance(accepted, str):  # a text says which library is missing
+            if accepted and not isinstance(accepted, str):  # a string names a missing library
                 file.seek(0)
                 return factory(file, "")
         except (SyntaxError, IndexError, TypeError, struct.error):
@@ -341,7 +341,7 @@ def identify(file: BinaryIO, name: str) -> Any:
 
 
 def develop(file: BinaryIO, name: str) -> Any:
-    """Develop a raw photograph to a PIL image, upright, with the camera's white balance."""
+    """Develop a raw photograph to an upright PIL image, with the camera's white balance."""
     from PIL import Image
 
     try:
@@ -356,10 +356,10 @@ def develop(file: BinaryIO, name: str) -> Any:
 
 
 def _hide_warning_of_large_images() -> None:
-    """Hide Pillow's warning of 89 to 178 million pixels, unless the program filters it itself."""
+    """Hide Pillow's warning about 89 to 178 megapixels, unless the program filters it itself."""
     from PIL import Image
 
     kind = Image.DecompressionBombWarning
-    # Not catch_warnings, which is not safe with threads.
+    # `warnings.catch_warnings` would not be thread-safe.
     if not any(category is kind for _, _, category, *_ in warnings.filters):
         warnings.filterwarnings("ignore", category=kind, append=True)

@@ -14,7 +14,7 @@ from .image import UPRIGHT, orientation_of
 from .image_file import open_image
 
 WHITES = (1, 255, 65535)
-"""Of masks of 1, 8 and 16 bits, whatever the file has room for."""
+"""White is one of these values: masks of 1, 8 or 16 bits may be stored in files of more bits."""
 
 
 def save_mask(mask: np.ndarray, path: str | Path) -> None:
@@ -31,10 +31,10 @@ def encode_mask(mask: np.ndarray) -> bytes:
 
 
 def load_mask(source: Any) -> np.ndarray:
-    """Read a mask of any bit depth as (H, W) bool: True where a pixel is brighter than half.
+    """Read a mask of any bit depth as (H, W) bool: True where a pixel is brighter than mid-grey.
 
-    White is the least of `WHITES` that no pixel is above, else the brightest pixel. The mask is
-    turned upright, as by `load_image`. Arguments and errors: see `open_image`.
+    White is the smallest of `WHITES` that no pixel exceeds, otherwise the brightest pixel. The mask
+    is turned upright, as in `load_image`. Arguments and errors are those of `open_image`.
     """
     with open_image(source, what="mask") as opened:
         deep = opened.mode.startswith("I")  # 16 or 32 bits per pixel

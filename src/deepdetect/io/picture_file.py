@@ -1,6 +1,6 @@
-"""Pictures as files, and what an image file carries beside its pixels, which they keep.
+"""Writing images with the metadata of their source: georeference, ICC colour profile and EXIF.
 
-Where it lies on the Earth (a GeoTIFF, or a world file, by rasterio), its colour profile, its EXIF.
+The georeference is that of a GeoTIFF or a world file, read by rasterio.
 """
 
 from __future__ import annotations
@@ -25,21 +25,22 @@ from .image_file import open_file, open_image, reading_options
 from .tiff import NO_DATA, TIFF_STARTS, chosen_page, no_data_of
 
 PIXEL_SCALE, TRANSFORMATION = 33550, 34264
-"""Tags of GeoTIFF: a file that has a place has one of them."""
+"""Tags of GeoTIFF: every georeferenced file has one of them."""
 
 PLACED_FORMATS = ("TIFF", "JPEG", "PNG", "JPEG2000", "BMP", "GIF")
-"""Formats of Pillow that GDAL reads a place of."""
+"""Pillow's names of formats whose georeference GDAL can read."""
 
 FIRST_CENTRE = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-"""From pixels to those of GDAL, where the first corner of the first one is (0, 0)."""
+"""Matrix from our pixels to GDAL's, where (0, 0) is the top left corner of the first pixel."""
 
 ICC_PROFILE = 34675
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
 MAX_JPEG_SIDE_PX = 65_500
-"""The largest width and height that libjpeg writes."""
+"""The largest width and height, in pixels, that libjpeg writes."""
 
 JPEG_QUALITY = 85
+"""Quality of JPEG files on libjpeg's scale of 0 to 100. Chosen by hand."""
 
 EXIF_TEXTS = (
     Base.ImageDescription,
@@ -51,19 +52,19 @@ EXIF_TEXTS = (
     Base.Copyright,
 )
 EXIF_DIRECTORIES = (IFD.Exif, IFD.GPSInfo)
-"""What EXIF says beside how pixels are stored."""
+"""EXIF texts and directories that do not depend on how pixels are stored."""
 
 
 @dataclass(frozen=True, eq=False)
 class Metadata:
-    """What an image file carries beside its pixels.
+    """What an image file contains in addition to its pixels.
 
     Attributes:
-        to_world: (3, 3) from pixels, the centre of the first at (0, 0), to coordinates; or None.
-        crs: the system of these coordinates, as rasterio takes it; None: a local grid.
-        no_data: number that stands for none, as GDAL's tag says, or None.
-        profile, exif: ICC profile, and EXIF as Pillow's; or None.
-        plain: whether its pixels are grey or RGB of 8 or 16 bits.
+        to_world: (3, 3) matrix from pixels (first centre at (0, 0)) to world coordinates, or None.
+        crs: coordinate reference system as an object of rasterio; None: a local grid.
+        no_data: value that means "no data" according to GDAL's tag, or None.
+        profile, exif: the ICC profile, and EXIF as Pillow's object; or None.
+        plain: whether pixels are grey or RGB of 8 or 16 bits.
     """
 
     to_world: np.ndarray | None = None
@@ -74,18 +75,18 @@ class Metadata:
     plain: bool = True
 
     def moved(self, matrix: np.ndarray | None) -> Metadata:
-        """Return that of the image whose pixels are these, moved by an affine (3, 3) matrix."""
+        """Return the metadata of the image warped by an affine (3, 3) matrix."""
         if self.to_world is None or matrix is None:
             return replace(self, to_world=None, crs=None)
         return replace(self, to_world=self.to_world @ np.linalg.inv(matrix / matrix[2, 2]))
 
     def write_beside(self, path: Path) -> None:
-        """Write a world file, and a .prj file, beside a picture that cannot tell its place."""
+        """Write a world file and a .prj file next to an image, unless it is a GeoTIFF."""
         if self.to_world is None or path.suffix.lower() in (".tif", ".tiff"):
             return
         numbers = self.to_world[:2].T.ravel()
         texts = {_world_files(path)[0]: "".join(f"{number:.17g}\n" for number in numbers)}
-        with suppress(AttributeError, ValueError):  # there is none, or not in this dialect
+        with suppress(AttributeError, ValueError):  # no CRS, or one that this dialect cannot state
             texts[path.with_suffix(".prj")] = self.crs.to_wkt(version="WKT1_ESRI")
         for place, text in texts.items():
             with atomic_path(place) as temporary:
@@ -94,12 +95,12 @@ class Metadata:
     def encode(self, rgb: np.ndarray, suffix: str, settings: list[int]) -> bytes:
         """Return a PNG or JPEG file of an (H, W, 3) RGB image."""
         parts = {cv2.IMAGE_METADATA_ICCP: self._profile_of(b"RGB ")}
-        with suppress(struct.error):  # numbers that Pillow reads and cannot write
+        with suppress(struct.error):  # numbers that Pillow can read but not write
             if exif := self._exif_of(rgb):
                 parts[cv2.IMAGE_METADATA_EXIF] = exif.tobytes().removeprefix(b"Exif\0\0")
         kept = {kind: np.frombuffer(part, np.uint8) for kind, part in parts.items() if part}
         bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-        for count in range(len(kept), 0, -1):  # EXIF is left out first, if it is too large
+        for count in range(len(kept), 0, -1):  # without EXIF if that is too large, then without ICC
             kinds, values = [*kept][:count], [*kept.values()][:count]
             done, data = cv2.imencodeWithMetadata(suffix, bgr, kinds, values, settings)
             if done:
@@ -107,29 +108,29 @@ class Metadata:
         return bytes(cv2.imencode(suffix, bgr, settings)[1])
 
     def _profile_of(self, space: bytes) -> bytes | None:
-        """Return the ICC profile where it is whole, and of the colours that are written."""
+        """Return the ICC profile if it is complete and for the colour space that is written."""
         profile = self.profile or b""
         length = int.from_bytes(profile[:4], "big")
         return profile[:length] if length <= len(profile) and profile[16:20] == space else None
 
     def _exif_of(self, picture: np.ndarray) -> Any:
-        """Return the EXIF of an upright picture of another size; or None."""
+        """Return the EXIF for an upright image of another size, or None."""
         if not self.exif:
             return None
         height, width = picture.shape[:2]
         fine = self.exif.get_ifd(IFD.Exif)
         size = fine.get(Base.ExifImageWidth), fine.get(Base.ExifImageHeight)
-        if size != (width, height):  # the equivalent is that of the whole frame
+        if size != (width, height):  # the 35 mm equivalent applies to the whole frame only
             fine.pop(Base.FocalLengthIn35mmFilm, None)
         fine |= {Base.ExifImageWidth: width, Base.ExifImageHeight: height}
         self.exif[Base.Orientation] = 1
-        for code in EXIF_TEXTS:  # of any encoding, which Pillow reads as Latin-1
+        for code in EXIF_TEXTS:  # Pillow reads texts of any encoding as Latin-1
             if not isinstance(text := self.exif.get(code, b""), bytes):
                 self.exif[code] = str(text).encode("latin-1", "replace")
         return self.exif
 
     def write_tiff(self, bands: np.ndarray, path: Path) -> None:
-        """Write an (H, W) or (H, W, C) image of any type as TIFF, whole or not at all."""
+        """Write an (H, W) or (H, W, C) image of any data type as TIFF atomically."""
         from tifffile import imwrite
 
         tags: list[tuple[Any, ...]] = []
@@ -140,7 +141,7 @@ class Metadata:
         tags += [(code, "s", 0, text, True) for code, text in texts.items()]
         directories = {code: exif.get_ifd(code) for code in EXIF_DIRECTORIES} if exif else {}
         directories = {code: each for code, each in directories.items() if _can_be_written(each)}
-        # Pointers, which tifffile does not write: they are made of the tags of the codes before.
+        # tifffile writes no pointers to directories: `_append_directory` makes them of these tags.
         tags += [(code - 1, "I", 1, 0, True) for code in directories]
         bands = bands[:, :, 0] if bands.shape[2:] == (1,) else bands
         colour = bands.shape[2:] == (3,) and bands.dtype in (np.uint8, np.uint16)
@@ -166,7 +167,7 @@ class Metadata:
 
 
 def _can_be_written(values: dict[int, Any]) -> bool:
-    """Whether there are values of EXIF, and Pillow can write them: it reads larger numbers."""
+    """Return whether there are EXIF values that Pillow can write: it reads larger numbers."""
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     directory = ImageFileDirectory_v2()
@@ -177,7 +178,7 @@ def _can_be_written(values: dict[int, Any]) -> bool:
 
 
 def _append_directory(path: Path, code: int, values: dict[int, Any]) -> None:
-    """Append a directory of EXIF to a TIFF file, whose tag `code - 1` becomes the pointer to it."""
+    """Append a directory of EXIF to a TIFF file and turn the tag `code - 1` into its pointer."""
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
     from tifffile import TiffFile
 
@@ -195,43 +196,43 @@ def _append_directory(path: Path, code: int, values: dict[int, Any]) -> None:
 
 
 def read_metadata(source: Any, *, placed: bool = False) -> Metadata:
-    """Read what an image file carries beside its pixels; nothing of what cannot be read.
+    """Read the metadata of an image file; what cannot be read counts as missing.
 
-    Where it lies on the Earth is read where `placed`, of a file that is named by its path.
+    The georeference is read if `placed` and the source is a path.
 
     Raises:
-        MissingExtraError: it has such a place, and rasterio is not installed.
+        MissingExtraError: it has a georeference, and rasterio is not installed.
     """
     found, kind, page, orientation = Metadata(), "", None, 1
     path = Path(source) if isinstance(source, (str, Path)) else None
-    if path is not None and not path.is_file():  # a pipe is read once
+    if path is not None and not path.is_file():  # a pipe can be read only once
         return found
     with open_file(source) as (file, _):
         if file.read(4) in TIFF_STARTS:
             (found, page), kind = _of_tiff(file), "TIFF"
-    with suppress(Exception), open_image(source) as image:  # raw photographs and others have none
+    with suppress(Exception), open_image(source) as image:  # fails for raw photographs and others
         found = replace(found, profile=found.profile or image.info.get("icc_profile"))
         exif, kind = image.getexif(), image.format
         kept = _kept_exif(exif) if kind == "TIFF" else exif
         found = replace(found, exif=kept if len(kept) else None)
         orientation = exif.get(Base.Orientation, 1)
-    # The place is that of the image as it is stored.
+    # The georeference applies to the image as it is stored, not turned upright.
     if placed and path is not None and kind in PLACED_FORMATS and orientation == 1:
         found = replace(found, **_read_place(path, page))
     return found
 
 
 def _read_place(path: Path, page: Any) -> dict[str, Any]:
-    """Return `to_world` and `crs` of an image file, and of the page of a TIFF file, if known."""
+    """Return `to_world` and `crs` of an image file, or of a page of a TIFF file, if known."""
     place: dict[str, Any] = {}
     tagged = page is not None and {PIXEL_SCALE, TRANSFORMATION} & {*page.tags.keys()}
     if not (tagged or any(each.is_file() for each in _world_files(path))):
         return place
-    require_packages(f"the place of {path} on the Earth", "rasterio")
-    name = str(path.absolute())  # in others a colon has a meaning
+    require_packages(f"the georeference of {path}", "rasterio")
+    name = str(path.absolute())  # GDAL may take a relative path with a colon for a driver
     if page is not None and page.index:
         name = f"GTIFF_DIR:{page.index + 1}:{name}"
-    # What GDAL does not read has no place; the errors of a .prj file are ValueErrors.
+    # Files that GDAL cannot read have no georeference; a bad .prj file raises a ValueError.
     with _rasterio() as rasterio, suppress(OSError, ValueError), rasterio.open(name) as file:
         if not file.transform.is_identity:
             place["to_world"] = np.reshape(file.transform, (3, 3)) @ FIRST_CENTRE
@@ -244,7 +245,7 @@ def _read_place(path: Path, page: Any) -> dict[str, Any]:
 
 @contextmanager
 def _rasterio() -> Iterator[Any]:
-    """Give rasterio, which does not warn in the block of images without a place."""
+    """Yield rasterio; in the block it does not warn about images without a georeference."""
     import rasterio
 
     with warnings.catch_warnings():
@@ -253,24 +254,24 @@ def _rasterio() -> Iterator[Any]:
 
 
 def _world_files(path: Path) -> list[Path]:
-    """Return what world files beside an image may be called, the usual name first."""
+    """Return the possible paths of an image's world file, the usual one first."""
     ending = path.suffix[1:]
     names = [f".{ending[:1]}{ending[-1:]}w", f".{ending}w", ".wld"]
     return [path.with_suffix(name) for name in [*names, *map(str.upper, names)]]
 
 
 def _kept_exif(exif: Any) -> Any:
-    """Return what a TIFF file's tags say beside how its pixels are stored."""
+    """Return the EXIF among a TIFF file's tags, without those on how pixels are stored."""
     kept = Image.Exif()
     kept.update({code: exif[code] for code in EXIF_TEXTS if code in exif})
     for code in set(EXIF_DIRECTORIES).intersection(exif):
         kept.get_ifd(code).update(exif.get_ifd(code))
-        kept[code] = 0  # a pointer, set when it is written
+        kept[code] = 0  # placeholder of a pointer, set on writing
     return kept
 
 
 def _of_tiff(file: Any) -> tuple[Metadata, Any]:
-    """Return what a TIFF file carries, and the page that is read."""
+    """Return the metadata of a TIFF file except EXIF and place, and the page that is read."""
     from tifffile import TiffFile
 
     file.seek(0)
@@ -283,19 +284,19 @@ def _of_tiff(file: Any) -> tuple[Metadata, Any]:
 
 
 def save_picture(rgb: np.ndarray, path: str | Path, metadata: Metadata = Metadata()) -> None:
-    """Write a (H, W, 3) uint8 or uint16 RGB picture as .png or .tif, or of 8 bits as .jpg.
+    """Write a (H, W, 3) uint8 or uint16 RGB image as .png, .tif or (with 8 bits) .jpg, atomically.
 
-    It is written whole or not at all.
+    The file also contains the metadata.
     """
     suffix = picture_suffix(path)
     if suffix.startswith(".tif"):
         metadata.write_tiff(rgb, Path(path))
         return
-    # Checked before OpenCV is asked, which would also log it.
+    # OpenCV would fail without a reason and log a warning.
     if suffix != ".png" and max(rgb.shape[:2]) > MAX_JPEG_SIDE_PX:
         size = f"{rgb.shape[1]}x{rgb.shape[0]}"
         raise DeepDetectError(
-            f"{path} cannot hold a picture of {size} pixels: give it a name that ends in .png"
+            f"{path} cannot store an image of {size} pixels as JPEG: use a name that ends in .png"
         )
     settings = []
     if suffix != ".png":
@@ -306,7 +307,7 @@ def save_picture(rgb: np.ndarray, path: str | Path, metadata: Metadata = Metadat
 
 
 def picture_suffix(path: str | Path) -> str:
-    """Return the suffix of a picture's file in lower case; call it before any expensive work."""
+    """Return the suffix of an image file in lower case; call it before any expensive work."""
     suffix = Path(path).suffix.lower()
     if suffix not in PICTURE_SUFFIXES:
         *names, last = PICTURE_SUFFIXES

@@ -1,4 +1,4 @@
-"""Point clouds in files: one registry of formats, chosen by the file's suffix."""
+"""Writing point clouds: one registry of formats, chosen by the file's suffix."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ VERTEX_WITH_NORMAL = np.dtype([("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", 
 def write_ply(cloud: PointCloud, path: Path, metadata: Mapping[str, str]) -> None:
     """Write binary PLY (Turk, 1994): float x y z, uchar red green blue; 15 bytes per point.
 
-    With normals, nx ny nz come between, and it is 27.
-    Frame, unit and metadata are comments, which libraries do not write; non-ASCII becomes "?".
+    Normals are written between them as float nx ny nz, which makes 27 bytes per point. Frame, unit
+    and metadata become comments, which PLY libraries do not write; non-ASCII becomes "?".
     """
     vertices = np.empty(len(cloud), VERTEX if cloud.normals is None else VERTEX_WITH_NORMAL)
     names = "x y z" if cloud.normals is None else "x y z nx ny nz"
@@ -55,12 +55,12 @@ POINT_CLOUD_WRITERS: dict[str, PointCloudWriter] = {
     ".glb": write_glb,
     ".html": write_html_page,
 }
-"""By suffix. A new format is a function `(cloud, path, metadata) -> None` and a line here."""
+"""Writers by suffix. New formats need a function `(cloud, path, metadata) -> None`, listed here."""
 
 
 @suggest_keywords
 def save_point_cloud(cloud: PointCloud, path: str | Path, metadata: Metadata | None = None) -> None:
-    """Write a point cloud, whole or not at all.
+    """Write a point cloud to a file atomically.
 
     Args:
         cloud: the cloud.
@@ -68,11 +68,11 @@ def save_point_cloud(cloud: PointCloud, path: str | Path, metadata: Metadata | N
             .ply: binary PLY, in the cloud's own frame and unit;
             .glb: binary glTF 2.0, y up and in metres;
             .html: a self-contained interactive viewer.
-        metadata: text and numbers by name, stored in the file, as {"source": "cones",
-            "seconds": 2.5}: as PLY comments, as glTF extras, or as the page's caption.
+        metadata: named texts and numbers, such as {"source": "cones", "seconds": 2.5}, stored as
+            PLY comments, as glTF extras, or in the page's caption.
 
     Raises:
-        OptionError: the suffix is unknown (a near one is named), or the cloud is empty.
+        OptionError: the suffix is unknown (the error suggests one), or the cloud is empty.
         DeepDetectError: the file cannot be written.
 
     Example:
@@ -93,12 +93,12 @@ def save_point_cloud(cloud: PointCloud, path: str | Path, metadata: Metadata | N
 
 
 def find_writer(path: str | Path) -> PointCloudWriter:
-    """Return the writer for a path; also used to check a suffix before the work begins."""
+    """Return the writer for a path; this also checks a suffix before expensive work."""
     return look_up("ending", Path(path).suffix.lower(), POINT_CLOUD_WRITERS)
 
 
 def format_metadata(metadata: Metadata) -> dict[str, str]:
-    """Format each value as one line of text: integers with commas, others with four digits.
+    """Format each value as one line: integers with commas, other numbers with four digits.
 
     Example:
         >>> format_metadata({"points": 49979, "within 1 px": 0.95312, "scene": "the  cones"})

@@ -1,4 +1,4 @@
-"""Keypoints and matches in files: npz or CSV, never pickles."""
+"""Reading and writing keypoints and matches: npz (without pickles) or CSV."""
 
 from __future__ import annotations
 
@@ -24,31 +24,31 @@ from ..features.keypoints import Keypoints
 from ..features.matches import Evidence, Matches, TwoViewGeometry
 
 OPTIONAL = ("logits", "sizes", "angles", "descriptors", "descriptor_type")
-"""Of keypoints, in npz files where there are any."""
+"""Attributes of keypoints that npz files contain if they are known."""
 
 MATCH_VALUES = (
     *("points0", "points1", "scores", "inliers"),
     *("subpixel", "indices0", "indices1"),
 )
-"""Of matches, by the names of their attributes, beside keypoints and geometry."""
+"""Attributes of matches in npz files, in addition to their keypoints and geometry."""
 
 CSV_ROWS = 100_000
-"""Written at a time: a table of all takes as much memory as the keypoints once more."""
+"""Tables are written by this many rows: one table of all rows would double the memory needed."""
 
 
 @suggest_keywords
 def save_keypoints(keypoints: Keypoints, path: str | Path) -> None:
-    """Write keypoints, whole or not at all.
+    """Write keypoints to a file atomically.
 
     Args:
         keypoints: the keypoints.
-        path: ending in .npz (arrays `keypoints` (N, 2) float32, `scores` (N,) float32,
-            `image_size` (width, height), and where there are any `logits`, `sizes` and `angles`
-            (N,) float32, `descriptors` (N, D) and `descriptor_type`) or .csv (columns x, y, score,
-            and size and angle where there are any).
+        path: ending in .npz or .csv. An npz file has the arrays `keypoints` (N, 2) float32,
+            `scores` (N,) float32, `image_size` (width, height), and, if known, `logits`, `sizes`
+            and `angles` (N,) float32, `descriptors` (N, D) and `descriptor_type`. A CSV file has
+            the columns x, y, score, and, if known, size and angle.
 
     Raises:
-        OptionError: the file's ending is another.
+        OptionError: the path has another ending.
         DeepDetectError: the file cannot be written.
     """
     if _format(path) == ".npz":
@@ -69,7 +69,7 @@ def load_keypoints(path: str | Path) -> Keypoints:
     """Read keypoints from the npz file that `save_keypoints` wrote.
 
     Raises:
-        DeepDetectError: the file is missing or is no such file.
+        DeepDetectError: the file is missing or has other content.
 
     Example:
         >>> import tempfile
@@ -85,20 +85,20 @@ def load_keypoints(path: str | Path) -> Keypoints:
 
 @suggest_keywords
 def save_matches(matches: Matches, path: str | Path) -> None:
-    """Write matches, whole or not at all.
+    """Write matches to a file atomically.
 
     Args:
         matches: the matches.
-        path: ending in .npz (arrays named as the attributes of `Matches`: `points0` and `points1`
-            (M, 2) float32, `indices0` and `indices1` (M,) int32 rows of the keypoints, `scores`
-            (M,) float32, `inliers` (M,) bool and `subpixel` bool; `keypoints0` (N, 2) float32,
-            `keypoint_scores0` (N,) float32 and `image_size0` (width, height), and the same of the
-            second image; and of a geometry `model`, `scene` and `confidence`, strings, `matrix`
-            (3, 3), or (0, 0) without one, and the numbers of its `Evidence`) or .csv (columns x0,
-            y0, x1, y1, score, inlier).
+        path: ending in .npz or .csv. An npz file has the attributes of `Matches`: `points0` and
+            `points1` (M, 2) float32, `indices0` and `indices1` (M,) int32 rows of the keypoints,
+            `scores` (M,) float32, `inliers` (M,) bool and `subpixel` bool. For each image, here
+            the first, it has `keypoints0` (N, 2) float32, `keypoint_scores0` (N,) float32 and
+            `image_size0` (width, height). For a geometry it has the strings `model`, `scene` and
+            `confidence`, `matrix` (3, 3), or (0, 0) if unknown, and the numbers of its `Evidence`.
+            A CSV file has the columns x0, y0, x1, y1, score, inlier.
 
     Raises:
-        OptionError: the file's ending is another.
+        OptionError: the path has another ending.
         DeepDetectError: the file cannot be written.
     """
     if _format(path) == ".csv":
@@ -125,7 +125,7 @@ def load_matches(path: str | Path) -> Matches:
         The matches. Their `seconds` are empty, and their keypoints have no logits.
 
     Raises:
-        DeepDetectError: the file is missing or is no such file.
+        DeepDetectError: the file is missing or has other content.
     """
     with _arrays_in(path, "matches") as arrays:
         keypoints = [
@@ -151,24 +151,24 @@ def load_matches(path: str | Path) -> Matches:
 
 @contextmanager
 def _arrays_in(path: str | Path, content: str) -> Iterator[dict[str, Any]]:
-    """Give the arrays of an npz file, those without a shape as numbers and texts.
+    """Yield the arrays of an npz file; those without dimensions become numbers and strings.
 
-    Errors, also of the block, say which file it is and what it should hold.
+    Errors, also in the block, name the file and the content that is expected.
     """
     try:
         with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             yield {name: _value(array) for name, array in arrays.items()}
     except FileNotFoundError:
         raise MissingFileError(f"there is no file {path}: check the path") from None
-    except Exception as error:  # zip, its compressions and NumPy raise many kinds
+    except Exception as error:  # NumPy and the zip decoders raise many types
         missing = "it has no array " if isinstance(error, KeyError) else ""
         raise InvalidFileError(
-            f"{path} holds no {content} ({missing}{first_line(error)}): write the file again"
+            f"{path} contains no {content} ({missing}{first_line(error)}): write the file again"
         ) from error
 
 
 def _value(array: np.ndarray) -> Any:
-    """Return an array, or the number or text in one without a shape; None for a matrix of none."""
+    """Return an array, the value of one without dimensions, or None for an empty (0, 0) matrix."""
     if array.shape == (0, 0):
         return None
     return array if array.ndim else array.item()
@@ -182,7 +182,7 @@ def _format(path: str | Path) -> str:
 
 
 def _save_csv(path: str | Path, header: str, columns: list[np.ndarray]) -> None:
-    # Scores rank: no two that differ may be rounded to one.
+    # Scores are ranks: 9 digits keep any two different float32 apart.
     digits = ["%.9g" if name == "score" else "%.7g" for name in header.split(",")]
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write(f"{header}\n".encode())
@@ -198,7 +198,7 @@ def read_matrix(path: Path) -> np.ndarray:
     except OSError as error:
         raise ImageError(f"{path} cannot be read ({error.strerror}): check the folder") from None
     except ValueError:
-        raise ImageError(f"{path} holds no 3x3 matrix: nine numbers are expected") from None
+        raise ImageError(f"{path} contains no 3x3 matrix: it needs nine numbers") from None
     if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
-        raise ImageError(f"{path} holds a matrix that cannot be inverted: get the file again")
+        raise ImageError(f"{path} contains a matrix that cannot be inverted: get the file again")
     return matrix

@@ -1,6 +1,6 @@
-"""TIFF files: which of their images is read, and what its numbers mean.
+"""Reading TIFF files: the choice of the page, and the conversion of its values to RGB.
 
-Each tag that changes what pixels mean is honoured, or refused by name.
+Each tag that changes the meaning of pixels is respected, or the error names it.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from .image_file import ReadingOptions, damaged_image, develop, identify
 TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 
 MIN_IS_WHITE, MIN_IS_BLACK, RGB, PALETTE, CMYK, YCBCR = 0, 1, 2, 3, 5, 6
-"""Photometric interpretations that are read."""
+"""Codes of photometric interpretations that are read."""
 
 MOSAICS = (32803, 34892)
-"""Those of raw photographs: a mosaic of colour filters, and linear raw."""
+"""Photometric interpretations of raw photographs: a colour filter array, and linear raw."""
 
 JPEG = (6, 7)
-"""Compressions that hold YCbCr."""
+"""Codes of JPEG compression, the only one for which YCbCr is read."""
 
 ALPHA = (1, 2)
-"""Extra samples that are no band."""
+"""Types of extra samples that are alpha and not a band."""
 
 ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
-"""Tags; the last is of GDAL."""
+"""Codes of tags; GDAL defines the last one."""
 
 MAX_BYTES_PER_PIXEL = 256
-"""Of all bands: a small file can claim any number of them."""
+"""Files with more bytes per pixel are rejected: a small file can claim any number of bands."""
 
 
 def read_tiff(
@@ -43,17 +43,18 @@ def read_tiff(
     """Read an image of a TIFF file.
 
     Returns:
-        (H, W, 3) RGB as it is stored, uint8, or uint16 of more bits where `deep`; where `raw` and
-        its numbers are no code of colours, all bands in their own type; and its EXIF orientation.
+        (H, W, 3) RGB, not yet turned upright, and the EXIF orientation. RGB is uint8, or uint16 if
+        `deep` and the file has more bits. If `raw`, grey and RGB files give all their bands,
+        (H, W, C), in their own data type.
 
     Raises:
-        ImageError: as of `load_image`.
-        MissingExtraError: it is a raw photograph, or compressed in a way that needs imagecodecs.
+        ImageError: as in `load_image`.
+        MissingExtraError: it is a raw photograph, or its compression needs imagecodecs.
     """
     from tifffile import TiffFile
 
     logger = logging.getLogger("tifffile")
-    if not logger.handlers:  # or it writes to standard error
+    if not logger.handlers:  # otherwise it writes to standard error
         logger.addHandler(logging.NullHandler())
     size = file.seek(0, os.SEEK_END)
     file.seek(0)
@@ -73,7 +74,7 @@ def read_tiff(
             return read_tiff(filled, name, options, deep, raw)
         try:
             array = page.asarray(squeeze=False)
-        except Exception as error:  # tifffile and its decoders raise many kinds
+        except Exception as error:  # tifffile and its decoders raise many types
             if "imagecodecs" not in str(error):
                 raise damaged_image(name, error) from None
             return _read_by_pillow(file, stored, page, name, options), 1
@@ -86,7 +87,7 @@ def read_tiff(
 
 
 def chosen_page(stored: list[Any], name: str, options: ReadingOptions) -> Any:
-    """Return the page that is asked for, or the largest; thumbnails and masks are none."""
+    """Return the page that the options choose, or the largest; skip thumbnails and masks."""
     pages = [page for page in stored if not (page.is_reduced or page.is_mask)]
     if not pages:
         below = [each for page in stored for each in page.pages or ()]
@@ -99,7 +100,7 @@ def chosen_page(stored: list[Any], name: str, options: ReadingOptions) -> Any:
 
 
 def _checked_kind(page: Any, name: str) -> int:
-    """Return the photometric interpretation; refuse what is not read."""
+    """Return the photometric interpretation; raise an ImageError if it cannot be read."""
     photometric, count = int(page.photometric), page.samplesperpixel
     known = photometric in (MIN_IS_WHITE, MIN_IS_BLACK, RGB, *MOSAICS)
     known |= photometric == PALETTE and count == 1 and page.colormap is not None
@@ -113,14 +114,14 @@ def _checked_kind(page: Any, name: str) -> int:
     elif page.nbytes > MAX_BYTES_PER_PIXEL * page.imagewidth * page.imagelength:
         known, what = False, f"{count} bands"
     if not known:
-        raise ImageError(f"{name} holds {what}, which are not read: convert it to RGB")
+        raise ImageError(f"{name} contains {what}, which cannot be read: convert it to RGB")
     return photometric
 
 
 def _to_rgb(
     bands: np.ndarray, page: Any, name: str, options: ReadingOptions, deep: bool
 ) -> np.ndarray:
-    """Return the RGB image that (H, W, bands) numbers are by the tags of their page."""
+    """Convert (H, W, bands) values to RGB as the tags of their page define."""
     photometric = int(page.photometric)
     chosen = _chosen_bands(bands, page, name, options)
     value, absent = no_data_of(page), None
@@ -150,17 +151,17 @@ def _chosen_bands(bands: np.ndarray, page: Any, name: str, options: ReadingOptio
     whole = photometric in (PALETTE, CMYK)
     if options.bands is not None:
         if whole or max(options.bands) > count:
-            raise ImageError(f"{name} has {count} bands: leave `bands` out, or choose of these")
+            raise ImageError(f"{name} has {count} bands: leave `bands` out, or choose from them")
         return bands[:, :, np.array(options.bands) - 1]
     grey = photometric in (MIN_IS_WHITE, MIN_IS_BLACK)
     alpha = bool(page.extrasamples) and page.extrasamples[-1] in ALPHA
     if not whole and not (count >= 3 if not grey else count - alpha in (1, 3)):
-        raise ImageError(f"{name} has {count} bands: choose three, as `bands=(3, 2, 1)`")
+        raise ImageError(f"{name} has {count} bands: choose three, such as `bands=(3, 2, 1)`")
     return bands if whole else bands[:, :, : count - alpha if grey else 3]
 
 
 def no_data_of(page: Any) -> float | None:
-    """Return the number that stands for no data, as GDAL's tag says."""
+    """Return the value that means "no data" according to GDAL's tag, or None."""
     try:
         return float(page.tags.valueof(NO_DATA))
     except (TypeError, ValueError):
@@ -168,7 +169,7 @@ def no_data_of(page: Any) -> float | None:
 
 
 def _white(page: Any) -> int | None:
-    """Return the number that is white, where the tags tell it."""
+    """Return the value of white if the tags tell it, otherwise None."""
     bits = page.bitspersample
     if page.dtype.kind != "u" or bits > 16 or bits == 8:
         return None
@@ -176,14 +177,14 @@ def _white(page: Any) -> int | None:
         return (1 << bits) - 1
     values = np.atleast_1d(page.tags.valueof(MAX_SAMPLE_VALUE, 0))
     largest = int(values.max())
-    # The largest of the pixels, as the standard has it, is hardly one below a power of two.
+    # By the standard the tag is the largest pixel value; 1 below a power of two it means white.
     return largest if largest > 255 and not largest & (largest + 1) else None
 
 
 def _read_by_pillow(
     file: BinaryIO, stored: list[Any], page: Any, name: str, options: ReadingOptions
 ) -> np.ndarray:
-    """Decode what tifffile cannot without imagecodecs, where Pillow is known to be right."""
+    """Decode by Pillow what tifffile cannot without imagecodecs, if Pillow decodes it correctly."""
     bits, photometric = page.bitspersample, int(page.photometric)
     plain = page.dtype.kind in ("b", "u") and (
         bits in (1, 8) or (bits == 16 and page.samplesperpixel == 1)
@@ -192,7 +193,7 @@ def _read_by_pillow(
     plain &= options.bands is None and page.tags.get(NO_DATA) is None
     if not plain or page not in stored:
         raise MissingExtraError(
-            f"{name} is compressed by {page.compression.name} with {bits} bits a number: run pip "
+            f"{name} has {page.compression.name} compression with {bits} bits per value: run pip "
             "install imagecodecs to read it"
         )
     with identify(file, name) as image:

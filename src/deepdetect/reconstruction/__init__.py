@@ -1,4 +1,4 @@
-"""Two images in, points in space out: calibration, pose, triangulation, what is wrong."""
+"""Reconstruction of two images: calibration, pose, triangulation, and checks."""
 
 import lazy_loader
 

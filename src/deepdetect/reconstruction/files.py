@@ -20,7 +20,7 @@ ENDINGS = (*POINT_CLOUD_WRITERS, "_depth.png", "_depth.npz", "_depth.jpg", ".jso
 def save_reconstruction(
     found: Reconstruction, paths: Mapping[str, Path], title: str, **values: Any
 ) -> dict[str, Any]:
-    """Write the files of all `ENDINGS`; return what the JSON holds, the given values among them."""
+    """Write the files of all `ENDINGS`; return the contents of the JSON, including `values`."""
     started = time.perf_counter()
     summary = found.summary()
     notes = {

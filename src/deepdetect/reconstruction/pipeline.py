@@ -1,7 +1,7 @@
-"""Two images in, coloured 3D points out (paper, Figure 8).
+"""Reconstruction of coloured 3D points from two images (paper, Figure 8).
 
 General pairs: keypoints -> matches -> pose -> triangulation -> checks. Rectified pairs: a dense
-disparity map, from which the keypoints of the left image take their points.
+disparity map, from which the keypoints of the left image become points.
 """
 
 from __future__ import annotations
@@ -41,14 +41,15 @@ from .result import Reconstruction
 from .two_view import checked_pose, reconstruct_two_view, refined_corners
 
 SOR_WINDOW_PX = 9
-"""Side of the window of pixels that SOR compares with in rectified pairs."""
+"""SOR of rectified pairs compares a pixel with those in a window of this side. Chosen by hand."""
 
 MIN_UNIQUE_FRACTION = 0.1
-"""Of the keypoints with a match on their row, where only unique matches count: unrelated images
-gave up to 0.005, rectified pairs at least 0.35."""
+"""This fraction of the keypoints must have a unique match on their row: for unrelated images it was
+up to 0.005, for rectified pairs at least 0.35."""
 
 MIN_MATCHED_FRACTION = 0.25
-"""The same where all matches count: up to 0.16, and at least 0.64."""
+"""This fraction must have a match if matches need not be unique: for unrelated images it was up to
+0.16, for rectified pairs at least 0.64."""
 
 
 @suggest_keywords
@@ -74,25 +75,25 @@ def reconstruct(
 
     Args:
         image0, image1: anything `load_image` takes. The points are in the frame of the first
-            camera, which of a rectified pair is the left one.
-        detector: as of `match_images`; default `DeepDetect("dense")`.
-        channels: order of the colours in images that are arrays, as of `load_image`.
-        calibration: file of the cameras, as for `Calibration.load`, or a `Calibration`. Without one
-            the focal length is taken from `focal_px`, or from EXIF.
+            camera, which is the left one of a rectified pair.
+        detector: a detector as in `match_images`; default `DeepDetect("dense")`.
+        channels: order of the colours in images that are arrays, as in `load_image`.
+        calibration: file of the cameras; also a `Calibration`. Without one the focal length is
+            `focal_px`, or that of EXIF.
         focal_px: focal length in pixels of both cameras, instead of a calibration.
         rectified: whether matches lie on the same row of both images. None: detected.
         selection: which pixels of a heat map become keypoints; None: those over 0.5. A density of 1
             takes every pixel, and `DENSE` disparities; `subpixel` does not apply.
-        ignore: as of `match_images`; of a rectified pair only the mask of the left image counts.
+        ignore: masks as in `match_images`; for a rectified pair, only that of the left image.
         seed: seed of all random choices.
         point_filter: which points are kept.
         progress: called with the name of each stage when it ends.
 
     Returns:
-        The points, with all that is known about them.
+        The points, with statistics about them.
 
     Raises:
-        ImageError: an image cannot be read or is not fit.
+        ImageError: an image cannot be read or used.
         OptionError: an option is unknown or out of its range.
         ReconstructionError: there is no calibration, it is wrong, or the pair gives no depth.
 
@@ -120,12 +121,12 @@ def reconstruct(
         if rectification.swapped:
             offset = known.disparity_offset_px
             raise ReconstructionError(
-                "this is a rectified pair with left and right exchanged: give the other one first"
+                "left and right of this rectified pair are exchanged: give the other image first"
                 + (f"; or the disparity offset of {offset:g} px is wrong" if offset else "")
             )
     detector = DeepDetect("dense") if detector is None else detector
     masks = ignore_masks(ignore, 2)
-    # Matches start at whole pixels, and disparities are those of pixels.
+    # Matches and disparities start at whole pixels of the left image.
     whole = None if selection is None else replace(selection, subpixel=False)
     if rectified:
         with timer.stage("keypoints"):
@@ -140,7 +141,7 @@ def reconstruct(
                 detector,
                 selection=whole,
                 ignore=masks,
-                # A homography would keep the points of one plane, and drop all in front of it.
+                # A homography would keep only the points on one plane.
                 model="fundamental",
                 seed=seed,
                 tentative_matches=tentative,
@@ -175,21 +176,21 @@ def estimate_pose(
 
     Args:
         image0, image1: anything `load_image` takes.
-        detector: as of `match_images`; default `DeepDetect()`.
-        channels: order of the colours in images that are arrays, as of `load_image`.
-        calibration: file of the cameras, as for `Calibration.load`, or a `Calibration`. Without one
-            the focal length is taken from `focal_px`, or from EXIF.
+        detector: a detector as in `match_images`; default `DeepDetect()`.
+        channels: order of the colours in images that are arrays, as in `load_image`.
+        calibration: file of the cameras; also a `Calibration`. Without one the focal length is
+            `focal_px`, or that of EXIF.
         focal_px: focal length in pixels of both cameras, instead of a calibration.
         seed: seed of all random choices.
         progress: called with the name of each stage when it ends.
 
     Returns:
-        Rotation and translation, X1 = rotation @ X0 + translation, whose length cannot be known.
+        Rotation and translation: X1 = rotation @ X0 + translation, of unknown length.
 
     Raises:
-        ImageError: an image cannot be read or is not fit.
-        ReconstructionError: there is no calibration, or it is wrong; a NoDepthError says that the
-            images show one plane, or the camera only turned, so that the pose cannot be told.
+        ImageError: an image cannot be read or used.
+        ReconstructionError: there is no calibration, or it is wrong; as a NoDepthError, the images
+            show one plane, or the camera only rotated, so the pose is undetermined.
 
     Example:
         >>> import cv2
@@ -225,12 +226,12 @@ def _from_disparities(
     point_filter: PointFilterOptions,
     timer: StageTimer,
 ) -> dict[str, Any]:
-    """Take the keypoints of the left image from the disparity map of a rectified pair."""
+    """Reconstruct the left keypoints of a rectified pair; return the fields of `Reconstruction`."""
     check_cameras(calibration)
     keypoints = replace(keypoints, xy=np.rint(keypoints.xy))
     if not len(keypoints):
         raise NoDepthError(
-            "the left image has no keypoint: lower `threshold`, or give a larger `density`"
+            "the left image has no keypoints: lower `threshold`, or give a larger `density`"
         )
     with timer.stage("matching"):
         found = compute_disparity(*grays, options).at(keypoints)
@@ -263,7 +264,7 @@ def _from_disparities(
         kept[kept] = inliers
     if not kept.any():
         raise ReconstructionError(
-            "no disparity gives a depth: the scene is too far away for cameras so close together"
+            "no disparity gives a depth: the scene is too far away for this baseline"
         )
     return {
         "points": (rays[kept] * depth[kept, None]).astype(np.float32),
@@ -284,16 +285,16 @@ def sor_inliers_on_grid(
     size: tuple[int, int],
     point_filter: PointFilterOptions = PointFilterOptions(),
 ) -> np.ndarray:
-    """Return which whole pixels (N, 2) of a rectified pair have about the depth of those around.
+    """Return (N,) bool: which whole pixels (N, 2) of a rectified pair are like those around them.
 
-    As `sor_inliers`, with all in a window as neighbors and the root mean square of the differences
-    of disparity as distance: three box filters. A pixel alone in its window is an outlier only
-    where most are not.
+    It is `sor_inliers` with all pixels of a window as neighbors, and the root mean square of the
+    differences of disparity as distance, which takes three box filters. A pixel alone in its window
+    is an outlier only if most pixels are not alone.
     """
     if not len(pixels):
         return np.ones(0, bool)
     places = np.rint(pixels).astype(np.int64)
-    middle = float(np.median(disparity))  # float32 squares of large numbers lose the differences
+    middle = float(np.median(disparity))  # squares of large numbers would lose small differences
     centred = (disparity - middle).astype(np.float64)
     others, total, squares = (
         window_sums(places, values, size[::-1], SOR_WINDOW_PX)
@@ -329,7 +330,7 @@ def _calibration(
     images: tuple[Any, Any],
     sizes: tuple[tuple[int, int], tuple[int, int]],
 ) -> Calibration:
-    """Return the calibration that is given, or the one the images carry."""
+    """Return the given calibration, or the one in the EXIF of the images."""
     if given is not None and focal_px is not None:
         raise OptionError("give `calibration` or `focal_px`, not both")
     if isinstance(given, Calibration):
@@ -337,7 +338,7 @@ def _calibration(
         return given
     if given is not None:
         names = [str(image) if isinstance(image, (str, Path)) else "" for image in images]
-        left, right = (re.search(r"image_0?(\d)\b", name) for name in names)  # of KITTI
+        left, right = (re.search(r"image_0?(\d)\b", name) for name in names)  # names of KITTI
         views = (int(left[1]), int(right[1])) if left and right else None
         return Calibration.load(given, *sizes, views=views)
     if focal_px is not None:

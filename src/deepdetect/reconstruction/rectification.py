@@ -1,7 +1,7 @@
-"""Rectified pairs: how they are told from others, and what shows that one is none, or has no depth.
+"""Recognition of rectified pairs, and checks that such a pair is right and has depth.
 
-Matches of a rectified pair lie on the same row of both images. These rows, a model without any
-parameter, must explain about as many matches as the best models with parameters do.
+Matches of a rectified pair lie on the same row of both images. This model without parameters must
+explain about as many matches as the best models with parameters do.
 """
 
 from __future__ import annotations
@@ -19,82 +19,86 @@ from ..geometry.two_view import SCENE_THRESHOLDS_PX, fit_model, is_planar, is_st
 from ..matching.guided import TentativeMatches, find_tentative_matches
 
 MAX_ROW_DISTANCE_PX = 1.0
-"""Rows by which a match of a rectified pair may be off."""
+"""Matches of a rectified pair may be off their row by this much. Chosen by hand."""
 
 MIN_INLIER_RATIO = 0.9
-"""Matches on rows per match that the best other model explains."""
+"""Rows must explain this share of the matches that the best other model does. Chosen by hand."""
 
 MIN_DISPARITY_SPREAD_PX = 2.0
-"""5th to 95th percentile of the disparities of a pair with depth; whole pixels differ by 1."""
+"""Disparities of a pair with depth must spread by this much from the 5th to the 95th percentile:
+matches at whole pixels always spread by 1."""
 
 MIN_PLANAR_SPREAD_PX = 8.0
-"""The same where one homography explains the pair: a slanted plane has it, a small rotation not."""
+"""Disparities must spread by this much if one homography explains the pair: those of a slanted
+plane do so, those of a camera that rotated a little spread less."""
 
 GRID_SIZE_PX = 8
-"""Cells of the left image of this size give one match each."""
+"""Each cell of the left image of this size gives one match. Chosen by hand."""
 
 ITERATIONS = 500
-"""Samples of three matches, for the rows that are shifted, tilted and scaled."""
+"""RANSAC draws this number of samples of three matches for `_best_other_rows`. Chosen by hand."""
 
 COARSE_SIDE_PX, COARSE_KEYPOINTS = 480, 1000
-"""Longer side of the copies of the coarse pass, and keypoints of each."""
+"""The first pass matches copies with this longer side and number of keypoints. Chosen by hand."""
 
 MIN_COARSE_INLIERS = 50
-"""Fewest matches of the coarse pass that a fundamental matrix must explain to decide."""
+"""The coarse pass decides only if a fundamental matrix explains this number of its matches. Chosen
+by hand."""
 
 MAX_COARSE_ROW_ERROR_PX = 0.6
-"""A pair is rectified after the coarse pass only where its rows are off by less than this at
-`MIN_INLIER_RATIO` of the matches. In pixels of the images themselves: many matches show together
-what each is too coarse for."""
+"""The coarse pass accepts a pair only if its rows are off by less at `MIN_INLIER_RATIO` of the
+matches, in pixels of the full images: many matches together are more accurate than each alone."""
 
 MAX_FOCAL_DIFFERENCE_FRACTION = 0.01
-"""Of the focal lengths of both views. Rectified views have one; lengths given to three digits pass,
-and at 0.01 a row is off by 2 px at the edge of 400."""
+"""Focal lengths of rectified views may differ by this, so that those given to three digits pass. At
+0.01 a row is off by 2 px, 200 px from the middle."""
 
 MAX_CY_DIFFERENCE_PX = 2.0
-"""Of cy of both views: twice what a match may be off its row."""
+"""cy of rectified views may differ by this, twice what a match may be off its row."""
 
 MIN_DEPTH_SPREAD_PX = 0.5
-"""Between the 5th and 95th percentile of the disparities of a scene with depth."""
+"""Disparities of a scene with depth spread by more, from the 5th to the 95th percentile. Chosen by
+hand."""
 
 MIN_DISPARITY_PX = -1.0
-"""With the offset; smaller ones put points behind the cameras."""
+"""A point with a smaller disparity, with its offset, is behind the cameras; one pixel is noise."""
 
 MAX_BEHIND_FRACTION = 0.25
-"""Of the points, behind the cameras."""
+"""A calibration is wrong if more points lie behind the cameras. Chosen by hand."""
 
 MAX_ROTATION_ERROR_PX, MIN_ROTATION_FRACTION = 0.3, 0.5
-"""Within which the rotation explains a disparity, and the fraction of them that it must explain:
-of four rotated views at least 0.64."""
+"""A rotation explains a disparity up to this error, and the pair if it explains more than this
+fraction: it was at least 0.64 for four views rotated by half a degree to two."""
 
 MAX_RATIO_TO_PLANE = 0.5
-"""Median error of the rotation over that of the best plane in disparity: of rotated views up to
-0.33, of slanted walls at least 5.3."""
+"""The median error of the rotation must be below this share of that of the best plane in disparity:
+it was up to 0.33 for rotated views, and at least 5.3 for slanted walls."""
 
 MAX_OFF_ROW_PX = 1.0
-"""Median distance by which the rotation moves matches off their rows: on rows they were found."""
+"""A rotation may move matches, all found on rows, off their rows by this median distance."""
 
 ROBUST_ITERATIONS = 12
 
 ROTATION_GRID_SIZE_PX, MIN_ROTATION_MATCHES, MAX_ROTATION_SAMPLES = 16, 30, 50_000
-"""With fewer disparities, one per cell, nothing is tried; more are not used."""
+"""A rotation is fitted to one disparity per cell of this size, if there are enough of them, and to
+at most a random sample of this number. Chosen by hand."""
 
 
 @dataclass(frozen=True)
 class Rectification:
-    """Whether a pair is rectified, and the figures that say so.
+    """Whether a pair is rectified, and the figures behind that decision.
 
     Attributes:
-        rectified: whether it is.
-        reason: why not; empty when it is.
-        swapped: it is rectified, but the left image was given as the right one.
-        on_rows: number of matches (one per cell) within a row of each other, of `matches`.
-        by_fundamental: number of them that the fundamental matrix explains as closely.
-        by_other_rows: the same for the rows that are shifted, tilted and scaled.
-        matches: number of matches that were used.
-        vertical_offset: median of y in the second less y in the first image, in pixels, of those
-            that the fundamental matrix explains.
-        disparities: 5th percentile, median, 95th percentile of those on rows in pixels, or NaN.
+        rectified: whether the pair is rectified.
+        reason: why it is not rectified, or empty.
+        swapped: the pair is rectified, but left and right are exchanged.
+        on_rows: number of `matches` whose rows differ by at most one.
+        by_fundamental: number of matches that a fundamental matrix explains as closely.
+        by_other_rows: number that rows explain which are shifted, tilted and scaled.
+        matches: number of matches that were used, one per cell.
+        vertical_offset: median of y in the second minus y in the first image, in pixels, of the
+            matches that the fundamental matrix explains.
+        disparities: 5th percentile, median and 95th percentile in pixels on rows, or NaN.
     """
 
     rectified: bool
@@ -111,10 +115,10 @@ class Rectification:
 def find_rectification(
     gray0: np.ndarray, gray1: np.ndarray, offset_px: float = 0.0, seed: int = 0
 ) -> tuple[Rectification, TentativeMatches | None]:
-    """Decide whether two images (H, W) are rectified, large ones by small copies where these can.
+    """Decide whether two images (H, W) are rectified; small copies of large images may decide.
 
-    `offset_px` is what is added to a disparity before it gives the depth. The tentative matches of
-    larger copies are returned where they were needed.
+    `offset_px` is added to a disparity before it gives a depth. Also returns the tentative matches
+    of larger copies, if they were needed.
     """
     size = gray0.shape[::-1]
     if gray0.shape != gray1.shape:
@@ -133,12 +137,12 @@ def find_rectification(
 def _coarse_pass(
     gray0: np.ndarray, gray1: np.ndarray, offset_px: float, seed: int
 ) -> Rectification | None:
-    """Decide from small copies of two images of one size; None where they leave it open."""
+    """Decide from small copies of two images of one size; None if these are not decisive."""
     coarse = find_tentative_matches(
         gray0, gray1, max_side_px=COARSE_SIDE_PX, max_keypoints=COARSE_KEYPOINTS
     )
     scale, size = coarse.scales[0], coarse.views[0].shape[::-1]
-    # The thresholds are pixels of the copies: what they decide holds with a margin.
+    # The thresholds are in pixels of the copies, so they leave a margin at full size.
     found = detect_rectification(*coarse.matched, size, offset_px * scale, seed)
     if found.by_fundamental < MIN_COARSE_INLIERS:
         return None
@@ -148,7 +152,7 @@ def _coarse_pass(
         decided = on_rows and _row_error(*coarse.matched, seed) < limit
     else:
         best = max(found.by_fundamental, found.by_other_rows)
-        # By three standard deviations of a binomial distribution.
+        # The margin is three standard deviations of a binomial distribution.
         deviation = np.sqrt(best * MIN_INLIER_RATIO * (1 - MIN_INLIER_RATIO))
         decided = found.on_rows < MIN_INLIER_RATIO * best - 3 * deviation
     if not decided:
@@ -160,11 +164,11 @@ def _coarse_pass(
 
 
 def _row_error(points0: np.ndarray, points1: np.ndarray, seed: int) -> float:
-    """Return by how much the rows of a pair that looks rectified are off at most of its matches.
+    """Return how far rows of a pair that looks rectified are off, for most of its matches.
 
-    Not the distance of each match from its row, which is as coarse as the matches, but what they
-    have in common: how that distance depends on the place (views that are turned, or bent by a
-    lens) and on the disparity (a camera that moved up or down as well).
+    A single match is too coarse to tell. So a function of position (for rotated views and lens
+    distortion) and disparity (for a camera that also moved up or down) is fitted to the distances
+    of all matches from their rows.
     """
     indices = grid_subsample(points0, GRID_SIZE_PX, seed)
     first, second = points0[indices], points1[indices]
@@ -190,7 +194,7 @@ def detect_rectification(
     first, second = points0[indices], points1[indices]
     limit = MAX_ROW_DISTANCE_PX
     on_rows = np.abs(second[:, 1] - first[:, 1]) <= limit
-    # Of a rectified pair Sampson's distance is that in rows over the root of 2.
+    # For a rectified pair, Sampson's distance is the difference of the rows over the root of 2.
     epipolar = fit_model(first, second, "fundamental", size, limit / np.sqrt(2), seed)
     other_rows = _best_other_rows(first, second, size, seed)
     disparity = (first - second)[on_rows, 0]
@@ -203,12 +207,12 @@ def detect_rectification(
     )
     best = max(by_fundamental, by_other_rows)
     reason = ""
-    # Rows are a line in every point; nothing was sampled, so this is on the safe side.
+    # The test for fundamental matrices allows for sampling; rows are not sampled, so it is strict.
     if log10_nfa(on_rows, "fundamental", limit, size) > MAX_LOG10_NFA:
         reason = "hardly any match is on the same row in both images"
     elif on_rows_count < MIN_INLIER_RATIO * best:
         reason = (
-            f"only {on_rows_count:,} of {best:,} matches that agree are on the same row in both "
+            f"only {on_rows_count:,} of {best:,} consistent matches are on the same row in both "
             "images"
         )
     elif spread[2] - spread[0] < MIN_DISPARITY_SPREAD_PX:
@@ -219,7 +223,7 @@ def detect_rectification(
         threshold_px = SCENE_THRESHOLDS_PX["homography"]
         plane = fit_model(first, second, "homography", size, threshold_px, seed)
         if is_planar(first, second, plane, epipolar, seed):
-            reason = "one homography explains all the matches: all move nearly the same"
+            reason = "one homography explains all the matches: they all move nearly alike"
     return Rectification(
         rectified=not reason,
         reason=reason,
@@ -236,9 +240,9 @@ def detect_rectification(
 def _best_other_rows(
     points0: np.ndarray, points1: np.ndarray, size: tuple[int, int], seed: int
 ) -> np.ndarray:
-    """Fit the vertical shift as a plane over the image, robustly; (M,) bool that agree with it.
+    """Fit the vertical shift as a plane over the image by RANSAC; return its inliers, (M,) bool.
 
-    Three matches give it, not seven as for a fundamental matrix: it stands more wrong matches.
+    A sample has three matches, not seven as for a fundamental matrix: it tolerates more outliers.
     """
     shift = points1[:, 1] - points0[:, 1]
     best = np.zeros(len(points0), bool)
@@ -260,7 +264,7 @@ def _best_other_rows(
 
 
 def check_cameras(calibration: Calibration) -> None:
-    """Refuse a calibration that no rectified pair has: focal lengths or cy of both views differ."""
+    """Raise a ReconstructionError if focal lengths or cy of both views differ."""
     camera0, camera1 = calibration.camera0, calibration.camera1
     pairs = [
         ("the focal lengths", focal0, focal1, MAX_FOCAL_DIFFERENCE_FRACTION * focal0)
@@ -270,32 +274,32 @@ def check_cameras(calibration: Calibration) -> None:
     for name, value0, value1, most in pairs:
         if abs(value1 - value0) > most:
             raise ReconstructionError(
-                f"{name} of the left and the right view are {value0:g} and {value1:g} px, those of "
-                f"a rectified pair are one: fix the calibration ({calibration.source}), or pass "
-                "`rectified=False`"
+                f"{name} of the left and the right view are {value0:g} and {value1:g} px, but must "
+                f"be equal for a rectified pair: fix the calibration ({calibration.source}), or "
+                "pass `rectified=False`"
             )
 
 
 def check_disparities(disparity: np.ndarray) -> None:
-    """Refuse disparities of a rectified pair that are all one value."""
+    """Raise a NoDepthError if all disparities of a rectified pair are nearly the same."""
     if is_static(disparity):
-        raise NoDepthError("all disparities are 0: both images were taken from one place")
+        raise NoDepthError("all disparities are 0: take the images from two different places")
     low, middle, high = np.quantile(disparity, [0.05, 0.5, 0.95])
     if high - low < MIN_DEPTH_SPREAD_PX:
         raise NoDepthError(
-            f"all disparities are {middle:.3g} px: one image is the other shifted sideways, or "
-            "both show one plane, and there is no depth"
+            f"all disparities are {middle:.3g} px, so there is no depth: one image is the other "
+            "shifted sideways, or both show one plane"
         )
 
 
 def check_pure_rotation(
     pixels: np.ndarray, disparity: np.ndarray, calibration: Calibration
 ) -> None:
-    """Refuse disparities that a camera which only rotated explains, far better than a plane.
+    """Raise a NoDepthError if a rotation explains the disparities far better than a plane does.
 
-    A rotation by an angle a about the vertical moves pixels along their rows by f a (1 + x^2) at
-    first order, x the slope of the ray: about like a wall, but bent. With a focal length that is
-    far off, a tilt besides, or a bend of less than the noise, it is not noticed.
+    A rotation by an angle a about the vertical moves pixels along their rows by f a (1 + x^2) to
+    first order, where x is the slope of the ray: like a wall, but curved. It is not noticed if the
+    focal length is far off, the camera also tilted, or the curvature is below the noise.
     """
     chosen = np.arange(len(pixels))
     if len(chosen) > MAX_ROTATION_SAMPLES:
@@ -315,7 +319,7 @@ def check_pure_rotation(
 
 
 def check_depths(disparity: np.ndarray, calibration: Calibration) -> None:
-    """Refuse disparities of a rectified pair of which many would lie behind the cameras."""
+    """Raise a ReconstructionError if many points of a rectified pair are behind the cameras."""
     offset = calibration.disparity_offset_px
     behind = float(np.mean(disparity + offset < MIN_DISPARITY_PX))
     if behind > MAX_BEHIND_FRACTION:
@@ -328,15 +332,15 @@ def check_depths(disparity: np.ndarray, calibration: Calibration) -> None:
 def _rotation_errors(
     pixels: np.ndarray, disparity: np.ndarray, calibration: Calibration
 ) -> np.ndarray:
-    """Fit a rotation to disparities robustly; (N,) what it leaves unexplained, in pixels.
+    """Fit a rotation to disparities robustly; return the residuals (N,) in pixels.
 
-    About the vertical and the line of sight: a tilt hardly changes disparities. Infinite when none
-    leaves the matches on their rows.
+    The axes are the vertical and the optical axis: a tilt hardly changes disparities. Residuals are
+    infinite if the rotation moves the matches off their rows.
     """
     camera, rays = calibration.camera1, calibration.camera0.rays(pixels)
     matched = pixels - np.column_stack([disparity, np.zeros(len(disparity))])
     wanted = camera.rays(matched)[:, 0]
-    # The rotation about the vertical that most pixels ask for is near enough to begin with.
+    # The median rotation about the vertical is close enough as a start.
     angle = np.median(np.arctan(wanted) - np.arctan(rays[:, 0]))
     rotation = cv2.Rodrigues(np.array([0, angle, 0]))[0]
     for _ in range(ROBUST_ITERATIONS):
@@ -350,7 +354,7 @@ def _rotation_errors(
 
 
 def _plane_errors(pixels: np.ndarray, disparity: np.ndarray) -> np.ndarray:
-    """Fit disparities linear in x and y robustly; (N,) what they leave unexplained, in pixels."""
+    """Fit a plane to disparities over x and y robustly; return the residuals (N,) in pixels."""
     design = np.column_stack([pixels / max(pixels.max(), 1), np.ones(len(pixels))])
     plane = np.array([0, 0, np.median(disparity)])
     for _ in range(ROBUST_ITERATIONS):

@@ -1,4 +1,4 @@
-"""What two images gave: 3D points, and all that is known about them."""
+"""The result of a reconstruction of two images: 3D points and statistics."""
 
 from __future__ import annotations
 
@@ -23,36 +23,36 @@ SCALE = {
     "calib.json)",
 }
 
-SHAPE = "; where cx of both cameras differ, depth without disparity_offset_px has a wrong shape"
-"""Of a rectified pair whose calibration does not say it."""
+SHAPE = "; if cx of both cameras differ, depth without disparity_offset_px has a wrong shape"
+"""This warning is for a rectified pair whose calibration does not give the offset."""
 
 
 @suggest_keywords
 @dataclass(frozen=True, eq=False, repr=False)
 class Reconstruction:
-    """3D points, and where they come from.
+    """3D points of two images, and how they were found.
 
     Attributes:
         points: (N, 3) float32 in the frame of the left camera: x right, y down, z forward.
-        colors: (N, 3) uint8 sRGB, of the left image.
+        colors: (N, 3) uint8 sRGB of the left image.
         pixels: (N, 2) float32 positions of the points in the left image.
         disparity: (N,) float32 in pixels for rectified pairs, else None: the match of the left
             (x, y) is the right (x - disparity, y).
-        matched: (N,) bool: seen in both images; False for points filled in from the surface beside
-            them: hidden from the right camera, outside its image, or on the edge of what hides
-            (only when every pixel of a rectified pair is asked for).
-        unit: "mm" when the baseline is known, else "baseline": the distance of the cameras is 1,
-            and the true scale is not known.
+        matched: (N,) bool: seen in both images. False for points filled in from a surface next to
+            them, because the right camera does not show them or they are at the edge of an
+            occluding surface (only if every pixel of a rectified pair becomes a point).
+        unit: "mm" if the baseline is known, else "baseline": the distance of the cameras is 1, and
+            the true scale is not known.
         size: (width, height) of the left image.
         rectified: whether the pair was treated as rectified.
-        rectification: the figures by which that was decided; None when it was given.
-        calibration: of the cameras.
-        pose: of the right camera for pairs that are not rectified, else None.
+        rectification: the figures behind that decision; None if the caller decided.
+        calibration: intrinsics and baseline of the cameras.
+        pose: pose of the right camera for pairs that are not rectified, else None.
         reprojection_errors: (N,) float32 for pairs that are not rectified, else None: distance
             of the points from their matches, in pixels (root mean square of both images).
         keypoints: number of keypoints in the left image.
-        matches: number of matches that the points were made from.
-        dropped: how many of these each check removed, in order.
+        matches: number of matches that were triangulated.
+        dropped: number of these that each check removed, in order.
         seconds: time of each stage.
     """
 
@@ -86,28 +86,28 @@ class Reconstruction:
 
     @property
     def cloud(self) -> PointCloud:
-        """The points with their colours, to be saved or drawn."""
+        """The points with their colours, to save or draw."""
         return PointCloud(self.points, self.colors, self.unit)
 
     @property
     def baseline_vector(self) -> np.ndarray:
-        """From the left to the right camera's centre, (3,) float64, as the points."""
+        """(3,) float64 from the left to the right camera centre, in the frame of the points."""
         length = 1.0 if self.calibration.baseline_mm is None else self.calibration.baseline_mm
         if self.pose is None:
             return np.array([length, 0, 0])
         return -length * (self.pose.rotation.T @ self.pose.translation)
 
     def triangulation_angles(self) -> np.ndarray:
-        """Return the angle at each point between both cameras, (N,) float64 in degrees."""
+        """Return the angle at each point between the rays to both cameras, (N,) in degrees."""
         points = self.points.astype(np.float64)
         return np.degrees(angles_between(points, points - self.baseline_vector))
 
     def depth_map(self) -> np.ndarray:
-        """Return the depth at each pixel of the left image, (H, W) float32; NaN where unknown."""
+        """Return the depth at each pixel of the left image, (H, W) float32; NaN if unknown."""
         return self._map(self.points[:, 2])
 
     def disparity_map(self) -> np.ndarray:
-        """Return the disparity at each pixel of the left image; NaN where it is unknown.
+        """Return the disparity at each pixel of the left image; NaN if unknown.
 
         Raises:
             ReconstructionError: the pair is not rectified.
@@ -117,20 +117,17 @@ class Reconstruction:
         return self._map(self.disparity)
 
     def matched_map(self) -> np.ndarray:
-        """Return (H, W) bool: pixels whose point was seen in both images, and not filled in."""
+        """Return (H, W) bool: pixels whose point was seen in both images, not filled in."""
         return self._map(self.matched.astype(np.float32)) == 1
 
     def summary(self) -> dict[str, Any]:
-        """Return all but the arrays as plain values for JSON: counts, times and quality.
-
-        NaN becomes None.
-        """
+        """Return everything except the arrays as plain values for JSON; NaN becomes None."""
         errors, disparity = self.reprojection_errors, self.disparity
         rows, pose, calibration = self.rectification, self.pose, self.calibration
         cameras = {"left": calibration.camera0, "right": calibration.camera1}
         unsaid = self.rectified and calibration.camera0 == calibration.camera1
         unsaid &= calibration.baseline_mm is None
-        why = "as asked for"
+        why = "set by the caller"
         if rows is not None:
             on_rows = f"{rows.on_rows:,} of {rows.matches:,} sparse matches are on the same row"
             why = rows.reason or on_rows
@@ -196,7 +193,7 @@ def _percentiles(values: np.ndarray) -> dict[str, float]:
 
 
 def _finite(value: Any) -> Any:
-    """Replace what is not finite, which JSON does not have, by None."""
+    """Replace numbers that are not finite, which JSON cannot hold, by None."""
     if isinstance(value, dict):
         return {name: _finite(part) for name, part in value.items()}
     if isinstance(value, tuple):

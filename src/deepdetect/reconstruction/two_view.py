@@ -1,8 +1,7 @@
-"""Points from the matches of two calibrated images that need not be rectified.
+"""3D points from the matches of two calibrated images that need not be rectified.
 
-Refined matches give the pose: all those on whole pixels; of matches on rectified rows, which know
-no more of it than what rectified the pair, a sample of corners, while the points are those of the
-matches as they are. Checks in between say why there is no depth.
+The pose is estimated from matches at corners, refined to sub-pixel accuracy; all matches are then
+triangulated as they are. Checks in between raise an error that says why there is no depth.
 """
 
 from __future__ import annotations
@@ -25,35 +24,37 @@ from .outliers import PointFilterOptions, disparity_space, sor_inliers
 from .subpixel import refine_matches, spread_corners
 
 MAX_EPIPOLAR_DISTANCE_PX = 1.0
-"""Within which a match agrees with the pose (Sampson's distance)."""
+"""A match agrees with the pose up to this Sampson distance. Chosen by hand."""
 
 MAX_REPROJECTION_ERROR_PX = 0.5
-"""Of a point that is kept (root mean square of both images)."""
+"""Points are kept up to this error (root mean square of both images). Chosen by hand."""
 
 POSE_CELLS = 10_000
-"""Of sub-pixel matches, the best corner of each of this many cells is refined for the pose."""
+"""The best corner of each of this many cells is refined for the pose. Chosen by hand."""
 
 GRID_SIZE_PX = 16
-"""Cells of this size in the first image give one match each: near ones are no further evidence."""
+"""Each cell of the first image of this size gives one match, because neighbouring matches are not
+independent evidence. Chosen by hand."""
 
 MAX_SCENE_DISTANCE_PX = SCENE_THRESHOLDS_PX["fundamental"]
-"""Within which a match agrees with a pose that is compared with the fundamental matrix."""
+"""A pose that is compared with a fundamental matrix explains a match up to the same distance."""
 
 MIN_POSE_RATIO = 0.75
-"""Matches of the essential over the fundamental matrix: a correct calibration explains as many."""
+"""The essential matrix must explain this share of the matches of the fundamental matrix: a correct
+calibration explains as many. Chosen by hand."""
 
 MIN_IN_FRONT_FRACTION = 0.75
-"""Of the inliers of a pose, in front of both cameras."""
+"""This fraction of the inliers of a pose must lie in front of both cameras. Chosen by hand."""
 
 FOCAL_FACTORS = (0.25, 0.35, 0.5, 0.7, 1.4, 2.0, 2.8, 4.0)
-"""Other focal lengths that are tried, in units of the given one."""
+"""These multiples of the given focal length are also tried."""
 
 MAX_FOCAL_ERROR_RATIO = 0.5
-"""Of the median error of another focal length to that of the given one, which is refused below it:
-a focal length that is off by a fifth passes."""
+"""The given focal length is rejected if another one reduces the median error to less than this
+share. A focal length that is off by a fifth passes."""
 
 GOOD_ERROR_PX = 0.1
-"""Median error at which no other focal length is tried."""
+"""No other focal length is tried if the median error is smaller. Chosen by hand."""
 
 NO_DEPTH = {
     "static": "nothing moves between the images: depth needs two images from two places",
@@ -61,15 +62,15 @@ NO_DEPTH = {
     "plane": "one homography explains all the matches: the images show a plane, or the camera only "
     "rotated, and there is no depth",
 }
-"""What is said of the kinds of scenes without depth."""
+"""Messages for the kinds of scenes without depth."""
 
 
 def refined_corners(
     images: tuple[np.ndarray, np.ndarray], points0: np.ndarray, points1: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the matches at corners, which a pose is estimated from, to sub-pixel accuracy.
+    """Return the matches at corners, refined to sub-pixel accuracy for the estimation of a pose.
 
-    From whole pixels of the first image; those that do not converge are left out.
+    They start at whole pixels of the first image; those that do not converge are left out.
     """
     pixels0 = np.rint(points0)
     rows = spread_corners(images[0], pixels0, POSE_CELLS)
@@ -85,9 +86,9 @@ def reconstruct_two_view(
     seed: int,
     timer: StageTimer,
 ) -> dict[str, Any]:
-    """Reconstruct the points of a pair; return what `Reconstruction` says of them.
+    """Reconstruct the points of a pair; return the fields of a `Reconstruction`.
 
-    The matches are sub-pixel; `images` are uint8 luma.
+    Matches have sub-pixel accuracy; `images` are uint8 luma.
     """
     points0, points1 = matches.points0.astype(np.float64), matches.points1.astype(np.float64)
     dropped: dict[str, int] = {}
@@ -119,8 +120,8 @@ def reconstruct_two_view(
     if not kept.any():
         counts = ", ".join(f"{reason}: {count:,}" for reason, count in dropped.items() if count)
         raise ReconstructionError(
-            f"none of the {len(points0):,} matches gives a point ({counts}): take "
-            "images that overlap more, or check the calibration"
+            f"all of the {len(points0):,} matches were filtered out ({counts}): take images that "
+            "overlap more, or check the calibration"
         )
     return {
         "points": made.points[kept].astype(np.float32),
@@ -142,7 +143,7 @@ def checked_pose(
     seed: int,
     timer: StageTimer,
 ) -> RelativePose:
-    """Estimate the pose from refined matches, (M, 2); an error says why it cannot be told."""
+    """Estimate the pose from refined matches, (M, 2); an error says why it cannot be estimated."""
     with timer.stage("checks"):
         cells, epipolar = check_matches(
             points0, points1, calibration.camera1.size, calibration, seed
@@ -166,22 +167,22 @@ def check_matches(
     calibration: Calibration | None = None,
     seed: int = 0,
 ) -> tuple[np.ndarray, TwoViewModel]:
-    """Refuse matches (M, 2) that show no overlap, no motion, or no depth.
+    """Raise a NoDepthError if matches (M, 2) show no overlap, no motion, or no depth.
 
     Returns the (K,) rows of those that were used, one per cell, and their fundamental matrix. A
-    calibration distinguishes a rotating camera from a plane.
+    calibration helps to distinguish a rotating camera from a plane.
     """
     if not len(points0):
         raise NoDepthError(
-            "there are no matches: the images do not overlap, or do not show the same scene, "
-            "or no pixel of one is above the threshold (lower `threshold`, or give `density`)"
+            "there are no matches: the images do not overlap, show different scenes, or have no "
+            "pixel above the threshold (lower `threshold`, or give `density`)"
         )
     indices = grid_subsample(points0, GRID_SIZE_PX, seed)
     kind, epipolar = classify_scene(points0[indices], points1[indices], size1, calibration, seed)
     if kind == "unrelated":
         raise NoDepthError(
             f"too few of the {len(points0):,} matches agree with one geometry: the images do not "
-            "overlap, or do not show the same scene"
+            "overlap, or show different scenes"
         )
     if kind != "depth":
         raise NoDepthError(NO_DEPTH[kind])
@@ -194,22 +195,24 @@ def check_pose(
     epipolar: TwoViewModel,
     calibration: Calibration,
 ) -> RelativePose:
-    """Refuse a pose that explains far less than is possible: the calibration is wrong.
+    """Raise a ReconstructionError if a pose explains far fewer matches than a fundamental matrix.
 
-    The pose is that of all matches; `indices` and `epipolar` are those of `check_matches`.
+    The calibration is then wrong. The pose is from all matches; `indices` and `epipolar` are from
+    `check_matches`.
     """
     wrong_focal = _wrong_focal(calibration)
     if pose is None:
-        raise ReconstructionError(f"no pose of the cameras fits the matches: {wrong_focal}")
+        raise ReconstructionError(f"no pose fits the matches: {wrong_focal}")
     possible = np.count_nonzero(epipolar.inliers)
     explained = np.count_nonzero(pose.errors[indices] < MAX_SCENE_DISTANCE_PX)
     if explained < MIN_POSE_RATIO * possible:
         raise ReconstructionError(
-            f"only {explained:,} of {possible:,} matches fit one pose of the cameras: {wrong_focal}"
+            f"only {explained:,} of {possible:,} matches fit one pose: {wrong_focal}"
         )
     if pose.cheirality_ratio < MIN_IN_FRONT_FRACTION:
         raise ReconstructionError(
-            f"only {pose.cheirality_ratio:.0%} of the points lie before both cameras: {wrong_focal}"
+            f"only {pose.cheirality_ratio:.0%} of the points are in front of both cameras: "
+            f"{wrong_focal}"
         )
     return pose
 
@@ -221,11 +224,11 @@ def check_focal(
     calibration: Calibration,
     seed: int = 0,
 ) -> None:
-    """Refuse a focal length when quite another one fits the matches far better; it is named.
+    """Raise a ReconstructionError if a very different focal length fits the matches far better.
 
-    Where the camera only moved sideways every focal length fits as well, and a wrong one is not
-    noticed: it gives a scene that is stretched in depth. `errors` are (M,) Sampson distances of the
-    pose from matches that a fundamental matrix explains.
+    If the camera only moved sideways, every focal length fits, and a wrong one, which stretches the
+    scene in depth, is not noticed. `errors` (M,) are Sampson distances to the pose of matches that
+    a fundamental matrix explains.
     """
     given = float(np.median(errors))
     if given < GOOD_ERROR_PX:
@@ -246,8 +249,8 @@ def check_focal(
     if best_factor != 1:
         focal = calibration.camera0.focal_px[0]
         raise ReconstructionError(
-            f"{_wrong_focal(calibration)}: one of about {focal * best_factor:.0f} px fits the "
-            f"matches {given / best:.1f} times as well"
+            f"{_wrong_focal(calibration)}: about {focal * best_factor:.0f} px fits the matches "
+            f"{given / best:.1f} times as well"
         )
 
 

@@ -1,8 +1,8 @@
-"""COLMAP: pycolmap, its camera models, and its database.
+"""COLMAP's camera models and its database, by pycolmap.
 
-COLMAP's centre of the first pixel is (0.5, 0.5), ours (0, 0): half a pixel is added to positions.
-Its scale is sigma, half of OpenCV's diameter, and its orientation is in radians, clockwise as
-OpenCV's.
+The centre of the first pixel is (0.5, 0.5) in COLMAP and (0, 0) here, so half a pixel is added to
+positions. A scale in COLMAP is sigma, half of OpenCV's diameter; orientations are in radians,
+clockwise as in OpenCV.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ from ..geometry.camera import Calibration, Camera
 from ..io.exif import camera_from_exif
 
 PIXEL_CENTRE = 0.5
-"""COLMAP's position of the centre of the first pixel; ours is 0."""
+"""Position of the centre of the first pixel in COLMAP; here it is 0."""
 
 SIFT_NUMBERS = 128
 
 ROWS = 256
-"""Of an image that are undistorted at once, which bounds the memory."""
+"""An image is undistorted in strips of this number of rows, which bounds the memory."""
 
 ESTIMATED_FOCAL_FACTOR = 1.2
-"""Focal length over the longer side, where nothing is known: where its estimation begins."""
+"""An unknown focal length is estimated from this multiple of the longer side on, as in COLMAP."""
 
 
 @contextmanager
 def quiet_pycolmap() -> Iterator[Any]:
-    """Give pycolmap, and let it log nothing while the block runs."""
+    """Return pycolmap, which logs nothing inside the `with` block."""
     pycolmap = import_pycolmap()
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
@@ -51,12 +51,13 @@ def quiet_pycolmap() -> Iterator[Any]:
 
 @dataclass(frozen=True)
 class CameraIntrinsics:
-    """One of COLMAP's camera models with its parameters; focal lengths and centre come first.
+    """One of COLMAP's camera models with its parameters.
 
     Attributes:
-        model: name, as "PINHOLE" or "SIMPLE_RADIAL".
+        model: name, such as "PINHOLE" or "SIMPLE_RADIAL".
         size: (width, height) in pixels.
-        params: as COLMAP has them, where the centre of the first pixel is (0.5, 0.5).
+        params: COLMAP's parameters: focal lengths, principal point, then distortion; the centre of
+            the first pixel is (0.5, 0.5).
         source: where they come from: "given", "focal_px", "EXIF", or "estimated".
     """
 
@@ -75,9 +76,9 @@ class CameraIntrinsics:
     def initial(
         cls, size: tuple[int, int], focal_px: float | None = None, source: str = "EXIF"
     ) -> CameraIntrinsics:
-        """Return intrinsics to be estimated, with one parameter of radial distortion.
+        """Return initial intrinsics with one parameter of radial distortion, to be estimated.
 
-        The estimation begins with `focal_px`, or a guess; `source` is that of the focal length.
+        The focal length is `focal_px`, or a guess; `source` says where it comes from.
         """
         if focal_px is None:
             focal_px, source = ESTIMATED_FOCAL_FACTOR * max(size), "estimated"
@@ -85,12 +86,12 @@ class CameraIntrinsics:
 
     @classmethod
     def of_colmap(cls, camera: Any, source: str = "given") -> CameraIntrinsics:
-        """Return the intrinsics of a camera of pycolmap."""
+        """Return the intrinsics of a `pycolmap.Camera`."""
         size = (int(camera.width), int(camera.height))
         return cls(camera.model_name, size, tuple(map(float, camera.params)), source)
 
     def colmap_camera(self) -> Any:
-        """Return the camera of pycolmap."""
+        """Return a `pycolmap.Camera`."""
         pycolmap = import_pycolmap()
         camera = pycolmap.Camera(
             model=self.model, width=self.size[0], height=self.size[1], params=list(self.params)
@@ -100,19 +101,19 @@ class CameraIntrinsics:
 
     @property
     def distorts(self) -> bool:
-        """Whether its images differ from those of a pinhole camera."""
+        """Whether the camera has distortion: its images differ from those of a pinhole camera."""
         return self.model not in ("PINHOLE", "SIMPLE_PINHOLE")
 
     @property
     def pinhole(self) -> Camera:
-        """The camera without the distortion."""
+        """The pinhole camera of the same focal length and principal point."""
         camera = self.colmap_camera()
         focal = (float(camera.focal_length_x), float(camera.focal_length_y))
         centre = (float(camera.principal_point_x), float(camera.principal_point_y))
         return Camera(self.size, focal, (centre[0] - PIXEL_CENTRE, centre[1] - PIXEL_CENTRE))
 
     def to_pinhole(self, xy: np.ndarray) -> np.ndarray:
-        """Return where the pinhole camera has positions (N, 2) of the image."""
+        """Return undistorted positions: from (N, 2) pixels of the image to the pinhole camera."""
         if not self.distorts or not len(xy):
             return xy
         pinhole = self.pinhole
@@ -120,7 +121,7 @@ class CameraIntrinsics:
         return np.asarray(rays * pinhole.focal_px + np.array(pinhole.centre))
 
     def from_pinhole(self, xy: np.ndarray) -> np.ndarray:
-        """Return where the image has positions (N, 2) of the pinhole camera."""
+        """Return distorted positions: from (N, 2) pixels of the pinhole camera to the image."""
         if not self.distorts or not len(xy):
             return xy
         found = self.colmap_camera().img_from_cam(self.pinhole.rays(xy))
@@ -128,13 +129,13 @@ class CameraIntrinsics:
 
     @property
     def without_border(self) -> CameraIntrinsics:
-        """A pinhole camera that sees no more than what this one does: as COLMAP undistorts."""
+        """A pinhole camera, cropped as COLMAP does it to what this camera shows."""
         pycolmap = import_pycolmap()
         cropped = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), self.colmap_camera())
         return CameraIntrinsics.of_colmap(cropped, self.source) if self.distorts else self
 
     def undistort(self, image: np.ndarray, pinhole: Camera | None = None) -> np.ndarray:
-        """Return an image (H, W) or (H, W, 3), of any size, as a pinhole camera would take it."""
+        """Return an image (H, W) or (H, W, 3), which may be scaled, without its distortion."""
         if not self.distorts:
             return image
         pinhole, camera = pinhole or self.pinhole, self.colmap_camera()
@@ -154,9 +155,9 @@ class CameraIntrinsics:
 def known_cameras(
     calibration: Camera | Calibration | str | Path, sizes: Mapping[str, tuple[int, int]]
 ) -> dict[str, Camera]:
-    """Return the cameras of the images, by name, that have the size of a calibration.
+    """Return the cameras, by name, of the images that have the size of a calibration.
 
-    A ReconstructionError says that it is wrong, or for none of them.
+    Raises a ReconstructionError if the calibration is wrong, or fits none of the images.
     """
     known: dict[str, Camera] = {}
     problem: ReconstructionError | None = None
@@ -182,10 +183,10 @@ def initial_intrinsics(
     focal_px: float | None = None,
     single_camera: bool | None = None,
 ) -> dict[str, CameraIntrinsics]:
-    """Return the known intrinsics of each image, or where their estimation begins.
+    """Return the known intrinsics of each image, or initial ones to be estimated.
 
-    `focal_px` is of the images whose camera is not known; None: of their EXIF, or a guess. Images
-    that share a camera, by `MultiViewOptions.single_camera`, get the same object.
+    `focal_px` is for images whose camera is not known; if it is None, EXIF or a guess takes its
+    place. Images that share a camera (`MultiViewOptions.single_camera`) get the same object.
     """
     begins = {}
     for name, size in sizes.items():
@@ -205,7 +206,7 @@ def initial_intrinsics(
         name: {None: begin, True: begin.size, False: name}[single_camera]
         for name, begin in begins.items()
     }
-    # Of a camera's images those without EXIF do not tell its focal length.
+    # Images without EXIF come last: the first one gives the focal length of a shared camera.
     for name in sorted(begins, key=lambda name: begins[name].source == "estimated"):
         shared.setdefault(keys[name], begins[name])
     return {name: shared[keys[name]] for name in sizes}
@@ -216,11 +217,11 @@ def write_database(
     images: Mapping[str, tuple[Keypoints, CameraIntrinsics]],
     matches: Mapping[Pair, np.ndarray],
 ) -> None:
-    """Write a new database of COLMAP to a file that does not exist, or is empty.
+    """Write a new COLMAP database to a file that does not exist or is empty.
 
-    Images with the same object of intrinsics share a camera. Keypoints with sizes have four columns
-    (x, y, scale, orientation), others two; descriptors are written as `sift_bytes`. Matches are
-    (K, 2) rows of keypoints.
+    Images with the same intrinsics object share a camera. Keypoints with sizes get four columns
+    (x, y, scale, orientation), others two. Descriptors are converted by `sift_bytes`. Matches are
+    (K, 2) indices of keypoints.
     """
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(path) as database:
         cameras: dict[int, tuple[int, int]] = {}  # camera and rig by the object
@@ -256,18 +257,18 @@ def write_database(
 
 
 def orientations_of(points: Keypoints) -> np.ndarray:
-    """Return (N,) orientations in radians, clockwise; 0 where there are none."""
+    """Return (N,) orientations in radians, clockwise, or 0 for keypoints without one."""
     if points.angles is None:
         return np.zeros(len(points), np.float32)
     return np.deg2rad(np.where(points.angles == UNSET_ANGLE, 0, points.angles))
 
 
 def sift_bytes(keypoints: Keypoints) -> np.ndarray | None:
-    """Return descriptors as SIFT's (N, 128) uint8, or None where they are of another kind.
+    """Return descriptors as (N, 128) uint8 as SIFT's, or None if they are of another kind.
 
-    Those of length 1 are multiplied by 512, as SIFT does it. Of learned ones the positive and the
-    negative numbers become 64 each, which COLMAP compares as it does SIFT's: one or two of 100
-    right matches are lost. Its vocabulary trees are of SIFT's words, and do not know them.
+    Descriptors of length 1 are multiplied by 512, as in SIFT. The 64 numbers of learned descriptors
+    become 128: their positive and their negative parts. COLMAP can then compare them; one or two of
+    100 correct matches are lost by the rounding. Its vocabulary trees are only for SIFT.
     """
     found = keypoints.descriptors
     if found is not None and is_learned(keypoints.descriptor_type):

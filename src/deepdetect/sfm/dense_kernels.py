@@ -1,8 +1,8 @@
-"""The compiled parts of dense points. Importing them takes numba; the first call compiles.
+"""Compiled kernels of dense points. Importing them loads numba; the first call compiles.
 
-Kernels work on the rows `first` to `last - 1`. A surface near a pixel is a plane: its inverse depth
-is linear in the pixel's position, whatever its slant. A match in a neighbour is the projection of
-(A, b), (3, 3) and (3,): pixel q of inverse depth w is seen at A (q, 1) + w b.
+Kernels work on the rows `first` to `last - 1`. The surface around a pixel is a plane, so its
+inverse depth is linear in the position of the pixel. A neighbour sees the pixel q of inverse depth
+w at A (q, 1) + w b, in homogeneous coordinates, with A (3, 3) and b (3,).
 """
 
 from __future__ import annotations
@@ -15,16 +15,20 @@ from .._shared.kernels import compiled
 from ..matching.stereo.kernels import count_bits
 
 HIDDEN = np.uint64(1) << np.uint64(63)
-"""Bit of a census of 62 bits: the neighbour does not show this place."""
+"""This bit above the 62 bits of a census marks places that the neighbour does not show."""
 
 MIN_TEXTURE = np.float32(0.18)
-"""Variance of the gradients along the epipolar line, over that of the noise, in a window with
-texture: plain skies have less, with their JPEG, and weathered stone has more."""
+"""A window has texture if the variance of its gradients along the epipolar line exceeds this share
+of the variance of the noise. Plain skies have less, with JPEG artefacts; weathered stone has more.
+"""
+
+MIN_GAIN = np.float32(0.2)
+"""Shifts are divided by the relative contrast of the neighbour, or by this if it is smaller."""
 
 
 @compiled(nogil=True)
 def _two_best(y, census, neighbours, columns, rows, hidden_cost, line):  # type: ignore[no-untyped-def]
-    """Write the sum of the two least distances to the neighbours, (D, W) uint8, of a row."""
+    """Write the sum of the two smallest distances to the neighbours, (D, W) uint8, for one row."""
     count, width = line.shape
     least, second = np.empty((2, width), np.uint8)
     for d in range(count):
@@ -44,11 +48,11 @@ def _two_best(y, census, neighbours, columns, rows, hidden_cost, line):  # type:
 
 @compiled(nogil=True)
 def cost_rows(first, last, census, neighbours, columns, rows, hidden_cost, cost):  # type: ignore[no-untyped-def]
-    """Write the costs of inverse depths, (H, W, D) uint8: of the two neighbours that agree best.
+    """Write the matching costs of inverse depths, (H, W, D) uint8.
 
-    `neighbours` (K, H', W') are censuses in the frame of the reference: the pixel (x, y) at the
-    inverse depth d is at `columns` (K, D, W) and `rows` (K, D, H) of theirs. An eighth of the sum
-    over 3 x 3 pixels.
+    A cost is an eighth of the sum, over 3 x 3 pixels, of the Hamming distances to the two
+    neighbours that agree best. `neighbours` (K, H', W') are censuses in the frame of the reference.
+    The pixel (x, y) at the inverse depth number d is at `columns` (K, D, W) and `rows` (K, D, H).
     """
     height, width, count = cost.shape
     line = np.empty((count, width), np.uint8)
@@ -73,7 +77,7 @@ def cost_rows(first, last, census, neighbours, columns, rows, hidden_cost, cost)
 
 @compiled(nogil=True)
 def choose_rows(first, last, total, out):  # type: ignore[no-untyped-def]
-    """Write the number of the least of D sums of costs, (H, W) float32, with a parabola's rest."""
+    """Write the index of the least of D summed costs, (H, W) float32, refined by a parabola."""
     count = total.shape[2]
     for y in range(first, last):
         for x in range(total.shape[1]):
@@ -92,10 +96,10 @@ def choose_rows(first, last, total, out):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True)
 def fit_rows(first, last, planes, weights, radius, tolerance, min_pixels, out):  # type: ignore[no-untyped-def]
-    """Fit a plane to the inverse depths around each pixel that lie near its own plane.
+    """Fit a plane around each pixel, to the inverse depths that lie near its present plane.
 
     `planes` (H, W, 3) float32 are inverse depths, NaN where unknown, and their changes per pixel
-    to the right and down. Of fewer pixels than `min_pixels` NaN.
+    to the right and down. A plane that would fit fewer than `min_pixels` becomes NaN.
     """
     height, width = planes.shape[:2]
     for y in range(first, last):
@@ -126,7 +130,7 @@ def fit_rows(first, last, planes, weights, radius, tolerance, min_pixels, out): 
             e, f = siv - si * sv / n, sjv - sj * sv / n
             area = a * c - b * b
             more_right = more_down = 0.0
-            if area > n:  # not on a line
+            if area > n:  # the pixels are not on a line
                 more_right, more_down = (e * c - f * b) / area, (f * a - e * b) / area
             out[y, x, 0] = w + (sv - more_right * si - more_down * sj) / n
             out[y, x, 1] = right + more_right
@@ -135,7 +139,7 @@ def fit_rows(first, last, planes, weights, radius, tolerance, min_pixels, out): 
 
 @compiled(nogil=True, inline="always")
 def _project(m, x, y, w):  # type: ignore[no-untyped-def]
-    """Return where a neighbour sees the pixel (x, y) of inverse depth w, and a depth."""
+    """Return where a neighbour sees the pixel (x, y) of inverse depth w, and its relative depth."""
     z = m[2, 0] * x + m[2, 1] * y + m[2, 2] + w * m[2, 3]
     across = m[0, 0] * x + m[0, 1] * y + m[0, 2] + w * m[0, 3]
     down = m[1, 0] * x + m[1, 1] * y + m[1, 2] + w * m[1, 3]
@@ -144,12 +148,12 @@ def _project(m, x, y, w):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
 def _compare(gray, y, x, plane, same, m, other, size, radius, spacing, noise):  # type: ignore[no-untyped-def]
-    """Compare the window around a pixel with that of a neighbour, warped by its plane.
+    """Compare the window around a pixel with that of a neighbour, warped by the plane.
 
-    Returns their correlation, by how many pixels the match should move along its line (one step of
-    Lucas-Kanade; contrast and brightness may differ), how far it moves for a change of the inverse
-    depth, and the weight of that, 0 without texture. The correlation is -1 where the neighbour does
-    not show it.
+    Returns their correlation; by how many pixels the match should move along its epipolar line (one
+    step of Lucas-Kanade that allows for other contrast and brightness); how far it moves per unit
+    of inverse depth; and the weight of this step, 0 without texture. The correlation is -1 if the
+    neighbour does not show the whole window.
     """
     nothing = np.float32(-1), np.float32(0), 0.0, np.float32(0)
     w, right, down = plane
@@ -205,7 +209,7 @@ def _compare(gray, y, x, plane, same, m, other, size, radius, spacing, noise):  
     moved = ps - sp * ss / n
     area = spread * steep - mixed * mixed
     gain = (covariance * steep - moved * mixed) / area
-    shift = (moved * spread - covariance * mixed) / (area * max(gain, np.float32(0.2)))
+    shift = (moved * spread - covariance * mixed) / (area * max(gain, MIN_GAIN))
     shift = min(max(shift, np.float32(-1)), np.float32(1))
     textured = steep - (1 + MIN_TEXTURE) * floor - mixed * mixed / spread
     weight = max(textured, np.float32(0)) / own
@@ -234,8 +238,8 @@ def propagate_rows(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Give pixels that correlate less than `sure` the plane of one of four others, if it is better.
 
-    `planes` and what follows as of `refine_rows`. The others are `jump` pixels of `planes` away.
-    `scores` (H, W) are those of the planes, `found` those of the new ones.
+    The others are `jump` pixels of `planes` away. `scores` (H, W) are the correlations of the given
+    planes, `found` those of the new ones. `refine_rows` describes the other arguments.
     """
     height, width = gray.shape
     rows, columns = planes.shape[:2]
@@ -273,14 +277,14 @@ def refine_rows(  # type: ignore[no-untyped-def]
     first, last, planes, stride, gray, neighbours, sizes, maps, radius, spacing, noise, tolerance,
     min_correlation, min_number, out, errors, certainty,
 ):  # fmt: skip
-    """Write the inverse depths after one step of Lucas-Kanade in all neighbours together.
+    """Write the inverse depths after one step of Lucas-Kanade over all neighbours together.
 
-    `planes` (H, W, 3), as of `fit_rows`, are at every `stride` pixels of `gray`, slopes per pixel
-    of `gray`. `neighbours` (K, H', W') float32 have (width, height) `sizes`, `maps` (K, 3, 4) are A
-    and b. Every `spacing`-th pixel of the window counts that is on the same surface. `errors` are
-    the distances in pixels to the matches of each neighbour alone, as root mean squares;
-    `certainty` is 0 where no neighbour has texture along its line, and the depth stays, and where
-    fewer than `min_number` correlate, and the depth becomes NaN.
+    `planes` (H, W, 3), as in `fit_rows`, are at every `stride`-th pixel of `gray`, with slopes per
+    pixel of `gray`. `neighbours` (K, H', W') float32 have (width, height) `sizes`, and `maps`
+    (K, 3, 4) are A and b. Every `spacing`-th pixel of the window is used if it is on the same
+    surface. `errors` are root mean square distances in pixels to the matches of each neighbour
+    alone. If fewer than `min_number` neighbours correlate, the depth becomes NaN; if none has
+    texture along its epipolar line, the depth stays. `certainty` is 0 in both cases.
     """
     height, width = gray.shape
     side = 2 * radius + 1
@@ -330,14 +334,14 @@ def fuse_rows(  # type: ignore[no-untyped-def]
     first, last, planes, neighbours, sizes, stride, there, back, rays, centres, max_error,
     max_difference, min_angle, fused, views, shown,
 ):  # fmt: skip
-    """Write the mean inverse depth of the depth maps that agree on each pixel of the first.
+    """Write the mean inverse depth of the depth maps that agree on each pixel of the first one.
 
-    `planes` (H, W, 3) and `neighbours` (K, H', W', 3), NaN where unknown, are at every `stride`
-    pixels; `sizes` (K, 2) are the rows and columns of the latter. `there` and `back` (K, 3, 4) are
-    A and b to the neighbours and from them. `rays` (3, 3) makes lines of sight of pixels, `centres`
-    (K, 3) are those of the neighbours in the same frame. A neighbour agrees where its own surface
-    is seen within `max_error` pixels. `views` (H, W) is how many do, with the first one, or 0;
-    `shown` (H, W), how many have the place in their image, hidden or not.
+    `planes` (H, W, 3) and `neighbours` (K, H', W', 3), NaN where unknown, are at every `stride`-th
+    pixel; `sizes` (K, 2) are the rows and columns of the neighbours. `there` and `back` (K, 3, 4)
+    are A and b to the neighbours and from them. `rays` (3, 3) maps pixels to lines of sight;
+    `centres` (K, 3) are camera centres of the neighbours in the same frame. A neighbour agrees if
+    its own surface reprojects to within `max_error` pixels. `views` (H, W) is the number of images
+    that agree, including the first, or 0; `shown` (H, W) the number whose frame contains the point.
     """
     for row in range(first, last):
         for column in range(planes.shape[1]):
@@ -382,11 +386,11 @@ def fuse_rows(  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True)
 def support_rows(first, last, planes, stride, chosen, reach, spacing, tolerance, support):  # type: ignore[no-untyped-def]
-    """Write how many of the pixels around each one are `chosen` (H, W) and on its surface, a share.
+    """Write the share of the pixels around each one that are `chosen` (H, W) and on its surface.
 
-    They are every `spacing`-th of a square up to `reach` pixels away, as far as it is inside.
-    `planes` are as of `fuse_rows`; inverse depths may differ from the own plane by `tolerance`,
-    relative.
+    They are every `spacing`-th pixel of a square up to `reach` pixels away, as far as it lies in
+    the image. `planes` are as in `fuse_rows`. A pixel is on the surface if its inverse depth
+    differs from the plane by at most `tolerance`, relative to the inverse depth.
     """
     height, width = chosen.shape
     for row in range(first, last):

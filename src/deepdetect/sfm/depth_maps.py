@@ -1,9 +1,9 @@
 """Depth maps of images with known cameras.
 
-A small copy of each image is matched with its best neighbours together, by semi-global matching;
-pixels that correlate badly take planes of others; and inverse depths are fitted to the grey values
-at full size. A surface near a pixel is a plane throughout, so that slanted ones are matched as well
-as others. What has no texture, and does not lie between textures of one surface, has no depth.
+Semi-global matching of small copies gives the first inverse depths. Pixels that correlate badly
+then take over the planes of others, and a fit to the grey values at full size refines all of them.
+Each pixel has a plane, so slanted surfaces are matched as well as frontal ones. A pixel without
+texture gets a depth only between textured pixels of the same surface.
 """
 
 from __future__ import annotations
@@ -26,96 +26,100 @@ from .colmap import CameraIntrinsics
 from .mapping import RegisteredImage, SparseModel
 
 MATCHED_NEIGHBOURS = 4
-"""Images that each one is matched with."""
+"""Number of neighbours that an image is matched with; time grows with it. Chosen by hand."""
 
 NEIGHBOURS = 8
-"""Images whose depth maps it is compared with, the matched ones among them."""
+"""Number of neighbours whose depth maps are compared with that of an image. Chosen by hand."""
 
 MIN_COMMON_POINTS = 30
-"""Sparse points that both see."""
+"""Number of sparse points that a neighbour must share with the image. Chosen by hand."""
 
 IDEAL_ANGLE_DEG = 5.0
-"""Between the lines of sight from both: smaller ones count less."""
+"""A shared point seen at a smaller angle counts less: its depth is uncertain. Chosen by hand."""
 
 MAX_ANGLE_DEG = 30.0
-"""Larger ones count less, since surfaces look different."""
+"""A shared point seen at a larger angle counts less: surfaces look different. Chosen by hand."""
 
 MAX_SIDE_PX = 2000
-"""Longer sides are scaled down to this."""
+"""Images with a longer side are scaled down to this, which bounds time and memory."""
 
 CACHED_IMAGES = 16
-"""Prepared images that a process keeps: following references share neighbours."""
+"""Number of undistorted images that a process caches: successive images share neighbours."""
 
 SMALL_SCALE = 0.5
-"""Of the copies that are searched, at most."""
+"""Copies for semi-global matching have at most this scale; half the size costs an eighth."""
 
 MAX_VOLUME = 3e7
-"""Pixels of such a copy times inverse depths; with more, it is smaller."""
+"""A copy with more pixels times inverse depths is scaled down further, which bounds the memory."""
 
 TAIL_FRACTION, DEPTH_MARGIN = 0.002, 0.2
-"""Of the inverse depths of the sparse points in an image, at each end, which may be wrong; and of
-their range, added at both ends: what is searched."""
+"""The search leaves out this fraction of the sparse points at each end of their inverse depths, and
+extends the range by the second fraction at each end. Chosen by hand."""
 
 MIN_FAR = 0.1
-"""Least inverse depth that is searched, relative to the least of the sparse points."""
+"""The search ends at this share of the smallest inverse depth of a sparse point. Chosen by hand."""
 
 MAX_APPROACH = 0.5
-"""Of the way to the middle of the searched depths, that a neighbour is ahead; it is moved away."""
+"""Neighbours are aligned at a depth of which the foremost has covered at most this share, because
+images cannot be aligned at a depth that a camera has passed. Chosen by hand."""
 
 PARALLAX_QUANTILE = 0.5
-"""Of how far matches move with the inverse depth, over the image; steps are so fine."""
+"""Inverse depths are spaced so that this quantile of the pixels moves by one pixel from one to the
+next: the median, because pixels near the epipole hardly move."""
 
 SAME_SURFACE_PX = 1.0
-"""An inverse depth that moves the match in a small copy by more belongs to another surface."""
+"""Two inverse depths are on different surfaces if a match in a small copy moves by more."""
 
 FIT_RADIUS_PX = 3
-"""Of the windows in which planes are fitted to the inverse depths of a small copy."""
+"""Radius of the windows in which planes are fitted to a small depth map. Chosen by hand."""
 
 FIT_TOLERANCES_PX = (4, 2, 1)
-"""Of these fits, one after the other: the first follows steep surfaces, such as the ground."""
+"""Tolerances of successive fits, in steps of the search. The first is wide, so that fits that begin
+with frontal planes can follow steep surfaces such as the ground. Chosen by hand."""
 
 MIN_FITTED = 12
-"""Pixels that a plane is fitted to, at least: smaller patches apart from all around are wrong."""
+"""Number of pixels that a plane must fit: smaller isolated patches are wrong. Chosen by hand."""
 
 WINDOW_RADIUS_PX, WINDOW_SPACING_PX = 4, 2
-"""Of the windows that are compared at full size, and of their pixels that are."""
+"""Windows of this radius are compared at full size, by 25 of their 81 pixels. Chosen by hand."""
 
 BLUR_SIGMA_PX = 1.0
-"""Of both images before, so that these pixels stand for all."""
+"""Sigma of the blur before this comparison, so that the pixels that are read represent the rest."""
 
 NOISE_LEVELS = 1.0
-"""Grey levels a pixel, which are added to all gradients."""
+"""Noise of a pixel in grey levels; weaker gradients do not move a depth. Chosen by hand."""
 
 JUMPS = (16, 8, 4, 2, 1)
-"""Distances over which planes spread, in pixels of the depth map."""
+"""Distances over which planes spread, in pixels of the depth map: five passes cover 31 pixels."""
 
 SURE_CORRELATION = 0.9
-"""With which a pixel keeps its own plane."""
+"""A pixel that correlates better than this keeps its plane, which saves time. Chosen by hand."""
 
 MIN_CORRELATION = 0.5
-"""Of the window of a pixel with that of a neighbour which takes part in its refinement."""
+"""A neighbour refines a pixel only if its window correlates at least this well. Chosen by hand."""
 
 SMOOTHING_RADII = (4, 3)
-"""Of the fits after each refinement, in pixels of the depth map."""
+"""Radii of the fits after the two refinements, in pixels of the depth map. Chosen by hand."""
 
 MIN_WEIGHT = 0.02
-"""Of a pixel without texture in these fits; half of the others have more than 0.5."""
+"""Weight of a pixel without texture in these fits; half of the textured ones have more than 0.5."""
 
 MIN_VIEWS = 3
-"""Images that must agree, the reference among them; `fusion` asks some places for others."""
+"""Number of images, with the reference, that must agree on a pixel: two alone are not checked by a
+third. `fusion` asks for other numbers in some places."""
 
 DEPTH_PIXEL = np.dtype(
     [("plane", np.float32, 3), ("error", np.float32), ("color", np.uint8, 3)], align=True
 )
-"""Of a depth map: the inverse depth, NaN where there is none, and its changes per pixel of the
-image to the right and down; the distance in pixels from the matches of each neighbour alone (root
-mean square); and the sRGB colour."""
+"""Pixel of a depth map. `plane` is the inverse depth (NaN if unknown) and its change per pixel of
+the image to the right and down; `error` the root mean square distance in pixels to the matches that
+each neighbour alone would give; `color` is sRGB."""
 
 
 def find_references(sparse: SparseModel) -> list[list[RegisteredImage]]:
     """Choose the neighbours of each image: those that share many points at a good angle.
 
-    Returns images, those that see most points first, each with its neighbours, the best first.
+    Returns, for each image, a list of it and its neighbours, best first.
     """
     found = []
     for image in sorted(sparse.images.values(), key=lambda image: -len(image.points)):
@@ -140,10 +144,10 @@ def find_references(sparse: SparseModel) -> list[list[RegisteredImage]]:
 def depth_map(
     folder: Path, images: Sequence[RegisteredImage], points: np.ndarray, stride_px: int
 ) -> np.ndarray:
-    """Match the first image with the others; (H, W) `DEPTH_PIXEL`.
+    """Return the depth map of the first image, matched with the others; (H, W) `DEPTH_PIXEL`.
 
-    It has every `stride_px` pixels of a row and of a column. `points` are those of the sparse
-    model, among whose depths it searches.
+    It has every `stride_px`-th pixel of a row and of a column. The search covers the depths of
+    `points`, those of the sparse model.
     """
     rgbs, views = zip(*(prepared_image(folder, image) for image in images), strict=True)
     grays = [luma(rgb) for rgb in rgbs]
@@ -153,7 +157,7 @@ def depth_map(
     low, high = np.quantile(1 / depth[seen], [TAIL_FRACTION, 1 - TAIL_FRACTION])
     margin = DEPTH_MARGIN * (high - low)
     small, step = _search(grays, views, (max(low - margin, MIN_FAR * low), high + margin))
-    # From the pixels of the small copy to those of the depth map.
+    # Resample from the pixels of the small copy to those of the depth map.
     ratio = np.divide(small.shape[1::-1], size)
     whole = [np.arange(0, side, stride_px) for side in size]
     places = [(at + 0.5) * each - 0.5 for at, each in zip(whole, ratio, strict=True)]
@@ -174,14 +178,14 @@ def depth_map(
 def _search(
     grays: Sequence[np.ndarray], views: Sequence[PosedView], searched: tuple[float, float]
 ) -> tuple[np.ndarray, float]:
-    """Search inverse depths by semi-global matching of small copies of the images.
+    """Search the range `searched` of inverse depths by semi-global matching of small copies.
 
-    Returns (h, w, 3) planes in pixels of the small copy of the first, and the change of the inverse
-    depth that moves a match there by a pixel.
+    Returns (h, w, 3) planes in pixels of the small copy of the first image, and the step of the
+    inverse depth, which moves a match there by one pixel.
     """
     from .dense_kernels import choose_rows, cost_rows
 
-    # Not where a camera that moves forward has passed.
+    # The depth at which neighbours are aligned must lie ahead of a camera that moves forward.
     passed = max(-relative_projection(views[0], view)[1][2] for view in views[1:])
     middle = min(float(np.mean(searched)), MAX_APPROACH / max(passed, 1e-9))
     parallax = max(_parallax(views[0], view, middle) for view in views[1:])
@@ -197,9 +201,9 @@ def _search(
     inverse = np.linspace(*searched, count)
     own = copies[0]
     size = np.array(own.shape[::-1])
-    # Neighbours are warped by the plane of the middle depth: what is left of another depth is a
-    # shift and a growth of the whole image.
-    warps, corners = [], np.empty((len(copies) - 1, 2, 2, count))  # first and last, x and y
+    # Neighbours are warped by the homography of the middle depth. Any other depth then differs only
+    # by a shift and a scale of the whole image.
+    warps, corners = [], np.empty((len(copies) - 1, 2, 2, count))  # first and last pixel, x and y
     for view, places in zip(small[1:], corners, strict=True):
         matrix, vector = relative_projection(small[0], view)
         warp = matrix + middle * np.outer(vector, [0, 0, 1])
@@ -237,7 +241,7 @@ def _search(
 def _warped_census(
     gray: np.ndarray, warp: np.ndarray, first: np.ndarray, last: np.ndarray
 ) -> np.ndarray:
-    """Return the census of an image at the pixels `first` to `last` of another, by a homography."""
+    """Return the census of an image that a homography warps to the pixels `first` to `last`."""
     from .dense_kernels import HIDDEN
 
     across, down = last - first + 1
@@ -252,7 +256,7 @@ def _warped_census(
 
 
 def _fit(planes: np.ndarray, weights: np.ndarray, radius: int, tolerance: float) -> np.ndarray:
-    """Fit a plane to the inverse depths around each pixel that are about on its own plane."""
+    """Fit a plane around each pixel, to the inverse depths that lie near its present plane."""
     from .dense_kernels import fit_rows
 
     fitted = np.empty_like(planes)
@@ -294,10 +298,10 @@ def _refine(
         sure = certainty > 0
         usual = np.median(certainty[sure]) if sure.any() else 1
         weights = certainty / (certainty + usual) + np.float32(MIN_WEIGHT)
-        # Slopes are per pixel of the depth map while it is fitted.
+        # The fit needs slopes per pixel of the depth map; elsewhere they are per pixel of an image.
         planes = _fit(np.dstack([refined, planes[..., 1:] * stride_px]), weights, radius, tolerance)
         planes[..., 1:] /= stride_px
-    # Windows reach into a texture beside their pixel.
+    # A window can reach texture that its own pixel does not have, so the textured area is eroded.
     reach = np.ones((2 * -(-WINDOW_RADIUS_PX // stride_px) + 1,) * 2, np.uint8)
     textured = cv2.erode((sure | np.isnan(planes[..., 0])).astype(np.uint8), reach) > 0
     planes[~_enclosed(planes, textured, stride_px, tolerance)] = np.nan
@@ -305,10 +309,10 @@ def _refine(
 
 
 def _enclosed(planes: np.ndarray, sure: np.ndarray, stride_px: int, tolerance: float) -> np.ndarray:
-    """Return which pixels of a depth map are `sure`, or on one surface between two that are.
+    """Return a mask of pixels that are `sure`, or lie on one surface between two that are.
 
-    The two are to the left and right, or above and below. Elsewhere the depth is only continued
-    from one side, such as that of a roof into the sky.
+    The two are to the left and right, or above and below. All other depths are extrapolated from
+    one side, such as that of a roof into the sky.
     """
     found = sure.copy()
     for axis in (0, 1):
@@ -323,7 +327,7 @@ def _enclosed(planes: np.ndarray, sure: np.ndarray, stride_px: int, tolerance: f
 
 
 def _reached(known: np.ndarray, begins: np.ndarray) -> np.ndarray:
-    """Return where a pixel or one above it is known, and no surface begins in between."""
+    """Return a mask of `known` pixels and those below one, up to where a new surface begins."""
     rows = np.arange(len(known))[:, None]
     last, first = (np.maximum.accumulate(np.where(each, rows, -1)) for each in (known, begins))
     return last >= first
@@ -344,7 +348,7 @@ def relative_projections(
 
 
 def _parallax(first: PosedView, second: PosedView, inverse_depth: float) -> float:
-    """Return by how many pixels matches move with the inverse depth, a quantile of the image.
+    """Return how far matches move per unit of inverse depth, in pixels, as a quantile of the image.
 
     Near the epipole, which lies ahead of a camera that moves forward, they do not move.
     """
@@ -358,7 +362,7 @@ def _parallax(first: PosedView, second: PosedView, inverse_depth: float) -> floa
 
 
 def prepared_image(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, PosedView]:
-    """Return an image without its distortion at most `MAX_SIDE_PX` long, and its view."""
+    """Return an undistorted image, at most `MAX_SIDE_PX` on its longer side, and its view."""
     path, view = folder / image.view.name, limited_view(image.view)
     return _undistorted(path, file_state(path), image.intrinsics, view.camera), view
 
@@ -367,7 +371,7 @@ def prepared_image(folder: Path, image: RegisteredImage) -> tuple[np.ndarray, Po
 def _undistorted(
     path: Path, state: tuple[int, int], intrinsics: CameraIntrinsics, camera: Camera
 ) -> np.ndarray:
-    """Read an image of this `file_state`, which extraction has let pass, without its distortion."""
+    """Read and undistort an image; a changed file has another `state` and is read again."""
     rgb = load_image(path, max_megapixels=np.inf)
     if camera.size != intrinsics.size:
         rgb = cv2.resize(rgb, camera.size, interpolation=cv2.INTER_AREA)
@@ -375,7 +379,7 @@ def _undistorted(
 
 
 def limited_view(view: PosedView) -> PosedView:
-    """Return a view of at most `MAX_SIDE_PX`."""
+    """Return a view whose longer side is at most `MAX_SIDE_PX`."""
     return _scaled(view, min(1.0, MAX_SIDE_PX / max(view.camera.size)))
 
 

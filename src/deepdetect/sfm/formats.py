@@ -1,4 +1,4 @@
-"""Further formats of a model: for surveyors, viewers of meshes, trainers of splats."""
+"""Further file formats of a model: point clouds in UTM, maps, meshes, and inputs for splats."""
 
 from __future__ import annotations
 
@@ -26,28 +26,29 @@ from .splat import write_splat
 FormatName = Literal["laz", "map", "mesh", "splat", "text"]
 
 LAZ_STEP_M = 0.001
-"""Precision of coordinates in LAZ files."""
+"""Precision of the coordinates in LAZ files."""
 
 MESH_MARGIN = 0.5
-"""Points farther from the robust box, by its size, are no part of a mesh."""
+"""A mesh leaves out points farther from the robust bounding box than this share of its size."""
 
 MESH_DEPTHS, MESH_TRIM = (6, 12), 3
-"""Levels of the octree, and how many coarser the surface may be than the finest one."""
+"""Bounds of the depth of the octree, which follows the number of points; and number of levels by
+which the octree may be coarser than that before the surface is trimmed. Chosen by hand."""
 
 MIN_MESH_POINTS = 100
-"""COLMAP's meshing ends the process where there are a handful."""
+"""A mesh needs this number of points: with a handful, COLMAP's meshing crashes the process."""
 
 COLORS = ("red", "green", "blue")
 
 POINTS_PER_CELL = 4.0
-"""Of a map: so few cells stay empty."""
+"""Mean number of points in a cell of a map: few cells stay empty. Chosen by hand."""
 
 MAX_MAP_SIDE = 10_000
-"""Cells of a map, across and down."""
+"""A map has at most this number of cells across and down, which bounds memory and files."""
 
 
 def write_laz(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
-    """Write model.laz: the points in UTM, with their colours in 16 bits (LAS 1.4, format 7)."""
+    """Write model.laz (LAS 1.4, format 7): the points in UTM, with colours of 16 bits."""
     import laspy
     from pyproj import CRS
 
@@ -57,16 +58,16 @@ def write_laz(found: MultiViewReconstruction, folder: Path, output: Path) -> Non
     header.add_crs(CRS.from_epsg(epsg))
     las = laspy.LasData(header)
     las.x, las.y, las.z = xyz.T
-    # 8 bits in 16: 255 becomes 65535
+    # From 8 to 16 bits: 255 becomes 65535.
     las.red, las.green, las.blue = found.cloud.colors.astype(np.uint16).T * 257
     with atomic_path(output / "model.laz") as path, path.open("wb") as file:
         las.write(file, do_compress=True)
 
 
 def write_map(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
-    """Write height.tif, metres, NaN where unknown, and orthophoto.tif: GeoTIFF in UTM, north up.
+    """Write height.tif, in metres, and orthophoto.tif: GeoTIFF in UTM, north up.
 
-    A cell has the median height and colour of the points in it.
+    A cell has the height and colour of the median of its points; heights without points are NaN.
     """
     xyz, epsg = _in_utm(found, "a map")
     low, high = np.percentile(xyz, (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0)
@@ -100,23 +101,23 @@ def _in_utm(found: MultiViewReconstruction, what: str) -> tuple[np.ndarray, int]
     place = found.georeference
     if not isinstance(place, Georeference) or place.origin is None:
         raise ReconstructionError(
-            f"{what} needs a place on the Earth: take photographs with GPS, or give ground "
+            f"{what} needs a georeferenced model: take photographs with GPS, or give ground "
             "control points"
         )
     return place.origin.to_utm(found.cloud.points)
 
 
 def write_text(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
-    """Write sparse_text/: COLMAP's model as text files."""
+    """Write sparse_text/: the sparse model in COLMAP's text format."""
     (output / "sparse_text").mkdir(exist_ok=True)
     with quiet_pycolmap() as pycolmap:
         pycolmap.Reconstruction(output / "sparse" / "0").write_text(output / "sparse_text")
 
 
 def write_mesh(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
-    """Write mesh.ply and mesh.glb: the surface of the dense points, coloured.
+    """Write mesh.ply and mesh.glb: a coloured surface through the dense points.
 
-    By screened Poisson reconstruction (Kazhdan and Hoppe, 2013), which COLMAP brings.
+    It is made by COLMAP's screened Poisson reconstruction (Kazhdan and Hoppe, 2013).
     """
     cloud = found.dense
     if len(cloud):
@@ -126,10 +127,10 @@ def write_mesh(found: MultiViewReconstruction, folder: Path, output: Path) -> No
         cloud = cloud[inside.all(axis=1)]
     if len(cloud) < MIN_MESH_POINTS:
         raise ReconstructionError(
-            f"a mesh needs {MIN_MESH_POINTS} dense points or more, there are {len(cloud)}: take "
-            "more images, closer together, or leave out the format mesh"
+            f"a mesh needs at least {MIN_MESH_POINTS} dense points, and there are {len(cloud)}: "
+            "take more images, closer together, or leave out the format mesh"
         )
-    # Points lie on surfaces, so that their number grows with the square of cells across.
+    # Points lie on surfaces, so their number grows with the square of the cells on a side.
     depth = round(float(np.clip(np.log2(np.sqrt(len(cloud))), *MESH_DEPTHS)))
     with tempfile.TemporaryDirectory(prefix="deepdetect-") as space:
         points, surface = Path(space) / "points.ply", Path(space) / "mesh.ply"
@@ -147,7 +148,7 @@ def write_mesh(found: MultiViewReconstruction, folder: Path, output: Path) -> No
 
 
 def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read what COLMAP has written: (N,) vertices with fields, and (M, 3) corners of triangles."""
+    """Read a mesh that COLMAP wrote: (N,) vertices with fields, and (M, 3) corners of triangles."""
     header, _, data = path.read_bytes().partition(b"end_header\n")
     counts = [int(number) for number in re.findall(rb"element \w+ (\d+)", header)]
     fields = re.findall(r"property (float|uchar) (\w+)", header.decode("ascii"))
@@ -160,12 +161,12 @@ def _read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Format(NamedTuple):
-    """How a format is written, of the images below a folder, as which files, by which packages."""
+    """A file format: its writer (model, folder of the images, output), its files, and packages."""
 
     write: Callable[[MultiViewReconstruction, Path, Path], None]
     files: tuple[str, ...]
     packages: tuple[str, ...] = ()
-    placed: bool = False  # on the Earth
+    placed: bool = False  # needs a georeferenced model
 
 
 FORMATS: dict[FormatName, Format] = {
@@ -178,7 +179,7 @@ FORMATS: dict[FormatName, Format] = {
 
 
 def check_formats(names: Sequence[FormatName]) -> None:
-    """Raise what is wrong with the names of formats, or missing for them, before hours of work."""
+    """Raise an error for an unknown format or a missing package before the long computation."""
     for name in names:
         check_name("format", name, FORMATS)
         require_packages(f"the format {name}", *FORMATS[name].packages)

@@ -1,4 +1,4 @@
-"""Dense points: what the depth maps of several images agree on."""
+"""Dense points: fusion of the depth maps of several images."""
 
 from __future__ import annotations
 
@@ -14,32 +14,34 @@ from ..geometry.camera import PosedView
 from .depth_maps import MIN_VIEWS, relative_projections
 
 MAX_ERROR_PX = 1.0
-"""Between a pixel and where the surface of another depth map is seen."""
+"""A depth map agrees up to this reprojection error. Chosen by hand; COLMAP's fusion allows 2 px."""
 
 MAX_DEPTH_DIFFERENCE = 0.01
-"""Of two depth maps that agree, and of two pixels on one surface, relative."""
+"""Inverse depths agree, or belong to one surface, up to this relative difference. COLMAP's fusion
+also allows 1 %."""
 
 MIN_ALL_VIEWS, ENOUGH_VIEWS = 4, 5
-"""A pixel is a point anywhere if the second number of images agree, or all whose frame contains it
-if these are fewer, but not fewer than the first."""
+"""A pixel becomes a point wherever it lies if the second number of images agree, or if all images
+that cover it agree and these are at least the first number. Chosen by hand."""
 
 EDGE_RADIUS_PX = 8
-"""As near as that to a farther surface fewer images make no point."""
+"""Only these numbers count within this distance of a farther surface: there, windows give pixels of
+the background the depth of the foreground in all images alike. Chosen by hand."""
 
 MIDDLE_SPACING_PX, MIN_MIDDLE_SHARE = 10, 0.6
-"""Elsewhere `MIN_VIEWS` are enough in the middle of a surface: where of 5 x 5 pixels around, so far
-from each other, this share is agreed on, too, and on the same surface. Most wrong points are on
-small patches."""
+"""`MIN_VIEWS` images are enough in the middle of a surface, because most wrong points are on small
+patches. A pixel is in the middle if this share of the 5 x 5 pixels around it, at this spacing, is
+agreed on by `MIN_VIEWS` and on its surface. Chosen by hand."""
 
 FILLED_RADIUS_PX, MIN_FILLED_VIEWS = 8, 2
-"""As near as that to such a middle of the same surface so few images are enough: the others may
-have something before it, or not show its rim."""
+"""This number of images is enough within this distance of such a pixel, on the same surface, which
+may be occluded in the others, or beyond their border. Chosen by hand."""
 
 MIN_TRIANGULATION_DEG = 1.0
-"""Smallest angle between two of the lines of sight."""
+"""A point needs this angle between its two outermost lines of sight. Chosen by hand."""
 
 DUPLICATE_DEPTH = 0.01
-"""Of a point that another reference has given already, the relative difference of the depths."""
+"""A point repeats an earlier one if their depths differ by less, relative. Chosen by hand."""
 
 DENSE_POINT = np.dtype(
     [
@@ -50,18 +52,17 @@ DENSE_POINT = np.dtype(
         ("views", np.uint8),
     ]
 )
-"""A point that several images agree on, the normal of its surface, towards the reference, its
-distance in pixels from the matches of the reference (root mean square), its sRGB colour, and how
-many images these are."""
+"""Dense point: position, unit normal towards the reference image, root mean square distance in
+pixels from the matches of the reference, sRGB colour, and number of images that agree on it."""
 
 
 def fuse_depth_maps(
     views: Sequence[PosedView], maps: Sequence[np.ndarray], stride_px: int
 ) -> np.ndarray:
-    """Return what enough depth maps (`DEPTH_PIXEL`) agree on with the first one (`DENSE_POINT`)."""
+    """Return the `DENSE_POINT`s of the first depth map on which enough of the others agree."""
     from .dense_kernels import fuse_rows
 
-    if len(maps) < MIN_FILLED_VIEWS:  # none of the neighbours has one
+    if len(maps) < MIN_FILLED_VIEWS:  # no neighbour has a depth map
         return np.empty(0, DENSE_POINT)
     planes = np.ascontiguousarray(maps[0]["plane"])
     sizes = np.array([each.shape for each in maps])
@@ -83,7 +84,7 @@ def fuse_depth_maps(
     xy, near = np.column_stack([column, row]) * float(stride_px), inverse[row, column]
     fused = np.empty(len(row), DENSE_POINT)
     fused["points"] = (camera.rays(xy) / near[:, None] - views[0].translation) @ views[0].rotation
-    # The inverse depth of a plane is its normal times the line of sight, over its distance.
+    # The inverse depth of a plane at a pixel is normal . line of sight / distance of the plane.
     ahead = near - (plane[:, 1:] * (xy - camera.centre)).sum(axis=1)
     away = np.column_stack([plane[:, 1:] * camera.focal_px, ahead]) @ views[0].rotation
     fused["normals"] = -away / np.linalg.norm(away, axis=1, keepdims=True)
@@ -93,7 +94,7 @@ def fuse_depth_maps(
 
 
 def _agreed(planes: np.ndarray, count: np.ndarray, shown: np.ndarray, stride_px: int) -> np.ndarray:
-    """Return on which pixels of a depth map enough images agree: `count` of those that show it."""
+    """Return a mask of the pixels on which enough images agree: `count` of the `shown` ones."""
     from .dense_kernels import support_rows
 
     def support(chosen: np.ndarray, reach: int, spacing: int) -> np.ndarray:
@@ -105,8 +106,7 @@ def _agreed(planes: np.ndarray, count: np.ndarray, shown: np.ndarray, stride_px:
     def pixels(length_px: int) -> int:
         return max(1, length_px // stride_px)
 
-    # Windows give pixels beside a nearer surface its depth, in all views alike. Single pixels are
-    # no surface.
+    # Find the pixels just before a farther surface. The dilation ignores single pixels.
     inverse, radius = planes[..., 0], pixels(EDGE_RADIUS_PX)
     known = cv2.dilate(np.where(inverse > 0, inverse, np.inf), np.ones((3, 3), np.uint8))
     farthest = cv2.erode(known, np.ones((2 * radius + 3,) * 2, np.uint8))
@@ -119,7 +119,7 @@ def _agreed(planes: np.ndarray, count: np.ndarray, shown: np.ndarray, stride_px:
 
 
 def merge_dense_points(parts: Iterable[tuple[PosedView, np.ndarray]], stride_px: int) -> np.ndarray:
-    """Join the points of all references, without those that an earlier one has given already."""
+    """Join the points of all references, and leave out those that repeat an earlier one."""
     kept, boxes = [np.empty(0, DENSE_POINT)], [np.empty((0, 3))]
     for view, own in parts:
         near = (_may_show(view, box, stride_px) for box in boxes)
@@ -136,7 +136,7 @@ def merge_dense_points(parts: Iterable[tuple[PosedView, np.ndarray]], stride_px:
 
 
 def _may_show(view: PosedView, corners: np.ndarray, margin_px: int) -> bool:
-    """Whether a view may show something of a box: no side of its frustum has all corners beyond."""
+    """Return whether a box may be in view: its corners are not all beyond one side of a frustum."""
     seen = (corners @ view.rotation.T + view.translation) @ view.camera.matrix.T
     xy, depth = seen[:, :2], seen[:, 2:]
     inside = [depth, xy + margin_px * depth, (np.array(view.camera.size) + margin_px) * depth - xy]
@@ -144,7 +144,7 @@ def _may_show(view: PosedView, corners: np.ndarray, margin_px: int) -> bool:
 
 
 def nearest_depths(view: PosedView, parts: Sequence[np.ndarray], stride_px: int) -> np.ndarray:
-    """Return the depth of the nearest of (N, 3) points in each cell of a view; infinite: none."""
+    """Return the depth of the nearest of (N, 3) points in each cell of a view, or infinity."""
     columns, rows = (-(-side // stride_px) for side in view.camera.size)
     nearest = np.full((rows, columns), np.inf)
     for points in parts:

@@ -1,4 +1,4 @@
-"""Scale and place of a model: by satellite fixes, ground control points, or a known distance."""
+"""Scale and place of a model: by GPS, ground control points, or a known distance."""
 
 from __future__ import annotations
 
@@ -20,57 +20,63 @@ from .colmap import import_pycolmap
 from .mapping import SparseModel
 
 GPS_ACCURACY_M = 3.0
-"""Of a fix that does not say it: that of ordinary receivers under the open sky."""
+"""Accuracy of a GPS position that does not state its own: that of usual receivers in the open."""
 
 CONTROL_ACCURACY_M = 0.1
-"""Of ground control points: surveyed to centimetres, clicked to a few pixels."""
+"""Accuracy of ground control points, surveyed to centimetres and marked to within a few pixels."""
 
 MIN_FIXES = 3
-"""That agree, for a model to get a place."""
+"""Number of positions that must agree: with two, the rotation about their line is undetermined."""
 
 MAX_SCALE_STD = 0.25
-"""Relative: fixes that are too close to each other for their accuracy say nothing of the scale."""
+"""A place needs a smaller relative standard deviation of the scale, which is large if positions lie
+close together for their accuracy. Chosen by hand."""
 
 MAX_HEADING_STD_DEG = 20.0
-"""The same of where north is."""
+"""A place needs a smaller standard deviation of the direction of north. Chosen by hand."""
 
 MAX_OPEN_AXIS_DEG = 10.0
-"""Standard deviation of an axis by the fixes alone, from which on the cameras' up decides on it."""
+"""If positions alone leave an axis less certain, the cameras' up decides on it. Chosen by hand."""
 
 GRAVITY_STD_DEG = 2.0
-"""Of a gimbal's angles."""
+"""Standard deviation of the angles of a gimbal. Chosen by hand."""
 
 UPRIGHT_STD_DEG, AHEAD_STD_DEG = 5.0, 25.0
-"""How level the rows of a photograph are, and the lines of sight on the whole."""
+"""Standard deviations of the tilt of the rows of a photograph, which are taken to be level, and of
+the mean tilt of the optical axes. Chosen by hand."""
 
 DOWNWARD_SHARE = 0.1
-"""What the lines of sight, which go down rather than up, count for where up is, beside columns."""
+"""Weight of the optical axes in the estimate of up, relative to the columns of the images: cameras
+look down rather than up. Chosen by hand."""
 
 MAX_DISTANCE_PX = 15.0
-"""From a pixel that is named to the nearest point of the model."""
+"""A named pixel means the point of the model that is seen within this distance. Chosen by hand."""
 
+SAME_PLACE_PX = 2.0
+"""The nearest point to the camera is taken among those not farther from the pixel than the closest
+one plus this, since it hides the others. Chosen by hand."""
 
-NEARLY_A_LINE = "they lie nearly on a line: how the model is turned about it follows from the \
-cameras' being upright"
+NEARLY_A_LINE = "they lie nearly on a line: the rotation of the model about it follows from the \
+assumption that cameras are held upright"
 
 
 @dataclass(frozen=True)
 class Origin:
-    """The point of the Earth, in WGS 84, from which a model goes east, north and up in metres."""
+    """Origin of a model in WGS 84: its axes go east, north and up from here, in metres."""
 
     latitude: float
     longitude: float
     height: float
 
     def to_enu(self, places: np.ndarray) -> np.ndarray:
-        """Return (N, 3) metres east, north and up of latitudes, longitudes and heights (N, 3)."""
+        """Convert (N, 3) latitudes, longitudes and heights to metres east, north and up."""
         where = self.latitude, self.longitude, self.height
         return np.asarray(_ellipsoid().ellipsoid_to_enu(places, *where))
 
     def to_utm(self, enu: np.ndarray) -> tuple[np.ndarray, int]:
-        """Return (N, 3) eastings, northings and heights in its zone of UTM, and the EPSG number."""
+        """Convert (N, 3) metres to the UTM zone of the origin; also return its EPSG number."""
         where = self.latitude, self.longitude, self.height
-        # The zone is that of the first.
+        # pycolmap takes the zone of the first point.
         all_ = np.vstack([np.zeros((1, 3)), np.asarray(enu, np.float64)])
         found, zone = _ellipsoid().ellipsoid_to_utm(_ellipsoid().enu_to_ellipsoid(all_, *where))
         return np.asarray(found)[1:], (32600 if self.latitude >= 0 else 32700) + int(zone)
@@ -83,16 +89,16 @@ def _ellipsoid() -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Georeference:
-    """How a model got its scale, and its place.
+    """Scale and place of a model, and how they were found.
 
     Attributes:
         similarity: from the frame of the mapping to the world.
         source: "GPS", "ground control points" or "known distance", which gives no place.
-        origin: of the world, whose axes go east, north and up; None without a place.
-        residuals: (3,) metres east, north and up from the model to each fix, by image, or to each
-            control point.
-        wrong: names of those that do not agree with the others, which were left out of account.
-        fit: how far all that can be trusted.
+        origin: origin of the world, whose axes go east, north and up; None without a place.
+        residuals: (3,) metres east, north and up from the model to each GPS position, by image, or
+            to each control point.
+        wrong: names of positions that contradict the others and were left out.
+        fit: the fitted similarity with its uncertainty.
     """
 
     similarity: Similarity
@@ -137,17 +143,17 @@ def georeference(
     control: Sequence[ControlRow] | None = None,
     scale_by: tuple[float, str, str] | None = None,
 ) -> Georeference | str:
-    """Find scale and place of a model, by what there is; or say why there are none.
+    """Find the scale and the place of a model, or return a sentence on why there is no scale.
 
     Args:
         sparse: the model.
-        points: (N, 3) its dense points, among which ends of a distance are sought, too.
-        folder: of the images.
-        control: ground control points, before the fixes of the images.
-        scale_by: as of `MultiViewOptions`, before both.
+        points: (N, 3) dense points, which can also be ends of a distance.
+        folder: folder of the images.
+        control: ground control points, which take precedence over GPS.
+        scale_by: known distance as in `MultiViewOptions`; its scale takes precedence over both.
 
     Raises:
-        OptionError: control points or ends of the distance are not found.
+        OptionError: the control points or the ends of the distance are not in the model.
         ReconstructionError: the control points contradict the model.
     """
     scale = None
@@ -164,12 +170,12 @@ def georeference(
 
 
 def require_fixes(folder: Path, what: str) -> None:
-    """Raise an OptionError where too few images below a folder carry a satellite fix."""
+    """Raise an OptionError if too few images below a folder have GPS."""
     found = sum(read_gps(path) is not None for path in find_images(folder))
     if found < MIN_FIXES:
         raise OptionError(
-            f"{what} needs a place on the Earth, and {found} images carry a satellite fix, where "
-            f"{MIN_FIXES} are needed: leave it out, or give ground control points"
+            f"{what} needs GPS in {MIN_FIXES} images, and {found} have it: leave the format out, "
+            "or give ground control points"
         )
 
 
@@ -178,7 +184,7 @@ def require_images(
     control: Sequence[ControlRow] | None,
     scale_by: tuple[float, str, str] | None,
 ) -> None:
-    """Raise an OptionError where control points, or the ends of a distance, name other images."""
+    """Raise an OptionError if control points or the ends of a distance name unknown images."""
     names = [*names]
     named = {Path(name).name: name for name in names} | {name: name for name in names}
     if control is not None:
@@ -191,15 +197,14 @@ def require_images(
 def georeference_by_gps(
     views: Mapping[str, PosedView], folder: Path, scale: float | None = None
 ) -> Georeference:
-    """Find the place of a model by the fixes of its images below a folder.
+    """Find the place of a model by the GPS of its images below a folder.
 
-    A ReconstructionError says why there is none. `scale` is in metres, where it is known.
+    A known `scale` is in metres per unit of the model. Raises a ReconstructionError that says why
+    no place is found.
     """
     fixes = {name: fix for name in views if (fix := read_gps(folder / name)) is not None}
     if len(fixes) < MIN_FIXES:
-        raise ReconstructionError(
-            f"{len(fixes)} of its images carry a satellite fix, {MIN_FIXES} are needed"
-        )
+        raise ReconstructionError(f"{len(fixes)} of the images have GPS, {MIN_FIXES} are needed")
     places = np.array([(fix.latitude, fix.longitude, fix.altitude) for fix in fixes.values()])
     stated = [fix.accuracy_m for fix in fixes.values() if fix.accuracy_m is not None]
     accuracy = float(np.median(stated)) if stated else GPS_ACCURACY_M
@@ -223,11 +228,10 @@ def _place(
     targets = origin.to_enu(places)
     targets[unknown, 2] = np.nan
     problem = ReconstructionError(
-        "its satellite fixes do not agree with each other, or lie too close together for their "
-        "accuracy"
+        "the GPS positions contradict each other, or lie too close together for their accuracy"
         if source == "GPS"
         else "the ground control points do not agree with the model: check their coordinates, "
-        "pixels and names of images"
+        "pixels and image names"
     )
     try:
         fit = fit_similarity(
@@ -245,10 +249,11 @@ def _place(
 def upright(
     views: Mapping[str, PosedView], gravities: Mapping[str, np.ndarray | None] = {}
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return what cameras know of up: the direction, and as `fit_similarity` what is level.
+    """Estimate the direction of up from cameras; also return what `fit_similarity` takes as level.
 
-    That is what is across the gravity of gimbals. Where there is none, the rows of photographs, and
-    less surely the lines of sight, are taken to be level.
+    Level directions are those across the gravity that a gimbal reports. Without a gimbal, the rows
+    of the photographs are taken to be level, and less certainly the optical axes. Returns the unit
+    vector up, the level vectors (L, 3) and their standard deviations (L,) in radians.
     """
     level, stds, down = [], [], []
     for name, view in views.items():
@@ -258,11 +263,11 @@ def upright(
             level += [*np.linalg.svd(down[-1][None])[2][1:]]
             stds += 2 * [GRAVITY_STD_DEG]
         else:
-            # That all look up somewhat does not become surer by their number.
+            # All cameras may look up a little: more of them do not make their mean more certain.
             level += [view.rotation[0], view.rotation[2]]
             stds += [UPRIGHT_STD_DEG, AHEAD_STD_DEG * np.sqrt(len(views))]
     up = -np.mean(down, axis=0) if down else np.zeros(3)
-    if not down:  # as Brown and Lowe's horizon of panoramas
+    if not down:  # as Brown and Lowe straighten panoramas: up is perpendicular to all rows
         across, *others = np.array([view.rotation for view in views.values()]).swapaxes(0, 1)
         above = -(others[0] + DOWNWARD_SHARE * others[1]).mean(axis=0)
         up = np.linalg.solve(across.T @ across / len(across) + 1e-3 * np.eye(3), above)
@@ -279,9 +284,9 @@ class ControlRow(NamedTuple):
 
 
 def read_control_points(path: str | Path) -> list[ControlRow]:
-    """Read ground control points as OpenDroneMap has them.
+    """Read a file of ground control points in the format of OpenDroneMap.
 
-    The first line is the coordinate system, as "EPSG:32633" or "WGS84 UTM 33N", the others are
+    The first line is the coordinate system, such as "EPSG:32633" or "WGS84 UTM 33N". The others are
     `x y z column row image [name]`.
     """
     require_packages("a file of ground control points", "pyproj")
@@ -302,10 +307,10 @@ def read_control_points(path: str | Path) -> list[ControlRow]:
             rows.append(ControlRow((name or [f"{x} {y} {z}"])[0], place, image, xy))
     except OSError as error:
         raise OptionError(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except Exception as error:  # of pyproj, and of numbers that are none
+    except Exception as error:  # from pyproj, or text in place of numbers
         raise OptionError(
-            f"{path} is no file of ground control points ({first_line(error)}): write the "
-            "coordinate system, as EPSG:32633, then lines of x y z column row image"
+            f"{path} is not a file of ground control points ({first_line(error)}): write the "
+            "coordinate system, such as EPSG:32633, then lines of x y z column row image"
         ) from None
     return rows
 
@@ -313,7 +318,7 @@ def read_control_points(path: str | Path) -> list[ControlRow]:
 def georeference_by_control_points(
     sparse: SparseModel, control: Sequence[ControlRow], scale: float | None = None
 ) -> Georeference:
-    """Find the place of a model by points that two or more of its images show."""
+    """Find the place of a model by control points that are marked in two or more of its images."""
     seen = _seen_by_several(control, _by_file_name(sparse.images))
     points = {name: _triangulated(sparse, rows) for name, rows in seen.items()}
     places = np.array([next(iter(rows.values())).place for rows in seen.values()])
@@ -325,7 +330,7 @@ def georeference_by_control_points(
 def _seen_by_several(
     control: Sequence[ControlRow], names: Mapping[str, str]
 ) -> dict[str, dict[str, ControlRow]]:
-    """Return the rows by point and image, of points in two or more images of these names."""
+    """Return observations by point and image, of points in two or more of the named images."""
     seen: dict[str, dict[str, ControlRow]] = {}
     for row in control:
         if row.image in names:
@@ -333,15 +338,15 @@ def _seen_by_several(
     seen = {name: rows for name, rows in seen.items() if len(rows) > 1}
     if len(seen) < MIN_FIXES:
         raise OptionError(
-            f"{len(seen)} ground control points are in two or more images of the model, "
-            f"{MIN_FIXES} are needed: name more, and the images as their files are called, with "
-            "their folders where two have one name"
+            f"{len(seen)} ground control points are marked in two or more images of the model, "
+            f"{MIN_FIXES} are needed: mark more, and name images by their files, with the folder "
+            "if two files have the same name"
         )
     return seen
 
 
 def _by_file_name(names: Iterable[str]) -> dict[str, str]:
-    """Return the names of images by these, and by the names of their files that only one has."""
+    """Return the names of images, by themselves and by file names that only one image has."""
     names = [*names]
     counts = Counter(Path(name).name for name in names)
     alone = {Path(name).name: name for name in names if counts[Path(name).name] == 1}
@@ -349,7 +354,7 @@ def _by_file_name(names: Iterable[str]) -> dict[str, str]:
 
 
 def _triangulated(sparse: SparseModel, rows: Mapping[str, ControlRow]) -> np.ndarray:
-    """Return the point nearest to the lines of sight."""
+    """Return the point (3,) nearest to the lines of sight of the observations."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for name, row in rows.items():
         view = sparse.images[name].view
@@ -364,15 +369,15 @@ def _triangulated(sparse: SparseModel, rows: Mapping[str, ControlRow]) -> np.nda
 def scale_by_distance(
     distance_m: float, end0: str, end1: str, sparse: SparseModel, points: np.ndarray
 ) -> float:
-    """Return the metres per unit of a model, by the distance of two cameras or of two points.
+    """Return the metres per unit of a model, from a known distance of two cameras or points.
 
-    An end is the name of an image, for its camera, or NAME:X,Y for what is at a pixel of it, where
-    `points` (N, 3) say.
+    An end is the name of an image, for the position of its camera, or NAME:X,Y, for the one of the
+    `points` (N, 3) at this pixel.
     """
     one, other = (_end(end, sparse, points) for end in (end0, end1))
     length = float(np.linalg.norm(one - other))
     if not length > 0:
-        raise OptionError(f"{end0} and {end1} are in one place: name two places")
+        raise OptionError(f"{end0} and {end1} are the same place: name two different places")
     return distance_m / length
 
 
@@ -389,17 +394,16 @@ def _end(end: str, sparse: SparseModel, points: np.ndarray) -> np.ndarray:
             f"the model has no point within {MAX_DISTANCE_PX:g} pixels of {end}: name a pixel with "
             "more texture around it"
         )
-    # Of several as near, the nearest to the camera hides the others.
-    near = np.flatnonzero(distances < distances.min() + 2)
+    near = np.flatnonzero(distances < distances.min() + SAME_PLACE_PX)
     return np.asarray(points[near[depth[near].argmin()]], np.float64)
 
 
 def _image_and_pixel(end: str, names: Mapping[str, str]) -> tuple[str, np.ndarray | None]:
-    """Return the image that an end of a distance names, and its pixel, if it is one."""
+    """Return the image that an end of a distance names, and the pixel, or None for a camera."""
     pixel = re.fullmatch(r"(.+):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)", end)
     name = pixel[1] if pixel else end
     if name not in names:
         raise OptionError(
-            f"{name} is no image of the model: name two of its images, or pixels as NAME:X,Y"
+            f"{name} is not an image of the model: name two of its images, or pixels as NAME:X,Y"
         )
     return names[name], np.array([float(pixel[2]), float(pixel[3])]) if pixel else None

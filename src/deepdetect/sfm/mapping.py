@@ -1,4 +1,4 @@
-"""Poses of all images and sparse points: COLMAP's mapping, and a last adjustment.
+"""Poses of all images and sparse points: COLMAP's mapping and a last bundle adjustment.
 
 Schönberger and Frahm, "Structure-from-Motion Revisited", 2016; Pan, Baráth, Pollefeys and
 Schönberger, "Global Structure-from-Motion Revisited", 2024.
@@ -23,56 +23,57 @@ from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
 from .pair_selection import largest_component
 
 MIN_VERIFIED = 30
-"""Matches of a pair that must agree with a two-view geometry, as many as COLMAP adds an image by:
-some 20 of 8,192 keypoints agree by chance, and wrong pairs make the mapping ten times slower."""
+"""Number of inliers that the two-view geometry of a pair needs; COLMAP also registers an image by
+30. Some 20 of 8,192 keypoints agree by chance, and wrong pairs slow the mapping down tenfold."""
 
 MAX_VERIFICATION_ERROR_PX = 4.0
-"""Of a match that agrees."""
+"""An inlier has an error up to this, which is COLMAP's default."""
 
 MAX_TRIALS = 5000
-"""Of a pair's random samples. COLMAP's 10,000, which few but pairs of different places reach, take
-more time than the mapping where many are compared."""
+"""RANSAC draws at most this number of samples for a pair. COLMAP's 10,000, which few pairs except
+those of different places reach, cost more time than the mapping if many pairs are compared."""
 
 MIN_VIEWS = 3
-"""Of a model; smaller ones are given up."""
+"""A model needs this number of images; `reconstruct` is for two."""
 
 MAX_MODELS = 5
-"""Components of images that do not hang together, of which models are made."""
+"""Number of unconnected components of the images of which models are made. Chosen by hand."""
 
 MAX_FIRST_PAIRS = 20
-"""With which each of them may begin."""
+"""Number of pairs with which the mapping of a component may try to begin. Chosen by hand."""
 
 FORWARD_ANGLE_DEG = 4.0
-"""COLMAP begins with a pair whose points are seen at large angles, and which did not move straight
-ahead. Where there is none, as in a clip from a car, or where more images are left than mapped, it
-may have, and this angle is enough."""
+"""The first pair of a second attempt needs this triangulation angle, and may have moved straight
+ahead. The attempt follows if COLMAP's 16 degrees without such motion find no first pair, as in a
+clip from a car, or leave out more images than they map. Chosen by hand."""
 
 ROBUST_SCALE_PX = 1.0
-"""Of the loss (Cauchy) of the last adjustment: larger errors count less."""
+"""Scale of the Cauchy loss of the last adjustment: larger errors count less. Chosen by hand."""
 
 MAX_REFINED_ERROR_PX = 1.0
-"""Of a refined track; a patch that is farther away shows something else."""
+"""Refined tracks lose observations with a larger error: such a patch shows something else."""
 
 ROUGH_TOLERANCE, TOLERANCE = 1e-6, 1e-8
-"""Of an adjustment before mistaken tracks are left out, and of the last one: it ends where a step
-lessens the sum of the errors by a smaller share. With less, cameras move by under a thousandth of
-their error, and it takes four times as long."""
+"""An adjustment ends if a step reduces the cost by a smaller fraction: before wrong tracks are left
+out, and in the last adjustment. Smaller tolerances move cameras by under a thousandth of their
+error, and take four times as long."""
 
 MIN_ANGLE_DEG = 1.0
-"""Between two lines of sight of a point."""
+"""A point needs two lines of sight at this angle. Chosen by hand; COLMAP asks for 1.5 degrees."""
 
 MIN_FOCAL_RATIO, MAX_FOCAL_RATIO, MAX_DISTORTION = 0.1, 10.0, 1.0
-"""Focal lengths over the longer side, and the largest parameter of distortion: COLMAP's limits."""
+"""COLMAP's bounds of the focal length relative to the longer side, and of distortion parameters."""
 
 MIN_VIEWS_OF_PRINCIPAL_POINT = 8
-"""If each camera took so many images, principal points are estimated, else they are the middle."""
+"""Number of images of each camera from which on principal points are estimated; with fewer they are
+the middle of the image. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
 class RegisteredImage:
-    """An image whose pose is known, and the points that it sees.
+    """An image with its pose and the points that it sees.
 
-    `points` (K,) are their rows, rising, and `xy` (K, 2) where it sees them, in pixels of the
+    `points` (K,) are ascending indices of points, and `xy` (K, 2) their positions in pixels of the
     pinhole camera of `view`.
     """
 
@@ -86,8 +87,8 @@ class RegisteredImage:
 class SparseModel:
     """Cameras and sparse points, in the frame and unit of the model.
 
-    Images are in COLMAP's order, points (P, 3), their sRGB colours (P, 3) uint8, their mean
-    reprojection errors (P,) in pixels, and `tracks` (P,) the number of images that each is seen in.
+    Images are in COLMAP's order. Points are (P, 3), their sRGB colours (P, 3) uint8, their mean
+    reprojection errors (P,) in pixels; `tracks` (P,) is the number of images that see each point.
     """
 
     images: Mapping[str, RegisteredImage]
@@ -98,20 +99,20 @@ class SparseModel:
 
     @property
     def views(self) -> dict[str, PosedView]:
-        """Cameras by the names of the images."""
+        """Cameras by name of the image."""
         return {name: image.view for name, image in self.images.items()}
 
     def common_points(self, image: RegisteredImage) -> list[int]:
-        """Count the points that each of the images shares with one."""
+        """Count the points that each image of the model shares with the given one."""
         seen = np.zeros(len(self.points), bool)
         seen[image.points] = True
         return [int(seen[other.points].sum()) for other in self.images.values()]
 
 
 def verify_pairs(database: Path, seed: int = 0, workers: int | None = None) -> dict[Pair, int]:
-    """Estimate the two-view geometries of matched pairs, and store them in the database.
+    """Estimate the two-view geometries of matched pairs and store them in the database.
 
-    Returns the number of matches that agree with its geometry, of each pair where enough do.
+    Returns the number of inliers of each pair that has enough of them.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_VERIFIED)
@@ -135,10 +136,10 @@ def map_images(
     seed: int = 0,
     registered: Callable[[int], object] = lambda count: None,
 ) -> tuple[Any, list[frozenset[str]]]:
-    """Estimate the poses of as many images as hang together, from a database of verified pairs.
+    """Estimate the poses of all images that are connected, from a database of verified pairs.
 
-    Known cameras stay as they are; `registered` is called with the number of images that were
-    added. Returns the largest model of pycolmap, and the names in each other component.
+    Known cameras stay fixed; `registered` is called with the number of images just added. Returns
+    the largest `pycolmap.Reconstruction`, and the names in each other component.
     """
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.IncrementalPipelineOptions()
@@ -151,7 +152,7 @@ def map_images(
         if known_cameras:
             how.ba_refine_focal_length = False
             how.ba_refine_extra_params = False
-            how.max_focal_length_ratio = np.inf  # a telescope's
+            how.max_focal_length_ratio = np.inf  # a telescope may exceed COLMAP's limit
         found, tried = list[Any](), list[Any]()
         for forward in (False, True):
             if forward:
@@ -170,7 +171,7 @@ def map_images(
             attempt = _sound(models, known_cameras)
             if not found or (attempt and _size(attempt[0]) > _size(found[0])):
                 found = attempt
-            # What is left may be more than the model: a drive beside some images of a house.
+            # The rest may be larger than the model, as a drive in a folder with some of a house.
             mapped = frozenset[str]().union(*map(_names, found))
             left = [pair for pair in verified if mapped.isdisjoint(pair)]
             if found and largest_component(left) <= _size(found[0]):
@@ -181,7 +182,7 @@ def map_images(
 def map_globally(
     database: Path, folder: Path, known_cameras: bool, seed: int = 0
 ) -> tuple[Any, list[frozenset[str]]]:
-    """Estimate the poses of all images at once, otherwise as `map_images`."""
+    """Estimate the poses of all images at once; arguments and results as in `map_images`."""
     with quiet_pycolmap() as pycolmap, tempfile.TemporaryDirectory(prefix="deepdetect-") as space:
         how = pycolmap.GlobalPipelineOptions()
         how.min_model_size, how.min_num_matches, how.random_seed = MIN_VIEWS, MIN_VERIFIED, seed
@@ -193,10 +194,10 @@ def map_globally(
 
 
 def _sound(models: Mapping[int, Any], known_cameras: bool) -> list[Any]:
-    """Return the models, the largest first, without those whose cameras ran away.
+    """Return the models, largest first, without those whose estimated cameras are implausible.
 
-    With few points, focal length and distortion may become such that COLMAP triangulates no points
-    of most images. Known ones stay.
+    With few points, focal length and distortion may diverge until COLMAP can triangulate nothing
+    in most images. Known cameras cannot diverge.
     """
     limits = MIN_FOCAL_RATIO, MAX_FOCAL_RATIO, MAX_DISTORTION
     found = []
@@ -209,16 +210,19 @@ def _sound(models: Mapping[int, Any], known_cameras: bool) -> list[Any]:
 
 
 def _largest(found: Sequence[Any], tried: Sequence[Any]) -> tuple[Any, list[frozenset[str]]]:
-    """Return the first of several models, and the names in the others; none may be sound."""
+    """Return the first of the sound models, and the names in the others.
+
+    Raises a NoDepthError if no model is sound; the models that were `tried` decide on its message.
+    """
     if not found and any(_size(model) >= MIN_VIEWS for model in tried):
         raise NoDepthError(
-            "focal length and distortion cannot be told from these images: give `calibration` or "
-            "`focal_px`, or take more images, from the side, too"
+            "focal length and distortion cannot be estimated from these images: give `calibration` "
+            "or `focal_px`, or take more images, also from the side"
         )
     if not found or _size(found[0]) < MIN_VIEWS:
         raise NoDepthError(
-            "the images do not hang together: take them so that each shows most of what the "
-            "one before shows, from another place"
+            "the images do not overlap enough to be connected: take each from another place, so "
+            "that it shows most of what the one before shows"
         )
     return found[0], [_names(model) for model in found[1:]]
 
@@ -232,9 +236,9 @@ def _names(model: Any) -> frozenset[str]:
 
 
 def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseModel:
-    """Return the cameras and points of a model of pycolmap.
+    """Return the cameras and points of a `pycolmap.Reconstruction`.
 
-    `sources` says where the intrinsics of each image began.
+    `sources` are the `CameraIntrinsics.source` of each image.
     """
     points = np.empty((len(model.points3D), 3))
     colors = np.empty(points.shape, np.uint8)
@@ -264,7 +268,7 @@ def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseMode
 def adjust(model: Any, known_cameras: bool, tolerance: float = TOLERANCE) -> None:
     """Adjust all cameras and points of a model (bundle adjustment) with a robust loss.
 
-    As `pycolmap.bundle_adjustment`, which cannot be kept from logging.
+    It does what `pycolmap.bundle_adjustment` does, whose log cannot be turned off.
     """
     taken = Counter(model.images[number].camera_id for number in model.reg_image_ids())
     enough = min(taken.values()) >= MIN_VIEWS_OF_PRINCIPAL_POINT
@@ -286,7 +290,7 @@ def adjust(model: Any, known_cameras: bool, tolerance: float = TOLERANCE) -> Non
 
 
 def adjust_refined(model: Any, known_cameras: bool) -> None:
-    """Adjust a model with refined tracks; the first adjustment tells which are mistaken."""
+    """Adjust a model with refined tracks twice; the first adjustment shows which are wrong."""
     for max_error_px, tolerance in (
         (MAX_VERIFICATION_ERROR_PX, ROUGH_TOLERANCE),
         (MAX_REFINED_ERROR_PX, TOLERANCE),
@@ -297,9 +301,9 @@ def adjust_refined(model: Any, known_cameras: bool) -> None:
 
 
 def normalise_model(model: Any) -> None:
-    """Bring a `pycolmap.Reconstruction` into the frame of the camera that sees most points.
+    """Transform a `pycolmap.Reconstruction` into the frame of the camera that sees most points.
 
-    1 is the spacing of its cameras.
+    The unit of length becomes `camera_spacing`.
     """
     sparse = read_sparse_model(model)
     view = max(sparse.images.values(), key=lambda image: len(image.points)).view
@@ -310,7 +314,7 @@ def normalise_model(model: Any) -> None:
 
 
 def transform_model(model: Any, similarity: Similarity) -> None:
-    """Move, turn and scale a `pycolmap.Reconstruction`."""
+    """Apply a similarity to a `pycolmap.Reconstruction`."""
     with quiet_pycolmap() as pycolmap:
         rotation = pycolmap.Rotation3d(similarity.rotation)
         model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))

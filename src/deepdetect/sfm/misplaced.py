@@ -1,8 +1,8 @@
-"""Images that the mapping has put in a wrong place, and their right one.
+"""Detection and correction of images to which the mapping gave a wrong pose.
 
-An image that comes early is placed by few points. Where a camera moves straight ahead, matches that
-are wrong along the line of motion agree with many places on it, and a wrong one stays: the points
-that the image itself gave their depth agree with it. Those that others see well without it do not.
+An image that is registered early is placed by few points. If the camera moves straight ahead,
+matches that are wrong along its path agree with many places on the path. A wrong place then stays,
+because points whose depth comes from this image agree with it. Points of the others show the error.
 """
 
 from __future__ import annotations
@@ -21,19 +21,20 @@ from .colmap import quiet_pycolmap
 from .mapping import MAX_VERIFICATION_ERROR_PX, MIN_ANGLE_DEG, MIN_VERIFIED, adjust
 
 MIN_SPREAD_DEG = MIN_ANGLE_DEG / 2
-"""Of the lines of sight of the other images about their mean (root mean square); of two images it
-is half of the angle between them. With less, the image that is checked gave a point its depth."""
+"""A point tests an image only if the other images' lines of sight to it spread by this root mean
+square angle about their mean. With less, the tested image itself gave the point its depth."""
 
 MIN_GAIN = 1.5
-"""Points that agree with another place, in those that agree with the one of the model. Of images
-that are in their place it is 1 within a hundredth, of others it was 3 and more."""
+"""Ratio of the points that agree with another pose to those that agree with the pose in the model,
+from which on the image is moved. It is within 1 % of 1 for images in their right place, and was 3
+or more for others."""
 
 MAX_ROUNDS = 3
-"""Of checks: with each image that is put right, the points by which others are checked get
-better."""
+"""Number of rounds of checks: images that were moved give better points to check others by."""
 
 MIN_KEPT = 0.9
-"""Observations of the points that are made anew, in those of before: it was .99 where it helped."""
+"""Fraction of observations that new points must keep, else the correction is undone. It was 0.99
+where a correction helped."""
 
 
 def correct_places(
@@ -44,10 +45,10 @@ def correct_places(
     seed: int = 0,
     quiet: bool = True,
 ) -> Any:
-    """Return a model of pycolmap in which all images are where the points of the others say.
+    """Return a `pycolmap.Reconstruction` in which misplaced images are moved to their right pose.
 
-    The database is that of the mapping. If an image is put elsewhere, all points are made anew, and
-    cameras and points adjusted. `quiet` shows no bar.
+    The database is that of the mapping. If an image is moved, all points are triangulated again,
+    and cameras and points adjusted. `quiet` shows no progress bar.
     """
     for _ in range(MAX_ROUNDS):
         with quiet_pycolmap() as pycolmap:
@@ -71,7 +72,7 @@ def correct_places(
 def _better_places(
     pycolmap: Any, model: Any, database: Path, seed: int, quiet: bool
 ) -> dict[int, Any]:
-    """Return the poses of those images that more points of others agree with, by their numbers."""
+    """Return the poses, by image number, that points of other images support better."""
     how = pycolmap.AbsolutePoseEstimationOptions()
     how.ransac.max_error, how.ransac.random_seed = MAX_VERIFICATION_ERROR_PX, seed
     points, found = _Points(model), {}
@@ -100,9 +101,9 @@ class _Points:
     """The points of a model, and which images see them.
 
     Attributes:
-        xyz: (P, 3) places.
-        keypoints: (K, 2) pixels of all keypoints of each image.
-        seen: (K,) rows of the points that they are of, or -1.
+        xyz: (P, 3) positions.
+        keypoints: (K, 2) pixels of all keypoints, by image.
+        seen: (K,) row of the point that each keypoint sees, or -1, by image.
     """
 
     def __init__(self, model: Any) -> None:
@@ -110,7 +111,7 @@ class _Points:
         places = [point.xyz for point in model.points3D.values()]
         self.xyz = np.array(places).reshape(-1, 3)
         self.keypoints, self.seen, self._sights = {}, {}, {}
-        # Of the lines of sight of all images that see a point.
+        # Number and sum of the lines of sight of all images that see a point.
         self._counts, self._sums = np.zeros(len(self.xyz)), np.zeros_like(self.xyz)
         for number in model.reg_image_ids():
             image = model.images[number]
@@ -127,7 +128,7 @@ class _Points:
     def matched(
         self, number: int, matches: Iterable[tuple[int, np.ndarray]]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return which keypoints of an image are matched to which points that others see well.
+        """Match keypoints of an image to points that other images determine; return rows of both.
 
         `matches` are (M, 2) rows of keypoints of the image and of each other one.
         """
@@ -135,7 +136,7 @@ class _Points:
         counts, sums = self._counts.copy(), self._sums.copy()
         counts[own] -= 1
         sums[own] -= sights
-        # The mean of unit vectors is the shorter, the farther they lie apart.
+        # The mean of unit vectors is shorter, the wider they spread.
         lengths = np.linalg.norm(sums, axis=1) / np.maximum(counts, 1)
         well = (counts > 1) & (lengths < np.cos(np.radians(MIN_SPREAD_DEG)))
         found = [np.empty(0, np.int64)]
@@ -148,7 +149,7 @@ class _Points:
 
 
 def _partners(pycolmap: Any, database: Any, images: Container[int]) -> dict[int, list[int]]:
-    """Return with which of the images each has verified matches."""
+    """Return the images with which each image has verified matches."""
     partners = defaultdict[int, list[int]](list)
     for pair, count in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
         first, second = pycolmap.pair_id_to_image_pair(pair)
@@ -159,13 +160,13 @@ def _partners(pycolmap: Any, database: Any, images: Container[int]) -> dict[int,
 
 
 def _matches(database: Any, number: int, other: int) -> np.ndarray:
-    """Return (M, 2) rows of keypoints of two images that agree with their geometry."""
+    """Return the inlier matches of two images, (M, 2) rows of keypoints."""
     matches = database.read_two_view_geometry(number, other).inlier_matches
     return np.asarray(matches, np.int64).reshape(-1, 2)
 
 
 def _agreeing(camera: Any, xy: np.ndarray, points: np.ndarray, pose: Any) -> int:
-    """Count points that a camera at a pose sees where (K, 2) keypoints are."""
+    """Count the points (K, 3) that a camera at a pose sees at their keypoints (K, 2)."""
     local = points @ pose.rotation.matrix().T + pose.translation
     errors = np.linalg.norm(camera.img_from_cam(local) - xy, axis=1)
     return int(((errors < MAX_VERIFICATION_ERROR_PX) & (local[:, 2] > 0)).sum())

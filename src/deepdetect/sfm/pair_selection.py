@@ -1,4 +1,4 @@
-"""Which images hang together, and which show nothing new."""
+"""Which images are connected by matches, and which show nothing new."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import numpy as np
 from ..batch.pair_list import Pair
 
 MIN_MATCHED = 0.5
-"""Of the keypoints of the image with fewer, matches by which images are said to show the same."""
+"""Two images can show the same only if at least this fraction of the keypoints of the one with
+fewer is matched. Chosen by hand."""
 
 
 def largest_component(pairs: Sequence[Pair]) -> int:
-    """Return the number of images in the largest component that pairs connect."""
+    """Return the number of images in the largest connected component of a graph of pairs."""
     components: list[set[str]] = []
     for pair in pairs:
         touched = [names for names in components if not names.isdisjoint(pair)]
@@ -23,10 +24,10 @@ def largest_component(pairs: Sequence[Pair]) -> int:
 
 
 def motion(first: np.ndarray, second: np.ndarray, matches: np.ndarray) -> float:
-    """Return how far most matched keypoints are from their partners, in pixels; infinite in doubt.
+    """Return the median motion of matched keypoints in pixels, or infinity if few are matched.
 
-    Keypoints are (N, 2) and (M, 2) pixels of two images, matches (K, 2) rows of both. Few of them
-    may be of what stands still in the frame, as a bonnet or a time that is shown.
+    Keypoints are (N, 2) and (M, 2) pixels of two images, matches (K, 2) rows of both. With few
+    matches, most may lie on something fixed to the frame, such as a bonnet or a time stamp.
     """
     if len(matches) < MIN_MATCHED * min(len(first), len(second)):
         return np.inf
@@ -36,12 +37,12 @@ def motion(first: np.ndarray, second: np.ndarray, matches: np.ndarray) -> float:
 def thin_out(
     names: Sequence[str], near: Mapping[Pair, float], dropped: Mapping[str, str] = {}
 ) -> dict[str, str]:
-    """Leave out images that are near to one before them that is kept, and return that one, too.
+    """Return the images to leave out, each with the earlier image that is kept in its place.
 
     Args:
-        names: in their order.
-        near: pairs that are too near to each other, with their distance.
-        dropped: what was left out before; what it is near to is kept.
+        names: all images in order.
+        near: pairs of images that show nearly the same, with their distance.
+        dropped: images left out before; those kept in their place stay.
     """
     partners: dict[str, dict[str, float]] = {name: {} for name in names}
     for (first, second), distance in near.items():

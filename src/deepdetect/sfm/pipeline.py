@@ -1,7 +1,7 @@
-"""A folder of images in; cameras, sparse and dense points out.
+"""Reconstruction of many images: cameras, sparse and dense points.
 
-Features and matches are those of `batch`, in HDF5 files; COLMAP maps. What each stage makes is kept
-in the folder of the results: a run that was killed goes on, and new images are added.
+Features and matches come from `batch`, poses from COLMAP. The results of each stage are kept in the
+output folder, so the same call continues an interrupted run, also with more images.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from .colmap import import_pycolmap, initial_intrinsics, known_cameras
 from .formats import FORMATS, FormatName, check_formats
 from .fusion import DENSE_POINT
 from .georeference import (
+    ControlRow,
     Georeference,
     georeference,
     read_control_points,
@@ -41,10 +42,10 @@ from .splat import write_transforms
 from .stages import WORK, MultiViewOptions, Stages, check_images
 
 MAX_KEYPOINTS = 8192
-"""Of an image, where nothing else is asked for."""
+"""Default number of keypoints of an image. Chosen by hand."""
 
 MIN_KEYPOINTS = 15
-"""With fewer an image cannot be matched."""
+"""Images with fewer keypoints are left out: they cannot be matched. Chosen by hand."""
 
 
 @suggest_keywords
@@ -65,33 +66,32 @@ def reconstruct_many(
     """Reconstruct the cameras and a dense model from three or more images of a scene.
 
     Writes into the folder `output`: model.ply, model.glb, model.html (a viewer, with the cameras),
-    model.json, transforms.json (nerfstudio's), sparse/0 and database.db (COLMAP's), and work/ with
-    what each stage made. Where the
-    images carry GPS, all of it is in metres east, north and up. A call that was interrupted or
-    killed goes on when it is made again. A script must call this under
-    `if __name__ == "__main__":`, since processes are started.
+    model.json, transforms.json (for nerfstudio), sparse/0 and database.db (for COLMAP), and work/
+    with intermediate results. If the images have GPS, the model is in metres east, north and up.
+    The same call continues an interrupted run. It starts processes, so a script must call it under
+    `if __name__ == "__main__":`.
 
     Args:
         images: a folder, or image files.
         output: folder for the results.
-        detector, selection: as of `extract_features`; None: a `PointDetector` of 8,192.
-        calibration: file of the cameras, as for `Calibration.load`, a `Calibration` or a `Camera`,
-            which is taken to be exact. Without one the focal length begins with `focal_px`, EXIF,
-            or a guess, and is estimated with the distortion.
-        focal_px: focal length in pixels of all images, roughly.
-        seed: seed of all random choices; COLMAP's threads may still make a small difference.
-        options: of all stages.
+        detector: detector of the keypoints. None: a `PointDetector` of 8,192 points.
+        selection: which keypoints are kept, as in `extract_features`.
+        calibration: file of the cameras, taken to be exact. Also a `Calibration` or a `Camera`.
+            Without one, focal length and distortion are estimated.
+        focal_px: rough focal length of all images in pixels; by default from EXIF, or a guess.
+        seed: seed of all random choices; COLMAP's threads may still cause small differences.
+        options: options of all stages.
         workers: number of processes; default one per processor.
-        overwrite: do all of it again.
+        overwrite: repeat all stages.
         quiet: show no progress bars.
 
     Returns:
-        Cameras and points. Images that are no part of it are in `unregistered`, with the reason.
+        Cameras and points. `unregistered` lists the images left out, with the reason.
 
     Raises:
         ImageError: the folder is missing or holds no image.
-        OptionError: an option is unknown or out of its range, or the results were made with others.
-        ReconstructionError: fewer than three images can be read, or (`NoDepthError`) hang together.
+        OptionError: an option is unknown or out of range, or differs from that of an earlier run.
+        ReconstructionError: fewer than three images can be read or, as `NoDepthError`, connected.
         MissingExtraError: pycolmap or h5py is not installed.
 
     Example:
@@ -99,23 +99,12 @@ def reconstruct_many(
         ...     found = reconstruct_many("images", "model", quiet=False)
         ...     found.centres, found.dense.points, found.unregistered
     """
-    import_pycolmap()  # what is missing is said before hours of work
-    check_formats(options.formats)
-    control = read_control_points(options.control_points) if options.control_points else None
-    detector = PointDetector(MAX_KEYPOINTS) if detector is None else detector
     target = Path(output)
-    check_output_folder(target)
-    if focal_px is not None:
-        Camera((1, 1), focal_px)  # which says what is wrong with it
-        if calibration is not None:
-            raise OptionError("give `calibration` or `focal_px`, not both")
-    if isinstance(calibration, (str, Path)):
-        check_camera_file(calibration)
-    if control is not None or options.scale_by is not None:
-        require_images(check_images(images, [target]), control, options.scale_by)
+    control = _check_arguments(images, target, calibration, focal_px, options)
+    detector = PointDetector(MAX_KEYPOINTS) if detector is None else detector
     if overwrite:
         work = target / WORK
-        if any(work.glob("features.h5*")):  # another folder of this name is not ours
+        if any(work.glob("features.h5*")):  # else it is another program's folder of this name
             shutil.rmtree(work, ignore_errors=True)
     stages = Stages(target, options, workers, quiet, seed)
     folder = stages.folder_of(images)
@@ -124,28 +113,7 @@ def reconstruct_many(
     timer = StageTimer()
     with timer.stage("features"):
         sizes, keypoints, unregistered = stages.extract(folder, detector, selection)
-    for name, count in keypoints.items():
-        if count < MIN_KEYPOINTS:
-            unregistered[name] = (
-                f"it has {count} keypoints: it is black, blurred, or shows nothing with texture"
-            )
-            del sizes[name]
-    known: Mapping[str, Camera] = {}
-    if calibration is not None:
-        known = known_cameras(calibration, sizes)
-        for name, (width, height) in sizes.items():
-            if name not in known:
-                unregistered[name] = (
-                    f"it is {width}x{height} pixels, and the calibration is for another size: "
-                    "give images of one size"
-                )
-        sizes = {name: sizes[name] for name in known}
-    if len(sizes) < MIN_VIEWS:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in [*unregistered.items()][:3])
-        raise ReconstructionError(
-            f"{len(sizes)} of {len(sizes) + len(unregistered)} images can be used, "
-            f"{MIN_VIEWS} are needed: {reasons or 'take more images'}"
-        )
+    sizes, known = _usable_images(sizes, keypoints, calibration, unregistered)
     with timer.stage("matching"):
         matches, alike = stages.match_images(sizes)
     for name, other in alike.items():
@@ -202,14 +170,72 @@ def reconstruct_many(
     return found
 
 
+def _check_arguments(
+    images: str | Path | Sequence[str | Path],
+    output: Path,
+    calibration: Camera | Calibration | str | Path | None,
+    focal_px: float | None,
+    options: MultiViewOptions,
+) -> list[ControlRow] | None:
+    """Check the arguments before hours of work; return the ground control points, if any."""
+    import_pycolmap()
+    check_formats(options.formats)
+    control = read_control_points(options.control_points) if options.control_points else None
+    check_output_folder(output)
+    if focal_px is not None:
+        Camera((1, 1), focal_px)  # checks the focal length
+        if calibration is not None:
+            raise OptionError("give `calibration` or `focal_px`, not both")
+    if isinstance(calibration, (str, Path)):
+        check_camera_file(calibration)
+    if control is not None or options.scale_by is not None:
+        require_images(check_images(images, [output]), control, options.scale_by)
+    return control
+
+
+def _usable_images(
+    sizes: Mapping[str, tuple[int, int]],
+    keypoints: Mapping[str, int],
+    calibration: Camera | Calibration | str | Path | None,
+    unregistered: dict[str, str],
+) -> tuple[dict[str, tuple[int, int]], Mapping[str, Camera]]:
+    """Return sizes and known cameras of the images with enough keypoints and a size that fits.
+
+    The others are added to `unregistered` with the reason.
+    """
+    for name, count in keypoints.items():
+        if count < MIN_KEYPOINTS:
+            unregistered[name] = (
+                f"it has {count} keypoints: it is black, blurred, or shows nothing with texture"
+            )
+    sizes = {name: size for name, size in sizes.items() if keypoints[name] >= MIN_KEYPOINTS}
+    known: Mapping[str, Camera] = {}
+    if calibration is not None:
+        known = known_cameras(calibration, sizes)
+        for name, (width, height) in sizes.items():
+            if name not in known:
+                unregistered[name] = (
+                    f"it is {width}x{height} pixels, and the calibration is for another size: "
+                    "give images of one size"
+                )
+        sizes = {name: sizes[name] for name in known}
+    if len(sizes) < MIN_VIEWS:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in [*unregistered.items()][:3])
+        raise ReconstructionError(
+            f"{len(sizes)} of {len(sizes) + len(unregistered)} images can be used, "
+            f"{MIN_VIEWS} are needed: {reasons or 'take more images'}"
+        )
+    return sizes, known
+
+
 def check_output_folder(output: Path) -> None:
-    """Raise an OptionError where results cannot be in a folder of this name."""
+    """Raise an OptionError if the output is not the name of a folder."""
     if output.is_file() or output.suffix.lower() in (".ply", ".glb", ".html"):
         raise OptionError(f"{output} is the name of a file: give the name of a folder with -o")
 
 
 def output_files(output: Path, formats: Sequence[FormatName] = ()) -> tuple[Path, ...]:
-    """Name all that is written into the folder of the results; the last is what stages made."""
+    """Return the paths of all results in the output folder; the last one is `WORK`."""
     names = (
         *("model.ply", "model.glb", "model.html", "model.json", "transforms.json"),
         *("sparse", "database.db"),
@@ -221,7 +247,7 @@ def output_files(output: Path, formats: Sequence[FormatName] = ()) -> tuple[Path
 def _write(
     found: MultiViewReconstruction, folder: Path, output: Path, formats: Sequence[FormatName]
 ) -> None:
-    """Write the files of the model, and then further formats, which may lack what they need."""
+    """Write the files of the model, and then the further formats, some of which may fail."""
     notes = {
         "title": f"{len(found.views)} images",
         "images": f"{len(found.views)} of {len(found.views) + len(found.unregistered)}",
@@ -247,16 +273,16 @@ def _write(
     for name in formats:
         try:
             FORMATS[name].write(found, folder, output)
-        except ReconstructionError as error:  # what one lacks, another may not need
+        except ReconstructionError as error:  # the other formats may still succeed
             failed.append(str(error))
     if failed:
-        raise ReconstructionError("; ".join(failed) + " (the other files are written)")
+        raise ReconstructionError("; ".join(failed) + " (all other files were written)")
 
 
 def _seen_from(
     view: PosedView, found: MultiViewReconstruction
 ) -> tuple[PointCloud, list[PosedView]]:
-    """Return the points and cameras in the frame of one of these, as the page shows them."""
+    """Return the points and cameras in the frame of one of the cameras, for the HTML viewer."""
     frame = f"camera of {view.name}"
     points = found.cloud.points @ view.rotation.T + view.translation
     cameras = [each.relative_to(view) for each in found.views.values()]
@@ -266,20 +292,21 @@ def _seen_from(
 def _why_unregistered(
     name: str, verified: Mapping[Pair, int], components: Iterable[frozenset[str]]
 ) -> str:
-    """Say why an image is no part of the model."""
+    """Return a sentence on why an image is not part of the model."""
     for names in components:
         if name in names:
             return (
-                f"it hangs together with {len(names) - 1} others only, which show too little else"
+                f"it is connected with only {len(names) - 1} others, which overlap too little with "
+                "the rest"
             )
     if partners := sum(name in pair for pair in verified):
-        return f"it matches {partners} others, but they give no pose: take more images between"
-    return "it matches none of the others: it shows something else, or from too far away"
+        return f"it matches {partners} others, but they give no pose: take more images in between"
+    return "it matches no other image: it shows something else, or from too far away"
 
 
 def _without_registered(
     components: Iterable[frozenset[str]], unregistered: Iterable[str]
 ) -> tuple[tuple[str, ...], ...]:
-    """Return the names in other components, without what two models share; the largest first."""
+    """Return the names in other components, largest first, without registered images."""
     left = [tuple(sorted(names & frozenset(unregistered))) for names in components]
     return tuple(sorted((names for names in left if len(names) > 1), key=len, reverse=True))

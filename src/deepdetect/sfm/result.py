@@ -1,4 +1,4 @@
-"""What many images gave: cameras, sparse and dense points, and what is known about them."""
+"""The result of a reconstruction of many images: cameras, points, and statistics."""
 
 from __future__ import annotations
 
@@ -14,38 +14,38 @@ from ..geometry.point_cloud import PointCloud
 from .colmap import CameraIntrinsics
 from .georeference import Georeference
 
-SCALE = "lengths are in spacings, the median distance from a camera to the nearest other one: the \
-true scale is not known, since"
+SCALE = "lengths are in spacings, the median distance from a camera to its nearest neighbour: the \
+true scale is unknown because"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MultiViewReconstruction:
     """Cameras and points of many images.
 
-    The world is the frame of the camera of `reference`: x right, y down, z forward. 1 is the median
-    distance from a camera to the nearest other one, or a metre if `scale_by` told a distance. Where
-    satellite fixes or ground control points place the model, it goes east, north and up in metres.
+    The world is the frame of the camera of `reference`: x right, y down, z forward. The unit is the
+    median distance from a camera to its nearest neighbour, or a metre if `scale_by` gave a length.
+    If GPS or ground control points place the model, its axes are east, north and up in metres.
 
     Attributes:
-        views: of the images that are part of it, by name; their cameras are pinhole cameras.
-        intrinsics: of the same cameras, with their distortion.
-        unregistered: why each of the others is not, by name.
-        components: names of unregistered images that hang together among themselves, the largest
+        views: poses of the registered images, by name, with pinhole cameras.
+        intrinsics: intrinsics of the same cameras, with their distortion.
+        unregistered: reasons why the other images are not registered, by name.
+        components: names of unregistered images that are connected with each other, the largest
             component first: each can be reconstructed alone.
         reference: name of the image whose camera's frame is the world, or that sees most points.
-        georeference: how the model got its scale and place, or why it has none.
-        sparse: the points by which the poses were estimated.
-        sparse_errors: (N,) float32 their mean reprojection errors in pixels.
-        sparse_views: (N,) int32 number of images that each of them is seen in.
-        dense: the dense points; empty where none were asked for.
-        dense_errors: (M,) float32 distances in pixels to the matches in other images, their RMS.
-        dense_views: (M,) uint8 number of images that agree on each of them.
-        keypoints: number of keypoints of each image.
-        matched: number of verified matches of each pair that has some.
+        georeference: scale and place of the model, or a sentence on why it lacks them.
+        sparse: points by which the poses were estimated.
+        sparse_errors: (N,) float32 mean reprojection errors of these points in pixels.
+        sparse_views: (N,) int32 numbers of images that see each of these points.
+        dense: dense points; empty if the options asked for none.
+        dense_errors: (M,) float32 distances in pixels to the matches in other images, as RMS.
+        dense_views: (M,) uint8 numbers of images that agree on each dense point.
+        keypoints: number of keypoints, by image.
+        matched: number of verified matches, by pair.
         pairs: number of pairs that were matched.
-        pair_choice: how they were chosen: "exhaustive", "sequential:10" or "similar".
-        seconds: time of each stage of this run; what an earlier run had done took none.
-        files: what was written.
+        pair_choice: choice of the pairs: "exhaustive", "sequential:10" or "similar".
+        seconds: time of each stage of this run; a stage that an earlier run had finished takes 0.
+        files: files that were written.
     """
 
     views: Mapping[str, PosedView]
@@ -76,16 +76,16 @@ class MultiViewReconstruction:
 
     @property
     def cloud(self) -> PointCloud:
-        """The dense points, or the sparse ones where there are none."""
+        """The dense points, or the sparse ones if there are no dense points."""
         return self.dense if len(self.dense) else self.sparse
 
     @property
     def centres(self) -> np.ndarray:
-        """(V, 3) float64 centres of the cameras, in the order of `views`: the path."""
+        """(V, 3) float64 centres of the cameras, in the order of `views`."""
         return np.array([view.centre for view in self.views.values()]).reshape(-1, 3)
 
     def summary(self) -> dict[str, Any]:
-        """Return all but the arrays as plain values for JSON: counts, times and errors."""
+        """Return everything except the arrays as plain values for JSON."""
         return {
             "images": len(self.views) + len(self.unregistered),
             "registered": len(self.views),

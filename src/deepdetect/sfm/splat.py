@@ -1,4 +1,4 @@
-"""What trainers of radiance fields and Gaussian splats begin with: images, cameras, points."""
+"""Inputs for the training of radiance fields and Gaussian splats: images, cameras, points."""
 
 from __future__ import annotations
 
@@ -20,24 +20,25 @@ from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
 from .result import MultiViewReconstruction
 
 SPLAT_POINTS = 200_000
-"""Of the initial cloud, about: trainers add their own where these are too few."""
+"""The initial cloud has at most this number of dense points; trainers add some. Chosen by hand."""
 
 JPEG_QUALITY = 95
 
 CELLS_PX, CLOSED_GAIN = (1, 2, 3, 4, 6, 8), 1.3
-"""Sides of what a point covers in a depth map: the first whose successor covers little more."""
+"""Sides of the square that a point covers in a depth map. The first is taken whose successor covers
+less than this factor more of the map, as then few gaps are left. Chosen by hand."""
 
 MAX_DEPTH_STEP = 0.1
-"""A point so much, relatively, behind one beside it in a depth map is seen through a gap."""
+"""A point farther than its neighbour by this share is seen through a gap. Chosen by hand."""
 
 DEPTH_PERCENT = 95.0
-"""Of all sparse points, whose depths from each view fit into its map at least."""
+"""Percentage of the sparse points of each view whose depths must fit into the 16 bits of a map."""
 
 MAX_VALUE_PER_UNIT = 1000.0
-"""Millimetres, which nearly all readers of depth maps expect, where they reach far enough."""
+"""Depth maps store millimetres, which nearly all readers expect, unless these reach too short."""
 
 OPENGL = np.diag([1.0, -1, -1, 1])
-"""From nerfstudio's cameras, y up and z backward, to ours."""
+"""Transform from camera axes of nerfstudio (y up, z backward) to ours (y down, z forward)."""
 
 
 def write_transforms(
@@ -48,14 +49,14 @@ def write_transforms(
     points: Path,
     **more: Any,
 ) -> None:
-    """Write nerfstudio's transforms.json: cameras, points, and `files` by their key and image."""
+    """Write nerfstudio's transforms.json: cameras, `points`, and `files` by JSON key and image."""
 
     def relative(file: Path) -> str:
-        # A folder that is a link has another parent than its name says.
+        # The parent of a symbolic link may differ from the one in its path.
         file = file.resolve()
         try:
             return Path(os.path.relpath(file, path.parent.resolve())).as_posix()
-        except ValueError:  # on another drive of Windows
+        except ValueError:  # the file is on another drive of Windows
             return file.as_posix()
 
     frames = []
@@ -76,9 +77,9 @@ def write_transforms(
 
 
 def write_splat(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
-    """Write splat/: images/ without distortion, sparse/0, depths/ (16 bits), transforms.json.
+    """Write splat/: undistorted images/, sparse/0, depths/ (16-bit PNG), and transforms.json.
 
-    Sparse points keep their tracks; dense ones are thinned to `SPLAT_POINTS`, evenly in space.
+    Sparse points keep their tracks. Dense points are thinned to `SPLAT_POINTS`, evenly in space.
     """
     target = output / "splat"
     cropped = {own: own.without_border for own in {*found.intrinsics.values()}}
@@ -115,7 +116,7 @@ def write_splat(found: MultiViewReconstruction, folder: Path, output: Path) -> N
             moved = new.pinhole.project(old.pinhole.rays(old.to_pinhole(xy - PIXEL_CENTRE)))
             for point, place in zip(image.points2D, moved, strict=True):
                 point.xy = place + PIXEL_CENTRE
-        for image in model.images.values():  # which share cameras
+        for image in model.images.values():  # a second loop, because images share cameras
             camera, pinhole = image.camera, intrinsics[image.name].colmap_camera()
             camera.model, camera.params = pinhole.model, pinhole.params
             camera.width, camera.height = pinhole.width, pinhole.height
@@ -135,13 +136,13 @@ def write_splat(found: MultiViewReconstruction, folder: Path, output: Path) -> N
 
 
 def thinned(points: np.ndarray, errors: np.ndarray, count: int) -> np.ndarray:
-    """Return rows of at most `count` of (N, 3) points: in each cell of a grid the best one."""
+    """Return rows of at most `count` of (N, 3) points: the one of least error in each cell."""
     order = np.argsort(errors, kind="stable")
     if len(points) <= count:
         return order
     low, high = 0.0, float(np.ptp(points, axis=0).max())
     best = order[:1]
-    for _ in range(20):  # halvings: to a millionth of the extent
+    for _ in range(20):  # bisection of the cell size, to a millionth of the extent
         cell = (low + high) / 2
         cells = np.floor((points[order] - points.min(axis=0)) / cell).astype(np.int64)
         keys = cells @ np.array([1, 2_097_152, 2_097_152**2])  # 21 bits for each axis
@@ -154,7 +155,7 @@ def thinned(points: np.ndarray, errors: np.ndarray, count: int) -> np.ndarray:
 
 
 def seen_depths(view: PosedView, points: np.ndarray) -> np.ndarray:
-    """Return the depth map (H, W) that points (N, 3) make, NaN where none is seen."""
+    """Return the depth map (H, W) of points (N, 3), NaN where no point is seen."""
     width, height = view.camera.size
     xy, depth = view.project(points)
     inside = (depth > 0) & ((xy > -0.5) & (xy < (width - 0.5, height - 0.5))).all(axis=1)

@@ -1,7 +1,7 @@
-"""The stages of a reconstruction of many images, each of which is done once.
+"""The stages of a reconstruction of many images, and their cached results.
 
-Features and matches are in the HDF5 files of `batch`. Mapping and dense points have a key of all
-that they depend on: a run does not make again what it finds with the right key.
+Features and matches are in the HDF5 files of `batch`. Models and depth maps are stored with a key
+made of all that they depend on, and a run reuses those with the right key.
 """
 
 from __future__ import annotations
@@ -57,41 +57,40 @@ from .pair_selection import motion, thin_out
 from .tracks import add_dense_tracks, refine_tracks
 
 MAX_EXHAUSTIVE = 50
-"""Images of which "auto" matches all pairs."""
+"""The choice "auto" matches all pairs of up to this number of images. Chosen by hand."""
 
 WORK = "work"
-"""Folder of what the stages made, within that of the results."""
+"""Folder of intermediate results, inside that of the results."""
 
 LINKS = ".images"
-"""Folder of links to listed images, within `WORK`. It is hidden, so that they are no further images
-of a folder that holds the results."""
+"""Folder of links to listed images, inside `WORK`. It is hidden, so that a search for images above
+the folder of the results does not find them a second time."""
 
 
 @suggest_keywords
 @dataclass(frozen=True)
 class MultiViewOptions:
-    """How many images become cameras and points.
+    """Options of the reconstruction of many images.
 
     Attributes:
-        pairs: which images are matched: "exhaustive": all; "sequential:10": each with the 10 that
-            follow it by name; "similar:20": with the 20 that are most like it; "auto": all of up
-            to 50, else "similar", as "similar:20".
-        min_motion: leave out images that show nearly the same as one before them, such as most
-            frames of a video: those in which half of the matched keypoints moved by less than this
-            share of the longer side. None: use all.
-        matches: "sparse": of keypoints; "dense": points of the depth maps also become points
-            of the model, and cameras are adjusted to all.
-        mapper: how COLMAP finds the poses: "incremental": one image after the other; "global": of
-            all images at once, for a thousand or more: of a few hundred it takes as long.
+        pairs: pairs of images to match: "exhaustive" (all pairs), "sequential:10" (each image with
+            the 10 that follow it by name), "similar:20" (with the 20 most similar ones), or "auto"
+            (exhaustive for up to 50 images, else similar:20).
+        min_motion: leave out an image if half of its matched keypoints moved, since an earlier one,
+            by less than this share of the longer side, as in most frames of a video. None: use all.
+        matches: "sparse" (only keypoints become points of the model) or "dense" (so do points of
+            the depth maps, and cameras are adjusted to both).
+        mapper: how COLMAP estimates the poses: "incremental" (one image after the other) or
+            "global" (all at once, which saves time only for a thousand images or more).
         dense: make dense points.
-        stride_px: distance in pixels between the places of a row or column that are tried.
-        single_camera: whether images of one size were taken by one camera; None: where their EXIF
-            gives one focal length, or none.
-        control_points: file of ground control points as OpenDroneMap's gcp_list.txt, by which the
-            model gets its scale and place in place of the GPS of the images.
-        scale_by: a distance in metres, and its two ends: two images (their cameras) or two pixels,
+        stride_px: try every N-th pixel of every N-th row as a dense point.
+        single_camera: whether images of one size were taken by one camera; by default, those of
+            which EXIF gives the same focal length, or none.
+        control_points: file of ground control points in the format of OpenDroneMap's gcp_list.txt;
+            they replace the GPS of the images.
+        scale_by: a length in metres and its two ends: two images (the cameras) or two pixels, such
             as IMG_1.jpg:120,340.
-        formats: further formats that the model is written in.
+        formats: further file formats of the model.
 
     Raises:
         OptionError: a value is unknown or out of its range.
@@ -110,7 +109,7 @@ class MultiViewOptions:
 
     def __post_init__(self) -> None:
         if self.scale_by is not None and not 0 < self.scale_by[0] < np.inf:
-            raise OptionError(f"`scale_by` must be a distance in metres, not {self.scale_by[0]}")
+            raise OptionError(f"`scale_by` must be a length above 0 m, not {self.scale_by[0]}")
         if self.pairs != "auto" and not (following(self.pairs) or similar(self.pairs)):
             raise OptionError(
                 f"`pairs` must be auto, exhaustive, sequential:10 or similar:20, not {self.pairs}"
@@ -118,7 +117,7 @@ class MultiViewOptions:
         check_name("matches", self.matches, ("sparse", "dense"))
         check_name("mapper", self.mapper, ("incremental", "global"))
         if "mesh" in self.formats and not self.dense:
-            raise OptionError("the format mesh is made of dense points: leave out `dense=False`")
+            raise OptionError("the format mesh needs dense points: leave out `dense=False`")
         check_ranges(
             self,
             counts=("stride_px",),
@@ -126,7 +125,7 @@ class MultiViewOptions:
         )
 
     def pair_choice(self, count: int) -> str:
-        """Return how the pairs of so many images are chosen."""
+        """Return how the pairs of `count` images are chosen."""
         if self.pairs != "auto":
             return self.pairs
         return "exhaustive" if count <= MAX_EXHAUSTIVE else "similar"
@@ -135,7 +134,7 @@ class MultiViewOptions:
 def check_images(
     images: str | Path | Sequence[str | Path], exclude: Sequence[Path] = ()
 ) -> dict[str, Path]:
-    """Return the images below a folder, or of a list, as `name_images`."""
+    """Return the paths of the images below a folder or in a list, by their names."""
     if isinstance(images, (str, Path)):
         folder = Path(images)
         return {path.relative_to(folder).as_posix(): path for path in find_images(folder, exclude)}
@@ -146,12 +145,12 @@ def check_images(
         if not path.is_file():
             raise MissingImageError(f"there is no file {path}: check the path")
         if path.suffix.lower() not in IMAGE_SUFFIXES:
-            raise OptionError(f"{path} must end as images do, in .jpg, .png or alike: rename it")
+            raise OptionError(f"{path} does not end in .jpg, .png or another image type: rename it")
     return name_images(paths)
 
 
 class Stages:
-    """The stages of a reconstruction; what each makes is kept in the folder of the results."""
+    """The stages of a reconstruction; their results are kept in the folder `output`."""
 
     def __init__(
         self,
@@ -167,13 +166,16 @@ class Stages:
         self.features = self.work / "features.h5"
 
     def folder_of(self, images: str | Path | Sequence[str | Path]) -> Path:
-        """Return the folder of the images: for a list, or around the results, one of links."""
+        """Return the folder of the images.
+
+        It is a folder of links if the images are a list, or the results lie among them.
+        """
         if isinstance(images, (str, Path)):
             if self.output.resolve() == Path(images).resolve():
                 raise OptionError(f"{images} holds the images: give another folder with -o")
             if not self.output.resolve().is_relative_to(Path(images).resolve()):
                 return Path(images)
-        taken = check_images(images, [self.output])  # without pictures among the results
+        taken = check_images(images, [self.output])  # images among the results do not count
         folder = self.work / LINKS
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
@@ -181,7 +183,7 @@ class Stages:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             try:
                 (folder / name).symlink_to(path.resolve())
-            except OSError:  # Windows lets only some users do it
+            except OSError:  # Windows allows links only to some users
                 shutil.copy2(path, folder / name)
         return folder
 
@@ -191,10 +193,10 @@ class Stages:
         detector: DeepDetect | PointDetector,
         selection: SelectionOptions | None = None,
     ) -> tuple[dict[str, tuple[int, int]], dict[str, int], dict[str, str]]:
-        """Find and describe the keypoints of all images below a folder.
+        """Detect and describe the keypoints of all images below a folder.
 
-        Returns (width, height) in pixels and number of keypoints of those that could be read, by
-        name; and a sentence on each of the others.
+        Returns, by name, sizes (width, height) and numbers of keypoints of the images that could be
+        read, and a sentence on each of the others.
         """
         report = extract_features(
             folder,
@@ -222,7 +224,7 @@ class Stages:
         return sizes, keypoints, failures
 
     def choose_pairs(self, names: Sequence[str]) -> list[Pair]:
-        """Choose which images are matched with each other."""
+        """Choose the pairs of images to match."""
         choice = self.options.pair_choice(len(names))
         if not (alike := similar(choice)):
             return list_pairs(choice, names)
@@ -231,9 +233,10 @@ class Stages:
     def match_images(
         self, sizes: Mapping[str, tuple[int, int]]
     ) -> tuple[dict[Pair, np.ndarray], dict[str, str]]:
-        """Match images of (width, height) with those chosen; return the matches, as `match`.
+        """Choose and match pairs of images, and leave out images that show nothing new.
 
-        And the images that were left out, with the one that shows nearly the same.
+        Sizes are (width, height). Returns matches as `match` does, and the images left out, each
+        with the image that shows nearly the same.
         """
         names, dropped, limit = [*sizes], dict[str, str](), self.options.min_motion
         while True:
@@ -248,16 +251,17 @@ class Stages:
                 for pair, moved in motions.items()
                 if moved < limit * max(sizes[pair[0]]) and sizes[pair[0]] == sizes[pair[1]]
             }
-            # Those most alike, which are matched, may all be left out: then others are.
+            # With similar pairs, an image may have lost all its partners: choose pairs again.
             if not (further := thin_out(names, near, dropped)):
                 return matches, dropped
             dropped |= further
             names = [name for name in names if name not in further]
 
     def match(self, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
-        """Match pairs; return (K, 2) rows of keypoints of each.
+        """Match pairs of images; return (K, 2) rows of keypoints of each pair.
 
-        Keypoints without sizes, or of other descriptors, are matched by the ratio test.
+        The ratio test replaces the filter by neighbours for keypoints that this filter does not
+        suit: those without sizes, or with other descriptors.
         """
         path = self.work / "matches.h5"
         first = first_keypoints(self.features)
@@ -282,11 +286,11 @@ class Stages:
         known: bool,
         refined: bool = True,
     ) -> tuple[Any, dict[Pair, int], list[frozenset[str]]]:
-        """Map, or read what an earlier run has mapped; known intrinsics stay as they are.
+        """Map the images, or read the model of an earlier run; `known` intrinsics stay fixed.
 
-        Tracks are `refined`, or are as the keypoints were found, and their points have no colours.
-        Returns the model of pycolmap; the number of matches of each pair that agree with its
-        geometry; and the names of the images in each other component.
+        If tracks are not `refined`, they stay at the keypoints, and points have no colours. Returns
+        the `pycolmap.Reconstruction`, the number of inliers of each pair, and the names of the
+        images in each other component.
         """
         pycolmap, options = import_pycolmap(), self.options
         images = {}
@@ -305,12 +309,12 @@ class Stages:
         )
         record = self.work / f"mapping-{made_of}.json"
         database, sparse = self.output / "database.db", self.work / "sparse"
-        with contextlib.suppress(OSError, ValueError):  # there is none, or a damaged one
+        with contextlib.suppress(OSError, ValueError):  # the record is missing or damaged
             noted = json.loads(record.read_text(encoding="utf-8"))
             verified = {(a, b): count for a, b, count in noted["verified"]}
             components = [frozenset(names) for names in noted["components"]]
             return pycolmap.Reconstruction(sparse), verified, components
-        # A log of SQLite's that a killed run has left would be taken for that of the new database.
+        # SQLite would take a log that a killed run has left for the one of the new database.
         for old in (*self.work.glob("mapping-*.json"), *self.output.glob("database.db-*")):
             old.unlink()
         with atomic_path(database) as path:
@@ -328,7 +332,7 @@ class Stages:
                     verified,
                     known,
                     self.seed,
-                    # Those of an attempt that is given up are counted again in the next.
+                    # A second attempt counts its images again, so the bar must not overflow.
                     lambda count: bar.update(min(count, len(images) - bar.n)),
                 )
         model = correct_places(model, database, folder, known, self.seed, self.quiet)
@@ -354,11 +358,11 @@ class Stages:
         return model, verified, components
 
     def dense(self, folder: Path, sparse: SparseModel) -> np.ndarray:
-        """Make the depth maps that earlier runs have not made, and fuse all (`DENSE_POINT`)."""
+        """Compute the missing depth maps, and fuse all of them to (N,) `DENSE_POINT`."""
         return merge_dense_points(self.fused(folder, sparse), self.options.stride_px)
 
     def fused(self, folder: Path, sparse: SparseModel) -> Iterator[tuple[PosedView, np.ndarray]]:
-        """Yield the dense points of each reference, before what several give is joined."""
+        """Yield each reference view with its dense points, some of which repeat those of others."""
         store, stride = self.work / "dense", self.options.stride_px
         references = find_references(sparse)
         paths: dict[str, Path] = {}
@@ -368,7 +372,7 @@ class Stages:
             states = [file_state(folder / image.view.name) for image in matched]
             path = store / f"{key(matched, states, stride, __version__)}.npz"
             paths[images[0].view.name] = path
-            if load_arrays(path) is None:  # those of a damaged file are made again
+            if load_arrays(path) is None:  # the file is missing or damaged
                 tasks.append((path, matched))
         for old in store.glob("*.npz"):
             if old not in paths.values():

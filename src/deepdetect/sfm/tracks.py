@@ -1,9 +1,9 @@
-"""Tracks at sub-pixel positions: patches of one image of each, aligned in all others.
+"""Sub-pixel refinement of tracks: a patch of one image is aligned in all other images.
 
-A keypoint is where its own image has a maximum, which noise and the angle of view move. Once the
-cameras are known, the image that sees a point from the middle tells the others what to look for: a
-patch of the surface, warped as they see it. Lindenberger et al., "Pixel-Perfect Structure-from-
-Motion with Featuremetric Refinement", 2021, align features of a network instead.
+A keypoint lies at a maximum of its own image, which noise and the viewing angle move. Once the
+cameras are known, a patch of the image that sees a point from the middle is warped to the other
+images and aligned there. Lindenberger et al., "Pixel-Perfect Structure-from-Motion with
+Featuremetric Refinement", 2021, align features of a network instead.
 """
 
 from __future__ import annotations
@@ -25,42 +25,43 @@ from .colmap import PIXEL_CENTRE, quiet_pycolmap
 from .mapping import RegisteredImage, SparseModel, read_sparse_model
 
 PATCH_RADIUS_PX = 6
-"""Of the patches that are aligned."""
+"""Radius of the patches that are aligned. Chosen by hand."""
 
 MAX_SHIFT_PX = 2.5
-"""From where the model sees a point to where the patch is found."""
+"""A patch may move by this much from the projection of its point. Chosen by hand."""
 
 BLUR_SIGMA_PX = 0.7
-"""Of the images before: cubic interpolation at other phases dampens noise differently."""
+"""Sigma of a blur of the images: without it, cubic interpolation dampens noise by an amount that
+depends on the sub-pixel position."""
 
 MIN_FACING = 0.3
-"""Cosine of the angle between the normal of a surface and the line of sight of an image that is
-asked for it."""
+"""An image is searched for a surface only if the cosine between the line of sight and the normal is
+at least this. Chosen by hand."""
 
 MAX_GROWTH = 7.0
-"""Of the area of a patch from one image to another, or the other way round."""
+"""The areas of a patch in two images may have this ratio. Chosen by hand."""
 
 MIN_COMMON_POINTS = 10
-"""Of two images, for points of one to be sought in the other."""
+"""Number of points that two images must share, else no patches are aligned. Chosen by hand."""
 
 DENSE_CELLS = 4500
-"""Of an image, for dense tracks: as many corners at most."""
+"""Number of grid cells of an image, each of which gives at most one dense track. Chosen by hand."""
 
 MIN_DISTANCE_PX = 3
-"""From a new track to those that its image is part of already."""
+"""Distance of a new track from the earlier tracks of its image. Chosen by hand."""
 
 MIN_DENSE_VIEWS = 3
-"""Of a dense track: two images only agree with themselves."""
+"""Number of images of a dense track: with two, no other image checks the match."""
 
 CACHED_IMAGES, CACHED_PIXELS = 8, 1e8
-"""That are kept in memory, of seven bytes each, as many images as fit but at least so many:
-following references share their neighbours."""
+"""The cache holds the second number of pixels, of seven bytes each, but at least the first number
+of images, because successive images share neighbours."""
 
 
 class Surfaces(NamedTuple):
-    """What is sought of an image: (K, 2) whole pixels, and the planes (K, 3), (K, 3) they lie on.
+    """Small planes to be found in other images: (K, 2) whole pixels, (K, 3) points and normals.
 
-    Normals are of length 1 and towards the image, in the frame of the model, as the points are.
+    Points and normals are in the frame of the model. Normals are unit vectors towards the image.
     """
 
     pixels: np.ndarray
@@ -69,10 +70,10 @@ class Surfaces(NamedTuple):
 
 
 def refine_tracks(model: Any, folder: Path, quiet: bool = True) -> None:
-    """Put refined tracks in place of those of a `pycolmap.Reconstruction`; cameras stay.
+    """Replace the tracks of a `pycolmap.Reconstruction` by refined ones; cameras stay fixed.
 
-    Each point keeps the image that sees it from the middle, at a whole pixel, and is aligned in the
-    others of its track. Points have the colour of their pixel. `quiet` shows no bar.
+    Each point lies at a whole pixel of the image that sees it from the middle, has the colour of
+    that pixel, and is aligned in the other images of its track. `quiet` shows no progress bar.
     """
     sparse = read_sparse_model(model)
     tracks = _Tracks(sparse, folder)
@@ -86,11 +87,11 @@ def refine_tracks(model: Any, folder: Path, quiet: bool = True) -> None:
 def add_dense_tracks(
     model: Any, folder: Path, fused: Iterable[tuple[PosedView, np.ndarray]]
 ) -> None:
-    """Add tracks of `DENSE_POINT`, with the view that they are seen from, to those of a model.
+    """Add tracks of dense points to those of a model.
 
-    An image gives the best corner in each cell of a grid, where tracks of earlier images have
-    none: what all of them show is matched from one image only. The model's own tracks, which are
-    shorter, are aligned again where no other is near.
+    `fused` are views, each with the `DENSE_POINT` array of its depth map. An image gives the best
+    corner of each cell of a grid, unless tracks of earlier images are near: then these match it
+    already. The model's own tracks, which are shorter, are aligned again if no new one is near.
     """
     sparse = read_sparse_model(model)
     tracks = _Tracks(sparse, folder)
@@ -105,9 +106,9 @@ def add_dense_tracks(
 
 
 def _central_views(sparse: SparseModel) -> dict[str, tuple[Surfaces, np.ndarray]]:
-    """Return by image the points that it sees from the middle of their track, and their rows.
+    """Return, by image, the points that it sees most nearly from the middle, and their rows.
 
-    Their surfaces are taken to face that middle.
+    The middle of a track is the mean of its lines of sight, which surfaces are assumed to face.
     """
     images = [*sparse.images.values()]
     rows = np.concatenate([image.points for image in images])
@@ -131,7 +132,7 @@ def _central_views(sparse: SparseModel) -> dict[str, tuple[Surfaces, np.ndarray]
 
 
 class _Tracks:
-    """Tracks of a model, as they are found."""
+    """The tracks that have been found for a model so far."""
 
     def __init__(self, sparse: SparseModel, folder: Path) -> None:
         self.sparse, self.images, self.folder = sparse, [*sparse.images.values()], folder
@@ -140,12 +141,12 @@ class _Tracks:
         self.colors = [np.empty((0, 3), np.uint8)]
         self.count = 0
         none = np.empty(0, np.int64), np.empty((0, 2))
-        self.seen = [[none] for _ in self.images]  # rows of points, and pixels, by image
+        self.seen = [[none] for _ in self.images]  # rows of points and pixels, by image
         largest = max(math.prod(image.intrinsics.size) for image in self.images)
         self.read = lru_cache(max(CACHED_IMAGES, int(CACHED_PIXELS / largest)))(self._read)
 
     def corners(self, name: str, points: np.ndarray) -> Surfaces:
-        """Choose those of the dense points of an image that become tracks."""
+        """Choose the dense points of an image that become tracks: the best corners of a grid."""
         image = self.images[self.numbers[name]]
         xy = image.intrinsics.from_pinhole(image.view.project(points["points"])[0])
         pixels = np.rint(xy).astype(np.int64).clip(0, np.array(image.intrinsics.size) - 1)
@@ -155,7 +156,7 @@ class _Tracks:
         return Surfaces(pixels[rows], places, normals)
 
     def free(self, name: str, pixels: np.ndarray) -> np.ndarray:
-        """Return rows of (K, 2) pixels of an image that are not near its tracks."""
+        """Return the rows of those of (K, 2) pixels of an image that are not near its tracks."""
         number = self.numbers[name]
         free = np.ones(self.images[number].intrinsics.size[::-1], np.uint8)
         for _, xy in self.seen[number]:
@@ -167,9 +168,9 @@ class _Tracks:
     def add(
         self, name: str, wanted: Surfaces, tracks: np.ndarray | None = None, min_views: int = 2
     ) -> None:
-        """Seek surfaces of an image in others; those that enough images see become points.
+        """Align patches of an image in others; those found in `min_views` images become points.
 
-        They are sought in the images of their `tracks`, rows of the model's points, or in all.
+        `tracks` are rows of the model's points: their images are searched. None: all images are.
         """
         own = self.numbers[name]
         pixels, points, _ = wanted
@@ -198,7 +199,7 @@ class _Tracks:
     def _aligned(
         self, image: RegisteredImage, other: RegisteredImage, wanted: Surfaces
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return rows of the surfaces that another image shows, and their pixels there."""
+        """Return rows of the patches found in another image, and their pixels there."""
         pixels, points, normals = wanted
         view, seen = image.view, []
         ahead = ((points - view.centre) * normals).sum(axis=1)
@@ -230,8 +231,8 @@ class _Tracks:
         return rows[converged], xy[converged]
 
     def write(self, model: Any) -> None:
-        """Put the tracks in place of those of a `pycolmap.Reconstruction`."""
-        self.read.cache_clear()  # the adjustment that follows needs the memory
+        """Replace the tracks of a `pycolmap.Reconstruction` by these."""
+        self.read.cache_clear()  # the next adjustment needs the memory
         with quiet_pycolmap() as pycolmap:
             numbers = {image.name: number for number, image in model.images.items()}
             model.delete_all_points2D_and_points3D()

@@ -1,4 +1,4 @@
-"""Video: points followed from frame to frame."""
+"""Tracking of points through the frames of a video."""
 
 from .pipeline import TrackingReport, point_candidates, track, track_frames
 from .tracker import Tracker, TrackingOptions

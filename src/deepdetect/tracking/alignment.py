@@ -1,7 +1,7 @@
-"""Patches of an image found again in later ones by Gauss-Newton, with their affine deformation.
+"""Alignment of patches of an image in later images, with an affine deformation, by Gauss-Newton.
 
-Baker and Matthews, "Lucas-Kanade 20 years on", 2004 (inverse compositional: all but the residuals
-is computed once for each patch); gain and offset of the light drop out of the equations.
+The method is inverse compositional (Baker and Matthews, "Lucas-Kanade 20 years on", 2004):
+everything but the residuals is computed once for each patch. Gain and offset are eliminated.
 """
 
 from __future__ import annotations
@@ -14,39 +14,43 @@ import numpy as np
 from .._shared.opencv import cv2
 
 RADIUS_PX = 10
-"""Of a patch; its middle counts most."""
+"""Radius of a patch, whose pixels have a Gaussian weight of sigma radius / 2. Chosen by hand."""
 
 BLUR_SIGMA_PX = 1.0
-"""Of images before their patches are read: what lies between pixels is then well defined."""
+"""Sigma of the blur of images, so that values between pixels can be interpolated well."""
 
 BORDER_PX = 3
-"""Of an image, that its blur makes unlike what other images show there."""
+"""Width of the border that is not used: it is blurred with values from beyond the image."""
 
 MAX_ITERATIONS = 30
 CONVERGENCE_PX = 0.03
-"""A patch that moves by less has arrived; OpenCV 4 reads images at steps of 1/32."""
+"""A patch that moves by less has converged; OpenCV 4 reads images at steps of 1/32 px."""
 
 MAX_SHIFT_PX = 3.0
-"""From where a patch is expected; translation alone may be off by it where surfaces come nearer."""
+"""A patch may move by this from its expected position, as translation alone may be off by it where
+surfaces come nearer. Chosen by hand."""
 
 MIN_CORRELATION = 0.8
-"""Of a patch that is found."""
+"""A patch that correlates less is not found. Chosen by hand."""
 
 MAX_GROWTH = 4.0
-"""Of the area of a patch: beyond it, too few of its pixels are seen in one of the images."""
+"""The area of a patch may grow or shrink by this factor. If it changes more, one of the images
+shows too few of its pixels. Chosen by hand."""
 
 RIDGE = 1e-4
-"""Added to the equations, as a share of their size: patches of parallel edges can be solved."""
+"""This share of their scale is added to the normal equations, since parallel edges make these
+singular. Chosen by hand."""
 
 MOST_READ = 1 << 14
-"""Patches that are read at once: OpenCV's limit for the sides of an image is 32,767."""
+"""Number of patches read at once, since OpenCV limits the sides of an image to 32,767."""
 
 
 class Patches(NamedTuple):
-    """Patches of P pixels: float32 values (N, P), step for each residual (N, 6, P), variance (N,).
+    """Patches of P pixels: float32 values (N, P), steps (N, 6, P), and variances (N,).
 
-    Steps are those of the place and of the deformation, row by row. `affinities` (N, 2, 2) float64
-    map offsets of pixels in the patches to offsets in the image in which they were found last.
+    Steps map residuals to changes of the position (2) and of the deformation (4, row by row).
+    `affinities` (N, 2, 2) float64 map offsets of pixels in the patches to offsets in the image in
+    which they were found last.
     """
 
     values: np.ndarray
@@ -70,7 +74,7 @@ class Patches(NamedTuple):
 def cut_patches(image: np.ndarray, xy: np.ndarray) -> Patches:
     """Return the patches around (N, 2) points of a blurred image.
 
-    One that the border or its blur reaches is empty, and is never found.
+    A patch that reaches into the border is empty, and is never found.
     """
     offsets, weights = _pixels()
     affinities = np.tile(np.eye(2), (len(xy), 1, 1))
@@ -102,8 +106,8 @@ def find_patches(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find patches in a blurred image near (N, 2) expected positions.
 
-    Returns (N, 2) positions and (N, 2, 2) affinities, float64, and (N,) whether each was found; the
-    others have no meaning.
+    Returns (N, 2) positions and (N, 2, 2) affinities, float64, and (N,) bool whether each was
+    found; positions and affinities of the others are meaningless.
     """
     found, affinities = xy.astype(np.float64), patches.affinities.copy()
     arrived = np.zeros(len(xy), bool)
@@ -135,16 +139,16 @@ def find_patches(
 
 @cache
 def _pixels() -> tuple[np.ndarray, np.ndarray]:
-    """Return where a patch's pixels lie from its middle, (2, P), and how much they count, (P,)."""
+    """Return the offsets of a patch's pixels from its centre, (2, P), and their weights, (P,)."""
     offsets = np.indices((2 * RADIUS_PX + 1,) * 2, np.float32)[::-1].reshape(2, -1) - RADIUS_PX
     weights = np.exp(-2 * (offsets**2).sum(axis=0) / RADIUS_PX**2)
     return offsets, weights / weights.sum()
 
 
 def _read(image: np.ndarray, xy: np.ndarray, affinities: np.ndarray) -> np.ndarray:
-    """Return the (N, P) values of an image around points, where the affinities put the pixels.
+    """Return the (N, P) values of an image around points, at offsets warped by the affinities.
 
-    By Lanczos' kernel: OpenCV's cubic one moves what it reads by up to .05 px.
+    The kernel is Lanczos': OpenCV's cubic kernel shifts what it reads by up to 0.05 px.
     """
     places = xy.astype(np.float32)[:, :, None] + affinities.astype(np.float32) @ _pixels()[0]
     parts = np.array_split(places, len(places) // MOST_READ + 1)

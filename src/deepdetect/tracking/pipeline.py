@@ -1,4 +1,4 @@
-"""From a video, a folder or a camera to a video of the tracks and their table."""
+"""Tracking from a video, a folder or a camera to a video with the tracks and a CSV file."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from .tracks import TrackDrawer, TrackedFrame, write_tracks
 from .video import Frame, FrameSource, check_video_name, write_video
 
 MIN_SIDE_PX = 32
-"""Smallest longer side that frames are scaled down to."""
+"""Frames must not be scaled down to a shorter longer side. Chosen by hand."""
 
 RATE_FRAMES = 10
-"""Frames of which the number per second is shown."""
+"""The displayed frame rate is a mean over this number of frames."""
 
 
 @dataclass(frozen=True)
 class TrackingReport:
-    """What was tracked.
+    """Statistics of a tracked video.
 
     Attributes:
         frames: number of frames.
         tracks: number of tracks.
-        tracks_per_frame: on average.
-        frames_per_track: on average.
-        fps: frames per second of the work, drawing and writing included.
-        seconds: of all the work.
-        files: that were written.
-        expected: number of frames that the source states, or None; a file cut off gives fewer.
+        tracks_per_frame: mean number of tracks in a frame.
+        frames_per_track: mean length of a track in frames.
+        fps: frames processed per second, including drawing and writing.
+        seconds: total time.
+        files: files that were written.
+        expected: number of frames that the source states, or None; a truncated file has fewer.
         failures: a sentence on each frame of a folder that was left out.
     """
 
@@ -59,7 +59,7 @@ class TrackingReport:
 
 
 def point_candidates(options: TrackingOptions = TrackingOptions()) -> Detect:
-    """Return what finds the best points of a frame, as a `Tracker` wants it."""
+    """Return a function that detects the best points of a frame, for a `Tracker`."""
     return PointDetector(CANDIDATES * options.max_keypoints).detect
 
 
@@ -70,9 +70,9 @@ def track_frames(
     """Follow points through all frames of a source.
 
     Args:
-        source: opened in a `with` block.
-        tracker: a new one.
-        max_side: longer sides of frames are scaled down to this for the tracker, in pixels.
+        source: a source that was opened in a `with` block.
+        tracker: a new tracker.
+        max_side: longer side in pixels that frames are scaled down to for the tracker.
 
     Returns:
         Iterator over each frame, (H, W, 3) uint8 RGB, and its tracks, in pixels of this frame.
@@ -111,26 +111,26 @@ def track(
     tail: int = 10,
     quiet: bool = True,
 ) -> TrackingReport:
-    """Follow the points of a video, and write a video with the tracks, and their table.
+    """Follow the points of a video; write a video with the tracks, and a CSV file of them.
 
-    Ctrl-C, SIGTERM or SIGHUP (of a terminal that is closed) on a camera ends the recording; both
-    files are written. An image of a folder that cannot be read, or has another size than the first
-    one, does not stop the others: it is named in the report.
+    Ctrl-C, SIGTERM or SIGHUP (a closed terminal) ends the recording of a camera, and both files are
+    written. Images of a folder that cannot be read, or differ in size from the first one, are left
+    out and named in the report.
 
     Args:
         source: a video file, a folder of images, or the number of a camera.
-        output: ending in .mp4, .mov, .mkv or .avi; the table beside it ends in .csv, with columns
-            frame, track, x, y and score. With .csv itself there is no video.
-        detector: that finds the points; None: a `PointDetector` of enough candidates.
-        options: how they are followed.
+        output: video ending in .mp4, .mov, .mkv or .avi; the CSV file next to it has the columns
+            frame, track, x, y and score. If it ends in .csv, no video is written.
+        detector: detector of the points; None: a `PointDetector` with enough candidates.
+        options: how points are followed.
         every: process every N-th frame.
         max_frames: largest number of frames that are taken. None: all.
-        max_side: longer sides of frames are scaled down to this many pixels for the search.
-        tail: number of positions of a track that are drawn.
+        max_side: longer side in pixels that frames are scaled down to for the tracking.
+        tail: number of past positions of a track that are drawn.
         quiet: show no progress bar.
 
     Returns:
-        What was tracked.
+        Statistics of the tracks.
 
     Raises:
         DeepDetectError: the source cannot be read, files cannot be written, or an option is wrong.
@@ -141,7 +141,7 @@ def track(
     video, table = output_files(output)
     made = [path.resolve() for path in (video, table) if path is not None]
     if is_path(source) and Path(str(source)).resolve() in made:
-        raise OptionError(f"{source} is the video itself: give another output")
+        raise OptionError(f"{source} is also the output: give another output")
     if tail < 1:
         raise OptionError(f"`tail` must be at least 1, not {tail}")
     frames = tracks = positions = 0
@@ -184,7 +184,7 @@ def track(
 
 
 def output_files(output: str | Path) -> tuple[Path | None, Path]:
-    """Return the files of the video, None where there is none, and of the table."""
+    """Return the paths of the video, or None if none is written, and of the CSV file."""
     path = Path(output)
     if path.suffix.lower() == ".csv":
         return None, path
@@ -194,9 +194,9 @@ def output_files(output: str | Path) -> tuple[Path | None, Path]:
 
 @contextmanager
 def _ended_by_signals(live: bool) -> Iterator[Callable[[], bool]]:
-    """Note the first Ctrl-C, SIGTERM or SIGHUP of a live source, so that its files are finished.
+    """Note the first Ctrl-C, SIGTERM or SIGHUP for a live source, so that its files are finished.
 
-    A second one ends all at once, and leaves no file.
+    A second signal ends the process at once, and leaves no file.
     """
     noted: list[int] = []
     with ExitStack() as handlers:

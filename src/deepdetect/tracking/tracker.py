@@ -1,10 +1,10 @@
-"""Points followed from frame to frame by pyramidal Lucas-Kanade.
+"""Tracking of points from frame to frame by pyramidal Lucas-Kanade.
 
-Lucas and Kanade, "An iterative image registration technique", 1981; Bouguet's pyramid; tracks that
-do not come back to where they started are dropped (Kalal et al., "Forward-backward error", 2010).
-So that errors hardly add up, each point is then put where its first patch fits best, as the surface
-has turned and come nearer since (Shi and Tomasi, "Good features to track", 1994).
-Where a cell of the image has no track, the best keypoint of that cell begins one.
+Lucas and Kanade, "An iterative image registration technique", 1981, with Bouguet's pyramid. Tracks
+that do not come back to where they started are dropped (Kalal et al., "Forward-backward error",
+2010). Each point is then aligned with its first patch under an affine deformation, so that errors
+hardly add up (Shi and Tomasi, "Good features to track", 1994). The best keypoints that are far
+enough from all tracks begin new ones.
 """
 
 from __future__ import annotations
@@ -27,23 +27,24 @@ from .alignment import BLUR_SIGMA_PX, Patches, cut_patches, find_patches
 from .tracks import TrackedFrame
 
 Detect = Callable[[np.ndarray], Keypoints]
-"""Keypoints of a (H, W, 3) uint8 RGB image."""
+"""Function that returns the keypoints of a (H, W, 3) uint8 RGB image."""
 
 CANDIDATES = 3
-"""Keypoints that are detected for each track that is wanted: the best well apart are taken."""
+"""Keypoints are detected in this multiple of the wanted tracks, to choose some that lie apart."""
 
 MIN_DISTANCE_PX, MIN_SPACING = 8.0, 0.35
-"""Smallest distance of a new point from all tracks, also as a share of the spacing of a grid of as
-many points as are wanted: points all over the image tell more about the motion of the camera."""
+"""A new point has this distance from all tracks, in pixels and as a share of the spacing of a grid
+of `max_keypoints` points: points all over the image tell more about the motion of the camera."""
 
 WINDOW_PX = 21
-"""Side of the patch that is followed."""
+"""The patch that is followed has this side, which is OpenCV's default."""
 
 LEVELS = 3
-"""Of the pyramid above the image: the more, the farther a point may move."""
+"""The pyramid has this number of levels above the image, as by default in OpenCV; each one doubles
+how far points may move between frames."""
 
 BORDER_PX = 2.0
-"""Points nearer to the border of the image are dropped."""
+"""Points nearer to the border of the image are dropped. Chosen by hand."""
 
 
 @suggest_keywords
@@ -52,10 +53,10 @@ class TrackingOptions:
     """How points are followed.
 
     Attributes:
-        max_keypoints: tracks at a time.
-        detect_every: look for new points after this many frames, or once many are lost.
-        min_kept: share of the tracks after the last search; with fewer, a search follows.
-        max_return_error_px: largest distance of a point from where following it back ends.
+        max_keypoints: largest number of tracks at a time.
+        detect_every: detect new points after this many frames, or once many tracks are lost.
+        min_kept: detect new points if fewer than this share of the last tracks is left.
+        max_return_error_px: largest error of a point after following it forward and back.
 
     Raises:
         OptionError: a value is out of its range.
@@ -79,7 +80,7 @@ class Tracker:
     """Follows points through the frames of a video.
 
     Args:
-        detect: finds keypoints in a (H, W, 3) uint8 RGB image, as `PointDetector(3000).detect`.
+        detect: detects keypoints in a (H, W, 3) uint8 RGB image, as `PointDetector().detect` does.
         options: how points are followed.
 
     Example:
@@ -110,16 +111,16 @@ class Tracker:
     def update(
         self, image: Any, *, number: int | None = None, channels: Channels = "rgb"
     ) -> TrackedFrame:
-        """Follow all points into the next frame, and begin new tracks where there are few.
+        """Follow all points into the next frame, and begin new tracks if there are few.
 
         Args:
-            image: as for `DeepDetect.detect`, of the same size as the frames before.
-            number: of the frame; None: how many there were before.
-            channels: the order of the colours.
+            image: an image as for `DeepDetect.detect`, of the same size as earlier frames.
+            number: number of the frame; None: the number of earlier frames.
+            channels: order of the colours.
 
         Raises:
-            ImageError: the image cannot be read or is not fit.
-            OptionError: it has another size than the frames before.
+            ImageError: the image cannot be read or used.
+            OptionError: the image differs in size from earlier frames.
         """
         rgb = load_image(image, channels=channels)
         options, gray = self.options, luma(rgb)
@@ -127,8 +128,8 @@ class Tracker:
             if self._gray.shape != gray.shape:
                 (height, width), (before_height, before_width) = gray.shape, self._gray.shape
                 raise OptionError(
-                    f"a frame has {width}x{height} pixels, those before have "
-                    f"{before_width}x{before_height}: use a tracker for each size"
+                    f"a frame has {width}x{height} pixels, but earlier ones have "
+                    f"{before_width}x{before_height}: use one tracker for each size"
                 )
             self._follow(self._gray, gray)
         image = gaussian_blur(gray, BLUR_SIGMA_PX)
@@ -151,7 +152,7 @@ class Tracker:
         return found
 
     def _follow(self, before: np.ndarray, gray: np.ndarray) -> None:
-        """Move the points to where the next frame shows them; drop those that are lost."""
+        """Move the points to their positions in the next frame; drop those that are lost."""
         xy = self._points["xy"]
         if not len(xy):
             return
@@ -169,7 +170,7 @@ class Tracker:
         self._patches = self._patches.select(kept)
 
     def _return_to_patches(self, image: np.ndarray) -> None:
-        """Move the points to where their first patches fit; take new patches where none does."""
+        """Align the points with their first patches; cut new patches for those that do not fit."""
         xy = self._points["xy"]
         places, affinities, found = find_patches(image, self._patches, xy)
         xy[found] = places[found]
@@ -203,7 +204,7 @@ def free_keypoints(
 ) -> np.ndarray:
     """Choose up to `count` keypoints, the best first, far from (M, 2) positions and each other.
 
-    Returns (K,) rows of the keypoints; distances are those of the nearest pixels.
+    Returns (K,) rows of the keypoints. Distances are between the nearest whole pixels.
     """
     width, height = keypoints.image_size
     radius = int(distance_px)

@@ -1,4 +1,4 @@
-"""Where points are in the frames of a video: a table in a file, and pictures."""
+"""Tracks of points in a video: their CSV file, and drawings over the frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..viz.draw import line_scale
 HEADER = "frame,track,x,y,score"
 
 HUE_STEP = 0.61803
-"""Of the colours of following tracks: neighbours are far apart (the golden ratio)."""
+"""Step of the hue from one track to the next: the golden ratio keeps successive tracks distinct."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +27,11 @@ class TrackedFrame:
     """The tracked points of one frame.
 
     Attributes:
-        number: of the frame, from 0 on, in the source.
-        tracks: (N,) int64 numbers of the tracks, rising: a point keeps its number.
+        number: number of the frame in the source, from 0 on.
+        tracks: (N,) int64 numbers of the tracks, ascending; a track keeps its number.
         xy: (N, 2) float32 positions, centre of the first pixel (0, 0).
-        scores: (N,) float32 of the keypoints with which the tracks began.
-        ages: (N,) int64 frames since then, 0 where a track begins here.
+        scores: (N,) float32 scores of the keypoints with which the tracks began.
+        ages: (N,) int64 frames since then, 0 if a track begins here.
 
     Raises:
         OptionError: the arrays do not have one row for each track.
@@ -48,7 +48,7 @@ class TrackedFrame:
         shapes = [np.shape(values) for values in (self.xy, self.scores, self.ages)]
         if shapes != [(count, 2), (count,), (count,)]:
             raise OptionError(
-                f"{count} tracks need (N, 2) positions, and scores and ages (N,), not {shapes}"
+                f"{count} tracks need positions (N, 2), scores (N,) and ages (N,), not {shapes}"
             )
 
     def __len__(self) -> int:
@@ -59,7 +59,7 @@ class TrackedFrame:
 def write_tracks(path: str | Path) -> Iterator[Callable[[TrackedFrame], None]]:
     """Open a CSV file of tracks, which appears when the block ends, whole or not at all.
 
-    What writes the rows of a frame is given: columns frame, track, x, y and score.
+    The block gets a function that writes the rows of a frame: frame, track, x, y and score.
     """
     if Path(path).suffix.lower() != ".csv":
         raise OptionError(f"{path} must end in .csv")
@@ -80,10 +80,10 @@ def load_tracks(path: str | Path) -> list[TrackedFrame]:
     """Read the CSV file that `deepdetect track` wrote.
 
     Returns:
-        The frames that have tracks, in their order.
+        The frames that have tracks, in order.
 
     Raises:
-        DeepDetectError: the file is missing or is no such file.
+        DeepDetectError: the file is missing or not a file of tracks.
 
     Example:
         >>> import tempfile
@@ -106,7 +106,7 @@ def load_tracks(path: str | Path) -> list[TrackedFrame]:
         raise MissingFileError(f"there is no file {path}: check the path") from None
     except (OSError, ValueError) as error:
         raise InvalidFileError(
-            f"{path} holds no tracks ({first_line(error)}): write the file again"
+            f"{path} is not a file of tracks ({first_line(error)}): write the file again"
         ) from None
     if not len(table):
         return []
@@ -124,7 +124,7 @@ def load_tracks(path: str | Path) -> list[TrackedFrame]:
 
 
 class TrackDrawer:
-    """Draws tracks with their last positions, up to `tail`, over frames."""
+    """Draws tracks over frames, each with its last `tail` positions."""
 
     def __init__(self, tail: int = 10) -> None:
         self._frames: deque[TrackedFrame] = deque(maxlen=tail)
@@ -154,6 +154,6 @@ class TrackDrawer:
 
 
 def track_color(track: int) -> tuple[int, int, int]:
-    """Return a bright RGB colour that a track keeps."""
+    """Return the RGB colour of a track, which is bright and the same in all frames."""
     red, green, blue = colorsys.hsv_to_rgb(track * HUE_STEP % 1, 0.8, 1.0)
     return round(255 * red), round(255 * green), round(255 * blue)

@@ -26,10 +26,10 @@ from ..io.image import find_images, load_image
 from ..io.image_file import IMAGE_SUFFIXES
 
 FOLDER_FPS = 10.0
-"""Of the frames in a folder, which say nothing of it."""
+"""Frame rate assumed for a folder of frames, and for a video that states none."""
 
 MAX_FPS = 1000.0
-"""What a file states above it is wrong."""
+"""A frame rate in a file above this is wrong, and ignored. Chosen by hand."""
 
 
 CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
@@ -37,11 +37,11 @@ CODECS = {".mp4": "mp4v", ".mov": "mp4v", ".mkv": "mp4v", ".avi": "MJPG"}
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A frame.
+    """A frame of a video.
 
     Attributes:
-        number: in the source, from 0 on.
-        rgb: (H, W, 3) uint8.
+        number: number in the source, from 0 on.
+        rgb: (H, W, 3) uint8 pixels.
     """
 
     number: int
@@ -51,24 +51,24 @@ class Frame:
 class FrameSource(AbstractContextManager["FrameSource"]):
     """The frames of a video file, of the images below a folder, or of a camera.
 
-    It is iterated once, in a `with` block.
+    Iterate over it once, in a `with` block.
 
     Args:
         source: a file, a folder (images in the order of their names), or the number of a camera.
         every: process every N-th frame.
-        max_frames: that are taken; None: all.
+        max_frames: largest number of frames that are taken; None: all.
 
     Attributes:
-        live: whether it is a camera, which has no end.
-        fps: frames per second of what is taken.
-        count: number of frames that will be taken, as the file states; None where unknown.
-        failures: a sentence on each image of a folder that was left out until now: it cannot be
-            read, or has another size than the first one.
+        live: whether the source is a camera, which has no end.
+        fps: frames per second, after `every`.
+        count: number of frames that will be taken, as the file states; None if unknown.
+        failures: a sentence on each image of a folder that was left out so far, because it cannot
+            be read or differs in size from the first one.
 
     Raises:
         MissingFileError: there is no such file, folder or camera.
         ImageError: the folder holds no image.
-        InvalidFileError: the file is no video that can be read.
+        InvalidFileError: the file is not a video that can be read.
         OptionError: an option is out of its range.
     """
 
@@ -100,7 +100,7 @@ class FrameSource(AbstractContextManager["FrameSource"]):
         if not self.live and not path.is_file():
             raise MissingFileError(f"there is no video, folder or camera {path}: check the path")
         if not self.live and path.suffix.lower() in IMAGE_SUFFIXES:
-            raise ImageError(f"{path} is one image: give a video, or the folder of the frames")
+            raise ImageError(f"{path} is a single image: give a video, or a folder of frames")
         capture = cv2.VideoCapture(self.camera if self.live else str(path))
         if capture.isOpened():
             return capture
@@ -109,8 +109,8 @@ class FrameSource(AbstractContextManager["FrameSource"]):
                 f"there is no camera {self.camera}, or another program uses it: try another number"
             )
         raise InvalidFileError(
-            f"{path} is no video that the installed OpenCV can read: convert it to MP4 "
-            "(H.264), or give a folder of its frames"
+            f"the installed OpenCV cannot read {path} as a video: convert it to MP4 (H.264), or "
+            "give a folder of its frames"
         )
 
     def __iter__(self) -> Iterator[Frame]:
@@ -141,14 +141,14 @@ class FrameSource(AbstractContextManager["FrameSource"]):
     def _from_capture(self) -> Iterator[Frame]:
         for number in count():
             wanted = number % self.every == 0
-            # What is not wanted is not decoded where the format allows it.
+            # `grab` skips a frame without decoding it, if the format allows it.
             done, bgr = self._capture.read() if wanted else (self._capture.grab(), None)
             if not done:
                 break
             if wanted:
                 yield Frame(number, load_image(bgr, channels="bgr"))
         if not number:
-            raise DeepDetectError("the source gives no frame: check it with another program")
+            raise DeepDetectError("the source has no frames: check it with another program")
 
     def __exit__(self, *_: object) -> None:
         if self._capture is not None:
@@ -165,10 +165,10 @@ def _camera_number(source: str | Path | int) -> int | None:
 
 
 def count_frames(path: Path) -> int:
-    """Return how many frames of a video file can be read one after the other."""
+    """Return the number of frames of a video file that can be read in sequence."""
     backend, settings = cv2.CAP_ANY, []
     if cv2.CAP_FFMPEG in cv2.videoio_registry.getBackends():
-        # It can leave frames undecoded, which takes a fiftieth of the time.
+        # FFmpeg can leave frames undecoded, which takes a fiftieth of the time.
         backend, settings = cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1]
     capture = cv2.VideoCapture(str(path), backend, settings)
     frames = next(number for number in count() if not capture.grab())
@@ -177,7 +177,7 @@ def count_frames(path: Path) -> int:
 
 
 def check_video_name(path: str | Path) -> str:
-    """Return the codec of a video file by its suffix; call it before any expensive work."""
+    """Return the codec for the suffix of a video file, or raise an OptionError."""
     suffix = Path(path).suffix.lower()
     if suffix not in CODECS:
         raise OptionError(f"{path} must end in {', '.join(CODECS)}, or .csv")
@@ -188,11 +188,11 @@ def check_video_name(path: str | Path) -> str:
 def write_video(path: str | Path, fps: float) -> Iterator[Callable[[np.ndarray], None]]:
     """Open a video file, which appears when the block ends, whole or not at all.
 
-    What writes a (H, W, 3) uint8 RGB frame is given; all have the size of the first. OpenCV does
-    not say when a frame could not be written: the whole file is checked.
+    The block gets a function that writes a (H, W, 3) uint8 RGB frame; all must have one size. The
+    finished file is checked, because OpenCV does not report a frame that it could not write.
 
     Raises:
-        DeepDetectError: the file cannot be written, as where the disk is full, or no frame was.
+        DeepDetectError: the file cannot be written (the disk may be full), or has no frames.
     """
     codec = check_video_name(path)
     sizes: list[tuple[int, int]] = []
@@ -206,10 +206,10 @@ def write_video(path: str | Path, fps: float) -> Iterator[Callable[[np.ndarray],
                 if not writer.isOpened():
                     raise DeepDetectError(
                         f"the installed OpenCV has no encoder ({codec}) for {path}: give a name "
-                        "that ends in .avi, or in .csv for the tracks alone"
+                        "that ends in .avi, or in .csv for only the tracks"
                     )
             elif size != sizes[0]:
-                raise DeepDetectError(f"a frame has {size} pixels, the first one had {sizes[0]}")
+                raise DeepDetectError(f"a frame has {size} pixels, but the first had {sizes[0]}")
             writer.write(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
             sizes.append(size)
 
@@ -218,7 +218,7 @@ def write_video(path: str | Path, fps: float) -> Iterator[Callable[[np.ndarray],
         finally:
             writer.release()
         if not sizes:
-            raise DeepDetectError(f"there is no frame to be written to {path}: check the source")
+            raise DeepDetectError(f"there are no frames to write to {path}: check the source")
         if (found := count_frames(temporary)) < len(sizes):
             raise DeepDetectError(
                 f"cannot write {path} ({found} of {len(sizes)} frames are in the file): free "

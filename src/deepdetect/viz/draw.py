@@ -1,4 +1,4 @@
-"""Pictures of keypoints, matches, heat maps and depth: everything that is drawn, from arrays."""
+"""Visualisations of keypoints, matches, heat maps and depth maps, drawn from arrays."""
 
 from __future__ import annotations
 
@@ -10,44 +10,43 @@ import numpy as np
 from .._shared.opencv import cv2
 
 MAX_CIRCLES = 5000
-"""More keypoints than this are drawn as single pixels."""
+"""More keypoints than this are drawn as single pixels: circles would cover the image."""
 
 LEAST_RADIUS_PX = 2.0
-"""Of the circle of a keypoint that has a size; without one it is a pixel more."""
+"""A keypoint's circle has at least this radius, and a pixel more without size. Chosen by hand."""
 
 PICTURE_SIDE_PX = 2000
-"""Longer side of a picture of matches: as JPEG it takes less than two megabytes."""
+"""Longest side of a visualisation, in pixels: as JPEG it then takes less than two megabytes."""
 
 READABLE_WIDTH_PX = 800
-"""Captions, lines and points grow with pictures that are wider than this."""
+"""Captions, lines and points grow in proportion above this image width. Chosen by hand."""
 
 LINES, DOTS = 60, 1500
-"""Of matches that have the colour of their position."""
+"""Numbers of matches drawn as lines and as points if colour shows position. Chosen by hand."""
 
 SHOWN_PERCENTILE = 99.0
-"""Values above it, and below the opposite one, have the last colours: few may be far away."""
+"""Colour scales end at this percentile and its opposite, so that outliers do not stretch them."""
 
 LEAST_DEPTH_LEVEL = 0.2
-"""Darker colours of the scale look like unknown depth."""
+"""Depth uses the colour scale from here: darker colours look like unknown depth. Chosen by hand."""
 
 CAPTION_HEIGHT = 28
-"""Of pictures that are not wider than `READABLE_WIDTH_PX`."""
-
 CAPTION_MARGIN = 6
-"""To the left and to the right of the text, as `CAPTION_HEIGHT`."""
-
 CAPTION_SCALE = 0.5
+"""The caption of an image of at most `READABLE_WIDTH_PX` has this height and side margin, in
+pixels, and this font scale. Chosen by hand so that it can be read."""
+
 GAP_PX = 6
-"""Between pictures that are joined."""
+"""Joined images are separated by gaps of this width. Chosen by hand."""
 
 GREEN, RED, WHITE = (60, 255, 60), (255, 60, 60), (255, 255, 255)
 
 
 def draw_keypoints(rgb: np.ndarray, xy: np.ndarray, sizes: np.ndarray | None) -> np.ndarray:
-    """Draw keypoints on a (H, W, 3) uint8 RGB image, which is dimmed; as `Keypoints.draw`."""
+    """Draw keypoints on a dimmed copy of a (H, W, 3) uint8 RGB image, for `Keypoints.draw`."""
     canvas, unit = rgb // 2, line_scale(rgb)
     if len(xy) > MAX_CIRCLES:
-        # Half transparent, so that the image shows through the dense points.
+        # Half transparent, so that the image stays visible below dense keypoints.
         columns, rows = np.clip(np.rint(xy).astype(int), 0, np.array(rgb.shape[1::-1]) - 1).T
         canvas[rows, columns] = canvas[rows, columns] // 2 + np.array(GREEN, np.uint8) // 2
         return canvas
@@ -70,9 +69,9 @@ def draw_matches(
 ) -> np.ndarray:
     """Draw the two images side by side, with lines between a random sample of the matches.
 
-    The lower image is enlarged to the height of the other, and both are scaled down where the
-    picture would be wider or higher than `PICTURE_SIDE_PX`. Good matches are green, the others red;
-    by position the good ones are coloured by their place in the first image, and most are dots.
+    The smaller image is enlarged to the height of the other. Both are then reduced if the result
+    exceeds `PICTURE_SIDE_PX`. Good matches are green, others red. With `by_position`, the colour of
+    good matches encodes their position in the first image, and most are drawn without a line.
     """
     height = max(rgb0.shape[0], rgb1.shape[0])
     width = sum(rgb.shape[1] * height / len(rgb) for rgb in (rgb0, rgb1))
@@ -92,7 +91,7 @@ def draw_matches(
         colors[good[order]] = _colors_of_positions(relative[good[order]])
     with_line = np.arange(len(order)) < (LINES if by_position else lines)
     unit = line_scale(canvas)
-    for k in np.argsort(good[order], kind="stable"):  # the good ones on top
+    for k in np.argsort(good[order], kind="stable"):  # draws good matches last, on top
         row, color = order[k], tuple(int(v) for v in colors[k])
         start = tuple(int(v) for v in np.rint(points0[row]))
         end = tuple(int(v) for v in np.rint(points1[row] + [shown[0].shape[1], 0]))
@@ -104,12 +103,13 @@ def draw_matches(
 
 
 def _colors_of_positions(positions: np.ndarray) -> np.ndarray:
-    """Return (N, 3) RGB colours of positions in [0, 1]: hue from left to right, dark downwards.
+    """Return (N, 3) RGB colours of positions in [0, 1]: hue encodes x, darkness encodes y.
 
-    None is red, which matches that are not good have.
+    Red is not used, since it marks matches that are not good.
     """
     x, y = np.clip(positions, 0, 1).T
-    hsv = np.stack([20 + 120 * x, np.full(len(x), 230), 255 - 110 * y], 1)  # of 180, 255, 255
+    # OpenCV's hue is in [0, 180), saturation and value are in [0, 255].
+    hsv = np.stack([20 + 120 * x, np.full(len(x), 230), 255 - 110 * y], 1)
     hsv = np.rint(hsv).astype(np.uint8)[None]
     return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0] if len(x) else np.empty((0, 3), np.uint8)
 
@@ -117,22 +117,22 @@ def _colors_of_positions(positions: np.ndarray) -> np.ndarray:
 def draw_circle(
     canvas: np.ndarray, centre: np.ndarray, radius: float, color: Sequence[int], width: int
 ) -> None:
-    """Draw a circle with sub-pixel position and radius."""
+    """Draw a circle with sub-pixel centre and radius."""
     x, y = np.rint(centre * 16).astype(int).tolist()
     cv2.circle(canvas, (x, y), round(radius * 16), tuple(color), width, cv2.LINE_AA, 4)
 
 
 def draw_heatmap(heatmap: np.ndarray) -> np.ndarray:
-    """Colour a (H, W) probability map, as (H, W, 3) uint8: dark blue is 0, yellow is 1."""
+    """Colour a (H, W) probability map as (H, W, 3) uint8 RGB: dark blue is 0, yellow is 1."""
     levels = np.rint(np.clip(heatmap, 0, 1) * 255).astype(np.uint8)
     return cv2.cvtColor(cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
 
 
 def draw_logits(logits: np.ndarray) -> np.ndarray:
-    """Colour a (H, W) map of logits, with a scale below it: 0 is a probability of one half.
+    """Colour a (H, W) map of logits, with a colour scale below it; 0 is a probability of 0.5.
 
-    Of probabilities most would be the darkest or the brightest colour: a sixth of the pixels of a
-    photograph have one that float32 rounds to 1.
+    A map of probabilities would saturate: they round to 1 in float32 for a sixth of the pixels of
+    a photograph.
     """
     shown = fit_picture(np.asarray(logits, np.float32))
     known = np.where(np.isfinite(shown), shown, 0)
@@ -144,19 +144,19 @@ def draw_logits(logits: np.ndarray) -> np.ndarray:
 
 
 def draw_depth(depth: np.ndarray, unit: str) -> np.ndarray:
-    """Colour a (H, W) depth map, NaN where unknown, with a scale, as `fit_picture` sizes it.
+    """Colour a (H, W) depth map, NaN where unknown, reduced by `fit_picture`, with a colour scale.
 
-    Yellow is near, dark blue far, black unknown.
+    Yellow is near, dark blue is far, black is unknown.
     """
     known = np.isfinite(depth)
     if not known.any():
         return add_caption(np.zeros((*depth.shape, 3), np.uint8), "no depth is known")
     near, far = shown_range(depth[known])
-    # By inverse depth, as differences are seen.
+    # Colours are linear in inverse depth, which is what disparity shows.
     inverse = 1 / np.maximum(np.where(known, depth, far), 1e-9)
     levels = (inverse - 1 / far) / max(1 / near - 1 / far, 1e-12)
     colors = draw_heatmap(LEAST_DEPTH_LEVEL + (1 - LEAST_DEPTH_LEVEL) * np.clip(levels, 0, 1))
-    # A point is more than a pixel, so that few of them are seen, too.
+    # Each known pixel is enlarged to 3x3, so that sparse depth is visible.
     spread = cv2.dilate(np.where(known[..., None], colors, 0).astype(np.uint8), np.ones((3, 3)))
     colors = np.where(known[..., None], colors, spread)
     words = f"depth in {'baselines' if unit == 'baseline' else unit}, black: unknown"
@@ -164,47 +164,47 @@ def draw_depth(depth: np.ndarray, unit: str) -> np.ndarray:
 
 
 def shown_range(values: np.ndarray) -> tuple[float, float]:
-    """Return the values that have the last colours."""
+    """Return the values at both ends of the colour scale."""
     low, high = np.percentile(values, (100 - SHOWN_PERCENTILE, SHOWN_PERCENTILE))
     return float(low), float(high)
 
 
 def viridis(levels: np.ndarray) -> np.ndarray:
-    """Return the (N, 3) colours of (N,) levels, as `draw_heatmap` has them."""
+    """Return the (N, 3) RGB colours of (N,) levels in [0, 1], those of `draw_heatmap`."""
     colors: np.ndarray = draw_heatmap(np.asarray(levels).reshape(1, -1))[0]
     return colors
 
 
 def line_scale(picture: np.ndarray) -> float:
-    """Return by how much captions, lines and points are enlarged."""
+    """Return the factor that enlarges captions, lines and points on an image of this width."""
     return max(1.0, picture.shape[1] / READABLE_WIDTH_PX)
 
 
 def resized(picture: np.ndarray, factor: float) -> np.ndarray:
-    """Scale a picture or a map; where it shrinks without aliasing."""
+    """Scale an image or a map; area averaging avoids aliasing when it shrinks."""
     size = [max(1, round(side * factor)) for side in picture.shape[1::-1]]
     method = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
     return cv2.resize(picture, size, interpolation=method)
 
 
 def fit_picture(picture: np.ndarray) -> np.ndarray:
-    """Scale a picture or a map down so that its longer side is at most `PICTURE_SIDE_PX`."""
+    """Scale an image or a map down so that its longer side is at most `PICTURE_SIDE_PX`."""
     factor = PICTURE_SIDE_PX / max(picture.shape[:2])
     return picture if factor >= 1 else resized(picture, factor)
 
 
 def add_caption(rgb: np.ndarray, text: str) -> np.ndarray:
-    """Add a line of text below a picture, scaled to be legible and to fit its width."""
+    """Add a line of text below an image, scaled to be legible and to fit its width."""
     return np.concatenate([rgb, _caption(text, rgb.shape[1], line_scale(rgb))])
 
 
 def add_scale(
     rgb: np.ndarray, text: str, low: float, high: float, least_level: float = 0.0
 ) -> np.ndarray:
-    """Add a line of text below a picture, and the colours of values from `low` to `high`.
+    """Add a line of text and a colour scale from `low` to `high` below an image.
 
-    The colours are those of `draw_heatmap` from `least_level` to 1. The values are at their ends,
-    with as many decimals as tell apart a tenth of the scale.
+    The scale shows the colours of `draw_heatmap` from `least_level` to 1. The values at its ends
+    have enough decimals to distinguish a tenth of the scale.
     """
     width, unit = rgb.shape[1], line_scale(rgb)
     bar, end = max(1, width // 5), width // 7
@@ -218,7 +218,7 @@ def add_scale(
 
 
 def _caption(text: str, width: int, unit: float) -> np.ndarray:
-    """Return a black strip with a line of text that fits it; `unit` is that of `line_scale`."""
+    """Return a black strip with a line of text that fits it; `unit` comes from `line_scale`."""
     strip = np.zeros((round(CAPTION_HEIGHT * unit), width, 3), np.uint8)
     room = width - round(2 * CAPTION_MARGIN * unit)
     if room <= 0:
@@ -232,7 +232,7 @@ def _caption(text: str, width: int, unit: float) -> np.ndarray:
 
 
 def join_pictures(panels: Sequence[np.ndarray], columns: int) -> np.ndarray:
-    """Join pictures of one size, this many in a row, with white gaps between them."""
+    """Join images of one size, with white gaps, in rows of `columns`."""
     height, width = panels[0].shape[:2]
     rows = -(-len(panels) // columns)
     size = rows * (height + GAP_PX) - GAP_PX, columns * (width + GAP_PX) - GAP_PX, 3

@@ -2,41 +2,41 @@
 
 COMMANDS = {
     "Training": {
-        "label": ("deepdetect_lab.cli.train", "training masks from nine classical detectors"),
-        "train": ("deepdetect_lab.cli.train", "train the network on images"),
+        "label": ("deepdetect_lab.cli.train", "Label images with nine classical detectors."),
+        "train": ("deepdetect_lab.cli.train", "Train the network on images."),
         "train-descriptor": (
             "deepdetect_lab.cli.train",
-            "train the learned descriptor of keypoints on images",
+            "Train the learned descriptor of keypoints on images.",
         ),
     },
 }
-"""The commands by their group: the function's module, and what it does."""
+"""The commands by group: the module of the function, and a summary."""
 
 DEVELOPMENT = {
     "Measuring": {
-        "datasets": ("deepdetect_lab.cli.datasets", "download data sets"),
+        "datasets": ("deepdetect_lab.cli.datasets", "Download data sets."),
         "benchmark": (
             "deepdetect_lab.cli.evaluate",
-            "the tables and figures of the paper, with baselines",
+            "Compute the tables and figures of the paper, with other detectors for comparison.",
         ),
-        "evaluate": ("deepdetect_lab.cli.evaluate", "how good weights are"),
+        "evaluate": ("deepdetect_lab.cli.evaluate", "Score weights on images with known masks."),
         "compare-clouds": (
             "deepdetect_lab.cli.evaluate",
-            "dense points compared with those of OpenMVS or COLMAP",
+            "Compare dense points with those of OpenMVS or COLMAP.",
         ),
         "evaluate-stereo": (
             "deepdetect_lab.cli.evaluate",
-            "correct stereo matches of weights and of label settings",
+            "Count correct stereo matches for weights and for label settings.",
         ),
     },
     "Weights": {
-        "shards": ("deepdetect_lab.cli.train", "pack images for training on large sets"),
-        "train-points": ("deepdetect_lab.cli.train", "train the ranker of keypoints on images"),
+        "shards": ("deepdetect_lab.cli.train", "Pack images for training on large sets."),
+        "train-points": ("deepdetect_lab.cli.train", "Train the ranker of keypoints on images."),
         "train-match-filter": (
             "deepdetect_lab.cli.train",
-            "train the network that tells right matches from wrong ones",
+            "Train the network that separates correct matches from wrong ones.",
         ),
-        "average": ("deepdetect_lab.cli.train", "the mean of several weights"),
+        "average": ("deepdetect_lab.cli.train", "Average several weights."),
     },
 }
-"""The commands after the word `dev`, in the same form."""
+"""The commands of `deepdetect dev`, in the same form."""

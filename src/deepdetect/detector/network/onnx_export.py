@@ -41,8 +41,8 @@ class OnnxOptions:
             runtimes without dynamic shapes. None: any height and width.
         batch: number of images of a file with a size; without a size any number.
         maps: include the network's probability and logits of all pixels.
-        max_keypoints: include this many points, those of `PointDetector`; 0 for none, as OpenCV
-            refuses files with points.
+        max_keypoints: include this many points of all scales; 0 for none, as OpenCV rejects files
+            with points.
 
     Raises:
         OptionError: a value is unknown or out of its range.

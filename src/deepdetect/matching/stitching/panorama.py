@@ -33,7 +33,7 @@ class StitchingOptions:
 
     Attributes:
         scale: pixels of the panorama per pixel in the middle of the reference.
-        max_canvas_megapixels: larger ones are refused; a pixel takes 22 to 56 bytes of memory.
+        max_canvas_megapixels: size limit of the panorama; a pixel takes 22 to 56 bytes of memory.
         registration_side: longer side in pixels to which images are reduced for registration.
 
     Raises:
@@ -127,7 +127,7 @@ def stitch(
             `DeepDetect()`.
         channels: order of the colours in images that are arrays, as of `load_image`.
         projection: "plane" keeps lines straight; "cylindrical" and "spherical" need cameras that
-            only turned, and level the horizon.
+            only rotated, and level the horizon.
         crop: cut the panorama to the largest rectangle without black.
         reference: number of the image in whose frame a flat panorama is, or that is in the middle
             of a curved one; None for the one in the middle of all.
