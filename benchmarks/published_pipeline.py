@@ -83,9 +83,9 @@ def compare(published: Callable[[], int], ours: Callable[[], int], rounds: int) 
         both: list[tuple[float, float]] = []
         found = []
         for run in (published, ours):
-            with profiled() as profiler:
+            with profiled() as profile:
                 found.append(run())
-            both.append(profiler.total)
+            both.append((profile.seconds, profile.memory))
         if turn:
             profiles.append(both)
             counts.append(found)

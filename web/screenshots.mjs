@@ -25,7 +25,7 @@ const VIEWS = [
     await counted(page, "#match-hint", "agree");
   } },
   { name: "wipe", fresh: true, go: async (page) => {
-    await example(page, "Coffee, turned").click();
+    await example(page, "Coffee, rotated").click();
     await counted(page, "#match-hint", "agree");
     await page.locator("#tab-wipe").click();
     await counted(page, "#wipe-hint", "registered");

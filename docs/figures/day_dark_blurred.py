@@ -31,7 +31,7 @@ from deepdetect.reconstruction import Reconstruction
 from deepdetect.viz.draw import draw_circle, draw_heatmap
 from deepdetect_lab.datasets import load_motorcycle
 from deepdetect_lab.datasets.degradation import DEGRADATIONS, degrade
-from deepdetect_lab.evaluation.clouds import orbit_camera, render
+from deepdetect_lab.evaluation.clouds import draw_cloud
 
 OUTPUT = Path(__file__).parents[1] / "images" / "day-dark-blurred.jpg"
 LIGHTS = {"daylight": None, "an eighth of the light": "dark-8", "out of focus": "blur-2"}
@@ -140,9 +140,7 @@ def stacked(
 
 def draw_model(model: Reconstruction) -> np.ndarray:
     """Draw the points of a model from the right and from above."""
-    cloud = model.cloud
-    size = (CELL[0] * 2, CELL[1] * 2)
-    return render(cloud, orbit_camera(cloud, AZIMUTH, ELEVATION, size))
+    return draw_cloud(model.cloud, AZIMUTH, ELEVATION, (CELL[0] * 2, CELL[1] * 2))
 
 
 if __name__ == "__main__":

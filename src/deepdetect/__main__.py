@@ -10,25 +10,25 @@ from ._shared.progress import STDERR, fails
 from ._shared.signals import noted_interrupts
 
 OPENCV_SETTINGS = {"OPENCV_LOG_LEVEL": "SILENT", "OPENCV_FFMPEG_LOGLEVEL": "-8"}
-"""Errors are one sentence, without lines of OpenCV and of its FFmpeg beside it.
+"""These variables keep OpenCV and its FFmpeg from printing lines next to our error messages.
 
-Both are read from the environment when OpenCV is loaded, and a user's own setting stays. Programs
-that import this package are left as they are.
+OpenCV reads them from the environment when it is loaded. A user's own setting stays, and programs
+that import this package are not affected.
 """
 
 STOPPED = 130
 
 
 def main() -> None:
-    """Run the command line; Ctrl-C ends it with exit code 130, while packages are imported, too."""
-    # Numbers of closed streams would go to files, which would get what libraries print.
+    """Run the command line; Ctrl-C ends it with exit code 130, also during imports."""
+    # Else a file could get the descriptor of a closed stream, and then what libraries print.
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(number)
     for name, value in OPENCV_SETTINGS.items():
         os.environ.setdefault(name, value)
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-        sys.stdout.reconfigure(errors="surrogateescape")  # names of files may be any bytes
+        sys.stdout.reconfigure(errors="surrogateescape")  # file names may be any bytes
     with noted_interrupts() as interrupts:
         try:
             from .cli import main as command
@@ -43,7 +43,7 @@ def main() -> None:
     if interrupts and code not in (None, 0, STOPPED):
         print("deepdetect: stopped; what was written stays", file=STDERR)
         code = STOPPED
-    fails(sys.stderr)  # or Python ends with an exit code of its own
+    fails(sys.stderr)  # a full disk would else change the exit code
     sys.exit(code)  # type: ignore[arg-type]
 
 

@@ -87,14 +87,14 @@ test("a 3D model is shown, and can be turned", async ({ page, app }) => {
 });
 
 test("registration is compared in the wipe", async ({ page, app }) => {
-  await openTasks(page, "Coffee, turned", app);
+  await openTasks(page, "Coffee, rotated", app);
   await startTask(page, "register");
   await page.getByRole("button", { name: "Compare with the first" }).click({ timeout: 120_000 });
   await expect(page.locator("#wipe-hint")).toContainText("guided matching");
 });
 
 test("a panorama", async ({ page, app }) => {
-  await openTasks(page, "Coffee, turned", app);
+  await openTasks(page, "Coffee, rotated", app);
   await startTask(page, "stitch");
   await expect(page.locator("#job-numbers")).toContainText("2 of 2", { timeout: 120_000 });
   const { name, content } = await downloaded(page, page.getByRole("button", { name: "panorama.jpg" }));
@@ -114,7 +114,7 @@ test("a task is cancelled", async ({ page, app }) => {
 });
 
 test("a task can follow a cancelled one at once", async ({ page, app }) => {
-  await openTasks(page, "Coffee, turned", app);
+  await openTasks(page, "Coffee, rotated", app);
   for (let k = 0; k < 2; k++) {
     await startTask(page, "match");
     await expect.poll(() => tasksOf(app).length).toBe(1);
@@ -133,7 +133,7 @@ test("a task that is cancelled while its result is fetched says nothing", async 
     await held;
     await route.continue();
   });
-  await openTasks(page, "Coffee, turned", app);
+  await openTasks(page, "Coffee, rotated", app);
   const asked = page.waitForRequest("**/files/registered.png", { timeout: 120_000 });
   await startTask(page, "register");
   await asked;
@@ -146,7 +146,7 @@ test("a task that is cancelled while its result is fetched says nothing", async 
 });
 
 test("a task ends with the pictures that it was for", async ({ page, app }) => {
-  await openTasks(page, "Coffee, turned", app);
+  await openTasks(page, "Coffee, rotated", app);
   await startTask(page, "register");
   await expect.poll(() => tasksOf(app).length).toBe(1);
   await page.locator(".remove").first().click();
@@ -184,7 +184,7 @@ test("a folder", async ({ page, app }, info) => {
   writeFileSync(join(folder, "damaged.png"), "no picture");
   writeFileSync(join(folder, "notes.txt"), "not asked for");
   await page.goto(app.address);
-  await page.getByRole("button", { name: "Work on a folder" }).click();
+  await page.getByRole("button", { name: "Process a folder" }).click();
   await page.locator("[data-kind=folder-keypoints]").click();
   await page.locator("#folder").setInputFiles(folder);
   await expect(page.locator("#job-numbers")).toContainText("2 of 3", { timeout: 120_000 });
@@ -204,8 +204,8 @@ test("what has no geometry is said in one sentence", async ({ page, app }) => {
 test("two tabs at once, each with its own task", async ({ page, context, app }) => {
   const other = await context.newPage();
   const seen = watch(other);
-  await openTasks(page, "Coffee, turned", app);
-  await openTasks(other, "Coffee, turned", app);
+  await openTasks(page, "Coffee, rotated", app);
+  await openTasks(other, "Coffee, rotated", app);
   await Promise.all([startTask(page, "register"), startTask(other, "match")]);
   await expect(page.locator("#job-numbers")).toContainText("Overlap", { timeout: 150_000 });
   await expect(other.locator("#job-numbers")).toContainText("homography", { timeout: 150_000 });
@@ -214,7 +214,7 @@ test("two tabs at once, each with its own task", async ({ page, context, app }) 
 
 test("without the key of this start nothing is answered", async ({ page, app }) => {
   await page.goto(app.address.replace(/#.*/, ""));
-  await expect(page.getByRole("alert")).toContainText("Open the address that deepdetect app has printed");
+  await expect(page.getByRole("alert")).toContainText("Open the address that deepdetect app printed");
   const status = await page.evaluate(async () => (await fetch("/api/jobs?kind=match", { method: "POST", body: "x" })).status);
   expect(status).toBe(401);
 });
@@ -222,7 +222,7 @@ test("without the key of this start nothing is answered", async ({ page, app }) 
 for (const width of [1280, 390]) {
   test(`the tasks are accessible and fit, ${width} px`, async ({ page, app }) => {
     await page.setViewportSize({ width, height: 844 });
-    await openTasks(page, "Coffee, turned", app);
+    await openTasks(page, "Coffee, rotated", app);
     await expectAccessible(page);
     await startTask(page, "register");
     await expect(page.locator("#job-progress")).toBeVisible();

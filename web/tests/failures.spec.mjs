@@ -22,7 +22,7 @@ for (const { name, answer, said } of [
     await page.route(MODEL, (route) => route.fulfill(answer));
     await openExample(page, "Coffee");
     await choose(page, "kind", "points");
-    await expect(page.getByRole("alert")).toContainText(`What finds and describes points could not be loaded ${said}`);
+    await expect(page.getByRole("alert")).toContainText(`The models for points could not be loaded ${said}`);
     await expect(page.locator("#busy")).toBeHidden();
     await choose(page, "kind", "dense");
     await expect(page.locator("#count")).toContainText("keypoint");
@@ -86,7 +86,7 @@ test("a file that cannot be read does not hide the one before it", async ({ page
   await page.goto("./");
   await page.locator("#file").setInputFiles([join(examples, "coffee.jpg"), letter]);
   await expect(page.locator("#count")).toContainText("keypoint");
-  await expect(page.getByRole("alert")).toContainText("letter.jpg is not a picture");
+  await expect(page.getByRole("alert")).toContainText("letter.jpg is not an image");
 });
 
 test("a picture that comes before the page is ready is taken when it is", async ({ page }) => {

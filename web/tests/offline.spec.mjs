@@ -67,12 +67,12 @@ test("a new version replaces the old one, whatever the browser itself has kept",
       expect(text).toContain(from);
       writeFileSync(join(folder, name), text.replaceAll(from, to));
     };
-    change("examples/examples.json", "Coffee, turned", "Tea, turned");
+    change("examples/examples.json", "Coffee, rotated", "Tea, rotated");
     change("sw.js", old.split(" ").at(-1), "another version");
     await page.reload(); // the old version, which looks for a newer one
     await expect.poll(kept).toEqual([expect.stringContaining("another version")]);
     await page.reload();
-    await expect(example(page, "Tea, turned")).toBeVisible();
+    await expect(example(page, "Tea, rotated")).toBeVisible();
     await openExample(page, "Coffee", address);
   } finally {
     end();

@@ -81,7 +81,7 @@ print("null")
 `, join(examples, "coffee.jpg"), path);
   await page.goto("./");
   await openFile(page, path);
-  await expect(page.locator("#files small")).toHaveText("2100×1400, seen as 1736×1152");
+  await expect(page.locator("#files small")).toHaveText("2100×1400, scaled to 1736×1152");
   const { content } = await downloaded(page, page.locator("#view-keypoints [data-download=json]"));
   const found = JSON.parse(content);
   const expected = askPython(`
@@ -191,7 +191,7 @@ good = [a for a, b in matcher.knnMatch(first, second, 2) if a.distance < 0.8 * b
         and back[a.trainIdx].trainIdx == a.queryIdx]
 print(json.dumps({"matches": len(good), "xy": [each.pt for each in keypoints]}))
 `, ...pair);
-  await openExample(page, "Coffee, turned");
+  await openExample(page, "Coffee, rotated");
   await expect(page.locator("#match-hint")).toContainText("agree");
   await page.getByLabel("Compare with SIFT").check();
   await expect(page.locator("#sift-count")).toContainText("agree");
@@ -265,7 +265,7 @@ test("pictures that show different things have no geometry", async ({ page }) =>
 });
 
 test("the wipe aligns a plane, and moves by mouse and by keys", async ({ page }) => {
-  await openExample(page, "Coffee, turned");
+  await openExample(page, "Coffee, rotated");
   await expect(page.locator("#match-hint")).toContainText("homography");
   await page.getByRole("tab", { name: "Compare" }).click();
   await expect(page.locator("#wipe-hint")).toContainText("registered");
@@ -308,11 +308,11 @@ test("a file that is no picture is refused in one sentence", async ({ page }, in
   await page.goto("./");
   await page.locator("#file").setInputFiles(bad);
   await expect(page.getByRole("alert")).toContainText(
-    "letter.jpg is not a picture that this browser can read: use JPEG or PNG.");
+    "letter.jpg is not an image that this browser can read: use JPEG or PNG.");
   await page.locator("#file").setInputFiles(small);
   await expect(page.getByRole("alert")).toContainText("small.png is 1x1 pixels");
   await page.locator("#file").setInputFiles([bad, small, bad]);
-  await expect(page.getByRole("alert")).toContainText("Give at most 2 pictures.");
+  await expect(page.getByRole("alert")).toContainText("Give at most 2 images.");
   await openFile(page, join(examples, "coffee.jpg"));
   await expect(page.locator("#error")).toBeHidden();
 });
@@ -323,7 +323,7 @@ test("what belongs to two pictures is not said of one", async ({ page }, info) =
   await page.goto("./");
   await page.locator("#file").setInputFiles([plain, join(examples, "coffee.jpg")]);
   await expect(page.locator("#match-count")).toHaveText("0 matches");
-  await expect(page.locator("#match-hint")).toHaveText("Nothing in one picture is like anything in the other.");
+  await expect(page.locator("#match-hint")).toHaveText("The two images have nothing similar.");
   await page.getByRole("tab", { name: "Compare" }).click();
   await expect(page.locator("#wipe-hint")).toContainText("No homography");
   await page.locator(".remove").first().click();
@@ -425,7 +425,7 @@ for (const [width, colorScheme] of [[1280, "light"], [1280, "dark"], [390, "ligh
     await page.goto("./");
     await expect(page.locator("#examples button")).toHaveCount(4);
     await check();
-    await example(page, "Coffee, turned").click();
+    await example(page, "Coffee, rotated").click();
     await expect(page.locator("#match-hint")).toContainText("agree");
     for (const name of ["Keypoints", "Heat map", "Match", "Compare"]) {
       await page.getByRole("tab", { name }).click();
@@ -440,7 +440,7 @@ for (const [width, colorScheme] of [[1280, "light"], [1280, "dark"], [390, "ligh
       }
     }
     await page.locator("#file").setInputFiles(join(examples, "coffee.jpg"));
-    await expect(page.getByRole("alert")).toContainText("There are two pictures already");
+    await expect(page.getByRole("alert")).toContainText("There are already two images");
     await check();
   });
 }

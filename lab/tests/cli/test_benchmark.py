@@ -67,7 +67,7 @@ def test_a_further_method_is_one_more_row_and_the_rest_is_found(made, folder: Pa
     rows = {row["method"]: row for row in values["tables"]["foreground"]["rows"]}
     assert list(rows)[:3] == ["FAST", "own_corner_finder:find", "AGAST"]
     assert rows["own_corner_finder:find"]["fraction on the foreground"] == 0.5
-    assert values["metadata"]["results made, not found in the cache"] == "2"
+    assert values["metadata"]["results computed, not read from the cache"] == "2"
 
 
 def test_what_fails_is_listed_and_the_rest_is_there(made, folder: Path, run) -> None:

@@ -24,7 +24,7 @@ from deepdetect_lab.evaluation.options import DEFAULT_PROTOCOLS, BenchmarkOption
 from deepdetect_lab.evaluation.protocols import masks
 from deepdetect_lab.evaluation.report import Report
 
-MADE = "results made, not found in the cache"
+MADE = "results computed, not read from the cache"
 SCENES = ("bark", "bikes", "boat", "graf", "leuven", "trees", "ubc", "wall")
 PAIRS = ("graf 1-6", "wall 1-6", "bikes 1-6", "leuven 1-6", "trees 1-6", "ubc 1-6", "boat 1-2")
 

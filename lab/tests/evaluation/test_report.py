@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -71,3 +72,15 @@ def test_json_has_every_digit_and_no_word_that_json_lacks(folder: Path) -> None:
     assert values["figures"] == {"fig": EVIL, "other": "Other"}
     assert values["metadata"]["command"] == EVIL
     assert values["skipped"] == [f"left {EVIL}"]
+
+
+def test_markdown_tables_have_as_many_cells_in_each_line(report: Report) -> None:
+    lines = report.tables()[0].to_markdown().splitlines()
+    assert len(lines) == 2 + 5
+    for line in lines:
+        assert line.startswith("|")
+        assert line.endswith("|")
+        assert len(re.findall(r"(?<!\\)\|", line)) == 4
+    assert lines[1] == "|---|---:|---:|"
+    assert lines[3] == "| nothing | – | – |"
+    assert "a\\|b <c>" in lines[0]

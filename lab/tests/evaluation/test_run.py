@@ -76,7 +76,7 @@ def test_keypoints_from_the_cache_equal_fresh_ones(tmp_path: Path, pair: Pair, n
     assert_same(found[0], fresh)
     # The cost is that of the making, also when it is read.
     assert made[1] == found[1]
-    assert made[1].seconds > 0
+    assert made[1] > 0
 
 
 def test_own_columns_come_back_from_the_cache(tmp_path: Path, pair: Pair) -> None:
@@ -112,7 +112,7 @@ def test_matches_from_the_cache_equal_fresh_ones(
     for part in ("points0", "points1", "keypoints0", "keypoints1"):
         np.testing.assert_array_equal(getattr(made, part), getattr(fresh, part))
         np.testing.assert_array_equal(getattr(found, part), getattr(fresh, part))
-    assert (found.match, found.describe) == (made.match, made.describe)
+    assert found.seconds == made.seconds
 
 
 def test_matches_by_euclid_equal_a_search_of_all_distances(pair: Pair) -> None:
@@ -230,7 +230,7 @@ def test_a_raised_version_makes_a_stage_again_and_what_is_made_from_it(
 ) -> None:
     run = Run(tmp_path, tmp_path)
     assert all(is_made(run, stage, 1) for stage in STAGES)
-    monkeypatch.setitem(STAGES, "matches", (2, STAGES["matches"][1]))
+    monkeypatch.setitem(STAGES, "matches", (99, STAGES["matches"][1]))
     again = [stage for stage in STAGES if is_made(run, stage, 1)]
     assert again == ["matches", "corner_errors", "pose"]
     monkeypatch.setattr(cv2, "__version__", "0.0.0")

@@ -77,7 +77,7 @@ def test_it_learns_and_its_file_does_the_same(
     assert (right[:, None] > wrong[::9]).mean() > 0.8
     assert [point["step"] for point in result.points] == [20, 40]
     assert result.best["validation_loss"] == result.points[1]["validation_loss"]
-    assert "| rootsift | filter, as precise |" in (tmp_path / "MODEL_CARD.md").read_text()
+    assert "| rootsift, filter, as precise: right |" in (tmp_path / "MODEL_CARD.md").read_text()
 
     numbers = np.repeat(np.arange(len(samples)), [len(each) for _, each in samples])
     unrelated = np.isin(numbers, (0, UNRELATED))

@@ -7,23 +7,24 @@ from unittest.mock import Mock
 import pytest
 
 from deepdetect_lab.training import (
-    train_descriptor,
-    train_match_filter,
-    train_points,
+    DescriptorTrainingOptions,
+    MatchFilterTrainingOptions,
+    PointsTrainingOptions,
+    train_on_pairs,
 )
 
 
 @pytest.mark.parametrize("validation", ["images/val", "other"])
 @pytest.mark.parametrize(
-    ("train_one", "trainer"),
+    ("options", "trainer"),
     [
-        (train_points, "points.task.RankerTrainer"),
-        (train_descriptor, "descriptor.task.DescriptorTrainer"),
-        (train_match_filter, "match_filter.MatchFilterTrainer"),
+        (PointsTrainingOptions(), "points.task.RankerTrainer"),
+        (DescriptorTrainingOptions(), "descriptor.task.DescriptorTrainer"),
+        (MatchFilterTrainingOptions(), "match_filter.MatchFilterTrainer"),
     ],
 )
 def test_pictures_of_validation_and_of_the_run_are_not_trained_on(
-    train_one: Any, trainer: str, validation: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    options: Any, trainer: str, validation: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     images, output = tmp_path / "images", tmp_path / "images/run"
     for path in (
@@ -36,7 +37,7 @@ def test_pictures_of_validation_and_of_the_run_are_not_trained_on(
         path.touch()
     made = Mock()
     monkeypatch.setattr(f"deepdetect_lab.training.{trainer}", made)
-    train_one(images, tmp_path / validation, output)
+    train_on_pairs(images, tmp_path / validation, output, options)
     listed, held_out = made.call_args.args[:2]
     assert listed == [images / "0.png", images / "a/1.png"]
     assert held_out == [tmp_path / validation / "3.png"]

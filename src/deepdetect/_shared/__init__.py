@@ -1,1 +1,1 @@
-"""What every other package uses: errors, registries, options, files, parallel work."""
+"""Code that all other packages use: errors, registries, options, files, parallel work."""

@@ -19,23 +19,23 @@ from pathlib import Path
 from .errors import DeepDetectError
 
 ABANDONED_S = 24 * 3600.0
-"""Age from which a temporary file of another machine is taken for that of a process that died."""
+"""A temporary file of another machine is abandoned if it is older than this. Chosen by hand."""
 
 STEM_LENGTH = 40
-"""Characters of the final name in a temporary one, which must not become too long."""
+"""A temporary name, which must not be too long, has this number of characters of the final one."""
 
-# Machine, process and a random number.
+# An owner is a machine, a process and a random number.
 _OWNER = re.compile(r"(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}")
 
-# Stem, owner, "part" and the suffix of the final file.
+# A temporary name is the stem, the owner, "part" and the suffix of the final file.
 _TEMPORARY = re.compile(rf"\..*\.{_OWNER.pattern}\.part(\..*)?")
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """Give a temporary path with the same suffix, which is renamed when the block succeeds.
+    """Yield a temporary path with the same suffix, which is renamed when the block succeeds.
 
-    Missing folders are made. Temporary files of processes that were killed are removed.
+    Missing folders are made. Temporary files of killed processes are removed.
 
     Raises:
         DeepDetectError: the file cannot be written (no permission, no space, not a folder).
@@ -45,10 +45,10 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     try:
         _clear(final.parent.absolute())
         final.parent.mkdir(parents=True, exist_ok=True)
-        temporary.touch(exist_ok=False)  # at once: work that fails removes folders it has made
+        temporary.touch(exist_ok=False)  # keeps the folder from being removed as empty
         yield temporary
         temporary.replace(final)
-    except DeepDetectError:  # of a missing file, which is an OSError
+    except DeepDetectError:  # one for a missing file is also an OSError
         raise
     except OSError as error:
         raise DeepDetectError(
@@ -60,65 +60,65 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
 
 def private_folder(prefix: str) -> Path:
-    """Make a folder for temporary files, which only this user can read; its maker removes it.
+    """Make a folder for temporary files that only this user can read; the caller removes it.
 
-    Folders of the same prefix whose processes have ended are removed.
+    Folders with the same prefix whose processes have ended are removed.
 
     Raises:
-        DeepDetectError: there is no folder for temporary files that can be written.
+        DeepDetectError: no folder for temporary files is writable.
     """
     try:
         parent = Path(tempfile.gettempdir())
         for path in _abandoned(parent, re.compile(re.escape(prefix) + _OWNER.pattern)):
-            shutil.rmtree(path, ignore_errors=True)  # no link, and nothing of another user's
+            shutil.rmtree(path, ignore_errors=True)  # fails for links and other users' folders
         folder = parent / f"{prefix}{_owner()}"
         folder.mkdir(mode=0o700)
     except OSError as error:
         raise DeepDetectError(
             f"cannot make a temporary folder ({error.strerror or error}): "
-            "free some space, or set TMPDIR to a folder that can be written"
+            "free some space, or set TMPDIR to a writable folder"
         ) from error
     return folder
 
 
 @lru_cache
 def _clear(folder: Path) -> None:
-    """Remove temporary files that others have left in a folder, once in a process."""
+    """Remove abandoned temporary files from a folder, once per process."""
     for path in _abandoned(folder, _TEMPORARY):
         with contextlib.suppress(OSError):
             path.unlink()
 
 
 def _abandoned(folder: Path, names: re.Pattern[str]) -> list[Path]:
-    """List what processes that have ended have left in a folder, by the names of it."""
-    # `glob` gives nothing of a folder that is missing, or may be written to but not listed.
+    """List files and folders whose names match, and whose processes have ended."""
+    # `glob` finds nothing in a folder that is missing or cannot be listed.
     matches = [(path, names.fullmatch(path.name)) for path in folder.glob("*")]
     return [path for path, match in matches if match and _has_ended(path, **match.groupdict())]
 
 
 def _has_ended(path: Path, machine: str, process: str) -> bool:
-    """Return whether a process has; one of another machine or container after a day."""
+    """Return whether a process has ended; on another machine or in a container, after a day."""
     try:
         if machine != _machine() or os.name != "posix":
             return time.time() - path.lstat().st_mtime > ABANDONED_S
-        os.kill(int(process), 0)  # only asks
-        # In a container that lacks an init nobody waits for the workers of a killed process.
+        os.kill(int(process), 0)  # sends no signal, only checks
+        # In a container without init, the workers of a killed process stay as zombies.
         state = Path(f"/proc/{process}/stat")
         return state.is_file() and state.read_text().rpartition(")")[2].split()[0] == "Z"
     except ProcessLookupError:
         return True
-    except (OSError, OverflowError):  # it is another user's, or the file is gone
+    except (OSError, OverflowError):  # another user's process, or the file is gone
         return False
 
 
 def _owner() -> str:
-    """Return the part of a temporary name that says which process it is of; new each time."""
+    """Return the part of a temporary name that identifies this process; new each time."""
     return f"{_machine()}-{os.getpid()}-{secrets.token_hex(4)}"
 
 
 @lru_cache
 def _machine() -> str:
-    """Return a digest of what the numbers of processes are unique in: a boot, and a container."""
+    """Return a digest of this boot and container, within which process numbers are unique."""
     parts = [platform.node()]
     with contextlib.suppress(OSError):  # Linux only
         parts += [Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")]

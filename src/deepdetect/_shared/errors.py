@@ -1,4 +1,4 @@
-"""Errors that a user can cause, and the suggestion of the name that was meant."""
+"""Errors that a user can cause, and suggestions for misspelled names."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from contextlib import contextmanager
 class DeepDetectError(Exception):
     """An error that the user can fix: one sentence says what is wrong and what to do.
 
-    The classes below are also the built-in error that says the same: `ValueError` for what is
-    wrong with an argument or with the content of a file, `FileNotFoundError` for a missing file,
-    `ImportError` for a missing package. The command line prints the sentence without a traceback
-    and ends with exit code 2.
+    The classes below also inherit from the matching built-in error: `ValueError` for a wrong
+    argument or wrong contents of a file, `FileNotFoundError` for a missing file, `ImportError` for
+    a missing package. The command line prints the sentence without a traceback and ends with exit
+    code 2.
     """
 
 
 class ImageError(DeepDetectError, ValueError):
-    """An image is missing, unreadable, too small, or has the wrong shape or type.
+    """An image is missing, unreadable or too small, or has a wrong shape or type.
 
-    A `ValueError`; where the file is missing a `FileNotFoundError`, too.
+    It is a `ValueError`, and also a `FileNotFoundError` if the file is missing.
     """
 
 
@@ -31,27 +31,27 @@ class OptionError(DeepDetectError, ValueError):
 class WeightsError(DeepDetectError, ValueError):
     """A weights file is missing, damaged, or does not fit the network.
 
-    A `ValueError`; where the file is missing a `FileNotFoundError`, too.
+    It is a `ValueError`, and also a `FileNotFoundError` if the file is missing.
     """
 
 
 class ReconstructionError(DeepDetectError, ValueError):
-    """Two images give no depth; the message says which of the usual reasons. A `ValueError`."""
+    """A reconstruction fails; the message gives the reason. It is a `ValueError`."""
 
 
 class NoDepthError(ReconstructionError):
-    """What two images show has no depth, or they do not overlap: nothing is wrong with the options.
+    """The images show no depth, or do not overlap, although the options are right.
 
     The command line ends with exit code 3.
     """
 
 
 class MissingExtraError(DeepDetectError, ImportError):
-    """An optional package is needed for what was asked and is not installed; an `ImportError`."""
+    """A call needs an optional package that is not installed; an `ImportError`."""
 
 
 class RegistrationError(DeepDetectError, ValueError):
-    """No homography between images can be trusted, or none that they can be drawn by."""
+    """No trustworthy homography between images is found, or none that can warp them."""
 
 
 class MissingFileError(DeepDetectError, FileNotFoundError):
@@ -71,17 +71,17 @@ class MissingCalibrationError(ReconstructionError, MissingFileError):
 
 
 class InvalidFileError(DeepDetectError, ValueError):
-    """A file does not hold what it should."""
+    """A file has other contents than it should."""
 
 
 class BatchError(DeepDetectError):
-    """Some of many files could not be worked on; the others are done.
+    """Some of many files could not be processed; the others are done.
 
     The command line lists them and ends with exit code 1.
 
     Args:
-        summary: how many, and what happened to the others.
-        failures: a sentence on each, with its name.
+        summary: number of failures, and what happened to the other files.
+        failures: a sentence on each failure, with the name of the file.
     """
 
     def __init__(self, summary: str, failures: Iterable[str]) -> None:
@@ -93,7 +93,7 @@ class BatchError(DeepDetectError):
 
 
 def first_line(error: object) -> str:
-    """Return the first line of the message of an error, its type where it has none."""
+    """Return the first line of the message of an error, or its type if the message is empty."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]
 
 
@@ -109,7 +109,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> OptionError:
 
 
 def check_name(kind: str, name: object, known: Collection[object]) -> None:
-    """Raise the error for an unknown name, as "projection", where it is none of the known ones."""
+    """Raise an OptionError for an unknown name; `kind` says what it names, such as "projection"."""
     if name not in known:
         raise unknown_name(kind, name, map(str, known))
 
@@ -118,7 +118,7 @@ WITHOUT_GPU = (
     "without a GPU with the option --extra-index-url https://download.pytorch.org/whl/cpu, "
     "which spares 6 GB"
 )
-"""How pip takes the build of torch for processors; on Linux it takes that for CUDA otherwise."""
+"""Advice for pip, which installs the build of torch for CUDA on Linux by default."""
 
 DISTRIBUTIONS = {
     "hloc": "git+https://github.com/cvg/Hierarchical-Localization",
@@ -126,18 +126,18 @@ DISTRIBUTIONS = {
     "ray": "'ray[data]'",
     "skimage": "scikit-image",
 }
-"""What modules are called on PyPI, where it is another name."""
+"""Names on PyPI of modules that have another name there."""
 
 
 def install_command(*packages: str) -> str:
-    """Return the command that installs modules, for the sentence of a `MissingExtraError`."""
+    """Return the command that installs modules, for the message of a `MissingExtraError`."""
     names = " ".join(DISTRIBUTIONS.get(package, package) for package in packages)
     command = f"pip install {names}"
     return f"{command}, {WITHOUT_GPU}" if "torch" in packages else command
 
 
 def require_packages(what: str, *packages: str) -> None:
-    """Raise a MissingExtraError where something needs a package that is not installed."""
+    """Raise a MissingExtraError if one of the packages is not installed; `what` needs them."""
     missing = [package for package in packages if importlib.util.find_spec(package) is None]
     if missing:
         names = ", ".join(missing)
@@ -149,7 +149,7 @@ def require_packages(what: str, *packages: str) -> None:
 
 @contextmanager
 def noted_failures(name: str, failures: list[str]) -> Iterator[None]:
-    """Note what is wrong with this one of many inputs; raise what concerns all of them."""
+    """Note an error that concerns one of many inputs; raise an error that concerns all of them."""
     try:
         yield
     except (MissingExtraError, WeightsError):
@@ -157,7 +157,7 @@ def noted_failures(name: str, failures: list[str]) -> Iterator[None]:
     except DeepDetectError as error:
         failures.append(str(error) if name in str(error) else f"{name}: {error}")
     except MemoryError:
-        failures.append(f"{name}: there is not enough memory for it: use a smaller image")
+        failures.append(f"{name}: there is not enough memory: use a smaller image")
 
 
 for _error in (
@@ -170,5 +170,5 @@ for _error in (
     RegistrationError,
     WeightsError,
 ):
-    # Where users import them from: tracebacks and `pickle` say so.
+    # Tracebacks and `pickle` name the module from which users import the error.
     _error.__module__ = "deepdetect"

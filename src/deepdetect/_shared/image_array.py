@@ -1,4 +1,4 @@
-"""Images in arrays and tensors of any usual layout and type, as 8-bit RGB and as planes."""
+"""Conversion of arrays and tensors of any usual layout and type to 8-bit RGB and to planes."""
 
 from __future__ import annotations
 
@@ -14,16 +14,14 @@ Channels = Literal["rgb", "bgr"]
 CHANNEL_COUNTS = (1, 3, 4)
 
 SENSOR_BITS = (8, 10, 12, 14, 16)
-"""Bits of sensors whose numbers are kept in 16: the fewest that hold the largest number count."""
+"""Bit depths of sensors with 16-bit files; the smallest one that holds an image is assumed."""
 
 LITTLE_RANGE = 1 / 8
-"""Share of the range below which floats, or numbers of 16 bits, are hardly meant to be an image."""
-
-DARK = "uses {:.1%} of its range, and is nearly black: give the range by `value_range`"
+"""A warning follows if values use a smaller share of their range than this. Chosen by hand."""
 
 
 def check_channels(channels: str) -> None:
-    """Refuse an unknown order of the colours of an image in an array."""
+    """Raise an OptionError for an unknown order of the colours of an array."""
     check_name("channel order", channels, ("rgb", "bgr"))
 
 
@@ -31,15 +29,15 @@ def as_array(image: Any) -> np.ndarray:
     """Return an array-like, or a PyTorch tensor of any device, as an array.
 
     Raises:
-        ImageError: it is None or an iterator, or its rows are of unequal length.
+        ImageError: the value is None or an iterator, or its rows differ in length.
     """
     if image is None:
         raise ImageError("the image is None, as `cv2.imread` returns for a missing file: check it")
     if hasattr(image, "__next__"):
-        raise ImageError("an image is an iterator: give one image, or a list to `detect_batch`")
+        raise ImageError("the image is an iterator: give one image, or a list to `detect_batch`")
     if hasattr(image, "detach") and hasattr(image, "cpu"):  # a tensor
         if image.is_meta or str(image.layout) != "torch.strided":
-            raise ImageError("a tensor on the device meta, or a sparse one, is no image: fill it")
+            raise ImageError("a tensor on the device meta, or a sparse one, is not an image")
         image = image.detach().cpu()
         if image.is_floating_point():
             image = image.float()  # NumPy has no bfloat16
@@ -59,13 +57,13 @@ def array_to_rgb(
     white: int | None = None,
     deep: bool = False,
 ) -> np.ndarray:
-    """Convert an image in an array or a PyTorch tensor, as of `load_image`, to (H, W, 3) RGB.
+    """Convert an array or PyTorch tensor, as in `load_image`, to an (H, W, 3) RGB image.
 
-    It is uint8, or where `deep` uint16 of all but uint8; `white` is the number of 16 bits that is
-    white, where it is known.
+    The result is uint8 or, if `deep` and the input is not uint8, uint16. `white` is the 16-bit
+    value of white, if known; `name` is used in messages.
 
     Raises:
-        ImageError: it has another shape, type or range, or holds NaN; `name` is what it is called.
+        ImageError: the image has another shape, type or range, or holds NaN.
         OptionError: the order of the channels is unknown.
     """
     check_channels(channels)
@@ -84,19 +82,19 @@ def array_to_rgb(
 
 
 def deep_values(image: Any) -> np.ndarray:
-    """Return the numbers of a PIL image of mode I or F, as wide as they are in its file."""
+    """Return the values of a PIL image of mode I or F, in the type of its file."""
     values = np.asarray(image)
     of_16_bits = image.mode == "I" and image.format in ("PNG", "PPM")
     return values.astype(np.uint16) if of_16_bits else values
 
 
 def to_8_bits(rgb: np.ndarray) -> np.ndarray:
-    """Return an image of uint8 or uint16 as uint8."""
+    """Convert a uint8 or uint16 image to uint8."""
     return rgb if rgb.dtype == np.uint8 else _in_range(rgb, (0, 65535), "", False)
 
 
 def fill_planes(rgb: np.ndarray, planes: np.ndarray) -> None:
-    """Write (H, W, 3) uint8 to larger (3, H, W) float32: the last row and column are repeated."""
+    """Write (H, W, 3) uint8 to larger (3, H, W) float32, repeating the last row and column."""
     below, right = planes.shape[1] - rgb.shape[0], planes.shape[2] - rgb.shape[1]
     if below or right:
         rgb = np.pad(rgb, ((0, below), (0, right), (0, 0)), mode="edge")
@@ -104,7 +102,7 @@ def fill_planes(rgb: np.ndarray, planes: np.ndarray) -> None:
 
 
 def srgb_to_linear() -> np.ndarray:
-    """Return the linear light in [0, 1] of each of the 256 levels of sRGB (IEC 61966-2-1)."""
+    """Return the linear intensity in [0, 1] of the 256 levels of sRGB (IEC 61966-2-1)."""
     value = np.arange(256) / 255
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
@@ -134,12 +132,12 @@ def _select_bands(array: np.ndarray, bands: Sequence[int], name: str) -> np.ndar
         array = np.moveaxis(array, 0, 2)
     if array.ndim != 3 or max(bands) > array.shape[2]:
         count = array.shape[2] if array.ndim == 3 else 1
-        raise ImageError(f"{name} has {count} bands: leave `bands` out, or choose of these")
+        raise ImageError(f"{name} has {count} bands: leave `bands` out, or choose among these")
     return array[:, :, np.array(bands) - 1]
 
 
 def _range_of(array: np.ndarray, name: str, white: int | None) -> tuple[float, float]:
-    """Return which numbers are black and white."""
+    """Return the values of black and white."""
     kind, size = array.dtype.kind, array.dtype.itemsize
     if kind == "b":
         return 0, 1
@@ -159,18 +157,19 @@ def _range_of(array: np.ndarray, name: str, white: int | None) -> tuple[float, f
         _tell_if_dark(high, name)
         return 0, 1
     raise ImageError(
-        f"{name} holds {array.dtype}, whose range is not known: give `value_range`, or convert it "
-        "to 8 bits, 16 bits without sign, or float in [0, 1]"
+        f"{name} is {array.dtype}, whose range is unknown: give `value_range`, or convert it to "
+        "uint8, uint16, or float in [0, 1]"
     )
 
 
 def _tell_if_dark(used: float, name: str) -> None:
     if 0 < used < LITTLE_RANGE:
-        warnings.warn(f"{name} {DARK.format(used)}", UserWarning, stacklevel=2)
+        used_range = f"{name} uses {used:.1%} of its range, and is nearly black"
+        warnings.warn(f"{used_range}: give the range by `value_range`", UserWarning, stacklevel=2)
 
 
 def _in_range(array: np.ndarray, value_range: Sequence[float], name: str, deep: bool) -> np.ndarray:
-    """Return the levels of numbers of which the first of a range is black and the second white."""
+    """Scale values linearly, so that the first of the range becomes black and the second white."""
     (low, high), size = value_range, array.dtype.itemsize
     if array.dtype == np.uint8 and (low, high) == (0, 255):
         return array
@@ -185,6 +184,6 @@ def _in_range(array: np.ndarray, value_range: Sequence[float], name: str, deep: 
     if array.dtype.kind == "u" and size <= 2:
         return levels(np.arange(256**size))[array]
     found = np.empty(array.shape, kind)
-    for row, values in enumerate(array):  # of whole images the copies are large
+    for row, values in enumerate(array):  # row by row, because copies of an image are large
         found[row] = levels(values)
     return found

@@ -1,7 +1,7 @@
-"""Compilation of the kernels by numba, at the first call of each.
+"""Compilation of kernels by numba, at the first call of each.
 
-Where numba can write to none of the places of its cache, as in a read-only container, the cache is
-in a folder of this user in the temporary directory, or else there is none.
+If numba cannot write to its usual cache folders, as in a read-only container, the cache is in a
+folder of this user in the temporary directory. If this fails, nothing is cached.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ _announcement: list[Callable[[], object]] = []
 
 
 def announce_compilation(tell: Callable[[], object]) -> None:
-    """Have a function called once, before the first kernel is compiled that no cache holds."""
+    """Set a function to be called once, before the first kernel that is not in the cache."""
     _announcement[:] = [tell]
 
 
 @functools.cache
 def _listen() -> None:
-    """Wait for the first compilation, which numba tells of when it finds nothing in its cache."""
+    """Register for numba's event of a compilation, which does not occur for a cached kernel."""
     from numba.core import event as events
 
     class Listener(events.Listener):
@@ -45,7 +45,7 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator that compiles a function by `numba.njit` at its first call, and caches it.
 
     Raises:
-        MissingExtraError: numba cannot be imported: it takes some versions of NumPy only.
+        MissingExtraError: numba cannot be imported; it may not support this version of NumPy.
     """
     try:
         import numba
@@ -55,17 +55,17 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
         ) from None
     if _announcement:
         _listen()
-    config: Any = numba.config  # its names are made at run time
+    config: Any = numba.config  # type checkers do not know its names
 
     def decorate(function: Callable[..., Any]) -> Any:
         with suppress(RuntimeError):  # numba found no writable folder
             return numba.njit(cache=True, **flags)(function)
         before = config.CACHE_DIR
         try:
-            # Read while a function is decorated, not when it is called.
+            # Numba reads the setting while a function is decorated, not when it is called.
             config.CACHE_DIR = str(_temporary_folder())
             return numba.njit(cache=True, **flags)(function)
-        except (AttributeError, OSError, RuntimeError):  # Windows has no `getuid`
+        except (AttributeError, OSError, RuntimeError):  # AttributeError: Windows lacks `getuid`
             return numba.njit(**flags)(function)
         finally:
             config.CACHE_DIR = before
@@ -76,14 +76,14 @@ def compiled(**flags: Any) -> Callable[[Callable[..., Any]], Any]:
 def _temporary_folder() -> Path:
     """Return a folder in the temporary directory that only this user can write.
 
-    Whoever can write there can make us run any code.
+    Anyone who can write to a cache of compiled code can make this process run any code.
 
     Raises:
-        OSError: there is none.
+        OSError: the folder cannot be created, or others can write to it.
     """
     folder = Path(tempfile.gettempdir()) / f"deepdetect-numba-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
     found = folder.lstat()
     if not stat.S_ISDIR(found.st_mode) or found.st_mode & 0o077 or found.st_uid != os.getuid():
-        raise PermissionError(f"{folder} is not this user's alone")
+        raise PermissionError(f"{folder} is not private to this user")
     return folder

@@ -1,7 +1,7 @@
-"""The processors and the memory of this machine: parallel work, and what is free for it.
+"""Processors and memory of this machine: parallel work, and how much memory is free.
 
-Not joblib, whose workers finish their task when the parent is killed. What starts processes is
-imported where it is used: it takes a tenth of the time and the memory of a detector that is ready.
+joblib is not used, because its workers finish their task when the parent is killed. Modules that
+start processes are imported late: they take a tenth of the time and memory of loading a detector.
 """
 
 from __future__ import annotations
@@ -31,51 +31,52 @@ Task = TypeVar("Task")
 Outcome = TypeVar("Outcome")
 
 PARTS_PER_THREAD = 4
-"""More than one, so that a thread with easy parts takes more of them."""
+"""Each thread gets this number of parts on average; one with easy parts takes more of them."""
 
 TASKS_PER_WORKER = 8
-"""Of `map_in_processes` that are given out at a time: others are done while the first one lasts."""
+"""`map_in_processes` submits this number of tasks per worker ahead, so that the others stay busy
+while it waits for the outcome of the first. Chosen by hand."""
 
 UNWANTED_TASK_S = 20.0
-"""How long a task may take to end after the work was interrupted or has failed."""
+"""A task has this time to end after the work was interrupted or failed; then it is killed."""
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""What libraries take the number of their threads from when they are loaded."""
+"""Environment variables from which libraries take their number of threads when they are loaded."""
 
 BYTES_PER = {
     # Descriptors, and the search trees of a matcher.
     "matched_keypoint": 1500,
-    # Blending a panorama: a pixel of the canvas, and of the box of one image on it.
+    # Blending of a panorama: a pixel of the canvas, and of the box of one image on it.
     "canvas_pixel": 34,
     "blended_pixel": 30,
-    # Two maps of float32, and room for what is made of them.
+    # Two maps of float32, and arrays derived from them.
     "pixel_of_level": 16,
-    # Dense matching, at its peak.
+    # Peak of dense matching.
     "dense_pixel": 250,
     "fused_pixel": 500,
 }
-"""Measured; `needed_memory` adds them up."""
+"""Bytes of memory per item, as measured; `needed_memory` adds them up."""
 
 DEFAULT_MEMORY = 4_000_000_000
-"""Bytes assumed where the system does not say."""
+"""Bytes assumed to be available if the system does not tell."""
 
-# M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD of malloc.h: no mappings, no trimming, room for more.
+# M_MMAP_MAX, M_TRIM_THRESHOLD and M_TOP_PAD of malloc.h: no mappings, no trimming, larger growth.
 _MALLOPT = ((-4, 0), (-1, -1), (-2, 2**28))
 _MMAP_THRESHOLD = (-3, 2**20)  # M_MMAP_THRESHOLD
 
 _max_threads: int | None = None
-"""The most threads that `parallel_for` uses in this process; None: one for each processor."""
+"""`parallel_for` uses at most this number of threads in this process; None: one per processor."""
 
 _chosen = threading.local()
-"""The number of threads that a caller has chosen, while its call runs."""
+"""Number of threads that a caller has chosen for the duration of a call."""
 
 
 TaskMap = Callable[..., Iterator[Any]]
-"""`map_in_processes`, or what does the same on a cluster."""
+"""Type of `map_in_processes`, and of functions that do the same on a cluster."""
 
 
 def processor_count() -> int:
-    """Return how many processors this process may use."""
+    """Return the number of processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -84,17 +85,17 @@ def processor_count() -> int:
 def map_in_processes(
     function: Callable[[Task], Outcome], tasks: Sequence[Task], workers: int | None = None
 ) -> Iterator[Outcome]:
-    """Apply a function of a module to every task, one in each of several processes at a time.
+    """Apply a module-level function to every task, in several processes.
 
-    Outcomes are in the order of the tasks.
+    Outcomes are in the order of the tasks. With one worker, the work is done in this process.
 
     Raises:
-        OptionError: `workers` is below 1; with 1 the work is done in this process.
+        OptionError: `workers` is below 1.
         DeepDetectError: a worker process died.
     """
     if workers is not None and workers < 1:
         raise OptionError(f"`workers` must be at least 1, not {workers}")
-    most = 61 if os.name == "nt" else len(tasks)  # Windows cannot wait for more
+    most = 61 if os.name == "nt" else len(tasks)  # Windows cannot wait for more processes
     count = min(workers or processor_count(), most, len(tasks))
     if count <= 1:
         with one_opencv_thread():
@@ -104,7 +105,7 @@ def map_in_processes(
     from concurrent.futures import ProcessPoolExecutor
     from concurrent.futures.process import BrokenProcessPool
 
-    # Spawned, not forked: a fork copies the locks of the parent's threads.
+    # A forked process would copy the locks of the parent's threads.
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
     remaining = iter(tasks)
@@ -112,7 +113,7 @@ def map_in_processes(
     pending: deque[Future[Outcome]] = deque()
 
     def submit(most: int) -> None:
-        # By the processes that are started, until their first task.
+        # The first submissions start processes, which inherit the blocked signal and one thread.
         with signals_held(), _one_thread_inherited():
             for task in islice(remaining, most):
                 pending.append(pool.submit(_run_task, function, task))
@@ -124,8 +125,8 @@ def map_in_processes(
             submit(1)
     except BrokenProcessPool:
         raise DeepDetectError(
-            "a worker process died, most likely for lack of memory: "
-            "use fewer `workers`, or smaller images"
+            "a worker process died, probably for lack of memory: use fewer `workers`, or smaller "
+            "images"
         ) from None
     finally:
         if pending:
@@ -134,7 +135,7 @@ def map_in_processes(
 
 
 def _end_workers(pool: ProcessPoolExecutor) -> None:
-    """End tasks that nobody wants any more: they clean up, or are killed after a while."""
+    """End tasks that are no longer needed: they clean up, or are killed after a while."""
     workers = list((pool._processes or {}).values())
     pool.shutdown(wait=False, cancel_futures=True)
     for worker in workers:
@@ -147,7 +148,7 @@ def _end_workers(pool: ProcessPoolExecutor) -> None:
 
 @contextmanager
 def _one_thread_inherited() -> Iterator[None]:
-    """Let libraries in processes that are started take one thread, unless the user says more."""
+    """Let libraries in new processes use one thread, unless the user has set a number."""
     unset = [name for name in _THREAD_VARIABLES if name not in os.environ]
     os.environ.update(dict.fromkeys(unset, "1"))
     try:
@@ -161,7 +162,7 @@ def _run_task(function: Callable[[Task], Outcome], task: Task) -> Outcome:
     try:
         end_worker_by_signals()
         return function(task)
-    except SystemExit:  # the pool would go on with the next task
+    except SystemExit:  # else the pool would run the next task
         os._exit(1)
 
 
@@ -171,14 +172,14 @@ def _start_worker() -> None:
 
 
 def start_child() -> None:
-    """Prepare a process that has been started: one thread, and it ends with its parent."""
+    """Prepare a new process: it uses one thread, and ends with its parent."""
     end_by_interrupt()
     use_one_thread()
     end_with_parent()
 
 
 def use_one_thread() -> None:
-    """Let OpenCV and `parallel_for` use one thread from now on: this process is one of many."""
+    """Let OpenCV and `parallel_for` use one thread from now on, in one of many processes."""
     global _max_threads
     cv2.setNumThreads(1)
     _max_threads = 1
@@ -186,7 +187,7 @@ def use_one_thread() -> None:
 
 @contextmanager
 def limited_threads(threads: int | None) -> Iterator[None]:
-    """Let what this thread calls use at most this many threads while the block runs; None: all."""
+    """Limit the threads used by calls from this thread while the block runs; None: no limit."""
     before = getattr(_chosen, "threads", None)
     _chosen.threads = threads or before
     try:
@@ -196,14 +197,14 @@ def limited_threads(threads: int | None) -> Iterator[None]:
 
 
 def thread_limit() -> int | None:
-    """Return how many threads this process may use, by OMP_NUM_THREADS too; None: a library's own.
+    """Return how many threads this process may use, or None for a library's own number.
 
-    ONNX Runtime's own are bound to processors, in every process to the same ones and also to those
-    that the process may not use: a process that is one of several is given a number.
+    OMP_NUM_THREADS counts. ONNX Runtime binds its own number of threads to processors, the same in
+    every process, even if it may not use them. So each of several processes gets a number.
     """
     if chosen := getattr(_chosen, "threads", None):
         return int(chosen)
-    # Who was started by it has it; others need not load it.
+    # A process that multiprocessing started has loaded the module; others need not import it.
     parent_of = getattr(sys.modules.get("multiprocessing.process"), "parent_process", None)
     wished = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
     if _max_threads is None and wished.isdecimal() and int(wished):
@@ -216,7 +217,7 @@ def thread_limit() -> int | None:
 
 
 def end_with_parent(end: Callable[[], object] = lambda: None) -> None:
-    """End this process when the one that started it has ended, after a last call."""
+    """End this process when its parent has ended, after a last call of `end`."""
     import multiprocessing
 
     def wait(parent: BaseProcess) -> None:
@@ -240,10 +241,10 @@ def one_opencv_thread() -> Iterator[None]:
 
 
 def parallel_for(count: int, work: Callable[..., object], *arguments: Any) -> None:
-    """Call `work(start, stop, *arguments)` for parts of a range, in as many threads as processors.
+    """Call `work(start, stop, *arguments)` for parts of a range, in a thread for each processor.
 
-    It should release the GIL, and its result must not depend on how the range is divided. In a
-    worker of `map_in_processes` it is one thread.
+    `work` should release the GIL, and its result must not depend on how the range is divided. A
+    worker of `map_in_processes` uses one thread.
     """
     threads = min(thread_limit() or processor_count(), count)
     if threads <= 1:
@@ -264,28 +265,28 @@ def available_memory() -> int:
 
 
 def needed_memory(**counts: float) -> float:
-    """Return the bytes that a step takes; `counts` by the names of `BYTES_PER`."""
+    """Return the bytes that a step needs; `counts` are numbers of the items of `BYTES_PER`."""
     return sum(BYTES_PER[name] * count for name, count in counts.items())
 
 
 def require_memory(what: str, advice: str, **counts: float) -> None:
-    """Refuse a step that would fill the memory; `counts` as of `needed_memory`.
+    """Check that a step does not exceed the memory; `counts` are as in `needed_memory`.
 
     Raises:
-        OptionError: more is needed than is available.
+        OptionError: the step needs more memory than is available.
     """
     needed = needed_memory(**counts)
     if needed > available_memory():
         raise OptionError(
-            f"{what} need about {needed / 1e9:.2g} GB of memory, more than is free: {advice}"
+            f"{what} need about {needed / 1e9:.2g} GB of memory, but less is free: {advice}"
         )
 
 
 def disable_malloc_trim() -> None:
-    """Let this process keep the memory that it frees, where the C library is glibc.
+    """Let this process keep the memory that it frees, if the C library is glibc.
 
-    By default glibc returns large blocks to the system at once, and each page of the next ones is
-    cleared again: a fifth of the time of a training step on the CPU, a sixth of that of labelling.
+    By default glibc returns large blocks to the system at once, which then clears each page of new
+    ones. This takes a fifth of the time of a training step on the CPU, and a sixth of labelling.
     """
     if platform.libc_ver()[0] == "glibc":
         for option, value in _MALLOPT:
@@ -293,10 +294,10 @@ def disable_malloc_trim() -> None:
 
 
 def release_freed_memory() -> None:
-    """Return freed memory to the system, now and, in blocks of a megabyte, from now on.
+    """Return freed memory to the system now, and blocks of a megabyte or more from now on.
 
-    The C library glibc keeps blocks of up to 32 MB otherwise, of which a network leaves hundreds of
-    megabytes. It is a setting of the whole process.
+    By default, glibc keeps blocks of up to 32 MB, so that a network leaves hundreds of megabytes
+    behind. The setting is for the whole process.
     """
     if platform.libc_ver()[0] == "glibc":
         library = ctypes.CDLL(None)
@@ -306,7 +307,7 @@ def release_freed_memory() -> None:
 
 def _system_memory() -> int:
     # MemAvailable includes caches that the system can drop.
-    with suppress(OSError, StopIteration):  # macOS lacks the file
+    with suppress(OSError, StopIteration):  # macOS does not have this file
         lines = Path("/proc/meminfo").read_text().splitlines()
         return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvail"))
     with suppress(AttributeError, ValueError):  # Windows
@@ -315,9 +316,9 @@ def _system_memory() -> int:
 
 
 def _container_memory() -> int:
-    """Return what the control group (version 2) of a container leaves to this process."""
+    """Return the bytes that the control group (version 2) of a container leaves to this process."""
     group = Path("/sys/fs/cgroup")
-    with suppress(OSError, ValueError, KeyError):  # there is none, or its limit is "max"
+    with suppress(OSError, ValueError, KeyError):  # no control group, or its limit is "max"
         limit, used, stat = (
             (group / f"memory.{name}").read_text() for name in ("max", "current", "stat")
         )

@@ -1,6 +1,6 @@
-"""OpenCV, imported when it is first used, whichever of its packages is installed.
+"""OpenCV, imported at its first use, from any of its packages.
 
-They all install into one folder `cv2`, a later one over an earlier one. Modules write
+All of these install into one folder `cv2`, later ones over earlier ones. Modules write
 `from .._shared.opencv import cv2`.
 """
 
@@ -18,7 +18,7 @@ from .errors import MissingExtraError, first_line, require_packages
 from .signals import sigterm_kept
 
 LOWEST_VERSION = "4.12"
-"""The first one that writes the EXIF of a picture."""
+"""OpenCV writes the EXIF of an image from this version on."""
 
 DISTRIBUTIONS = (
     "opencv-python",
@@ -26,11 +26,11 @@ DISTRIBUTIONS = (
     "opencv-contrib-python",
     "opencv-contrib-python-headless",
 )
-"""The packages on PyPI that bring `cv2`."""
+"""Packages on PyPI that contain `cv2`."""
 
 
 class _OpenCV(ModuleType):
-    """Stands for `cv2`, and imports it when it is asked for anything."""
+    """Stand-in for `cv2` that imports it at the first access to an attribute."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(import_opencv(), name)
@@ -47,56 +47,56 @@ def import_opencv() -> ModuleType:
     """Import OpenCV.
 
     Raises:
-        MissingExtraError: there is none, it cannot be imported, or it is too old.
+        MissingExtraError: OpenCV is missing, cannot be imported, or is too old.
     """
     try:
         found = importlib.import_module("cv2")
     except ImportError as error:
         raise MissingExtraError(
             f"OpenCV cannot be imported ({first_line(error)}): run pip install "
-            "opencv-python-headless, which needs no libraries of a screen, or any other package "
-            f"of OpenCV {LOWEST_VERSION} or later"
+            "opencv-python-headless, which needs no display, or another package of OpenCV "
+            f"{LOWEST_VERSION} or later"
         ) from None
     version = getattr(found, "__version__", None)
-    if version is None:  # a folder `cv2` that another package of OpenCV has left behind
+    if version is None:  # the removal of a package has left a folder `cv2` behind
         raise MissingExtraError(
-            "the folder cv2 of the installed OpenCV is not complete, as after the removal of "
-            "another package of it: pip install --force-reinstall opencv-python-headless"
+            "the folder cv2 of the installed OpenCV is incomplete, as after the removal of another "
+            "package of OpenCV: run pip install --force-reinstall opencv-python-headless"
         )
     if version_numbers(version) < version_numbers(LOWEST_VERSION):
         raise MissingExtraError(
-            f"OpenCV {version} is installed, and {LOWEST_VERSION} or later is needed: "
+            f"OpenCV {version} is installed, but {LOWEST_VERSION} or later is needed: run "
             f"pip install --upgrade {' '.join(installed_distributions()) or 'opencv-python'}"
         )
     return found
 
 
 def import_pycolmap(purpose: str = "a reconstruction from many images") -> Any:
-    """Import pycolmap, after OpenCV: the other way round some versions of both crash.
+    """Import pycolmap, after OpenCV, because some versions crash in the other order.
 
-    A MissingExtraError says that it, or h5py, is not installed, and what it is needed for.
+    Raises a MissingExtraError that names the purpose if pycolmap or h5py is not installed.
     """
     import_opencv()
     require_packages(purpose, "pycolmap", "h5py")
-    with sigterm_kept():  # or a process that is ended would print a stack trace
+    with sigterm_kept():  # pycolmap's handler would print a stack trace
         import pycolmap
     return pycolmap
 
 
 def is_lack_of_memory(error: Exception) -> bool:
-    """Return whether an exception is OpenCV's for lack of memory; OpenCV is not imported for it."""
+    """Return whether an exception is OpenCV's for lack of memory, without importing OpenCV."""
     loaded = sys.modules.get("cv2")
     wanted = loaded is not None and isinstance(error, loaded.error)
     return wanted and getattr(error, "code", None) == cv2.Error.StsNoMem
 
 
 def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
-    """Return a factory of OpenCV, as "AgastFeatureDetector_create".
+    """Return a factory of OpenCV, such as "AgastFeatureDetector_create".
 
-    Version 5 moved some from `cv2` to `cv2.xfeatures2d`, which is one of the contrib modules.
+    Version 5 moved some of them from `cv2` to `cv2.xfeatures2d`, one of the contrib modules.
 
     Raises:
-        MissingExtraError: it is in the contrib modules, and these are not installed.
+        MissingExtraError: the factory is in the contrib modules, which are not installed.
     """
     for home in (cv2, getattr(cv2, "xfeatures2d", None)):
         if hasattr(home, name):
@@ -112,13 +112,13 @@ def opencv_factory(name: str) -> Callable[..., cv2.Feature2D]:
 
 
 def installed_distributions() -> list[str]:
-    """Return which of the packages that bring `cv2` are installed."""
-    import importlib.metadata  # takes longer than all of this package
+    """Return the installed packages that contain `cv2`."""
+    import importlib.metadata  # this import takes longer than that of this package
 
     installed = {each.name for each in importlib.metadata.distributions()}
     return [name for name in DISTRIBUTIONS if name in installed]
 
 
 def version_numbers(version: str) -> list[int]:
-    """Return what versions are compared by."""
+    """Return the numbers of a version, by which versions are compared."""
     return [int(part) for part in re.findall(r"\d+", version)]

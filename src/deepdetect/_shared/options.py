@@ -1,4 +1,4 @@
-"""Options, and entries by name: an unknown name is an error that suggests the right one."""
+"""Checks of options and names: an error for an unknown name suggests the nearest known one."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ Entry = TypeVar("Entry")
 def suggest_keywords(
     function: Callable[Parameters, Result], elsewhere: Mapping[str, str] = {}
 ) -> Callable[Parameters, Result]:
-    """Decorate a function so that an unknown keyword is an error with the nearest right one.
+    """Decorate a function so that an unknown keyword raises an error that suggests a known one.
 
-    So is an argument of a wrong type, where its annotation is of simple types. It keeps its
-    signature, and a class, decorated above `dataclass`, stays the same class.
-    `elsewhere` says what to do instead, by keywords that belong to other functions.
+    An argument of a wrong type also raises an error, if its annotation consists of simple types.
+    The function keeps its signature; a class, decorated above `dataclass`, stays the same class.
+    `elsewhere` maps keywords of other functions to advice on what to do instead.
     """
     if isinstance(function, type):
         kind: Any = function
@@ -57,13 +57,13 @@ def suggest_keywords(
 
 
 def shown(value: object) -> str:
-    """Return a value for the sentence of an error: short, and of one line."""
+    """Return a value for an error message, short and on one line."""
     return " ".join(reprlib.repr(value).split())
 
 
 ACCEPTED: Mapping[Any, tuple[Any, ...]] = {
     bool: (bool, np.bool_),
-    int: (Real,),  # whole ones, which is checked where they are used
+    int: (Real,),  # `check_ranges` tests for whole numbers
     float: (Real,),
     str: (str,),
     Path: (os.PathLike,),
@@ -71,18 +71,18 @@ ACCEPTED: Mapping[Any, tuple[Any, ...]] = {
     Callable: (Callable,),
     Mapping: (Mapping,),
 }
-"""What is taken for a type in a signature, numbers of NumPy as well."""
+"""Types that are accepted for an annotation, including those of NumPy."""
 MADE_LATER = type(functools.cache(len))
-"""What some keypoints are, which are made when they are asked for."""
+"""Type of a cached function, which can stand for keypoints that it makes at first use."""
 KINDS_OF: Mapping[Any, Any] = {Literal: str, Callable: Callable, Mapping: Mapping}
 
 
 @functools.cache
 def _kinds(function: Callable[..., Any]) -> dict[str, tuple[Any, ...]]:
-    """Return what the arguments of a function must be, as far as all of it is of simple types."""
+    """Return the accepted types of those arguments whose annotations consist of simple types."""
     try:
         hints = typing.get_type_hints(function)
-    except NameError:  # a type is imported for checkers alone
+    except NameError:  # a type is only imported for type checkers
         return {}
     found = {}
     for name, hint in hints.items():
@@ -95,10 +95,10 @@ def _kinds(function: Callable[..., Any]) -> dict[str, tuple[Any, ...]]:
 
 
 def numbers_of(name: str, value: Any, kind: type | None, columns: int | None = None) -> np.ndarray:
-    """Return numbers as an array of a type, or their own, of rows of so many where that is said.
+    """Return numbers as an array of a type, None for their own, in rows of `columns` if given.
 
     Raises:
-        OptionError: they are none, or of another shape.
+        OptionError: the value is not numeric, or has another shape.
     """
     try:
         found: np.ndarray = np.asarray(value, kind)
@@ -117,7 +117,7 @@ def whole(name: str, value: Any) -> int:
 
 
 LARGEST = 1e38
-"""Of finite numbers, float32 ones too."""
+"""Options that must be finite, also in float32, are below this."""
 
 
 def check_ranges(
@@ -129,10 +129,10 @@ def check_ranges(
     counts: Sequence[str] = (),
     between: Mapping[str, tuple[float, float]] = {},
 ) -> None:
-    """Check the numbers in fields of options, in tuples each of them; None always passes.
+    """Check the numbers in fields of options, also those in tuples; None always passes.
 
-    The names of fields above 0, from 0, in [0, 1], and whole from 1; and the smallest and largest
-    allowed value by the name of a field. Where the default is whole, values must be.
+    Fields are given by name: those above 0, from 0 on, in [0, 1], whole numbers from 1 on, and with
+    a smallest and largest value. If the default of a field is an int, its value must be whole.
 
     Raises:
         OptionError: a value is not a number, or out of its range.
@@ -164,16 +164,16 @@ def _numbers(value: object) -> list[Any]:
 
 
 def look_up(kind: str, name: str, registry: Mapping[str, Entry]) -> Entry:
-    """Return the entry of this name; `kind` says what the entries are, as "matcher".
+    """Return the entry of this name; `kind` says what the entries are, such as "matcher".
 
     Raises:
-        OptionError: the name is unknown (the nearest right one is named).
+        OptionError: the name is unknown; the message suggests the nearest known one.
     """
     check_name(kind, name, registry)
     return registry[name]
 
 
 def names_a_file(value: str | Path) -> bool:
-    """Return whether a value is a path, not a name: it has a suffix or a separator."""
+    """Return whether a value is a path rather than a name: it has a suffix or a separator."""
     text = str(value)
     return bool(Path(text).suffix) or any(mark in text for mark in (os.sep, os.altsep) if mark)

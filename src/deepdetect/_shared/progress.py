@@ -1,4 +1,4 @@
-"""How far long tasks are: progress bars, and the times of stages."""
+"""Progress bars of long tasks, and times of stages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 
 class _StandardError:
-    """Standard error as it is at the time; where it is None, closed or full, nothing is written."""
+    """The present standard error; if it is None, closed or full, nothing is written."""
 
     encoding = "utf-8"
 
@@ -33,7 +33,7 @@ STDERR: Any = _StandardError()
 
 
 def fails(stream: Any) -> bool:
-    """Whether a stream is on a full disk or a broken pipe; then nothing more is written to it."""
+    """Return whether a stream has a full disk or broken pipe; if so, discard further output."""
     if stream is None:
         return False
     try:
@@ -45,7 +45,7 @@ def fails(stream: Any) -> bool:
 
 
 def progress(total: int | None, title: str, unit: str, quiet: bool = False, done: int = 0) -> Any:
-    """Return a tqdm bar on standard error; with `done` units at its beginning."""
+    """Return a tqdm bar on standard error, which begins with `done` units."""
     from tqdm import tqdm
 
     return tqdm(
@@ -64,11 +64,11 @@ def progress(total: int | None, title: str, unit: str, quiet: bool = False, done
 def stage_progress(
     title: str, stages: Sequence[str] = (), quiet: bool = False
 ) -> Iterator[Callable[[str], None]]:
-    """Show a bar of stages; yield a function to be called with the name of each when it ends.
+    """Show a bar of stages; yield a function to call with the name of each stage when it ends.
 
-    It shows the stage that is at work, or without a list the last one.
+    The bar shows the running stage or, without a list, the last one that ended.
     """
-    # On a terminal only: what is logged stays readable.
+    # The bar appears only on a terminal, so that logs stay readable.
     quiet = quiet or not STDERR.isatty()
     with progress(len(stages) or None, title, "stage", quiet) as bar:
         bar.set_postfix_str(stages[0] if stages else "")
@@ -81,7 +81,7 @@ def stage_progress(
 
 
 def say(text: str) -> None:
-    """Write a line to standard error, above a bar where there is one."""
+    """Write a line to standard error, above a bar if there is one."""
     from tqdm import tqdm
 
     tqdm.write(text, file=STDERR)
@@ -105,7 +105,7 @@ class StageTimer:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time what runs inside as the stage of this name."""
+        """Measure the block as the stage of this name."""
         started = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started

@@ -1,6 +1,6 @@
-"""What was made from what: is it of the same input and options, is it whole, may it be replaced?
+"""Records of outputs: which inputs and options made them, are they complete, may they be replaced?
 
-A record beside each output, `.deepdetect/NAME.json` in its folder, says from what it was made.
+The record of an output is `.deepdetect/NAME.json` in its folder.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from .atomic import atomic_path
 from .errors import DeepDetectError, MissingFileError, OptionError
 
 FOLDER = ".deepdetect"
-"""Of the records, in the folder of the outputs."""
+"""Folder of the records, inside the folder of the outputs."""
 
 ADVICE = "choose another place with -o, or replace it with --overwrite"
 
 
 def key(*values: Any) -> str:
-    """Return 32 hexadecimal digits of values, the same in every process and on every machine.
+    """Return a digest of values, 32 hexadecimal digits that are the same on every machine.
 
     Values are None, booleans, numbers, text, bytes, arrays (by type, shape and content), paths (by
     the content of their files), dataclasses (by name and fields), lists or tuples, sets and dicts.
@@ -42,7 +42,7 @@ def key(*values: Any) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON gives it back; arrays and files become digests. See `key`."""
+    """Return a value as JSON would restore it; arrays and files become digests. See `key`."""
     match value:
         case None | bool() | int() | float() | str():
             return value
@@ -69,15 +69,15 @@ def plain(value: Any) -> Any:
 
 
 def file_digest(path: Path) -> str:
-    """Return the SHA-256 of a file; it is read once in a process, and when it has changed.
+    """Return the SHA-256 of a file; a process reads it again only if it has changed.
 
     Raises:
-        MissingFileError: it cannot be read.
+        MissingFileError: the file cannot be read.
     """
     try:
         return _file_digest(path.resolve(), *file_state(path))
     except OSError as error:
-        raise MissingFileError(f"{path} cannot be read ({error.strerror})") from None
+        raise MissingFileError(f"{path} cannot be read ({error.strerror}): check it") from None
 
 
 @lru_cache(maxsize=4096)
@@ -87,7 +87,7 @@ def _file_digest(path: Path, size: int, changed: int) -> str:
 
 
 def file_state(path: Path) -> tuple[int, int]:
-    """Return a file's size in bytes and the time of its last change in ns; zeros without it."""
+    """Return the size of a file in bytes and the time of its last change in ns, or zeros."""
     try:
         status = path.stat()
     except OSError:
@@ -96,13 +96,13 @@ def file_state(path: Path) -> tuple[int, int]:
 
 
 def check_same(place: Path, before: object, now: Mapping[str, Any], advice: str = ADVICE) -> None:
-    """Refuse what was made with other settings than those of this run, as `plain` returns them.
+    """Compare the settings of an existing output with those of this run, both as from `plain`.
 
     Raises:
-        OptionError: some differ, which are named, or there are none.
+        OptionError: some settings differ (it names them), or the output has no settings.
     """
     if not isinstance(before, Mapping):
-        raise OptionError(f"{place} exists, written by something else: {advice}")
+        raise OptionError(f"{place} exists, written by another program: {advice}")
     names = sorted(n for n in now if n not in before or before[n] != now[n])
     if names:
         other = ", ".join(f"`{name}`" for name in names)
@@ -111,14 +111,14 @@ def check_same(place: Path, before: object, now: Mapping[str, Any], advice: str 
 
 @dataclass(frozen=True)
 class Outputs:
-    """The outputs of one piece of work, and the record beside each of what it was made from.
+    """The outputs of one piece of work, each with a record of its inputs and settings.
 
     Attributes:
-        paths: files or folders that are made.
-        inputs: files or folders that they are made from.
-        settings: what else they depend on, as for `key`; outputs of others are not replaced.
-        overwrite: replace whatever there is.
-        growing: outputs of a part of the inputs are replaced, too.
+        paths: output files or folders.
+        inputs: input files or folders.
+        settings: other values that outputs depend on, as for `key`.
+        overwrite: replace any existing output.
+        growing: also replace outputs of a part of the inputs.
 
     Example:
         >>> import tempfile
@@ -138,40 +138,40 @@ class Outputs:
     growing: bool = False
 
     def check(self) -> None:
-        """Refuse to replace what was made otherwise; call it before long work.
+        """Check before long work that existing outputs may be replaced.
 
         Raises:
-            OptionError: an output was made from other files, with other settings, or otherwise.
+            OptionError: an output has other inputs or settings, or no record.
         """
         if not self.overwrite:
             for path in self.paths:
                 self._known(path)
 
     def find(self) -> dict[str, Any] | None:
-        """Return the values noted with outputs that are done, None where work is left.
+        """Return the values noted with complete outputs, or None if there is work to do.
 
         Raises:
-            OptionError: as `check`, or an output has been changed since it was made.
+            OptionError: `check` fails, or an output was changed after it was made.
         """
         if self.overwrite:
             return None
         records = [self._known(path) for path in self.paths]
         for path, record in zip(self.paths, records, strict=True):
             if record and record["digest"] and not _is_unchanged(path, record):
-                raise OptionError(f"{path} exists, and has been changed: {ADVICE}")
+                raise OptionError(f"{path} exists, and was changed: {ADVICE}")
         states = [list(file_state(path)) for path in self.inputs]
         done = all(record and record["whole"] and record["states"] == states for record in records)
         return records[0]["values"] if done and records[0] else None
 
     @contextmanager
     def writing(self) -> Iterator[dict[str, Any]]:
-        """Note what outputs are made from, before and after the work; yield values to note, too.
+        """Write the records before and after the work; yield a dictionary of values to note.
 
-        Work that fails leaves no trace: what it has not replaced is known as what it was before.
-        What work that is killed has written is known as its own.
+        If the work fails, outputs that it did not replace keep their former records. If it is
+        killed, the outputs already have its records.
 
         Raises:
-            OptionError: as `check`.
+            OptionError: `check` fails.
             DeepDetectError: the folder cannot be written.
         """
         self.check()
@@ -190,20 +190,20 @@ class Outputs:
             for path, record, (state, content) in zip(self.paths, records, before, strict=True):
                 if file_state(path) == state:
                     _restore(record, content)
-            for folder in sorted(missing, reverse=True):  # from the innermost
-                with contextlib.suppress(OSError):  # it is not empty
+            for folder in sorted(missing, reverse=True):  # the innermost first
+                with contextlib.suppress(OSError):  # the folder is not empty
                     folder.rmdir()
             raise
 
     def _known(self, path: Path) -> dict[str, Any] | None:
-        """Return the record of an output, None where there is no output; refuse another's."""
+        """Return the record of an output, or None without one; check that it may be replaced."""
         if not path.exists():
             return None
         names = [str(each.resolve()) for each in self.inputs]
         record = _read(path)
         if record is None:
             origin = " and ".join(names)
-            raise OptionError(f"{path} exists, and is not known to be of {origin}: {ADVICE}")
+            raise OptionError(f"{path} exists, but has no record of {origin}: {ADVICE}")
         before = record["inputs"]
         if before != names and not (self.growing and {*before} <= {*names}):
             raise OptionError(f"{path} exists, made from {' and '.join(before)}: {ADVICE}")
@@ -230,7 +230,7 @@ def _record(output: Path) -> Path:
 
 
 def _read(output: Path) -> dict[str, Any] | None:
-    """Read the record of an output, None where there is none or it is damaged."""
+    """Read the record of an output; return None if it is missing or damaged."""
     try:
         record = json.loads(_record(output).read_bytes())
     except (OSError, ValueError):
@@ -249,25 +249,25 @@ def _restore(record: Path, content: bytes | None) -> None:
 
 
 def _is_unchanged(path: Path, record: Mapping[str, Any]) -> bool:
-    # A copy of the folder has other times.
+    # A copy of the folder has other times, but the same digests.
     return list(file_state(path)) == record["state"] or file_digest(path) == record["digest"]
 
 
 def inputs_of(path: Path) -> list[str]:
-    """Return what an output was made from, as resolved paths; nothing of what is no output."""
+    """Return the inputs of an output as resolved paths, or nothing for a file without record."""
     record = _read(path)
     return [] if record is None else list(record["inputs"])
 
 
 def was_made(path: Path, root: Path) -> bool:
-    """Whether a file below a folder was made by these commands, or lies in a folder that was."""
+    """Return whether a file below a folder is an output, or lies in a folder that is one."""
     return path != root and (_record(path).is_file() or was_made(path.parent, root))
 
 
 def save_arrays(path: str | Path, arrays: Mapping[str, Any], *, compress: bool = True) -> None:
     """Write arrays by name to an NPZ file, whole or not at all."""
-    # Coordinates of dense points shrink to a tenth; NumPy's own level takes five times as long for
-    # a twentieth less.
+    # At level 1 coordinates of dense points shrink to a tenth. NumPy's level takes five times as
+    # long, and saves only another twentieth.
     method = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
     with (
         atomic_path(path) as temporary,
@@ -279,17 +279,17 @@ def save_arrays(path: str | Path, arrays: Mapping[str, Any], *, compress: bool =
 
 
 def load_arrays(path: Path) -> dict[str, np.ndarray] | None:
-    """Read the arrays of `save_arrays`; None where there is no file or it is damaged."""
+    """Read the arrays of `save_arrays`; return None if the file is missing or damaged."""
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             return dict(file)
-    except Exception:  # damage shows as any of a dozen errors of zip, zlib and numpy
+    except Exception:  # a damaged file raises one of a dozen errors of zip, zlib and numpy
         return None
 
 
 @contextmanager
 def lock(path: Path, final: Path) -> Iterator[None]:
-    """Let one process at a time write a file, by a file for the lock; on Windows nothing is locked.
+    """Let only one process at a time write a file, by a lock file; on Windows nothing is locked.
 
     Raises:
         OptionError: another process holds the lock.
@@ -304,7 +304,7 @@ def lock(path: Path, final: Path) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise OptionError(
-                f"{final} is being written by another process: wait, or choose another with -o"
+                f"another process is writing {final}: wait, or choose another file with -o"
             ) from None
         except OSError:  # a network folder without locks
             pass

@@ -1,4 +1,4 @@
-"""ONNX Runtime and OpenVINO: imported without telemetry, and sessions of the first."""
+"""Import of ONNX Runtime and OpenVINO without telemetry, and sessions of ONNX Runtime."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ _import_lock = threading.Lock()
 
 def import_onnxruntime() -> ModuleType:
     """Import ONNX Runtime with ORT_DISABLE_TELEMETRY=1, unless the user has set it."""
-    # It is read during the import: disable_telemetry_events() would come too late.
+    # The variable is read during the import; disable_telemetry_events() would come too late.
     variable = "ORT_DISABLE_TELEMETRY"
     return _import_with("onnxruntime", os.environ, variable, os.environ.get(variable, "1"))
 
 
 def import_openvino() -> ModuleType:
-    """Import OpenVINO as if openvino_telemetry were not installed, which it is prepared for."""
-    # Only the variable CI would switch it off, which other packages read too.
+    """Import OpenVINO as if the optional openvino_telemetry were not installed."""
+    # The only variable that turns telemetry off is CI, which other packages also read.
     return _import_with("openvino", sys.modules, "openvino_telemetry", None)
 
 
 def _import_with(
     package: str, entries: MutableMapping[str, Any], key: str, value: object
 ) -> ModuleType:
-    """Import a package while an entry has a value; then put back what was there.
+    """Import a package while an entry has a value; then restore the entry.
 
     Both packages start telemetry when they are imported: they write an identifier into the home
-    folder, and OpenVINO sends an event. One that was imported before is left as it is.
+    folder, and OpenVINO sends an event. A package that was imported before is not changed.
     """
     with _import_lock:
         if package in sys.modules:
@@ -58,16 +58,16 @@ def start_session(
     provider: str = CPU,
     keep_memory: bool = True,
 ) -> Any:
-    """Start a session that prints nothing, for a file or its content."""
+    """Start a session that prints nothing, for a file or its contents."""
     onnxruntime = import_onnxruntime()
     settings = onnxruntime.SessionOptions()
-    settings.log_severity_level = 4  # what fails is said by the exception, and by us
+    settings.log_severity_level = 4  # errors also raise an exception
     settings.enable_cpu_mem_arena = settings.enable_mem_pattern = keep_memory
-    # Threads that spin begin sooner, but take processors from what follows, long after each run.
+    # Spinning threads start work sooner, but take processors from other work long after a run.
     settings.add_session_config_entry("session.intra_op.allow_spinning", "0")
     settings.intra_op_num_threads = int(threads or thread_limit() or 0)
-    # Falling back to the CPU after a failure, it would print blocks of text.
+    # A fallback to the CPU after a failure would print blocks of text.
     session = onnxruntime.InferenceSession(model, settings, providers=[provider], enable_fallback=0)
     session.disable_fallback()
-    session._model_bytes = None  # the content of the file, which it keeps for falling back
+    session._model_bytes = None  # the contents of the file, kept only for a fallback
     return session

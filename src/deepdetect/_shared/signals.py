@@ -1,4 +1,4 @@
-"""Signals that ask a process to end: the one place where they are handled, and sent."""
+"""Handling and sending of signals that ask a process to end; no other module does so."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from contextlib import contextmanager
 from types import FrameType
 
 ENDING = ("SIGTERM", "SIGHUP")
-"""Sent by `kill`, and by a terminal that is closed; Windows lacks the second."""
+"""Signals sent by `kill`, and by a terminal that is closed; Windows lacks the second."""
 
 
 @contextmanager
 def handle_signals(
     handler: Callable[[int, FrameType | None], object], names: Sequence[str] = ENDING
 ) -> Iterator[None]:
-    """Have a function called for signals while the block runs, in the main thread.
+    """Set a handler for signals while the block runs, in the main thread.
 
-    Signals that are ignored, as by `nohup`, are left alone; so are handled ones but Ctrl+C.
+    Signals that are ignored, as by `nohup`, stay ignored. Other handlers stay, except Ctrl-C's.
     """
     before = {}
     if threading.current_thread() is threading.main_thread():
@@ -36,15 +36,15 @@ def handle_signals(
 
 
 def exit_by_signal(number: int, frame: FrameType | None) -> None:
-    """End the program as a shell reports it; a handler for `handle_signals`."""
+    """End the program with the exit code that shells use; a handler for `handle_signals`."""
     raise SystemExit(128 + number)
 
 
 @contextmanager
 def noted_interrupts() -> Iterator[list[int]]:
-    """Give a list that gets an entry at each Ctrl-C, which still raises KeyboardInterrupt.
+    """Yield a list that gets an entry at each Ctrl-C, which still raises KeyboardInterrupt.
 
-    Packages that are interrupted while they are imported may raise something else.
+    The list is needed because an interrupted import of a package may raise another error.
     """
     noted: list[int] = []
 
@@ -58,7 +58,7 @@ def noted_interrupts() -> Iterator[list[int]]:
 
 @contextmanager
 def endings_interrupt() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP be as Ctrl-C while the block runs."""
+    """Treat SIGTERM and SIGHUP like Ctrl-C while the block runs."""
     with (
         handle_signals(signal.default_int_handler, ["SIGTERM"]),
         handle_signals(lambda *_: signal.raise_signal(signal.SIGTERM), ["SIGHUP"]),
@@ -68,7 +68,7 @@ def endings_interrupt() -> Iterator[None]:
 
 @contextmanager
 def sigterm_kept() -> Iterator[None]:
-    """Undo what native code that the block loads does to SIGTERM, which Python does not know."""
+    """Restore the handler of SIGTERM after the block, whose native code may change it."""
     handler = signal.getsignal(signal.SIGTERM)
     yield
     if handler is not None and threading.current_thread() is threading.main_thread():
@@ -77,13 +77,13 @@ def sigterm_kept() -> Iterator[None]:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Let Ctrl-C wait while the block starts processes, in them for `end_worker_by_signals`."""
+    """Defer Ctrl-C while the block starts processes, in these until `end_worker_by_signals`."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
     from multiprocessing import resource_tracker
 
-    # Or the first process starts it, and it ends the mask.
+    # If the first process started the tracker, that would reset the mask.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
@@ -98,14 +98,11 @@ def end_by_interrupt() -> None:
 
 
 def end_worker_by_signals() -> None:
-    """Let Ctrl-C, which `signals_held` has held, and SIGTERM end a worker by SystemExit.
-
-    It cleans up what its task holds open.
-    """
+    """Let SIGTERM, and Ctrl-C that `signals_held` has deferred, end a worker by SystemExit."""
     both = (signal.SIGINT, signal.SIGTERM)
 
     def end(number: int, frame: FrameType | None) -> None:
-        for name in both:  # both may come
+        for name in both:  # both signals may arrive
             signal.signal(name, signal.SIG_IGN)
         raise SystemExit
 
@@ -116,7 +113,7 @@ def end_worker_by_signals() -> None:
 
 
 def kill_group(process: int = 0) -> None:
-    """Kill the group of a process, of this one by default; nothing where there is no group."""
+    """Kill the group of a process, by default of this one; do nothing without process groups."""
     if hasattr(os, "killpg"):
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(process, signal.SIGKILL)

@@ -1,1 +1,1 @@
-"""The page in a browser, served on this computer, with what Python does better."""
+"""The page in a browser, served on this computer, with tasks that run in Python."""

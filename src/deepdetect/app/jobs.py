@@ -1,4 +1,4 @@
-"""Tasks at work: a process and a folder each, forgotten when the page has no more use for them."""
+"""Running tasks: each has a process and a folder, both removed when the page no longer asks."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from ..io.image_file import read_with, reading_options
 from .tasks import TASKS, Order
 
 FOLDER_PREFIX = "deepdetect-app-"
-"""Of the folder of a server, in the folder for temporary files."""
+"""Prefix of a server's folder in the folder for temporary files."""
 
 NO_RESULT = "the task ended without a result: there may be too little memory for it"
 
@@ -39,11 +39,11 @@ class AppOptions:
         max_file_mb: size of the largest image file, in megabytes.
         max_task_mb: size of all image files of one task, in megabytes.
         max_files: number of images of one task.
-        max_megapixels: larger images are refused before they are decoded.
+        max_megapixels: larger images are rejected before they are decoded.
         max_tasks: number of tasks that run at the same time.
-        max_task_s: seconds after which a task is ended.
-        abandoned_s: discard a task and its result if the page has not asked for it for this many
-            seconds. Pages in the background ask once a minute.
+        max_task_s: seconds after which a task is stopped.
+        abandoned_s: seconds without a request from the page, after which a task and its result are
+            discarded. Pages in the background ask once a minute.
         max_request_s: seconds that the images of a task may take to arrive.
 
     Raises:
@@ -66,12 +66,12 @@ class AppOptions:
 
 
 class Job:
-    """A task, and the process that does it.
+    """A task and its process.
 
     Attributes:
-        name: secret, known to the page alone.
-        state: what the page is told.
-        started, asked: when it began, and when the page has last asked for it.
+        name: secret name that only the page knows.
+        state: state that is sent to the page.
+        started, asked: times of the start, and of the last request from the page.
     """
 
     def __init__(self, order: Order) -> None:
@@ -83,26 +83,26 @@ class Job:
         context = multiprocessing.get_context("spawn")
         self._receiver, sender = context.Pipe(duplex=False)
         self.process = context.Process(target=run_task, args=(sender, order))
-        with signals_held(), sender:  # Ctrl+C is for the server, which ends its tasks
+        with signals_held(), sender:  # Ctrl-C is for the server, which ends its tasks
             self.process.start()
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
 
     def file(self, name: str) -> Path | None:
-        """Return one of the files that the task has named; None for any other name."""
+        """Return one of the result files of the task, or None for any other name."""
         files = [*self.state.get("files", ()), self.state.get("shown")]
         return self.folder / "results" / name if name in files else None
 
     def stop(self, reason: str) -> None:
-        """End the process with all that it has started."""
+        """End the process and all processes that it has started."""
         self._reason = reason
         if self.process.pid is not None:
             kill_group(self.process.pid)
-        self.process.kill()  # before it had a group, and on Windows
+        self.process.kill()  # on Windows, and as long as it has no group
         self._listener.join()
 
     def _listen(self) -> None:
-        with contextlib.suppress(EOFError, OSError), self._receiver:  # killed while it sends
+        with contextlib.suppress(EOFError, OSError), self._receiver:  # the process may be killed
             while True:
                 self.state = self._receiver.recv()
         self.process.join()
@@ -111,7 +111,7 @@ class Job:
 
 
 class Jobs:
-    """All tasks of a server. They are started by one thread, that of the server."""
+    """All tasks of a server, which are started by the server's thread."""
 
     def __init__(self, limits: AppOptions) -> None:
         self.limits = limits
@@ -119,37 +119,37 @@ class Jobs:
         self._folder = private_folder(FOLDER_PREFIX)
 
     def new_folder(self) -> Path:
-        """Make a folder for the images of a task, which nobody else can read."""
+        """Make a folder for the images of a task that other users cannot read."""
         return Path(tempfile.mkdtemp(dir=self._folder))
 
     def check_room(self) -> None:
-        """Raise an OptionError where too many tasks are at work."""
+        """Raise an OptionError if too many tasks are running."""
         if sum(job.process.is_alive() for job in self._jobs.values()) >= self.limits.max_tasks:
             raise OptionError(
-                f"the most tasks ({self.limits.max_tasks}) are at work: wait, or cancel one"
+                f"too many tasks ({self.limits.max_tasks}) are running: wait, or cancel one"
             )
 
     def start(self, order: Order) -> Job:
-        """Start a task where there is room."""
+        """Start a task, or raise an OptionError if too many are running."""
         self.check_room()
         job = Job(order)
         self._jobs[job.name] = job
         return job
 
     def find(self, name: str) -> Job | None:
-        """Return a task by its name, and note that the page has asked for it."""
+        """Return a task by its name, and note the time of this request."""
         if job := self._jobs.get(name):
             job.asked = time.monotonic()
         return job
 
     def remove(self, name: str) -> None:
-        """End a task, if there is one of this name, and remove its files."""
+        """End the task of this name, if it exists, and remove its files."""
         if job := self._jobs.pop(name, None):
             job.stop("it was cancelled")
             shutil.rmtree(job.folder, ignore_errors=True)
 
     def end_overdue(self) -> None:
-        """End the tasks that last too long, and forget those that the page has forgotten."""
+        """End tasks that take too long, and remove those that the page no longer asks for."""
         now = time.monotonic()
         for job in list(self._jobs.values()):
             if now - job.asked > self.limits.abandoned_s:
@@ -166,10 +166,10 @@ class Jobs:
 
 
 def run_task(sender: Connection, order: Order) -> None:
-    """Do a task, in a process of its own: its files are in `results`, its state is sent."""
+    """Run a task in its own process: write files to `results`, and send states."""
     if hasattr(os, "setsid"):
-        os.setsid()  # so that all it starts can be ended
-    for stream in (1, 2):  # what libraries print
+        os.setsid()  # a group, so that processes it starts can be ended
+    for stream in (1, 2):  # discard what libraries print
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
     end_with_parent(kill_group)
     results = order.folder / "results"
@@ -193,7 +193,7 @@ def run_task(sender: Connection, order: Order) -> None:
 
 
 def _for_the_page(message: str, order: Order) -> str:
-    """Name images and files as the user does, and options as `deepdetect app` does."""
+    """Replace paths by the user's names, and names of options by flags of `deepdetect app`."""
     for number, image in enumerate(order.images):
         message = message.replace(str(image.path), image.name)
         message = message.replace(f"images[{number}]", image.name)

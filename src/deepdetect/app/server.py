@@ -1,7 +1,7 @@
-"""The server of the page: for one user, on the loopback address only, keeping nothing.
+"""Server of the page: for one user, only on the loopback address, without permanent storage.
 
-Starlette and uvicorn speak HTTP. It answers only requests that name this computer and come from
-its own page with the key of this start, and that are not too large.
+Starlette and uvicorn handle HTTP. The server rejects requests that name another host, come from
+another page, lack the key of this start, or are too large.
 """
 
 from __future__ import annotations
@@ -49,26 +49,26 @@ STATIC = Path(__file__).parent / "static"
 
 CLOSE = {"Connection": "close"}
 SHUTDOWN_S = 1
-"""How long the end waits for requests that are being answered."""
+"""The server waits this long for running requests when it shuts down."""
 
 CHECK_EVERY_S = 1.0
-"""How often it is looked for tasks that last too long or are forgotten."""
+"""Tasks that take too long or are abandoned are looked for at this interval."""
 
 MAX_IMAGE_PIXELS = 2_100_000
-"""The page reduces images to two megapixels, with sides that are multiples of 8."""
+"""The page scales images to two megapixels, with sides that are multiples of 8."""
 
 POINT_BYTES = 12
 MAX_POINTS = 4000
-"""Of an image, as many as the page's slider allows; each is x, y and a size in float32."""
+"""The page's slider allows this number of points, each of which is x, y and a size in float32."""
 
 MIN_SIDE = 16
 MAX_DESCRIPTION_BYTES = 1 << 18
-"""Of the names and sizes of images, and of the options of a task."""
+"""The names and sizes of images and the options of a task have at most this size as JSON."""
 
 MAX_NAME_LENGTH = 200
 
 CANNOT_START = (
-    "the task cannot be started ({}): free some space and memory, or start deepdetect app again"
+    "the task cannot start ({}): free some space and memory, or start deepdetect app again"
 )
 
 HEADERS = {
@@ -87,15 +87,15 @@ VIEWER_POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
     "frame-ancestors 'self'; sandbox allow-scripts allow-downloads"
 )
-"""The viewer of a model is one file with its script in it, and cannot reach the page around it."""
+"""The viewer of a model is one file with an inline script, isolated from the page around it."""
 
 
 class AppServer:
-    """Serves the page until it is closed; a context manager that ends tasks and removes files.
+    """Server of the page; as a context manager it ends all tasks and removes all files.
 
     Attributes:
-        key: the secret of this start, which every request but those for the page must have.
-        port: the one that it listens at.
+        key: secret of this start; all requests except those for the page itself must have it.
+        port: port that the server listens on.
 
     Raises:
         OptionError: the port is taken.
@@ -110,7 +110,7 @@ class AppServer:
     def __init__(self, options: AppOptions = AppOptions()) -> None:
         self.options = options
         self.key = secrets.token_urlsafe(24)
-        self._processors = threading.Lock()  # one image at a time: it takes all processors
+        self._processors = threading.Lock()  # one image at a time uses all processors
         self.jobs = Jobs(options)
         try:
             self._socket = socket.create_server((HOST, options.port))
@@ -146,7 +146,7 @@ class AppServer:
         return f"http://{HOST}:{self.port}/#key={self.key}"
 
     def serve_forever(self) -> None:
-        """Answer requests until `stop`, or until Ctrl+C: KeyboardInterrupt."""
+        """Answer requests until `stop` is called, or until Ctrl-C raises KeyboardInterrupt."""
         self._server.run(sockets=[self._socket])
 
     def stop(self) -> None:
@@ -154,7 +154,7 @@ class AppServer:
         self._server.should_exit = True
 
     def _routes(self) -> Starlette:
-        # Of the system's table, which programs of Windows change.
+        # The system's table may lack this type: programs on Windows change it.
         mimetypes.add_type("text/javascript", ".js")
         return Starlette(
             routes=[
@@ -181,10 +181,10 @@ class AppServer:
         )
 
     async def _guard(self, request: Request, answer: RequestResponseEndpoint) -> Response:
-        """Refuse requests for other computers (DNS rebinding), and of other pages."""
+        """Reject requests for other hosts (DNS rebinding) and from other pages."""
         host = request.headers.get("Host")
         allowed = [f"{name}:{self.port}" for name in NAMES]
-        if self.port == HTTP_PORT:  # browsers leave it out
+        if self.port == HTTP_PORT:  # browsers omit this port
             allowed += NAMES
         if host not in allowed:
             response = _refusal(421, "this address is not served here")
@@ -228,12 +228,12 @@ class AppServer:
         }
 
     def _check_key(self, request: Request) -> None:
-        """Refuse requests without the key of this start, and of other sites."""
+        """Reject requests without the key of this start, and from other sites."""
         given = request.headers.get("Authorization", "").removeprefix("Bearer ")
         if not hmac.compare_digest(given.encode(), self.key.encode()):
             raise HTTPException(
                 401,
-                "the key of this page is wrong: open the address that deepdetect app has printed",
+                "the key of this page is wrong: open the address that deepdetect app printed",
             )
         if request.headers.get("Sec-Fetch-Site", "same-origin") != "same-origin":
             raise HTTPException(403, "only the page of deepdetect app may ask this")
@@ -243,7 +243,7 @@ class AppServer:
         return DeepDetect(resolution="native")
 
     async def _heatmap(self, request: Request) -> Response:
-        """Answer the pixels of an image, (H, W, 3) uint8, with its logits, (H, W) float32."""
+        """Receive an image, (H, W, 3) uint8; send its logits, (H, W) float32."""
 
         def logits(rgb: np.ndarray, _: bytes) -> np.ndarray:
             return self._detector.heatmap_and_logits(rgb)[1]
@@ -251,7 +251,7 @@ class AppServer:
         return await self._answer(request, 3, logits)
 
     async def _candidates(self, request: Request) -> Response:
-        """Answer the grey levels of an image, (H, W) uint8, with its candidates for points.
+        """Receive the grey values of an image, (H, W) uint8; send its candidates for points.
 
         They are (4, N) float32: x, y, sigmas and logits, the strongest first.
         """
@@ -264,9 +264,9 @@ class AppServer:
         return await self._answer(request, 1, ranked)
 
     async def _descriptors(self, request: Request) -> Response:
-        """Answer grey levels, (H, W) uint8, and points of them with upright learned descriptors.
+        """Receive grey values, (H, W) uint8, and points; send upright learned descriptors.
 
-        The points are (N, 2) float32 positions and (N,) sizes, the descriptors (N, 64).
+        Points are (N, 2) float32 positions and (N,) sizes, descriptors (N, 64).
         """
 
         def described(gray: np.ndarray, numbers: bytes) -> np.ndarray:
@@ -286,18 +286,18 @@ class AppServer:
         compute: Callable[[np.ndarray, bytes], np.ndarray],
         max_points: int = 0,
     ) -> Response:
-        """Answer the pixels of an image, (H, W, C) uint8, and points, with float32 of them."""
+        """Receive an image, (H, W, C) uint8, and points; send the float32 result of `compute`."""
         self._check_key(request)
         try:
             width, height = (int(request.query_params[name]) for name in ("width", "height"))
         except (KeyError, ValueError):
             raise HTTPException(400, "the size of the image is missing") from None
         if min(width, height) < MIN_SIDE or width * height > MAX_IMAGE_PIXELS:
-            raise HTTPException(400, f"an image cannot be {width}x{height} here")
+            raise HTTPException(400, f"an image of {width}x{height} pixels is not accepted here")
         length = channels * width * height
         points = _body_length(request, length + POINT_BYTES * max_points) - length
         if points < 0 or points % POINT_BYTES:
-            raise HTTPException(400, "these are not the pixels of such an image")
+            raise HTTPException(400, "the request does not have the pixels of such an image")
         async with asyncio.timeout(self.options.max_request_s):
             body = await request.body()
         pixels = np.frombuffer(body, np.uint8, length).reshape(height, width, channels)
@@ -309,7 +309,7 @@ class AppServer:
         return Response(await run_in_threadpool(answer), media_type="application/octet-stream")
 
     async def _new_job(self, request: Request) -> Response:
-        """Start a task: a length, a description in JSON of that length, and the images."""
+        """Start a task. The request is a length, JSON of this length, and the images."""
         self._check_key(request)
         kind, options = request.query_params.get("kind", ""), self.options
         if kind not in TASKS:
@@ -327,13 +327,13 @@ class AppServer:
         files, given = _described(await body.read(size))
         if len(files) > options.max_files:
             raise OptionError(
-                f"{len(files)} images are over {options.max_files}: allow more by --max-files"
+                f"{len(files)} images exceed the limit of {options.max_files}: raise --max-files"
             )
         for name, length in files:
             if length > options.max_file_mb * 1e6:
                 raise OptionError(f"{name} is over {options.max_file_mb:g} MB: make it smaller")
         if sum(length for _, length in files) != left - 4 - size:
-            raise HTTPException(400, "the images are not as long as is said")
+            raise HTTPException(400, "the images differ from their stated length")
         numbers = TASKS[kind].check(len(files), given)
         with contextlib.ExitStack() as made:
             folder = self.jobs.new_folder()
@@ -354,7 +354,7 @@ class AppServer:
     def _job(self, request: Request) -> Any:
         job = self.jobs.find(request.path_params["name"])
         if job is None:
-            raise HTTPException(404, "there is no such task: it may have been forgotten")
+            raise HTTPException(404, "there is no such task: it may have been removed")
         return job
 
     def _job_state(self, request: Request) -> Response:
@@ -365,7 +365,7 @@ class AppServer:
         path = self._job(request).file(request.path_params["file"])
         if path is None:
             raise HTTPException(404, "there is no such file")
-        if path.suffix == ".html":  # a frame cannot send the key: the task's name is one, too
+        if path.suffix == ".html":  # a frame cannot send the key, but the task's name is secret
             return FileResponse(path, headers={"Content-Security-Policy": VIEWER_POLICY})
         self._check_key(request)
         return FileResponse(path)
@@ -402,13 +402,13 @@ def _body_length(request: Request, largest: int) -> int:
         raise HTTPException(411, "the length of the request is missing")
     if int(text) > largest:
         raise HTTPException(
-            413, f"this is over {largest / 1e6:.3g} MB: give fewer or smaller images"
+            413, f"the request exceeds {largest / 1e6:.3g} MB: give fewer or smaller images"
         )
     return int(text)
 
 
 def _described(text: bytes) -> tuple[list[tuple[str, int]], dict[str, object]]:
-    """Return the names and lengths of images, and the options, of a description in JSON."""
+    """Read the names and lengths of images, and the options, from a description in JSON."""
     try:
         values = json.loads(text)
         files = [(_clean(str(one["name"])), one["size"]) for one in values["files"]]
@@ -420,5 +420,5 @@ def _described(text: bytes) -> tuple[list[tuple[str, int]], dict[str, object]]:
 
 
 def _clean(name: str) -> str:
-    """Return a name that can be shown: not too long, and of one line."""
+    """Return a name that can be displayed: not too long, and on one line."""
     return "".join(c if c.isprintable() else "_" for c in name[-MAX_NAME_LENGTH:]) or "image"

@@ -1,6 +1,6 @@
-"""What the page can ask Python for: one function and one line of `TASKS` each.
+"""Tasks that the page can run in Python: one function and one line of `TASKS` each.
 
-A task reads images, tells its progress, writes files, and returns what the page shows beside.
+A task reads images, reports its progress, writes files, and returns what the page shows.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from ..sfm.pipeline import reconstruct_many
 
 FOLDER_KEYPOINTS = 2048
 MODEL_STAGES = 9
-"""Of a 3D model at most, with its files."""
+"""A 3D model takes at most this number of stages, including its files."""
 
 ASSUMED_FOCAL = 1.2
-"""Times the longer side: the focal length of images that do not say theirs, as COLMAP has it."""
+"""Images without EXIF are given this multiple of the longer side as focal length, as in COLMAP."""
 
 Report = Callable[[str, int, int], None]
-"""Is told the stage that begins, how many are done, and how many there are (0: not known)."""
+"""Function called with the stage that begins, the number of stages done, and their total (or 0)."""
 
 Options = Mapping[str, float]
 
 
 @dataclass(frozen=True)
 class SentImage:
-    """The file of an image that the page has sent, and its name there; never used as a path."""
+    """Image file sent by the page, and its name there, which is never used as a path."""
 
     path: Path
     name: str
@@ -55,7 +55,7 @@ Images = Sequence[SentImage]
 
 @dataclass(frozen=True)
 class Order:
-    """A task of this kind to be done: its folder is made for it, and has the images."""
+    """A task to run, in its own folder, which holds the images."""
 
     kind: str
     images: Images
@@ -66,7 +66,7 @@ class Order:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """Names and values as text, the file that the page shows, and all that can be downloaded."""
+    """Result of a task: names and values as text, the file to show, and files to download."""
 
     numbers: Mapping[str, str]
     shown: str
@@ -75,11 +75,11 @@ class TaskResult:
 
 @dataclass(frozen=True)
 class Task:
-    """A line of the table of tasks.
+    """A kind of task.
 
-    `files` are the least and the largest number of images, None for as many as are allowed;
-    `packages` those that it needs beside those that DeepDetect brings; `options` the names of the
-    numbers that it takes, and what the page calls them; `folder` whether it is for whole folders.
+    `files` are the smallest and the largest number of images, None for the server's limit.
+    `packages` are those not installed with DeepDetect. `options` maps names of numeric options to
+    labels on the page. `folder` says whether the task is for whole folders.
     """
 
     title: str
@@ -92,12 +92,12 @@ class Task:
 
     @property
     def missing(self) -> str:
-        """What has to be installed first; empty where nothing has."""
+        """Command that installs missing packages, or an empty string."""
         absent = [name for name in self.packages if importlib.util.find_spec(name) is None]
         return install_command(*absent) if absent else ""
 
     def check(self, count: int, options: Mapping[str, object]) -> dict[str, float]:
-        """Return the options as numbers, where they and the number of images fit."""
+        """Check the options and the number of images; return the options as numbers."""
         least, most = self.files
         if count < least or (most is not None and count > most):
             number = f"{least}" if most == least else f"at least {least}"
@@ -152,7 +152,7 @@ def run_register(images: Images, options: Options, folder: Path, report: Report)
 
 
 def run_stitch(images: Images, options: Options, folder: Path, report: Report) -> TaskResult:
-    """Make a panorama."""
+    """Stitch a panorama."""
     stages = _stages(stages_of(len(images)), report)
     panorama = stitch([one.path for one in images], progress=stages)
     save_picture(panorama.image, folder / "panorama.jpg")
@@ -169,7 +169,7 @@ def run_stitch(images: Images, options: Options, folder: Path, report: Report) -
 
 
 def run_reconstruct(images: Images, options: Options, folder: Path, report: Report) -> TaskResult:
-    """Make a 3D model of two images."""
+    """Reconstruct a 3D model from two images."""
     done = itertools.count(1)
     report("starting", 0, MODEL_STAGES)
     left, right = (one.path for one in images)
@@ -208,7 +208,7 @@ def run_reconstruct(images: Images, options: Options, folder: Path, report: Repo
 def run_reconstruct_many(
     images: Images, options: Options, folder: Path, report: Report
 ) -> TaskResult:
-    """Make cameras and a dense model of many images."""
+    """Reconstruct cameras and a dense model from many images."""
     report("cameras and points of all images", 0, 0)
     work = folder / "work"
     found = reconstruct_many([one.path for one in images], work)
@@ -225,7 +225,7 @@ def run_reconstruct_many(
 def run_folder_keypoints(
     images: Images, options: Options, folder: Path, report: Report
 ) -> TaskResult:
-    """Write the best keypoints of each image, as one CSV file each, into one ZIP file."""
+    """Write the best keypoints of each image as a CSV file into one ZIP file."""
     detector = PointDetector(FOLDER_KEYPOINTS)
     table, failures = folder / "table.csv", []
     shown, total = "", 0
@@ -257,7 +257,7 @@ def run_folder_keypoints(
 
 
 def _entry_name(name: str, others: Sequence[str]) -> str:
-    """Return a name in the archive for an image, which no other has, and without a folder.
+    """Return a unique file name in the archive for an image, without folders.
 
     Example:
         >>> _entry_name("a/b.jpg", []), _entry_name("../b", ["b.csv"])
@@ -270,7 +270,7 @@ def _entry_name(name: str, others: Sequence[str]) -> str:
 
 
 def _stages(names: Sequence[str], report: Report) -> Callable[[str], None]:
-    """Report the first stage; return what is called when a stage ends. "files" is the last one."""
+    """Report the first stage; return a function to call after each. The last one is "files"."""
     all_names, done = [*names, "files"], itertools.count()
 
     def ended(_: str) -> None:
@@ -284,23 +284,23 @@ def _stages(names: Sequence[str], report: Report) -> Callable[[str], None]:
 TASKS: dict[str, Task] = {
     "match": Task("Guided matching", "all matches that agree with one geometry", run_match, (2, 2)),
     "register": Task(
-        "Registration", "the second picture in the frame of the first", run_register, (2, 2)
+        "Registration", "the second image in the frame of the first", run_register, (2, 2)
     ),
-    "stitch": Task("Panorama", "of pictures that overlap", run_stitch, (2, None)),
+    "stitch": Task("Panorama", "from overlapping images", run_stitch, (2, None)),
     "reconstruct": Task(
         "3D model",
         "coloured points, and a depth map",
         run_reconstruct,
         (2, 2),
-        options={"focal_px": "Focal length in pixels, where the pictures do not say it"},
+        options={"focal_px": "Focal length in pixels, if the images lack it"},
     ),
     "folder-keypoints": Task(
-        "Keypoints", "of each picture, as CSV files", run_folder_keypoints, (1, None), folder=True
+        "Keypoints", "of each image, as CSV files", run_folder_keypoints, (1, None), folder=True
     ),
-    "folder-stitch": Task("Panorama", "of all pictures", run_stitch, (2, None), folder=True),
+    "folder-stitch": Task("Panorama", "from all images", run_stitch, (2, None), folder=True),
     "folder-model": Task(
         "3D model",
-        "of three or more pictures",
+        "from three or more images",
         run_reconstruct_many,
         (3, None),
         ("pycolmap", "h5py"),

@@ -1,4 +1,4 @@
-"""Collections of images: features and matches of many files, in the files of hloc."""
+"""Features and matches of collections of images, in files in hloc's layout."""
 
 from .engines import ENGINES
 from .extraction import extract_features

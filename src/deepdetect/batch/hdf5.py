@@ -161,10 +161,7 @@ def _written(path: Path, mode: str) -> Iterator[Any]:
 
 
 def write_groups(path: Path, groups: Iterable[Group]) -> None:
-    """Write a file of groups, whole or not at all; without groups, write no file.
-
-    Groups are written one by one, so that an iterator needs the memory of one.
-    """
+    """Write groups one by one to a file, whole or not at all; without groups, write no file."""
     groups = iter(groups)
     first = next(groups, None)
     if first is None:

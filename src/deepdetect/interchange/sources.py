@@ -162,10 +162,7 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
 
 
 def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
-    """Return the names of the images below a folder, by the names that their npz files may have.
-
-    These are the path with or without suffix, and the stem if it is unique.
-    """
+    """Return the names of images by what npz files may be called: their path, or a unique stem."""
     if folder is None:
         return None
     names: dict[str, set[str]] = {}

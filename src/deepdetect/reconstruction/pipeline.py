@@ -78,7 +78,7 @@ def reconstruct(
             camera, which is the left one of a rectified pair.
         detector: a detector as in `match_images`; default `DeepDetect("dense")`.
         channels: order of the colours in images that are arrays, as in `load_image`.
-        calibration: file of the cameras; also a `Calibration`. Without one the focal length is
+        calibration: file of the cameras. A `Calibration` also works. By default the focal length is
             `focal_px`, or that of EXIF.
         focal_px: focal length in pixels of both cameras, instead of a calibration.
         rectified: whether matches lie on the same row of both images. None: detected.
@@ -178,7 +178,7 @@ def estimate_pose(
         image0, image1: anything `load_image` takes.
         detector: a detector as in `match_images`; default `DeepDetect()`.
         channels: order of the colours in images that are arrays, as in `load_image`.
-        calibration: file of the cameras; also a `Calibration`. Without one the focal length is
+        calibration: file of the cameras. A `Calibration` also works. By default the focal length is
             `focal_px`, or that of EXIF.
         focal_px: focal length in pixels of both cameras, instead of a calibration.
         seed: seed of all random choices.

@@ -67,8 +67,8 @@ MAX_BEHIND_FRACTION = 0.25
 """A calibration is wrong if more points lie behind the cameras. Chosen by hand."""
 
 MAX_ROTATION_ERROR_PX, MIN_ROTATION_FRACTION = 0.3, 0.5
-"""A rotation explains a disparity up to this error, and the pair if it explains more than this
-fraction: it was at least 0.64 for four views rotated by half a degree to two."""
+"""A rotation explains a disparity up to this error, and a pair if it explains more than this share
+of the disparities: it was 0.64 or more for four views rotated by half a degree to two."""
 
 MAX_RATIO_TO_PLANE = 0.5
 """The median error of the rotation must be below this share of that of the best plane in disparity:

@@ -69,10 +69,7 @@ def refine_matches(
 
 
 def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
-    """Choose whole pixels (N, 2) that can be aligned well; return (M,) int64 rows, ascending.
-
-    Each of `count` cells of the image gives its best corner (Shi and Tomasi, 1994).
-    """
+    """Return rows (M,) of whole pixels (N, 2): the best Shi-Tomasi corner of `count` cells."""
     column, row = np.asarray(points, np.int64).reshape(-1, 2).T
     strength = cv2.cornerMinEigenVal(gray, CORNER_WINDOW_PX)[row, column]
     side = np.sqrt(gray.size / count)

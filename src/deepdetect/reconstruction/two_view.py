@@ -68,10 +68,7 @@ NO_DEPTH = {
 def refined_corners(
     images: tuple[np.ndarray, np.ndarray], points0: np.ndarray, points1: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the matches at corners, refined to sub-pixel accuracy for the estimation of a pose.
-
-    They start at whole pixels of the first image; those that do not converge are left out.
-    """
+    """Return the matches at corners that converge to sub-pixel accuracy, for a pose."""
     pixels0 = np.rint(points0)
     rows = spread_corners(images[0], pixels0, POSE_CELLS)
     refined, converged = refine_matches(*images, pixels0[rows], points1[rows])
@@ -86,10 +83,7 @@ def reconstruct_two_view(
     seed: int,
     timer: StageTimer,
 ) -> dict[str, Any]:
-    """Reconstruct the points of a pair; return the fields of a `Reconstruction`.
-
-    Matches have sub-pixel accuracy; `images` are uint8 luma.
-    """
+    """Reconstruct points from sub-pixel matches and uint8 luma; return fields of the result."""
     points0, points1 = matches.points0.astype(np.float64), matches.points1.astype(np.float64)
     dropped: dict[str, int] = {}
     with timer.stage("sub-pixel"):

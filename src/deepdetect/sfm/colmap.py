@@ -224,7 +224,7 @@ def write_database(
     (K, 2) indices of keypoints.
     """
     with quiet_pycolmap() as pycolmap, pycolmap.Database.open(path) as database:
-        cameras: dict[int, tuple[int, int]] = {}  # camera and rig by the object
+        cameras: dict[int, tuple[int, int]] = {}  # numbers of camera and rig, by object
         numbers: dict[str, int] = {}
         for name, (points, intrinsics) in images.items():
             if id(intrinsics) not in cameras:

@@ -53,19 +53,19 @@ MAX_VOLUME = 3e7
 """A copy with more pixels times inverse depths is scaled down further, which bounds the memory."""
 
 TAIL_FRACTION, DEPTH_MARGIN = 0.002, 0.2
-"""The search leaves out this fraction of the sparse points at each end of their inverse depths, and
-extends the range by the second fraction at each end. Chosen by hand."""
+"""The search ignores this fraction of the sparse points at each end of their inverse depths, which
+may be wrong, and then extends the range by the second fraction at each end. Chosen by hand."""
 
 MIN_FAR = 0.1
 """The search ends at this share of the smallest inverse depth of a sparse point. Chosen by hand."""
 
 MAX_APPROACH = 0.5
-"""Neighbours are aligned at a depth of which the foremost has covered at most this share, because
-images cannot be aligned at a depth that a camera has passed. Chosen by hand."""
+"""Images are first aligned at one depth, which must lie ahead of all cameras: the foremost one has
+covered at most this share of the way to it. Chosen by hand."""
 
 PARALLAX_QUANTILE = 0.5
-"""Inverse depths are spaced so that this quantile of the pixels moves by one pixel from one to the
-next: the median, because pixels near the epipole hardly move."""
+"""The search takes such steps that a pixel at this quantile moves by one pixel in each: the median,
+because pixels near the epipole hardly move."""
 
 SAME_SURFACE_PX = 1.0
 """Two inverse depths are on different surfaces if a match in a small copy moves by more."""
@@ -105,8 +105,8 @@ MIN_WEIGHT = 0.02
 """Weight of a pixel without texture in these fits; half of the textured ones have more than 0.5."""
 
 MIN_VIEWS = 3
-"""Number of images, with the reference, that must agree on a pixel: two alone are not checked by a
-third. `fusion` asks for other numbers in some places."""
+"""Number of images that must agree on a pixel, including its own: a third one confirms the match of
+two. `fusion` asks for other numbers in some places."""
 
 DEPTH_PIXEL = np.dtype(
     [("plane", np.float32, 3), ("error", np.float32), ("color", np.uint8, 3)], align=True
@@ -117,10 +117,7 @@ each neighbour alone would give; `color` is sRGB."""
 
 
 def find_references(sparse: SparseModel) -> list[list[RegisteredImage]]:
-    """Choose the neighbours of each image: those that share many points at a good angle.
-
-    Returns, for each image, a list of it and its neighbours, best first.
-    """
+    """Return each image with its best neighbours, those that share many points at a good angle."""
     found = []
     for image in sorted(sparse.images.values(), key=lambda image: -len(image.points)):
         scored: list[tuple[float, RegisteredImage]] = []

@@ -115,10 +115,7 @@ def write_text(found: MultiViewReconstruction, folder: Path, output: Path) -> No
 
 
 def write_mesh(found: MultiViewReconstruction, folder: Path, output: Path) -> None:
-    """Write mesh.ply and mesh.glb: a coloured surface through the dense points.
-
-    It is made by COLMAP's screened Poisson reconstruction (Kazhdan and Hoppe, 2013).
-    """
+    """Write mesh.ply and mesh.glb: COLMAP's screened Poisson surface (Kazhdan and Hoppe, 2013)."""
     cloud = found.dense
     if len(cloud):
         box = robust_box(cloud)

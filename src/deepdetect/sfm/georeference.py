@@ -29,14 +29,14 @@ MIN_FIXES = 3
 """Number of positions that must agree: with two, the rotation about their line is undetermined."""
 
 MAX_SCALE_STD = 0.25
-"""A place needs a smaller relative standard deviation of the scale, which is large if positions lie
-close together for their accuracy. Chosen by hand."""
+"""A model gets a place only if the relative standard deviation of its scale is smaller. It is large
+if positions lie close together for their accuracy. Chosen by hand."""
 
 MAX_HEADING_STD_DEG = 20.0
-"""A place needs a smaller standard deviation of the direction of north. Chosen by hand."""
+"""A model gets a place only if north has a smaller standard deviation. Chosen by hand."""
 
 MAX_OPEN_AXIS_DEG = 10.0
-"""If positions alone leave an axis less certain, the cameras' up decides on it. Chosen by hand."""
+"""The cameras' up decides on an axis if positions alone leave it a larger standard deviation."""
 
 GRAVITY_STD_DEG = 2.0
 """Standard deviation of the angles of a gimbal. Chosen by hand."""
@@ -53,8 +53,8 @@ MAX_DISTANCE_PX = 15.0
 """A named pixel means the point of the model that is seen within this distance. Chosen by hand."""
 
 SAME_PLACE_PX = 2.0
-"""The nearest point to the camera is taken among those not farther from the pixel than the closest
-one plus this, since it hides the others. Chosen by hand."""
+"""Points up to this much farther from the pixel than the closest one are also candidates, of which
+the one nearest to the camera is taken, since it hides the others. Chosen by hand."""
 
 NEARLY_A_LINE = "they lie nearly on a line: the rotation of the model about it follows from the \
 assumption that cameras are held upright"

@@ -110,10 +110,7 @@ class SparseModel:
 
 
 def verify_pairs(database: Path, seed: int = 0, workers: int | None = None) -> dict[Pair, int]:
-    """Estimate the two-view geometries of matched pairs and store them in the database.
-
-    Returns the number of inliers of each pair that has enough of them.
-    """
+    """Store the two-view geometries of matched pairs; return the inlier counts of sound ones."""
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_VERIFIED)
         how.ransac.max_error = MAX_VERIFICATION_ERROR_PX
@@ -236,10 +233,7 @@ def _names(model: Any) -> frozenset[str]:
 
 
 def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseModel:
-    """Return the cameras and points of a `pycolmap.Reconstruction`.
-
-    `sources` are the `CameraIntrinsics.source` of each image.
-    """
+    """Return cameras and points of a `pycolmap.Reconstruction`; `sources` are for intrinsics."""
     points = np.empty((len(model.points3D), 3))
     colors = np.empty(points.shape, np.uint8)
     row_of = {}
@@ -266,10 +260,7 @@ def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseMode
 
 
 def adjust(model: Any, known_cameras: bool, tolerance: float = TOLERANCE) -> None:
-    """Adjust all cameras and points of a model (bundle adjustment) with a robust loss.
-
-    It does what `pycolmap.bundle_adjustment` does, whose log cannot be turned off.
-    """
+    """Bundle-adjust a model with a robust loss. pycolmap's own function cannot turn off its log."""
     taken = Counter(model.images[number].camera_id for number in model.reg_image_ids())
     enough = min(taken.values()) >= MIN_VIEWS_OF_PRINCIPAL_POINT
     with quiet_pycolmap() as pycolmap:
@@ -301,10 +292,7 @@ def adjust_refined(model: Any, known_cameras: bool) -> None:
 
 
 def normalise_model(model: Any) -> None:
-    """Transform a `pycolmap.Reconstruction` into the frame of the camera that sees most points.
-
-    The unit of length becomes `camera_spacing`.
-    """
+    """Give a model the frame of the camera that sees most points, and `camera_spacing` as unit."""
     sparse = read_sparse_model(model)
     view = max(sparse.images.values(), key=lambda image: len(image.points)).view
     centres = np.array([each.centre for each in sparse.views.values()])

@@ -76,8 +76,8 @@ def reconstruct_many(
         output: folder for the results.
         detector: detector of the keypoints. None: a `PointDetector` of 8,192 points.
         selection: which keypoints are kept, as in `extract_features`.
-        calibration: file of the cameras, taken to be exact. Also a `Calibration` or a `Camera`.
-            Without one, focal length and distortion are estimated.
+        calibration: file of the cameras, which are kept fixed. A `Calibration` or a `Camera` also
+            works. Without one, focal length and distortion are estimated.
         focal_px: rough focal length of all images in pixels; by default from EXIF, or a guess.
         seed: seed of all random choices; COLMAP's threads may still cause small differences.
         options: options of all stages.
@@ -199,10 +199,7 @@ def _usable_images(
     calibration: Camera | Calibration | str | Path | None,
     unregistered: dict[str, str],
 ) -> tuple[dict[str, tuple[int, int]], Mapping[str, Camera]]:
-    """Return sizes and known cameras of the images with enough keypoints and a size that fits.
-
-    The others are added to `unregistered` with the reason.
-    """
+    """Return sizes and cameras of usable images; add reasons for others to `unregistered`."""
     for name, count in keypoints.items():
         if count < MIN_KEYPOINTS:
             unregistered[name] = (

@@ -166,10 +166,7 @@ class Stages:
         self.features = self.work / "features.h5"
 
     def folder_of(self, images: str | Path | Sequence[str | Path]) -> Path:
-        """Return the folder of the images.
-
-        It is a folder of links if the images are a list, or the results lie among them.
-        """
+        """Return the folder of the images, or of links to a list, or to images around results."""
         if isinstance(images, (str, Path)):
             if self.output.resolve() == Path(images).resolve():
                 raise OptionError(f"{images} holds the images: give another folder with -o")
@@ -418,6 +415,6 @@ def _depth_task(
 def _fuse_task(
     images: list[RegisteredImage], paths: Mapping[str, Path], stride_px: int
 ) -> np.ndarray:
-    images = [image for image in images if image.view.name in paths]  # others have no map
+    images = [image for image in images if image.view.name in paths]  # others have no depth map
     maps = [(load_arrays(paths[image.view.name]) or {})["depth"] for image in images]
     return fuse_depth_maps([limited_view(image.view) for image in images], maps, stride_px)

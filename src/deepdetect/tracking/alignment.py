@@ -72,10 +72,7 @@ class Patches(NamedTuple):
 
 
 def cut_patches(image: np.ndarray, xy: np.ndarray) -> Patches:
-    """Return the patches around (N, 2) points of a blurred image.
-
-    A patch that reaches into the border is empty, and is never found.
-    """
+    """Return patches around (N, 2) points of a blurred image, empty ones at its border."""
     offsets, weights = _pixels()
     affinities = np.tile(np.eye(2), (len(xy), 1, 1))
     slopes = [

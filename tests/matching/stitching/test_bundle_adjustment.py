@@ -19,7 +19,7 @@ CAMERA = np.array([[600.0, 0, 319.5], [0, 600, 239.5], [0, 0, 1]])
 
 
 def turned(degrees: tuple[float, float, float]) -> np.ndarray:
-    """The homography of a camera that only turned, to the frame of one that did not."""
+    """The homography of a camera that only rotated, to the frame of one that did not."""
     return CAMERA @ cv2.Rodrigues(np.radians(degrees))[0] @ np.linalg.inv(CAMERA)
 
 

@@ -1,4 +1,4 @@
-"""The commands that this distribution adds to `deepdetect`, by entry points of its group."""
+"""Commands that this distribution adds to `deepdetect` by entry points."""
 
 COMMANDS = {
     "Training": {
@@ -10,7 +10,7 @@ COMMANDS = {
         ),
     },
 }
-"""The commands by group: the module of the function, and a summary."""
+"""Commands by group; each has the module of its function and a summary."""
 
 DEVELOPMENT = {
     "Measuring": {
@@ -39,4 +39,4 @@ DEVELOPMENT = {
         "average": ("deepdetect_lab.cli.train", "Average several weights."),
     },
 }
-"""The commands of `deepdetect dev`, in the same form."""
+"""Commands of `deepdetect dev`, in the same form."""

@@ -1,4 +1,4 @@
-"""`deepdetect dev datasets`: data sets on the web."""
+"""Commands of `deepdetect dev datasets`, which download data sets."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def get(
 ) -> Result:
     """Download a data set and unpack it.
 
-    Run it again to resume a download that broke off.
+    Run the command again to resume an interrupted download.
 
         deepdetect dev datasets get coco
         deepdetect train --preset paper data/coco -o run

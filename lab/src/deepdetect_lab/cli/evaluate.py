@@ -1,4 +1,4 @@
-"""`deepdetect dev evaluate`, `evaluate-stereo`, `benchmark` and `demo`: what weights are worth."""
+"""Commands that evaluate: `evaluate`, `evaluate-stereo`, `compare-clouds`, `benchmark`."""
 
 from __future__ import annotations
 
@@ -13,21 +13,19 @@ from deepdetect._shared.options import look_up
 from deepdetect.cli import _options as cli
 from deepdetect.cli._detection import NETWORK
 from deepdetect.detector.detector import DeepDetect, HeatmapDetector
-from deepdetect.detector.heatmap import HeatmapOptions
 from deepdetect.detector.pretrained import PRETRAINED
 
 from ..datasets import StereoPair
 from ..datasets.middlebury import load_middlebury
-from ..datasets.planar import load_oxford
 from ..evaluation.baselines.external import find_feature
 from ..evaluation.benchmarks import BENCHMARKS, run_benchmarks
-from ..evaluation.options import PAPER_RESOLUTION_PX, BenchmarkOptions
+from ..evaluation.options import BenchmarkOptions
 from ..evaluation.protocols.dense_points import CLOUD_COLUMNS, CLOUD_NOTE
 from ..evaluation.protocols.dense_points import compare_clouds as compare
 from ..evaluation.protocols.masks import LabelDetector
 from ..evaluation.protocols.stereo_matches import score_stereo_matches
 from ..evaluation.report import Table
-from ..evaluation.weights import Evaluation, evaluate_oxford
+from ..evaluation.weights import Evaluation
 from ..evaluation.weights import evaluate as run
 from ..labels import find_label_settings
 
@@ -45,7 +43,6 @@ def evaluate(
     /,
     *,
     compare: list[str] | None = None,
-    labels: bool = False,
     scale: list[float] | None = None,
     **values: Any,
 ) -> cli.Result:
@@ -53,8 +50,8 @@ def evaluate(
 
     Prints the mean binary cross-entropy (BCE) and intersection over union (IoU), the expected
     calibration error over all pixels, and the density of keypoints at 0.5 and of the masks,
-    separately for normal and for low-visibility images; with --oxford also what the paper's
-    protocol gives. What cannot be read or measured is listed at the end, and in no score.
+    separately for normal and for low-visibility images. With --oxford it also prints the scores of
+    the paper's protocol. Unreadable files are listed at the end and are not in the scores.
 
         deepdetect dev evaluate samples/ --weights run/deepdetect.onnx --compare other.onnx
         deepdetect dev evaluate photos/ --scale 0.5 --scale 1 --scale 2
@@ -62,15 +59,10 @@ def evaluate(
 
     Args:
         compare: Evaluate these weights too, beside the first; may be repeated.
-        labels: With --oxford: measure the labels too, which weights without error would give.
         scale: Score the images scaled by this factor too, on labels of their own; may be repeated.
             The images then need no masks.
     """
     measures = MEASURES.take(values)
-    if labels and "oxford" not in measures:
-        raise OptionError("--labels measures on the Oxford scenes: name their folder with --oxford")
-    # What is missing is said before hours of work.
-    scenes = load_oxford(measures["oxford"]) if "oxford" in measures else []
     measures |= {"samples": samples, "scales": tuple(scale or ()), "quiet": False}
     weights = [values.pop("weights", "default"), *(compare or ())]
     detectors = [DeepDetect(path, **values) for path in weights]
@@ -82,18 +74,13 @@ def evaluate(
     report = {**columns[0], **({"compare": columns[1:]} if compare else {})}
     scores: list[Any] = [found[0], *(each.oxford for each in found)]
     scores += [each.foreground for each in found]
-    if labels:
-        squashed = LabelDetector(heatmap_options=HeatmapOptions(PAPER_RESOLUTION_PX))
-        scores.append(evaluate_oxford(squashed, scenes, quiet=False))
-        report["labels"] = {"oxford": asdict(scores[-1])}
-        columns.append({"weights": "labels", **report["labels"]})
     by_scale = [
         {f"x{row['scale']:g} {row['visibility']}": row for row in column.get("scales", ())}
         for column in columns
     ]
     text = cli.table(*({**c, "scales": s} for c, s in zip(columns, by_scale, strict=True)))
     failures = [failure for score in scores if score is not None for failure in score.failures]
-    # What all weights lack is listed once.
+    # Failures that all weights share are listed once.
     return cli.Result(report, text, list(dict.fromkeys(failures)), what="parts")
 
 
@@ -127,18 +114,18 @@ def evaluate_stereo(
     weights: list[str] | None = None,
     label_settings: list[str] | None = None,
 ) -> cli.Result:
-    """Match rectified stereo pairs, and evaluate the matches by their true disparity.
+    """Match rectified stereo pairs and evaluate the matches by their true disparity.
 
-    Matching uses neither the rows nor the truth; a match is correct within 1 px. Random points of
-    the same density and all pixels are the baselines.
+    Matching uses neither the rectification nor the true disparity. A match is correct within 1 px.
+    Random points of the same density and all pixels are the baselines.
 
         deepdetect dev evaluate-stereo cones/ teddy/ --weights default --weights dense
         deepdetect dev evaluate-stereo cones/ teddy/ --label-settings mine.toml
 
     Args:
-        weights: default, dense, free or espnet, the pretrained weights, or a file; may be repeated.
-        label_settings: Label settings whose labels are the keypoints, without a network: paper or
-            dense, or a file; may be repeated.
+        weights: Pretrained weights (default, dense, free or espnet), or a file; may be repeated.
+        label_settings: Label settings (paper or dense), or a file: the labels are the keypoints,
+            without a network; may be repeated.
     """
     pairs: list[StereoPair] = []
     failures: list[str] = []
@@ -161,12 +148,13 @@ def evaluate_stereo(
 def compare_clouds(
     model: Annotated[Path, Parameter(help="Folder of `deepdetect reconstruct`.")],
     /,
-    *clouds: Annotated[Path, Parameter(help="PLY files in its frame.", required=True)],
+    *clouds: Annotated[Path, Parameter(help="PLY files in the frame of the model.", required=True)],
 ) -> cli.Result:
-    """Compare the dense points of a model with the clouds of other programs.
+    """Compare the dense points of a model with point clouds of other programs.
 
-    Prints how much of the images each cloud covers, and how far its depths are from those of
-    model.ply. The clouds must be in the frame of the model: give OpenMVS or COLMAP its sparse/0.
+    Prints how much of the images each cloud covers, and how much its depths differ from those of
+    model.ply. The clouds must be in the coordinate frame of the model, so run OpenMVS or COLMAP on
+    its sparse/0.
 
         deepdetect dev compare-clouds model/ openmvs/scene_dense.ply colmap/fused.ply
     """
@@ -193,9 +181,9 @@ def benchmark(
     geometry_weights: list[str] | None = None,
     **values: Any,
 ) -> cli.Result:
-    """Write a report on the detectors: report.md with figures, tables/*.csv, report.json.
+    """Evaluate detectors and write a report: report.md with figures, tables/*.csv, report.json.
 
-    A second run does only what is new. What cannot be measured is listed at the end (exit code 1).
+    A second run computes only new results. Failures are listed at the end (exit code 1).
 
         deepdetect dev benchmark oxford --data data --max-pairs 1 --baselines sift -o quick
         deepdetect dev benchmark oxford --data data -o report --method xfeat.onnx
@@ -204,12 +192,14 @@ def benchmark(
     Args:
         data: Folder of the data sets.
         output: Folder for the report.
-        protocol: paper, standard, guided or degraded; may be repeated.  [default: all but degraded]
-        method: A further method, NAME, FILE.onnx or MODULE:FUNCTION; may be repeated.
-        baselines: Classical methods, with commas between; none for none. [default: all]
-        preset: published: show the network the channels as the paper's code does (BGR).
-        cache: Folder of the stages' results.  [default: cache in the output]
-        geometry_weights: Weights for stereo pairs, as --weights; may be repeated.  [default: dense]
+        protocol: Protocol: paper, standard, guided or degraded; may be repeated.
+            [default: all except degraded]
+        method: A further method: NAME, FILE.onnx or MODULE:FUNCTION; may be repeated.
+        baselines: Classical methods, separated by commas, or none. [default: all]
+        preset: published: give the network BGR images, as the paper's code does.
+        cache: Folder for cached results.  [default: cache in the output]
+        geometry_weights: Name or file of weights for stereo pairs; may be repeated.
+            [default: dense]
     """
     output = cli.output_folder(output)
     if values.get("resolution") not in (None, "auto", "native"):
@@ -231,7 +221,7 @@ def benchmark(
     )
     report = run_benchmarks(names, data, options, cache=cache or output / "cache", quiet=False)
     paths = report.save(output)
-    tables = [f"{t.title}\n\n{t.to_markdown()}\n" for t in report.tables() if t.in_text]
+    tables = [f"{t.title}\n\n{t.to_markdown()}\n" for t in report.tables()]
     skipped = [f"skipped: {reason}" for reason in report.skipped if reason not in report.failures]
     return cli.Result(
         {**report.values(), "files": paths},

@@ -1,9 +1,10 @@
-"""`deepdetect train` and its kinds, `label`, `shards` and `average`."""
+"""Commands for training: `train`, the other networks, `label`, `shards` and `average`."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,9 +31,8 @@ from ..training import (
     write_shards,
 )
 from ..training import train as train_network
-from ..training import train_descriptor as train_descriptor_network
-from ..training import train_match_filter as train_filter
-from ..training import train_points as train_ranker
+from ..training import train_on_pairs as train_network_on_pairs
+from ..training.run import PairOptions
 
 Folder = Annotated[Path, Parameter(help="Folder of images; `train` also takes shards.")]
 RUN = cli.From(
@@ -43,8 +43,8 @@ RUN = cli.From(
     types={"init_weights": list[str] | None},
     defaults={
         "validation": "one image in twenty is held out",
-        "labels": "in the run's folder",
-        "init_weights": "random ones, by the seed",
+        "labels": "in the output folder",
+        "init_weights": "random, by the seed",
     },
 )
 RECIPE = cli.From(
@@ -67,31 +67,31 @@ RECIPE = cli.From(
 )
 DEVICE = cli.From(DeviceOptions, "device")
 SHARDS = replace(RECIPE, common="max_images augmentations", more="short_sides square val_fraction")
-"""What of a recipe is fixed once the labels are made."""
+"""Options of a recipe that cannot change after the labels are made."""
 
 SHARD_SIZE = cli.From(write_shards, "shard_size", more="")
 ENGINE = replace(EXTRACTION, common="")
-POINTS_RUN = cli.From(train_ranker, "validation num_workers", more="", types={"validation": Path})
-FILTER_RUN = cli.From(train_filter, "validation", more="", types={"validation": Path})
-DESCRIPTOR_RUN = cli.From(
-    train_descriptor_network,
+PAIRS_RUN = cli.From(
+    train_network_on_pairs,
     "validation init_weights device num_workers",
     more="",
     flags={"init_weights": "--init"},
     types={"validation": Path, "init_weights": Path | None},
-    defaults={"init_weights": "random ones, by the seed", "num_workers": "0 on a CPU"},
+    defaults={"init_weights": "random, by the seed", "num_workers": "0 on a CPU"},
 )
+WORKERS_RUN = replace(PAIRS_RUN, common="validation num_workers")
+FILTER_RUN = replace(PAIRS_RUN, common="validation")
 
 
 def chosen_label_settings(
     detectors: str | None = None, label_settings: str | None = None
 ) -> LabelOptions:
-    """Find settings by name or TOML file; detectors replace theirs.
+    """Find label settings by name or TOML file; given detectors replace its detectors.
 
     Args:
-        detectors: Some of sift, orb, brisk, fast, agast, harris, shi-tomasi, canny, sobel, with
-            commas between.  [default: all]
-        label_settings: Detectors and their settings: paper or dense, or a file.  [default: paper]
+        detectors: Detectors, separated by commas: sift, orb, brisk, fast, agast, harris,
+            shi-tomasi, canny, sobel.  [default: all]
+        label_settings: Detectors and their settings: paper, dense, or a file.  [default: paper]
     """
     settings = find_label_settings(label_settings or "paper")
     if detectors is None:
@@ -109,8 +109,8 @@ def chosen_recipe(
     """Return a preset's training options with the given values changed.
 
     Args:
-        preset: Recipe that the other options change: default (its values are shown here), dense
-            (normal light only, denser labels), and of ESPNet espnet or paper (the paper's own).
+        preset: Recipe, which other options change: default (its values are shown here), dense
+            (normal light only, denser labels), espnet (ESPNet), or paper (ESPNet as in the paper).
     """
     if "stages" in values:
         values["stages"] = tuple(map(Stage.parse, values["stages"]))
@@ -118,7 +118,7 @@ def chosen_recipe(
     labels = chosen_label_settings(detectors, label_settings)
     if label_settings is not None:
         values["labels"] = labels
-    elif detectors is not None:  # the preset's settings, for the detectors that are used
+    elif detectors is not None:  # the preset's settings of the chosen detectors
         values["labels"] = recipe.labels.with_detectors(labels.detectors)
     return replace(recipe, **values)
 
@@ -138,17 +138,17 @@ def train(
 ) -> cli.Result:
     """Train the network on the images, or the shards, in a folder.
 
-    Labels are made first, once, by the detectors of `deepdetect label`. The run's folder gets
-    checkpoint.safetensors, best.safetensors and deepdetect.onnx (the weights of the lowest
-    validation loss) and the loss curves, curves.csv and curves.png. An interrupted run resumes when
-    the same command is given again.
+    First, labels are made once by the detectors of `deepdetect label`. The output folder gets
+    checkpoint.safetensors, best.safetensors and deepdetect.onnx (the weights with the lowest
+    validation loss), and the loss curves curves.csv and curves.png. Run the same command again to
+    resume an interrupted run.
 
         deepdetect train photos/ -o run
         deepdetect detect photo.jpg --weights run/deepdetect.onnx
 
     Args:
         output: Folder of the run.
-        profiling: Time 30 steps of each stage and report what limits the speed; train nothing.
+        profiling: Only time 30 steps of each stage, and report what limits the speed.
     """
     run = RUN.take(values)
     if given := run.pop("init_weights", None):
@@ -156,7 +156,7 @@ def train(
     run |= {"device": DeviceOptions(**DEVICE.take(values)), "log": cli.say}
     recipe = chosen_recipe(**values)
     if profiling:
-        profiles = [asdict(each) for each in profile(images, output, recipe, **run)]
+        profiles = profile(images, output, recipe, **run)
         return cli.Result(profiles, "\n".join(map(cli.table, profiles)))
     result = train_network(images, output, recipe, **run)
     best = result.best
@@ -173,70 +173,70 @@ def train(
     )
 
 
-@cli.command(POINTS_RUN, cli.From(PointsTrainingOptions, "steps seed"))
+def _train_on_pairs(
+    images: Path, output: Path, make_options: Callable[..., PairOptions], values: dict[str, Any]
+) -> cli.Result:
+    run = {**PAIRS_RUN.take(values), "log": cli.say}
+    result = train_network_on_pairs(images, output=output, options=make_options(**values), **run)
+    files = {"weights": result.weights, "onnx": result.onnx}
+    return cli.Result({**files, "best": result.best, "points": result.points})
+
+
+@cli.command(WORKERS_RUN, cli.From(PointsTrainingOptions, "steps seed"))
 def train_points(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
     """Train the ranker of keypoints on the images in a folder.
 
-    Pairs of views are made of single images, so no labels are needed. The run's folder gets
-    best.npz (the weights of the highest validation score), MODEL_CARD.md, curves.csv, curves.png
-    and checkpoint.safetensors. An interrupted run resumes when the same command is given again.
+    Pairs of synthetic views are generated from single images, so no labels are needed. The output
+    folder gets best.npz, MODEL_CARD.md, the curves and a checkpoint. Run the same command again to
+    resume an interrupted run.
 
         deepdetect dev train-points photos/train --validation photos/val -o run
 
     Args:
         output: Folder of the run.
     """
-    run = {**POINTS_RUN.take(values), "output": output, "log": cli.say}
-    result = train_ranker(images, options=PointsTrainingOptions(**values), **run)
-    return cli.Result({"weights": result.weights, "best": result.best, "points": result.points})
+    return _train_on_pairs(images, output, PointsTrainingOptions, values)
 
 
-@cli.command(DESCRIPTOR_RUN, cli.From(DescriptorTrainingOptions, "steps pairs seed"))
+@cli.command(PAIRS_RUN, cli.From(DescriptorTrainingOptions, "steps pairs seed"))
 def train_descriptor(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
     """Train the learned descriptor of keypoints on the images in a folder.
 
-    Pairs of views are made of single images, so no labels are needed. The run's folder gets
-    descriptor.onnx and descriptor.safetensors (the weights of the highest validation score),
-    MODEL_CARD.md, curves.csv, curves.png and checkpoint.safetensors. An interrupted run resumes
-    when the same command is given again.
+    Pairs of synthetic views are generated from single images, so no labels are needed. The output
+    folder gets descriptor.onnx, descriptor.safetensors, MODEL_CARD.md, the curves and a checkpoint.
+    Run the same command again to resume an interrupted run.
 
         deepdetect train-descriptor photos/train --validation photos/val -o run
 
     Args:
         output: Folder of the run.
     """
-    run = {**DESCRIPTOR_RUN.take(values), "output": output, "log": cli.say}
-    result = train_descriptor_network(images, options=DescriptorTrainingOptions(**values), **run)
-    files = {"weights": result.weights, "onnx": result.onnx}
-    return cli.Result({**files, "best": result.best, "points": result.points})
+    return _train_on_pairs(images, output, DescriptorTrainingOptions, values)
 
 
 @cli.command(FILTER_RUN, cli.From(MatchFilterTrainingOptions, "steps drawn val_pairs seed"))
 def train_match_filter(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
-    """Train the network that tells right matches from wrong ones by their neighbours.
+    """Train the network that separates correct matches from wrong ones by their neighbours.
 
-    Pairs of views are made of single images. The run's folder gets match_filter.onnx and
-    match_filter.safetensors (the weights of the lowest validation loss), MODEL_CARD.md, curves.csv,
-    curves.png and checkpoint.safetensors.
+    Pairs of synthetic views are generated from single images. The output folder gets
+    match_filter.onnx, match_filter.safetensors, MODEL_CARD.md, the curves and a checkpoint. Run the
+    same command again to resume an interrupted run.
 
         deepdetect dev train-match-filter photos/train --validation photos/val -o run
 
     Args:
         output: Folder of the run.
     """
-    run = {**FILTER_RUN.take(values), "output": output, "log": cli.say}
-    result = train_filter(images, options=MatchFilterTrainingOptions(**values), **run)
-    files = {"weights": result.weights, "onnx": result.onnx}
-    return cli.Result({**files, "best": result.best, "points": result.points})
+    return _train_on_pairs(images, output, MatchFilterTrainingOptions, values)
 
 
 @cli.command(PRESET, LABELS, SHARDS, SHARD_SIZE, ENGINE)
 def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Result:
     """Pack the images in a folder with their labels into tar files.
 
-    They are in WebDataset's layout. Training reads a few of them at a time, so they may be on a
-    slow disk or a network. Give both commands the same options. When it is interrupted, the same
-    command resumes.
+    The files have WebDataset's layout. Training reads a few of them at a time, so they may be on a
+    slow disk or a network drive. Give both commands the same options. Run the same command again to
+    resume after an interruption.
 
         deepdetect dev shards --preset paper data/coco -o data/shards
         deepdetect train --preset paper data/shards -o run
@@ -246,7 +246,7 @@ def shards(images: Folder, /, *, output: cli.Output, **values: Any) -> cli.Resul
     """
     folder = cli.output_folder(output)
     how = {**SHARD_SIZE.take(values), **_engine(values)}
-    # Shards are for any stages: one that fits every size stands for them.
+    # Shards fit any stages, so a stage for every size is given here.
     recipe = chosen_recipe(**{**values, "stages": ["16x1x1"]})
     made = write_shards(images, folder, recipe, quiet=False, **how)
     return cli.Result(
@@ -270,9 +270,9 @@ def label(
 ) -> cli.Result:
     """Mark the keypoints and edges of images (files or folders) by nine classical detectors.
 
-    Writes a 1-bit PNG mask STEM.png for each image: white where one of the detectors marks the
-    pixel. Masks that exist already are skipped, unless their image has changed; what was made of
-    another image or with other settings is replaced with --overwrite only.
+    Writes a 1-bit PNG mask STEM.png for each image: white where a detector marks the pixel.
+    Existing masks of unchanged images are skipped. Masks of another image or of other settings are
+    only replaced with --overwrite.
 
         deepdetect label photos/ -o masks
         deepdetect label photo.jpg -o masks --detectors fast,sobel --visualize
@@ -318,7 +318,7 @@ def average(
     *weights: Annotated[
         str,
         Parameter(
-            help=".safetensors files, or default, dense, free or espnet; one twice counts double.",
+            help=".safetensors files, or default, dense, free or espnet; repeat one to double it.",
             required=True,
         ),
     ],
@@ -327,14 +327,14 @@ def average(
 ) -> cli.Result:
     """Average weights (a model soup) into best.safetensors and deepdetect.onnx.
 
-    The mean of runs that continue each other is often better than each of them; one file alone is
-    written as ONNX. Files of another run are replaced with --overwrite only.
+    The mean of successive runs is often better than each of them. A single file is just converted
+    to ONNX. Files of another run are only replaced with --overwrite.
 
         deepdetect dev average first/best.safetensors second/best.safetensors -o mean
         deepdetect dev evaluate samples/ --weights mean/deepdetect.onnx
 
     Args:
-        output: Folder for both files.
+        output: Folder for the two files.
     """
     folder = cli.output_folder(output)
     files = {"weights": folder / "best.safetensors", "onnx": folder / "deepdetect.onnx"}

@@ -1,4 +1,4 @@
-"""Data sets with ground truth, and those on the web (`known/datasets.json`)."""
+"""Data sets with ground truth, and downloads of data sets (`known/datasets.json`)."""
 
 import json
 from functools import cache, partial
@@ -13,7 +13,7 @@ from .posed_images import PosedImage, PosedScene, load_posed_scenes
 
 @cache
 def remote_datasets() -> dict[str, RemoteDataset]:
-    """Return the data sets on the web by name."""
+    """Return the data sets that can be downloaded, by name."""
     return {name: _remote_dataset(name, **entry) for name, entry in _known("datasets").items()}
 
 

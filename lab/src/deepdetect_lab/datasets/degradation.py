@@ -1,6 +1,6 @@
-"""Copies of photographs as a camera would have taken them in little light, or blurred.
+"""Simulate photographs in little light, out of focus, or with motion blur.
 
-To add a degradation, write a function from linear light in [0, 1] and a random generator to the
+To add a degradation, write a function from linear light in [0, 1] and a random generator to an
 8-bit image, and add it to `DEGRADATIONS`.
 """
 
@@ -17,22 +17,23 @@ from deepdetect._shared.image_array import srgb_to_linear
 from deepdetect._shared.opencv import cv2
 
 FULL_WELL = 10_000.0
-"""Electrons that white gives in full light, each colour of each pixel by itself; their number is
-Poisson distributed (shot noise)."""
+"""Mean number of electrons of white in full light, for each colour of each pixel. Shot noise is
+Poisson noise of this number. Chosen by hand; not measured."""
 
 READ_NOISE = 3.0
-"""Standard deviation in electrons of what reading the sensor adds (Gaussian)."""
+"""Standard deviation of Gaussian read noise, in electrons. Chosen by hand; not measured."""
 
 
 @dataclass(frozen=True)
 class Degradation:
-    """What is done to an image.
+    """A degradation of images.
 
     Attributes:
-        name: as "dark-8".
-        title: how tables name it.
-        apply: makes uint8 sRGB of float32 linear light in [0, 1], (H, W, 3), and random numbers.
-        version: raise it when a change of the code changes the result.
+        name: short name, for example "dark-8".
+        title: name in tables.
+        apply: function from (H, W, 3) float32 linear light in [0, 1] and a random generator to
+            uint8 sRGB.
+        version: number to increase whenever a change of the code changes the result.
     """
 
     name: str
@@ -42,42 +43,42 @@ class Degradation:
 
 
 def degrade(rgb: np.ndarray, degradation: Degradation) -> np.ndarray:
-    """Return a degraded copy of (H, W, 3) uint8 sRGB; the same one for the same image."""
+    """Return a degraded copy of (H, W, 3) uint8 sRGB; it is the same in every call."""
     own = int.from_bytes(hashlib.sha256(rgb.tobytes()).digest()[:8], "little")
     return degradation.apply(to_linear(rgb), np.random.default_rng([0, own]))
 
 
 def to_linear(rgb: np.ndarray) -> np.ndarray:
-    """Undo the gamma of sRGB (IEC 61966-2-1): uint8 to float32 in [0, 1]."""
+    """Convert uint8 sRGB (IEC 61966-2-1) to float32 linear light in [0, 1]."""
     return srgb_to_linear().astype(np.float32)[rgb]
 
 
 def to_srgb(linear: np.ndarray) -> np.ndarray:
-    """Apply the gamma of sRGB, and round to uint8."""
+    """Convert linear light to uint8 sRGB."""
     light = np.clip(linear, 0, 1)
     value = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     return np.rint(255 * value).astype(np.uint8)
 
 
 def darken(linear: np.ndarray, generator: np.random.Generator, fraction: float) -> np.ndarray:
-    """Photograph a scene in a fraction of the light, with the same exposure and gain."""
+    """Simulate a photograph in a fraction of the light, with the same exposure and gain."""
     electrons = generator.poisson(linear * (fraction * FULL_WELL)).astype(np.float32)
     electrons += generator.normal(0, READ_NOISE, linear.shape).astype(np.float32)
     return to_srgb(electrons / FULL_WELL)
 
 
 def blur_gaussian(linear: np.ndarray, _: np.random.Generator, sigma_px: float) -> np.ndarray:
-    """Photograph a scene out of focus: a Gaussian blur."""
+    """Simulate defocus by a Gaussian blur."""
     return to_srgb(cv2.GaussianBlur(linear, (0, 0), sigma_px))
 
 
 def blur_motion(linear: np.ndarray, generator: np.random.Generator, length_px: float) -> np.ndarray:
-    """Photograph a scene while the camera moves evenly, in a direction drawn for the image."""
+    """Simulate uniform camera motion in a random direction, which the image determines."""
     return to_srgb(cv2.filter2D(linear, -1, motion_kernel(length_px, generator.uniform(0, np.pi))))
 
 
 def motion_kernel(length_px: float, angle: float) -> np.ndarray:
-    """Return the kernel of an even motion along a line around the pixel; its sum is 1.
+    """Return the kernel of uniform motion along a line centred at the pixel; its sum is 1.
 
     The angle of the line is in radians, from x towards y.
     """

@@ -1,6 +1,7 @@
-"""Data sets on the web: downloaded with resuming and checksums, unpacked, and checked.
+"""Download data sets with resuming and checksums, unpack them, and check them.
 
-It is our own, on `requests`: pooch does not resume a broken download, as COCO's 19 GB need.
+It uses `requests` and not pooch, because pooch does not resume a broken download, which the 19 GB
+of COCO need.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ from deepdetect.io.image import find_images
 from deepdetect.io.image_file import IMAGE_SUFFIXES
 
 CHUNK_BYTES = 1 << 16
-"""At most this much is lost when a download breaks off."""
+"""Downloads are written in blocks of this size, so that an interruption loses at most one."""
 
 TIMEOUT_SECONDS = 60.0
-"""A host that sends nothing for this long has failed."""
+"""A host is given up if it sends nothing for this long. Chosen by hand; not measured."""
 
 ARCHIVE_SUFFIXES = (".zip", ".tar.gz", ".tgz", ".tar")
 
@@ -37,20 +38,20 @@ WRITE_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO),
     *(errno.EMFILE, errno.ENFILE),
 )
-"""What the disk or the system refuses; other errors of unpacking lie in the archive."""
+"""Errors of the disk or the system; other errors of unpacking mean a bad archive."""
 
 
 @dataclass(frozen=True)
 class RemoteFile:
-    """A file on the web.
+    """A file to download.
 
     Attributes:
-        urls: its official host first, then mirrors; the next one is tried when one fails.
-        size: in bytes, roughly.
+        urls: addresses, the official host first, then mirrors; they are tried in this order.
+        size: approximate size in bytes.
         checksum: "md5:..." or "sha256:..."; None: the contents of the data set are checked.
-        into: in the data set, the folder that an archive is unpacked into, or a file's path.
-        inside: folder of the archive whose contents are taken.
-        suffixes: endings of the files that are taken from a tar archive; empty for all files.
+        into: folder of the data set to unpack an archive into, or path of a single file.
+        inside: folder of the archive whose contents are used.
+        suffixes: endings of the files to unpack from a tar archive; empty for all files.
     """
 
     urls: tuple[str, ...]
@@ -68,19 +69,19 @@ class RemoteFile:
 
 @dataclass(frozen=True)
 class RemoteDataset:
-    """A data set of images on the web.
+    """A data set of images to download.
 
     Attributes:
-        name: the name users choose it by.
-        title: what it is.
-        files: archives, which are unpacked, and single files.
+        name: name by which users choose it.
+        title: short description.
+        files: archives to unpack, and single files.
         images: number of images.
         licence: the terms of use.
-        contents: `content_digest` of files by their path in the data set, which does not depend
-            on the archive or the image format they came in.
-        texts: files that are written, not downloaded, by path in the data set.
-        prepare: turns what was unpacked into the data set, in the folder that it is given; its
-            second argument says whether it shows no progress.
+        contents: `content_digest` of files by their path in the data set; it does not depend on
+            the archive or the image format.
+        texts: contents of text files to write, by path in the data set.
+        prepare: function that converts the unpacked files in a folder to the data set; its second
+            argument says whether progress bars are off.
     """
 
     name: str
@@ -94,19 +95,19 @@ class RemoteDataset:
 
     @property
     def size(self) -> int:
-        """Bytes of the download."""
+        """Size of the download in bytes."""
         return sum(file.size for file in self.files)
 
 
 def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = True) -> Path:
-    """Download and unpack a data set, unless it is there already.
+    """Download and unpack a data set, unless the folder already holds it.
 
-    A download that broke off is resumed. The folder appears when all images are in it and are
-    the right ones; then the archives are removed.
+    An interrupted download is resumed. The folder appears when all images are complete and correct;
+    then the archives are removed.
 
     Args:
         dataset: the data set.
-        folder: where its images go.
+        folder: folder for its images.
         quiet: show no progress bar.
 
     Returns:
@@ -126,7 +127,7 @@ def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = Tru
         paths = [store / f"{k:02d}-{file.name}" for k, file in enumerate(dataset.files)]
         every = zip(dataset.files, paths, strict=True)
         missing = [(file, path) for file, path in every if not path.exists()]
-        # Twice the size: for the archives, and for what is unpacked.
+        # Archives and unpacked files together need about twice the size.
         done = sum(file_state(_part(path))[0] for _, path in missing)
         needed = dataset.size + sum(file.size for file, _ in missing) - done
         free = shutil.disk_usage(store).free
@@ -151,15 +152,15 @@ def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = Tru
 
 
 def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
-    """Download a file; it appears when it is whole and its checksum is right.
+    """Download a file, which appears when it is complete and its checksum is correct.
 
-    Until then the bytes are in `path` with ".part" added, where the next call resumes. Where every
-    host fails, the error is that of the last one.
+    Until then the bytes are in `path` with ".part" added, so the next call can resume. If all hosts
+    fail, the error of the last host is raised.
     """
     part = _part(path)
     for k, url in enumerate(file.urls):
         if k and file.checksum is None:
-            part.unlink(missing_ok=True)  # another host may have other bytes
+            part.unlink(missing_ok=True)  # another host may send other bytes
         try:
             _fetch(url, file, part, quiet)
             if file.checksum is not None and not has_checksum(part, file.checksum):
@@ -172,7 +173,7 @@ def download(file: RemoteFile, path: Path, *, quiet: bool = True) -> None:
         except DeepDetectError as error:
             failure = error
         except requests.RequestException as error:
-            what, advice = type(error).__name__, "give the same command again to resume"
+            what, advice = type(error).__name__, "run the same command again to resume"
             if error.response is not None:
                 what, advice = f"the server answers {error.response.status_code}", "try again later"
             failure = DeepDetectError(f"{url} cannot be downloaded ({what}): {advice}")
@@ -187,11 +188,11 @@ def has_checksum(path: Path, checksum: str) -> bool:
 
 
 def content_digest(folder: Path, name: str) -> str | None:
-    """Return the SHA-256 of a file's content in any format, None when there is no such file.
+    """Return the SHA-256 of a file's content in any format; None if there is no such file.
 
-    Of an image, which is named without its suffix, the pixels with their shape and type are
-    digested, so that a lossless copy in another format has the same digest; of any other file the
-    words, without white space.
+    Images are named without suffix. Their digest covers pixels, shape and type, so a lossless copy
+    in another format has the same digest. The digest of other files covers the words without white
+    space.
     """
     path = folder / name
     if path.is_file() and path.suffix.lower() not in IMAGE_SUFFIXES:
@@ -215,13 +216,13 @@ def _fetch(url: str, file: RemoteFile, part: Path, quiet: bool) -> None:
     have = file_state(part)[0]
     headers = {"Range": f"bytes={have}-"} if have else {}
     with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT_SECONDS) as response:
-        if response.status_code == 416:  # nothing is missing, which the checksum confirms
+        if response.status_code == 416:  # the file is complete; the checksum confirms it
             if file.checksum is None:
                 part.unlink()
-                raise requests.ConnectionError("the partial file is of another file")
+                raise requests.ConnectionError("the partial file belongs to another file")
             return
         response.raise_for_status()
-        if response.status_code != 206:  # the server sends all of it again
+        if response.status_code != 206:  # the server sends the whole file again
             have = 0
         length = response.headers.get("Content-Length")
         total = have + int(length) if length else max(file.size, have)
@@ -253,7 +254,7 @@ def _check(dataset: RemoteDataset, folder: Path, subject: str) -> None:
 
 
 def _assemble(dataset: RemoteDataset, paths: Sequence[Path], final: Path, quiet: bool) -> None:
-    """Unpack into a folder beside the final one, and rename it when it is complete and right."""
+    """Unpack into a temporary folder, and rename it when it is complete and correct."""
     unfinished = final.with_name(f".{final.name}.part")
     shutil.rmtree(unfinished, ignore_errors=True)
     unfinished.mkdir(parents=True)
@@ -273,7 +274,7 @@ def _assemble(dataset: RemoteDataset, paths: Sequence[Path], final: Path, quiet:
         _check(dataset, unfinished, "the download")
     except DeepDetectError:
         shutil.rmtree(unfinished)
-        for path in paths:  # or the same wrong files would be used again
+        for path in paths:  # otherwise the same wrong files would be used again
             path.unlink()
         raise
     if final.exists():
@@ -290,15 +291,15 @@ def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
         else:
             with tarfile.open(archive) as tar:
                 while tar.fileobj.read(CHUNK_BYTES):
-                    pass  # the checksum of gzip lies behind the last member
+                    pass  # reads gzip to its end, where its checksum is
                 endings = file.suffixes or ("",)
                 members = [m for m in tar if not m.isdir() and m.name.lower().endswith(endings)]
                 _extract(members, lambda one: _extract_file(tar, one, target), quiet)
-    except Exception as error:  # zip, tar and their compressions raise many kinds
+    except Exception as error:  # zip, tar and their compressions raise many types
         if isinstance(error, OSError) and error.errno in WRITE_ERRORS:
             raise
         raise DeepDetectError(
-            f"{file.urls[0]} is no archive that can be unpacked ({first_line(error)}): try again"
+            f"{file.urls[0]} cannot be unpacked ({first_line(error)}): try again"
         ) from None
     if file.inside and (target / file.inside).is_dir():
         for entry in sorted((target / file.inside).iterdir()):
@@ -307,13 +308,13 @@ def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
 
 
 def _extract_file(tar: tarfile.TarFile, member: tarfile.TarInfo, target: Path) -> None:
-    """Write a file of a tar archive below a folder; a link becomes a copy.
+    """Extract a file of a tar archive into a folder; a link becomes a copy.
 
-    Python has a filter for it from 3.11.4 on only.
+    Python's own filter for safe extraction exists only since 3.11.4.
     """
     path, content = target / member.name, tar.extractfile(member)
     if content is None or not path.resolve().is_relative_to(target.resolve()):
-        raise tarfile.TarError(f"{member.name!r} leads outside, or is no file")
+        raise tarfile.TarError(f"{member.name!r} is outside the folder or not a file")
     path.parent.mkdir(parents=True, exist_ok=True)
     with content, path.open("wb") as file:
         shutil.copyfileobj(content, file)

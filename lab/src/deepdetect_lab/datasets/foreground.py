@@ -1,6 +1,6 @@
 """Photographs with a mask of their foreground, for example ECSSD (Yan et al., 2013).
 
-NAME.jpg (or .png) and NAME_mask.png lie side by side; the mask is white on the foreground.
+A folder holds pairs NAME.jpg (or .png) and NAME_mask.png; masks are white on the foreground.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ SUFFIXES = (".jpg", ".png")
 
 @dataclass(frozen=True)
 class MaskedPhotograph:
-    """A photograph's file and that of its foreground."""
+    """The files of a photograph and of its foreground mask."""
 
     image: Path
     mask: Path
 
 
 def load_foreground(folder: str | Path) -> list[MaskedPhotograph]:
-    """List the photographs that have a mask; an ImageError where there is none."""
+    """List the photographs with masks; raise an ImageError without any."""
     found = []
     for mask in sorted(Path(folder).glob("*_mask.png")):
         stem = mask.name.removesuffix("_mask.png")

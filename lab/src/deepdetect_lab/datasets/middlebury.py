@@ -1,13 +1,13 @@
 """Rectified stereo with ground truth: Middlebury 2003 to 2014 (Scharstein and Szeliski).
 
-A scene is a folder with left.png, right.png, disparity.png (of the left view) and a calib.json,
-which says how the grey values of the disparity become pixels::
+A scene is a folder with left.png, right.png, disparity.png (of the left view) and calib.json, which
+says how grey values are converted to disparities in pixels::
 
     {"ground_truth": {"file": "disparity.png", "value_per_pixel": 4.0,
                       "resolution_factor": 1.0, "unknown": 0}}
 
-A pixel's disparity in the full-size image is its value / value_per_pixel; resolution_factor is
-the width of the map over that of the image.
+The disparity in pixels of the full-size image is the grey value divided by value_per_pixel;
+resolution_factor is the width of the disparity map divided by that of the image.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from deepdetect.io.image_file import open_image
 
 @dataclass(frozen=True, eq=False)
 class StereoPair:
-    """Two rectified views: the match of the left (x, y) is the right (x - disparity, y).
+    """Two rectified views; the left pixel (x, y) matches the right pixel (x - disparity, y).
 
     Attributes:
         name: the scene's name.
@@ -50,7 +50,7 @@ class CalibratedStereoPair(StereoPair):
 
 
 def load_middlebury(folder: str | Path) -> StereoPair:
-    """Load a scene with its ground truth, at the size and in the pixels of the images."""
+    """Load a scene with its ground truth, at the size and in pixels of the images."""
     root, left, right = _load_views(folder)
     path = root / "calib.json"
     try:
@@ -66,16 +66,16 @@ def load_middlebury(folder: str | Path) -> StereoPair:
     with open_image(file) as image:
         stored, is_gray = np.asarray(image), image.mode == "L" or image.mode.startswith("I")
     if not is_gray or not value > 0:
-        raise ImageError(f"the ground truth {file} is no grey image with a scale above 0")
+        raise ImageError(f"the ground truth {file} is not a grey image with a scale above 0")
     disparity = np.where(stored == unknown, np.nan, stored / value).astype(np.float32)
-    # A map may be smaller than the images: each pixel has the nearest of its values.
+    # A map may be smaller than the images; it is upscaled by nearest neighbours.
     size = (left.shape[1], left.shape[0])
     disparity = np.asarray(Image.fromarray(disparity).resize(size, Image.Resampling.NEAREST))
     return StereoPair(root.name, left, right, disparity)
 
 
 def load_calibrated_pair(folder: str | Path) -> CalibratedStereoPair:
-    """Load a scene with its calib.json, without its ground truth: the disparity is NaN."""
+    """Load a scene with its calib.json but without ground truth; the disparity is NaN."""
     root, left, right = _load_views(folder)
     size = (left.shape[1], left.shape[0])
     calibration = Calibration.load(root / "calib.json", size)

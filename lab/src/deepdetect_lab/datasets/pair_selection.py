@@ -1,4 +1,4 @@
-"""Which pairs of a collection of images are matched: the same ones every time."""
+"""Choose, reproducibly, the pairs of a collection of images to match."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ Item = TypeVar("Item")
 
 
 FRAME_DISTANCES = (1, 3, 5, 10, 15, 20)
-"""Between the two images of a pair of a sequence, in frames."""
+"""Distances in frames between the images of a sequence's pairs. Chosen by hand; not measured."""
 
 
 def unordered_pairs(count: int, max_pairs: int) -> list[tuple[int, int]]:
-    """Choose pairs of images in no order: all, or `max_pairs` evenly spaced ones of more."""
-    # Counted, not listed: ten thousand images have fifty million pairs.
+    """Choose all pairs of unordered images, or `max_pairs` evenly spaced ones if there are more."""
+    # Pairs are not listed, because ten thousand images have fifty million.
     ends = np.cumsum(np.arange(count - 1, 0, -1))
     ranks = np.array(evenly_spaced(range(count * (count - 1) // 2), max_pairs), int)
     first = np.searchsorted(ends, ranks, side="right")
@@ -27,7 +27,7 @@ def unordered_pairs(count: int, max_pairs: int) -> list[tuple[int, int]]:
 def sequence_pairs(
     frames: Sequence[int], max_pairs: int, distances: Sequence[int]
 ) -> list[tuple[int, int]]:
-    """Choose pairs of frame numbers: as many evenly spaced ones at each of the distances."""
+    """Choose pairs of frame numbers, equally many at each distance and evenly spaced."""
     existing = set(frames)
     starts_per_distance = max(1, max_pairs // len(distances))
     pairs = [
@@ -41,7 +41,7 @@ def sequence_pairs(
 
 
 def evenly_spaced(items: Sequence[Item], count: int) -> list[Item]:
-    """Return evenly spaced ones of a sequence, the first and the last included."""
+    """Return evenly spaced items of a sequence, including the first and the last."""
     if len(items) <= count:
         return list(items)
     return [items[row] for row in np.linspace(0, len(items) - 1, count).round().astype(int)]

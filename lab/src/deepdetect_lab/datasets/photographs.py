@@ -1,7 +1,7 @@
-"""Photographs to train on: crops of pictures in public repositories, each with its licence.
+"""Training photographs: crops of photographs in public repositories, each with its licence.
 
 Their list, `known/photographs.csv.gz`, was made by `benchmarks/list_photographs.py` of commit
-81b8253, without near copies and without the data sets that the network is measured on.
+81b8253. It has no near-duplicates and no images of the data sets used for evaluation.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from .download import RemoteFile
 
 CROP_SIDE_PX = 480
 JPEG_QUALITY = 97
-"""Labels hardly change by it: the loss is below the noise of a photograph."""
+"""Labels hardly change at this JPEG quality, because the loss is smaller than image noise."""
 
 VALIDATION_SHARE = 1 / 20
 
 FREE_LICENCES = ("CC0", "CC BY", "CC BY-SA", "Unsplash")
-"""Beginnings of the licences that allow any use, of weights that were trained on them too."""
+"""Prefixes of licences that allow any use, including use of weights trained on the images."""
 
 RESTRICTED = re.compile(r"\b(n[cd]|non-?commercial|no-?deriv\w*)\b", re.IGNORECASE)
-"""What a licence says that begins as a free one and is not."""
+"""Restrictions in licences that begin like a free one."""
 
 LICENCES_FILE = "licences.csv"
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
@@ -49,7 +49,7 @@ SOURCES_FOLDER = "sources"
 
 @dataclass(frozen=True)
 class Source:
-    """A repository on GitHub, "OWNER/NAME", at a commit, whose archive has so many megabytes.
+    """A GitHub repository "OWNER/NAME" at a commit; `megabytes` is the size of its archive.
 
     The names of its crops begin with `name`.
     """
@@ -61,7 +61,7 @@ class Source:
 
     @property
     def archive(self) -> RemoteFile:
-        """The archive of the commit."""
+        """The archive of the commit, as a file to download."""
         owner, name = self.repository.split("/")
         return RemoteFile(
             (f"https://github.com/{owner}/{name}/archive/{self.commit}.tar.gz",),
@@ -74,7 +74,7 @@ class Source:
 
 @cache
 def listed_sources() -> dict[str, Source]:
-    """Return the repositories that crops are listed of, by name."""
+    """Return the repositories of the listed crops, by name."""
     text = resources.files(__package__).joinpath("known/sources.json").read_text("utf-8")
     names = ("name", "repository", "commit", "megabytes")
     return {row["name"]: Source(*(row[name] for name in names)) for row in json.loads(text)}
@@ -82,9 +82,9 @@ def listed_sources() -> dict[str, Source]:
 
 @dataclass(frozen=True)
 class Crop:
-    """A square of a picture of a `Source`, with the picture's licence and the SHA-256 of its file.
+    """A square crop of a photograph of a `Source`, with its licence and the SHA-256 of its file.
 
-    Its upper left corner is (x, y) in the picture, scaled to a shorter side of `short_side_px`.
+    The photograph is scaled to a shorter side of `short_side_px`; (x, y) is the upper left corner.
     """
 
     source: str
@@ -97,18 +97,18 @@ class Crop:
 
     @property
     def is_free(self) -> bool:
-        """Whether the licence allows any use: CC BY does, CC BY-NC and CC BY-ND do not."""
+        """Whether the licence allows any use, as CC BY does, unlike CC BY-NC and CC BY-ND."""
         return self.licence.startswith(FREE_LICENCES) and not RESTRICTED.search(self.licence)
 
     @property
     def part(self) -> str:
-        """Where it goes, "train" or "val": all crops of a picture to the same."""
+        """Part of the data set, "train" or "val"; it is the same for all crops of a photograph."""
         return "val" if int(self.sha256[:8], 16) < VALIDATION_SHARE * 2**32 else "train"
 
 
 @cache
 def listed_crops() -> tuple[Crop, ...]:
-    """Return all crops, those of a picture one after the other."""
+    """Return all crops, with those of a photograph in a row."""
     file = resources.files(__package__).joinpath("known/photographs.csv.gz")
     text = gzip.decompress(file.read_bytes()).decode()
     return tuple(
@@ -118,9 +118,9 @@ def listed_crops() -> tuple[Crop, ...]:
 
 
 def write_crops(folder: Path, quiet: bool, crops: Sequence[Crop]) -> None:
-    """Replace the repositories below `sources` by crops in `train` and `val`, and licences.csv.
+    """Replace the repositories in `sources` by crops in `train` and `val`, and licences.csv.
 
-    Crops of a picture come one after the other.
+    Crops of the same photograph must be in a row.
     """
     rows = [("file", "picture", "licence", "sha256")]
     with progress(len(crops), "cropping", "crop", quiet) as bar:
@@ -138,7 +138,7 @@ def write_crops(folder: Path, quiet: bool, crops: Sequence[Crop]) -> None:
 
 
 def _cut(sources: Path, crops: Sequence[Crop]) -> Iterator[tuple[Crop, Image.Image]]:
-    """Yield crops with their pixels; a picture is read once for all of its crops."""
+    """Yield crops with their pixels; each photograph is read once for all of its crops."""
     for listed, of_picture in groupby(crops, attrgetter("source", "path", "sha256")):
         source, path, sha256 = listed
         try:
@@ -147,7 +147,7 @@ def _cut(sources: Path, crops: Sequence[Crop]) -> Iterator[tuple[Crop, Image.Ima
             raise DeepDetectError(f"{source} has no {path}: get the archive again") from None
         if hashlib.sha256(content).hexdigest() != sha256:
             raise DeepDetectError(
-                f"{path} of {source} is not the picture that is listed: get the archive again"
+                f"{path} of {source} differs from the listed photograph: get the archive again"
             )
         picture = Image.fromarray(load_image(content))
         for crop in of_picture:
@@ -155,10 +155,10 @@ def _cut(sources: Path, crops: Sequence[Crop]) -> Iterator[tuple[Crop, Image.Ima
 
 
 def cut(picture: Image.Image, short_side_px: int, x: int, y: int) -> Image.Image:
-    """Scale a picture and cut a square of `CROP_SIDE_PX` out of it."""
+    """Scale a photograph and crop a square of `CROP_SIDE_PX`."""
     scale = short_side_px / min(picture.size)
     size = [max(short_side_px, round(side * scale)) for side in picture.size]
-    # Only what is needed is scaled: some pictures have 100 megapixels.
+    # Only the crop is scaled, because some photographs have 100 megapixels.
     box = np.array([x, y, x + CROP_SIDE_PX, y + CROP_SIDE_PX]) * (
         np.array(picture.size * 2) / np.array(size * 2)
     )

@@ -1,4 +1,4 @@
-"""Planar scenes with true homographies: Oxford, HPatches, and the paper's badly visible pairs."""
+"""Planar scenes with true homographies: Oxford, HPatches, and the paper's low-visibility pairs."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ NOT_IN_D2NET_SUBSET = {
     *("i_contruction", "i_crownnight", "i_dc", "i_pencils", "i_whitebuilding"),
     *("v_artisans", "v_astronautis", "v_talent"),
 }
-"""The eight scenes of HPatches beyond 1600x1200, which most papers leave out (D2-Net's list)."""
+"""HPatches scenes above 1600x1200 pixels, which most papers leave out, as D2-Net's paper does."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlanarPair:
-    """Two images of a plane, or from one point of view; the first one's number is 1.
+    """Two images of a plane, or from one viewpoint; the number of the first image is 1.
 
-    The (3, 3) homography takes columns (x, y, 1) of the first image to the second; centre of the
-    first pixel (0, 0). `kind` is what changes between them, "" where the data set does not say.
+    The (3, 3) homography maps columns (x, y, 1) of the first image to the second; the centre of the
+    first pixel is (0, 0). `kind` is the change between the images, "" if unknown.
     """
 
     scene: str
@@ -54,24 +54,24 @@ class PlanarPair:
 
     @property
     def name(self) -> str:
-        """As papers write it: "graf 1-6"."""
+        """Name as in papers, for example "graf 1-6"."""
         return f"{self.scene} 1-{self.number}"
 
 
 @dataclass(frozen=True, eq=False)
 class PlanarScene:
-    """A scene: the pairs of its first image with each other one."""
+    """A scene and the pairs of its first image with each other image."""
 
     name: str
     pairs: tuple[PlanarPair, ...]
 
     @property
     def images(self) -> list[Path]:
-        """All of its images."""
+        """All images of the scene."""
         return [self.pairs[0].first, *(pair.second for pair in self.pairs)]
 
     def with_max_pairs(self, max_pairs: int) -> PlanarScene:
-        """Return the scene with evenly spaced ones of its pairs, at most so many; one: the last."""
+        """Return the scene with at most `max_pairs` evenly spaced pairs; 1 takes the last pair."""
         kept = self.pairs[-1:] if max_pairs == 1 else evenly_spaced(self.pairs, max_pairs)
         return replace(self, pairs=tuple(kept))
 
@@ -79,9 +79,9 @@ class PlanarScene:
 def load_oxford(
     folder: str | Path, truth: Literal["published", "refined"] = "published"
 ) -> list[PlanarScene]:
-    """List the eight scenes (Mikolajczyk et al., 2005), or those of them that are there.
+    """List the Oxford scenes in a folder, at most eight (Mikolajczyk et al., 2005).
 
-    The "published" truth is in H1toKp; "refined" reads H1toKp.refined where there is one.
+    "published" homographies are read from H1toKp, "refined" ones from H1toKp.refined if it exists.
     """
     scenes = []
     for name, kind in OXFORD_KINDS.items():
@@ -100,9 +100,9 @@ def load_oxford(
 
 
 def load_hpatches(folder: str | Path) -> list[PlanarScene]:
-    """List the scenes that are there (Balntas et al., 2017): 116 in the whole set.
+    """List the HPatches scenes in a folder, at most 116 (Balntas et al., 2017).
 
-    The folders i_NAME (light) and v_NAME (viewpoint) hold 1.ppm (or .png) to 6, H_1_2 to H_1_6.
+    The folders i_NAME (light) and v_NAME (viewpoint) hold 1.ppm (or .png) to 6 and H_1_2 to H_1_6.
     """
     root = Path(folder)
     homographies = [f"H_1_{number}" for number in range(2, 7)]
@@ -136,9 +136,9 @@ def _load_scene(
     layout: str,
     kind: str = "",
 ) -> PlanarScene:
-    """Load images, PREFIX1 and so on, and the homographies from the first to each of the others.
+    """Load images PREFIX1, PREFIX2, ... and the homographies from the first to each other image.
 
-    The suffixes are looked for in this order; `layout` says what the folder must hold.
+    Suffixes are tried in the given order; `layout` is a text that says what the folder must hold.
     """
     files = []
     for number in range(1, len(homographies) + 2):

@@ -1,13 +1,13 @@
-"""Folders of images with known cameras, in three public layouts, or with satellite fixes.
+"""Read folders of images with known cameras, in three public layouts, or with GPS positions.
 
-- Strecha's (Strecha et al., 2008): NNNN.jpg or .png with NNNN.camera (or NNNN.jpg.camera).
+- Strecha et al. (2008): NNNN.jpg or .png with NNNN.camera (or NNNN.jpg.camera).
 - KITTI odometry (Geiger et al., 2012): NNNNNN.png or .jpg with calib.txt, whose first line is the
   projection matrix of the images' camera, or K.txt, its camera matrix, and poses.txt, whose line N
   belongs to image N.
-- COLMAP's model, text or binary (Schönberger and Frahm, 2016): in the folder, or in its sparse/ or
-  sparse/0/; the images in the folder or in its images/. Without distortion. pycolmap reads it.
+- COLMAP (Schönberger and Frahm, 2016): a text or binary model without distortion in the folder, in
+  sparse/ or in sparse/0/, and images in the folder or in images/. pycolmap reads the model.
 
-Intrinsics are of the images as they are: where a file names another size, they are scaled to it.
+Intrinsics refer to the image files; if the camera is for another image size, they are scaled.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from .pair_selection import FRAME_DISTANCES, sequence_pairs, unordered_pairs
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 
 MAX_ROTATION_ERROR = 1e-3
-"""By which a rotation's columns may fail to be orthonormal: files have few digits."""
+"""The largest difference of a rotation's columns from orthonormal ones: files have few digits."""
 
 MAX_ASPECT_ERROR = 0.01
-"""By which an image may be stretched against the size that its camera is for: sizes are whole."""
+"""The largest difference of the aspect ratios of an image and its camera: sizes are rounded."""
 
 COLMAP_FILES = ("images.bin", "images.txt")
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image and its camera; centre of the first pixel (0, 0).
+    """An image and its camera; the centre of the first pixel is (0, 0).
 
     Attributes:
         path: the image's file.
@@ -57,7 +57,7 @@ class PosedImage:
 
 @dataclass(frozen=True, eq=False)
 class PosedPair:
-    """Two images of a scene, and how many frames lie between them, None for unordered images."""
+    """Two images of a scene and their distance in frames, None for unordered images."""
 
     scene: str
     first: PosedImage
@@ -66,7 +66,7 @@ class PosedPair:
 
     @property
     def name(self) -> str:
-        """As in "fountain 0000-0005"."""
+        """Name of the pair, for example "fountain 0000-0005"."""
         return f"{self.scene} {self.first.path.stem}-{self.second.path.stem}"
 
     @property
@@ -92,11 +92,11 @@ class PosedScene:
     """A scene.
 
     Attributes:
-        name: the folder's.
-        images: all of them, by name.
-        pairs: those that were chosen.
-        located_only: whether only the places of the cameras are known, in metres, as GPS has them;
-            intrinsics and rotations say nothing, and there are no pairs.
+        name: name of the folder.
+        images: all images, sorted by name.
+        pairs: the chosen pairs.
+        located_only: whether only camera positions are known, in metres, from GPS; intrinsics and
+            rotations are then meaningless, and there are no pairs.
     """
 
     name: str
@@ -108,16 +108,16 @@ class PosedScene:
 def load_posed_scenes(
     folder: str | Path, max_pairs: int = 60, located: bool = False
 ) -> list[PosedScene]:
-    """Read the scene that a folder is, or those that its subfolders are.
+    """Read a folder as one scene, or each of its subfolders as a scene.
 
     Args:
         folder: a scene in one of the three layouts, or a folder of scenes.
-        max_pairs: at most this many pairs of a scene. Of images in no order all pairs, where there
-            are more an evenly spaced choice; of a sequence as many at each of `FRAME_DISTANCES`.
-        located: take folders, too, whose first image has a satellite fix.
+        max_pairs: largest number of pairs of a scene. Pairs of unordered images are evenly spaced;
+            a sequence has equally many pairs at each of `FRAME_DISTANCES`.
+        located: also read folders whose first image has a GPS position.
 
     Raises:
-        ImageError: there is no scene, or a file of one is missing or damaged.
+        ImageError: there is no scene, or a file is missing or damaged.
     """
     root = Path(folder).resolve()
     below = sorted(path for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
@@ -168,7 +168,7 @@ def _load_scene(
 
 
 def _read_strecha(folder: Path) -> list[PosedImage]:
-    """Read K, a row of zeros, the camera's axes and its centre in the world, and the size."""
+    """Read K, a row of zeros, axes and centre of the camera in the world, and the image size."""
     images = []
     for file in sorted(folder.glob("*.camera")):
         numbers = _numbers(_text(file).split(), 26, str(file))
@@ -206,21 +206,21 @@ def _read_kitti(folder: Path) -> list[PosedImage]:
         frame = int(path.stem)
         if frame >= len(lines):
             raise ImageError(
-                f"{poses} has {len(lines)} lines and no pose of {path.name}: line 1 is of 000000"
+                f"{poses} has {len(lines)} lines, but no pose of {path.name}: line 1 is of 000000"
             )
         where = f"line {frame + 1} of {poses}"
         pose = _numbers(lines[frame].split(), 12, where).reshape(3, 4)
         axes, centre = pose[:, :3], pose[:, 3]
         image = _posed_image(path, projection[:, :3], axes.T, -axes.T @ centre, where)
-        _image_size(path)  # damaged images are an error, and those that are to be turned
-        # The poses are of the first camera; the last column leads from it to the images' own.
+        _image_size(path)  # raises errors for damaged images and for EXIF rotations
+        # Poses are those of the first camera; the last column gives the images' offset from it.
         offset = np.linalg.solve(image.intrinsics, projection[:, 3])
         images.append(replace(image, translation=image.translation + offset))
     return images
 
 
 def _colmap_model(folder: Path) -> Path | None:
-    """Return where a model of COLMAP lies, or None."""
+    """Return the folder of a COLMAP model, or None."""
     places = [folder, folder / "sparse", folder / "sparse" / "0"]
     return next((p for p in places if any((p / name).is_file() for name in COLMAP_FILES)), None)
 
@@ -229,9 +229,9 @@ def _read_colmap(folder: Path) -> list[PosedImage]:
     place = _colmap_model(folder) or folder
     try:
         model = import_pycolmap("COLMAP's model").Reconstruction(place)
-    except (ValueError, IndexError, RuntimeError) as error:  # by what is wrong with it
+    except (ValueError, IndexError, RuntimeError) as error:  # the type depends on the damage
         raise ImageError(
-            f"{place} holds no model that pycolmap can read ({first_line(error)}): write cameras, "
+            f"{place} has no model that pycolmap can read ({first_line(error)}): write cameras, "
             "images and points3D with COLMAP"
         ) from None
     images = []
@@ -247,7 +247,7 @@ def _read_colmap(folder: Path) -> list[PosedImage]:
                 f"a camera in {place} is of the model {camera.model_name}, not PINHOLE: undistort "
                 "the images first (colmap image_undistorter)"
             )
-        # The centre of COLMAP's first pixel is (0.5, 0.5).
+        # COLMAP's first pixel has its centre at (0.5, 0.5).
         matrix = camera.calibration_matrix() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
         matrix = _scaled(matrix, (camera.width, camera.height), paths[0], place)
         rotation, translation = pose.rotation.matrix(), np.array(pose.translation)
@@ -259,7 +259,7 @@ def _read_located(folder: Path) -> list[PosedImage]:
     paths = sorted(path for path in folder.iterdir() if path.suffix in SUFFIXES)
     fixes = [(path, fix) for path in paths if (fix := read_gps(path)) is not None]
     places = np.nan_to_num([(fix.latitude, fix.longitude, fix.altitude) for _, fix in fixes])
-    pycolmap = import_pycolmap("places of satellite fixes")
+    pycolmap = import_pycolmap("GPS positions")
     ellipsoid = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
     metres = np.asarray(ellipsoid.ellipsoid_to_enu(places, *places[0]))
     nothing = np.eye(3)
@@ -276,10 +276,10 @@ def _posed_image(
     translation: np.ndarray,
     where: str | Path,
 ) -> PosedImage:
-    """Check the camera of an image."""
+    """Check an image's camera and return both."""
     wrong = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if wrong > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
-        raise ImageError(f"{where} holds no rotation: its columns must be orthonormal")
+        raise ImageError(f"{where} is not a rotation: its columns must be orthonormal")
     lower = [intrinsics[1, 0], intrinsics[2, 0], intrinsics[2, 1], intrinsics[2, 2] - 1]
     if min(intrinsics[0, 0], intrinsics[1, 1]) <= 0 or np.any(lower):
         raise ImageError(
@@ -292,7 +292,7 @@ def _posed_image(
 def _scaled(
     intrinsics: np.ndarray, size: tuple[float, float], image: Path, file: Path
 ) -> np.ndarray:
-    """Scale intrinsics for a (width, height) to the image: pixels are areas, so edges map."""
+    """Scale intrinsics of a (width, height) to the image so that image borders coincide."""
     own = _image_size(image)
     if min(size) <= 0 or abs(own[0] * size[1] / (own[1] * size[0]) - 1) > MAX_ASPECT_ERROR:
         raise ImageError(
@@ -309,7 +309,7 @@ def _image_size(path: Path) -> tuple[int, int]:
         turned = orientation_of(opened) in UPRIGHT
     if turned:
         raise ImageError(
-            f"{path} is to be turned by its EXIF orientation: save it upright without that tag"
+            f"{path} is rotated by its EXIF orientation: save it upright without that tag"
         )
     return size
 
@@ -320,7 +320,7 @@ def _text(path: Path) -> str:
     except OSError as error:
         raise ImageError(f"{path} cannot be read ({error.strerror}): check the folder") from None
     except UnicodeDecodeError:
-        raise ImageError(f"{path} is no text: get it again") from None
+        raise ImageError(f"{path} is not a text file: get it again") from None
 
 
 def _numbers(words: Sequence[str], count: int, where: str) -> np.ndarray:

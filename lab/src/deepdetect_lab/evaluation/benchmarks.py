@@ -1,6 +1,7 @@
-"""The benchmarks, and how they are run.
+"""Run benchmarks by name and collect one report.
 
-To add one, write a function from a run and options to sections, and its line in `BENCHMARKS`.
+To add a benchmark, write a function that takes a run and options and returns sections, and add it
+to `BENCHMARKS`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "foreground": ("paper", "foreground"),
     "low-visibility": ("planar", "low_visibility"),
 }
-"""Module of `protocols`, imported when it is run, and its function, by the benchmark's name."""
+"""Each benchmark has a module of `protocols`, which is imported when it runs, and a function."""
 
 
 def run_benchmarks(
@@ -43,8 +44,8 @@ def run_benchmarks(
 ) -> Report:
     """Run benchmarks of `BENCHMARKS` and collect their report.
 
-    The folder of the data has one for each data set, or is the only one; without a folder for the
-    cache nothing is kept. Missing data are an error of one benchmark alone.
+    The data folder has a subfolder for each data set, or is the folder of the only data set.
+    Without a cache folder no results are kept. If data are missing, only their benchmark fails.
     """
     started = time.monotonic()
     entries = [look_up("benchmark", name, BENCHMARKS) for name in names]
@@ -64,7 +65,7 @@ def run_benchmarks(
     metadata = {
         **provenance(),
         **_weights(names, options),
-        "results made, not found in the cache": str(run.made),
+        "results computed, not read from the cache": str(run.made),
         "minutes": f"{(time.monotonic() - started) / 60:.1f}",
         "peak memory": f"{peak_memory() / 1e9:.2f} GB",
     }
@@ -74,7 +75,7 @@ def run_benchmarks(
 
 
 def _weights(names: Sequence[str], options: BenchmarkOptions) -> dict[str, str]:
-    """Return the names of the weights that were run, with the beginning of their SHA-256."""
+    """Return the names of the evaluated weights, with the beginning of their SHA-256."""
     files = {}
     if set(names) != {"middlebury"}:
         files["weights (SHA-256)"] = [options.detector.weights]

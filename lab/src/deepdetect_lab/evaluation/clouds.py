@@ -1,114 +1,71 @@
-"""Pictures of point clouds from any side, drawn without a screen."""
+"""Pictures of point clouds from any side, by matplotlib."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from deepdetect._shared.opencv import cv2
-from deepdetect.geometry.camera import Camera, PosedView
-from deepdetect.geometry.point_cloud import (
-    BOX_PERCENTILE,
-    PointCloud,
-    angular_spacing,
-    require_points,
-    robust_box,
-)
+from deepdetect.geometry.point_cloud import PointCloud, robust_box
 from deepdetect.viz.draw import add_caption, join_pictures
 
-SUPERSAMPLING = 2
-"""Each pixel is the mean of this many by this many, which makes edges smooth."""
+DPI = 100
+"""Pixels to an inch, in which matplotlib counts."""
 
-FILL_RATIO = 0.95
-"""Fraction of the picture's width or height that the cloud takes."""
+POINT_AREA = 1.5
+"""Area of a drawn point, in units of (1/72 inch)^2. It is 1.7 pixels wide, so that a surface with
+one point per image pixel has no gaps in side views."""
 
-POINT_OVERLAP = 1.4
-"""Points are drawn this much wider than their spacing, to close gaps also in side views."""
-
-MAX_POINT_WIDTH_PX = 5
-"""No point is drawn wider, so that a sparse cloud looks sparse."""
+ZOOM = 2.2
+"""Zoom of the plot; at 1 the robust box of a cloud fills less than half of the figure's width."""
 
 
-def orbit_camera(
+def draw_cloud(
     cloud: PointCloud,
     azimuth: float = 12.0,
     elevation: float = 8.0,
     size: tuple[int, int] = (800, 600),
-) -> PosedView:
-    """Place a camera that looks at the robust centre of a cloud, which fills its picture.
+    like: PointCloud | None = None,
+) -> np.ndarray:
+    """Draw a cloud on white, (H, W, 3) uint8; near points hide far ones.
 
-    Its distance from the centre is that of the left camera, so that small angles give a picture
-    like the photograph: to the right of the scene (azimuth) and up (elevation; 90 looks down).
+    It is seen from the right (azimuth) and from above (elevation), in degrees; the robust box of
+    another cloud, or its own, fills the picture.
     """
-    a, e = np.deg2rad([azimuth, elevation])
-    right = [np.cos(a), 0, np.sin(a)]
-    down = [np.sin(e) * np.sin(a), np.cos(e), -np.sin(e) * np.cos(a)]
-    forward = [-np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)]
-    axes = np.array([right, down, forward])
-    box = robust_box(cloud)
-    distance = max(float(np.linalg.norm(box.centre)), box.radius)
-    translation = distance * np.array([0, 0, 1.0]) - axes @ box.centre
-    # With a focal length of 1 and the axis at 0, to see what the cloud covers.
-    plain = PosedView("", Camera(size, 1.0, (0, 0)), axes, translation)
-    xy, depth = plain.project(cloud.points)
-    low, high = np.percentile(xy[depth > 0], (BOX_PERCENTILE, 100 - BOX_PERCENTILE), axis=0)
-    wanted = FILL_RATIO * np.array(size) / np.maximum(high - low, 1e-6)
-    focal = float(wanted.min())
-    centre = ((np.array(size) - 1) / 2 - focal * (low + high) / 2).tolist()
-    return replace(plain, camera=Camera(size, focal, centre))
-
-
-def render(cloud: PointCloud, camera: PosedView) -> np.ndarray:
-    """Draw a cloud on white, (H, W, 3) uint8, each point as a square that hides what is behind it.
-
-    Each is as wide as a closed surface needs at its spacing and depth.
-    """
-    require_points(cloud)
-    width, height = camera.camera.size
-    fine_camera = camera.camera.scaled((width * SUPERSAMPLING, height * SUPERSAMPLING))
-    nearest = _nearest_points(cloud, replace(camera, camera=fine_camera))
-    # The last colour is that of pixels which show no point.
-    colors = np.append(cloud.colors, np.full((1, 3), 255, np.uint8), axis=0)
-    return cv2.resize(colors[nearest], (width, height), interpolation=cv2.INTER_AREA)
+    figure = Figure((size[0] / DPI, size[1] / DPI), DPI)
+    canvas: Any = FigureCanvasAgg(figure)
+    axes: Any = figure.add_axes((0, 0, 1, 1), projection="3d")
+    box = robust_box(cloud if like is None else like)
+    right, down, ahead = cloud.points.T
+    colors = cloud.colors / 255
+    axes.scatter(
+        right, ahead, -down, c=colors, s=POINT_AREA, marker="s", linewidths=0, depthshade=False
+    )
+    x, y, z = box.centre
+    limits = ((middle - box.radius, middle + box.radius) for middle in (x, z, -y))
+    axes.set(**dict(zip(("xlim", "ylim", "zlim"), limits, strict=True)))
+    axes.set_box_aspect((1, 1, 1), zoom=ZOOM)
+    axes.view_init(elevation, azimuth - 90)
+    axes.set_axis_off()
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 def draw_clouds(left: np.ndarray, clouds: Mapping[str, PointCloud], width: int = 796) -> np.ndarray:
-    """Draw the left image and clouds by title, which share its frame and one unit, two in a row.
+    """Draw the left image and clouds by title in a grid of two columns.
 
-    All are seen by one camera, which the one with the most points places.
+    All are seen from one place, which the one with the most points decides.
     """
     size = (width, max(1, round(width * left.shape[0] / left.shape[1])))
     shrinks = left.shape[1] > width
     image = cv2.resize(left, size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
     panels = [add_caption(image, "left image")]
-    camera = orbit_camera(max(clouds.values(), key=len), size=size)
+    largest = max(clouds.values(), key=len)
     for title, cloud in clouds.items():
-        # Without points there is a white panel, which is what a method that finds none shows.
-        empty = np.full((size[1], size[0], 3), 255, np.uint8)
-        drawn = render(cloud, camera) if len(cloud) else empty
+        drawn = draw_cloud(cloud, size=size, like=largest)
         panels.append(add_caption(drawn, f"{title}: {len(cloud):,} points"))
     return join_pictures(panels, 2)
-
-
-def _nearest_points(cloud: PointCloud, camera: PosedView) -> np.ndarray:
-    """Find which point each pixel shows: (H, W) int64 index, -1 for none."""
-    width, height = camera.camera.size
-    xy, depth = camera.project(cloud.points)
-    spread = camera.camera.focal_px[0] * POINT_OVERLAP * angular_spacing(cloud)
-    sides = spread * np.maximum(cloud.points[:, 2], 0) / np.where(depth > 0, depth, np.inf)
-    sides = np.clip(np.rint(sides), 1, MAX_POINT_WIDTH_PX * SUPERSAMPLING).astype(np.int64)
-    corners = np.rint(xy - (sides[:, None] - 1) / 2)
-    visible = (depth > 0) & (corners > -sides[:, None]).all(1) & (corners < (width, height)).all(1)
-    # From here on a point is its rank by depth, and the smallest rank is what a pixel shows.
-    order = np.flatnonzero(visible)
-    order = order[np.argsort(depth[order].astype(np.float32), kind="stable")]
-    sides, corners = sides[order], corners[order].astype(np.int64)
-    nearest = np.full(width * height, len(order))
-    for across, down in np.ndindex(2 * (int(sides.max(initial=0)),)):
-        rank = np.flatnonzero(sides > max(across, down))
-        column, row = (corners[rank] + (across, down)).T
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        np.minimum.at(nearest, row[inside] * width + column[inside], rank[inside])
-    return np.append(order, -1)[nearest].reshape(height, width)

@@ -1,4 +1,4 @@
-"""What a benchmark compares."""
+"""Options of a benchmark, and the local features that it compares."""
 
 from __future__ import annotations
 
@@ -27,30 +27,32 @@ from .baselines.random import all_pixels_feature, random_feature
 
 PROTOCOLS = ("paper", "standard", "guided", "degraded")
 DEFAULT_PROTOCOLS = PROTOCOLS[:3]
-"""All but "degraded", which measures everything five times."""
+"""The default leaves out "degraded", because it measures everything five times."""
 
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
 PAPER_RESOLUTION_PX = 480
 
 BASELINES: dict[str, LocalFeature] = {**CLASSICAL, **HESSIAN}
-"""The classical baselines by name: the paper's, and those of the standard protocol only."""
+"""Classical baselines by name: those of the paper and those of the standard protocol only."""
 
 
 @suggest_keywords
 @dataclass(frozen=True, eq=False)
 class BenchmarkOptions:
-    """What is compared, and how.
+    """Which methods a benchmark compares, and with which settings.
 
     Attributes:
-        detector: DeepDetect, with the weights that are evaluated.
-        protocols: of `PROTOCOLS`.
+        detector: DeepDetect with the weights to evaluate.
+        protocols: names of protocols from `PROTOCOLS`.
         classical: names of the classical baselines.
         others: further local features.
-        channels: order of the colours in the paper's protocol; "bgr" in the paper's code.
-        geometry_weights: the weights for stereo pairs, one or more.
-        max_pairs: at most this many pairs of each scene, evenly spaced; the last one if it is one.
-        max_images: at most this many of a scene: of a sequence the first, else evenly spaced.
-        ranker: ranker of the points, as for `PointDetector`.
+        channels: order of the colour channels in the paper's protocol; the paper's code uses "bgr".
+        geometry_weights: one or more weights for stereo pairs.
+        max_pairs: largest number of pairs per scene, evenly spaced; 1 takes the last pair.
+        max_images: largest number of images per scene: the first ones of a sequence, else evenly
+            spaced ones.
+        ranker: npz file of `deepdetect dev train-points` that ranks the keypoints. None: the
+            bundled file.
 
     Raises:
         OptionError: a name is unknown, or a number is out of its range.
@@ -75,11 +77,11 @@ class BenchmarkOptions:
         stems = [Path(weights).stem for weights in self.geometry_weights]
         if len(set(stems)) < len(stems):
             raise OptionError(
-                f"two geometry_weights have one name ({', '.join(stems)}): rename a file"
+                f"two geometry_weights have the same name ({', '.join(stems)}): rename a file"
             )
 
     def deepdetect_480(self, threshold: float = 0.5) -> LocalFeature:
-        """Return DeepDetect as the paper runs it: images squashed to 480x480, SIFT of size 3."""
+        """Return DeepDetect as in the paper: 480x480 images, SIFT of size 3."""
         return deepdetect_feature(
             self.detector.configured(HeatmapOptions(PAPER_RESOLUTION_PX, self.channels)),
             SelectionOptions(threshold),
@@ -88,16 +90,16 @@ class BenchmarkOptions:
         )
 
     def native_detector(self) -> DeepDetect:
-        """Return the detector at the image's own size."""
+        """Return the detector at native image resolution."""
         return self.detector.configured(HeatmapOptions("native", self.channels))
 
     def deepdetect_native(self) -> LocalFeature:
-        """Return DeepDetect at the image's own size, all pixels over 0.5."""
+        """Return DeepDetect at native image resolution; all pixels over 0.5 are keypoints."""
         title = "DeepDetect, native resolution, all pixels over 0.5"
         return deepdetect_feature(self.native_detector(), name="deepdetect-native", title=title)
 
     def chance_baselines(self) -> tuple[LocalFeature, LocalFeature]:
-        """Return random points of the number that `deepdetect_480` finds, and all pixels."""
+        """Return two baselines: as many random points as `deepdetect_480` finds, and all pixels."""
         return random_feature(self.deepdetect_480()), all_pixels_feature()
 
     def density_features(self) -> list[LocalFeature]:
@@ -107,16 +109,16 @@ class BenchmarkOptions:
         return without_repeats([*classical, *self.others, *own, *self.chance_baselines()])
 
     def matching_features(self) -> list[LocalFeature]:
-        """Return the rows of Table II: the low settings, DeepDetect, chance baselines."""
+        """Return the rows of Table II: detectors with low settings, DeepDetect, chance."""
         low = [CLASSICAL[name] for name in self.classical if name.endswith("-low")]
         own = [self.deepdetect_480(), *self.chance_baselines()]
         return without_repeats([*low, *self.others, *own])
 
     def standard_features(self) -> list[LocalFeature]:
-        """Return the rows of the standard protocol: default settings, ours sparse, chance."""
+        """Return the rows of the standard protocol: default settings, sparse DeepDetect, chance."""
         ranked = {**STANDARD, **HESSIAN}
         chosen = [name for name in ranked if name in self.classical]
-        # Those with descriptors of their own have a row with these, too.
+        # Features with their own descriptors get a second row that uses them.
         systems = {f.name: f for f in self.others if f.name in BASELINES}
         systems |= {name: STANDARD[name] for name in ("sift", "orb") if name in chosen}
         own = deepdetect_feature(
@@ -142,9 +144,9 @@ class BenchmarkOptions:
 
 
 def without_repeats(features: Sequence[LocalFeature]) -> list[LocalFeature]:
-    """Return the features, each once; two that are not the same must not have one name."""
+    """Remove repeated features; raise an OptionError if two different ones share a name."""
     by_name: dict[str, LocalFeature] = {}
     for feature in features:
         if by_name.setdefault(feature.name, feature).version != feature.version:
-            raise OptionError(f"two methods are named {feature.name}: rename the file of one")
+            raise OptionError(f"two methods are named {feature.name}: rename one of their files")
     return list(by_name.values())

@@ -1,4 +1,4 @@
-"""Seconds and memory of a piece of work."""
+"""Measure time and memory of a piece of work."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from deepdetect._shared.errors import DeepDetectError
 from deepdetect._shared.machine import start_child
@@ -15,70 +16,43 @@ from deepdetect._shared.machine import start_child
 Outcome = TypeVar("Outcome")
 
 
-class Profile(NamedTuple):
+@dataclass
+class Profile:
     """What a piece of work took: wall time, and bytes that the process grew by at most."""
 
     seconds: float = 0.0
     memory: float = 0.0
 
 
-class StageProfiler:
-    """Measures stages that follow each other: `record` ends one. No two may run at a time.
-
-    The memory is exact on Linux, which is told to forget the peak where a stage begins; elsewhere a
-    peak counts where it is the highest of the process so far.
-
-    Attributes:
-        stages: by name; stages of one name add up their seconds, the largest memory counts.
-        total: of all stages; its memory includes what an earlier stage still holds.
-    """
-
-    def __init__(self) -> None:
-        self.stages: dict[str, Profile] = {}
-        self.total = Profile()
-        self._begin()
-        self._first = self._before
-
-    def record(self, name: str) -> None:
-        """End a stage, and begin the next one."""
-        seconds = time.perf_counter() - self._started
-        peak = max(_memory("VmHWM"), self._before)
-        before = self.stages.get(name, Profile())
-        memory = max(before.memory, peak - self._before)
-        self.stages[name] = Profile(before.seconds + seconds, memory)
-        memory = max(self.total.memory, peak - self._first)
-        self.total = Profile(self.total.seconds + seconds, memory)
-        self._begin()
-
-    def _begin(self) -> None:
-        global _highest
-        _highest = peak_memory()
-        with suppress(OSError):
-            Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM, see man 5 proc
-        self._before = _memory("VmRSS")
-        self._started = time.perf_counter()
-
-
 _highest = 0
-"""Of the peaks that were forgotten."""
+"""The highest of the peaks that were forgotten."""
 
 
 @contextmanager
-def profiled() -> Iterator[StageProfiler]:
-    """Measure the time and the growth of memory of the block: the `total`, when it has ended."""
-    profiler = StageProfiler()
-    yield profiler
-    profiler.record("block")
+def profiled() -> Iterator[Profile]:
+    """Measure the time and the growth of memory of a block, which are known when it has ended.
+
+    The memory is exact on Linux, which is told to forget the peak where a block begins; elsewhere a
+    peak counts where it is the highest of the process so far. No two blocks may run at a time.
+    """
+    global _highest
+    _highest = peak_memory()
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")  # resets VmHWM, see man 5 proc
+    profile, before, started = Profile(), _memory("VmRSS"), time.perf_counter()
+    yield profile
+    profile.seconds = time.perf_counter() - started
+    profile.memory = max(_memory("VmHWM") - before, 0)
 
 
 def peak_memory() -> int:
-    """Return the most memory that the process has held so far, in bytes; 0 where unknown."""
+    """Return the peak memory of the process so far, in bytes; 0 if unknown."""
     return max(_highest, _memory("VmHWM"))
 
 
 def _memory(name: str) -> int:
-    """Return a number of bytes of /proc/self/status; the highest so far on other systems."""
-    # Linux's ru_maxrss counts what the process that started this one held, too; this does not.
+    """Return a memory value of /proc/self/status in bytes; the peak so far on other systems."""
+    # Linux's ru_maxrss includes the memory of the parent process; /proc/self/status is exact.
     with suppress(OSError), open("/proc/self/status", encoding="ascii") as status:
         return next(int(line.split()[1]) * 1024 for line in status if line.startswith(f"{name}:"))
     try:
@@ -90,21 +64,21 @@ def _memory(name: str) -> int:
 
 
 def run_in_child(function: Callable[..., Outcome], *arguments: Any) -> Outcome:
-    """Call a module's function in a process whose `peak_memory` is that of its work alone.
+    """Call a module-level function in a new process, so that `peak_memory` measures only its work.
 
-    OpenCV and our kernels have one thread there. Raises a DeepDetectError where the process was
-    ended from outside, else what the function raises.
+    OpenCV and our kernels use one thread there. Errors of the function are passed on; a
+    DeepDetectError is raised if the process is killed.
     """
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
     from concurrent.futures.process import BrokenProcessPool
 
-    # Spawned: a fork would begin with all memory of this process.
+    # A forked process would start with all memory of this one, so a new one is spawned.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context, initializer=start_child) as pool:
         try:
             return pool.submit(function, *arguments).result()
         except BrokenProcessPool:
             raise DeepDetectError(
-                "its process was ended, probably for lack of memory: take fewer or smaller images"
+                "the process was killed, probably for lack of memory: use fewer or smaller images"
             ) from None

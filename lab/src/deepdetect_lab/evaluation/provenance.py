@@ -18,7 +18,7 @@ PACKAGES = ("numpy", *DISTRIBUTIONS, "pillow", *RUNTIMES)
 
 
 def provenance() -> dict[str, str]:
-    """Return what is written into every checkpoint, weights file and report, by name."""
+    """Return by name the values that every checkpoint, weights file and report records."""
     program, *arguments = sys.argv or [""]
     name = Path(program).name
     command = ["deepdetect" if name == "__main__.py" else name, *arguments]
@@ -39,7 +39,7 @@ def _versions() -> list[str]:
 
 
 def _commit() -> str:
-    """Return the git commit of the sources, with "+" when files are modified, or ""."""
+    """Return the git commit of the sources, with "+" if files are modified; "" if unknown."""
 
     def git(*words: str) -> str:
         command = ["git", "-C", str(Path(__file__).resolve().parent), *words]
@@ -47,7 +47,7 @@ def _commit() -> str:
         return done.stdout.strip()
 
     try:
-        # An installed package may lie in the folder of another project's repository.
+        # An installed package may be inside the repository of another project.
         git("ls-files", "--error-unmatch", __file__)
         changed = git("status", "--porcelain", "--", ":/src", ":/lab/src")
         return git("rev-parse", "HEAD") + ("+" if changed else "")

@@ -1,4 +1,4 @@
-"""A report: rows of values, tables and charts made of them, written as Markdown, CSV and JSON."""
+"""Reports: tables and charts of measured values, written as Markdown, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from deepdetect._shared.atomic import atomic_path
 from deepdetect._shared.opencv import cv2
 
 Cell = str | int | float | None
-"""What a table holds: None is shown as a dash."""
+"""The value of a table's cell; None is shown as a dash."""
 
 Row = dict[Any, Any]
-"""What was measured once: values by name."""
+"""The values of one measurement by name."""
 
 Rows = list[Row]
 
@@ -31,22 +31,22 @@ def where(rows: Iterable[Row], **wanted: Any) -> Rows:
 
 
 def mean(rows: Iterable[Row], name: Any) -> float | None:
-    """Return the mean of the values of this name that are not NaN; None without any."""
+    """Return the mean of the values of this name that are not NaN; None if there are none left."""
     return mean_of(row[name] for row in rows)
 
 
 def mean_of(values: Iterable[float | None]) -> float | None:
-    """Return the mean of the values that are not None or NaN; None without any."""
+    """Return the mean of the values that are neither None nor NaN; None if no value is left."""
     known = [value for value in values if value is not None and value == value]
     return float(np.mean(known)) if known else None
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table; its key, as "oxford_matches", is the name of its file.
+    """A table whose key, for example "oxford_matches", is the name of its file.
 
     The columns say how numbers are written, as ".3f", ",d" or ".1%", by title. The rows have cells
-    by title; one that is missing, None or NaN is a dash. report.md only names one not `in_text`.
+    by title; one that is missing, None or NaN is a dash.
     """
 
     key: str
@@ -54,10 +54,9 @@ class Table:
     columns: Mapping[str, str]
     rows: Sequence[Row]
     note: str = ""
-    in_text: bool = True
 
     def values(self) -> list[dict[str, Cell]]:
-        """Return each row in the order of the columns; JSON has no NaN: it becomes None."""
+        """Return the rows in the order of the columns; NaN becomes None, since JSON has no NaN."""
         return [
             {
                 title: None if isinstance(cell, float) and not math.isfinite(cell) else cell
@@ -68,7 +67,7 @@ class Table:
         ]
 
     def to_markdown(self) -> str:
-        """Write the table in Markdown: names to the left, numbers to the right."""
+        """Write the table in Markdown; names are aligned left, numbers right."""
 
         def line(cells: Iterable[str]) -> str:
             return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
@@ -80,7 +79,7 @@ class Table:
         return "\n".join([line(self.columns), rule, *map(line, rows)])
 
     def to_csv(self) -> str:
-        """Write all digits; an unknown value is an empty cell."""
+        """Write the table as CSV with all digits; unknown values are empty cells."""
         text = io.StringIO(newline="")
         writer = csv.writer(text)
         writer.writerow(self.columns)
@@ -91,26 +90,26 @@ class Table:
 
 
 def _shown(cell: Cell, style: str) -> str:
-    """Write a cell as text; an unknown value, NaN or None, is a dash."""
+    """Write a cell as text; None and NaN become a dash."""
     if cell is None or cell != cell:
         return "–"
     return cell if isinstance(cell, str) else format(cell, style)
 
 
 Measure = Callable[[Rows], Cell]
-"""What makes a cell of the rows of one method."""
+"""A function from the rows of one method to the value of a cell."""
 
 Columns = Mapping[str, tuple[str, Measure]]
-"""The style and the cell of each column, by its title."""
+"""Number format and `Measure` of each column, by its title."""
 
 
 def average(style: str, name: Any, **wanted: Any) -> tuple[str, Measure]:
-    """Make the column of the mean of a value, over the rows that have the wanted values."""
+    """Make a column with the mean of a value over the rows that have the wanted values."""
     return style, lambda rows: mean(where(rows, **wanted), name)
 
 
 def median(style: str, name: Any) -> tuple[str, Measure]:
-    """Make the column of the median of a value, over the rows where it is not None."""
+    """Make a column with the median of a value over the rows where it is not None."""
 
     def of_known(rows: Rows) -> Cell:
         known = [row[name] for row in rows if row[name] is not None]
@@ -128,9 +127,9 @@ def tabulate(
     note: str = "",
     groups: Sequence[Row] = ({},),
 ) -> Table:
-    """Make a table with a line for each method, by its title, of the rows of `Run.rows`.
+    """Make a table from the rows of `Run.rows`, with a line for each method.
 
-    In each group of the rows, by values that they have in common: the first columns.
+    With groups, each combination of their values has its own lines, and they are the first columns.
     """
     lines = []
     for group in groups:
@@ -145,7 +144,7 @@ def tabulate(
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture: the name of its file, the line under it, and the PNG file's bytes."""
+    """A figure: name of its file, caption, and the bytes of the PNG file."""
 
     key: str
     title: str
@@ -164,10 +163,10 @@ class Section:
 
 @dataclass(frozen=True)
 class Report:
-    """All of a benchmark.
+    """The report of a benchmark.
 
-    `metadata` says how it was made, `skipped` what was not measured, each with the reason;
-    `failures` are those of them that were wanted and could not be measured.
+    `metadata` describes the run. `skipped` lists what was not measured, with reasons; `failures`
+    are the requested measurements among them that failed.
     """
 
     title: str
@@ -208,8 +207,7 @@ class Report:
         for section in self.sections:
             parts += [f"## {section.title}", *section.text]
             for table in section.tables:
-                shown = table.to_markdown() if table.in_text else f"In `tables/{table.key}.csv`."
-                parts += [f"**{table.title}**", shown, *filter(None, [table.note])]
+                parts += [f"**{table.title}**", table.to_markdown(), *filter(None, [table.note])]
             parts += [f"![{f.title}](figures/{f.key}.png)\n\n{f.title}" for f in section.figures]
         skipped = "\n".join(f"- {reason}" for reason in self.skipped) or "- nothing"
         made = "\n".join(f"- {name}: {text}" for name, text in self.metadata.items())
@@ -220,11 +218,11 @@ MARKERS = ("o", "s", "^", "x")
 DASHES = ("-", "--", ":", "-.")
 
 WIDEST = 1600
-"""Pixels; wider pictures are shrunk."""
+"""Wider images are shrunk to this width in pixels. Chosen by hand; not measured."""
 
 
 def bar_chart(values: Mapping[str, float], label: str, highlighted: Sequence[str] = ()) -> bytes:
-    """Draw horizontal bars by name, with the value beside each, some in another colour."""
+    """Draw horizontal bars by name, each with its value; highlighted ones have another colour."""
     figure = _figure(8, 0.32 * len(values) + 1)
     axes = figure.subplots()
     colors = ["C1" if name in highlighted else "C0" for name in values]
@@ -243,14 +241,14 @@ def line_chart(
     x_label: str,
     y_label: str,
 ) -> bytes:
-    """Draw lines of (x, y) values, with their names in a legend; one of one value is a point."""
+    """Draw lines of (x, y) values with a legend; a line of one value is drawn as a point."""
     figure = _figure(11, max(4.5, 0.27 * len(lines) + 0.5))
     axes = figure.subplots()
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
     axes.grid(alpha=0.3)
     for k, (name, (x, y)) in enumerate(lines.items()):
-        # Ten colours, and other marks and lines each time round.
+        # Colours repeat after ten lines; markers and dashes then change.
         marker, dash = MARKERS[k // 10 % len(MARKERS)], DASHES[k // 10 % len(DASHES)]
         axes.plot(x, y, label=name, color=f"C{k % 10}", marker=marker, linestyle=dash)
     if lines:
@@ -259,7 +257,7 @@ def line_chart(
 
 
 def picture(rgb: np.ndarray) -> bytes:
-    """Encode a (H, W, 3) uint8 RGB picture, shrunk where it is very wide."""
+    """Encode an (H, W, 3) uint8 RGB image as PNG; images wider than `WIDEST` are shrunk."""
     if rgb.shape[1] > WIDEST:
         size = (WIDEST, round(rgb.shape[0] * WIDEST / rgb.shape[1]))
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""A run of benchmarks: its data, cached results of stages, and what could not be measured."""
+"""A run of benchmarks: its data, cached results of stages, and failed measurements."""
 
 from __future__ import annotations
 
@@ -24,41 +24,41 @@ from deepdetect.io.image import load_image
 from deepdetect.matching.pipeline import check_memory
 
 from .baselines.method import LocalFeature
-from .profiling import Profile, profiled
+from .profiling import profiled
 from .report import Row, Rows
 
 Result = TypeVar("Result")
 
 STAGES: dict[str, tuple[int, tuple[str, ...]]] = {
-    "keypoints": (1, ()),
-    "matches": (1, ("keypoints",)),
+    "keypoints": (2, ()),
+    "matches": (2, ("keypoints",)),
     "guided": (8, ("keypoints",)),
-    "stereo": (4, ()),
+    "stereo": (5, ()),
     "repeatability_paper": (1, ("keypoints",)),
     "repeatability_mutual_nn": (1, ("keypoints",)),
     "corner_errors": (1, ("matches",)),
-    "pose": (8, ("matches", "guided")),
+    "pose": (9, ("matches", "guided")),
     "sfm": (4, ()),
 }
-"""Version of each stage, and the stages it is made from.
+"""Version of each cached stage, and the stages whose results it uses.
 
-Raise the version when a change of the code changes the stage's results: cached ones of another
-version are not used, nor what was made from them.
+Increase the version whenever a change of the code changes the results of a stage. Otherwise old
+cached results of this stage and of the stages that use it would be read.
 """
 
 RECENT_IMAGES = 8
 
 
 class CacheError(DeepDetectError):
-    """A result cannot be kept: the folder cannot be written."""
+    """A result cannot be cached, because the folder is not writable."""
 
 
 @dataclass(frozen=True)
 class MatchSettings:
     """How the descriptors of a pair are matched.
 
-    The matcher is for Euclid's distances; binary descriptors are matched by Hamming's, exactly.
-    Only the best `budget` keypoints of each image take part.
+    `matcher` applies to Euclidean distances; binary descriptors are matched exactly by Hamming
+    distance. Only the best `budget` keypoints of each image are matched.
     """
 
     matcher: str = "flann"
@@ -70,31 +70,30 @@ class MatchSettings:
 
 @dataclass(frozen=True, eq=False)
 class PairMatches:
-    """The (M, 2) matched positions of a pair, and those of all keypoints that took part.
+    """The (M, 2) matched positions of a pair, and the positions of all keypoints used.
 
-    With what describing both images and matching took when it was done.
+    With the seconds that describing both images and matching took when it was done.
     """
 
     points0: np.ndarray
     points1: np.ndarray
     keypoints0: np.ndarray
     keypoints1: np.ndarray
-    describe: Profile
-    match: Profile
+    seconds: float
 
 
 class Run:
     """A run of benchmarks.
 
     Args:
-        data: folder of the data sets, or of the only one that is needed.
-        cache: folder of the results of stages, each under a digest of all that it depends on; a
-            damaged file is made again, old ones are never removed. None keeps nothing.
+        data: folder of the data sets, or folder of the only data set needed.
+        cache: folder for the results of stages; each file is named by a digest of all inputs.
+            Damaged files are computed again; old files are never removed. None: no cache.
         quiet: show no progress bars.
 
     Attributes:
-        made: number of results that were computed, not found in the cache.
-        skipped, failures: as of `Report`.
+        made: number of results that were computed, not read from the cache.
+        skipped, failures: as in `Report`.
     """
 
     def __init__(self, data: Path, cache: Path | None = None, quiet: bool = True) -> None:
@@ -102,17 +101,17 @@ class Run:
         self.made = 0
         self.skipped: list[str] = []
         self.failures: list[str] = []
-        self._recent: OrderedDict[str, tuple[Keypoints, Profile]] = OrderedDict()
-        self._described: tuple[str, list[np.ndarray], Profile] | None = None
+        self._recent: OrderedDict[str, tuple[Keypoints, float]] = OrderedDict()
+        self._described: tuple[str, list[np.ndarray], float] | None = None
 
     def folder(self, name: str) -> Path:
-        """Return the folder of a data set: below `data`, or `data` itself."""
+        """Return the folder of a data set: a subfolder of `data`, or `data` itself."""
         below = self.data / name
         return below if below.is_dir() else self.data
 
     @cached_property
     def files_folder(self) -> Path:
-        """Folder for images that are made: the cache's, or a temporary one."""
+        """Folder for generated images: the cache, or a temporary folder."""
         if self.cache is not None:
             return self.cache
         folder = Path(tempfile.mkdtemp(prefix="deepdetect-benchmark-"))
@@ -120,22 +119,22 @@ class Run:
         return folder
 
     def attempt(self, name: str, work: Callable[..., Result], *arguments: Any) -> Result | None:
-        """Do a piece of work; when it cannot be done, note that it is skipped and why.
+        """Run some work; if it fails, record the reason and return None.
 
-        Only errors of data and of detectors from outside are noted. Any other is a bug and passes,
-        an error of options too: those of the user were checked before the run.
+        Only errors of data and of external detectors are recorded. All others are raised as bugs.
+        This includes errors of options, because the user's options were checked before the run.
         """
         try:
             return work(*arguments)
         except (CacheError, OptionError):
             raise
         except (DeepDetectError, cv2.error) as error:
-            reason = getattr(error, "err", None) or error  # what OpenCV says without its files
+            reason = getattr(error, "err", None) or error  # without OpenCV's source files
             self.fail(f"{name}: {first_line(reason)}")
             return None
 
     def fail(self, reason: str) -> None:
-        """Note what was wanted and cannot be measured."""
+        """Record a requested measurement that failed."""
         self.skipped.append(reason)
         self.failures.append(reason)
 
@@ -146,10 +145,10 @@ class Run:
         items: Mapping[str, Any],
         measure: Callable[[Any, Any], Row],
     ) -> Rows:
-        """Measure each method, which has a name and perhaps a title, on each item by its name.
+        """Measure each method on each item; items are given by name.
 
-        `what` is the beginning of what the progress bar shows and of the reason of a failure. The
-        rows have the names as "method" and "item"; those that failed are missing.
+        Methods have a name and may have a title. `what` begins the texts of the progress bar and of
+        failures. Rows hold the names as "method" and "item"; failed measurements have no row.
         """
         rows: Rows = []
         with progress(len(methods) * len(items), "benchmark", "task", self.quiet) as bar:
@@ -164,9 +163,10 @@ class Run:
         return rows
 
     def cached(self, stage: str, depends: object, make: Callable[[], Row]) -> Row:
-        """Find a result of one of `STAGES`, or make and keep it: arrays, numbers and texts.
+        """Read a result of one of `STAGES` from the cache, or compute it and keep it.
 
-        It depends on the values of `depends`, as for `records.key`: of a path on its content.
+        A result holds arrays, numbers and texts. The values of `depends` identify it; a path is
+        identified by the content of its file.
         """
         path = None
         kept: Mapping[str, np.ndarray] | None = None
@@ -183,8 +183,8 @@ class Run:
                     raise CacheError(str(error)) from None
         return {name: value if value.ndim else value.item() for name, value in kept.items()}
 
-    def keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, Profile]:
-        """Find the keypoints of an image, or read them and what it took from the cache."""
+    def keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, float]:
+        """Find the keypoints of an image and the seconds it took, or read both from the cache."""
         name = f"{feature.detection} {file_digest(image)}"
         if name not in self._recent:
             self._recent[name] = self._keypoints(feature, image)
@@ -193,23 +193,23 @@ class Run:
             self._recent.popitem(last=False)
         return self._recent[name]
 
-    def _keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, Profile]:
+    def _keypoints(self, feature: LocalFeature, image: Path) -> tuple[Keypoints, float]:
         def make() -> Row:
             rgb = load_image(image)
-            with profiled() as profiler:
+            with profiled() as profile:
                 found = feature.detect(rgb)
             known = {name: value for name, value in vars(found).items() if value is not None}
-            return {**known, "profile": profiler.total}
+            return {**known, "seconds": profile.seconds}
 
         kept = self.cached("keypoints", (feature.detection, image), make)
-        profile = Profile(*kept.pop("profile").tolist())
+        seconds = kept.pop("seconds")
         width, height = kept.pop("image_size").tolist()
-        return Keypoints(image_size=(width, height), **kept), profile
+        return Keypoints(image_size=(width, height), **kept), seconds
 
     def matches(
         self, feature: LocalFeature, images: tuple[Path, Path], settings: MatchSettings
     ) -> PairMatches:
-        """Match two images, or read their matches from the cache."""
+        """Return the matches of two images, from the cache if possible."""
         both = [self.keypoints(feature, image)[0] for image in images]
         if settings.budget is not None:
             both = [keypoints.best(settings.budget) for keypoints in both]
@@ -218,7 +218,7 @@ class Run:
             check_memory([len(keypoints) for keypoints in both])
             descriptors, describe = self._descriptors(feature, images, both)
             matcher = get_matcher("hamming" if feature.binary else settings.matcher)
-            with profiled() as profiler:
+            with profiled() as profile:
                 found = match_descriptors(
                     descriptors[0],
                     descriptors[1],
@@ -228,33 +228,32 @@ class Run:
                     seed=settings.seed,
                     positions=(both[0].xy, both[1].xy),
                 )
-            profiles = describe, profiler.total
-            return {"rows0": found.indices0, "rows1": found.indices1, "profiles": profiles}
+            seconds = describe + profile.seconds
+            return {"rows0": found.indices0, "rows1": found.indices1, "seconds": seconds}
 
         kept = self.cached("matches", (*feature.key, images, settings), make)
-        describe, match = (Profile(*profile) for profile in kept["profiles"].tolist())
         points = both[0].xy[kept["rows0"]], both[1].xy[kept["rows1"]]
-        return PairMatches(*points, both[0].xy, both[1].xy, describe, match)
+        return PairMatches(*points, both[0].xy, both[1].xy, kept["seconds"])
 
     def _descriptors(
         self, feature: LocalFeature, images: tuple[Path, Path], both: Sequence[Keypoints]
-    ) -> tuple[list[np.ndarray], Profile]:
+    ) -> tuple[list[np.ndarray], float]:
         """Describe both images; those of the last pair are kept for other settings of matching."""
         name = key(*feature.key, images, [len(keypoints) for keypoints in both])
         if self._described is None or self._described[0] != name:
-            self._described = None  # frees its memory before more is needed
+            self._described = None  # frees memory before new descriptors are computed
             rgb = [load_image(image) for image in images]
-            with profiled() as profiler:
+            with profiled() as profile:
                 descriptors = [
                     feature.describe(pixels, keypoints)
                     for pixels, keypoints in zip(rgb, both, strict=True)
                 ]
-            self._described = name, descriptors, profiler.total
+            self._described = name, descriptors, profile.seconds
         return self._described[1:]
 
 
 def stage_versions(stage: str) -> dict[str, Any]:
-    """Return what a stage's results depend on: its version, its sources' and the packages'."""
+    """Return the versions of a stage, of the stages that it uses, and of the packages."""
     version, sources = STAGES[stage]
     versions = {"numpy": np.__version__, "opencv": cv2.__version__, stage: version}
     for source in sources:

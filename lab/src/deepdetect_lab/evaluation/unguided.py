@@ -1,4 +1,4 @@
-"""Matches by descriptors alone, as the paper makes them: what guided matching is compared with."""
+"""Matching by descriptors alone, as in the paper: the comparison method for guided matching."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from deepdetect.matching import match_features
 from .baselines.method import PAPER_DESCRIPTOR, PointDescriptor
 
 PAPER_RATIO = 0.99
-"""The ratio test of the authors' published code keeps matches strictly under it."""
+"""The ratio test of the authors' published code keeps matches with a ratio under 0.99."""
 
 UPRIGHT_SIFT = PointDescriptor(angle_deg=0.0)
-"""SIFT of the paper's size, but upright: OpenCV takes the paper's angle of -1 as it is."""
+"""SIFT of the paper's size, but upright: OpenCV uses the paper's angle of -1 as an angle."""
 
 
 def match_unguided(
@@ -33,14 +33,14 @@ def match_unguided(
     mutual: bool = False,
     seed: int = 0,
 ) -> Matches:
-    """Match the keypoints of two images over the whole images, each described by its position.
+    """Match the keypoints of two images by their descriptors, without geometry.
 
     Args:
-        image0, image1: anything `load_image` takes.
-        detector: anything with a method `heatmap` or `detect`.
+        image0, image1: images in any form that `load_image` accepts.
+        detector: object with a method `heatmap` or `detect`.
         selection: which pixels of a heat map become keypoints; None: those over 0.5.
-        descriptor: how they are described.
-        matcher, ratio, mutual, seed: as of `match_features`.
+        descriptor: descriptor of the keypoints.
+        matcher, ratio, mutual, seed: as in `match_features`.
     """
     start = time.perf_counter()
     features = []

@@ -1,4 +1,4 @@
-"""How good weights are: known masks, labels at several scales, and the paper's protocol."""
+"""Evaluate weights by known masks, by labels at several scales, and by the paper's protocol."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ from .run import Run
 
 @dataclass(frozen=True)
 class OxfordScore:
-    """What weights give on the Oxford scenes, images squashed to 480x480 and RGB.
+    """Scores of weights on the Oxford scenes, with RGB images resized to 480x480.
 
     Attributes:
-        density: keypoints per pixel at each of the paper's thresholds, mean over all images; at
-            equal density at the first of them only.
-        repeatability: by scene, mean over its five pairs, as in the paper, clipped.
-        correct: correct matches (FLANN, ratio 0.99, under 1 px by the published
-            homography) by pair, means over several seeds of FLANN.
-        matches: all matches that pass the ratio test, likewise.
-        failures: a sentence on each image and pair that could not be measured: it is in no mean.
+        density: keypoints per pixel at each of the paper's thresholds, mean over all images; with
+            equal density only at the first threshold.
+        repeatability: the paper's clipped repeatability by scene, mean over its five pairs.
+        correct: number of correct matches by pair (FLANN, ratio 0.99, error under 1 px by the
+            published homography), mean over several seeds of FLANN.
+        matches: number of all matches that pass the ratio test, by pair, mean over the seeds.
+        failures: a sentence for each image or pair that failed; the means do not include it.
     """
 
     density: dict[float, float]
@@ -57,14 +57,14 @@ class OxfordScore:
 
 @dataclass(frozen=True)
 class ForegroundScore:
-    """How many keypoints lie on the foreground of photographs, images squashed to 480x480.
+    """How many keypoints are on the foreground of photographs resized to 480x480.
 
     Attributes:
-        fraction: of the keypoints, mean over the photographs.
+        fraction: fraction of the keypoints on the foreground, mean over the photographs.
         density: keypoints per pixel, mean over the photographs.
-        covered: of the pixels, which is what random keypoints reach.
-        photographs: how many were measured: those with a keypoint.
-        failures: a sentence on each photograph that could not be measured.
+        covered: fraction of the pixels on the foreground, which random keypoints reach.
+        photographs: number of photographs measured, those with a keypoint.
+        failures: a sentence for each photograph that could not be measured.
     """
 
     fraction: float
@@ -76,14 +76,14 @@ class ForegroundScore:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How good weights are.
+    """Scores of weights.
 
     Attributes:
-        masks: against the known masks of samples, by visibility, "normal" and "low".
-        scales: against the labels of scaled images, by scale and visibility.
-        oxford: by the paper's protocol.
-        foreground: of photographs with a known foreground.
-        failures: a sentence on each sample that cannot be read and is not in the scores; `oxford`
+        masks: agreement with the known masks of samples, by visibility ("normal" or "low").
+        scales: agreement with the labels of scaled images, by scale and visibility.
+        oxford: scores by the paper's protocol.
+        foreground: scores on photographs with a known foreground.
+        failures: a sentence for each sample that cannot be read and is not in the scores; `oxford`
             and `foreground` have their own.
     """
 
@@ -108,18 +108,17 @@ def evaluate(
     """Evaluate weights.
 
     Args:
-        detector: with the weights; default `DeepDetect()`. The known masks are compared at the
-            detector's own resolution, the rest at the resolution of the protocol.
+        detector: DeepDetect with the weights; default `DeepDetect()`. Known masks are compared at
+            the detector's own resolution, everything else at the resolution of the protocol.
         samples: folder of images `image_NAME.png` with known masks `mask_image_NAME.png`; with
             `scales` any images, without masks.
-        scales: factors above 0: the samples scaled by each are compared with labels of their own.
-        oxford: folder of the eight Oxford scenes, for `OxfordScore`.
-        foreground: folder of photographs NAME.jpg with their foreground NAME_mask.png: the fraction
-            of the keypoints that lies on it.
-        equal_density: take as many keypoints of each image of `oxford` and `foreground` as its
-            label marks, the most probable ones, instead of all above the threshold 0.5. More
-            keypoints are more repeatable and have more matches whatever they are, so weights are
-            compared in this way.
+        scales: factors above 0; samples scaled by each factor are compared with their own labels.
+        oxford: folder of the eight Oxford scenes, for which repeatability and matches are measured.
+        foreground: folder of photographs NAME.jpg with their foreground NAME_mask.png, for which
+            the fraction of the keypoints on the foreground is measured.
+        equal_density: in images of `oxford` and `foreground`, take the most probable keypoints, as
+            many as the image's label marks, instead of all above the threshold 0.5. This makes
+            weights comparable, since any larger set of keypoints repeats and matches more often.
         quiet: show no progress bars.
 
     Raises:
@@ -139,10 +138,10 @@ def evaluate(
     if not all(0 < scale < math.inf for scale in scales):
         raise OptionError(f"scales must be numbers above 0, not {list(scales)}")
     if scales and samples is None:
-        raise OptionError("scales are of the images in samples: name their folder, too")
+        raise OptionError("scales apply to the images in samples: also name their folder")
     if equal_density and oxford is None and foreground is None:
         raise OptionError(
-            "`equal_density` needs keypoints: name a folder as `oxford` or `foreground`, too"
+            "`equal_density` needs keypoints: also name a folder as `oxford` or `foreground`"
         )
     scenes = None if oxford is None else load_oxford(oxford)
     masked = None if foreground is None else load_foreground(foreground)
@@ -188,8 +187,8 @@ def evaluate_oxford(
 ) -> OxfordScore:
     """Evaluate weights, or anything with a method `heatmap`, on scenes of `load_oxford`.
 
-    A DeepDetect sees images squashed to 480x480, whatever its own resolution; its other options
-    stay. It takes as many keypoints of each image as its label marks where `equal_density` is set.
+    A DeepDetect gets images resized to 480x480, whatever its own resolution; its other options
+    stay. With `equal_density` it takes as many keypoints per image as the label marks.
     """
     detector = _of_paper(detector, equal_density)
     features = [_feature(detector)]
@@ -230,7 +229,7 @@ def evaluate_foreground(
     equal_density: bool = False,
     quiet: bool = True,
 ) -> ForegroundScore:
-    """Measure how many keypoints lie on the foreground; arguments as of `evaluate_oxford`."""
+    """Measure the fraction of keypoints on the foreground; arguments as in `evaluate_oxford`."""
     run = Run(Path(), quiet=quiet)
     rows = foreground_rows(run, [_feature(_of_paper(detector, equal_density))], images)
     known = [row for row in rows if row["density"] > 0]
@@ -243,7 +242,7 @@ def evaluate_foreground(
 
 
 def _of_paper(detector: Any, equal_density: bool) -> Any:
-    """Return a detector that sees images as in the paper; others than DeepDetect as they are."""
+    """Return a DeepDetect that resizes images as in the paper; other detectors are unchanged."""
     if not isinstance(detector, DeepDetect):
         return detector
     options = replace(

@@ -1,4 +1,4 @@
-"""Labels for training: classical detectors, and their fusion into one binary mask."""
+"""Labels for training: fusion of classical detectors into one binary mask."""
 
 from .detectors import DETECTOR_NAMES, DETECTORS, LabelDetector
 from .fusion import Label, draw_label, fuse, visibility_of

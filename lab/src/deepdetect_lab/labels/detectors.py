@@ -1,7 +1,7 @@
-"""The nine label detectors: a function for each, and the table of all of them.
+"""The nine label detectors: a function for each, and a table of all.
 
-To add a detector, write a function from a (H, W) uint8 grey image and its settings to a (H, W) bool
-mask, and add it to `DETECTORS` with its settings: the paper's for normal images, and their ranges.
+To add a detector, write a function from an (H, W) uint8 grey image and settings to an (H, W) bool
+mask. Add it to `DETECTORS` with its settings: the paper's values for normal images, and ranges.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from deepdetect._shared.opencv import cv2, opencv_factory
 Value = bool | int | float
 Settings = Mapping[str, Any]
 Range = tuple[float, float] | range
-"""Smallest and largest value, or all values."""
+"""A tuple of the smallest and the largest value, or a range of all values."""
 
 AGAST_OAST_9_16 = 3
-"""`AgastFeatureDetector::OAST_9_16`; not every OpenCV exports it to Python."""
+"""The value of `AgastFeatureDetector::OAST_9_16`, which some OpenCV versions do not export."""
 
-# Beyond these ranges OpenCV ends the process, runs for minutes, takes another number (modulo 256),
-# or raises an error.
+# Outside these ranges OpenCV crashes, runs for minutes, wraps values (modulo 256), or raises an
+# error.
 GRAY_LEVELS = (0, 255)
 BLOCK_SIZES = (1, 255)
 KERNEL_SIZES = range(1, 32, 2)
 CANNY_THRESHOLDS = (0, 2040)
-"""Range of the sum of both gradients of the 3x3 Sobel filter, in grey levels."""
+"""The sum of the absolute gradients of the 3x3 Sobel filter has this range, in grey levels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +39,10 @@ class LabelDetector:
     """A classical detector.
 
     Attributes:
-        kind: whether it marks keypoints or edges (the two halves of the paper's Figure 4).
-        function: from a (H, W) uint8 grey image and all settings to a (H, W) bool mask.
-        settings: each one's value for normal images, and its range where it is a number.
-        low_visibility: settings of an image with few grey levels that differ from those.
+        kind: whether it marks keypoints or edges (the two masks of the paper's Figure 4).
+        function: function from an (H, W) uint8 grey image and all settings to an (H, W) bool mask.
+        settings: value of each setting for normal images, and the range of numeric settings.
+        low_visibility: changed settings for images with few grey levels.
     """
 
     kind: Literal["keypoint", "edge"]
@@ -52,16 +52,16 @@ class LabelDetector:
 
     @property
     def defaults(self) -> dict[str, Value]:
-        """The settings of a normal image."""
+        """Settings for normal images."""
         return {name: value for name, (value, _) in self.settings.items()}
 
     def mask(self, gray: np.ndarray, **settings: Value) -> np.ndarray:
-        """Return what it marks in a (H, W) uint8 image, (H, W) bool, with some other settings."""
+        """Return the (H, W) bool mask of an (H, W) uint8 image, with changed settings."""
         return self.function(gray, {**self.defaults, **settings})
 
 
 def pixels_mask(shape: tuple[int, ...], xy: np.ndarray) -> np.ndarray:
-    """Mark the pixel nearest to each (N, 2) point, halves rounded to even; none is outside."""
+    """Mark the pixel nearest to each of (N, 2) points inside the image; halves round to even."""
     mask = np.zeros(shape[:2], dtype=bool)
     column, row = np.rint(np.asarray(xy, dtype=np.float64).reshape(-1, 2)).astype(np.intp).T
     inside = (column >= 0) & (column < mask.shape[1]) & (row >= 0) & (row < mask.shape[0])
@@ -74,9 +74,9 @@ def _marked(gray: np.ndarray, detector: cv2.Feature2D) -> np.ndarray:
 
 
 def _sift(gray: np.ndarray, settings: Settings) -> np.ndarray:
-    """Extrema of the difference-of-Gaussians scale space (Lowe, 2004).
+    """Detect extrema of the difference-of-Gaussians scale space (Lowe, 2004).
 
-    By default the edge test is practically switched off.
+    The default settings practically switch off the edge test.
     """
     detector = cv2.SIFT_create(
         nOctaveLayers=settings["octave_layers"],
@@ -88,8 +88,8 @@ def _sift(gray: np.ndarray, settings: Settings) -> np.ndarray:
 
 
 def _orb(gray: np.ndarray, settings: Settings) -> np.ndarray:
-    """FAST corners on an image pyramid (Rublee et al., 2011); by default nothing is cut off."""
-    # OpenCV refuses levels of less than a pixel.
+    """Detect FAST corners on an image pyramid (Rublee et al., 2011); by default all are kept."""
+    # OpenCV fails on pyramid levels smaller than a pixel.
     most = 1 + int(math.log(min(gray.shape)) / math.log(settings["scale_factor"]))
     detector = cv2.ORB_create(
         nfeatures=settings["features"],
@@ -103,38 +103,38 @@ def _orb(gray: np.ndarray, settings: Settings) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _brisk_detector(threshold: int, octaves: int) -> cv2.Feature2D:
-    """Make a BRISK detector once: its sampling pattern costs as much as a dark image."""
+    """Make a BRISK detector, cached because making its pattern takes as long as a dark image."""
     return opencv_factory("BRISK_create")(thresh=threshold, octaves=octaves)
 
 
 def _brisk(gray: np.ndarray, settings: Settings) -> np.ndarray:
-    """AGAST corners in a scale space (Leutenegger et al., 2011)."""
-    # OpenCV refuses octaves of less than a pixel; in each, a layer has 2/3 of the size.
+    """Detect AGAST corners in a scale space (Leutenegger et al., 2011)."""
+    # OpenCV fails on octaves smaller than a pixel; each has a layer of 2/3 of its size.
     most = (2 * min(gray.shape) // 3).bit_length()
     return _marked(gray, _brisk_detector(settings["threshold"], min(settings["octaves"], most)))
 
 
 def _fast(gray: np.ndarray, settings: Settings) -> np.ndarray:
-    """The segment test on a circle of 16 pixels (Rosten and Drummond, 2006)."""
+    """Detect corners by the segment test on a circle of 16 pixels (Rosten and Drummond, 2006)."""
     kind = cv2.FAST_FEATURE_DETECTOR_TYPE_9_16
     create = cv2.FastFeatureDetector_create
     return _marked(gray, create(settings["threshold"], settings["suppression"], kind))
 
 
 def _agast(gray: np.ndarray, settings: Settings) -> np.ndarray:
-    """The segment test with an adaptive decision tree (Mair et al., 2010).
+    """Detect corners by the segment test with an adaptive decision tree (Mair et al., 2010).
 
-    With equal settings the mask is that of FAST: only the order of the comparisons differs.
+    With equal settings the mask equals that of FAST; only the order of comparisons differs.
     """
     create = opencv_factory("AgastFeatureDetector_create")
     return _marked(gray, create(settings["threshold"], settings["suppression"], AGAST_OAST_9_16))
 
 
 def _harris(gray: np.ndarray, settings: Settings) -> np.ndarray:
-    """Corners of the gradient covariance (Harris and Stephens, 1988).
+    """Detect corners by the gradient covariance matrix (Harris and Stephens, 1988).
 
-    The response is dilated by 3x3, which makes blobs, before it is compared with a threshold
-    relative to the largest response.
+    The response is dilated by 3x3, which creates blobs. Then a threshold relative to the largest
+    response is applied.
     """
     response = cv2.cornerHarris(gray, settings["block_size"], settings["aperture"], settings["k"])
     if settings["dilate"]:
@@ -143,9 +143,9 @@ def _harris(gray: np.ndarray, settings: Settings) -> np.ndarray:
 
 
 def _shi_tomasi(gray: np.ndarray, settings: Settings) -> np.ndarray:
-    """The smaller eigenvalue of the gradient covariance (Shi and Tomasi, 1994).
+    """Detect corners by the smaller eigenvalue of the gradient covariance (Shi and Tomasi, 1994).
 
-    0 `corners` are all of them.
+    If `corners` is 0, all corners are kept.
     """
     found = cv2.goodFeaturesToTrack(
         gray,
@@ -158,12 +158,12 @@ def _shi_tomasi(gray: np.ndarray, settings: Settings) -> np.ndarray:
 
 
 def _canny(gray: np.ndarray, settings: Settings) -> np.ndarray:
-    """Thin edges: gradient maxima with hysteresis (Canny, 1986), without a blur before."""
+    """Detect thin edges: gradient maxima with hysteresis (Canny, 1986), without blurring."""
     return cv2.Canny(gray, settings["low_threshold"], settings["high_threshold"]) > 0
 
 
 def _sobel(gray: np.ndarray, settings: Settings) -> np.ndarray:
-    """Thick edges: a gradient by a wide filter, large relative to the largest one."""
+    """Detect thick edges: gradients of a wide filter above a fraction of the largest one."""
     dx = cv2.Sobel(gray, cv2.CV_64F, 1, 0, ksize=settings["kernel_size"])
     dy = cv2.Sobel(gray, cv2.CV_64F, 0, 1, ksize=settings["kernel_size"])
     magnitude = cv2.magnitude(dx, dy)
@@ -243,7 +243,7 @@ DETECTOR_NAMES: tuple[str, ...] = tuple(DETECTORS)
 
 
 def select_detectors(names: Iterable[str]) -> tuple[str, ...]:
-    """Check names of detectors, and put them into the order of the table."""
+    """Check detector names and sort them in the order of the table."""
     wanted = set(names)
     for name in sorted(wanted - DETECTORS.keys()):
         raise unknown_name("label detector", name, DETECTOR_NAMES)

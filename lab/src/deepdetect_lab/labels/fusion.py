@@ -1,6 +1,6 @@
 """Keypoint-edge fusion: the pixelwise OR of the label detectors (paper, Section III-A).
 
-Of images, and of files, whose labels are 1-bit PNG masks.
+It labels images, and image files, for which it writes 1-bit PNG masks.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .detectors import DETECTORS
 from .settings import LabelOptions, Visibility
 
 LOW_VISIBILITY_RANGE = 64
-"""An image whose luma spans fewer grey levels than this is of low visibility."""
+"""An image has low visibility if its luma spans fewer grey levels (measured: `visibility_of`)."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -35,7 +35,7 @@ class Label:
     Attributes:
         keypoints: (H, W) bool, pixels marked by a keypoint detector.
         edges: (H, W) bool, pixels marked by an edge detector.
-        visibility: the settings that were used, "normal" or "low".
+        visibility: visibility of the image, "normal" or "low", which selects the settings.
     """
 
     keypoints: np.ndarray
@@ -44,7 +44,7 @@ class Label:
 
     @cached_property
     def mask(self) -> np.ndarray:
-        """(H, W) bool, the pixelwise OR of both."""
+        """(H, W) bool, the pixelwise OR of both masks."""
         return self.keypoints | self.edges
 
     def __repr__(self) -> str:
@@ -53,16 +53,15 @@ class Label:
 
     @property
     def density(self) -> float:
-        """Fraction of the pixels that are marked."""
+        """Fraction of marked pixels."""
         return float(self.mask.mean())
 
 
 def visibility_of(gray: np.ndarray) -> Visibility:
-    """Decide which detector settings an image gets.
+    """Decide whether an image has normal or low visibility, which selects detector settings.
 
-    An image is of low visibility when its luma spans fewer than 64 grey levels between the 1st and
-    the 99th percentile. (The paper's darkened images span at most 32; its normal ones at least
-    146.)
+    An image has low visibility if its luma spans fewer than 64 grey levels between the 1st and the
+    99th percentile. (The paper's darkened images span at most 32, its normal ones at least 146.)
 
     Args:
         gray: (H, W) uint8 luma.
@@ -83,18 +82,18 @@ def visibility_of(gray: np.ndarray) -> Visibility:
 def fuse(
     image: Any, options: LabelOptions = LabelOptions(), *, channels: Channels = "rgb"
 ) -> Label:
-    """Run the chosen detectors on the luma of an image and fuse what they mark.
+    """Run the chosen detectors on the luma of an image and fuse their masks.
 
     Args:
-        image: (H, W) uint8 luma; or anything `load_image` takes, whose luma is used.
-        options: which detectors, and which of their settings.
-        channels: order of the colours in an image that is an array, as of `load_image`.
+        image: (H, W) uint8 luma, or an image in any form that `load_image` accepts.
+        options: detectors and their settings.
+        channels: order of the colour channels if the image is an array, as in `load_image`.
 
     Returns:
-        The label, whose `mask` is the pixelwise OR.
+        The label; its `mask` is the pixelwise OR.
 
     Raises:
-        ImageError: the image cannot be read or is not fit.
+        ImageError: the image cannot be read or is unsuitable.
 
     Example:
         >>> square = np.zeros((32, 32), np.uint8)
@@ -115,10 +114,10 @@ def fuse(
 
 
 def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
-    """Draw the paper's Figure 4: image, keypoint mask, edge mask, and both combined.
+    """Draw the paper's Figure 4: image, keypoint mask, edge mask, and their combination.
 
     Returns:
-        Four panels in a row, each mask captioned with its density.
+        Four panels in a row; captions of masks give their density.
     """
     panels = [add_caption(rgb, f"image ({label.visibility} visibility settings)")]
     masks = {"keypoints": label.keypoints, "edges": label.edges, "combined": label.mask}
@@ -130,7 +129,7 @@ def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LabelTask:
-    """A mask to be made from an image file; `figure` is the paper's Figure 4 of this label."""
+    """An image file to label and the mask file; `figure` is a file for the paper's Figure 4."""
 
     image: Path
     mask: Path
@@ -140,13 +139,13 @@ class LabelTask:
 
     @property
     def outputs(self) -> Outputs:
-        """The files, and the records of what they were made from."""
+        """The output files, and the records of their inputs."""
         paths = [self.mask] if self.figure is None else [self.mask, self.figure]
         return Outputs(paths, [self.image], {"label": self.options}, self.overwrite)
 
 
 def label_file(task: LabelTask) -> dict[str, Any] | str:
-    """Make the mask of an image file; return its numbers, or what is wrong with the image."""
+    """Write the mask of an image file; return its values, or an error text for the image."""
     try:
         rgb = load_image(task.image)
         label = fuse(luma(rgb), task.options)

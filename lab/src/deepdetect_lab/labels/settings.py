@@ -1,4 +1,4 @@
-"""Which detectors make a label, with which settings: by name, from a TOML file, or one by one."""
+"""Settings of labels: detectors and parameters, chosen by name, TOML file, or one by one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .detectors import DETECTOR_NAMES, DETECTORS, Value, select_detectors
 Visibility = Literal["normal", "low"]
 
 Settings = Mapping[str, Mapping[str, Mapping[str, Value]]]
-"""Changed settings by detector, section and parameter, as a settings file holds them."""
+"""Changed settings by detector, section and parameter, as in a settings file."""
 
 SECTIONS: dict[Visibility, str] = {"normal": "normal", "low": "low_visibility"}
 
@@ -24,17 +24,17 @@ SECTIONS: dict[Visibility, str] = {"normal": "normal", "low": "low_visibility"}
 @suggest_keywords
 @dataclass(frozen=True)
 class LabelOptions:
-    """How a label is made.
+    """Detectors and settings of a label.
 
     Attributes:
         detectors: names of the detectors to fuse (default: all nine).
-        visibility: settings for "normal" or "low" light, or "auto": low where the luma spans fewer
-            than 64 grey levels from the 1st to the 99th percentile.
-        settings: those that differ from the paper's, for normal and for low visibility.
+        visibility: settings for "normal" or "low" visibility. "auto" chooses "low" if the luma
+            spans fewer than 64 grey levels from the 1st to the 99th percentile.
+        settings: settings that differ from the paper's, for normal and for low visibility.
 
     Raises:
-        OptionError: a name is unknown (the nearest right one is named), or a value has another
-            type than the default or is out of its range.
+        OptionError: a name is unknown (the message gives the nearest known name), or a value has
+            the wrong type or is out of its range.
 
     Example:
         >>> LabelOptions(settings={"fast": {"normal": {"threshold": 20}}}).visibility
@@ -58,16 +58,16 @@ class LabelOptions:
         object.__setattr__(self, "settings", checked)
         if idle := sorted(checked.keys() - set(self.detectors)):
             raise OptionError(
-                f"{idle[0]} has settings and is not among the detectors: add it, or remove them"
+                f"{idle[0]} has settings but is not among the detectors: add it, or remove them"
             )
 
     def with_detectors(self, names: tuple[str, ...]) -> LabelOptions:
-        """Return the options with other detectors, without the settings of those left out."""
+        """Return the options with other detectors, without settings of omitted detectors."""
         kept = {name: self.settings[name] for name in self.settings if name in names}
         return replace(self, detectors=names, settings=kept)
 
     def parameters(self, detector: str, visibility: Visibility) -> dict[str, Value]:
-        """Return all parameters of a detector for images of a visibility."""
+        """Return all parameters of a detector for a visibility."""
         entry = DETECTORS[detector]
         low = entry.low_visibility if visibility == "low" else {}
         changed = self.settings.get(detector, {}).get(SECTIONS[visibility], {})
@@ -80,7 +80,9 @@ def _checked(detector: str, sections: Any) -> dict[str, dict[str, Value]]:
     if not isinstance(sections, Mapping) or not all(
         isinstance(values, Mapping) for values in sections.values()
     ):
-        raise OptionError(f"{detector} must be a table of tables, as normal = {{ threshold = 20 }}")
+        raise OptionError(
+            f"{detector} must be a table of tables, like normal = {{ threshold = 20 }}"
+        )
     for section in sections:
         check_name(f"part of {detector}", section, SECTIONS.values())
     return {
@@ -98,7 +100,7 @@ def _checked_value(detector: str, name: str, value: Any) -> Value:
         raise OptionError(f"{name} of {detector} must be of type {kind.__name__}, not {value!r}")
     if limits is None:
         return bool(value)
-    if not limits[0] <= value <= limits[-1]:  # nor NaN
+    if not limits[0] <= value <= limits[-1]:  # also excludes NaN
         raise OptionError(f"{name} of {detector} must lie in [{limits[0]:.12g}, {limits[-1]:.12g}]")
     if isinstance(limits, range) and value not in limits:
         raise OptionError(f"the setting {name} of {detector} must be odd, not {value}")
@@ -107,15 +109,15 @@ def _checked_value(detector: str, name: str, value: Any) -> Value:
 
 LABEL_SETTINGS: dict[str, LabelOptions] = {
     "paper": LabelOptions(),
-    # Denser, for geometry: chosen by true stereo matches (docs/training.md).
+    # Denser labels suit geometry; chosen by true stereo matches (docs/training.md).
     "dense": LabelOptions(settings={"sobel": {"normal": {"relative_threshold": 0.02}}}),
 }
 
 
 def find_label_settings(settings: str | Path) -> LabelOptions:
-    """Look settings up by name, or read them from a file.
+    """Look up label settings by name, or read them from a file.
 
-    A TOML file may name the detectors, and change some of their settings::
+    A TOML file may choose detectors and change some of their settings::
 
         detectors = ["fast", "harris", "sobel"]  # default: all nine
 
@@ -127,7 +129,7 @@ def find_label_settings(settings: str | Path) -> LabelOptions:
         settings: a name of `LABEL_SETTINGS`, or the path of a file.
 
     Raises:
-        OptionError: the name is unknown, or the file cannot be read or has a wrong entry.
+        OptionError: the name is unknown, or the file is unreadable or has a wrong entry.
 
     Example:
         >>> find_label_settings("dense").settings
@@ -141,11 +143,11 @@ def find_label_settings(settings: str | Path) -> LabelOptions:
     except OSError as error:
         raise OptionError(f"{path} cannot be read ({error.strerror}): check the path") from None
     except (ValueError, RecursionError) as error:
-        raise OptionError(f"{path} is no valid TOML file ({error})") from None
+        raise OptionError(f"{path} is not a valid TOML file ({error})") from None
     detectors = content.pop("detectors", list(DETECTOR_NAMES))
     try:
         if not isinstance(detectors, list) or not all(isinstance(name, str) for name in detectors):
-            raise OptionError('detectors must be a list of names, as ["fast", "sobel"]')
+            raise OptionError('detectors must be a list of names, for example ["fast", "sobel"]')
         return LabelOptions(tuple(detectors), settings=content)
     except OptionError as error:
         raise OptionError(f"{path}: {error}") from None

@@ -1,1 +1,1 @@
-"""The networks in torch, their trained weights, and their export to ONNX files."""
+"""Networks in torch, their trained weights, and their export to ONNX files."""

@@ -1,7 +1,7 @@
 """ESPNet: the efficient spatial pyramid network (Mehta et al., ECCV 2018), in torch.
 
-The paper trains it to predict the fusion mask (Section III-B). Module names
-follow the published state dict, so that its weights load unchanged.
+The paper trains it to predict the fusion mask (Section III-B). Module names are those of the
+published state dict, so that its weights can be loaded.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections import OrderedDict
 import torch
 from torch import Tensor, nn
 
-EPSILON = 1e-3  # of every batch normalisation, as published
+EPSILON = 1e-3  # for batch normalisation, as published
 DILATIONS = (1, 2, 4, 8, 16)
 
 
@@ -20,16 +20,16 @@ def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1) -> nn.
 
 
 def _norm_activation(channels: int, **before: nn.Module) -> nn.Sequential:
-    """Make batch normalisation, then PReLU with one slope per channel, behind named modules."""
+    """Make batch normalisation and PReLU with one slope per channel, after the given modules."""
     norm = nn.BatchNorm2d(channels, eps=EPSILON)
     return nn.Sequential(OrderedDict(before, bn=norm, act=nn.PReLU(channels)))
 
 
 class DilatedConvolution(nn.Module):
-    """A 3x3 convolution with holes, in float32 on the CPU also under autocast.
+    """A dilated 3x3 convolution, which uses float32 on the CPU even under autocast.
 
-    In bfloat16 with channels_last the gradients of PyTorch (2.13) are NaN there, or wrong; with
-    gradients of our own a step of the training was 7 % faster.
+    In bfloat16 with channels_last PyTorch 2.13 returns NaN or wrong gradients there. With gradients
+    of our own a training step was 7 % faster.
     """
 
     def __init__(self, inputs: int, outputs: int, dilation: int) -> None:
@@ -44,9 +44,9 @@ class DilatedConvolution(nn.Module):
 
 
 class SpatialPyramid(nn.Module):
-    """Reduce, then five dilated branches, fused by running sums and joined.
+    """Reduction, then five dilated branches, which are summed cumulatively and concatenated.
 
-    The reducing convolution has a kernel of 1, or of 3 and stride 2 to halve the size.
+    The reducing convolution has kernel size 1, or kernel size 3 and stride 2 to halve the size.
     """
 
     d1: DilatedConvolution
@@ -63,7 +63,7 @@ class SpatialPyramid(nn.Module):
             setattr(self, f"d{dilation}", DilatedConvolution(narrow, width, dilation))
 
     def branches(self, x: Tensor) -> Tensor:
-        """Return the joined branches: each is the sum of its own and the smaller dilations."""
+        """Return the concatenated branches; each is the sum of its and all smaller dilations."""
         reduced = self.c1(x)
         parts = [self.d1(reduced)]
         running = self.d2(reduced)
@@ -100,7 +100,7 @@ class ResidualPyramid(SpatialPyramid):
 
 
 class Encoder(nn.Module):
-    """ESPNet's encoder: features at 1/2, 1/4 and 1/8 of the image's size."""
+    """ESPNet's encoder, with features at 1/2, 1/4 and 1/8 of the image size."""
 
     def __init__(self, decoder_channels: int, p: int, q: int) -> None:
         super().__init__()
@@ -131,9 +131,9 @@ class Encoder(nn.Module):
 
 
 class ESPNet(nn.Module):
-    """The whole network: a logit for each pixel of an image whose sides are multiples of 8.
+    """The network: it predicts a logit per pixel of an image whose sides are multiples of 8.
 
-    The default has 408,039 parameters: `p` pyramids at 1/4 of the size and `q` at 1/8.
+    It has `p` pyramids at 1/4 of the size and `q` at 1/8; the default has 408,039 parameters.
     """
 
     def __init__(self, p: int = 5, q: int = 9, decoder_channels: int = 10) -> None:

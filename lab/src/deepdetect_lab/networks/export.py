@@ -1,4 +1,4 @@
-"""Networks of torch as ONNX files for any size, as `deepdetect` reads them."""
+"""Export networks from torch to ONNX files, which `deepdetect` reads."""
 
 from __future__ import annotations
 
@@ -6,49 +6,59 @@ import io
 import logging
 import warnings
 from collections import OrderedDict
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
+
+import onnx
+import torch
+from torch import Tensor, nn
 
 from deepdetect.detector.network.onnx_export import OnnxOptions, write_model
 from deepdetect.detector.network.onnx_graph import add_padding
 
-if TYPE_CHECKING:
-    from onnx import ModelProto
-    from torch import nn
-
 OPSET = 17
-"""The ONNX operator set of all files: ONNX Runtime 1.24, OpenVINO and OpenCV 4 read it."""
+"""This ONNX operator set is chosen because ONNX Runtime 1.24, OpenVINO and OpenCV 4 read it."""
+
+
+def to_onnx(
+    network: nn.Module,
+    inputs: Mapping[str, Tensor],
+    output: str,
+    axes: Mapping[str, Mapping[int, str]],
+    training: Any = torch.onnx.TrainingMode.EVAL,
+) -> onnx.ModelProto:
+    """Trace a network with named inputs; `axes` names the dynamic axes of inputs and output."""
+    written = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # warnings of the tracer
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+        torch.onnx.export(
+            network.cpu().eval(),
+            tuple(inputs.values()),
+            written,  # type: ignore[arg-type]  # annotated for the other exporter
+            input_names=list(inputs),
+            output_names=[output],
+            dynamic_axes=axes,
+            opset_version=OPSET,
+            dynamo=False,
+            training=training,
+        )
+    return onnx.load_model_from_string(written.getvalue())
 
 
 def export_onnx(network: nn.Module, path: str | Path) -> None:
-    """Write a network for any size; whole or not at all."""
-    write_model(_of_torch(network), path, OnnxOptions(max_keypoints=0), {})
-
-
-def _of_torch(network: nn.Module) -> ModelProto:
-    import onnx
-    import torch
-
-    # Its parts are named after it: `tiling` knows the names that PyTorch's exporter gives.
-    module = torch.nn.Sequential(OrderedDict(network=network.cpu())).eval()
+    """Write a network that predicts heat maps for any image size, atomically."""
+    # This name is part of all node names, on which `tiling` relies.
+    module = nn.Sequential(OrderedDict(network=network))
     axes = {0: "batch", 2: "height", 3: "width"}
-    written = io.BytesIO()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-        torch.onnx.export(
-            module,
-            (torch.zeros(2, 3, 64, 96),),
-            written,  # type: ignore[arg-type]  # its annotation is of the other exporter
-            input_names=["image"],
-            output_names=["logits"],
-            dynamic_axes={"image": axes, "logits": axes},
-            opset_version=OPSET,
-            dynamo=False,
-            # Keeps batch normalisation as nodes, for `add_padding` to fold in float64. The network
-            # is in evaluation mode already.
-            training=torch.onnx.TrainingMode.PRESERVE,
-        )
-    model = onnx.load_model_from_string(written.getvalue())
+    # Batch normalisation is kept as nodes, which `add_padding` folds in float64.
+    model = to_onnx(
+        module,
+        {"image": torch.zeros(2, 3, 64, 96)},
+        "logits",
+        {"image": axes, "logits": axes},
+        torch.onnx.TrainingMode.PRESERVE,
+    )
     add_padding(model)
-    return model
+    write_model(model, path, OnnxOptions(max_keypoints=0), {})

@@ -1,10 +1,10 @@
 """The fast network: plain convolutions of the luma, and a global term of the whole image.
 
-A label is made of the luma by detectors of small windows, so a few plain convolutions see enough;
-runtimes compute these at their best, as they do not dilated branches and sums. But its thresholds
-are relative to the strongest response anywhere and to the range of the grey levels. So a global
-term (histogram of the luma, means and maxima of the features) scales the luma at the start, and
-gives thresholds of the features before they are enlarged again.
+Labels are computed from the luma by detectors with small windows, so a few plain convolutions
+suffice. Runtimes compute these faster than dilated branches and sums. But the detectors' thresholds
+are relative to the strongest response of the image and to its range of grey levels. So a global
+term (histogram of the luma, means and maxima of the features) scales the luma at the start and
+gives thresholds for the features before upsampling.
 """
 
 from __future__ import annotations
@@ -20,26 +20,27 @@ from torch.nn.functional import (
 )
 
 HALF, QUARTER, EIGHTH = 16, 32, 40
-"""Channels at these sizes of the image; most of the time is spent at half of it."""
+"""Number of channels at 1/2, 1/4 and 1/8 of the size; 1/2 has fewest, since it takes most time."""
 
 RED, GREEN, BLUE = 9798, 19235, 3735
-"""Weights of the luma (BT.601) in parts of 32,768, by which OpenCV computes it."""
+"""Weights of the luma (BT.601) in units of 1/32,768, as in OpenCV."""
 
 BINS = 24
-"""Of the histogram of the luma; a value counts for the two bins beside it."""
+"""Number of bins of the luma's histogram; a value is split between the two nearest bins. Chosen by
+hand; not measured."""
 
 HISTOGRAM_STEP_PX = 8
-"""One pixel in so many, in both directions, is counted."""
+"""The histogram samples every 8th pixel in both directions to save time."""
 
 GAIN_RANGE = (-1, 5)
-"""Of the logarithm of the gain; dark images span a hundredth of the grey levels."""
+"""Range of the gain's logarithm, since dark images span only 1/100 of the grey levels."""
 
 
 class Luma(nn.Module):
-    """Maps (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W), OpenCV's 8-bit luma divided by 255.
+    """Map (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W), OpenCV's 8-bit luma divided by 255.
 
-    Labels are made of that luma, and in dark images one grey level decides. The numbers are whole
-    and below 2^24, so float32 holds them; convolutions would be rounded by GPUs (TF32).
+    Labels are computed from this luma, and in dark images a single grey level matters. All values
+    are integers below 2^24, which float32 holds exactly; GPUs would round convolutions (TF32).
     """
 
     def forward(self, image: Tensor) -> Tensor:
@@ -49,9 +50,9 @@ class Luma(nn.Module):
 
 
 class Exposure(nn.Module):
-    """Maps (B, 1, H, W) luma to (B, BINS + 2, 1, 1) features and its (B, 1, 1, 1) mean.
+    """Map (B, 1, H, W) luma to (B, BINS + 2, 1, 1) features and its (B, 1, 1, 1) mean.
 
-    The features are logarithms of the histogram, the mean, and the logarithm of the variance.
+    Features are the logarithms of the histogram, the mean, and the logarithm of the variance.
     """
 
     def forward(self, luma: Tensor) -> tuple[Tensor, Tensor]:
@@ -65,7 +66,7 @@ class Exposure(nn.Module):
 
 
 class Perceptron(nn.Sequential):
-    """Two linear layers, with ReLU between them, of (B, C, 1, 1) features."""
+    """Two linear layers with ReLU in between, for (B, C, 1, 1) features."""
 
     def __init__(self, inputs: int, hidden: int, outputs: int) -> None:
         super().__init__(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
@@ -78,7 +79,7 @@ class Perceptron(nn.Sequential):
 
 
 class Convolution(nn.Module):
-    """A convolution, batch normalisation, ReLU; stride 2 halves the size."""
+    """Convolution, batch normalisation and ReLU; stride 2 halves the size."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1, kernel: int = 3) -> None:
         super().__init__()
@@ -90,9 +91,9 @@ class Convolution(nn.Module):
 
 
 class FastNetwork(nn.Module):
-    """A logit for each pixel of an image whose sides are multiples of 8.
+    """The network: it predicts a logit per pixel of an image whose sides are multiples of 8.
 
-    57,613 parameters, 632 million multiply-adds at 640x480.
+    It has 57,613 parameters and needs 632 million multiply-adds at 640x480.
 
     Example:
         >>> FastNetwork()(torch.zeros(1, 3, 16, 24)).shape
@@ -120,11 +121,11 @@ class FastNetwork(nn.Module):
         self.logits = nn.Conv2d(HALF, 4, 1)
         nn.init.constant_(
             self.get_parameter("logits.bias"), -1.0
-        )  # about the share of marked pixels
+        )  # about the fraction of marked pixels
 
     def forward(self, image: Tensor) -> Tensor:
         """Map (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W) logits."""
-        # Autocast would round the luma, of which low thresholds are a grey level.
+        # Autocast would round the luma, but the smallest thresholds are a single grey level.
         with torch.autocast(image.device.type, enabled=False):
             luma = self.luma(image)
             exposure, mean = self.exposure(luma)

@@ -1,4 +1,4 @@
-"""The networks by name, and their weights as safetensors files: state dicts with notes."""
+"""Networks by name, and their weights in safetensors files: state dicts with notes."""
 
 from __future__ import annotations
 
@@ -19,38 +19,38 @@ from .espnet import ESPNet
 from .fast import FastNetwork
 
 NETWORKS: dict[str, type[nn.Module]] = {"espnet": ESPNet, "fast": FastNetwork}
-"""Made without arguments, they map (B, 3, H, W) float32 RGB in [0, 1] to (B, 1, H, W) logits.
+"""Networks by name. They need no arguments and map (B, 3, H, W) float32 RGB in [0, 1] to
+(B, 1, H, W) logits.
 
-Sides are multiples of `STRIDE`. To add a network, write its module beside this one, and its name
-here.
+Sides are multiples of `STRIDE`. To add a network, write a module in this package and add it here.
 """
 
 
 FOLDER = Path(__file__).parents[1] / "weights"
-"""The trained weights that training can start from; `deepdetect` has them as ONNX files."""
+"""Folder of trained weights from which training can start; `deepdetect` has them in ONNX files."""
 
 
 def find_weights(weights: str | Path) -> Path:
-    """Return the path of a safetensors file, or of that of weights named in `PRETRAINED`."""
+    """Return the path of a safetensors file, given as a path or by a name of `PRETRAINED`."""
     if names_a_file(weights):
         return Path(weights)
     return FOLDER / f"{look_up('name or file of weights', str(weights), PRETRAINED)}.safetensors"
 
 
 def save_tensors(tensors: Mapping[str, Tensor], path: str | Path, notes: dict[str, str]) -> None:
-    """Write tensors, with notes in the file's header, whole or not at all."""
+    """Write tensors atomically, with notes in the file's header."""
     stored = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     with atomic_path(path) as temporary:
         try:
             save_file(stored, temporary, metadata=notes)
-        except SafetensorError as error:  # a full disk
+        except SafetensorError as error:  # for example a full disk
             raise OSError(str(error)) from None
 
 
 def load_network(path: str | Path, *kinds: type[nn.Module]) -> nn.Module:
     """Make a network from a weights file, in evaluation mode.
 
-    It is the one of those kinds, by default of `NETWORKS`, that has most of the file's tensors.
+    The network is the one of those kinds (default: `NETWORKS`) that shares most tensors with it.
     """
     if not Path(path).is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")
@@ -61,7 +61,7 @@ def load_network(path: str | Path, *kinds: type[nn.Module]) -> nn.Module:
         network = max(networks, key=lambda each: len(each.state_dict().keys() & state.keys()))
         network.load_state_dict(state)
     except (SafetensorError, OSError, RuntimeError) as error:
-        # torch names the first wrong tensor on its second line.
+        # The second line of torch's message names the first wrong tensor.
         reason = " ".join(str(error).split("\n\t")[:2]).strip()
         reason = reason if len(reason) < 160 else reason[:160] + "..."
         raise WeightsError(
@@ -74,8 +74,8 @@ def load_network(path: str | Path, *kinds: type[nn.Module]) -> nn.Module:
 def average_weights(paths: Sequence[str | Path]) -> nn.Module:
     """Make a network, as `load_network` does, from the mean of several weights files.
 
-    The mean of runs that went on from one another is often better than each of them
-    (Wortsman et al., "Model soups", 2022). Counts, which have no mean, are the first file's.
+    The mean of successive runs is often better than each of them (Wortsman et al., "Model soups",
+    2022). Integer counts are taken from the first file.
     """
     networks = [load_network(path) for path in paths]
     for path, network in zip(paths, networks, strict=True):
@@ -104,7 +104,7 @@ def read_notes(path: str | Path) -> dict[str, str]:
 
 
 def weights_digest(network: nn.Module) -> str:
-    """Return the SHA-256 of a network's state, the same whatever file it came from."""
+    """Return the SHA-256 of a network's state, which does not depend on its file."""
     digest = hashlib.sha256()
     for name, value in sorted(network.state_dict().items()):
         digest.update(name.encode())

@@ -9,12 +9,9 @@ from .recipe import (
     TrainingOptions as TrainingOptions,
 )
 from .run import (
-    StageProfile as StageProfile,
     profile as profile,
     train as train,
-    train_descriptor as train_descriptor,
-    train_match_filter as train_match_filter,
-    train_points as train_points,
+    train_on_pairs as train_on_pairs,
 )
 from .sampler import CropSampler as CropSampler, Schedule as Schedule
 from .shards import write_shards as write_shards

@@ -1,4 +1,4 @@
-"""Augmentation: darkening, mirrors, colours of the same luma, and augmented views."""
+"""Augmentation: darkening, transposition, colour changes with equal luma, and augmented views."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from .synthetic import WHITE, Camera, Effect, Light, blur, record, relight
 RED, GREEN, BLUE = 0.299, 0.587, 0.114  # of the luma (BT.601)
 
 AUGMENTATION_VERSION = 3
-"""Part of the names of augmented views: when `augment` draws otherwise, old labels do not fit."""
+"""Version in the names of augmented views. Increase it when `augment` changes, because old labels
+then do not fit."""
 
 
 @dataclass(frozen=True)
 class Darkening:
-    """Two factors in (0, 1], those of Pillow's `ImageEnhance.Brightness` and `.Contrast`.
+    """Two factors in (0, 1] for Pillow's `ImageEnhance.Brightness` and `.Contrast`.
 
-    The published dark images fit brightness 0.3 and contrast 0.4.
+    Brightness 0.3 and contrast 0.4 reproduce the published dark images.
     """
 
     brightness: float
@@ -31,18 +32,18 @@ class Darkening:
 
 
 BRIGHTNESS, CONTRAST = (0.2, 0.45), (0.3, 0.55)
-"""Ranges that the factors of a `Darkening` are drawn from. The product stays under 0.25, so that a
-darkened image spans fewer than the 64 grey levels under which an image is of low visibility."""
+"""Ranges of the factors of a `Darkening`. Their product stays under 0.25, so that a darkened image
+spans under 64 grey levels, the limit of low visibility."""
 
 # What `augment` draws from.
 TURN_PROBABILITY = 0.5
-"""Of any angle; other views keep the sharpness of the image, which turning blurs."""
+"""Share of views rotated by any angle; the others stay sharp, since rotation blurs."""
 
 CROP_SCALE = (0.7, 1.0)
-"""Side of the cut-out square, as a fraction of the largest that fits."""
+"""Range of the crop's side as a fraction of the largest that fits. Chosen by hand; not measured."""
 
 INTERPOLATIONS = ("NEAREST", "LINEAR", "CUBIC", "AREA", "LANCZOS4")
-"""What views that are not turned are made smaller by, as OpenCV names it."""
+"""OpenCV interpolations, one of which downscales an upright view."""
 
 LIGHT = Light(
     share=0.5,
@@ -51,14 +52,14 @@ LIGHT = Light(
     shift=(-0.15, 0.15),
 )
 CAMERA = Camera(blur=Effect(0.3, 0.5, 2.5), noise=(Effect(0.25, 1, 8),), jpeg=Effect(0.35, 20, 95))
-"""The recipe of the views."""
+"""Ranges of the changes of light and camera in augmented views. Chosen by hand; not measured."""
 
 MAX_JITTER_SATURATION = 1.2
-"""Largest factor of the saturation of rotated colours."""
+"""Rotated colours have their saturation multiplied by at most this factor. Chosen by hand."""
 
 
 def draw_darkening(generator: np.random.Generator) -> Darkening:
-    """Draw both factors, rounded to thousandths so that a file name can hold them."""
+    """Draw both factors, rounded to thousandths to fit into a file name."""
     return Darkening(
         round(float(generator.uniform(*BRIGHTNESS)), 3),
         round(float(generator.uniform(*CONTRAST)), 3),
@@ -66,22 +67,22 @@ def draw_darkening(generator: np.random.Generator) -> Darkening:
 
 
 def darken(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:
-    """Reduce the brightness, then the contrast (paper, Section III-B), of (H, W, 3) uint8."""
+    """Reduce brightness, then contrast of (H, W, 3) uint8 (paper, Section III-B)."""
     dim = ImageEnhance.Brightness(Image.fromarray(rgb)).enhance(darkening.brightness)
     return np.asarray(ImageEnhance.Contrast(dim).enhance(darkening.contrast))
 
 
 def transpose(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mirror a crop and its label along the diagonal: only BRISK labels it differently."""
-    # Copies a hundred times faster than a view.
+    """Mirror a crop and its label along the diagonal; only BRISK would label it differently."""
+    # OpenCV copies a hundred times faster than a NumPy view.
     return cv2.transpose(image), cv2.transpose(mask.view(np.uint8)).view(bool)
 
 
 def jitter_color(rgb: np.ndarray, generator: np.random.Generator, exact: bool) -> np.ndarray:
     """Remove the colours or rotate the hue, both with the same luma, of (H, W, 3) uint8 RGB.
 
-    Where it must be exact, colours are removed: rotating them can change the luma by one level,
-    which matters for the keypoints of dark images.
+    If `exact`, colours are removed, because a rotation may change the luma by one level, which
+    matters for keypoints of dark images.
     """
     if exact or generator.random() < 0.5:
         return cv2.cvtColor(luma(rgb), cv2.COLOR_GRAY2RGB)
@@ -92,8 +93,8 @@ def jitter_color(rgb: np.ndarray, generator: np.random.Generator, exact: bool) -
 def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
     """Rotate the colours of (H, W, 3) uint8 RGB by an angle in the plane of Cb and Cr.
 
-    The luma changes by rounding only, by at most one level. Colours that would leave the range of
-    uint8 are desaturated until they fit.
+    Rounding changes the luma by at most one level. Colours outside of the uint8 range are
+    desaturated until they fit.
     """
     red, green, blue = cv2.split(rgb.astype(np.float32))
     gray = RED * red + GREEN * green + BLUE * blue
@@ -103,7 +104,7 @@ def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
     cosine, sine = saturation * math.cos(angle), saturation * math.sin(angle)
     blue, red = blue_range * (cosine * blue - sine * red), red_range * (sine * blue + cosine * red)
     green = -(RED * red + BLUE * blue) / GREEN
-    # How far each pixel goes beyond white or black, as a multiple of the available range.
+    # Distance of each pixel's colours from grey, in multiples of the available range.
     above = np.maximum(np.maximum(red, green), blue) / np.maximum(255 - gray, 1e-6)
     below = np.minimum(np.minimum(red, green), blue) / np.minimum(-gray, -1e-6)
     scale = 1 / np.maximum(np.maximum(above, below), 1)
@@ -112,7 +113,7 @@ def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
 
 
 def augment(rgb: np.ndarray, side: int, seed: int) -> np.ndarray:
-    """Make a (side, side, 3) view of a part of an image: turned, relit, blurred, compressed.
+    """Make a (side, side, 3) view of a part of an image: rotated, relit, blurred, compressed.
 
     Its label is made from the view itself. Other versions of NumPy and OpenCV may give slightly
     different views for the same seed.
@@ -126,13 +127,13 @@ def augment(rgb: np.ndarray, side: int, seed: int) -> np.ndarray:
 
 
 def _rotated_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) -> np.ndarray:
-    """Cut out a square at any angle, whose corners lie inside the image."""
+    """Crop a square at a random angle, with all corners inside the image."""
     angle = generator.uniform(0, 2 * math.pi)
     cosine, sine = math.cos(angle), math.sin(angle)
-    extent = abs(cosine) + abs(sine)  # of a rotated square of side 1
+    extent = abs(cosine) + abs(sine)  # extent of a rotated unit square
     window = (min(rgb.shape[:2]) - 1) / extent * generator.uniform(*CROP_SCALE)
     step = window / side
-    if step > 1:  # averaged before it is sampled more coarsely
+    if step > 1:  # averaged before coarser sampling
         factor = 1 / step
         size = (max(round(rgb.shape[1] * factor), 1), max(round(rgb.shape[0] * factor), 1))
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)

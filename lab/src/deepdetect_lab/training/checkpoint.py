@@ -1,4 +1,4 @@
-"""Checkpoints of a training run: one safetensors file, written whole; nothing is pickled."""
+"""Checkpoints of a training run: one safetensors file, written atomically, without pickle."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from deepdetect._shared.records import key
 from ..networks.weights import save_tensors
 
 Point = dict[str, float]
-"""A point of the curves: losses and measures by name after a number of steps."""
+"""A point of the training curves: losses and measures by name after a number of steps."""
 
 
 def save_checkpoint(
@@ -28,7 +28,7 @@ def save_checkpoint(
     optimizers: Sequence[Optimizer],
     metadata: Mapping[str, Any],
 ) -> None:
-    """Write "network.NAME", "average.NAME", "optimizer.MOMENT.PARAMETER" of each, and JSON."""
+    """Write tensors "network.NAME", "average.NAME", "optimizer.MOMENT.PARAMETER", and JSON."""
     tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
     tensors |= {f"average.{name}": value for name, value in average.state_dict().items()}
     for name, parameter in network.named_parameters():
@@ -40,7 +40,7 @@ def save_checkpoint(
 
 
 def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read the tensors and the metadata of a checkpoint; a WeightsError where it is damaged."""
+    """Read tensors and metadata of a checkpoint; raise a WeightsError if it is damaged."""
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in list(file.keys())}
@@ -49,7 +49,7 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             raise ValueError("its content is not what was written")
     except (SafetensorError, OSError, KeyError, ValueError) as error:
         raise WeightsError(
-            f"{path} is not a whole checkpoint ({first_line(error)}): delete it"
+            f"{path} is not a complete checkpoint ({first_line(error)}): delete it"
         ) from None
     return tensors, json.loads(header["state"])
 
@@ -60,9 +60,9 @@ def restore(
     average: nn.Module,
     optimizers: Sequence[Optimizer],
 ) -> None:
-    """Bring a network, its average and its optimisers to the state of a checkpoint of the same run.
+    """Restore a network, its average and its optimisers from a checkpoint of the same run.
 
-    It must be of the same run: fused optimisers write beyond a moment of another shape.
+    The run must be the same, because fused optimisers write beyond moments of another shape.
     """
     for kind, module in (("network", network), ("average", average)):
         module.load_state_dict({name: tensors[f"{kind}.{name}"] for name in module.state_dict()})
@@ -81,7 +81,7 @@ def restore(
 
 
 def _like(value: Tensor, parameter: Tensor) -> Tensor:
-    """Bring a moment to its parameter's device and memory layout, which fused Adam relies on."""
+    """Move a moment to its parameter's device and memory layout, on which fused Adam relies."""
     if value.shape == parameter.shape:
         return torch.empty_like(parameter).copy_(value)
     return value.to(parameter.device, copy=True)

@@ -1,4 +1,4 @@
-"""torch datasets: random crops to train on, and whole images for validation."""
+"""torch datasets: random crops for training, and whole images for validation."""
 
 from __future__ import annotations
 
@@ -38,10 +38,10 @@ from .views import (
 
 
 class FolderSource:
-    """Images in files, and their labels as 1-bit PNG files, in a subfolder for the label settings.
+    """Image files, and labels in 1-bit PNG files in a subfolder for the label settings.
 
-    A label is named by the content of its image: a replaced image gets a new label. Up to
-    `memory_bytes` of views are kept in memory; those beyond are rendered each time.
+    Labels are named by the content of the image, so a replaced image gets a new label. Up to
+    `memory_bytes` of views are kept in memory; further views are rendered each time.
     """
 
     shard_sizes = None
@@ -64,7 +64,7 @@ class FolderSource:
         return self.images[index]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_kept": {}}  # a process that is not forked has its own
+        return {**self.__dict__, "_kept": {}}  # a spawned process keeps its own views
 
     def label_path(self, image: SourceImage, view: View) -> Path:
         """Return the file of a label."""
@@ -91,12 +91,12 @@ class FolderSource:
     def make_labels(
         self, views: Sequence[tuple[View, ...]], workers: int | None = None, quiet: bool = True
     ) -> int:
-        """Make the missing labels of some views of each image in processes; return their number.
+        """Make the missing labels of views of each image in processes; return their number.
 
-        The views that are rendered for it are kept.
+        The rendered views are kept in memory.
 
         Raises:
-            BatchError: images cannot be read; the other labels are made all the same.
+            BatchError: images cannot be read; all other labels are made.
         """
         tasks, memory = [], self.memory_bytes
         for index, (image, needed) in enumerate(zip(self.images, views, strict=True)):
@@ -122,13 +122,13 @@ class FolderSource:
 
 
 LabelTask = tuple[int, Path, dict[View, Path], bool]
-"""An image, by number and file, the labels to be written, and whether its views are sent back."""
+"""Number and file of an image, the labels to write, and whether to return its views."""
 
 
 def _make_labels(
     task: LabelTask, options: LabelOptions
 ) -> tuple[LabelTask, dict[View, tuple[np.ndarray, np.ndarray]], str]:
-    """Write the labels of an image; return the views with their labels, and the error, if any."""
+    """Write the labels of an image; return views with labels, and an error if there is one."""
     _, file, labels, keep = task
     made = {}
     try:
@@ -148,9 +148,9 @@ ImageSource = FolderSource | ShardSource
 
 
 class CropDataset(Dataset[tuple[Tensor, Tensor]]):
-    """Random crops of views, augmented. Its indices come from a `CropSampler`.
+    """Random augmented crops of views, indexed by a `CropSampler`.
 
-    A crop is a function of index and seed: (crop, crop, 3) uint8 RGB, (crop, crop) bool label.
+    A crop depends only on index and seed: (crop, crop, 3) uint8 RGB, (crop, crop) bool label.
     """
 
     def __init__(self, source: ImageSource, options: TrainingOptions) -> None:
@@ -178,7 +178,7 @@ class CropDataset(Dataset[tuple[Tensor, Tensor]]):
     def _choose_view(
         self, image: SourceImage, stage: Stage, generator: np.random.Generator
     ) -> View:
-        """Choose the light by the dark fraction, then one of the stage's sizes."""
+        """Choose normal or dark light at random, then one of the stage's sizes."""
         dark = generator.random() < self.options.dark_fraction
         fitting = [
             view
@@ -189,9 +189,9 @@ class CropDataset(Dataset[tuple[Tensor, Tensor]]):
 
 
 class ValidationDataset(Dataset[tuple[Tensor, Tensor]]):
-    """The whole images: (H, W, 3) uint8 RGB, and (H, W) bool label.
+    """Whole images, (H, W, 3) uint8 RGB, with (H, W) bool labels.
 
-    Those in normal light come first, then the darkened ones.
+    Images in normal light come first, then darkened ones.
     """
 
     def __init__(self, source: ImageSource) -> None:
@@ -208,7 +208,7 @@ class ValidationDataset(Dataset[tuple[Tensor, Tensor]]):
 
 @dataclass(frozen=True)
 class TrainingData:
-    """The images of a run, and a digest of them."""
+    """Training and validation images of a run, and their digest."""
 
     training: ImageSource
     validation: ImageSource
@@ -226,9 +226,9 @@ def prepare_data(
     processes: int = 1,
     quiet: bool = True,
 ) -> TrainingData:
-    """List the images of a run and make the missing labels of their views; arguments of `train`.
+    """List the images of a run and make missing labels of their views; arguments as in `train`.
 
-    `processes` of this machine load images, each with views of its own in memory.
+    `processes` is the number of loading processes, each of which keeps its own views in memory.
     """
     images, output = Path(images), Path(output)
     folder = output / "labels" if labels is None else Path(labels)
@@ -260,9 +260,9 @@ def prepare_data(
 
 @contextlib.contextmanager
 def loading(loader: DataLoader[Any]) -> Iterator[Iterator[Any]]:
-    """Yield an iterator over a loader; an error in one of its processes comes as raised there.
+    """Yield an iterator over a loader; errors in its processes are raised unchanged.
 
-    OpenCV has one thread meanwhile: a forked process cannot use the threads of its parent.
+    OpenCV uses one thread meanwhile, because a forked process cannot use its parent's threads.
     """
     batches: Any = None
     try:

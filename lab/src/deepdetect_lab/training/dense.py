@@ -30,12 +30,11 @@ from ..networks.weights import (
     load_network,
     weights_digest,
 )
-from .checkpoint import Point
 from .dataset import CropDataset, TrainingData, ValidationDataset, loading
 from .optim import make_optimizers
 from .recipe import DeviceOptions, InitWeights, TrainingOptions
 from .sampler import CropSampler, Schedule, milestones
-from .trainer import Trainer
+from .trainer import Trainer, seeded
 
 ONNX = "deepdetect.onnx"
 
@@ -62,15 +61,18 @@ def initial_network(
             "`frozen_batch_norm` would keep the batch statistics of random weights: "
             "give trained ones as `init_weights`, or leave it out"
         )
-    with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
-        torch.default_generator.manual_seed(options.seed)
-        return dataclasses.replace(options, frozen_batch_norm=False), make()
+    return dataclasses.replace(options, frozen_batch_norm=False), seeded(make, options.seed)
 
 
 class DenseTrainer(Trainer):
     """A network that maps images to heat maps, with its initial weights, and labelled images."""
 
     objective, sign = "validation_loss", 1
+    purpose = "that maps RGB in [0, 1] to the probability that a label detector marks a pixel"
+    measures = (
+        "On the validation images, in normal light and darkened: mean binary cross-entropy per "
+        "pixel, and intersection over union at 0.5"
+    )
     weights_file = "best.safetensors"
 
     def __init__(
@@ -142,6 +144,10 @@ class DenseTrainer(Trainer):
             self.compiled = False
             self._forward = self._set_up()
             return self.logits(images)
+
+    def device_memory_bytes(self) -> int:
+        """Return the peak memory of torch on the GPU, 0 on the CPU."""
+        return torch.cuda.max_memory_allocated() if self.device.type == "cuda" else 0
 
     def describe(self) -> str:
         """Say in words how the network is run."""
@@ -220,20 +226,6 @@ class DenseTrainer(Trainer):
         best = load_network(folder / self.weights_file)
         export_onnx(best, folder / ONNX)
         return folder / ONNX
-
-    def card(self, best: Point) -> tuple[str, list[str]]:
-        count = sum(parameter.numel() for parameter in self.network.parameters())
-        network = (
-            f"{type(self.network).__name__}, {count:,} parameters. Input: RGB in [0, 1]; output: "
-            "the\nprobability that a pixel is a keypoint or an edge for one of the label detectors."
-        )
-        return network, [
-            "On the validation images, by which these weights were chosen (mean binary",
-            "cross-entropy per pixel / intersection over union at threshold 0.5):",
-            "",
-            f"- normal: {best['normal_loss']:.4f} / {best['normal_iou']:.3f}",
-            f"- darkened: {best['dark_loss']:.4f} / {best['dark_iou']:.3f}",
-        ]
 
 
 def freeze_batch_norm(network: nn.Module) -> None:

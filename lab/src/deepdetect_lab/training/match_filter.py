@@ -1,4 +1,4 @@
-"""The training of the match filter: right matches from wrong ones by their neighbours.
+"""Training of the match filter, which separates correct and wrong matches by their neighbours.
 
 Keypoints of two views of a synthetic scene, and now and then of unrelated scenes, are described in
 one of two ways and matched; which matches are right is known.
@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import copy
 import math
-import warnings
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, relu
@@ -23,7 +23,6 @@ from torch.utils.data import DataLoader, Dataset
 from deepdetect._shared.atomic import atomic_path
 from deepdetect._shared.machine import map_in_processes
 from deepdetect._shared.progress import progress
-from deepdetect._shared.records import key
 from deepdetect.detector.point_detector import PointDetector
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.features.learned import LEARNED, LEARNED_RATIO, RATIO, match_learned
@@ -31,16 +30,14 @@ from deepdetect.features.match_filter import AROUND, filter_inputs, nearest_rows
 from deepdetect.features.matchers import DescriptorMatches, exact_neighbours, match_descriptors
 from deepdetect.features.sift import ROOT_SIFT
 
-from ..evaluation.report import Table
-from ..networks.export import OPSET
+from ..networks.export import to_onnx
 from ..networks.weights import load_network
-from .checkpoint import Point
 from .descriptor.views import photograph_view
 from .recipe import MatchFilterTrainingOptions
 from .sampler import milestones
 from .scenes import correspond, draw_layers, draw_until_seen, render_layers
 from .synthetic import rotation
-from .trainer import Trainer
+from .trainer import Trainer, digests, seeded, with_plateau
 
 ONNX = "match_filter.onnx"
 
@@ -263,6 +260,12 @@ class MatchFilterTrainer(Trainer):
     """The match filter, and the images whose views it is trained on."""
 
     objective, sign = "validation_loss", 1
+    purpose = "that separates correct matches from wrong ones"
+    measures = (
+        "On pairs of views of the validation images: the cross-entropy, and of the matches that a "
+        "ratio test, the filter, and the filter made as precise as that keep, how many are right, "
+        "their precision, and those of unrelated views"
+    )
     weights_file = "match_filter.safetensors"
     max_gradient_norm = 1.0
     average_decay = 0.0
@@ -279,18 +282,13 @@ class MatchFilterTrainer(Trainer):
         self.options = options
         self.samples = draw_samples(images, options.seed, options.drawn, quiet)
         self.held_out = draw_samples(validation, VALIDATION_SEED, options.val_pairs, quiet)
-        with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
-            torch.default_generator.manual_seed(options.seed)
-            self.network = MatchFilter()
+        self.network = seeded(MatchFilter, options.seed)
         self.average = copy.deepcopy(self.network).eval()
         parameters = self.network.parameters()
         self.optimizers = [torch.optim.AdamW(parameters, weight_decay=WEIGHT_DECAY)]
         self.steps = options.steps
         self.milestones = milestones(options.steps, options.val_count)
-        self.origin = {
-            "images_digest": key(images)[:16],
-            "validation_digest": key(validation)[:16],
-        }
+        self.origin = digests(images, validation)
         self.notes = {"images": str(len(images))}
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
@@ -298,9 +296,6 @@ class MatchFilterTrainer(Trainer):
         steps = range(first, self.steps if last is None else last)
         dataset = BatchDataset(self.samples, self.options)
         return DataLoader(dataset, batch_size=None, sampler=steps, generator=torch.Generator())
-
-    def pixels(self, batch: Any) -> int:
-        return 2 * self.options.pairs * SIDE_PX**2
 
     def loss(self, batch: tuple[list[Tensor], Tensor]) -> Tensor:
         values, errors = batch
@@ -310,8 +305,8 @@ class MatchFilterTrainer(Trainer):
 
     def learning_rate(self, step: int) -> float:
         """Return the learning rate of a step: a warm-up, a plateau, a linear decay to 0."""
-        warm_up, decay = (step + 1) / WARM_UP_STEPS, (1 - step / self.steps) / DECAY_SHARE
-        return self.options.learning_rate * min(1, warm_up, decay)
+        factor = with_plateau(step, self.steps, WARM_UP_STEPS, DECAY_SHARE)
+        return self.options.learning_rate * factor
 
     def validate(self, step: int) -> dict[str, float]:
         """Measure the weights so far."""
@@ -322,33 +317,12 @@ class MatchFilterTrainer(Trainer):
         export_match_filter(best, self.held_out[0], folder / ONNX)
         return folder / ONNX
 
-    def card(self, best: Point) -> tuple[str, list[str]]:
-        count = sum(parameter.numel() for parameter in self.network.parameters())
-        rows = [
-            {
-                "descriptors": name,
-                "matches kept": way.format(ratio),
-                **{title: best[f"{name}, {way}: {title}"] for title in MEASURES},
-            }
-            for name, ratio in RATIOS.items()
-            for way in WAYS
-        ]
-        styles = {"descriptors": "", "matches kept": "", **MEASURES}
-        return f"a network of {count:,} parameters that tells right matches from wrong ones.", [
-            f"Matches of {len(self.held_out):,} pairs of views of the validation images, by whose",
-            "loss this step was chosen; as precise: as the ratio test is.",
-            "",
-            Table("measures", "", styles, rows).to_markdown(),
-            "",
-            f"Loss {best['validation_loss']:.4f} at step {best['step']:,}.",
-        ]
-
 
 RATIOS = {LEARNED: LEARNED_RATIO, ROOT_SIFT: RATIO}
 """The ratio test that each kind of descriptors is compared with."""
 
-WAYS = ("ratio under {}", "filter", "filter, as precise")
-MEASURES = {"right": ",.0f", "precision": ".3f", "of unrelated views": ",.0f"}
+WAYS = ("ratio test", "filter", "filter, as precise")
+MEASURES = ("right", "precision", "of unrelated views")
 
 
 @torch.no_grad()
@@ -386,12 +360,7 @@ def measure(network: MatchFilter, samples: Sequence[Sample]) -> dict[str, float]
 
 def export_match_filter(network: MatchFilter, sample: Sample, path: Path) -> None:
     """Write the network as `filter_matches` reads it."""
-    names = list(sample[0])
-    values = tuple(torch.from_numpy(each) for each in sample[0].values())
-    axes = {name: {0: "matches"} for name in (*names, "logits")}
-    how: dict[str, Any] = {"dynamo": False, "opset_version": OPSET, "dynamic_axes": axes}
-    with atomic_path(path) as temporary, warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of what it traces
-        torch.onnx.export(
-            network, values, temporary, input_names=names, output_names=["logits"], **how
-        )
+    inputs = {name: torch.from_numpy(each) for name, each in sample[0].items()}
+    axes = {name: {0: "matches"} for name in (*inputs, "logits")}
+    with atomic_path(path) as temporary:
+        onnx.save(to_onnx(network, inputs, "logits", axes), temporary)

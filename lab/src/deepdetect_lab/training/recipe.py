@@ -98,7 +98,7 @@ class TrainingOptions:
             known yet, would undo much.
         average_decay: decay, in each step, of the exponential average of the weights, which is what
             is validated and saved; 0: the weights themselves are.
-        max_gradient_norm: larger gradients are scaled down to it; None: none are.
+        max_gradient_norm: gradients with a larger norm are scaled down to it; None: no limit.
         frozen_batch_norm: normalise by the batch statistics of the initial weights, as the
             finished network does, not by those of each batch, which vary much between batches of a
             few images. None: if the initial weights are trained ones.
@@ -314,7 +314,7 @@ class MatchFilterTrainingOptions:
         drawn: pairs of views that are drawn before the first step, to be taken from.
         learning_rate: highest learning rate, after the warm-up; it falls linearly to 0.
         val_count: number of times that the weights are measured.
-        val_pairs: pairs that they are measured on.
+        val_pairs: pairs that the weights are measured on.
         seed: seed of the weights and the pairs.
 
     Raises:

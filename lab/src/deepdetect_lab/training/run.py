@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -22,15 +21,15 @@ from .recipe import (
     InitWeights,
     MatchFilterTrainingOptions,
     PointsTrainingOptions,
-    Stage,
     TrainingOptions,
 )
 
 if TYPE_CHECKING:
     from .dense import DenseTrainer
-    from .trainer import TrainingResult
+    from .trainer import Trainer, TrainingResult
 
 Log = Callable[[str], None]
+PairOptions = PointsTrainingOptions | DescriptorTrainingOptions | MatchFilterTrainingOptions
 
 
 @suggest_keywords
@@ -82,122 +81,71 @@ def train(
         >>> detector = DeepDetect(result.onnx)  # doctest: +SKIP
     """
     data = {"validation": validation, "labels": labels, "workers": workers}
-    trainer = _dense_trainer(images, output, options, init_weights, device, log, data)
+    trainer = _dense_trainer(images, output, options, init_weights, device, log, **data)
     return trainer.fit(Path(output), log)
 
 
 @suggest_keywords
-def train_points(
+def train_on_pairs(
     images: str | Path,
     validation: str | Path,
     output: str | Path,
-    options: PointsTrainingOptions = PointsTrainingOptions(),
-    *,
-    num_workers: int = 0,
-    log: Log | None = None,
-) -> TrainingResult:
-    """Train the ranker of points on pairs of views that are made of single images.
-
-    An interrupted run resumes as one of `train` does.
-
-    Args:
-        images: folder of images.
-        validation: folder of other images, which choose the best weights.
-        output: folder for checkpoint.safetensors, best.npz, MODEL_CARD.md and the curves.
-        options: the recipe.
-        num_workers: processes that make the pairs; 0: the training process does.
-        log: takes lines of text for the user; without it there is no progress bar either.
-
-    Returns:
-        The weights' file and the curves.
-
-    Raises:
-        ImageError: a folder is missing or empty.
-        OptionError: the folder holds a run with other options or images.
-    """
-    from .points.task import RankerTrainer
-
-    trainer = RankerTrainer(*_files(images, validation, output), options, num_workers)
-    return trainer.fit(Path(output), log)
-
-
-@suggest_keywords
-def train_descriptor(
-    images: str | Path,
-    validation: str | Path,
-    output: str | Path,
-    options: DescriptorTrainingOptions = DescriptorTrainingOptions(),
+    options: PairOptions,
     *,
     init_weights: str | Path | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
     num_workers: int | None = None,
     log: Log | None = None,
 ) -> TrainingResult:
-    """Train the learned descriptor on pairs of views that are made of single images.
+    """Train on pairs of views that are made of single images; the options say what.
 
-    An interrupted run resumes as one of `train` does.
+    It is the ranker of points, the learned descriptor, or the match filter, which takes a quarter
+    of an hour on two processors. An interrupted run resumes as one of `train` does.
 
     Args:
         images: folder of images, best of some 480 pixels a side.
         validation: folder of other images, which choose the best weights.
-        output: folder for checkpoint.safetensors, descriptor.safetensors, descriptor.onnx,
-            MODEL_CARD.md and the curves.
-        options, log: as of `train_points`.
-        init_weights: weights (descriptor.safetensors) to start from. None: random ones, by the
-            seed.
-        device: "auto" is CUDA if there is a GPU, else the CPU.
+        output: folder for checkpoint.safetensors, the best weights (of the ranker best.npz, else
+            safetensors and ONNX), MODEL_CARD.md and the curves.
+        options: the recipe.
+        init_weights: weights (descriptor.safetensors) that a descriptor starts from. None: random
+            ones, by the seed.
+        device: "auto" is CUDA if there is a GPU, else the CPU. Only a descriptor is trained on one.
         num_workers: processes that make the pairs; 0: the training process does. None: 0 on a CPU,
-            one per processor but one beside a GPU.
+            one per processor but one beside a GPU. A match filter draws its pairs before, by all
+            processors.
+        log: takes lines of text for the user; without it there is no progress bar either.
 
     Returns:
-        The weights' files, of which `PointDetector` takes the ONNX file, and the curves.
+        The weights' files, of which `PointDetector` takes those of ranker and descriptor.
 
     Raises:
-        The errors of `train_points`; an OptionError, too, where the images show nothing.
+        ImageError: a folder is missing or empty.
+        OptionError: the folder holds a run with other options or images, or the images show
+            nothing.
         WeightsError: the initial weights are missing or do not fit.
 
     Example:
-        >>> result = train_descriptor("photos/train", "photos/val", "run")  # doctest: +SKIP
+        >>> from deepdetect_lab.training import DescriptorTrainingOptions
+        >>> options = DescriptorTrainingOptions(steps=400)
+        >>> result = train_on_pairs("photos/train", "photos/val", "run", options)  # doctest: +SKIP
         >>> PointDetector(descriptor=result.onnx).extract("a.png")  # doctest: +SKIP
     """
-    from .descriptor.task import DescriptorTrainer
-
     where = DeviceOptions(device=device, num_workers=num_workers)
-    initial = None if init_weights is None else Path(init_weights)
-    trainer = DescriptorTrainer(*_files(images, validation, output), options, initial, where)
-    return trainer.fit(Path(output), log)
+    files = _files(images, validation, output)
+    trainer: Trainer
+    if isinstance(options, DescriptorTrainingOptions):
+        from .descriptor.task import DescriptorTrainer
 
+        trainer = DescriptorTrainer(*files, options, init_weights, where)
+    elif isinstance(options, PointsTrainingOptions):
+        from .points.task import RankerTrainer
 
-@suggest_keywords
-def train_match_filter(
-    images: str | Path,
-    validation: str | Path,
-    output: str | Path,
-    options: MatchFilterTrainingOptions = MatchFilterTrainingOptions(),
-    *,
-    log: Log | None = None,
-) -> TrainingResult:
-    """Train the match filter on pairs of views that are made of single images.
+        trainer = RankerTrainer(*files, options, num_workers or 0)
+    else:
+        from .match_filter import MatchFilterTrainer
 
-    Pairs are drawn, described and matched before the first step, by the bundled descriptors; an
-    interrupted run draws the same again. On two processors it takes a quarter of an hour.
-
-    Args:
-        images: folder of images.
-        validation: folder of other images, which choose the best weights.
-        output: folder for checkpoint.safetensors, match_filter.safetensors, match_filter.onnx,
-            MODEL_CARD.md and the curves.
-        options, log: as of `train_points`.
-
-    Returns:
-        The weights' files and the curves.
-
-    Raises:
-        The errors of `train_points`; an OptionError, too, where the images show nothing.
-    """
-    from .match_filter import MatchFilterTrainer
-
-    trainer = MatchFilterTrainer(*_files(images, validation, output), options, log is None)
+        trainer = MatchFilterTrainer(*files, options, log is None)
     return trainer.fit(Path(output), log)
 
 
@@ -213,10 +161,10 @@ def _dense_trainer(
     images: str | Path,
     output: str | Path,
     options: TrainingOptions,
-    init_weights: InitWeights | None,
-    device: DeviceOptions,
-    log: Log | None,
-    data: Mapping[str, Any],
+    init_weights: InitWeights | None = None,
+    device: DeviceOptions = DeviceOptions(),
+    log: Log | None = None,
+    **data: Any,
 ) -> DenseTrainer:
     """Make the labels, and what is trained on them; `data` are further arguments of `train`."""
     from .dataset import prepare_data
@@ -228,113 +176,60 @@ def _dense_trainer(
     return DenseTrainer(network, options, prepared, device)
 
 
-TIMED_STEPS = 30
-"""Of each stage, by `profile`."""
-
-WARM_UP_STEPS = 5
-"""Before them: they compile, allocate memory and render the first views."""
+TIMED_STEPS, WARM_UP_STEPS = 30, 5
+"""Steps of each stage that `profile` times, and those before them, which compile, allocate memory
+and render the first views."""
 
 
-@dataclass(frozen=True)
-class StageProfile:
-    """The speed of one stage.
-
-    Attributes:
-        stage: the stage.
-        steps: steps that were timed.
-        images_per_second: crops per second.
-        full_images_per_second: the same in 480x480 images' worth of pixels.
-        waiting_fraction: fraction of the time in which the training waited for data.
-        memory_bytes: peak resident memory of the process so far, 0 where unknown.
-        device_memory_bytes: peak memory of torch on the GPU, or None.
-    """
-
-    stage: Stage
-    steps: int
-    images_per_second: float
-    full_images_per_second: float
-    waiting_fraction: float
-    memory_bytes: int
-    device_memory_bytes: int | None
-
-
-@suggest_keywords
 def profile(
     images: str | Path,
     output: str | Path,
     options: TrainingOptions = TrainingOptions(),
     *,
-    validation: str | Path | None = None,
-    labels: str | Path | None = None,
-    init_weights: InitWeights | None = None,
-    device: DeviceOptions = DeviceOptions(),
-    workers: int | None = None,
     log: Log | None = None,
-) -> list[StageProfile]:
-    """Time some steps of each stage of a run; nothing but the label cache is written.
+    **how: Any,
+) -> list[dict[str, Any]]:
+    """Time some steps of each stage of a run of `train`; only the label cache is written.
 
-    Args:
-        images, output, options, validation, labels, init_weights, device, workers, log: as of
-            `train`.
-
-    Returns:
-        One profile per stage.
-
-    Raises:
-        The errors of `train`.
-
-    Example:
-        >>> profile("photos", "run")[0].images_per_second  # doctest: +SKIP
+    Returns the speed of each stage, in crops and in 480x480 images' worth of pixels; the fraction
+    of the time in which the training waited for data; and the peaks of memory so far, 0 where
+    unknown.
     """
-    options = dataclasses.replace(options, interleave=False)  # each stage by itself
-    data = {"validation": validation, "labels": labels, "workers": workers}
-    trainer = _dense_trainer(images, output, options, init_weights, device, log, data)
-    steps_of_stage = trainer.schedule.steps_of_stage
-    lengths = [min(n, TIMED_STEPS + WARM_UP_STEPS) for n in steps_of_stage]
-    if log is not None:
-        log(f"timing {trainer.describe()}")
-    profiles, first = [], 0
-    with progress(sum(lengths), "timing", "step", log is None) as bar:
-        for length, whole in zip(lengths, steps_of_stage, strict=True):
-            profiles.append(_time_steps(trainer, first, first + length, bar.update))
-            first += whole
-    return profiles
-
-
-def _time_steps(
-    trainer: DenseTrainer, first: int, last: int, done: Callable[[int], object]
-) -> StageProfile:
-    import torch
-
     from ..evaluation.profiling import peak_memory
     from .dataset import loading
     from .trainer import FULL_IMAGE_PIXELS
 
-    stage, warm_up = trainer.schedule.position(first).stage, min(WARM_UP_STEPS, last - first - 1)
-    on_gpu = trainer.device.type == "cuda"
-    if on_gpu:
-        torch.cuda.reset_peak_memory_stats()
-    waited = 0.0
-    started = time.perf_counter()
-    with loading(trainer.loader(first, last)) as batches:
-        for step in range(first, last):
-            asked = time.perf_counter()
-            if step == first + warm_up:
-                waited, started = 0.0, asked
-            batch = next(batches)
-            waited += time.perf_counter() - asked
-            trainer.training_step(batch, step)
-            done(1)
-    # Reading the loss has waited for the GPU at each step.
-    seconds = time.perf_counter() - started
-    steps = last - first - warm_up
-    rate = steps * stage.batch / seconds
-    return StageProfile(
-        stage=stage,
-        steps=steps,
-        images_per_second=rate,
-        full_images_per_second=rate * stage.crop**2 / FULL_IMAGE_PIXELS,
-        waiting_fraction=waited / seconds,
-        memory_bytes=peak_memory(),
-        device_memory_bytes=torch.cuda.max_memory_allocated() if on_gpu else None,
-    )
+    options = dataclasses.replace(options, interleave=False)  # each stage by itself
+    trainer = _dense_trainer(images, output, options, log=log, **how)
+    if log is not None:
+        log(f"timing {trainer.describe()}")
+    profiles, first = [], 0
+    whole = trainer.schedule.steps_of_stage
+    lengths = [min(steps, TIMED_STEPS + WARM_UP_STEPS) for steps in whole]
+    with progress(sum(lengths), "timing", "step", log is None) as bar:
+        for stage, steps, length in zip(options.stages, whole, lengths, strict=True):
+            timed_from, waited = first + min(WARM_UP_STEPS, length - 1), 0.0
+            with loading(trainer.loader(first, first + length)) as batches:
+                for step in range(first, first + length):
+                    asked = time.perf_counter()
+                    if step == timed_from:
+                        waited, started = 0.0, asked
+                    batch = next(batches)
+                    waited += time.perf_counter() - asked
+                    trainer.training_step(batch, step)  # reads the loss, so it waits for the GPU
+                    bar.update(1)
+            seconds = time.perf_counter() - started
+            timed = first + length - timed_from
+            rate = timed * stage.batch / seconds
+            row = {
+                "stage": dataclasses.asdict(stage),
+                "steps": timed,
+                "images_per_second": rate,
+                "full_images_per_second": rate * stage.crop**2 / FULL_IMAGE_PIXELS,
+                "waiting_fraction": waited / seconds,
+                "memory_bytes": peak_memory(),
+                "device_memory_bytes": trainer.device_memory_bytes(),
+            }
+            profiles.append(row)
+            first += steps
+    return profiles

@@ -16,10 +16,10 @@ from torch.utils.data import Sampler
 from .recipe import Stage, TrainingOptions
 
 FINAL_LEARNING_RATE = 1e-6
-"""At the end of the cosine annealing (paper, Section III-B)."""
+"""Cosine annealing ends at this learning rate (paper, Section III-B)."""
 
 SHUFFLED_SHARDS = 4
-"""So many shards are read at a time, and their images shuffled."""
+"""Number of shards read at a time, whose images are shuffled. Chosen by hand; not measured."""
 
 
 class CropIndex(NamedTuple):

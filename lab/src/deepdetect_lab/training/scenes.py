@@ -99,11 +99,11 @@ MOTION_SHIFT, MOTION_SCALE, MOTION_ANGLE, MOTION_TILT = 22.0, 0.12, 0.06, 0.15
 the view, of the logarithm of the scale, of the angle in radians, of the logarithm of the tilt."""
 
 ALIASED_SCALE, PIXEL_SIGMA = 1.15, 0.5
-"""From this scale on a photograph is blurred before it is sampled, as if a pixel of either had a
-Gaussian of this sigma in its own pixels."""
+"""Photographs reduced by more than the first factor are blurred before sampling, as if pixels of
+both images were Gaussians with the second number as sigma, in pixels."""
 
 COVERED = 0.5
-"""From this share on a part covers a pixel."""
+"""A part in front covers a pixel if its share is at least this."""
 
 STEP_PX = 2.0
 """Derivatives are differences over this step to both sides: more than what is rounded."""

@@ -58,7 +58,7 @@ class Shards:
 
     @staticmethod
     def open(folder: Path, options: TrainingOptions) -> Shards | None:
-        """Read the index of a folder of shards for a recipe; None where there are none.
+        """Read the index of a folder of shards for a recipe; None if it has no index.
 
         Raises:
             OptionError: the shards were made with other options.

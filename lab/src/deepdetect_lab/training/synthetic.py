@@ -42,8 +42,8 @@ CURVE_TONES = 6
 """A curve of tones rises through 6 random values between black and white."""
 
 DARK_NOISE_LEVELS, DARK_NOISE_LIGHT = (0.2, 0.6, 3.0), 0.25
-"""In little light the sigma of the noise is drawn from 0.2 grey levels up; the most is 0.6 without
-any light and grows to 3.0 at a quarter of it: what is darker has fewer photons, and less noise."""
+"""Sigma of the noise in little light is at least 0.2 grey levels. Its maximum grows from 0.6
+without light to 3.0 at 1/4 of the light, since fewer photons have less shot noise."""
 
 
 def happens(rng: np.random.Generator, share: float) -> bool:

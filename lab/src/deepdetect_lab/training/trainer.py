@@ -10,8 +10,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import torch
 from torch import Tensor, nn
 from torch.nn.utils import clip_grad_norm_
 from torch.optim import Optimizer
@@ -20,13 +21,15 @@ from torch.utils.data import DataLoader
 from deepdetect._shared.atomic import atomic_path
 from deepdetect._shared.errors import OptionError
 from deepdetect._shared.progress import progress
-from deepdetect._shared.records import check_same, file_digest, plain
+from deepdetect._shared.records import check_same, file_digest, key, plain
 
 from ..evaluation.provenance import provenance
 from ..evaluation.report import Table, line_chart
 from ..networks.weights import read_notes, save_tensors
 from .checkpoint import Point, read_checkpoint, restore, save_checkpoint
 from .dataset import loading
+
+Network = TypeVar("Network", bound=nn.Module)
 
 CHECKPOINT = "checkpoint.safetensors"
 CARD = "MODEL_CARD.md"
@@ -56,7 +59,7 @@ class TrainingResult:
             a ranker.
         points: the curves: losses and measures by name, for each validation.
         best: the point of those weights.
-        images_per_second: mean rate, in 480x480 images' worth of pixels.
+        images_per_second: mean rate, in 480x480 images' worth of pixels; 0 for a training on pairs.
     """
 
     weights: Path
@@ -78,6 +81,8 @@ class Trainer(abc.ABC):
         origin: digests of the images and of the initial weights: a run is resumed with the same
             recipe and origin only.
         notes: what else is written into the weights.
+        purpose: what the network does, for the model card.
+        measures: what the measures are, for the model card.
         introduction: what the user is told before the first step.
         steps: of the whole run.
         milestones: numbers of steps done after which it is validated.
@@ -94,6 +99,8 @@ class Trainer(abc.ABC):
     options: Any
     origin: dict[str, str]
     notes: dict[str, str]
+    purpose: str
+    measures: str
     introduction: Sequence[str] = ()
     steps: int
     milestones: set[int]
@@ -106,9 +113,9 @@ class Trainer(abc.ABC):
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
         """Return the loader of the batches of some steps."""
 
-    @abc.abstractmethod
     def pixels(self, batch: Any) -> int:
-        """Return the number of pixels in a batch."""
+        """Return the number of pixels in a batch, by which the speed is told."""
+        return 0
 
     @abc.abstractmethod
     def learning_rate(self, step: int) -> float:
@@ -130,10 +137,6 @@ class Trainer(abc.ABC):
         """Read the notes of a file of weights; a WeightsError where it is missing."""
         return read_notes(path)
 
-    @abc.abstractmethod
-    def card(self, best: Point) -> tuple[str, list[str]]:
-        """Say in the model card what the network is, and how good it is."""
-
     def export(self, folder: Path) -> Path | None:
         """Write the best weights in another form; return the file."""
         return None
@@ -152,7 +155,7 @@ class Trainer(abc.ABC):
         loss.backward()
         value = loss.item()
         norm = clip_grad_norm_(self.network.parameters(), self.max_gradient_norm)
-        # A finite loss can have gradients that are not, in bfloat16.
+        # In bfloat16 a finite loss may have gradients that are not finite.
         if not (math.isfinite(value) and norm.isfinite()):
             raise OptionError(
                 f"the loss or its gradients are not finite at step {step}: start again with a "
@@ -194,14 +197,15 @@ class Trainer(abc.ABC):
                 state.step += 1
                 pixels += self.pixels(batch)
                 bar.update(1)
-                speed = pixels / FULL_IMAGE_PIXELS / (time.monotonic() - started)
-                loss = state.loss_sum / state.loss_count
-                text = f"loss {loss:.4f}, {speed:.1f} images/s"
+                text = f"loss {state.loss_sum / state.loss_count:.4f}"
+                if pixels:
+                    speed = pixels / FULL_IMAGE_PIXELS / (time.monotonic() - started)
+                    text += f", {speed:.1f} images/s"
                 if state.points:
                     text += f", best {self._best(state)[self.objective]:.4f}"
                 bar.set_postfix_str(text, False)
                 if state.step in self.milestones:
-                    self._save(state, folder)  # the validation takes its time, too
+                    self._save(state, folder)  # validation also takes time
                     self._validate(state, folder)
                 if time.monotonic() - saved >= CHECKPOINT_INTERVAL_S:
                     self._save(state, folder)
@@ -254,19 +258,22 @@ class Trainer(abc.ABC):
 
     def _write_card(self, folder: Path, points: Sequence[Point], best: Point) -> None:
         weights = folder / self.weights_file
-        notes, (network, quality) = self.read_notes(weights), self.card(best)
+        notes, count = self.read_notes(weights), sum(p.numel() for p in self.network.parameters())
         known = ("command", "options", "point")
         options = json.loads(notes["options"])
+        best_rows = [{"measure": k.replace("_", " "), "value": v} for k, v in best.items()]
         recipe = [{"option": name, "value": json.dumps(value)} for name, value in options.items()]
         lines = [
             "# Model card",
             "",
             f"`{weights.name}`, SHA-256 `{file_digest(weights)}`:",
-            network,
+            f"a network of {count:,} parameters {self.purpose}.",
             "",
             "## How good the weights are",
             "",
-            *quality,
+            f"{self.measures}. This step was chosen by the {self.objective.replace('_', ' ')}.",
+            "",
+            Table("best", "", {"measure": "", "value": ".4f"}, best_rows).to_markdown(),
             "",
             "## Where they come from",
             "",
@@ -287,6 +294,23 @@ class Trainer(abc.ABC):
         ]
         with atomic_path(folder / CARD) as temporary:
             temporary.write_text("\n".join(lines), encoding="utf-8")
+
+
+def seeded(make: Callable[[], Network], seed: int) -> Network:
+    """Make a network with random weights by a seed; the caller's random numbers are left alone."""
+    with torch.random.fork_rng(devices=()):
+        torch.default_generator.manual_seed(seed)
+        return make()
+
+
+def digests(images: Sequence[Path], validation: Sequence[Path]) -> dict[str, str]:
+    """Return the origin of a run on images, by their content and names."""
+    return {"images_digest": key(images)[:16], "validation_digest": key(validation)[:16]}
+
+
+def with_plateau(step: int, steps: int, warm_up: float, decay_share: float) -> float:
+    """Return a factor of the learning rate: a warm-up over steps, 1, a linear decay to 0."""
+    return min(1, (step + 1) / warm_up, (1 - step / steps) / decay_share)
 
 
 def save_curves(points: Sequence[Point], folder: Path) -> None:

@@ -137,7 +137,7 @@ def train_val_split(
     training: list[SourceImage] = []
     validation: list[SourceImage] = []
     for image in images:
-        # Of the reversed checksum, which is independent of the choice of `list_images`.
+        # The reversed checksum is independent of the choice of `list_images`.
         draw = int(f"{zlib.crc32(image.path.name.encode()):032b}"[::-1], 2) / 2**32
         (validation if draw < val_fraction else training).append(image)
     if not validation:

@@ -21,7 +21,6 @@ from deepdetect_lab.evaluation.baselines.opencv import (
     with_kd_trees,
 )
 from deepdetect_lab.evaluation.options import BenchmarkOptions
-from deepdetect_lab.evaluation.profiling import StageProfiler
 from deepdetect_lab.evaluation.protocols import paper_numbers
 from deepdetect_lab.evaluation.protocols.paper import (
     OXFORD_PAIRS,
@@ -137,7 +136,7 @@ def test_voxels_of_cones(shared: Path, published: Callable[[str], Path]) -> None
     scene = load_calibrated_pair(shared / "data" / "middlebury" / "cones")
     detector = DeepDetect(published("reconstruction")).configured(HeatmapOptions(480, "bgr"))
     feature = deepdetect_feature(detector)
-    counts = [len(paper_points(feature, scene, StageProfiler(), seed)[0]) for seed in range(3)]
+    counts = [len(paper_points(feature, scene, seed)[0]) for seed in range(3)]
     assert np.median(counts) == pytest.approx(FIGURE_8["DeepDetect"]["cones"], rel=0.003)
 
 
@@ -145,7 +144,7 @@ def test_voxels_of_cones(shared: Path, published: Callable[[str], Path]) -> None
 def test_voxels_of_cones_by_sift(shared: Path) -> None:
     """The paper prints 14,128 for SIFT with low settings, by an older OpenCV."""
     scene = load_calibrated_pair(shared / "data" / "middlebury" / "cones")
-    points, _ = paper_points(self_described("sift-low"), scene, StageProfiler())
+    points, _ = paper_points(self_described("sift-low"), scene)
     assert len(points) == pytest.approx(FIGURE_8["SIFT, low settings"]["cones"], rel=0.05)
 
 

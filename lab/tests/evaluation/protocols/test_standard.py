@@ -20,6 +20,7 @@ from deepdetect_lab.evaluation.benchmarks import run_benchmarks
 from deepdetect_lab.evaluation.metrics import repeatability
 from deepdetect_lab.evaluation.metrics.repeatability import mutual_nn_repeatability
 from deepdetect_lab.evaluation.options import BenchmarkOptions
+from deepdetect_lab.evaluation.protocols import standard
 from deepdetect_lab.evaluation.protocols.standard import (
     pair_row,
     repeated,
@@ -53,12 +54,13 @@ def table_of(feature: LocalFeature, rows: Rows, key: str) -> dict[str, object]:
 
 
 def test_budgets_repeatability_and_coverage_are_those_of_the_best_points(
-    pairs: list[PlanarPair], tmp_path: Path
+    pairs: list[PlanarPair], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(standard, "BUDGETS", (64, None))
     run = Run(tmp_path, tmp_path / "cache")
     method = with_common_descriptor(CLASSICAL["fast-low"])
     for pair in pairs:
-        row = pair_row(run, method, pair, (64, None))
+        row = pair_row(run, method, pair)
         for budget in (64, None):
             points = []
             for path in (pair.first, pair.second):
@@ -98,7 +100,7 @@ def test_learned_descriptors_are_matched_without_a_ratio_test(
 ) -> None:
     method = with_common_descriptor(CLASSICAL["fast-low"])
     tested, untested = (
-        pair_row(Run(tmp_path), dataclasses.replace(method, learned=learned), pairs[1], (512,))
+        pair_row(Run(tmp_path), dataclasses.replace(method, learned=learned), pairs[1])
         for learned in (False, True)
     )
     assert untested["matches"] > tested["matches"]

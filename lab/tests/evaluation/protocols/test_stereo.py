@@ -11,24 +11,20 @@ import pytest
 from PIL import Image
 
 from deepdetect import DeepDetect
-from deepdetect.geometry.camera import Calibration, Camera
 from deepdetect.io.image import luma
 from deepdetect_lab.datasets.middlebury import StereoPair, load_calibrated_pair, load_middlebury
 from deepdetect_lab.evaluation.baselines.opencv import self_described
 from deepdetect_lab.evaluation.options import BenchmarkOptions
-from deepdetect_lab.evaluation.profiling import StageProfiler
 from deepdetect_lab.evaluation.protocols.masks import LabelDetector
 from deepdetect_lab.evaluation.protocols.stereo import (
     AS_IT_IS,
     SHIFTED,
-    count_voxels,
     ground_truths,
     middlebury,
     shift_view,
 )
 from deepdetect_lab.evaluation.protocols.stereo_matches import score_stereo_matches
 from deepdetect_lab.evaluation.protocols.stereo_pipelines import (
-    STAGES,
     paper_points,
     pipelines,
     sgbm_disparity,
@@ -84,10 +80,7 @@ def rows(section: Section, key: str) -> dict[str, dict[str, object]]:
 @pytest.mark.slow
 def test_ours_is_exact_and_the_baselines_are_there(section: Section) -> None:
     found = rows(section, "middlebury_cones")
-    for name, row in found.items():
-        known = [row[f"{stage}, s"] for stage in STAGES if row[f"{stage}, s"] is not None]
-        assert row["matching, s"] > 0, name
-        assert row["seconds"] == pytest.approx(sum(known))
+    assert all(row["seconds"] > 0 and row["all, MB"] >= 0 for row in found.values())
     ours = found["ours, weights dense"]
     assert ours["points"] > 8_000
     assert ours["1 - bad-1"] > 0.97
@@ -119,15 +112,6 @@ def test_without_a_truth_nothing_is_evaluated(section: Section) -> None:
             assert row["points"] == known[name]["points"]
 
 
-def test_voxels_are_cubes_with_a_point() -> None:
-    camera = Camera((101, 101), 100.0)
-    calibration = Calibration(camera, camera, baseline_mm=10)
-    # Depth 1000 / disparity; at a depth of 100 mm a pixel is 1 mm.
-    pixels = np.array([[50.2, 50.2], [50.7, 50.2], [53.2, 50.2], [50.2, 50.2], [10, 10]])
-    disparity = np.array([10.0, 10, 10, 5, -1])
-    assert count_voxels(calibration, pixels, disparity, 2.0) == 3
-
-
 def test_sgbm_finds_a_shift() -> None:
     texture = np.random.default_rng(0).integers(0, 256, (60, 120, 3), np.uint8)
     texture = cv2.GaussianBlur(texture, (0, 0), 1)
@@ -139,9 +123,7 @@ def test_sgbm_finds_a_shift() -> None:
 
 def test_the_papers_pipeline_keeps_what_lies_on_a_row(data: Path) -> None:
     scene = load_calibrated_pair(data / "middlebury" / "cones")
-    profiler = StageProfiler()
-    points0, points1 = paper_points(self_described("sift-low"), scene, profiler)
-    assert list(profiler.stages) == list(STAGES)
+    points0, points1 = paper_points(self_described("sift-low"), scene)
     assert len(points0) == len(points1) > 1_000
     assert (np.abs(points0[:, 1] - points1[:, 1]) <= 1).mean() > 0.98
 

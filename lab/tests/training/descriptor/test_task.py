@@ -23,7 +23,7 @@ from deepdetect_lab.training import (
     DescriptorTrainingOptions,
     DeviceOptions,
     TrainingResult,
-    train_descriptor,
+    train_on_pairs,
 )
 from deepdetect_lab.training.checkpoint import read_checkpoint
 from deepdetect_lab.training.descriptor.losses import KINDS, shares_right
@@ -41,7 +41,7 @@ OPTIONS = DescriptorTrainingOptions(steps=3, pairs=2, val_count=1, val_pairs=1)
 
 
 def run(textures: Path, folder: Path, **how: Any) -> TrainingResult:
-    return train_descriptor(textures, textures, folder, OPTIONS, device="cpu", **how)
+    return train_on_pairs(textures, textures, folder, OPTIONS, device="cpu", **how)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -168,7 +168,7 @@ def test_images_without_detail_are_refused(tmp_path: Path, monkeypatch: pytest.M
 
 def test_cross_modal_weights_are_told_from_others(textures: Path, tmp_path: Path) -> None:
     options = replace(OPTIONS, steps=1, cross_modal=True)
-    found = train_descriptor(textures, textures, tmp_path, options, device="cpu")
+    found = train_on_pairs(textures, textures, tmp_path, options, device="cpu")
     assert found.onnx is not None
     points = PointDetector(200, descriptor=found.onnx)
     assert points.descriptor_type == f"cross-modal-{file_digest(found.onnx)[:16]}"

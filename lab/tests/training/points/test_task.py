@@ -15,7 +15,7 @@ from deepdetect.detector.points.detection import detect_points
 from deepdetect.detector.points.ranker import load_ranker
 from deepdetect.features.keypoints import Keypoints
 from deepdetect.io.image import find_images
-from deepdetect_lab.training import PointsTrainingOptions, TrainingResult, train_points
+from deepdetect_lab.training import PointsTrainingOptions, TrainingResult, train_on_pairs
 from deepdetect_lab.training.checkpoint import read_checkpoint
 from deepdetect_lab.training.points.measure import MEASURES, measure, validation_pairs
 from deepdetect_lab.training.points.task import RankerTrainer
@@ -35,7 +35,7 @@ def few_and_small() -> Iterator[None]:
 
 
 def run(textures: Path, folder: Path) -> TrainingResult:
-    return train_points(textures, textures, folder, OPTIONS)
+    return train_on_pairs(textures, textures, folder, OPTIONS)
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Panoramas: images registered with each other by dense matches, and composited."""
+"""Panoramas: registration of images by dense matches, and compositing."""
 
 from .panorama import Panorama, StitchingOptions, stages_of, stitch
 

@@ -1,7 +1,7 @@
-"""Bundle adjustment of all images of a panorama: of homographies, or of cameras that only turned.
+"""Bundle adjustment of a panorama: homographies, or rotations and focal lengths of cameras.
 
-Gauss-Newton with Huber's weights. What counts is how far a point that is taken to the common frame
-and back into its partner image comes from where it belongs there.
+It uses Gauss-Newton with Huber weights. A residual is the distance between a match in the second
+image and its partner, mapped from the first image to the common frame and on to the second image.
 """
 
 from __future__ import annotations
@@ -16,35 +16,35 @@ from ...geometry.camera import Camera, Size
 from ...geometry.transforms import transform_points
 
 MAX_ITERATIONS, MIN_STEP = 20, 1e-7
-"""The fit ends after this many iterations, or with a smaller change of the parameters."""
+"""The fit ends after this many iterations, or if the parameters change by less than the step."""
 
 UNIT_PX = 500.0
-"""Unit of length of the fit, so that all entries of a homography are of one order."""
+"""Unit of length in the fit, chosen so that all entries of a homography have similar magnitudes."""
 
 HUBER_THRESHOLD_PX = 2.0
-"""Larger residuals have less weight."""
+"""Huber's loss reduces the weight of larger residuals. Chosen by hand; not measured."""
 
 FOCAL_LENGTHS = np.geomspace(0.3, 10, 100) * 640 / UNIT_PX
-"""Where the search for the focal length starts, in units: 0.3 to 10 times the longer side."""
+"""Start values of the focal length, in units of the fit: 0.3 to 10 times the longer side."""
 
 FOCAL_WEIGHT = 1e-4
-"""Of a focal length's distance from the common one: half a pixel of noise per tenth of its size."""
+"""Weight of equal focal lengths: a difference of 10 % costs as much as a residual of 0.5 px."""
 
 Matrices = Mapping[int, np.ndarray]
-"""By the number of the image."""
+"""A (3, 3) matrix for each image number."""
 
 Sizes = Mapping[int, tuple[int, int]]
-"""(width, height) of the images, by number."""
+"""(width, height) for each image number."""
 
 Links = list[tuple[int, int, np.ndarray, np.ndarray]]
-"""Numbers of two images, and (M, 2) points of both that are the same, in units."""
+"""Two image numbers, and their (M, 2) corresponding points in units of the fit."""
 
 
 @dataclass(frozen=True, eq=False)
 class RegisteredPair:
     """Two images, by their numbers, related by a homography that dense keypoints confirm.
 
-    `points` are some of the first image's keypoints with a match, of so many `matches`.
+    `points` are matched keypoints of the first image, perhaps fewer than the number of `matches`.
     """
 
     first: int
@@ -56,16 +56,16 @@ class RegisteredPair:
 
 @dataclass(frozen=True, eq=False)
 class RotatingCamera:
-    """A camera that only turned, with its principal point in the middle of the image.
+    """A camera that only rotates, with its principal point at the image centre.
 
-    The rotation goes from the camera to the common frame: x right, y down, z forward.
+    The rotation maps camera coordinates to the common frame: x right, y down, z forward.
     """
 
     focal_px: float
     rotation: np.ndarray
 
     def to_common(self, size: Size) -> np.ndarray:
-        """Return the (3, 3) map from pixels of its image to directions in the common frame."""
+        """Return the (3, 3) map from image pixels to directions in the common frame."""
         return np.asarray(self.rotation @ np.linalg.inv(Camera(size, self.focal_px).matrix))
 
 
@@ -75,10 +75,10 @@ Cameras = Mapping[int, RotatingCamera]
 def adjust_homographies(
     homographies: Matrices, pairs: Sequence[RegisteredPair], sizes: Sizes
 ) -> tuple[dict[int, np.ndarray], float]:
-    """Fit all homographies but the first, which stays, to all pairs at once.
+    """Fit all homographies jointly to all pairs; the first one stays fixed.
 
-    `homographies` go from each image to the frame of the first one, near enough; `sizes` are
-    (width, height). Returns the root mean square of the residuals in pixels, too.
+    `homographies` are start values, from each image to the frame of the first. Also returns the
+    root mean square of the residuals in pixels.
     """
     to_unit, current, links = _in_units(homographies, pairs, sizes)
     reference, *moving = homographies
@@ -87,7 +87,7 @@ def adjust_homographies(
     for _ in range(MAX_ITERATIONS):
         normal, right = _normal_equations(current, links, columns, directions)
         step = np.linalg.lstsq(normal, right, rcond=None)[0]
-        for number, column in columns.items():  # H (I + E), with the last element of E 0
+        for number, column in columns.items():  # update H (I + E); the last element of E is 0
             change = np.append(step[column : column + 8], 0).reshape(3, 3)
             current[number] = _unit_determinant(current[number] @ (np.eye(3) + change))
         if np.abs(step).max(initial=0) < MIN_STEP:
@@ -102,7 +102,7 @@ def adjust_homographies(
 def adjust_cameras(
     homographies: Matrices, pairs: Sequence[RegisteredPair], sizes: Sizes
 ) -> tuple[dict[int, RotatingCamera], float]:
-    """Fit rotations and focal lengths of all cameras; else as `adjust_homographies`."""
+    """Fit rotations and focal lengths of all cameras, otherwise like `adjust_homographies`."""
     _, to_first, links = _in_units(homographies, pairs, sizes)
     starts = [_rotations(to_first, focal) for focal in FOCAL_LENGTHS]
     best = int(np.argmin([misfit for _, misfit in starts]))
@@ -116,7 +116,7 @@ def adjust_cameras(
         for number, column in columns.items():
             normal[column + 3, column + 3] += FOCAL_WEIGHT
             right[column + 3] -= FOCAL_WEIGHT * np.log(focals[number] / common)
-        step = np.linalg.lstsq(normal, right, rcond=None)[0]  # all may turn together
+        step = np.linalg.lstsq(normal, right, rcond=None)[0]  # a common rotation is undetermined
         for number, column in columns.items():
             rotations[number] = rotations[number] @ cv2.Rodrigues(step[column : column + 3])[0]
             focals[number] *= float(np.exp(step[column + 3]))
@@ -128,11 +128,11 @@ def adjust_cameras(
 
 
 def level_cameras(cameras: Cameras, reference: int) -> dict[int, RotatingCamera]:
-    """Turn all cameras together, so that the horizon is level and the reference in the middle.
+    """Rotate all cameras together so that the horizon is level and the reference is in the middle.
 
-    The horizon is what the rows of all images are parallel to (Brown and Lowe, "Automatic panoramic
-    image stitching using invariant features", 2007), and where they leave it open, upright to the
-    mean of the columns.
+    The horizon is the plane to which the rows of all images are nearly parallel (Brown and Lowe,
+    "Automatic panoramic image stitching using invariant features", 2007). If the rows do not
+    determine it, it is perpendicular to the mean of the columns.
     """
     across = np.array([camera.rotation[:, 0] for camera in cameras.values()])
     down = np.mean([camera.rotation[:, 1] for camera in cameras.values()], axis=0)
@@ -148,7 +148,7 @@ def level_cameras(cameras: Cameras, reference: int) -> dict[int, RotatingCamera]
 def _in_units(
     homographies: Matrices, pairs: Sequence[RegisteredPair], sizes: Sizes
 ) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], Links]:
-    """Return the maps of pixels to units, 0 in the middle; and homographies and links in units."""
+    """Return maps from pixels to units around the image centre; homographies, links in units."""
     to_unit = {}
     for number in homographies:
         x, y = (np.array(sizes[number]) - 1) / (2 * UNIT_PX)
@@ -160,7 +160,7 @@ def _in_units(
     }
     links = []
     for pair in pairs:
-        # The homography is sharper than keypoints on whole pixels.
+        # The homography is more accurate than keypoints at integer pixels.
         targets = transform_points(pair.points, pair.homography)
         points = transform_points(pair.points, to_unit[pair.first])
         targets = transform_points(targets, to_unit[pair.second])
@@ -173,8 +173,8 @@ def _normal_equations(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return both sides of the normal equations.
 
-    `columns` says where the parameters of an image begin; their (9, P) `directions` what a
-    parameter adds to E of H (I + E).
+    `columns` gives the index of an image's first parameter, `directions` the (9, P) derivatives of
+    E by its parameters, where E updates a homography to H (I + E).
     """
     count = sum(matrix.shape[1] for matrix in directions.values())
     normal, right = np.zeros((count, count)), np.zeros(count)
@@ -200,7 +200,7 @@ def _normal_equations(
 def _linearised(
     first: np.ndarray, second: np.ndarray, points: np.ndarray, targets: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return residuals in the second image (M, 2) and their derivatives by both E (M, 2, 9)."""
+    """Return (M, 2) residuals in the second image and their (M, 2, 9) derivatives by each E."""
     between = np.linalg.inv(second) @ first
     homogeneous = np.column_stack([points, np.ones(len(points))])
     mapped = homogeneous @ between.T
@@ -224,7 +224,7 @@ def _residual_px(current: Matrices, links: Links) -> float:
 
 
 def _rotations(homographies: Matrices, focal: float) -> tuple[dict[int, np.ndarray], float]:
-    """Return the rotations nearest to homographies in units, and how far these are from them."""
+    """Return the rotations nearest to homographies in units, and their distance from them."""
     rotations, misfit = {}, 0.0
     for number, matrix in homographies.items():
         left, stretch, right = np.linalg.svd(
@@ -236,7 +236,7 @@ def _rotations(homographies: Matrices, focal: float) -> tuple[dict[int, np.ndarr
 
 
 def _turns_and_focal(focal: float) -> np.ndarray:
-    """Return the (9, 4) derivatives of E by turns about x, y and z, and by the log focal length."""
+    """Return the (9, 4) derivatives of E by rotations about x, y, z and by the log focal length."""
     turns = np.zeros((4, 3, 3))
     turns[0, 1, 2], turns[0, 2, 1] = -focal, 1 / focal
     turns[1, 0, 2], turns[1, 2, 0] = focal, -1 / focal

@@ -1,6 +1,6 @@
-"""Where the images of a panorama lie, on a plane, a cylinder or a sphere.
+"""Place the images of a panorama on a plane, a cylinder or a sphere.
 
-Size and memory of a canvas are known before anything is drawn.
+The size and memory of a canvas are known before anything is drawn.
 """
 
 from __future__ import annotations
@@ -26,25 +26,26 @@ from ...geometry.transforms import (
 from .bundle_adjustment import Cameras, Matrices, Sizes
 
 Box = tuple[int, int, int, int]
-"""Left, top, right and bottom in pixels, right and bottom outside."""
+"""Left, top, right and bottom in pixels; right and bottom are exclusive."""
 
 MAX_DEPTH_RATIO = 5.0
-"""How many times farther from the camera one corner of an image may lie on a flat canvas than
-another: near the horizon an image is stretched without bound."""
+"""The depths of an image's corners may differ by this ratio on a flat canvas, because images near
+the horizon are stretched without bound. Chosen by hand; not measured."""
 
 MIN_WARP_SCALE = 0.67
-"""An image that the canvas shows smaller than this is blurred first, against aliasing."""
+"""Images drawn at a smaller scale are blurred first, because they would alias."""
 
 MIN_SHOWN_PX = 16
-"""Images shown still smaller are blurred as if their longer side had this many pixels: wider blurs
-take minutes."""
+"""Images drawn smaller are blurred as if their longer side had this many pixels, because wider
+blurs take minutes."""
 
 
 @dataclass(frozen=True, eq=False)
 class WarpedImage:
-    """An image on the canvas, mirrored beyond its borders, whose left and top are the `corner`.
+    """An image warped to the canvas, with its left and top at `corner`.
 
-    The image is (h, w, 3) uint8 or uint16; the mask, (h, w) uint8, is 255 inside.
+    The image is (h, w, 3) uint8 or uint16, mirrored beyond its borders. The (h, w) uint8 mask is
+    255 inside.
     """
 
     image: np.ndarray
@@ -54,10 +55,10 @@ class WarpedImage:
 
 @dataclass(frozen=True, eq=False)
 class Canvas:
-    """Where images lie on a canvas: boxes by the number of the image, or ~number of its rest.
+    """Boxes of images on a canvas by image number, or by ~number for the rest of a split image.
 
-    `draw(place, rgb, scale_of_image, scale_of_canvas)` draws one, both made smaller. A `closed`
-    canvas shows all around: its right end goes on at its left one.
+    `draw(place, rgb, scale_of_image, scale_of_canvas)` warps an image; the scales are those of
+    reduced copies. A `closed` canvas shows 360 degrees, so its right border continues at the left.
     """
 
     boxes: dict[int, Box]
@@ -71,7 +72,7 @@ class Canvas:
         return right, bottom
 
     def check_size(self, max_megapixels: float) -> None:
-        """Raise an OptionError if it has too many pixels, or needs more memory than there is."""
+        """Raise an OptionError if it has too many pixels or needs too much memory."""
         width, height = self.size
         if width * height > max_megapixels * 1e6:
             raise OptionError(
@@ -88,7 +89,7 @@ class Canvas:
 
 
 def least_distorted(sizes: Sizes, homographies: Matrices) -> int:
-    """Return the number of the image in whose frame all images are least distorted."""
+    """Return the number of the image in whose frame the images are least distorted."""
 
     def stretch(frame: int) -> float:
         back = np.linalg.inv(homographies[frame])
@@ -102,9 +103,10 @@ def least_distorted(sizes: Sizes, homographies: Matrices) -> int:
 def plan_plane(
     sizes: Sizes, homographies: Matrices, reference: int, scale: float
 ) -> tuple[Canvas, dict[int, np.ndarray]]:
-    """Find the smallest flat canvas of all images, with so many pixels per pixel of the reference.
+    """Find the smallest flat canvas that holds all images.
 
-    The homographies go to any common frame; those that are returned go to the canvas.
+    `scale` is the number of canvas pixels per pixel of the reference. The given homographies map to
+    any common frame, the returned ones to the canvas.
     """
     back = np.linalg.inv(homographies[reference])
     placed = {number: back @ matrix for number, matrix in homographies.items()}
@@ -112,12 +114,12 @@ def plan_plane(
         depths = _depths(sizes[number], matrix)
         if depths.min() * MAX_DEPTH_RATIO <= depths.max():
             raise RegistrationError(
-                f"images[{number}] is seen too much from the side of images[{reference}] for a "
-                "flat panorama: choose a `reference` between them, or, if the camera only turned, "
-                "the projection 'cylindrical'"
+                f"images[{number}] is too oblique to images[{reference}] for a flat panorama: "
+                "choose a `reference` between them, or, if the camera only rotated, the "
+                "projection 'cylindrical'"
             )
     placed = {number: scaled_homography(matrix, 1, scale) for number, matrix in placed.items()}
-    # A pixel belongs to an image when its centre does.
+    # A pixel belongs to an image if its centre does.
     edges = {n: transform_points(outer_corners(sizes[n]), matrix) for n, matrix in placed.items()}
     low = np.ceil(np.min([edge.min(0) for edge in edges.values()], axis=0))
     boxes = {}
@@ -154,16 +156,16 @@ def plan_curved(
 ) -> Canvas:
     """Find the smallest canvas of all images on a cylinder or a sphere.
 
-    It has `scale` pixels per pixel in the middle of the reference, but for a turn of whole pixels.
-    Where images show all around, it is cut through the middle of the one that is most behind.
+    It has `scale` pixels per pixel at the centre of the reference; a full turn is rounded to whole
+    pixels. If the images show 360 degrees, it is cut through the image opposite the reference.
     """
     turn = round(2 * np.pi * cameras[reference].focal_px * scale)
     angles = {n: float(np.arctan2(*one.rotation[[0, 2], 2])) for n, one in cameras.items()}
 
     def aimed(number: int, start: float, canvas_scale: float, image_scale: float) -> Any:
-        """Return a warper, the matrices of its camera, and the column that is 0 for it.
+        """Return a warper, its camera matrices, and the column of its origin.
 
-        It draws each image ahead, where it is in one piece.
+        The camera looks at the image, so that the warped image is not split.
         """
         radius = turn * canvas_scale / (2 * np.pi)
         middle = round((angles[number] - start) % (2 * np.pi) * radius)
@@ -185,14 +187,14 @@ def plan_curved(
     closed = len(np.unique(np.concatenate(columns))) == turn
     if closed:
         start = min(angles.values(), key=lambda angle: np.cos(angle - angles[reference]))
-    else:  # in the widest gap
+    else:  # cut in the widest gap
         order = np.sort([*angles.values()])
         gaps = np.diff(np.append(order, order[0] + 2 * np.pi))
         start = float((order + gaps / 2)[gaps.argmax()])
     boxes = find_boxes(start)
     top = min(box[1] for box in boxes.values())
     origin = 0 if closed else min(box[0] for box in boxes.values())
-    if closed:  # what reaches over an end goes on at the other
+    if closed:  # a box that exceeds one border continues at the other
         wrapped = {}
         for number, (left, up, right, down) in boxes.items():
             wrapped[number] = (max(left, 0), up, min(right, turn), down)
@@ -223,23 +225,23 @@ def plan_curved(
 
 
 def image_of(place: int) -> int:
-    """Return the number of the image in a place: ~number is where its rest goes on."""
+    """Return the image number of a box key; ~number stands for the rest of a split image."""
     return max(place, ~place)
 
 
 def _smooth(rgb: np.ndarray, shown: float) -> np.ndarray:
-    """Blur an image that is shown much smaller."""
+    """Blur an image that is drawn much smaller, against aliasing."""
     if shown >= MIN_WARP_SCALE:
         return rgb
     return antialiased(rgb, max(shown, MIN_SHOWN_PX / max(rgb.shape)))
 
 
 def _depths(size: tuple[int, int], homography: np.ndarray) -> np.ndarray:
-    """Return how far before the camera of the frame the corners of an image lie, (4,).
+    """Return the depths of an image's corners, (4,), in front of the camera of the frame.
 
-    For images of equal cameras that only turned it is the cosine of the angle off the axis, but for
-    a factor; below 0 is behind the horizon.
+    For equal cameras that only rotate, depths are proportional to the cosine of the angle from the
+    axis. They are negative behind the horizon.
     """
-    # Matrices are known but for a factor; rotations do not mirror.
+    # A homography's factor is arbitrary, but rotations have a positive determinant.
     matrix = homography / np.cbrt(np.linalg.det(homography))
     return outer_corners(size) @ matrix[2, :2] + matrix[2, 2]

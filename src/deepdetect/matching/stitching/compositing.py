@@ -1,7 +1,7 @@
-"""Putting the images of a panorama on their canvas.
+"""Composite the images of a panorama on their canvas.
 
-Exposure and seams are found on small copies; the images are warped one after the other and blended
-in frequency bands (Burt and Adelson, "A multiresolution spline with application to image mosaics",
+Exposure and seams are found on small copies. Images are warped one after another and blended in
+frequency bands (Burt and Adelson, "A multiresolution spline with application to image mosaics",
 1983).
 """
 
@@ -16,22 +16,23 @@ from ..._shared.opencv import cv2
 from .canvas import Box, Canvas, WarpedImage, image_of
 
 NUM_BANDS = 5
-"""Frequency bands; the coarsest blends over about 2^5 pixels."""
+"""Number of frequency bands; the coarsest blends over about 2^5 pixels."""
 
 SEAM_MEGAPIXELS = 0.5
-"""Size of the canvas, at the most, on which exposure and seams are found."""
+"""Exposure and seams are found on a small canvas of at most this size. Chosen by hand."""
 
 MIN_OVERLAP_PX = 100
-"""Pixels there by which two images must overlap for their brightness to be compared."""
+"""Brightness is compared if two images overlap by more pixels there. Chosen by hand."""
 
 SEAM_TOLERANCE_PX, SEAM_PERCENT = 1.0, 90.0
-"""Pixels there that images may differ along nearly all of a seam: on a screen it is not seen."""
+"""Parallax is reported if this percentile of displacements along a seam exceeds the tolerance, in
+pixels of the small canvas, since smaller ones would be invisible on a screen."""
 
 MIN_FLOW_PX = 32
-"""Side of an overlap in which displacements can be found."""
+"""Optical flow needs an overlap with at least this side. Chosen by hand; not measured."""
 
 GAIN_ERROR_STD, GAIN_PRIOR_STD = 0.05, 0.5
-"""Standard deviations of log brightness: of what an overlap says of two, and of images."""
+"""Standard deviations of log brightness ratios in overlaps, and of log gains. Chosen by hand."""
 
 
 def composite(
@@ -39,18 +40,17 @@ def composite(
     small: Mapping[int, tuple[np.ndarray, float]],
     canvas: Canvas,
 ) -> tuple[np.ndarray, np.ndarray, dict[int, float], dict[tuple[int, int], float]]:
-    """Put images onto a canvas.
+    """Composite images on a canvas.
 
-    `load` returns an image, (H, W, 3) RGB, uint8 or uint16, by its number, and is called once for
-    each place; `small` are the same images in uint8, made smaller, and their scales. Returns the
-    panorama, black where there is nothing, uint16 where an image is; a mask of where there is
-    something; the gain of each image; and by how many pixels of the panorama
-    two images differ along their seam, of those that differ too much.
+    `load` returns an image by number, (H, W, 3) RGB, uint8 or uint16; it is called once per box.
+    `small` holds reduced uint8 copies and their scales. Returns the panorama (black outside, uint16
+    if an image is), its mask, the gain of each image, and the parallax of pairs whose images differ
+    too much along their seam, in pixels of the panorama.
     """
     width, height = canvas.size
     scale = min(1.0, float(np.sqrt(SEAM_MEGAPIXELS * 1e6 / (width * height))))
     low = {place: canvas.draw(place, *small[image_of(place)], scale) for place in canvas.boxes}
-    low = {place: one for place, one in low.items() if one.mask.size}  # rests are too narrow there
+    low = {place: one for place, one in low.items() if one.mask.size}  # some are too narrow
     gains = _gains(low)
     seams = _seams(low, gains)
     parallax = {pair: px / scale for pair, px in _parallax(low, gains, seams).items()}
@@ -73,7 +73,7 @@ def composite(
 
 
 class _Blender:
-    """Sums of images in frequency bands, weighted by their masks, and of these weights."""
+    """Sums, by frequency band, of images weighted by their masks, and sums of the weights."""
 
     def __init__(self, width: int, height: int) -> None:
         step = 1 << NUM_BANDS
@@ -85,9 +85,9 @@ class _Blender:
     def feed(
         self, image: np.ndarray, factor: float, mask: np.ndarray, corner: tuple[int, int]
     ) -> None:
-        """Add an image, times a factor, where its mask is 255."""
+        """Add an image, multiplied by a factor, where its mask is 255."""
         (height, width), (x, y), step = mask.shape, corner, 1 << NUM_BANDS
-        # To whole pixels of the coarsest band, and as far as the mask is spread there.
+        # The box is extended to whole coarse pixels and by the blur of the mask.
         rows, columns = self.weights[0].shape
         top, left = (max(0, (start // step - 2) * step) for start in (y, x))
         bottom = min(rows, (-(-(y + height) // step) + 2) * step)
@@ -109,7 +109,7 @@ class _Blender:
             band, weight = coarse, cv2.pyrDown(weight)
 
     def blend(self) -> np.ndarray:
-        """Return a float32 image, of whole pixels of the coarsest band; the sums are used up."""
+        """Return the blended float32 image, padded to coarse pixels; consumes the sums."""
         image: np.ndarray | None = None
         while self.sums:
             band, weight = self.sums.pop(), self.weights.pop()
@@ -122,10 +122,10 @@ class _Blender:
 
 
 def _gains(low: Mapping[int, WarpedImage]) -> dict[int, float]:
-    """Find factors that make images equally bright where they overlap, on the whole near 1.
+    """Find gains near 1 that make images equally bright where they overlap.
 
-    Least squares of logarithms, else as Brown and Lowe, "Automatic panoramic image stitching using
-    invariant features", 2007.
+    They solve a least-squares problem as in Brown and Lowe, "Automatic panoramic image stitching
+    using invariant features", 2007, but in logarithms.
     """
     numbers = [*dict.fromkeys(map(image_of, low))]
     rows, right = [*np.eye(len(numbers)) / GAIN_PRIOR_STD], [0.0] * len(numbers)
@@ -142,12 +142,12 @@ def _gains(low: Mapping[int, WarpedImage]) -> dict[int, float]:
 
 
 def _overlap_means(first: WarpedImage, second: WarpedImage) -> tuple[float, float] | None:
-    """Return the mean brightness of both images where they overlap; None for too small a part."""
+    """Return the mean brightness of both images in their overlap; None if it is too small."""
     parts = _overlap(first, second)
     shared = (first.mask[parts[0]] > 0) & (second.mask[parts[1]] > 0)
     if np.count_nonzero(shared) < MIN_OVERLAP_PX:
         return None
-    # Black is not 0 times white.
+    # Adding 1 avoids a gain of 0 or infinity for black images.
     means = [
         float(one.image[part][shared].mean()) + 1
         for one, part in zip((first, second), parts, strict=True)
@@ -156,7 +156,7 @@ def _overlap_means(first: WarpedImage, second: WarpedImage) -> tuple[float, floa
 
 
 def _overlap(first: WarpedImage, second: WarpedImage) -> list[tuple[slice, slice]]:
-    """Return the rows and columns of both that are the same box of the canvas; it may be empty."""
+    """Return rows and columns of the overlap box in both images; it may be empty."""
     both = first, second
     left, top = np.max([one.corner for one in both], axis=0)
     right, bottom = np.min([np.add(one.corner, one.mask.shape[::-1]) for one in both], axis=0)
@@ -169,7 +169,7 @@ def _overlap(first: WarpedImage, second: WarpedImage) -> list[tuple[slice, slice
 def _parallax(
     low: Mapping[int, WarpedImage], gains: Mapping[int, float], seams: Mapping[int, np.ndarray]
 ) -> dict[tuple[int, int], float]:
-    """Find by how many pixels images differ along their seams, of those that differ too much."""
+    """Find the displacement in pixels along the seams of pairs that differ too much."""
     flow = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     found: dict[tuple[int, int], float] = {}
     for places in combinations(low, 2):
@@ -198,10 +198,10 @@ def _parallax(
 
 
 def _seams(low: Mapping[int, WarpedImage], gains: Mapping[int, float]) -> dict[int, np.ndarray]:
-    """Divide the overlaps where the images differ least; (h, w) uint8 masks on the small canvas."""
+    """Find seams where images differ least; return (h, w) uint8 masks on the small canvas."""
     images = [one.image.astype(np.float32) * gains[image_of(n)] for n, one in low.items()]
     corners, masks = [one.corner for one in low.values()], [one.mask for one in low.values()]
-    # Graph cuts take minutes where large overlaps are equal.
+    # Dynamic programming is used, because graph cuts take minutes if large overlaps are equal.
     masks = cv2.detail_DpSeamFinder("COLOR").find(images, corners, masks)
     return {
         number: mask.get() if isinstance(mask, cv2.UMat) else mask
@@ -210,17 +210,17 @@ def _seams(low: Mapping[int, WarpedImage], gains: Mapping[int, float]) -> dict[i
 
 
 def _upscale_mask(seam: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a mask of the small canvas in the shape of the large one, with a margin: no gaps."""
+    """Upscale a mask from the small canvas, with a margin so that no gaps remain."""
     wide = cv2.dilate(seam, np.ones((5, 5), np.uint8))
     large = cv2.resize(wide, shape[::-1], interpolation=cv2.INTER_LINEAR)
     return np.where(large > 127, np.uint8(255), np.uint8(0))
 
 
 def crop_box(valid: np.ndarray, whole_rows: bool = False) -> Box:
-    """Return the largest rectangle of a mask, (H, W) bool, that is true everywhere.
+    """Return the largest rectangle of an (H, W) bool mask that is true everywhere.
 
-    With `whole_rows` it has the full width, if a row has.
-    Row by row, for each column: the run that ends there, and how far its height reaches sideways.
+    With `whole_rows` it has the full width if any row is true everywhere. For each row it tracks
+    the height of the run that ends in each column, and how far that height extends sideways.
     """
     if whole_rows and valid.all(axis=1).any():
         valid = np.repeat(valid.all(axis=1, keepdims=True), valid.shape[1], axis=1)

@@ -1,4 +1,4 @@
-"""Panoramas: from images to one."""
+"""Stitch images to a panorama."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ PROJECTIONS = get_args(Projection)
 @suggest_keywords
 @dataclass(frozen=True)
 class StitchingOptions:
-    """How images become a panorama.
+    """Scale, size limit and registration size of a panorama.
 
     Attributes:
-        scale: pixels of the panorama per pixel in the middle of the reference.
+        scale: panorama pixels per image pixel at the centre of the reference.
         max_canvas_megapixels: size limit of the panorama; a pixel takes 22 to 56 bytes of memory.
         registration_side: longer side in pixels to which images are reduced for registration.
 
@@ -54,24 +54,25 @@ class StitchingOptions:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Panorama:
-    """Images put together.
+    """A stitched panorama.
 
     Attributes:
-        image: (H, W, 3) RGB, black where no image is: uint8, or uint16 where one of them has more
-            than 8 bits.
-        valid: (H, W) bool, where one is.
-        homographies: (3, 3) from each image, by its number: of a flat panorama to `image`, of a
-            curved one to the reference; in the order in which they were connected.
-        reference: number of the image that is not distorted, or is in the middle of a curve.
-        unregistered: why each other image has no part in it, by its number.
-        matches: number of dense matches of each pair that was registered.
-        residual_px: root mean square of the distances that the homographies of the pairs are
-            from the panorama's, in pixels of the registration; flat: 0 without closed loops.
-        gains: factor that the brightness of each image was multiplied by.
+        image: (H, W, 3) RGB, black outside of all images; uint16 if an image has more than 8 bits,
+            otherwise uint8.
+        valid: (H, W) bool, true where an image is.
+        homographies: (3, 3) homographies by image number, in the order in which images were
+            connected. They map to `image` for a flat panorama, else to the reference.
+        reference: number of the image that is undistorted, or in the middle of a curved panorama.
+        unregistered: by image number, the reason why an image is not in the panorama.
+        matches: number of dense matches of each registered pair.
+        residual_px: root mean square distance between the pairs' homographies and the panorama's,
+            in pixels of the registration; 0 for a flat panorama without closed loops.
+        gains: brightness factor of each image.
         seconds: time of each stage.
-        parallax: pixels of the panorama by which two images differ along their seam, of the pairs
-            where it is seen: the camera moved between them.
-        closed: whether it shows all around: its right end goes on at its left one.
+        parallax: displacement along the seam of two images, in panorama pixels, for pairs where it
+            is visible because the camera moved.
+        closed: whether the panorama shows 360 degrees, so that its right border continues at the
+            left.
     """
 
     image: np.ndarray
@@ -95,7 +96,7 @@ class Panorama:
 
 
 def stages_of(count: int) -> list[str]:
-    """Return what `stitch` reports of so many images: each image and each pair, too."""
+    """Return the stages that `stitch` reports for `count` images, also each image and pair."""
     each = ["keypoints"] * count + ["overlaps"] * (count * (count - 1) // 2)
     return ["reading", *each, "registration", "compositing"]
 
@@ -113,37 +114,37 @@ def stitch(
     options: StitchingOptions = StitchingOptions(),
     progress: Callable[[str], object] | None = None,
 ) -> Panorama:
-    """Make a panorama of images from one place, or of a plane.
+    """Stitch images taken from one place, or of a plane, to a panorama.
 
-    Pairs are registered by guided matching at reduced size, jointly refined, and drawn onto one
-    canvas with equal brightness, seams where they differ least, and soft borders. A flat canvas
-    shows less than 180 degrees, in practice 100 to 120; a cylinder or a sphere shows all around.
+    Pairs are registered by guided matching at reduced size, and all are refined jointly. Images
+    are blended on one canvas with equal brightness and seams where they differ least. A flat canvas
+    shows less than 180 degrees, in practice 100 to 120; a cylinder or a sphere shows up to 360.
 
     Args:
-        images: two or more, in any order; each anything `load_image` takes. Paths are read when
-            they are needed, so that only one image at its full size is in the memory.
-        detector: a `DeepDetect`, or anything with its `heatmap` method: SIFT's keypoints find the
-            overlaps, dense ones confirm them; or a `PointDetector`, whose points do both. Default
+        images: two or more images in any order, in any form that `load_image` accepts. Paths are
+            loaded one at a time, so that only one full-size image is in memory.
+        detector: a `DeepDetect` or an object with a `heatmap` method: SIFT keypoints find overlaps
+            and dense keypoints confirm them. Or a `PointDetector`, whose points do both. Default
             `DeepDetect()`.
-        channels: order of the colours in images that are arrays, as of `load_image`.
+        channels: order of the colour channels in images that are arrays, as in `load_image`.
         projection: "plane" keeps lines straight; "cylindrical" and "spherical" need cameras that
             only rotated, and level the horizon.
-        crop: cut the panorama to the largest rectangle without black.
-        reference: number of the image in whose frame a flat panorama is, or that is in the middle
-            of a curved one; None for the one in the middle of all.
+        crop: crop the panorama to the largest rectangle without black.
+        reference: number of the undistorted image of a flat panorama, or of the middle image of a
+            curved one; None chooses the image that distorts the others least.
         seed: seed of all random choices.
         options: scale, limits and sizes.
         progress: called with the name of each stage (`stages_of`) when it ends.
 
     Returns:
-        The panorama, of all images that could be connected.
+        The panorama of all images that could be connected.
 
     Raises:
         ImageError: an image cannot be read or is not fit.
         OptionError: an option is out of its range, there are fewer than two images, or the
             panorama would be too large.
-        RegistrationError: no two images overlap, or one reaches the horizon of the reference, or
-            the cameras of a curved panorama did more than turn.
+        RegistrationError: no two images overlap, one reaches the horizon of the reference, or the
+            cameras of a curved panorama did not only rotate.
 
     Example:
         >>> from deepdetect import PointDetector
@@ -158,12 +159,12 @@ def stitch(
     check_name("projection", projection, PROJECTIONS)
     several = isinstance(images, Sequence) or getattr(images, "ndim", 0) == 4
     if not several or len(images) < 2:
-        raise OptionError("a panorama needs two images or more: give more images")
+        raise OptionError("a panorama needs at least two images: give more images")
     if reference is not None:
         reference = whole("reference", reference)
         if not 0 <= reference < len(images):
             raise OptionError(
-                f"`reference` must number an image, 0 to {len(images) - 1}, not {reference}"
+                f"`reference` must be an image number, 0 to {len(images) - 1}, not {reference}"
             )
     timer = StageTimer(progress)
     small: dict[int, tuple[np.ndarray, float]] = {}
@@ -224,7 +225,7 @@ def _plan(
 ) -> tuple[Canvas, dict[int, np.ndarray], int]:
     """Return the canvas, the homographies of the panorama, and the number of the reference.
 
-    `scales` are those at which the images were registered, `sizes` those of the whole images.
+    `scales` are the factors of the images for registration, `sizes` their full sizes.
     """
     if projection == "plane" or registration.cameras is None:
         homographies = {

@@ -1,10 +1,10 @@
-"""Homographies of many images into the frame of one.
+"""Estimate homographies from many images to the frame of one.
 
-Which images overlap is found with few keypoints. The pairs that do are registered by guided
-matching, whose test by dense keypoints they must pass. The pairs with the most matches make a
-spanning tree; homographies composed along it are the start of a fit to all pairs at once. Pairs
-that overlap by this fit, but not by their keypoints, or disagree with it, are tried again from
-where it puts them, and all are fitted once more.
+Sparse keypoints show which images overlap. These pairs are registered by guided matching, and dense
+keypoints must confirm them. The pairs with most matches form a spanning tree; homographies composed
+along it initialise a joint fit to all pairs. Pairs are matched again, starting from this fit, if
+they disagree with it, or if they overlap in it without having been registered. Then the joint fit
+is repeated.
 """
 
 from __future__ import annotations
@@ -29,37 +29,39 @@ from ..guided.initial_geometry import InitialGeometry, estimate_initial_geometry
 from .bundle_adjustment import RegisteredPair, RotatingCamera, adjust_cameras, adjust_homographies
 
 SIFT_KEYPOINTS = 2000
-"""Sparse keypoints by which overlaps are found."""
+"""Number of sparse keypoints per image to find overlaps. Chosen by hand; not measured."""
 
 MAX_KEYPOINTS = 30_000
-"""Dense keypoints per image that must confirm a homography."""
+"""A homography is confirmed by at most this many dense keypoints per image. Chosen by hand."""
 
 MIN_PARTNERS = 3
-"""Pairs that each image takes part in, where it has that many, beyond those that connect all."""
+"""A pair of connected images is skipped if both have this many partners, since it takes time."""
 
 MIN_OVERLAP = 0.1
-"""Fraction of the keypoints of one image that the other shows by the fit, for a pair to be tried
-again."""
+"""A pair is tried again if the fit maps at least this fraction of an image's keypoints into the
+other. Chosen by hand; not measured."""
 
 MAX_FURTHER_TRIALS = 2
-"""Of the geometries that keypoints show, where dense matches refute the first."""
+"""Number of further geometries to try if dense matches reject the first; each takes time."""
 
 MAX_DISAGREEMENT_PX = 2.0
-"""Root mean square of what the fit leaves of a pair, above which it is tried again."""
+"""A pair is tried again if the root mean square of its residuals in the fit is larger. Chosen by
+hand; not measured."""
 
 MAX_CORRESPONDENCES = 400
-"""Evenly spread matches per pair that the fit of all uses."""
+"""Number of evenly spread matches per pair in the joint fit. Chosen by hand; not measured."""
 
 MAX_CAMERA_RESIDUAL_PX = 3.0
-"""Of cameras that only turned, at the size of the registration: 0.2 to 1 without parallax."""
+"""Cameras that only rotate have smaller residuals at registration size: 0.2 to 1 px without
+parallax."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointRegistration:
-    """Images in a common frame, by number; fields as of `Panorama`.
+    """Images in a common frame, by number; other fields are as in `Panorama`.
 
-    The homographies, in the order in which images were connected, go to the frame of the first one;
-    there are cameras where these are asked for.
+    Homographies map to the frame of the first image, in the order in which images were connected.
+    `cameras` is None unless rotating cameras are requested.
     """
 
     homographies: dict[int, np.ndarray]
@@ -70,7 +72,7 @@ class JointRegistration:
 
 
 class _Image(NamedTuple):
-    """An image with its sparse, described keypoints, and the (N, 2) dense ones."""
+    """An image with sparse keypoints and descriptors, and (N, 2) dense keypoints."""
 
     gray: np.ndarray
     features: Keypoints
@@ -88,9 +90,9 @@ def register_images(
 ) -> JointRegistration:
     """Find the homographies of overlapping images, (H, W, 3) uint8 RGB, to a common frame.
 
-    Points of a detector without heat map find the overlaps and confirm the homographies; else
-    SIFT's keypoints find them and dense ones confirm. `reference` is the number of an image that
-    must be among them, None for the most images; `turning` finds the cameras, too.
+    SIFT keypoints find overlaps and dense keypoints confirm homographies; the points of a detector
+    without heat map do both. The largest group of connected images is registered, or the group of
+    the image numbered `reference`. With `turning` rotating cameras are also estimated.
     """
     done = progress or (lambda _: None)
     views = []
@@ -108,8 +110,8 @@ def register_images(
         nothing = f"no two of these {len(images)} images overlap"
     if len(group) == 1:
         raise RegistrationError(
-            f"{nothing} so that a homography can be trusted: they must show common detail, and be "
-            "taken from one place or show a plane"
+            f"{nothing} with a reliable homography: take images with common detail, from one place "
+            "or of a plane"
         )
     unregistered = {
         number: "it overlaps with no other image"
@@ -131,7 +133,7 @@ def register_images(
         homographies, cameras, residual_px = _adjust(group, pairs, sizes, turning)
     if turning and residual_px > MAX_CAMERA_RESIDUAL_PX:
         raise RegistrationError(
-            f"the cameras of these images did more than turn ({residual_px:.1f} px remain): "
+            f"the cameras of these images did not only rotate ({residual_px:.1f} px remain): "
             "take all from one place, or choose the projection 'plane'"
         )
     counts = {(pair.first, pair.second): pair.matches for pair in pairs}
@@ -144,7 +146,7 @@ def _adjust(
     sizes: dict[int, tuple[int, int]],
     turning: bool,
 ) -> tuple[dict[int, np.ndarray], dict[int, RotatingCamera] | None, float]:
-    """Fit all images of a group to their pairs; returns what remains, in pixels, too."""
+    """Fit all images of a group jointly to their pairs; also return the residual in pixels."""
     homographies, residual_px = adjust_homographies(_compose(group, pairs), pairs, sizes)
     cameras = None
     if turning:
@@ -160,7 +162,7 @@ def _prepare(image: np.ndarray, detector: AnyDetector) -> _Image:
         else:
             points = describe_keypoints(gray, find_keypoints(detector, image))
         return _Image(gray, points, np.rint(points.xy))
-    # Without suppression: neighbouring pixels are what the verification compares.
+    # The verification compares neighbouring pixels, so non-maximum suppression is off.
     keypoints = find_keypoints(detector, image, SelectionOptions(max_keypoints=MAX_KEYPOINTS))
     return _Image(gray, detect_sift(gray, SIFT_KEYPOINTS), keypoints.xy)
 
@@ -187,7 +189,7 @@ def _registered_pairs(
         for _ in range(MAX_FURTHER_TRIALS):
             if pair is not None or geometry.matrix is None:
                 break
-            # Where towers or windows look alike, most keypoints can agree on what is wrong.
+            # With repeated structure (windows) most keypoints may agree on a wrong geometry.
             tentative = tentative.apart_from(geometry.matrix)
             geometry = estimate_initial_geometry(tentative, "homography", seed)
             pair = _register(views, first, second, geometry, seed)
@@ -201,7 +203,7 @@ def _registered_pairs(
 def _register(
     views: Sequence[_Image], first: int, second: int, geometry: InitialGeometry, seed: int
 ) -> RegisteredPair | None:
-    """Match densely by a geometry; None where it is refuted, or none."""
+    """Match densely guided by a geometry; return None if there is none or it is rejected."""
     if geometry.matrix is None:
         return None
     a, b = views[first], views[second]
@@ -221,11 +223,11 @@ def _registered_again(
     pairs: Sequence[RegisteredPair],
     seed: int,
 ) -> list[RegisteredPair]:
-    """Register pairs that disagree with a fit, or are missing in it, from where it puts them.
+    """Register pairs again, starting from a fit, if they disagree with it or are missing in it.
 
-    Where towers or windows look alike, or lie along one line, keypoints show wrong homographies,
-    which dense matches refute, or confirm in part; the fit knows them from all other pairs. Of both
-    the one with more matches is returned. Without the pair that closes a turn its ends drift apart.
+    With repeated or collinear structure (towers, windows) keypoints give wrong homographies, which
+    dense matches reject or confirm in part. The fit predicts them from all other pairs. The result
+    with more matches is returned. A full turn needs its closing pair, or its ends drift apart.
     """
     known = {(pair.first, pair.second): pair for pair in pairs}
     partners: dict[int, set[int]] = {number: set() for number in to_common}
@@ -273,7 +275,7 @@ def _registered_again(
 
 
 def _shown(first: _Image, second: _Image, homography: np.ndarray) -> float:
-    """Return the fraction of the keypoints of one image that another shows, by a homography."""
+    """Return the fraction of an image's keypoints that a homography maps into another image."""
     x, y, depth = homography @ np.vstack([first.keypoints.T, np.ones(len(first.keypoints))])
     height, width = second.gray.shape
     inside = (x > 0) & (x < depth * (width - 1)) & (y > 0) & (y < depth * (height - 1))
@@ -281,7 +283,7 @@ def _shown(first: _Image, second: _Image, homography: np.ndarray) -> float:
 
 
 def _connected(number: int, pairs: Sequence[RegisteredPair]) -> set[int]:
-    """Return the images that pairs connect with one of them, itself included."""
+    """Return the images that pairs connect with a given image, itself included."""
     reached = {number}
     while True:
         touching = [pair for pair in pairs if pair.first in reached or pair.second in reached]
@@ -292,7 +294,7 @@ def _connected(number: int, pairs: Sequence[RegisteredPair]) -> set[int]:
 
 
 def _compose(group: Sequence[int], pairs: Sequence[RegisteredPair]) -> dict[int, np.ndarray]:
-    """Compose homographies to the image with most matches, along the maximum spanning tree."""
+    """Compose homographies along the maximum spanning tree, to the image with most matches."""
     tree: list[RegisteredPair] = []
     steps: list[tuple[int, int, np.ndarray]] = []
     matches = dict.fromkeys(group, 0)

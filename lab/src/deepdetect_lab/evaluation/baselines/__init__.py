@@ -1,1 +1,1 @@
-"""Detectors with their descriptors to compare with: classical, from outside, and chance."""
+"""Detectors and descriptors as baselines: classical ones, external ones, and chance."""

@@ -1,16 +1,16 @@
-"""Detectors from outside by name: a classical one, an ONNX file, or any function Python can import.
+"""Find detectors by name: a classical detector, an ONNX file, or an importable function.
 
-A function is named as "package.module:function"; it takes a (H, W, 3) uint8 RGB image and returns a
-dict with `keypoints` (N, 2), `scores` (N,) and optionally `descriptors` (N, D). Attributes of the
-function say more: `learned` (descriptors that need no ratio test), `binary` (compared by Hamming's
-distance), and `version`, to be changed when its results change: of its sources only the module's
-own file is watched.
+A function is named as "package.module:function". It takes an (H, W, 3) uint8 RGB image and returns
+a dict with `keypoints` (N, 2), `scores` (N,) and optionally `descriptors` (N, D). It may have these
+attributes: `learned` (its descriptors need no ratio test), `binary` (they are compared by Hamming
+distance) and `version`. Change `version` whenever the results change, because the cache only
+notices changes in the module's own file.
 
-An ONNX file has one input, 1x3xHxW RGB or 1x1xHxW grey (the mean of the three) in [0, 1], of any or
-of a fixed size, and the outputs of that dict in that frame, like XFeat's; each may have a leading
-dimension of 1. Or it has maps, like EdgePoint2's: `scores` 1x1xHxW, logits of which the maxima are
-keypoints, and `descriptors` 1xDxhxw. An image is resized to a fixed size, or for maps to sides that
-are multiples of 32, and the keypoints are scaled back.
+An ONNX file has one input in [0, 1], 1x3xHxW RGB or 1x1xHxW grey (the mean of the channels). Its
+size is fixed or free. The outputs are those of the dict, in pixels of the input, as XFeat has them;
+a leading dimension of 1 is allowed. Alternatively they are maps, as EdgePoint2 has them: `scores`,
+1x1xHxW logits whose maxima are the keypoints, and `descriptors`, 1xDxhxw. Images are resized to the
+fixed size, or for maps to sides that are multiples of 32; keypoints are scaled back.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from .method import COMMON_DESCRIPTOR, BaselineError, LocalFeature
 from .opencv import CLASSICAL
 
 MAP_SIDE, MAP_BORDER_PX, MAP_LEAST_LOGIT, MAP_WINDOW = 32, 4, -5, np.ones((5, 5), np.uint8)
-"""EdgePoint2's, of files with maps: sides are multiples of it; keypoints are so far from the border
-or farther, have more than such a logit, and are the highest of such a window."""
+"""Values of EdgePoint2, used for ONNX files with maps: the divisor of the sides, the distance of
+keypoints from the border, their smallest logit, and the window of non-maximum suppression."""
 
 
 def find_feature(word: str) -> LocalFeature:
     """Find a local feature by its name, an ONNX file, or "package.module:function".
 
     Raises:
-        OptionError: there is none.
+        OptionError: no local feature has this name.
         WeightsError: the file cannot be used.
     """
     if Path(word).suffix == ".onnx":
@@ -58,20 +58,20 @@ def find_feature(word: str) -> LocalFeature:
 
 
 def plugin_feature(target: str) -> LocalFeature:
-    """Make a local feature of a function; modules in the current folder are found too."""
+    """Make a local feature of a function in an installed module or one in the current folder."""
     module, _, name = target.partition(":")
     here = str(Path.cwd())
     sys.path.insert(0, here)
     try:
         function = getattr(importlib.import_module(module), name)
-    except Exception as error:  # the module's own code runs here
+    except Exception as error:  # the module's code may raise anything
         raise OptionError(
             f"{target} cannot be imported ({first_line(error)}): name it as package.module:function"
         ) from None
     finally:
         sys.path.remove(here)
     if not callable(function):
-        raise OptionError(f"{target} is no function: it must take an image and return a dict")
+        raise OptionError(f"{target} is not a function: it must take an image and return a dict")
     source = getattr(sys.modules[module], "__file__", None)
     watched = str(Path(source).stat().st_mtime_ns) if source else "1"
     version = f"{getattr(function, 'version', '')} {watched}"
@@ -82,17 +82,17 @@ def plugin_feature(target: str) -> LocalFeature:
 def onnx_feature(
     path: str | Path, backend: str = "onnxruntime", threads: int | None = None
 ) -> LocalFeature:
-    """Make a local feature of an ONNX file, run by "onnxruntime" or "openvino".
+    """Make a local feature of an ONNX file, which "onnxruntime" or "openvino" runs.
 
     Raises:
-        WeightsError: the file cannot be opened, or has other inputs or outputs.
+        WeightsError: the file cannot be opened, or its inputs or outputs do not fit.
     """
     file = Path(path)
     try:
         version = file_digest(file)[:16]
         network = _OPENERS[backend](file, threads)
     except Exception as error:  # the exceptions of runtimes have no common base
-        raise WeightsError(f"{file} is no ONNX file that runs ({first_line(error)})") from None
+        raise WeightsError(f"{file} is not a usable ONNX file ({first_line(error)})") from None
     shapes = network.shapes
     if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] not in (1, 3):
         raise WeightsError(f"{file} must have one input 1x3xHxW, RGB, or 1x1xHxW, not {shapes}")
@@ -106,7 +106,7 @@ def onnx_feature(
 
 
 class _Network(NamedTuple):
-    """An ONNX file that is open; sides that are not fixed are no ints."""
+    """An open ONNX file; in `shapes`, sides that are not fixed are not ints."""
 
     shapes: list[list[Any]]
     outputs: list[str]
@@ -146,7 +146,7 @@ def _run_onnx(network: _Network, rgb: np.ndarray) -> dict[str, np.ndarray]:
         side if isinstance(side, int) else max(1, round(own / MAP_SIDE)) * MAP_SIDE if maps else own
         for side, own in zip(sides, (height, width), strict=True)
     ]
-    # Area averaging where pixels fall together; where the image grows, that would repeat pixels.
+    # Images are downscaled by area averaging, which would repeat pixels if they were upscaled.
     smaller = wanted[0] <= height and wanted[1] <= width
     method = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
     resized = cv2.resize(rgb, (wanted[1], wanted[0]), interpolation=method)
@@ -162,13 +162,13 @@ def _run_onnx(network: _Network, rgb: np.ndarray) -> dict[str, np.ndarray]:
             for name, rank in (("keypoints", 2), ("scores", 1), ("descriptors", 2))
             if (value := found.get(name)) is not None
         }
-    # The borders of both frames are the same lines, half a pixel before the first centre.
+    # Image borders coincide; they are half a pixel outside the first pixel centre.
     scale = np.array([width / wanted[1], height / wanted[0]])
     return {**parts, "keypoints": (parts["keypoints"] + 0.5) * scale - 0.5}
 
 
 def _maxima(logits: np.ndarray, descriptors: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the maxima of (H, W) logits, with descriptors of a (D, h, w) map."""
+    """Return the maxima of (H, W) logits as keypoints, with descriptors from a (D, h, w) map."""
     peaks = (logits == cv2.dilate(logits, MAP_WINDOW)) & (logits > MAP_LEAST_LOGIT)
     inner = slice(MAP_BORDER_PX, -MAP_BORDER_PX)
     xy = np.argwhere(peaks[inner, inner])[:, ::-1] + MAP_BORDER_PX
@@ -204,9 +204,9 @@ def _external_feature(
             return Keypoints(
                 found["keypoints"], found["scores"], size, descriptors=found.get("descriptors")
             )
-        except Exception as error:  # anyone's code
+        except Exception as error:  # external code may raise anything
             raise BaselineError(
-                f"{name} made no keypoints and scores: {type(error).__name__}: {first_line(error)}"
+                f"{name} gave no keypoints and scores: {type(error).__name__}: {first_line(error)}"
             ) from error
 
     def describe(rgb: np.ndarray, features: Keypoints) -> np.ndarray:

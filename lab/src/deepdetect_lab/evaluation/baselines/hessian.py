@@ -1,6 +1,6 @@
-"""The determinant of the Hessian, at one scale and in scale space, ranked by its magnitude.
+"""Detect maxima of |det Hessian| at one scale and in scale space, ranked by this response.
 
-One line of OpenCV for each scale and no training: what a learned ranking of keypoints has to beat.
+This baseline is one line of OpenCV per scale without training; a learned ranking must beat it.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from .method import PAPER_DESCRIPTOR, LocalFeature, OwnScaleDescriptor
 SIGMA_PX = 3.0
 
 SIGMAS_PX = tuple(float(sigma) for sigma in np.geomspace(1.5, 9.1, 7))
-"""Of the scale space: a factor of 1.35 from one to the next."""
+"""Scales in pixels, each 1.35 times the one before. Chosen by hand; not measured."""
 
 NMS_RADIUS = 2
 DISTANCE_PX = 2.0
-"""Least distance of two keypoints of the scale space."""
+"""Keypoints of all scales are at least this far apart. Chosen by hand; not measured."""
 
 SIZE_PER_SIGMA = 5.0
-"""Diameter of a keypoint: 2.5 sigma around it."""
+"""The diameter of a keypoint is 5 sigma, so it covers 2.5 sigma around its centre."""
 
 
 def hessian_response(gray: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Compute |det H| sigma^4, (H, W) float32, of an image in [0, 1]: scales can be compared."""
+    """Compute the scale-normalised |det H| sigma^4 of an image in [0, 1], (H, W) float32."""
     scaled = gray.astype(np.float32) / 255 if gray.dtype == np.uint8 else gray
     smooth = cv2.GaussianBlur(scaled, (0, 0), sigma_px)
     second = np.array([[1, -2, 1]], np.float32)
@@ -38,7 +38,7 @@ def hessian_response(gray: np.ndarray, sigma_px: float) -> np.ndarray:
 
 
 def detect_hessian(gray: np.ndarray, sigma_px: float = SIGMA_PX) -> Keypoints:
-    """Detect the maxima of `hessian_response` in windows of 5x5, with sub-pixel positions."""
+    """Detect maxima of `hessian_response` in 5x5 windows and refine them to sub-pixel positions."""
     response = hessian_response(gray, sigma_px)
     options = SelectionOptions(threshold=0, nms_radius=NMS_RADIUS, subpixel=True)
     found = select_keypoints(response, options)
@@ -47,7 +47,7 @@ def detect_hessian(gray: np.ndarray, sigma_px: float = SIGMA_PX) -> Keypoints:
 
 
 def detect_hessian_scales(gray: np.ndarray) -> Keypoints:
-    """Detect the maxima at each scale; of neighbours, also of other scales, the best stays."""
+    """Detect maxima at each scale; near neighbours of any scale are suppressed by the best."""
     scales = [detect_hessian(gray, sigma) for sigma in SIGMAS_PX]
     xy, scores = (np.concatenate([getattr(p, name) for p in scales]) for name in ("xy", "scores"))
     sizes = np.repeat([SIZE_PER_SIGMA * sigma for sigma in SIGMAS_PX], [len(p) for p in scales])
@@ -61,7 +61,7 @@ HESSIAN: dict[str, LocalFeature] = {
         title,
         detect,
         PAPER_DESCRIPTOR.describe,
-        own_scale=OwnScaleDescriptor(0.5),  # a size of 2.5 sigma; SIFT has 2
+        own_scale=OwnScaleDescriptor(0.5),  # this gives a size of 2.5 sigma; SIFT uses 2
     )
     for name, title, detect in (
         ("hessian", f"|det Hessian|, sigma {SIGMA_PX:g}", lambda rgb: detect_hessian(luma(rgb))),
@@ -72,4 +72,4 @@ HESSIAN: dict[str, LocalFeature] = {
         ),
     )
 }
-"""By name; rows of the standard protocol, none of the paper's."""
+"""The Hessian baselines by name; only the standard protocol uses them."""

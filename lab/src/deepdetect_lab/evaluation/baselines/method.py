@@ -1,4 +1,4 @@
-"""What a benchmark compares: a detector with the descriptor that is used for its keypoints."""
+"""Local features, which benchmarks compare: a detector and the descriptor of its keypoints."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from deepdetect.io.image import luma
 
 
 class BaselineError(DeepDetectError):
-    """A detector or descriptor from outside the package failed, or returned something unusable."""
+    """An external detector or descriptor failed or returned unusable values."""
 
 
 @dataclass(frozen=True)
 class LocalFeature:
-    """A detector and its descriptor, by a name as "sift-low" and a title as tables have it.
+    """A detector and its descriptor, with a name such as "sift-low" and a title for tables.
 
     Attributes:
         detect: function from a (H, W, 3) uint8 RGB image to its keypoints.
         describe: function from the image and its keypoints to (N, D) descriptors.
-        binary: the descriptors are compared by Hamming's distance, else by Euclid's.
-        learned: the descriptors were learned for their detector and need no ratio test.
-        version: what results depend on besides the name: cached ones of another are not used.
-        detection: what the keypoints depend on, where several features share them.
-        own_scale: how keypoints with sizes of their own are described at these.
+        binary: descriptors are compared by Hamming distance instead of Euclidean distance.
+        learned: descriptors were learned for their detector and need no ratio test.
+        version: everything besides the name that changes results; it is part of the cache key.
+        detection: cache key of the keypoints if several features share them.
+        own_scale: descriptor at the keypoints' own sizes and angles, if they have sizes.
     """
 
     name: str
@@ -54,15 +54,15 @@ class LocalFeature:
 
     @property
     def key(self) -> tuple[str, str]:
-        """What results depend on besides the images."""
+        """Name and version, which together with the images determine the results."""
         return self.name, self.version
 
 
 @dataclass(frozen=True)
 class PointDescriptor:
-    """How keypoints are described by their positions alone; the defaults are the paper's.
+    """A descriptor of keypoint positions with a fixed size and angle; the defaults are the paper's.
 
-    An angle of -1 is OpenCV's "unset".
+    An angle of -1 means "unset" in OpenCV.
     """
 
     name: str = "sift"
@@ -77,21 +77,21 @@ class PointDescriptor:
 PAPER_DESCRIPTOR = PointDescriptor()
 
 COMMON_DESCRIPTOR = PointDescriptor("rootsift", 4.0, 0.0)
-"""Of all detectors without descriptors of their own in the standard protocol."""
+"""The standard protocol describes keypoints with it if a detector has no own descriptors."""
 
 
 @dataclass(frozen=True)
 class OwnScaleDescriptor:
-    """RootSIFT of keypoints at their own sizes and angles; without angles the dominant gradient's.
+    """RootSIFT at the keypoints' own sizes and angles; default angle: the dominant gradient.
 
-    A descriptor covers a square with six times its size as the side; the factor scales the size.
+    A descriptor covers a square whose side is six times the size; `size_factor` scales the size.
     """
 
     size_factor: float = 1.0
 
     def describe(self, rgb: np.ndarray, features: Keypoints) -> np.ndarray:
-        """Describe keypoints by positions, sizes and angles; (N, 128) uint8."""
-        if features.sizes is None:  # where none was found
+        """Describe keypoints at their positions, sizes and angles; return (N, 128) uint8."""
+        if features.sizes is None:  # no keypoint was found
             return np.zeros((0, 128), np.uint8)
         gray = luma(rgb)
         sizes = self.size_factor * features.sizes
@@ -110,14 +110,14 @@ def with_own_scale(feature: LocalFeature) -> LocalFeature:
 
 
 def with_common_descriptor(feature: LocalFeature) -> LocalFeature:
-    """Return a feature with the descriptor that all detectors get in the standard protocol."""
+    """Return a feature with the descriptor that the standard protocol uses for all detectors."""
     return _described(feature, COMMON_DESCRIPTOR, f"{feature.name}-common", feature.title)
 
 
 def _described(
     feature: LocalFeature, descriptor: PointDescriptor | OwnScaleDescriptor, name: str, title: str
 ) -> LocalFeature:
-    """Describe each position once: SIFT has some for several orientations."""
+    """Describe each position once, since SIFT repeats positions with several orientations."""
     return replace(
         feature,
         name=name,
@@ -139,7 +139,7 @@ def deepdetect_feature(
     descriptor: PointDescriptor = PAPER_DESCRIPTOR,
     version: str = "",
 ) -> LocalFeature:
-    """Make a local feature of a detector; with a version, of anything with a method `heatmap`."""
+    """Make a local feature of a DeepDetect, or of any object with `heatmap` and a version."""
     if not version:
         digest = file_digest(detector.weights)[:16]
         version = f"{digest} {detector.runtime} {detector.heatmap_options} {selection} {descriptor}"
@@ -151,7 +151,7 @@ def deepdetect_feature(
 
 
 def points_feature(ranker: str | Path | None = None) -> LocalFeature:
-    """Make a local feature of the ranked keypoints of all scales, at the image's own size."""
+    """Make a local feature of ranked multi-scale keypoints at native image resolution."""
     detector = PointDetector(None, resolution="native", ranker=ranker)
     return LocalFeature(
         "deepdetect-points",

@@ -1,4 +1,4 @@
-"""The classical detectors of OpenCV, with their default settings and with the paper's low ones."""
+"""OpenCV's classical detectors, with default settings and with the paper's low settings."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ OPENCV_SETTINGS: dict[str, tuple[str, str, Mapping[str, Any]]] = {
         {"threshold": 1, "nonmaxSuppression": False, "type": AGAST_7_12D},
     ),
 }
-"""Title, OpenCV's factory and its settings by name; all others have its defaults."""
+"""Title, OpenCV's factory and changed settings of each detector; low settings are the paper's."""
 
 
 def _make(name: str) -> cv2.Feature2D:
@@ -57,10 +57,10 @@ def _make(name: str) -> cv2.Feature2D:
 
 
 def describe_with(descriptor: cv2.Feature2D, rgb: np.ndarray, features: Keypoints) -> np.ndarray:
-    """Compute OpenCV's descriptors, a row for each keypoint.
+    """Compute OpenCV's descriptors, one row per keypoint.
 
-    A descriptor that cannot be computed, as ORB's near the border, is 0 throughout: such a row
-    finds a partner by chance only, and no keypoint is lost from the count.
+    If a descriptor cannot be computed, for example ORB near the border, its row is all 0. Such a
+    row matches only by chance, and the number of keypoints stays the same.
     """
     dtype = np.uint8 if descriptor.descriptorType() == cv2.CV_8U else np.float32
     rows = np.zeros((len(features), descriptor.descriptorSize()), dtype)
@@ -93,7 +93,7 @@ def _opencv(name: str) -> LocalFeature:
 
 
 def self_described(name: str) -> LocalFeature:
-    """Make a local feature of `OPENCV_SETTINGS` whose descriptors have these settings, too."""
+    """Make a local feature of `OPENCV_SETTINGS` that also describes with these settings."""
     return replace(
         _opencv(name),
         name=f"{name}-self-described",
@@ -104,9 +104,9 @@ def self_described(name: str) -> LocalFeature:
 def _harris(
     name: str, title: str, block_size: int, aperture: int, k: float, quality: float
 ) -> LocalFeature:
-    """Harris corners (1988) as the paper takes them.
+    """Make the Harris detector (1988) as in the paper.
 
-    Every pixel whose response, dilated by 3x3, is over a fraction of the largest is a keypoint.
+    A keypoint is any pixel whose response, dilated by 3x3, exceeds a fraction of the largest.
     """
 
     def detect(rgb: np.ndarray) -> Keypoints:
@@ -117,7 +117,7 @@ def _harris(
 
 
 def _harris_maxima(rgb: np.ndarray) -> Keypoints:
-    """Harris corners as the field takes them: one per corner, ranked by its response."""
+    """Detect Harris corners as is usual: one keypoint per corner, ranked by response."""
     response = cv2.cornerHarris(luma(rgb), 3, 3, 0.04)
     return _pixels(response, (response == cv2.dilate(response, None)) & (response > 0))
 
@@ -129,7 +129,7 @@ def _pixels(response: np.ndarray, chosen: np.ndarray) -> Keypoints:
 
 
 def _shi_tomasi(name: str, title: str, quality: float, k: float) -> LocalFeature:
-    """Shi-Tomasi corners as the paper takes them, with Harris's response."""
+    """Make the Shi-Tomasi detector as in the paper, with the Harris response."""
 
     def detect(rgb: np.ndarray) -> Keypoints:
         corners, scores = cv2.goodFeaturesToTrackWithQuality(
@@ -141,7 +141,7 @@ def _shi_tomasi(name: str, title: str, quality: float, k: float) -> LocalFeature
 
 
 def _shi_tomasi_eigenvalue(rgb: np.ndarray) -> Keypoints:
-    """Shi-Tomasi corners (1994): ranked by the smaller eigenvalue, with sub-pixel positions."""
+    """Detect sub-pixel Shi-Tomasi corners (1994), ranked by the smaller eigenvalue."""
     gray = luma(rgb)
     corners, scores = cv2.goodFeaturesToTrackWithQuality(
         gray, MAX_CORNERS, 1e-4, 1, None, blockSize=3
@@ -149,7 +149,7 @@ def _shi_tomasi_eigenvalue(rgb: np.ndarray) -> Keypoints:
     if corners is not None:
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
         fine = cv2.cornerSubPix(gray, corners.copy(), (2, 2), (-1, -1), criteria)
-        # Where the search ran away there was no corner to settle on.
+        # If the refinement moves far away, there is no corner to converge to.
         stayed = np.abs(fine - corners).max(2, keepdims=True) < 1
         corners = np.where(stayed, fine, corners)
     return _corners(rgb, corners, scores)
@@ -170,7 +170,7 @@ CLASSICAL: dict[str, LocalFeature] = {
     "shi-tomasi": _shi_tomasi("shi-tomasi", "Shi-Tomasi", 0.01, 0.04),
     "shi-tomasi-low": _shi_tomasi("shi-tomasi-low", "Shi-Tomasi, low settings", 1e-6, 0.001),
 }
-"""The paper's classical detectors, as its tables have them."""
+"""The classical detectors of the paper's tables."""
 
 STANDARD: dict[str, LocalFeature] = {
     "sift": CLASSICAL["sift"],
@@ -183,12 +183,12 @@ STANDARD: dict[str, LocalFeature] = {
         "shi-tomasi-eigenvalue", "Shi-Tomasi, sub-pixel", _shi_tomasi_eigenvalue, "SIFT_create"
     ),
 }
-"""By the names of the default settings, what replaces them where detectors are compared by their
-best N keypoints: settings that give enough of them, ranked by score."""
+"""Replacements of default settings for comparisons of the best N keypoints. They give enough
+keypoints, ranked by score."""
 
 
 def with_kd_trees(features: Iterable[LocalFeature]) -> list[LocalFeature]:
-    """Add after each binary one with low settings one that the paper's kd-trees match, as bytes."""
+    """Add a copy of each binary feature with low settings, matched as bytes by kd-trees."""
     found: list[LocalFeature] = []
     for feature in features:
         found.append(feature)

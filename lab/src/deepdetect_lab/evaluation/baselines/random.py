@@ -1,4 +1,4 @@
-"""Chance baselines: detectors that know nothing about the image."""
+"""Chance baselines: detectors that do not look at the image."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .method import PAPER_DESCRIPTOR, LocalFeature
 
 
 class RandomDetector:
-    """A detector to which any pixel is as good as another; each call draws other probabilities."""
+    """A detector with random probabilities, which are drawn anew in each call."""
 
     def __init__(self, seed: int = 0) -> None:
         self._generator = np.random.default_rng(seed)
@@ -25,7 +25,7 @@ class RandomDetector:
 
 
 class AllPixels:
-    """A detector to which every pixel is a keypoint."""
+    """A detector that marks every pixel as a keypoint."""
 
     def heatmap(self, image: object) -> np.ndarray:
         """Return ones."""
@@ -33,10 +33,10 @@ class AllPixels:
 
 
 def random_feature(like: LocalFeature, name: str = "random") -> LocalFeature:
-    """Make the baseline of random pixels, in each image as many as another feature finds there."""
+    """Make a baseline of random pixels, as many per image as another feature finds."""
 
     def detect(rgb: np.ndarray) -> Keypoints:
-        # The image is the seed, so that both images of a pair do not get the same pixels.
+        # The image gives the seed, so the two images of a pair get different pixels.
         seed = int.from_bytes(hashlib.sha256(rgb.tobytes()).digest()[:4], "little")
         count = len(like.detect(rgb))
         size = (rgb.shape[1], rgb.shape[0])
@@ -52,7 +52,7 @@ def random_feature(like: LocalFeature, name: str = "random") -> LocalFeature:
 
 
 def all_pixels_feature() -> LocalFeature:
-    """Make the baseline that takes every pixel; its best N form a regular grid for any N."""
+    """Make a baseline of all pixels, whose best N form a regular grid for any N."""
 
     def detect(rgb: np.ndarray) -> Keypoints:
         height, width = rgb.shape[:2]

@@ -1,1 +1,1 @@
-"""Metrics of masks, keypoints, matches, homographies and disparities, against a known truth."""
+"""Metrics of keypoints, matches, homographies, poses and disparities, with ground truth."""

@@ -1,4 +1,4 @@
-"""What a true homography says: of points, of matches, and of an estimated homography."""
+"""Evaluate points, matches and estimated homographies by the true homography."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from deepdetect.geometry.transforms import transfer_errors, transform_points
 CORNER_THRESHOLDS_PX = (1.0, 3.0, 5.0)
 
 MATCH_THRESHOLDS_PX = tuple(range(1, 11))
-"""Of the mean matching accuracy."""
+"""Thresholds of the mean matching accuracy, as D2-Net's paper has them."""
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
-"""(width, height) of both images."""
+"""(width, height) of each of the two images."""
 
 
 def inside(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return which (N, 2) points lie in an image, (N,) bool; false where one is not finite.
+    """Return which (N, 2) points are inside an image, (N,) bool; false if a point is not finite.
 
-    The image reaches half a pixel beyond the centres of its outer pixels.
+    The image extends half a pixel beyond the centres of its outer pixels.
     """
     points = np.asarray(points, np.float64).reshape(-1, 2)
     return np.all((points >= -0.5) & (points < np.asarray(size) - 0.5), axis=1)
@@ -30,10 +30,10 @@ def inside(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def project_visible(
     points: np.ndarray, homography: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
-    """Map (N, 2) points into another image; those that it does not show become NaN.
+    """Map (N, 2) points into another image; points that it does not show become NaN.
 
-    A homography also maps what lies beyond its horizon, where the plane is not visible, but turns
-    it inside out: the determinant of its Jacobian, det(H) / depth^3, is negative there.
+    A homography also maps points beyond the horizon, where the plane is invisible. There it flips
+    the orientation: the determinant of its Jacobian, det(H) / depth^3, is negative.
     """
     depth = np.asarray(points, np.float64).reshape(-1, 2) @ homography[2, :2] + homography[2, 2]
     mapped = transform_points(points, homography)
@@ -49,12 +49,12 @@ def match_accuracy(
     homography: np.ndarray,
     sizes: Sizes,
 ) -> dict[Any, Any]:
-    """Evaluate (M, 2) matched positions of two images beside all (N, 2) keypoints of both.
+    """Evaluate (M, 2) matched positions of two images, given all (N, 2) keypoints of both.
 
-    Returns "matches", their number; by distance of 1 to 10 px in the second image ("correct", px),
-    how many are at most that far off, ("precision", px), their fraction (D2-Net's matching
-    accuracy), and ("score", px), those that both images show over the keypoints that could have a
-    match (Mikolajczyk's matching score).
+    Returns the number of "matches" and, for thresholds of 1 to 10 px in the second image:
+    ("correct", px), the number of matches within the threshold; ("precision", px), their fraction
+    (D2-Net's matching accuracy); and ("score", px), Mikolajczyk's matching score: correct matches
+    that both images show, divided by the keypoints that could have a match.
     """
     errors = transfer_errors(points0, points1, homography)
     back = np.linalg.inv(homography)
@@ -76,9 +76,10 @@ def match_accuracy(
 
 
 def corner_error(estimated: np.ndarray | None, true: np.ndarray, size: tuple[int, int]) -> float:
-    """Return the mean distance of the first image's corners under two homographies, in pixels.
+    """Return the mean distance between the image corners mapped by two homographies, in pixels.
 
-    Of centres of corner pixels (SuperPoint's metric, DeTone 2018). Infinite without an estimate.
+    Corners are the centres of corner pixels, as in SuperPoint's metric (DeTone, 2018). The error is
+    infinite without an estimate.
     """
     if estimated is None:
         return float("inf")
@@ -90,15 +91,15 @@ def corner_error(estimated: np.ndarray | None, true: np.ndarray, size: tuple[int
 
 
 def accuracy_at(errors: Sequence[float], threshold: float) -> float:
-    """Return the fraction of the errors that are at most the threshold; 0 when there are none."""
+    """Return the fraction of the errors that are at most the threshold; 0 without errors."""
     return float(np.mean(np.asarray(errors) <= threshold)) if len(errors) else 0.0
 
 
 def area_under_curve(errors: Sequence[float], threshold: float) -> float:
-    """Return the area under the cumulative curve of the errors up to a threshold, over it.
+    """Return the area under the cumulative error curve up to a threshold, divided by it.
 
-    As SuperGlue and glue-factory compute it: the curve is drawn with straight lines from (0, 0), so
-    it lies up to half an error's share above the mean of `accuracy_at` up to the threshold.
+    SuperGlue and glue-factory define it so: the curve consists of straight lines from (0, 0), so
+    the area exceeds the mean of `accuracy_at` by up to half the share of one error.
     """
     if not len(errors):
         return 0.0

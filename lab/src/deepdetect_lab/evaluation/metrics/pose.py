@@ -1,4 +1,4 @@
-"""How far estimated cameras are from the true ones: two by two, with the AUC, or all together."""
+"""Errors of estimated cameras: relative poses of pairs, or absolute poses after alignment."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from deepdetect.geometry.similarity import least_squares_similarity
 from deepdetect.geometry.transforms import epipolar_errors
 
 POSE_THRESHOLDS_DEG = (5.0, 10.0, 20.0)
-"""Of the AUC."""
+"""Thresholds of the AUC, as SuperGlue's paper has them."""
 
 LINE_WIDTH = 0.01
-"""Of the spread of centres along a line: with less across it, they are on it."""
+"""Camera centres count as collinear if their spread across a line is below this fraction of the
+spread along it. Chosen by hand; not measured."""
 
 EPIPOLAR_THRESHOLD_PX = 1.0
-"""Within which a match agrees with the true pose."""
+"""A match agrees with the true pose if its Sampson distance is smaller. Chosen by hand."""
 
 
 def rotation_error(estimated: np.ndarray, true: np.ndarray) -> float:
@@ -30,8 +31,8 @@ def rotation_error(estimated: np.ndarray, true: np.ndarray) -> float:
 def translation_error(estimated: np.ndarray, true: np.ndarray) -> float:
     """Return the angle between the directions of two translations, in degrees from 0 to 180.
 
-    SuperGlue and glue-factory count an opposite direction as right; here it is wrong, as the points
-    in front of the cameras decide it. A true translation of length 0 has no direction: error 0.
+    SuperGlue and glue-factory count an opposite direction as correct. Here it is wrong, because
+    points must be in front of the cameras. If the true translation is 0, the error is 0.
     """
     across = float(np.linalg.norm(np.cross(estimated, true)))
     return float(np.degrees(np.arctan2(across, np.dot(estimated, true))))
@@ -42,7 +43,8 @@ def epipolar_inlier_ratio(
 ) -> float:
     """Return the fraction of the matches whose Sampson distance is under the threshold.
 
-    A match that slid along its line agrees too: an upper bound of the precision. 0 without any.
+    Wrong matches on the correct epipolar line also agree, so this is an upper bound of the
+    precision. It is 0 without matches.
     """
     if not len(points0):
         return 0.0
@@ -53,11 +55,12 @@ def epipolar_inlier_ratio(
 def camera_errors(
     views: Sequence[PosedView], truth: Sequence[PosedView]
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Compare three or more cameras with the true ones, after a rotation, a shift and a scale.
+    """Compare three or more cameras with ground truth after alignment by a similarity transform.
 
-    These bring the centres nearest to the true ones (least squares; Umeyama, 1991). Returns the
-    distances of the centres in the unit of the truth, the angles of the rotations in degrees, and
-    the scale. Centres on a line leave the rotation about it open: the angles are NaN.
+    The transform fits the centres to the true ones by least squares (Umeyama, 1991). Returns the
+    distances of the centres in units of the ground truth, the angles between the rotations in
+    degrees, and the scale. For collinear centres the rotation about the line is undetermined, so
+    the angles are NaN.
     """
     own = np.array([view.centre for view in views])
     true = np.array([view.centre for view in truth])
@@ -81,8 +84,8 @@ def relative_pose_errors(
 ) -> list[float]:
     """Return the error of each pair's relative pose in degrees, for `area_under_curve`.
 
-    The larger of the angles of the rotation and between the directions of the translation; infinite
-    where one of both cameras is missing. It needs no alignment.
+    The error is the larger of rotation error and translation error (angles); it is infinite if one
+    of the two cameras is missing. No alignment is needed.
     """
     errors = []
     for pair in itertools.combinations(sorted(truth), 2):

@@ -1,8 +1,8 @@
-"""Which keypoints of one image are found again in another, and where in the image they lie.
+"""Repeatability of keypoints, their coverage, and their fraction on the foreground.
 
-The paper's definition lets several keypoints share a partner and counts over all keypoints, so a
-full grid of pixels scores best. By mutual nearest neighbours a keypoint has one partner at most,
-only what both images show counts, and random points of the same number say what the value is worth.
+In the paper's definition several keypoints may share a partner and all keypoints count, so a full
+grid of pixels scores best. With mutual nearest neighbours a keypoint has at most one partner, and
+only points that both images show count. The value of as many random points is the chance level.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ from deepdetect.geometry.transforms import transform_points
 from .homography import Sizes, project_visible
 
 CHANCE_POINTS = 20_000
-"""Random points that the chance level is computed from, drawn several times where they are few."""
+"""Fewer keypoints are drawn several times for the chance level, so that it has little noise, until
+this many random points are drawn. Chosen by hand; not measured."""
 
 MAX_DRAWS = 100
 MIN_POINTS_FOR_THREADS = 20_000
 
 CELL_PX = 32
-"""Side of the square cells of the coverage."""
+"""Side of the square cells of the coverage. Chosen by hand; not measured."""
 
 
 def repeatability_paper(
@@ -33,9 +34,9 @@ def repeatability_paper(
 ) -> float:
     """Return the repeatability as the paper's code computes it, clipped at 1.
 
-    The points of the first image that land strictly closer than the radius to some point of the
-    second, over the smaller of the two total counts: points outside the overlap count in the
-    denominator, several may share one, and nothing is corrected for chance.
+    It is the number of points of the first image that map strictly closer than the radius to some
+    point of the second, divided by the smaller of the two counts. The counts include points outside
+    the overlap, several points may share a partner, and chance is not subtracted.
     """
     fewest = min(len(points0), len(points1))
     if not fewest:
@@ -54,11 +55,12 @@ def mutual_nn_repeatability(
     radii_px: Sequence[float] = (1.0, 2.0, 3.0),
     with_chance: bool = True,
 ) -> list[tuple[float, float, float]]:
-    """Measure the repeatability by mutual nearest neighbours in the overlap, beside chance.
+    """Measure the repeatability by mutual nearest neighbours in the overlap, and its chance level.
 
-    Returns for each radius the fraction of the fewer keypoints in the overlap that are repeated,
-    the one that as many random points reach (pixels, where the keypoints are pixels; NaN where it
-    is not wanted), and the mean distance of the partners in px, NaN without any.
+    Returns three values for each radius. The first is the number of mutual neighbours divided by
+    the smaller number of keypoints in the overlap. The second is the same for as many random
+    points, or NaN if not requested; they are at pixel centres if all keypoints are. The third is
+    the mean distance of the partners in pixels, or NaN without partners.
     """
     visible = _in_overlap(points0, points1, homography, sizes)
     distances = _mutual_distances(*visible, max(radii_px))
@@ -90,8 +92,8 @@ def _kd_tree(points: np.ndarray) -> Any:
 
 
 def _nearest(tree: Any, points: np.ndarray, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return distances, infinite beyond the radius, and rows of the nearest points of the tree."""
-    # The bound is exclusive in the tree, and keeps it from searching far.
+    """Return distances (infinite beyond the radius) and indices of the nearest tree points."""
+    # The upper bound of the search is exclusive; it saves time.
     bound = np.nextafter(radius_px, np.inf)
     workers = -1 if min(tree.n, len(points)) > MIN_POINTS_FOR_THREADS else 1
     distance, rows = tree.query(points, distance_upper_bound=bound, workers=workers)
@@ -99,7 +101,7 @@ def _nearest(tree: Any, points: np.ndarray, radius_px: float) -> tuple[np.ndarra
 
 
 def _mutual_distances(points0: np.ndarray, points1: np.ndarray, radius_px: float) -> np.ndarray:
-    """Return the distances of the pairs of points that are mutual nearest neighbours."""
+    """Return the distances between mutual nearest neighbours."""
     if not len(points0) or not len(points1):
         return np.empty(0)
     distance, nearest = _nearest(_kd_tree(points1), points0, radius_px)
@@ -115,10 +117,11 @@ def _chance(
     radii_px: Sequence[float],
     on_pixels: bool,
 ) -> list[float]:
-    """Return the values of random points of the same number in the overlap of each image.
+    """Return the values for equally many random points in the overlap of each image.
 
-    Pixels meet more often than points between them where little moves: five lie within 1 px of
-    one, on an area of 3.14. So points that are not on pixels are compared with such ones.
+    If little moves between the images, points at pixel centres coincide more often: five centres
+    are within 1 px of a centre, in an area of 3.14. So random points are at pixel centres only if
+    the keypoints are.
     """
     fewest = min(counts)
     if not fewest:
@@ -128,7 +131,7 @@ def _chance(
     draws = min(-(-CHANCE_POINTS // fewest), MAX_DRAWS)
     found = np.zeros(len(radii_px))
     for _ in range(draws):
-        # Classical detectors may mark a pixel more than once; random points then do so too.
+        # Classical detectors may mark pixels repeatedly; random points then also repeat.
         drawn = [
             grid[generator.choice(len(grid), count, replace=count > len(grid))]
             for grid, count in zip(grids, counts, strict=True)
@@ -140,7 +143,7 @@ def _chance(
     return [float(value) for value in found / (draws * fewest)]
 
 
-@lru_cache(maxsize=2)  # all keypoint budgets of a pair draw from the same
+@lru_cache(maxsize=2)  # all keypoint budgets of a pair share it
 def _overlapping_grids(homography: bytes, sizes: Sizes) -> tuple[np.ndarray, np.ndarray]:
     """Return the pixels of both images that the other one shows, in the second image."""
 
@@ -153,7 +156,7 @@ def _overlapping_grids(homography: bytes, sizes: Sizes) -> tuple[np.ndarray, np.
 
 
 def coverage(xy: np.ndarray, size: tuple[int, int]) -> float:
-    """Return the fraction of the cells of a grid on a (width, height) image that hold a keypoint.
+    """Return the fraction of the grid cells of a (width, height) image that contain a keypoint.
 
     Cells at the right and lower border may be smaller.
     """
@@ -164,9 +167,9 @@ def coverage(xy: np.ndarray, size: tuple[int, int]) -> float:
 
 
 def foreground_fraction(xy: np.ndarray, foreground: np.ndarray) -> float:
-    """Return the fraction of (N, 2) keypoints on a (H, W) bool foreground; NaN without any.
+    """Return the fraction of (N, 2) keypoints on an (H, W) bool foreground; NaN without keypoints.
 
-    Section IV-A of the paper.
+    The metric is defined in section IV-A of the paper.
     """
     if not len(xy):
         return float("nan")

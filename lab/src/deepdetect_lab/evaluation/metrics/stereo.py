@@ -1,4 +1,4 @@
-"""Matches and points of a rectified stereo pair, evaluated by its true disparity."""
+"""Evaluate matches and points of a rectified stereo pair by its true disparity."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ DISPARITY_TOLERANCES_PX = (0.5, 1.0, 2.0, 4.0)
 def stereo_score(
     points0: np.ndarray, points1: np.ndarray, disparity: np.ndarray
 ) -> dict[str, float]:
-    """Score (N, 2) matched positions by the (H, W) true disparity of the left image, or NaN."""
+    """Score (N, 2) matches by the (H, W) true disparity of the left image; NaN is unknown."""
     return score_errors(disparity_errors(points0, points1, disparity))
 
 
 def disparity_scores(
     pixels: np.ndarray, disparity: np.ndarray, truth: np.ndarray
 ) -> dict[str, float]:
-    """Evaluate (N,) disparities at (N, 2) pixels by the (H, W) true one, NaN where it is unknown.
+    """Evaluate (N,) disparities at (N, 2) pixels by the (H, W) true disparity; NaN is unknown.
 
-    By the titles of the columns: "1 - bad-t" and the mean error of the points with a known truth;
-    of the pixels with known truth, hidden ones too, the fraction with a point at most 1 px off; and
-    the number and accuracy of the points whose counterpart lies outside the right image.
+    Returns values by column title: "1 - bad-t" and the mean error of points with ground truth; the
+    completeness, the fraction of pixels with ground truth (occluded ones included) that have a
+    point with an error of at most 1 px; and the number and accuracy of points whose counterpart is
+    outside the right image.
     """
     disparity = np.asarray(disparity, np.float64)
     columns, rows = np.rint(np.asarray(pixels, np.float64).reshape(-1, 2)).astype(np.int64).T
@@ -35,7 +36,7 @@ def disparity_scores(
     known = np.isfinite(errors)
     near = errors[known]
     accuracy = {t: _fraction(near <= t) for t in DISPARITY_TOLERANCES_PX}
-    complete = np.zeros(truth.shape, bool)  # each pixel once, however many points it has
+    complete = np.zeros(truth.shape, bool)  # each pixel counts once
     good = np.flatnonzero(known)[near <= TOLERANCE_PX]
     complete[rows[good], columns[good]] = True
     completeness = _fraction(complete[np.isfinite(truth)])

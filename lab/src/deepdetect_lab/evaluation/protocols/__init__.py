@@ -1,1 +1,1 @@
-"""Protocols: what is measured, on any data of their kind, as tasks, tables and figures."""
+"""Protocols: measurements on data of one kind, and their tables and figures."""

@@ -1,7 +1,7 @@
-"""Dense points of many images: how much of the images they cover, and whether halves agree.
+"""Measure how much of the images dense points cover, and how well independent halves agree.
 
-Beside them OpenCV's semi-global matching of pairs, rectified by the same cameras; or the clouds
-that other programs, as OpenMVS or COLMAP, have made of the same model.
+They are compared with OpenCV's semi-global matching of pairs rectified by the same cameras, or with
+clouds of other programs, such as OpenMVS or COLMAP, from the same model.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from .stereo_pipelines import sgbm_disparity
 SGBM = "SGBM, OpenCV"
 
 APART = 0.01
-"""Relative difference of two depths that are not of one surface."""
+"""Two depths are of different surfaces if their relative difference is larger. Chosen by hand."""
 
 DENSE_COLUMNS = {
     "scene": "",
@@ -48,19 +48,20 @@ DENSE_COLUMNS = {
 }
 
 DENSE_NOTE = (
-    "With true intrinsics, where these are known. Share: of the pixels that are tried in "
-    "an image, those with a point by its own depth map, and those that any point is seen at; mean "
-    "over the images. Error: from a point to the matches of its image alone. Halves: every other "
-    "image makes points without the others; of the pixels at which both have one, the relative "
-    "difference of the depths, and the share of those that differ by over 1 %. CPU seconds: of "
-    "depth maps and their fusion. SGBM: each image with its best neighbour, rectified by the same "
-    "cameras, as far as they overlap then; in place of halves, its maps by the best and by the "
-    "second-best neighbour."
+    "True intrinsics are used where known. Share: fraction of the attempted pixels of an image "
+    "that have a point in its own depth map, or that see any point of the cloud; mean over the "
+    "images. Error: distance from a point to the matches of its image alone. Halves: two halves of "
+    "the images, taken alternately, are reconstructed separately. Where both have a point, columns "
+    "give the relative difference of the depths and the share of differences over 1 %. CPU "
+    "seconds: time for depth maps and their fusion. SGBM: each image is matched with its best "
+    "neighbour after rectification by the same cameras, where they overlap. Instead of halves, its "
+    "depth maps from the best and the second-best neighbour are compared."
 )
 
 
 CELL_PX = 4
-"""Clouds are compared in cells of so many pixels: other programs make a point of every second."""
+"""Clouds are compared in square cells of this side, since other programs reconstruct only every
+second pixel."""
 
 CLOUD_COLUMNS = {
     "cloud": "",
@@ -71,16 +72,17 @@ CLOUD_COLUMNS = {
 }
 
 CLOUD_NOTE = (
-    "Share: of the cells of 4 x 4 pixels of an image, at most 2,000 pixels a side, those in which "
-    "any point is seen; mean over the images. From the first: where both have a point, the "
-    "relative difference of the depths, and the share of cells in which it is over 1 %."
+    "Share: fraction of the cells of 4 x 4 pixels that see a point, in images of at most 2,000 "
+    "pixels a side; mean over the images. From the first: comparison with the first cloud in cells "
+    "where both have a point: the relative difference of the depths, and the share of cells in "
+    "which it is over 1 %."
 )
 
 
 def compare_clouds(model: Path, clouds: Sequence[Path]) -> Rows:
-    """Compare clouds in PLY files, all in the frame of the cameras in `model`/sparse/0.
+    """Compare clouds in PLY files that share the coordinate frame of `model`/sparse/0.
 
-    Returns the `CLOUD_COLUMNS` of each. A DeepDetectError says what cannot be read.
+    Returns the `CLOUD_COLUMNS` of each cloud. Unreadable files raise a DeepDetectError.
     """
     sparse = model / "sparse" / "0"
     if not sparse.is_dir():
@@ -90,7 +92,7 @@ def compare_clouds(model: Path, clouds: Sequence[Path]) -> Rows:
         views = read_sparse_model(pycolmap.Reconstruction(sparse)).views.values()
     except (ValueError, IndexError, RuntimeError) as error:
         raise InvalidFileError(
-            f"{sparse} is no model of COLMAP ({first_line(error)}): check it"
+            f"{sparse} is not a COLMAP model ({first_line(error)}): check it"
         ) from error
     limited = [limited_view(view) for view in views]
     rows: Rows = []
@@ -110,10 +112,10 @@ def compare_clouds(model: Path, clouds: Sequence[Path]) -> Rows:
 def measure_dense_points(
     images: Sequence[Path], cameras: Mapping[str, Camera], detector: PointDetector
 ) -> Row:
-    """Make dense points of images; to be called in a process of its own.
+    """Reconstruct dense points of images; call it in a separate process.
 
-    Returns the `DENSE_COLUMNS` from "points" on, and those of SGBM after its name and a space; only
-    "points", 0, where there is no model.
+    Returns the `DENSE_COLUMNS` from "points" on, and those of SGBM with its name and a space before
+    them. If there is no model, it returns only "points": 0.
     """
     with tempfile.TemporaryDirectory(prefix="deepdetect-dense-") as scratch:
         options = MultiViewOptions(pairs="exhaustive")
@@ -163,9 +165,9 @@ def measure_dense_points(
 
 
 def _agreement(pairs: Sequence[Sequence[np.ndarray]], name: str = "halves") -> Row:
-    """Compare two depth maps of each of some views, infinite where they have none.
+    """Compare pairs of depth maps of the same view; unknown depths are infinite.
 
-    Returns nothing where no pixel has two depths.
+    Returns an empty row if no pixel has both depths.
     """
     differences = []
     for first, second in pairs:
@@ -183,9 +185,9 @@ def _agreement(pairs: Sequence[Sequence[np.ndarray]], name: str = "halves") -> R
 def _sgbm_points(
     one: tuple[np.ndarray, PosedView], other: tuple[np.ndarray, PosedView], seen: np.ndarray
 ) -> np.ndarray:
-    """Return (N, 3) points of an image by OpenCV's matching with another, of RGB and views.
+    """Return (N, 3) points of an image, from OpenCV's semi-global matching with another image.
 
-    Disparities are sought among those of sparse points.
+    Each image is given as RGB and view. The disparity range is that of the sparse points.
     """
     (rgb0, view0), (rgb1, view1) = one, other
     moved = view1.relative_to(view0)
@@ -197,7 +199,7 @@ def _sgbm_points(
         None,
         size,
         moved.rotation,
-        moved.translation[:, None],  # OpenCV 5 wants a column
+        moved.translation[:, None],  # OpenCV 5 requires a column
         flags=0,
         alpha=-1,
     )
@@ -207,7 +209,7 @@ def _sgbm_points(
             (rgb0, rgb1), matrices, (turn0, turn1), (first, second), strict=True
         )
     ]
-    # One above the other: along columns. Otherwise along rows, which may be the wrong way round.
+    # Cameras above each other are matched along columns, others along rows, possibly reversed.
     axis = int(abs(second[1, 3]) > abs(second[0, 3]))
     if axis:
         views = [np.ascontiguousarray(view.transpose(1, 0, 2)) for view in views]
@@ -217,7 +219,7 @@ def _sgbm_points(
     low, high = offset + np.quantile(scale / depths[depths > 0], [0.01, 0.99])
     lowest, count = math.floor(low) - 16, 16 * math.ceil((high - low + 32) / 16)
     borders_px = max(lowest + count, 0), max(-lowest, 0)
-    if sum(borders_px) > max(size):  # rectified, they hardly overlap
+    if sum(borders_px) > max(size):  # the rectified images hardly overlap
         return np.empty((0, 3))
     disparity = sgbm_disparity(views[0], views[1], count, borders_px, lowest)
     disparity = disparity.T if axis else disparity
@@ -236,14 +238,14 @@ def _halves(sparse: SparseModel) -> list[SparseModel]:
 
 
 def read_ply_points(path: Path) -> np.ndarray:
-    """Read the (N, 3) float64 points of a PLY file of any program, without those at infinity.
+    """Read the finite (N, 3) float64 points of a PLY file that any program has written.
 
-    By plyfile: those of OpenMVS have lists, which the readers of OpenCV, COLMAP and trimesh refuse.
-    An InvalidFileError says that it is none.
+    It uses plyfile, because files of OpenMVS contain lists, on which the readers of OpenCV, COLMAP
+    and trimesh fail. An InvalidFileError is raised for other files.
     """
     try:
         head, end, rest = path.read_bytes().partition(b"end_header")
-        head = head.decode("ascii", "replace").encode("ascii", "replace")  # comments are any text
+        head = head.decode("ascii", "replace").encode("ascii", "replace")  # any text
         vertices = plyfile.PlyData.read(BytesIO(head + end + rest))["vertex"]
         points = np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
     except FileNotFoundError:

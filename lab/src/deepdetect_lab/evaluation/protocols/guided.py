@@ -1,6 +1,6 @@
-"""Matches by descriptors alone and guided ones, each with its precision, beside chance.
+"""Compare guided matching with matching by descriptors alone and with chance.
 
-Guided matching multiplies the matches of any points: only beside chance does a count say something.
+Guided matching increases the matches of any points, so counts only mean something next to chance.
 """
 
 from __future__ import annotations
@@ -45,13 +45,14 @@ COLUMNS = {
 }
 
 NOTE = (
-    f"Correct: under {CORRECT_PX:g} px by the true homography, each point of the first image once. "
-    "Matchable: points of the first image with any point of the second this near to their true "
-    "place. Unique: correct matches, each point of the second image once. Guided: the seed of the "
-    f"median count, the lower of two, of {SEEDS}; ±: standard deviation of the counts; lowest: the "
-    "smallest as a fraction of the matchable. Without a trusted geometry a seed has no matches, as "
-    "from match_images. Corner error: median over the seeds guided by a homography. Seconds: "
-    "median of the guided matching alone, of the run that made them."
+    f"Correct: matches with an error under {CORRECT_PX:g} px by the true homography; each point of "
+    "the first image counts once. Matchable: points of the first image whose true position has a "
+    "point of the second image within this distance. Unique: correct matches, where each point of "
+    f"the second image counts once. Guided: the run with the median count of {SEEDS} seeds (the "
+    "lower of two). ±: standard deviation of the counts. Lowest: the smallest count as a fraction "
+    "of the matchable points. Without a trusted geometry a seed has no matches, as in "
+    "match_images. Corner error: median over the seeds guided by a homography. Seconds: median "
+    "time of guided matching alone, when it was computed."
 )
 
 
@@ -62,9 +63,9 @@ def guided_sections(
     key: str,
     title: str,
 ) -> list[Section]:
-    """Match pairs by descriptors alone and guided.
+    """Match pairs by descriptors alone and with guidance.
 
-    `truths` has the same pairs with the homographies that evaluate them, by the names of these.
+    `truths` maps names of ground truths to the same pairs with these true homographies.
     """
     if "guided" not in options.protocols:
         return []
@@ -92,14 +93,14 @@ def guided_sections(
     ]
     text = (
         "By descriptors alone: the paper's matching (SIFT of size 3, FLANN, ratio 0.99). Guided: "
-        "the default of `match_images`; the true homography only evaluates. DeepDetect sees "
-        f"images squashed to 480x480 as {options.channels.upper()}."
+        "the default of `match_images`; the true homography is only used for evaluation. "
+        f"DeepDetect gets images resized to 480x480 as {options.channels.upper()}."
     )
     return [Section(f"{title}, descriptors alone and guided", (text,), tables)]
 
 
 def guided_row(run: Run, feature: LocalFeature, by_truth: Mapping[str, PlanarPair]) -> Row:
-    """Return the cells of `COLUMNS` by truth."""
+    """Return the cells of `COLUMNS` by name of the ground truth."""
     pair = next(iter(by_truth.values()))
     images = (pair.first, pair.second)
     alone = run.matches(feature, images, PAPER_MATCHING)
@@ -143,7 +144,7 @@ def _guided_cells(
 
 
 def guided_by(models: Sequence[str]) -> str:
-    """Name the models that guided, and how many seeds they guided if not all."""
+    """Name the geometries that guided, and the number of guided seeds if not all were guided."""
     trusted = [model for model in models if model != "none"]
     names = " or ".join(dict.fromkeys(trusted)) or "none"
     if len(trusted) in (0, len(models)):
@@ -156,17 +157,17 @@ def _correct(points0: np.ndarray, points1: np.ndarray, pair: PlanarPair) -> np.n
 
 
 def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -> Row:
-    """Match a pair guided, or read that; its homography is not used.
+    """Match a pair with guided matching, cached; its true homography is not used.
 
-    Returns "model", what guided ("none": there are no matches), "matrix", the geometry, "points0"
-    and "points1", (M, 2), and "seconds" of the guided matching alone.
+    Returns "model", the geometry that guided ("none": no matches); its "matrix"; the (M, 2)
+    "points0" and "points1"; and the "seconds" of guided matching alone.
     """
     images = (pair.first, pair.second)
     first, second = (run.keypoints(feature, image)[0].xy for image in images)
 
     def make() -> Row:
         grays = luma(load_image(pair.first)), luma(load_image(pair.second))
-        with profiled() as profiler:
+        with profiled() as profile:
             geometry = guiding_geometry(grays, seed=seed)
             trusted, found = guided_matches(grays, (first, second), geometry, seed)
         return {
@@ -174,7 +175,7 @@ def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -
             "matrix": np.empty((0, 3)) if trusted.matrix is None else trusted.matrix,
             "points0": np.empty((0, 2)) if found is None else found.starts(first),
             "points1": np.empty((0, 2)) if found is None else found.points1,
-            "seconds": profiler.total.seconds,
+            "seconds": profile.seconds,
         }
 
     return run.cached("guided", (feature.detection, images, seed), make)

@@ -1,4 +1,4 @@
-"""How well heat maps fit known masks, and the labels of images at several scales."""
+"""Compare heat maps with known masks, and with labels of images at several scales."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from deepdetect.io.masks import load_mask
 from ...labels import LabelOptions, fuse, visibility_of
 
 EPSILON = 1e-7
-"""Probabilities are kept this far from 0 and 1: the next float32 under 1 is 6e-8 away."""
+"""Probabilities keep this distance from 0 and 1, since float32 numbers near 1 differ by 6e-8."""
 
 NUM_BINS = 20
-"""Bins of equal width of the calibration error."""
+"""Number of equal bins for the calibration error. Chosen by hand; not measured."""
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,14 @@ class MaskScore:
     """How well heat maps fit the masks of images.
 
     Attributes:
-        loss: binary cross-entropy per pixel, natural logarithm; mean over the images.
-        iou: intersection over union of the masks, the predicted one at threshold 0.5;
-            1 where both are empty; mean over the images.
+        loss: binary cross-entropy per pixel (natural logarithm), mean over the images.
+        iou: intersection over union of known mask and heat map thresholded at 0.5, mean over the
+            images; 1 if both are empty.
         images: number of images.
-        calibration_error: the expected calibration error (Naeini et al., 2015) over all pixels:
-            the mean difference, in the bin of a pixel, between probability and marked share.
-        density: keypoints per pixel at the threshold 0.5.
-        label_density: marked pixels per pixel.
+        calibration_error: expected calibration error (Naeini et al., 2015) over all pixels: the
+            mean difference, over bins, between probability and fraction of marked pixels.
+        density: keypoints per pixel at threshold 0.5.
+        label_density: fraction of pixels that the masks mark.
     """
 
     loss: float
@@ -58,7 +58,7 @@ def score_heatmap(heatmap: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
 
 
 Measured = tuple[float, float, np.ndarray]
-"""Loss, IoU, and (4, 20) sums by bin: pixels, their probabilities, the marked, the predicted."""
+"""Loss, IoU, and (4, 20) sums by bin: pixels, probabilities, marked and predicted pixels."""
 
 
 def measure_heatmap(heatmap: np.ndarray, mask: np.ndarray) -> Measured:
@@ -71,7 +71,7 @@ def measure_heatmap(heatmap: np.ndarray, mask: np.ndarray) -> Measured:
 
 
 def mean_score(measured: Sequence[Measured]) -> MaskScore:
-    """Return the score of one or more images: losses by image, all others by pixel."""
+    """Return the score of images: loss and IoU averaged by image, the others over all pixels."""
     loss = sum(loss for loss, _, _ in measured) / len(measured)
     iou = sum(iou for _, iou, _ in measured) / len(measured)
     pixels, probabilities, marked, predicted = np.sum([sums for *_, sums in measured], axis=0)
@@ -82,14 +82,14 @@ def mean_score(measured: Sequence[Measured]) -> MaskScore:
 
 
 CERTAIN_LOGIT = 200.0
-"""Float32 rounds its probability to 1, and that of its negative to 0."""
+"""The probability of this logit is 1 in float32, and that of its negative is 0."""
 
 
 def sample_images(folder: str | Path) -> list[Path]:
     """List the images of a folder of samples `image_*.png` with masks `mask_image_*.png`.
 
     Raises:
-        ImageError: there is none.
+        ImageError: the folder has no samples.
     """
     images = sorted(Path(folder).glob("image_*.png"))
     if not images:
@@ -100,29 +100,29 @@ def sample_images(folder: str | Path) -> list[Path]:
 
 
 def load_sample(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Load a sample: (H, W, 3) uint8 RGB, and its known mask, (H, W) bool.
+    """Load the image of a sample, (H, W, 3) uint8 RGB, and its known mask, (H, W) bool.
 
     Raises:
-        ImageError: one of them is missing or damaged, or the mask is of another size.
+        ImageError: a file is missing or damaged, or the mask has another size.
     """
     rgb = load_image(path)
     mask = load_mask(path.with_name(f"mask_{path.name}"))
     if mask.shape != rgb.shape[:2]:
-        raise ImageError(f"the mask of {path} has another size than the image")
+        raise ImageError(f"the mask of {path} differs from the image in size")
     return rgb, mask
 
 
 def score_samples(
     heatmap: Callable[[np.ndarray], np.ndarray], samples: Iterable[tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, MaskScore]:
-    """Score what maps an image to a heat map on samples of `load_sample`, by visibility."""
+    """Score a function from images to heat maps on samples of `load_sample`, by visibility."""
     return _by_visibility(
         (visibility_of(luma(rgb)), measure_heatmap(heatmap(rgb), mask)) for rgb, mask in samples
     )
 
 
 def _by_visibility(images: Iterable[tuple[str, Measured]]) -> dict[str, MaskScore]:
-    """Score the images of each visibility, "normal" and "low", of which there are any."""
+    """Score images by visibility, "normal" or "low"; a visibility without images is left out."""
     measured: dict[str, list[Measured]] = {"normal": [], "low": []}
     for visibility, one in images:
         measured[visibility].append(one)
@@ -130,7 +130,7 @@ def _by_visibility(images: Iterable[tuple[str, Measured]]) -> dict[str, MaskScor
 
 
 def check_scale(image: np.ndarray, scale: float, name: str = "an image") -> None:
-    """Raise an ImageError where an image is downscaled to under 16 pixels."""
+    """Raise an ImageError if scaling leaves a side of under 16 pixels."""
     if (side := round(scale * min(image.shape[:2]))) < MINIMUM_SIDE:
         raise ImageError(
             f"{name} scaled by {scale:g} has a side of {side} pixels: "
@@ -141,13 +141,13 @@ def check_scale(image: np.ndarray, scale: float, name: str = "an image") -> None
 def score_at_scale(
     detector: DeepDetect, images: Iterable[np.ndarray], scale: float
 ) -> dict[str, MaskScore]:
-    """Score weights on (H, W, 3) images scaled by a factor, against labels of their own.
+    """Score weights on scaled (H, W, 3) images by labels made from the scaled images.
 
-    At native resolution; images are downscaled by area averaging and upscaled cubically. The
-    visibility of each image decides how it is labelled.
+    Images are processed at their scaled size. They are downscaled by area averaging and upscaled by
+    cubic interpolation. The visibility of an image selects how it is labelled.
 
     Raises:
-        ImageError: an image is downscaled to under 16 pixels.
+        ImageError: a scaled image has a side of under 16 pixels.
     """
     native = detector.configured(replace(detector.heatmap_options, resolution="native"))
 
@@ -164,8 +164,9 @@ def score_at_scale(
 class LabelDetector:
     """A detector whose keypoints are the fusion label itself, without a network.
 
-    Its numbers are those of weights without any error: weights that exceed them do so by their
-    errors. The image is labelled as a network with the heatmap options sees it, or as it is.
+    It scores like weights without any error, so weights that score higher do so because of their
+    errors. The label is computed from the network's input if heat-map options are given, otherwise
+    from the image.
     """
 
     def __init__(
@@ -183,7 +184,7 @@ class LabelDetector:
         return fuse(luma(rgb), self.options).mask.astype(np.float32)
 
     def _network(self, image: np.ndarray) -> np.ndarray:
-        """Do what the network is trained for: (1, 3, H, W) RGB in [0, 1] to (1, 1, H, W) logits."""
+        """Imitate a perfect network: map (1, 3, H, W) RGB in [0, 1] to (1, 1, H, W) logits."""
         rgb = np.rint(image[0].transpose(1, 2, 0) * 255).astype(np.uint8)
         mask = fuse(luma(rgb), self.options).mask[None, None]
         return np.where(mask, np.float32(CERTAIN_LOGIT), np.float32(-CERTAIN_LOGIT))
@@ -192,8 +193,8 @@ class LabelDetector:
 class LabelDensityDetector:
     """A detector that takes the most probable pixels of each image, as many as its label marks.
 
-    Weights that mark more have more repeatable keypoints and more matches for that alone. With this
-    detector all are compared at the same number of keypoints.
+    Weights that mark more pixels get a higher repeatability and more matches for this reason alone.
+    This detector compares weights at equal numbers of keypoints.
     """
 
     def __init__(self, detector: DeepDetect) -> None:
@@ -202,11 +203,11 @@ class LabelDensityDetector:
         self.labels = LabelDetector(heatmap_options=seen)
 
     def heatmap(self, image: Any) -> np.ndarray:
-        """Return (H, W) float32: 1 at the pixels that are taken, else 0."""
+        """Return an (H, W) float32 map with 1 at the chosen pixels and 0 elsewhere."""
         rgb = load_image(image)
         count = int(np.count_nonzero(self.labels.heatmap(rgb) > 0.5))
         heatmap, logits = self.detector.heatmap_and_logits(rgb)
         taken = np.zeros(heatmap.size, np.float32)
-        # Of equal ones the first in the order of rows.
+        # Ties are broken by the order of rows.
         taken[np.argsort(-logits.ravel(), kind="stable")[:count]] = 1
         return taken.reshape(heatmap.shape)

@@ -1,4 +1,4 @@
-"""The paper's protocol: density, foreground, repeatability, correct matches."""
+"""The paper's protocol: density, foreground, repeatability and correct matches."""
 
 from __future__ import annotations
 
@@ -42,29 +42,30 @@ OXFORD_PAIRS = (
     *(("graf", 6), ("wall", 6), ("bikes", 6), ("leuven", 6), ("trees", 6), ("ubc", 6)),
     ("boat", 2),
 )
-"""The pairs of the paper's Table II: scene, and number of the second image."""
+"""The pairs of the paper's Table II: scene and number of the second image."""
 
 CORRECT_PX = 1.0
-"""A match is correct strictly under this distance."""
+"""A match is correct if its error by the true homography is strictly smaller."""
 
 PAPER_MATCHING = MatchSettings(matcher="flann", ratio=0.99)
 
 SEEDS = 3
-"""FLANN's trees are random, and counts of one seed vary by some per cent."""
+"""Seeds of FLANN are averaged, because its random trees change the counts by some per cent."""
 
 FEW_MATCHES = 1000
 MANY_SEEDS = 64
-"""Few correct matches (graf's are a hundred) vary by a tenth from seed to seed."""
+"""Pairs with fewer correct matches use more seeds: counts of about 100 (graf) vary by a tenth."""
 
 REPEATABILITY_NOTE = (
-    "Points of the first image that land under 1 px from some point of the second, over the "
-    "smaller of the two counts, clipped at 1. It grows with the density: see the baselines."
+    "Number of points of the first image that map to less than 1 px from a point of the second, "
+    "divided by the smaller number of points, clipped at 1. It grows with the density, as the "
+    "baselines show."
 )
 
 MATCHES_NOTE = (
-    "FLANN (5 trees, 50 checks), ratio 0.99; correct: strictly under 1 px by the homography in the "
-    "file. Binary descriptors (ORB, BRISK) are matched exactly by Hamming's distance. The number "
-    "grows with the number of points, whatever they are: see the baselines."
+    "FLANN (5 trees, 50 checks), ratio 0.99. Correct: error strictly under 1 px by the homography "
+    "in the file. Binary descriptors (ORB, BRISK) are matched exactly by Hamming distance. The "
+    "number grows with the number of points of any kind, as the baselines show."
 )
 
 
@@ -75,9 +76,9 @@ def density_table(
     key: str,
     with_paper: bool = False,
 ) -> Table:
-    """Measure the keypoints per pixel of all images: the mean, and that of each scene.
+    """Tabulate the keypoints per pixel: the mean over all images, and the mean of each scene.
 
-    The paper's numbers are beside the mean that they are of, without one of the scenes.
+    The paper's numbers are next to the mean without the scene that the paper leaves out.
     """
 
     def measure(feature: LocalFeature, item: tuple[str, Path]) -> Row:
@@ -95,9 +96,9 @@ def density_table(
         **({title: (".4f", without)} if with_paper else {}),
         **{scene.name: average(".4f", "density", scene=scene.name) for scene in scenes},
     }
-    note = "The mean is over all images. Several keypoints on one pixel all count."
+    note = "The mean is over all images. Keypoints at the same pixel all count."
     if with_paper:
-        note += f" The paper's means are those without {NOT_IN_DENSITY}."
+        note += f" The paper's means leave out {NOT_IN_DENSITY}."
     table = tabulate(key, "Keypoints per pixel", features, rows, columns, note)
     return with_paper_column(table, title, DENSITY) if with_paper else table
 
@@ -105,7 +106,7 @@ def density_table(
 def repeatability_table(
     run: Run, features: Sequence[LocalFeature], scenes: Sequence[PlanarScene], key: str
 ) -> Table:
-    """Measure the paper's repeatability at 1 px: the mean of the scenes, and that of each."""
+    """Tabulate the paper's repeatability at 1 px: the mean over scenes, and each scene."""
 
     def over_scenes(own: Rows) -> Cell:
         return mean_of(mean(where(own, scene=s.name), "repeatability") for s in scenes)
@@ -122,7 +123,7 @@ def repeatability_table(
 def repeatability_rows(
     run: Run, features: Sequence[LocalFeature], scenes: Sequence[PlanarScene]
 ) -> Rows:
-    """Measure the "repeatability" of all pairs, with their "scene"."""
+    """Measure the paper's "repeatability" of all pairs; rows also hold the "scene"."""
 
     def measure(feature: LocalFeature, pair: PlanarPair) -> Row:
         return {"scene": pair.scene, "repeatability": pair_repeatability(run, feature, pair)}
@@ -138,7 +139,7 @@ def matches_table(
     key: str,
     title: str = "Correct matches",
 ) -> Table:
-    """Count correct matches under 1 px, and their fraction of all matches."""
+    """Tabulate the number of correct matches (error under 1 px) and their fraction."""
 
     def measure(feature: LocalFeature, pair: PlanarPair) -> Row:
         correct, matches = correct_matches(run, feature, pair)
@@ -157,14 +158,14 @@ def matches_table(
 
 
 def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Table I's second half: which fraction of the keypoints lies on the foreground."""
+    """Measure the fraction of keypoints on the foreground, the second half of Table I."""
     images = load_foreground(run.folder("foreground"))
     features = options.density_features()
     rows = foreground_rows(run, features, images)
     for feature in features:
         own = where(rows, method=feature.name)
         if empty := sum(row["fraction"] != row["fraction"] for row in own):  # NaN
-            run.skipped.append(f"foreground of {feature.title}: {empty} images without a keypoint")
+            run.skipped.append(f"foreground of {feature.title}: {empty} images have no keypoint")
 
     def over_chance(own: Rows) -> Cell:
         known = [row for row in own if row["fraction"] == row["fraction"]]
@@ -179,8 +180,8 @@ def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
     }
     covered = {row["item"]: row["covered"] for row in rows}
     note = (
-        f"{len(covered)} images; their foreground is {mean_of(covered.values()) or 0:.1%} of the "
-        "pixels, which is what random points reach. The paper used 18 unpublished images."
+        f"{len(covered)} images; their foreground covers {mean_of(covered.values()) or 0:.1%} of "
+        "the pixels, the value of random points. The paper used 18 unpublished images."
     )
     table = tabulate("foreground", "Keypoints on the foreground", features, rows, columns, note)
     table = with_paper_column(table, title, FOREGROUND)
@@ -190,16 +191,16 @@ def foreground(run: Run, options: BenchmarkOptions) -> list[Section]:
 def foreground_rows(
     run: Run, features: Sequence[LocalFeature], images: Sequence[MaskedPhotograph]
 ) -> Rows:
-    """Measure the fraction of the keypoints on the foreground, NaN without any, and their density.
+    """Measure the fraction of keypoints on the foreground (NaN without any) and their density.
 
-    The "covered" fraction of the pixels is what random keypoints reach.
+    The "covered" fraction of the pixels is the value of random keypoints.
     """
 
     def measure(feature: LocalFeature, image: MaskedPhotograph) -> Row:
         keypoints, _ = run.keypoints(feature, image.image)
         mask = load_mask(image.mask)
         if mask.shape[::-1] != keypoints.image_size:
-            raise ImageError(f"{image.mask.name} is not of the photograph's size")
+            raise ImageError(f"{image.mask.name} and its photograph differ in size")
         fraction = foreground_fraction(keypoints.xy, mask)
         return {"fraction": fraction, "density": keypoints.density, "covered": float(mask.mean())}
 
@@ -221,7 +222,7 @@ def pair_repeatability(run: Run, feature: LocalFeature, pair: PlanarPair) -> flo
 def correct_matches(
     run: Run, feature: LocalFeature, pair: PlanarPair, seed: int = 0
 ) -> tuple[int, int]:
-    """Return the number of correct matches of a pair, and of all, by one seed of FLANN."""
+    """Return the numbers of correct matches and of all matches of a pair, for one FLANN seed."""
     settings = MatchSettings(PAPER_MATCHING.matcher, PAPER_MATCHING.ratio, seed=seed)
     found = run.matches(feature, (pair.first, pair.second), settings)
     errors = transfer_errors(found.points0, found.points1, pair.homography)
@@ -229,7 +230,7 @@ def correct_matches(
 
 
 def mean_correct_matches(run: Run, feature: LocalFeature, pair: PlanarPair) -> tuple[int, int]:
-    """Return both counts as rounded means over `SEEDS`, under `FEW_MATCHES` over `MANY_SEEDS`."""
+    """Return both counts as rounded means over the seeds (`MANY_SEEDS` below `FEW_MATCHES`)."""
     counts: list[tuple[int, int]] = []
     for seed in range(MANY_SEEDS):
         if seed == SEEDS and np.mean(counts, axis=0)[0] >= FEW_MATCHES:
@@ -240,7 +241,7 @@ def mean_correct_matches(run: Run, feature: LocalFeature, pair: PlanarPair) -> t
 
 
 def keypoint_figure(run: Run, features: Sequence[LocalFeature], scene: PlanarScene) -> Figure:
-    """Draw Figure 2: the keypoints of SIFT, of SIFT with low settings, and ours."""
+    """Draw Figure 2: keypoints of SIFT, of SIFT with low settings, and of DeepDetect."""
     image = scene.images[0]
     rgb = load_image(image)
     panels, counts = [], []
@@ -255,7 +256,7 @@ def keypoint_figure(run: Run, features: Sequence[LocalFeature], scene: PlanarSce
 
 
 def mask_figure(scene: PlanarScene) -> Figure:
-    """Draw Figure 4: the keypoint and the edge mask of an image, and both combined."""
+    """Draw Figure 4: the keypoint mask and the edge mask of an image, and their combination."""
     from ...labels import draw_label, fuse
 
     rgb = load_image(scene.images[0])
@@ -264,7 +265,7 @@ def mask_figure(scene: PlanarScene) -> Figure:
 
 
 def match_figure(run: Run, feature: LocalFeature, number: str, pair: PlanarPair) -> Figure:
-    """Draw Figure 6 or 7: a sample of the matches of a pair, the correct ones green."""
+    """Draw Figure 6 or 7: a random sample of a pair's matches; correct ones are green."""
     found = run.matches(feature, (pair.first, pair.second), PAPER_MATCHING)
     correct = transfer_errors(found.points0, found.points1, pair.homography) < CORRECT_PX
     drawn = draw_matches(
@@ -273,6 +274,6 @@ def match_figure(run: Run, feature: LocalFeature, number: str, pair: PlanarPair)
     precision = correct.mean() if len(correct) else 0.0
     title = (
         f"{number}: {feature.title}, {pair.name}: {len(correct):,} matches, "
-        f"{int(correct.sum()):,} correct ({precision:.1%}); a random sample drawn"
+        f"{int(correct.sum()):,} correct ({precision:.1%}); a random sample is drawn"
     )
     return Figure(f"matches_{pair.name.replace(' ', '_')}", title, picture(drawn))

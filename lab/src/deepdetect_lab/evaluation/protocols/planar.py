@@ -1,4 +1,4 @@
-"""The benchmarks of image pairs with homographies: Oxford, HPatches, dust and smoke."""
+"""Benchmarks on image pairs with homographies: Oxford, HPatches, dust and smoke."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ from .paper_numbers import (
 from .standard import standard_sections
 
 KEYPOINT_SCENES = ("graf", "bikes", "leuven")
-"""Of Figure 2."""
+"""Scenes of the paper's Figure 2."""
 
 GUIDED_PAIRS = (*paper.OXFORD_PAIRS, ("boat", 6), ("bark", 6))
 
 FIGURE_7_SCENES = 4
-"""Half of each kind."""
+"""Number of drawn scenes: half change in illumination, half in viewpoint."""
 
 TRUTHS = {
     "published": (
-        "Evaluated by the homographies that the data set ships, for comparison with papers. They "
-        "are wrong by up to 26 px in places, so figures at 1 px are limited by them."
+        "Evaluated by the published homographies of the data set, for comparison with papers. "
+        "Their errors are up to 26 px in places, which limits the scores at 1 px."
     ),
     "refined": (
-        "Evaluated by more accurate homographies, estimated from the images by "
-        "`benchmarks/refine_oxford.py` with no detector of ours in the loop."
+        "Evaluated by more accurate homographies, which `benchmarks/refine_oxford.py` estimates "
+        "from the images without any of our detectors."
     ),
 }
 
-NOTHING_MOVES = "Nothing moves between the two images of a scene."
+NOTHING_MOVES = "The two images of a scene show no motion: the true homography is the identity."
 
 
 def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Tables I and II, the Oxford half of III, Figures 1, 2, 4 and 6; the other protocols."""
+    """Measure Tables I and II, Oxford in Table III, Figures 1, 2, 4, 6, and other protocols."""
     folder = run.folder("oxford")
     by_truth = {"published": load_oxford(folder), "refined": load_oxford(folder, "refined")}
     for truth, of_truth in by_truth.items():
@@ -76,7 +76,7 @@ def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
     if unrefined and {*options.protocols} - {"paper"}:
         run.skipped.append(
             f"refined homographies of {', '.join(unrefined)}: there is no file H1toKp.refined "
-            "(benchmarks/refine_oxford.py makes them); these are evaluated by the published one"
+            "(run benchmarks/refine_oxford.py); these scenes are evaluated by the published ones"
         )
     sections = _oxford_paper(run, options, scenes)
     for truth, of_truth in by_truth.items():
@@ -84,7 +84,7 @@ def oxford(run: Run, options: BenchmarkOptions) -> list[Section]:
         sections += standard_sections(run, options, pairs_of(of_truth), key, title, TRUTHS[truth])
     chosen = {t: select_pairs(by_truth[t], GUIDED_PAIRS) for t in reversed(by_truth)}
     sections += guided_sections(run, options, chosen, "oxford", "Oxford")
-    # Of the last, most accurate truth.
+    # The last ground truth is the most accurate.
     return sections + degraded_sections(run, options, pairs_of(of_truth), "oxford", title)
 
 
@@ -102,9 +102,9 @@ def _oxford_paper(
     drawn = [scene for scene in scenes if scene.name in KEYPOINT_SCENES]
     figure_6, figures = _figures(run, options, figure_6_pairs, "oxford", drawn)
     text = (
-        "Tables I and II, the Oxford half of III, Figures 1, 2, 4 and 6. DeepDetect sees images "
-        f"squashed to 480x480 as {options.channels.upper()}; the classical detectors see them as "
-        "they are. The paper's numbers are beside ours."
+        "Tables I and II, the Oxford half of Table III, Figures 1, 2, 4 and 6. DeepDetect gets "
+        f"images resized to 480x480 as {options.channels.upper()}; the classical detectors get "
+        "original images. The paper's numbers are next to ours."
     )
     tables = [
         density,
@@ -144,13 +144,13 @@ def _figures(
 def _drawn(
     run: Run, what: str, draw: Callable[[Any], Figure], items: Sequence[PlanarPair | PlanarScene]
 ) -> list[Figure]:
-    """Draw each item; of what cannot be drawn the reason is noted."""
+    """Draw each item; if an item cannot be drawn, record the reason."""
     figures = [run.attempt(f"{what} of {item.name}", draw, item) for item in items]
     return [figure for figure in figures if figure is not None]
 
 
 def hpatches(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Table III and Figure 7, and the other protocols on 116 scenes and on the D2-Net subset."""
+    """Measure Table III, Figure 7, and other protocols on 116 scenes and the D2-Net subset."""
     found = load_hpatches(run.folder("hpatches"))
     scenes = [scene.with_max_pairs(options.max_pairs) for scene in found]
     last = [scene.pairs[-1] for scene in scenes]
@@ -161,7 +161,7 @@ def hpatches(run: Run, options: BenchmarkOptions) -> list[Section]:
     sections = _hpatches_paper(run, options, scenes, last)
     for name, chosen in subsets.items():
         key, title = f"hpatches_{len(chosen)}", f"HPatches, {name}"
-        text = "Evaluated by its own files."
+        text = "Evaluated by the homographies of the data set."
         sections += standard_sections(run, options, pairs_of(chosen), key, title, text)
     sections += guided_sections(run, options, {"published": last}, "hpatches", "HPatches")
     return sections + degraded_sections(run, options, pairs_of(scenes), "hpatches", "HPatches")
@@ -178,8 +178,8 @@ def _hpatches_paper(
     of_kind = [[pair for pair in last if light[pair.scene] is kind] for kind in (True, False)]
     drawn = [pair for pairs in of_kind for pair in pairs[: FIGURE_7_SCENES // 2]]
     text = (
-        f"{len(scenes)} scenes, of 116 in the whole set. Matches of images 1 and 6. The paper "
-        f"reports {NUMBERS['max_matches']:,} as the most correct matches of a pair."
+        f"{len(scenes)} of the 116 scenes of the data set. Images 1 and 6 are matched. The largest "
+        f"number of correct matches of a pair in the paper is {NUMBERS['max_matches']:,}."
     )
     tables = [
         table_3(repeatability, light),
@@ -193,7 +193,7 @@ def _hpatches_paper(
 
 
 def table_3(by_scene: Table, light: Mapping[str, bool]) -> Table:
-    """Average the repeatability by kind of scene; `light` says which change in illumination."""
+    """Average the repeatability by kind of scene; `light` marks scenes with changing light."""
     titles = {}
     rows: Rows = [{"method": row["method"]} for row in by_scene.rows]
     for kind, wanted in (("illumination", True), ("viewpoint", False)):
@@ -207,7 +207,7 @@ def table_3(by_scene: Table, light: Mapping[str, bool]) -> Table:
         "Table III: repeatability as in the paper, by kind of scene",
         {"method": "", **dict.fromkeys(titles.values(), ".4f")},
         rows,
-        f"{by_scene.note} The paper's numbers are of 57 and 59 scenes.",
+        f"{by_scene.note} The paper used 57 and 59 scenes.",
     )
     numbers = {
         title: {titles[kind]: value for kind, value in of_method.items()}
@@ -217,7 +217,7 @@ def table_3(by_scene: Table, light: Mapping[str, bool]) -> Table:
 
 
 def low_visibility(run: Run, options: BenchmarkOptions) -> list[Section]:
-    """Run the protocols on the dusty and the smoky pair (Figure 6)."""
+    """Run the protocols on the pairs with dust and with smoke (Figure 6)."""
     scenes = load_low_visibility(run.folder("low-visibility"))
     pairs = pairs_of(scenes)
     key, title = "low_visibility", "Low visibility"
@@ -245,6 +245,6 @@ def pairs_of(scenes: Sequence[PlanarScene]) -> list[PlanarPair]:
 def select_pairs(
     scenes: Sequence[PlanarScene], chosen: Sequence[tuple[str, int]]
 ) -> list[PlanarPair]:
-    """Return the pairs of scenes and numbers, as those of Table II; those that are there."""
+    """Return the pairs with given scenes and numbers that exist, for example those of Table II."""
     found = {(pair.scene, pair.number): pair for pair in pairs_of(scenes)}
     return [found[name] for name in chosen if name in found]

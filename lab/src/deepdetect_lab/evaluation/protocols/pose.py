@@ -1,4 +1,4 @@
-"""Relative poses from matches, in images with known cameras."""
+"""Evaluate relative poses from matches in images with known cameras."""
 
 from __future__ import annotations
 
@@ -44,54 +44,55 @@ from ..unguided import UPRIGHT_SIFT, match_unguided
 THRESHOLD_PX = 1.0
 CONFIDENCE = 0.99999
 MIN_MATCHES = 6
-"""One more than give an essential matrix: with five each is perfect."""
+"""Five matches always fit an essential matrix exactly, so at least one more is needed."""
 
 NO_FAR_POINTS = 1e9
-"""OpenCV leaves points beyond this many baselines out when it chooses one of four poses."""
+"""Points farther away, in baselines, do not count when OpenCV chooses one of four poses. The
+value is so large that all points count."""
 
 BUDGET = 8192
 RATIO = 0.8
 GOOD_DEG = 5.0
-"""Under which a pose counts as right where methods are compared pair by pair."""
+"""A pose counts as correct under this error, in degrees, where methods are compared by pair."""
 
 STRAIGHT_AHEAD = "no matches: straight ahead"
 
-DISTANCE, ERROR = "frame distance", "pose error, °"
+ERROR = "pose error, °"
 AGREEING = f"agreeing within {EPIPOLAR_THRESHOLD_PX:g} px"
 
 TEXT = (
-    "The relative pose of two cameras from matches alone, the same way for all methods: OpenCV's "
-    f"MAGSAC at {THRESHOLD_PX:g} px with the true intrinsics (confidence {CONFIDENCE:g}), then the "
-    "one of four poses with most points in front of both cameras. The error is the larger of two "
-    "angles: of the rotation, and between the directions of the translation. DeepDetect: "
-    "`match_images` with its defaults (guided), and by descriptors alone (patchmatch, mutual "
-    f"nearest neighbours). Further methods: the best {BUDGET:,} keypoints, exact mutual nearest "
-    f"neighbours, ratio {RATIO:g} (none for learned descriptors).",
-    f'"{STRAIGHT_AHEAD}" sees no image: no rotation, the second camera in front of the first. In a '
-    "clip from a moving car that is a strong guess.",
+    "The relative pose of two cameras is estimated from matches in the same way for all methods: "
+    f"by OpenCV's MAGSAC at {THRESHOLD_PX:g} px with the true intrinsics (confidence "
+    f"{CONFIDENCE:g}). Among the four possible poses, the one with most points in front of both "
+    "cameras is used. The error is the larger of rotation error and translation error (angles). "
+    "DeepDetect: `match_images` with its defaults (guided), and by descriptors alone (patchmatch, "
+    f"mutual nearest neighbours). Further methods: the best {BUDGET:,} keypoints, exact mutual "
+    f"nearest neighbours, ratio {RATIO:g} (none for learned descriptors).",
+    f'"{STRAIGHT_AHEAD}" uses no image. It assumes no rotation, and the second camera in front of '
+    "the first. In a clip from a moving car this is a strong guess.",
     "The thresholds by which guided matching chooses between plane and depth were chosen on "
-    "Strecha's fountain and a KITTI clip: on these the figures are no test of that choice.",
+    "Strecha's fountain and a KITTI clip, so results on these do not test that choice.",
 )
 
 NOTE = (
-    "Failed: pairs without a pose; their error is infinite. AUC: area under the curve of the "
-    "errors up to a threshold, as SuperGlue and glue-factory compute it, but an opposite "
+    "Failed: pairs without a pose; their error is infinite. AUC: area under the cumulative error "
+    "curve up to a threshold, as in SuperGlue and glue-factory, except that an opposite "
     "translation is wrong here. Matches: median. Agreeing: fraction of the matches whose Sampson "
     f"distance from the true epipolar geometry is under {EPIPOLAR_THRESHOLD_PX:g} px, mean over "
-    "the pairs; no matches count as 0."
+    "the pairs; a pair without matches counts as 0."
 )
 
-Found = tuple[np.ndarray, np.ndarray, float, str, str]
+Found = tuple[np.ndarray, np.ndarray, float, str]
 """The (M, 2) matched positions of two images, the seconds that it took, what guided: "homography",
-"fundamental" or "none", and the confidence; "" for methods that are never guided."""
+"fundamental" or "none"; "" for methods that are never guided."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseMethod:
     """A row of the tables.
 
-    `match` finds the matches of two images (None: the pose is always straight ahead), which
-    depend on `name` and `version`.
+    `match` finds the matches of two images; with None the pose is always straight ahead. `name` and
+    `version` identify the results in the cache.
     """
 
     name: str
@@ -110,16 +111,15 @@ def pose(run: Run, options: BenchmarkOptions) -> list[Section]:
 
     def measure(method: PoseMethod, item: tuple[PosedScene, PosedPair]) -> Row:
         scene, pair = item
-        row = {"scene": scene.name, DISTANCE: pair.frame_distance, "pair": pair.name}
-        return row | pose_row(run, method, pair)
+        return {"scene": scene.name, **pose_row(run, method, pair)}
 
     rows = run.rows("pose of ", methods, items, measure)
-    tables = [scene_table(scenes, methods, rows), pair_table(list(items), methods, rows)]
+    tables = [scene_table(scenes, methods, rows)]
     return [Section("Relative poses", TEXT, tables)]
 
 
 def pose_methods(run: Run, options: BenchmarkOptions) -> list[PoseMethod]:
-    """Return DeepDetect's rows, the baselines that were chosen, and the control."""
+    """Return DeepDetect's methods, the chosen baselines, and the guess without images."""
     detector, own = options.native_detector(), options.deepdetect_native()
     ways = {"DeepDetect": _match_guided, "DeepDetect, unguided": _match_unguided}
     chosen = {"sift": CLASSICAL["sift"], "orb": STANDARD["orb"]}
@@ -139,35 +139,34 @@ def _match_guided(detector: DeepDetect, images: tuple[Path, Path]) -> Found:
     found = match_images(*images, detector)
     geometry = found.geometry
     assert geometry is not None
-    told = geometry.model, geometry.confidence
-    return found.points0, found.points1, sum(found.seconds.values()), *told
+    return found.points0, found.points1, sum(found.seconds.values()), geometry.model
 
 
 def _match_unguided(detector: DeepDetect, images: tuple[Path, Path]) -> Found:
     how: dict[str, Any] = {"descriptor": UPRIGHT_SIFT, "matcher": "patchmatch", "mutual": True}
     found = match_unguided(*images, detector, **how)
-    return found.points0, found.points1, sum(found.seconds.values()), "", ""
+    return found.points0, found.points1, sum(found.seconds.values()), ""
 
 
 def _feature_method(run: Run, feature: LocalFeature) -> PoseMethod:
-    """Match exactly, with the ratio test; learned descriptors without it."""
+    """Make a method with exact matching and a ratio test (none for learned descriptors)."""
     ratio, test = (math.inf, "no ratio test") if feature.learned else (RATIO, f"ratio {RATIO:g}")
     settings = MatchSettings("exact", ratio, mutual=True, budget=BUDGET)
 
     def match(images: tuple[Path, Path]) -> Found:
-        detect = [run.keypoints(feature, image)[1].seconds for image in images]
+        detect = [run.keypoints(feature, image)[1] for image in images]
         found = run.matches(feature, images, settings)
-        seconds = sum(detect) + found.describe.seconds + found.match.seconds
-        return found.points0, found.points1, seconds, "", ""
+        seconds = sum(detect) + found.seconds
+        return found.points0, found.points1, seconds, ""
 
     title = f"{feature.title}, {test}"
     return PoseMethod(feature.name, title, match, (*feature.key, settings))
 
 
 def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
-    """Measure a method on a pair, or read the result from the cache, by the titles of the columns.
+    """Measure a method on a pair, cached; return the values by column title.
 
-    Errors in degrees are infinite without a pose; of the control there is nothing else.
+    Errors are in degrees and infinite without a pose. The guess without images has only errors.
     """
     match = method.match
     images = (pair.first.path, pair.second.path)
@@ -175,27 +174,26 @@ def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
 
     def make() -> Row:
         assert match is not None
-        points0, points1, seconds, guided_by, confidence = match(images)
+        points0, points1, seconds, guided_by = match(images)
         return {
             **pose_errors(estimate_pose(points0, points1, *cameras), pair),
             "matches": len(points0),
             AGREEING: epipolar_inlier_ratio(points0, points1, pair.fundamental),
             "seconds": seconds,
             "guided by": guided_by,
-            "confidence": confidence,
         }
 
     if match is None:
-        nothing: Row = dict.fromkeys(("matches", AGREEING, "seconds", "guided by", "confidence"))
+        nothing: Row = dict.fromkeys(("matches", AGREEING, "seconds", "guided by"))
         return pose_errors((np.eye(3), np.array([0.0, 0.0, -1.0])), pair) | nothing
     truth = (*cameras, pair.rotation, pair.translation)
     estimate = (THRESHOLD_PX, CONFIDENCE, EPIPOLAR_THRESHOLD_PX)
     row = run.cached("pose", (method.name, method.version, images, truth, estimate), make)
-    return row | {name: row[name] or None for name in ("guided by", "confidence")}
+    return row | {"guided by": row["guided by"] or None}
 
 
 def pose_errors(pose: tuple[np.ndarray, np.ndarray] | None, pair: PosedPair) -> Row:
-    """Return the errors of a pose in degrees, infinite without one, by the titles of columns."""
+    """Return a pose's errors in degrees by column title; they are infinite without a pose."""
     rotation = translation = float("inf")
     if pose is not None:
         rotation = rotation_error(pose[0], pair.rotation)
@@ -207,15 +205,15 @@ def pose_errors(pose: tuple[np.ndarray, np.ndarray] | None, pair: PosedPair) -> 
 def estimate_pose(
     points0: np.ndarray, points1: np.ndarray, intrinsics0: np.ndarray, intrinsics1: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Estimate the relative pose of two cameras from (M, 2) matches; None where there is none.
+    """Estimate the relative pose of two cameras from (M, 2) matches; return None on failure.
 
     Returns the (3, 3) rotation and (3,) translation of length 1: X1 = rotation @ X0 + translation.
     """
     if len(points0) < MIN_MATCHES:
         return None
-    # Of a common camera, so that both images may have any intrinsics. It has the mean focal length,
-    # not 1: in normalised coordinates the MAGSAC of OpenCV 5 is less accurate (SIFT on 87 pairs of
-    # a KITTI clip: median rotation error 0.13 instead of 0.05 degrees).
+    # Both images are mapped to a common camera, so their intrinsics may differ. It has the mean
+    # focal length, because OpenCV 5's MAGSAC is less accurate in normalised coordinates (SIFT on 87
+    # pairs of a KITTI clip: median rotation error 0.13 instead of 0.05 degrees).
     focal = float(np.mean([k[i, i] for k in (intrinsics0, intrinsics1) for i in (0, 1)]))
     camera = np.diag([focal, focal, 1.0])
     first = _of_camera(points0, intrinsics0, camera)
@@ -229,13 +227,13 @@ def estimate_pose(
         _, rotation, translation, *_ = cv2.recoverPose(
             essential, first, second, camera, distanceThresh=NO_FAR_POINTS, mask=inliers
         )
-    except cv2.error:  # degenerate input, as all points in one place
+    except cv2.error:  # degenerate input, for example all points at one place
         return None
     return rotation, translation.ravel()
 
 
 def _of_camera(points: np.ndarray, intrinsics: np.ndarray, camera: np.ndarray) -> np.ndarray:
-    """Move positions to where another camera without rotation sees them."""
+    """Map positions to another camera with the same pose."""
     homogeneous = np.column_stack([np.asarray(points, np.float64), np.ones(len(points))])
     return np.ascontiguousarray((homogeneous @ (camera @ np.linalg.inv(intrinsics)).T)[:, :2])
 
@@ -258,7 +256,7 @@ SUMMARY: Columns = {
 
 
 def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], rows: Rows) -> Table:
-    """Tabulate each method on each scene, losses to SIFT beside wins."""
+    """Tabulate each method on each scene, with the pairs better and worse than SIFT."""
     sift = {row["item"]: row[ERROR] < GOOD_DEG for row in where(rows, method="sift")}
 
     def against_sift(own: Rows, only_sift: bool) -> int | None:
@@ -280,36 +278,9 @@ def scene_table(scenes: Sequence[PosedScene], methods: Sequence[PoseMethod], row
         "seconds": median(".2f", "seconds"),
     }
     note = (
-        f"{NOTE} Guided by: pairs by the geometry that guided. Worse than SIFT: pairs with an "
-        f"error of {GOOD_DEG:g}° or more where SIFT's is under it; better: the other way round. "
-        "Seconds: median, from the images to the matches, of the run that made them."
+        f"{NOTE} Guided by: number of pairs guided by this geometry. Worse than SIFT: pairs with "
+        f"an error of {GOOD_DEG:g}° or more for which SIFT's error is smaller than {GOOD_DEG:g}°; "
+        "better: the reverse. Seconds: median time from images to matches, when it was computed."
     )
     groups = [{"scene": scene.name} for scene in scenes]
     return tabulate("pose", "Relative poses", methods, rows, columns, note, groups)
-
-
-PAIR_COLUMNS = {
-    "pair": "",
-    "method": "",
-    DISTANCE: "d",
-    "rotation error, °": ".3f",
-    "translation error, °": ".3f",
-    ERROR: ".3f",
-    "matches": ",d",
-    AGREEING: ".1%",
-    "guided by": "",
-    "confidence": "",
-    "seconds": ".2f",
-}
-
-
-def pair_table(items: Sequence[str], methods: Sequence[PoseMethod], rows: Rows) -> Table:
-    """Tabulate each method on each pair."""
-    lines = [
-        {**row, "method": method.title}
-        for item in items
-        for method in methods
-        for row in where(rows, item=item, method=method.name)
-    ]
-    title = "Relative poses, all pairs"
-    return Table("pose_pairs", title, PAIR_COLUMNS, lines, NOTE, in_text=False)

@@ -1,7 +1,7 @@
-"""Cameras and points of many images whose cameras are known: ranked points, SIFT, chance.
+"""Evaluate structure from motion on scenes with known cameras: ranked points, SIFT, chance.
 
-All methods go through the stages of `reconstruct_many` with the same options; only the keypoints,
-and for SIFT the matches, are others. Each runs in a process of its own, which tells its memory.
+All methods use the stages of `reconstruct_many` with the same options. Only the keypoints differ,
+and for SIFT the matches. Each method runs in its own process, so that its memory can be measured.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ from .dense_points import DENSE_COLUMNS, DENSE_NOTE, SGBM, measure_dense_points
 MIN_IMAGES = 3
 
 POSE_THRESHOLDS_DEG = (0.5, 1.0, 5.0)
-"""Of the AUC: adjusted cameras are more accurate than those of two images."""
+"""AUC thresholds; they are below those of image pairs, since adjusted cameras are more accurate."""
 
 DATABASE = "sift.db"
 
 OPTIONS = MultiViewOptions(pairs="exhaustive")
-"""Of all methods: those of `reconstruct_many`, but every pair is matched."""
+"""All methods use these options: the defaults of `reconstruct_many`, but all pairs are matched."""
 
 KINDS = ("true", "estimated")
 MODEL_COLUMNS = {"sparse points": ",d", "track length": ".2f", "reprojection error, px": ".3f"}
@@ -57,7 +57,6 @@ CAMERA_COLUMNS = {
     **{"scene": "", "keypoints": "", "intrinsics": "", "images": "d", "registered": "d"},
     **{f"AUC at {threshold:g}°": ".3f" for threshold in POSE_THRESHOLDS_DEG},
     "centres, unit of the truth": ".5f",
-    "centres, ‰ of the extent": ".2f",
     "from the first row's, unit of the truth": ".5f",
     "rotations, °": ".3f",
     **MODEL_COLUMNS,
@@ -77,21 +76,21 @@ COST_COLUMNS = {
 }
 
 TEXT = (
-    "The cameras of all images of a scene and sparse points, as by `reconstruct_many`: every pair "
-    "is matched, COLMAP verifies and maps, tracks are refined, and a last adjustment with a robust "
-    "loss follows. All methods have the same stages and options, once with the true intrinsics and "
-    "once with estimated ones; the true poses only evaluate. What differs are the keypoints: the "
-    "ranked points of DeepDetect; as many random points with their sizes; and pycolmap's own SIFT "
-    "with its own matcher, at as many places at most, some of them at two angles, once with the "
-    "tracks as they are and once with refined ones. Dense tracks are those of `--matches dense`. "
-    "Where only satellite fixes are known, centres are compared with these.",
+    "Cameras of all images and sparse points are reconstructed as by `reconstruct_many`: every "
+    "pair is matched, COLMAP verifies and maps, tracks are refined, and a last bundle adjustment "
+    "with a robust loss follows. All methods use the same stages and options, once with true and "
+    "once with estimated intrinsics; the true poses are only used for evaluation. The keypoints "
+    "differ: the ranked points of DeepDetect; as many random points with their sizes; and "
+    "pycolmap's SIFT with its own matcher, at no more positions, some of them with two angles. "
+    "SIFT runs once with unrefined and once with refined tracks. Dense tracks are those of "
+    "`--matches dense`. Where only GPS positions are known, camera centres are compared with them.",
 )
 
 CAMERA_NOTE = (
     "AUC: of the relative poses of all pairs of images, the error being the larger of the angle of "
     "the rotation and that between the directions of translation, infinite where an image is not "
     "registered. Centres and rotations: mean errors of the registered cameras after the alignment "
-    "of their centres; extent: the largest distance of two true cameras. From the first row's: "
+    "of their centres. From the first row's: "
     "mean distance of the centres from the first method's; where that is much less than the errors "
     "of both, these are the truth's, or common to both. The alignment leaves the rotation "
     "about a straight line of cameras open, so these have no rotations: take the AUC. Track "
@@ -100,10 +99,10 @@ CAMERA_NOTE = (
 )
 
 COST_NOTE = (
-    "Of one process without other work: keypoints, descriptors and matches on one thread, "
-    "verification and mapping on as many as COLMAP takes. Memory: the most that the process held, "
-    "with Python and all libraries. The ranked points, whose places random ones take, are in the "
-    "memory of these, not in their seconds. On a busy machine compare CPU seconds."
+    "Each method runs in its own process: keypoints, descriptors and matches on one thread, "
+    "verification and mapping on COLMAP's default number of threads. Memory: peak memory of the "
+    "process, with Python and all libraries. Random points replace ranked points, which add to "
+    "their memory but not to their seconds. On a busy machine, compare CPU seconds."
 )
 
 
@@ -112,11 +111,11 @@ Pair = tuple[str, str]
 
 @dataclass(frozen=True)
 class SfmMethod:
-    """A row of the tables; `name` is also the title, and results depend on `version`, too.
+    """A row of the tables; `name` is the title, and `name` and `version` identify cached results.
 
-    `find` writes the keypoints of the images in a folder, `match` returns the matches of pairs;
-    both are functions of a module. With `chance` the time that finding takes means nothing; tracks
-    are `refined`, or as COLMAP leaves them; `tracks` is the option `matches`.
+    `find` writes the keypoints of images into a folder, `match` returns the matches of pairs; both
+    are module-level functions. With `chance` the time of `find` is not reported. `refined` says
+    whether COLMAP's tracks are refined, and `tracks` is the option `matches`.
     """
 
     name: str
@@ -130,7 +129,7 @@ class SfmMethod:
 
 @lru_cache
 def true_views(scene: PosedScene) -> dict[str, PosedView]:
-    """Return the true cameras and poses by the names of the files."""
+    """Return the true cameras and poses by file name."""
     views = {}
     for image in scene.images:
         name, matrix = image.path.name, image.intrinsics
@@ -143,17 +142,17 @@ def true_views(scene: PosedScene) -> dict[str, PosedView]:
 
 def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
     """Reconstruct all scenes by all methods."""
-    import_pycolmap()  # what is missing is said at once
+    import_pycolmap()  # fails early if pycolmap is not installed
     folder = run.folder("sfm")
     scenes = load_posed_scenes(run.folder("pose") if folder == run.data else folder, located=True)
     chosen = {}
     for each in scenes:
         if len(each.images) < MIN_IMAGES:
-            run.fail(f"{each.name}: it has {len(each.images)} images, 3 are needed")
+            run.fail(f"{each.name}: it has {len(each.images)} images, but 3 are needed")
         else:
             chosen[each.name] = choose_images(each, options.max_images)
     for feature in options.others:
-        run.skipped.append(f"sfm: {feature.title}: this benchmark runs no further methods")
+        run.skipped.append(f"sfm: {feature.title}: this benchmark does not run further methods")
     methods = sfm_methods(options)
     rows = run.rows("", methods, chosen, partial(measure_scene, run))
     rows = [row for name in chosen for row in where(rows, item=name)]
@@ -171,9 +170,9 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
 
 
 def choose_images(scene: PosedScene, most: int) -> PosedScene:
-    """Return a scene with all of its images, the first of a sequence, or evenly spaced ones.
+    """Limit the images of a scene: the first ones of a sequence, else evenly spaced ones.
 
-    Between evenly spaced frames of a long sequence there would be nothing in common.
+    Evenly spaced frames of a long sequence would not overlap.
     """
     sequence = bool(scene.pairs) and scene.pairs[0].frame_distance is not None
     images = scene.images[:most] if sequence else evenly_spaced(scene.images, most)
@@ -181,7 +180,7 @@ def choose_images(scene: PosedScene, most: int) -> PosedScene:
 
 
 def sfm_methods(options: BenchmarkOptions) -> list[SfmMethod]:
-    """Return the ranked points, SIFT where it is among the baselines, each twice, and chance."""
+    """Return two methods of ranked points, two of SIFT if it is a baseline, and chance."""
     points = PointDetector(MAX_KEYPOINTS, ranker=options.ranker)
     version, random = _version(points), "baseline: as many random points"
     ours = SfmMethod("DeepDetect, points", partial(find_points, points), version=version)
@@ -197,10 +196,10 @@ def _version(points: PointDetector) -> str:
 
 
 def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
-    """Reconstruct a scene by a method, or read the result from the cache.
+    """Reconstruct a scene by a method, cached.
 
-    Returns the values of `run_method`, the "scene", and for each kind of intrinsics the registered
-    "views" and the `MODEL_COLUMNS`.
+    Returns the values of `run_method`, the "scene", and for true and for estimated intrinsics the
+    registered "views" and the `MODEL_COLUMNS`.
     """
     images = tuple(image.path for image in scene.images)
     cameras = {name: view.camera for name, view in true_views(scene).items()}
@@ -224,7 +223,7 @@ def measure_scene(run: Run, method: SfmMethod, scene: PosedScene) -> Row:
 
 
 def dense_rows(run: Run, scene: PosedScene, detector: PointDetector) -> Rows:
-    """Measure the dense points of a scene, or read the result from the cache."""
+    """Measure the dense points of a scene, cached."""
     images = tuple(image.path for image in scene.images)
     cameras = {name: view.camera for name, view in true_views(scene).items()}
     known = {} if scene.located_only else cameras
@@ -243,7 +242,7 @@ def dense_rows(run: Run, scene: PosedScene, detector: PointDetector) -> Rows:
 
 
 def camera_table(rows: Rows) -> Table:
-    """Tabulate cameras and sparse points of each method on each scene."""
+    """Tabulate the cameras and sparse points of each method on each scene."""
     lines = []
     for row in rows:
         scene: PosedScene = row["scene"]
@@ -266,9 +265,6 @@ def camera_table(rows: Rows) -> Table:
                 true = [truth[name] for name in views]
                 centres, rotations, _ = camera_errors(list(views.values()), true)
                 line["centres, unit of the truth"] = float(centres.mean())
-                places = np.array([view.centre for view in truth.values()])
-                extent = np.linalg.norm(places[:, None] - places, axis=2).max()
-                line["centres, ‰ of the extent"] = 1000 * float(centres.mean()) / float(extent)
                 if not scene.located_only:
                     line["rotations, °"] = float(rotations.mean())
             if first is not row:
@@ -282,7 +278,7 @@ Views = Mapping[str, PosedView]
 
 
 def _apart(views: Views, others: Views, truth: Views) -> float | None:
-    """Return the mean distance of the centres of two models in the unit of the truth."""
+    """Return the mean distance between two models' camera centres, in units of the ground truth."""
     names = sorted(set(views) & set(others))
     if len(names) < MIN_IMAGES:
         return None
@@ -297,7 +293,7 @@ def find_points(detector: PointDetector, stages: Stages, folder: Path) -> None:
 
 
 def find_random_points(detector: PointDetector, stages: Stages, folder: Path) -> None:
-    """Put as many random points in place of the ranked ones, with their sizes in another order."""
+    """Replace ranked points by as many random points, with their sizes in random order."""
     find_points(detector, stages, folder)
     with import_h5py().File(stages.features, "r+") as file:
         for number, name in enumerate(sorted(path.name for path in folder.iterdir())):
@@ -316,7 +312,7 @@ def find_random_points(detector: PointDetector, stages: Stages, folder: Path) ->
 
 
 def find_sift(stages: Stages, folder: Path) -> None:
-    """Find keypoints by pycolmap's own SIFT with its defaults, at no more places than ours."""
+    """Detect keypoints by pycolmap's SIFT with its defaults, at no more positions than ours."""
     names = sorted(path.name for path in folder.iterdir())
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.FeatureExtractionOptions()
@@ -339,7 +335,7 @@ def find_sift(stages: Stages, folder: Path) -> None:
 
 
 def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
-    """Match by pycolmap's own matcher with its defaults; the verification is that of all."""
+    """Match by pycolmap's matcher with its defaults; verification is the same for all methods."""
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.FeatureMatchingOptions()
         how.num_threads = 1
@@ -359,9 +355,10 @@ def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
 
 
 def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, Camera]) -> Row:
-    """Reconstruct images by a method; to be called in a process of its own.
+    """Reconstruct images by a method; call it in a separate process.
 
-    Returns the `COST_COLUMNS`, and those of `_unpacked` after "true " and "estimated ".
+    Returns the `COST_COLUMNS`, and the values of `_unpacked` with prefixes "true " and
+    "estimated ".
     """
     with tempfile.TemporaryDirectory(prefix="deepdetect-sfm-") as scratch:
         options = replace(OPTIONS, matches=method.tracks)
@@ -389,7 +386,7 @@ def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, 
             model, seconds = None, np.nan
             if known or kind == "estimated":
                 cpu = time.process_time()
-                with contextlib.suppress(NoDepthError):  # none is a result, too
+                with contextlib.suppress(NoDepthError):  # no model is also a result
                     model = stages.map(folder, intrinsics, matches, bool(known), method.refined)[0]
                 seconds = time.process_time() - cpu
             row[MAPPING_CPU.format(kind)] = seconds
@@ -402,9 +399,10 @@ def _times() -> np.ndarray:
 
 
 def _unpacked(model: Any) -> Row:
-    """Return what is kept of a model of pycolmap, or of None.
+    """Return the values to keep of a pycolmap model, or of None.
 
-    The "names" and (N, 12) "poses" (rotation, translation) of its images, and `MODEL_COLUMNS`.
+    They are the "names" and (N, 12) "poses" (rotation, translation) of its images, and the
+    `MODEL_COLUMNS`.
     """
     columns: Row = {**dict.fromkeys(MODEL_COLUMNS, np.nan), "sparse points": 0}
     if model is None:

@@ -1,4 +1,4 @@
-"""The standard metrics on pairs with homographies, at equal budgets and beside chance."""
+"""Standard metrics on pairs with homographies, at equal keypoint budgets, with chance levels."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from ..report import (
 from ..run import MatchSettings, Run
 
 BUDGETS: tuple[int | None, ...] = (512, 1024, 2048, 4096, 8192, None)
-"""Numbers of keypoints; None: all."""
+"""Budgets, the numbers of best keypoints that are compared; None takes all."""
 
 RADII_PX = (1.0, 2.0, 3.0)
 SEEDS = 5
@@ -49,34 +49,42 @@ RATIO = 0.85
 INLIER_THRESHOLD_PX = 3.0
 
 MIN_FILLED = 0.9
-"""A budget is shown where a method fills at least this fraction of it, on average."""
+"""A budget is shown if a method finds at least this fraction of it on average, because otherwise
+numbers of keypoints would differ. Chosen by hand."""
 
 MAX_CHANCE = 0.95
-"""Chance beyond which nothing can be distinguished from it."""
+"""Chance correction is left out above this chance level, since it would divide by nearly 0."""
 
 MATCHING_NOTE = (
-    f"The best {MATCHING_BUDGET:,} keypoints of each image; the same upright RootSIFT of size "
-    f"4 for all, except in the rows that name others; mutual nearest neighbours, ratio {RATIO} "
-    "(none for learned descriptors). Means over the pairs; no matches count as a precision of 0."
+    f"The best {MATCHING_BUDGET:,} keypoints of each image are matched by mutual nearest "
+    f"neighbours with ratio {RATIO} (none for learned descriptors). All have the same upright "
+    "RootSIFT of size 4, except in rows that name others. Values are means over the pairs; without "
+    "matches the precision is 0."
 )
 
 
 def standard_sections(
+    run: Run, options: BenchmarkOptions, pairs: Sequence[PlanarPair], *texts: str
+) -> list[Section]:
+    """Return the section of `standard_section`, where the protocol is wanted."""
+    wanted = "standard" in options.protocols
+    return [standard_section(run, options, pairs, *texts)] if wanted else []
+
+
+def standard_section(
     run: Run,
     options: BenchmarkOptions,
     pairs: Sequence[PlanarPair],
     key: str,
     title: str,
     text: str,
-) -> list[Section]:
+) -> Section:
     """Measure and show all features on all pairs."""
-    if "standard" not in options.protocols:
-        return []
     features = options.standard_features()
     rows = standard_rows(run, features, pairs)
     what = f"{title} ({len(pairs)} pairs)"
     tables = standard_tables(features, rows, key, what)
-    return [Section(f"{title}, the standard protocol", (text,), tables)]
+    return Section(f"{title}, the standard protocol", (text,), tables)
 
 
 def standard_rows(run: Run, features: Sequence[LocalFeature], pairs: Sequence[PlanarPair]) -> Rows:
@@ -85,16 +93,14 @@ def standard_rows(run: Run, features: Sequence[LocalFeature], pairs: Sequence[Pl
     return run.rows("", features, items, lambda feature, pair: pair_row(run, feature, pair))
 
 
-def pair_row(
-    run: Run, feature: LocalFeature, pair: PlanarPair, budgets: Sequence[int | None] = BUDGETS
-) -> Row:
+def pair_row(run: Run, feature: LocalFeature, pair: PlanarPair) -> Row:
     """Measure a feature on a pair.
 
     Returns:
-        By name: "kind"; ("keypoints", budget) in the image that has fewer; ("repeated", budget,
-        radius), and the same of "chance" and "localization"; ("coverage", budget) of the first
-        image; "matches", and ("correct", px), ("precision", px) and ("score", px); "all matches"
-        and ("accuracy", px) without a ratio test; and "corner errors" by seed.
+        Values by name: "kind"; ("keypoints", budget) in the image that has fewer; ("repeated",
+        budget, radius), "chance" and "localization" likewise; ("coverage", budget) of the first
+        image; "matches", ("correct", px), ("precision", px) and ("score", px); "all matches" and
+        ("accuracy", px) without a ratio test; and "corner errors" by seed.
     """
     images = (pair.first, pair.second)
     first, second = (run.keypoints(feature, image)[0] for image in images)
@@ -128,9 +134,9 @@ def pair_row(
         **{("accuracy", px): without_ratio["precision", px] for px in MATCH_THRESHOLDS_PX},
         "corner errors": run.cached("corner_errors", depends, corner_errors)["errors"].tolist(),
     }
-    # Each position once: another orientation of SIFT's is not another place.
+    # Positions count once, although SIFT repeats some with other orientations.
     places = [first.distinct(), second.distinct()]
-    for budget in budgets:
+    for budget in BUDGETS:
         row |= _at_budget(run, feature, pair, places, budget)
     return row
 
@@ -162,7 +168,7 @@ def _at_budget(
 
 
 def repeated(rows: Rows, budget: int | None, radius: float, name: str = "repeated") -> float | None:
-    """Return the mean repeatability, or its "chance"; None where the budget is not filled."""
+    """Return the mean repeatability, or its "chance"; None if the budget is not filled."""
     filled = mean(rows, ("keypoints", budget))
     if filled is None or (budget is not None and filled < MIN_FILLED * budget):
         return None
@@ -175,7 +181,7 @@ def correct(rows: Rows) -> float | None:
 
 
 def budget_name(budget: int | None) -> str:
-    """Return how tables name a budget."""
+    """Return the name of a budget in tables."""
     return "all" if budget is None else f"{budget:,}"
 
 
@@ -282,29 +288,29 @@ ACCURACY_COLUMNS: Columns = {
 COVERAGE_COLUMNS: Columns = {budget_name(b): average(".3f", ("coverage", b)) for b in BUDGETS}
 
 REPEATABILITY_NOTE = (
-    "Keypoints that are mutual nearest neighbours, at most the radius apart, over the fewer of "
-    "the keypoints that both images show, each position once; mean over the pairs. Chance: the "
-    f"same number of random points. Chance-corrected: 0 is chance, 1 is all; a dash where "
-    f"chance is over {MAX_CHANCE:.0%}. A budget that a method does not fill to "
-    f"{MIN_FILLED:.0%} is a dash. Localization: mean distance of the pairs of keypoints."
+    "Number of mutual nearest neighbours, at most the radius apart, divided by the smaller number "
+    "of keypoints that both images show; positions count once; mean over the pairs. Chance: the "
+    f"value of as many random points. Chance-corrected: 0 is chance, 1 is all; a dash where "
+    f"chance is over {MAX_CHANCE:.0%}. A dash also means that a method finds under "
+    f"{MIN_FILLED:.0%} of the budget. Localization: mean distance of the pairs of keypoints."
 )
 
 KIND_NOTE = (
-    f"By what changes between the two images, at {MATCHING_BUDGET:,} keypoints: mutual-NN "
-    "repeatability, and correct matches at 1 px. Means over the pairs of a kind."
+    f"Mutual-NN repeatability and correct matches at 1 px, with {MATCHING_BUDGET:,} keypoints, by "
+    "kind of change between the two images. Values are means over the pairs of a kind."
 )
 
 HOMOGRAPHY_NOTE = (
-    f"{MATCHING_NOTE} MAGSAC at {INLIER_THRESHOLD_PX:g} px. Error: mean distance of the first "
-    "image's corners from where the true homography takes them, at the images' own size; a "
-    "pair without a homography counts as wrong. Accuracy: fraction of the pairs within a "
-    "threshold; AUC: area under it, as SuperGlue computes it. Mean and standard deviation (±) "
-    f"over {SEEDS} seeds of MAGSAC."
+    f"{MATCHING_NOTE} MAGSAC at {INLIER_THRESHOLD_PX:g} px. Error: mean distance between the first "
+    "image's corners mapped by the estimated and by the true homography, in original pixels; a "
+    "pair without a homography counts as wrong. Accuracy: fraction of the pairs with an error up "
+    "to a threshold; AUC: area under this curve, as in SuperGlue. Mean and standard deviation (±) "
+    f"are over {SEEDS} seeds of MAGSAC."
 )
 
 ACCURACY_NOTE = (
-    f"Mutual nearest neighbours of the best {MATCHING_BUDGET:,} keypoints, no ratio test for "
-    "any method: fraction of the matches within each distance, mean over the pairs."
+    "Fraction of the matches within each distance, mean over the pairs. All methods match the best "
+    f"{MATCHING_BUDGET:,} keypoints by mutual nearest neighbours without a ratio test."
 )
 
-COVERAGE_NOTE = "Fraction of the cells of 32x32 px that hold a keypoint of the first image."
+COVERAGE_NOTE = "Fraction of the first image's cells of 32x32 px that contain a keypoint."

@@ -1,8 +1,9 @@
-"""Points that pipelines make of stereo pairs, beside the true disparity: Figure 8 of the paper."""
+"""Evaluate points of stereo pipelines by the true disparity: Figure 8 of the paper."""
 
 from __future__ import annotations
 
 import json
+import statistics
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -17,41 +18,44 @@ from ...datasets.middlebury import CalibratedStereoPair, load_calibrated_pair, l
 from ..clouds import draw_clouds
 from ..metrics.stereo import DISPARITY_TOLERANCES_PX, disparity_scores
 from ..options import BenchmarkOptions
+from ..profiling import profiled
 from ..report import Figure, Row, Section, Table, picture, where
 from ..run import Run
 from .paper_numbers import FIGURE_8, with_paper_column
-from .stereo_pipelines import ROUNDS, STAGES, Pipeline, pipelines
+from .stereo_pipelines import ROUNDS, Pipeline, pipelines
 
 TRUTH_OFFSETS = {"dolls": 2}
-"""Baselines by which the view of a ground truth lies to the left of the left image.
+"""Stereo baselines by which the ground truth's view is to the left of the left image.
 
-Shifted by them it has under 0.7 of the photometric error; points are evaluated by both.
+After this shift its photometric error is below 0.7 of that before; both versions are evaluated.
 """
 
 AS_IT_IS = ""
 SHIFTED = "ground truth shifted to its photographs"
 
 TEXT = (
-    "Ours: `deepdetect reconstruct --rectified`: strict, so what lies at a disparity discontinuity "
-    "is left out; --density 1 asks for every pixel and fills what only the left view shows. The "
-    "paper's pipeline, as in the authors' notebooks: images squashed to 480x480 as BGR, SIFT, "
-    "FLANN (10 trees, 100 checks), a ratio for each scene (cones, rocks, cloth 0.9, dolls 0.85, "
-    "moebius 0.77; others 0.9), essential matrix by RANSAC at 0.5 px. SIFT: the same with its own "
-    "keypoints. SGBM: block 5, three ways, uniqueness 10, speckle filter, both views extended."
+    "Ours: `deepdetect reconstruct --rectified`, which leaves out points at disparity "
+    "discontinuities; --density 1 gives a point for every pixel and fills pixels that only the "
+    "left view shows. The paper's pipeline, as in the authors' notebooks: images resized to "
+    "480x480 as BGR, SIFT descriptors, FLANN (10 trees, 100 checks), a ratio for each scene "
+    "(cones, rocks, cloth 0.9, dolls 0.85, moebius 0.77; others 0.9), essential matrix by RANSAC "
+    "at 0.5 px. SIFT: the same with SIFT keypoints. SGBM: block size 5, three-way mode, uniqueness "
+    "ratio 10, speckle filter, both views extended."
 )
 
 NOTE = (
     "1 - bad-t: fraction of the points with known truth at most t px off; EPE: their mean error; "
     "completeness: fraction of the pixels with known truth, hidden ones too, with a point at most "
     "1 px off; F-score: harmonic mean of both. Half-occluded: the true counterpart lies outside "
-    "the right image. Voxels: cubes that hold a point; the paper means the matches left by the "
-    f"essential matrix. Seconds: median of {ROUNDS} runs (ours, SGBM) or one, from images in "
-    "memory. Memory: growth of the process in the stage; all: since the first began, largest run."
+    "the right image. The paper's numbers of voxels are the matches that the essential matrix "
+    f"left. Seconds: median of {ROUNDS} runs (ours, SGBM) or one, from images in memory. MB: "
+    "growth of the process, in the largest run."
 )
 
 SHIFTED_NOTE = (
-    "The true disparity belongs to another view than the photographs; here it is shifted by whole "
-    "baselines, which fits them far better, without what the left view does not see."
+    "The true disparity belongs to another view than the photographs. Here it is shifted by whole "
+    "stereo baselines, which fits the photographs far better; pixels hidden in the left view are "
+    "left out."
 )
 
 
@@ -81,26 +85,25 @@ def middlebury(run: Run, options: BenchmarkOptions) -> list[Section]:
 
 
 def reconstruct_points(run: Run, pipeline: Pipeline, scene: Path) -> Row:
-    """Reconstruct a scene, the run of median time, or read it from the cache.
+    """Reconstruct a scene, or read that from the cache.
 
-    Returns the "pixels", their "disparity", and the columns that do not depend on the truth.
+    Returns the "pixels", their "disparity", and the columns that do not depend on ground truth.
     """
 
     def make() -> Row:
         pair = load_calibrated_pair(scene)
-        runs = [pipeline.run(pair) for _ in range(pipeline.rounds)]
-        runs = sorted(runs, key=lambda points: points[3].total.seconds)
-        pixels, disparity, filled, profiler = runs[len(runs) // 2]
-        stages = profiler.stages.items()
+        run_once, profiles = pipeline.prepare(pair), []
+        for _ in range(pipeline.rounds):
+            with profiled() as profile:
+                pixels, disparity, filled = run_once()
+            profiles.append(profile)
         return {
             "pixels": pixels,
             "disparity": disparity,
             "points": len(pixels),
             "of them filled": filled,
-            **{f"{stage}, s": profile.seconds for stage, profile in stages},
-            "seconds": profiler.total.seconds,
-            **{f"{stage}, MB": profile.memory / 1e6 for stage, profile in stages},
-            "all, MB": max(profiler.total.memory for *_, profiler in runs) / 1e6,
+            "seconds": statistics.median(profile.seconds for profile in profiles),
+            "all, MB": max(profile.memory for profile in profiles) / 1e6,
         }
 
     files = [scene / name for name in ("left.png", "right.png", "calib.json")]
@@ -115,44 +118,26 @@ def points_table(
     truth: np.ndarray | None,
 ) -> Table:
     """Tabulate number, accuracy, time and memory of the points of all pipelines."""
-    unit, edge = _voxel(pair)
-    voxels = f"voxels of {edge:g} {unit}"
     columns = {
-        **{"pipeline": "", "points": ",d", "of them filled": ",d", voxels: ",d"},
+        **{"pipeline": "", "points": ",d", "of them filled": ",d"},
         **{f"1 - bad-{tolerance:g}": ".4f" for tolerance in DISPARITY_TOLERANCES_PX},
         **{"EPE, px": ".3f", "completeness at 1 px": ".4f", "F-score": ".4f"},
         **{"half-occluded, with a point": ",d", "of these within 1 px": ".4f"},
-        **{f"{stage}, s": ".2f" for stage in STAGES},
-        "seconds": ".2f",
-        **{f"{stage}, MB": ",.0f" for stage in STAGES},
-        "all, MB": ",.0f",
+        **{"seconds": ".2f", "all, MB": ",.0f"},
     }
     lines: list[Row] = []
     for pipeline in compared:
         line = {"pipeline": pipeline.name, **found.get(pipeline.name, {})}
         if pipeline.name in found:
             points = line["pixels"], line["disparity"]
-            line[voxels] = count_voxels(pair.calibration, *points, edge)
             line |= {} if truth is None else disparity_scores(*points, truth)
         lines.append(line)
     key = f"middlebury_{pair.name}" + ("_shifted" if which == SHIFTED else "")
     paper = {p.name: p.paper[pair.name] for p in compared if pair.name in p.paper}
     title = f"{pair.name}, {which}" if which else pair.name
-    unknown = "" if truth is not None else "There is no true disparity: nothing is evaluated. "
+    unknown = "" if truth is not None else "There is no true disparity to evaluate by. "
     note = f"{SHIFTED_NOTE} {NOTE}" if which == SHIFTED else unknown + NOTE
     return with_paper_column(Table(key, title, columns, lines, note), "points", paper)
-
-
-def _voxel(pair: CalibratedStereoPair) -> tuple[str, float]:
-    return ("mm", 2.0) if pair.calibration.baseline_mm else ("baseline", 0.05)
-
-
-def count_voxels(
-    calibration: Calibration, pixels: np.ndarray, disparity: np.ndarray, edge: float
-) -> int:
-    """Count the cubes of a grid, with edges in mm or baselines, that hold a point."""
-    cubes = np.floor(_triangulate(calibration, pixels, disparity)[0] / edge).astype(np.int64)
-    return len(np.unique(cubes, axis=0))
 
 
 def _triangulate(
@@ -166,7 +151,7 @@ def _triangulate(
 def clouds_figure(
     pair: CalibratedStereoPair, compared: Sequence[Pipeline], found: Mapping[str, Row]
 ) -> Figure | None:
-    """Draw Figure 8: the points of the pipelines that the paper draws; None without any."""
+    """Draw Figure 8: points of the pipelines that the paper draws; None without points."""
     clouds = {}
     # Ours come last, as in the paper.
     for pipeline in sorted(compared, key=lambda pipeline: pipeline.drawn == "ours"):
@@ -175,7 +160,8 @@ def clouds_figure(
             continue
         space, kept = _triangulate(pair.calibration, points["pixels"], points["disparity"])
         columns, rows = np.rint(points["pixels"][kept]).astype(np.int64).T
-        clouds[pipeline.drawn] = PointCloud(space, pair.left[rows, columns], _voxel(pair)[0])
+        unit = "mm" if pair.calibration.baseline_mm else "baseline"
+        clouds[pipeline.drawn] = PointCloud(space, pair.left[rows, columns], unit)
     if not any(map(len, clouds.values())):
         return None
     counts = ", ".join(f"{name} {len(cloud):,}" for name, cloud in clouds.items())
@@ -186,16 +172,16 @@ def clouds_figure(
 
 
 def ground_truths(scene: Path) -> Mapping[str, np.ndarray | None]:
-    """Return the true disparities of a scene: as its file has it, and perhaps shifted."""
+    """Return the true disparities of a scene: that of its file and, for some, a shifted one."""
     disparity = load_middlebury(scene).disparity
     offset = TRUTH_OFFSETS.get(scene.name, 0)
     return {AS_IT_IS: disparity} | ({SHIFTED: shift_view(disparity, offset)} if offset else {})
 
 
 def shift_view(disparity: np.ndarray, baselines: int) -> np.ndarray:
-    """Show a disparity map from a view this many baselines to the right; NaN where it is hidden.
+    """Warp a disparity map to a view some stereo baselines to the right; hidden pixels are NaN.
 
-    Where several places fall on one pixel the nearest of them is visible.
+    If several points map to one pixel, the nearest is visible.
     """
     rows, columns = np.nonzero(np.isfinite(disparity))
     values = disparity[rows, columns]

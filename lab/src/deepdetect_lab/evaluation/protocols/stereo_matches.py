@@ -1,4 +1,4 @@
-"""Matches of stereo pairs by descriptors alone, evaluated by the true disparity, beside chance."""
+"""Evaluate matches of stereo pairs by descriptors alone, with the true disparity and chance."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ def score_stereo_matches(
 ) -> list[dict[str, Any]]:
     """Match rectified pairs with several sources of keypoints, and evaluate the matches.
 
-    By descriptors alone over the whole image: neither the rows nor the true disparity are used. A
-    source's rows are followed by those of random points at its density, since more keypoints always
-    find more; all pixels come last.
+    Descriptors are matched over the whole image; neither the rectification nor the true disparity
+    is used. The result of a source is followed by that of random points at its density, because
+    more keypoints always find more matches. All pixels come last.
     """
     rows: list[dict[str, Any]] = []
     with progress(len(pairs) * (2 * len(sources) + 1), "matching", "pair", quiet) as bar:
@@ -45,7 +45,7 @@ def score_stereo_matches(
 
 
 def match_stereo(pair: StereoPair, detector: AnyDetector, density: float | None = None) -> Matches:
-    """Match both views by descriptors alone and without estimating their geometry."""
+    """Match both views by descriptors alone, without estimating their geometry."""
     selection = SelectionOptions(density=density)
     return match_unguided(
         pair.left, pair.right, detector, selection=selection, descriptor=UPRIGHT_SIFT
@@ -53,5 +53,5 @@ def match_stereo(pair: StereoPair, detector: AnyDetector, density: float | None 
 
 
 def match_random_points(pair: StereoPair, density: float) -> Matches:
-    """Match random points of a density, in keypoints per pixel: the chance baseline."""
+    """Match random points of a density in keypoints per pixel, as a chance baseline."""
     return match_stereo(pair, RandomDetector(), max(density, 1e-6))

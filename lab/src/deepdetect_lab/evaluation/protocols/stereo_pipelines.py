@@ -1,4 +1,4 @@
-"""Pipelines that turn a stereo pair into points: ours, the paper's, OpenCV's SGBM, and chance."""
+"""Pipelines from a stereo pair to points: ours, the paper's, OpenCV's SGBM, and chance."""
 
 from __future__ import annotations
 
@@ -24,28 +24,26 @@ from ..baselines.method import LocalFeature, deepdetect_feature
 from ..baselines.opencv import self_described
 from ..baselines.random import AllPixels, RandomDetector
 from ..options import PAPER_RESOLUTION_PX, BenchmarkOptions
-from ..profiling import StageProfiler
 from .paper_numbers import FIGURE_8
 
-STAGES = ("keypoints", "matching", "geometry")
 ROUNDS = 3
-"""Runs of what takes seconds; the one of median time is reported."""
+"""Pipelines that take seconds run this often, and the run of median time is reported."""
 
-Points = tuple[np.ndarray, np.ndarray, int, StageProfiler]
-"""(N, 2) float32 pixels of the left image, (N,) float32 disparities, how many of them were not
-matched but filled in, and what the stages took."""
+Points = tuple[np.ndarray, np.ndarray, int]
+"""(N, 2) float32 pixels of the left image, (N,) float32 disparities, and how many of them were not
+matched but filled in."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """What turns two images into points; `name` is also the title in tables.
+    """A function from two images to points; `name` is also the title in tables.
 
-    Results depend on `version` besides the name. `drawn` is the title in Figure 8 (empty: not
-    drawn), `paper` the number of points in the paper by scene.
+    `prepare` returns what is timed. Results depend on `version` besides the name. `drawn` is the
+    title in Figure 8 (empty: not drawn), `paper` the number of points in the paper by scene.
     """
 
     name: str
-    run: Callable[[CalibratedStereoPair], Points]
+    prepare: Callable[[CalibratedStereoPair], Callable[[], Points]]
     version: str = ""
     rounds: int = ROUNDS
     drawn: str = ""
@@ -59,14 +57,14 @@ PAPER_SETTINGS: dict[str, tuple[float, float, float, float]] = {
     "rocks": (0.9, 1512, 638, 555),
     "cloth": (0.9, 1050, 641, 555),
 }
-"""Ratio, focal length and principal point in px, by scene, of the authors' notebooks."""
+"""Ratio, focal length and principal point (pixels) of each scene, from the authors' notebooks."""
 
 PAPER_FLANN_TREES = 10
 PAPER_FLANN_CHECKS = 100
 
 
 def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
-    """Return what is compared, chance baselines last."""
+    """Return the compared pipelines, chance baselines last."""
     native = options.native_detector()
     detectors = {Path(each).stem: native.with_weights(each) for each in options.geometry_weights}
     found: list[Pipeline] = []
@@ -88,7 +86,7 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
     every = partial(_ours, detector=AllPixels())
     return [
         *found,
-        Pipeline("OpenCV's SGBM", sgbm),
+        Pipeline("OpenCV's SGBM", lambda scene: partial(sgbm, scene)),
         Pipeline("baseline: as many random pixels as ours", random, found[0].version, 1),
         Pipeline("baseline: all pixels", every),
         Pipeline("all pixels, --density 1", partial(every, density=1)),
@@ -97,9 +95,14 @@ def pipelines(options: BenchmarkOptions) -> list[Pipeline]:
 
 def _ours(
     scene: CalibratedStereoPair, *, detector: AnyDetector, density: float | None = None
-) -> Points:
+) -> Callable[[], Points]:
     _compile_kernels()
-    profiler = StageProfiler()
+    return partial(_reconstructed, scene, detector, density)
+
+
+def _reconstructed(
+    scene: CalibratedStereoPair, detector: AnyDetector, density: float | None
+) -> Points:
     found = reconstruct(
         scene.left,
         scene.right,
@@ -107,58 +110,53 @@ def _ours(
         calibration=scene.calibration,
         rectified=True,
         selection=SelectionOptions(density=density),
-        progress=lambda stage: profiler.record(stage if stage in STAGES else "geometry"),
     )
-    profiler.record("geometry")
     assert found.disparity is not None
-    filled = int(np.count_nonzero(~found.matched))
-    return found.pixels, found.disparity, filled, profiler
+    return found.pixels, found.disparity, int(np.count_nonzero(~found.matched))
 
 
-def _random(scene: CalibratedStereoPair, *, like: DeepDetect) -> Points:
+def _random(scene: CalibratedStereoPair, *, like: DeepDetect) -> Callable[[], Points]:
     density = float((like.heatmap(scene.left) > 0.5).mean())
     return _ours(scene, detector=RandomDetector(), density=density)
 
 
 def _paper(feature: LocalFeature, drawn: str = "", paper: Mapping[str, float] = {}) -> Pipeline:
     def run(scene: CalibratedStereoPair) -> Points:
-        feature.detect(scene.left)  # the first run of a size takes longer
-        profiler = StageProfiler()
-        points0, points1 = paper_points(feature, scene, profiler)
+        points0, points1 = paper_points(feature, scene)
         disparity = (points0[:, 0] - points1[:, 0]).astype(np.float32)
-        return points0.astype(np.float32), disparity, 0, profiler
+        return points0.astype(np.float32), disparity, 0
 
-    return Pipeline(feature.title, run, feature.version, 1, drawn, paper)
+    def prepare(scene: CalibratedStereoPair) -> Callable[[], Points]:
+        feature.detect(scene.left)  # the first run of a size takes longer
+        return partial(run, scene)
+
+    return Pipeline(feature.title, prepare, feature.version, 1, drawn, paper)
 
 
 def paper_points(
-    feature: LocalFeature, scene: CalibratedStereoPair, profiler: StageProfiler, seed: int = 0
+    feature: LocalFeature, scene: CalibratedStereoPair, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Match a stereo pair; return the (M, 2) points that the essential matrix leaves ("voxels").
+    """Match a stereo pair; return the (M, 2) inliers of the essential matrix ("voxels").
 
-    The number of points is that of one draw of RANSAC: other trees of FLANN, by another seed, or
-    another order of the matches give up to 1 % more or less.
+    The number of points depends on the random choices of RANSAC: another seed of FLANN's trees, or
+    another order of the matches, changes it by up to 1 %.
     """
     images = scene.left, scene.right
     ratio, camera_matrix = paper_settings(scene)
     features = [feature.detect(rgb) for rgb in images]
-    profiler.record("keypoints")
     check_memory([len(one) for one in features])
     first, second = (feature.describe(rgb, one) for rgb, one in zip(images, features, strict=True))
     flann = partial(flann_neighbours, trees=PAPER_FLANN_TREES, checks=PAPER_FLANN_CHECKS)
     found = match_descriptors(first, second, flann, ratio=ratio, seed=seed)
-    profiler.record("matching")
-    kept = essential_inliers(
+    return essential_inliers(
         features[0].xy[found.indices0].astype(np.float64),
         features[1].xy[found.indices1].astype(np.float64),
         camera_matrix,
     )
-    profiler.record("geometry")
-    return kept
 
 
 def paper_settings(scene: CalibratedStereoPair) -> tuple[float, np.ndarray]:
-    """Return the authors' ratio and camera matrix; of other scenes their most frequent ratio."""
+    """Return the authors' ratio and camera matrix; other scenes get the most frequent ratio."""
     camera = scene.calibration.camera0.matrix
     own = 0.9, camera[0, 0], camera[0, 2], camera[1, 2]
     ratio, focal, x, y = PAPER_SETTINGS.get(scene.name, own)
@@ -168,7 +166,7 @@ def paper_settings(scene: CalibratedStereoPair) -> tuple[float, np.ndarray]:
 def essential_inliers(
     points0: np.ndarray, points1: np.ndarray, camera_matrix: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Keep the inliers of the essential matrix; triangulate them for the time that takes."""
+    """Return the inliers of the essential matrix; triangulation only adds its time."""
     if len(points0) < 6:
         return points0[:0], points1[:0]
     essential, inliers = cv2.findEssentialMat(
@@ -191,11 +189,10 @@ def essential_inliers(
 
 
 def sgbm(scene: CalibratedStereoPair) -> Points:
-    """Run OpenCV's semi-global matching on every pixel, in the range that ours finds.
+    """Run OpenCV's semi-global matching on every pixel, with the disparity range that ours finds.
 
-    From 0 or below; both views are extended by it, so that there are values at the margins, too.
+    The range starts at 0 or below. Views are extended by it, so that margins also get values.
     """
-    profiler = StageProfiler()
     gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
     search = find_disparity_range(*gray)
     smallest, largest = (0, 64) if search is None else (min(search[0], 0), search[1])
@@ -203,9 +200,8 @@ def sgbm(scene: CalibratedStereoPair) -> Points:
     borders = max(smallest + count, 0), -smallest
     disparity = sgbm_disparity(scene.left, scene.right, count, borders, smallest)
     rows, columns = np.nonzero(np.isfinite(disparity))
-    profiler.record("matching")
     pixels = np.column_stack([columns, rows]).astype(np.float32)
-    return pixels, disparity[rows, columns], 0, profiler
+    return pixels, disparity[rows, columns], 0
 
 
 def sgbm_disparity(
@@ -217,7 +213,8 @@ def sgbm_disparity(
 ) -> np.ndarray:
     """Run OpenCV's semi-global matching on RGB views, extended by borders on the left and right.
 
-    A multiple of 16 of disparities is tried. Returns (H, W) float32 in pixels, NaN without one.
+    The number of tried disparities is a multiple of 16. Returns (H, W) float32 disparities in
+    pixels, NaN where none was found.
     """
     matcher = cv2.StereoSGBM_create(
         minDisparity=min_disparity,
@@ -243,7 +240,7 @@ def sgbm_disparity(
 
 @lru_cache(maxsize=1)
 def _compile_kernels() -> None:
-    """Run once on a small scene, so that no scene's time includes the compilation."""
+    """Run once on a small scene, so that measured times do not include compilation."""
     scene = np.random.default_rng(0).integers(0, 256, (96, 160), np.uint8)
     scene = cv2.GaussianBlur(scene, (0, 0), 1)
     column, row = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in (160, 96)))

@@ -1,1 +1,1 @@
-"""Training the learned descriptor: photographs -> pairs of views -> network -> ONNX file."""
+"""Training of the learned descriptor on pairs of synthetic views of photographs."""

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import math
-import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
@@ -16,7 +13,7 @@ from deepdetect._shared.atomic import atomic_path
 from deepdetect.detector.points.descriptor import STRIDE
 from deepdetect.features.learned import LEARNED
 
-from ...networks.export import OPSET
+from ...networks.export import to_onnx
 from .network import DescriptorNetwork
 
 MIN_HALVED = 1000
@@ -25,15 +22,11 @@ MIN_HALVED = 1000
 
 def export_descriptor(network: DescriptorNetwork, path: Path, kind: str = LEARNED) -> None:
     """Write a network as `PointDetector.extract` reads it (see `DESCRIPTOR_GRAPHS`)."""
-    inputs = torch.zeros(1, 1, STRIDE, 2 * STRIDE), torch.ones(1, 50, 2), torch.ones(1, 50)
-    names, written = ["luma", "xy", "sizes"], io.BytesIO()
-    axes: dict[str, Any] = {name: {1: "keypoints"} for name in ("xy", "sizes", "descriptors")}
-    how: dict[str, Any] = {"input_names": names, "output_names": ["descriptors"], "dynamo": False}
-    how |= {"dynamic_axes": {"luma": {2: "height", 3: "width"}} | axes, "opset_version": OPSET}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of what it traces
-        torch.onnx.export(network.cpu().eval(), inputs, written, **how)  # type: ignore[arg-type]
-    model = onnx.load_model_from_string(written.getvalue())
+    luma = torch.zeros(1, 1, STRIDE, 2 * STRIDE)
+    inputs = {"luma": luma, "xy": torch.ones(1, 50, 2), "sizes": torch.ones(1, 50)}
+    axes = {name: {1: "keypoints"} for name in ("xy", "sizes", "descriptors")}
+    axes["luma"] = {2: "height", 3: "width"}
+    model = to_onnx(network, inputs, "descriptors", axes)
     model.doc_string, graph = kind, model.graph
     for kernel in [each for each in graph.initializer if math.prod(each.dims) > MIN_HALVED]:
         values = onnx.numpy_helper.to_array(kernel).astype(np.float16)

@@ -1,4 +1,4 @@
-"""The loss of pairs of views, and the measure: how many keypoints find their own in the other."""
+"""Loss of pairs of views, and the validation metric: the fraction of correct mutual matches."""
 
 from __future__ import annotations
 
@@ -14,17 +14,19 @@ from .network import DescriptorNetwork, turn
 from .views import Pair
 
 NEAR_PX = 3.0
-"""From the right keypoint: in the loss nearer ones are not wrong, in the measure they are right."""
+"""Keypoints within this distance of the true position are ignored as negatives by the loss, and
+correct in the metric."""
 
 MAX_LOG_TEMPERATURE = 4.3
 UPRIGHT, ANGLE_NOISE = 0.45, 0.15
-"""Radians: pairs turned by less can be matched as they are; the standard deviation of angles."""
+"""Pairs rotated by less than the first angle, in radians, count as upright. Errors of simulated
+keypoint angles have the second as standard deviation. Chosen by hand; not measured."""
 
 KINDS = ("upright", "turned", "zoomed")
 
 
 def kind_of(angle: float, zoom: float) -> str:
-    """Say as which of `KINDS` a pair is measured, by how its views are turned and zoomed."""
+    """Return the kind of a pair, one of `KINDS`, by rotation and zoom between its views."""
     if zoom > 0.6:  # by 1.8
         return "zoomed"
     return "upright" if angle < UPRIGHT else "turned"
@@ -91,7 +93,7 @@ def _near(xy: Tensor) -> Tensor:
 def shares_right(
     network: DescriptorNetwork, batches: Iterable[Pair], counted: int = 1
 ) -> dict[str, float]:
-    """Return which share of keypoints are mutual nearest neighbours and right, by kind of pair.
+    """Return the share of keypoints that are correct mutual nearest neighbours, by kind of pair.
 
     The network is in evaluation mode; there are pairs of all of `KINDS`.
     """

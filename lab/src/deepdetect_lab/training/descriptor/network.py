@@ -20,19 +20,19 @@ from torch.nn.functional import avg_pool2d, batch_norm, interpolate, normalize, 
 from deepdetect.features.learned import CONSTANT, FREQUENCIES
 
 HALF, QUARTER, EIGHTH, SIXTEENTH, COARSEST, HIDDEN = 16, 32, 64, 96, 128, 160
-"""Channels at so much of the size (the coarsest: 1/32), and of the perceptron."""
+"""Numbers of channels at 1/2 to 1/32 of the image size, and of the perceptron."""
 
 DIMENSIONS = CONSTANT + 2 * len(FREQUENCIES)
 OCTAVES = 3
 FIRST_OCTAVE_PX = 4.5
-"""Keypoints up to this size are read in the image itself, of twice the size in its half."""
+"""Keypoints up to this size are described in the full image, up to twice this size at 1/2."""
 
 SMALLEST_SIZE_PX = 2.5
 NOISE = 1 / 255
-"""What varies by less than this, one grey level, is not raised to full contrast."""
+"""Variations below one grey level are not amplified to full contrast, since they are noise."""
 
 CELL_PX, CELLS = 8, 5
-"""Local contrast is that of squares of 5 cells of 8 pixels."""
+"""Local contrast is computed over squares of 5 cells of 8 pixels. Chosen by hand; not measured."""
 
 BATCH_MOMENTUM = 0.1
 
@@ -40,8 +40,8 @@ BATCH_MOMENTUM = 0.1
 class Convolution(nn.Module):
     """A convolution, batch normalisation, ReLU.
 
-    The statistics of the batch are those of the first octave, for the others, too: as they are once
-    the network is trained, where one normalisation serves all.
+    All octaves use the batch statistics of the first octave, since the trained network has a single
+    normalisation for all.
     """
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> None:
@@ -69,7 +69,7 @@ class Convolution(nn.Module):
 
 
 class Halving(nn.Module):
-    """Two convolutions, of which the first halves the size."""
+    """Two convolutions; the first halves the size."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -83,7 +83,7 @@ class Halving(nn.Module):
 
 
 class DescriptorNetwork(nn.Module):
-    """Describes keypoints of luma whose sides are multiples of 128."""
+    """A network that describes keypoints in luma images whose sides are multiples of 128."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -110,7 +110,7 @@ class DescriptorNetwork(nn.Module):
         return self.describe(self.maps(luma), xy, sizes)
 
     def maps(self, luma: Tensor) -> list[list[Tensor]]:
-        """Return, of each octave, features at 1/2, 1/4, 1/8, 1/8 with surroundings, 1/16."""
+        """Return for each octave features at 1/2, 1/4, 1/8, 1/8 with context, and 1/16."""
         x, result = _normalized(luma), []
         for octave in range(OCTAVES):
             if octave:
@@ -127,7 +127,7 @@ class DescriptorNetwork(nn.Module):
         return result
 
     def describe(self, maps: list[list[Tensor]], xy: Tensor, sizes: Tensor) -> Tensor:
-        """Return (B, N, 64) descriptors by the features."""
+        """Return (B, N, 64) descriptors from the feature maps."""
         octaves = [
             torch.cat(
                 [
@@ -153,7 +153,7 @@ class DescriptorNetwork(nn.Module):
 
 
 def _normalized(luma: Tensor) -> Tensor:
-    """Return (B, 2, H, W): luma by the contrast of the whole image, and by that around."""
+    """Return (B, 2, H, W): luma normalised by global contrast, and by local contrast."""
     mean = luma.mean((2, 3), keepdim=True)
     variance = (luma - mean).square().mean((2, 3), keepdim=True)
     whole = (luma - mean) / (variance + 1e-6).sqrt()
@@ -195,7 +195,7 @@ def _read(features: Tensor, xy: Tensor) -> Tensor:
 
 
 def turn(descriptors: Tensor, angles: Tensor) -> Tensor:
-    """Turn (..., 64) descriptors by (...) radians, as `turn_descriptors` does by degrees."""
+    """Rotate (..., 64) descriptors by (...) radians, as `turn_descriptors` does by degrees."""
     turns = angles[..., None] * torch.from_numpy(FREQUENCIES).to(angles)
     constant, numbers = descriptors[..., :CONSTANT], descriptors[..., CONSTANT:]
     (real, imaginary), (c, s) = numbers.chunk(2, -1), (turns.cos(), turns.sin())

@@ -1,4 +1,4 @@
-"""The training of the learned descriptor: pairs of views, their loss, the validation metric."""
+"""Training of the learned descriptor: pairs of views, their loss, and the validation metric."""
 
 from __future__ import annotations
 
@@ -12,17 +12,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from deepdetect._shared.records import key
 from deepdetect.features.learned import CROSS_MODAL, LEARNED, angles_counted
 
-from ...evaluation.report import Table
 from ...networks.weights import load_network, weights_digest
-from ..checkpoint import Point
 from ..optim import Muon
 from ..recipe import DescriptorTrainingOptions, DeviceOptions
 from ..sampler import milestones
-from ..scenes import SIDE_PX, draw_until_seen
-from ..trainer import Trainer
+from ..scenes import draw_until_seen
+from ..trainer import Trainer, digests, seeded, with_plateau
 from .export import export_descriptor
 from .losses import KINDS, contrastive_loss, kind_of, shares_right
 from .network import DescriptorNetwork
@@ -31,17 +28,17 @@ from .views import Pair, draw_pair
 ONNX = "descriptor.onnx"
 
 REUSE, WINDOW, FIRST_BATCHES = 4, 4096, 8
-"""Steps that see a pair, in the mean (to draw one takes longer than to train on it); pairs that
-are kept for it, the last ones; and batches' worth of them at the first step."""
+"""A pair is used in 4 steps on average, because drawing takes longer than a training step. The last
+4,096 pairs are kept for this. The first step draws 8 batches."""
 
 WARM_UP_STEPS, WARM_UP_SHARE = 300, 0.15
-"""Steps of the warm-up; of short runs a share."""
+"""Number of warm-up steps, but at most this share of all steps. Chosen by hand; not measured."""
 
 DECAY_SHARE = 0.65
-"""Of the steps, the last ones, in which the learning rate falls to 0, linearly."""
+"""The learning rate falls linearly to 0 over this last share of the steps. Chosen by hand."""
 
 VECTOR_RATE = 0.4
-"""Learning rate of AdamW, which trains what Muon does not, in that of Muon."""
+"""AdamW trains the parameters that Muon cannot; its learning rate is Muon's times this factor."""
 
 
 def pairs_of_step(options: DescriptorTrainingOptions, step: int) -> np.ndarray:
@@ -103,6 +100,11 @@ class DescriptorTrainer(Trainer):
     """A network that describes keypoints, and the images whose views it is trained on."""
 
     objective, sign = "score", -1
+    purpose = "that describes keypoints"
+    measures = (
+        "Share of the keypoints that are mutual nearest neighbours and correct to 3 px, on pairs "
+        "of views of the validation images; the score is their mean"
+    )
     weights_file = "descriptor.safetensors"
     max_gradient_norm = 2.0
     average_decay = 0.998
@@ -122,17 +124,13 @@ class DescriptorTrainer(Trainer):
         self.kind = CROSS_MODAL if options.cross_modal else LEARNED
         self.device = torch.device(device.accelerator)
         self.files = images
-        if init_weights is None:
-            with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
-                torch.default_generator.manual_seed(options.seed)
-                network: Any = DescriptorNetwork()
-        else:
-            network = load_network(init_weights, DescriptorNetwork)
-        self.origin = {
-            "images_digest": key(self.files)[:16],
-            "validation_digest": key(validation)[:16],
-            "initial_weights": weights_digest(network)[:16],
-        }
+        network: Any = (
+            seeded(DescriptorNetwork, options.seed)
+            if init_weights is None
+            else load_network(init_weights, DescriptorNetwork)
+        )
+        self.origin = digests(images, validation)
+        self.origin["initial_weights"] = weights_digest(network)[:16]
         self.notes = {"images": str(len(self.files)), "run_on": str(self.device)}
         batches = validation_batches(validation, options)
         self.batches = [Pair(*(each.to(self.device) for each in batch)) for batch in batches]
@@ -162,9 +160,6 @@ class DescriptorTrainer(Trainer):
             generator=torch.Generator(),
         )
 
-    def pixels(self, batch: Any) -> int:
-        return 2 * self.options.pairs * SIDE_PX**2
-
     def loss(self, batch: tuple[int, list[int], Pair | None]) -> Tensor:
         """Return the loss of a step's pairs, of which the batch has those it is the first to see.
 
@@ -185,9 +180,8 @@ class DescriptorTrainer(Trainer):
 
     def learning_rate(self, step: int) -> float:
         """Return the rate of Muon in a step: a warm-up, a plateau, a linear decay to 0."""
-        warm_up = (step + 1) / min(WARM_UP_STEPS, WARM_UP_SHARE * self.steps)
-        decay = (1 - step / self.steps) / DECAY_SHARE
-        return self.options.learning_rate * min(1, warm_up, decay)
+        warm_up = min(WARM_UP_STEPS, WARM_UP_SHARE * self.steps)
+        return self.options.learning_rate * with_plateau(step, self.steps, warm_up, DECAY_SHARE)
 
     def validate(self, step: int) -> dict[str, float]:
         """Measure the average of the weights so far."""
@@ -198,15 +192,3 @@ class DescriptorTrainer(Trainer):
         best: Any = load_network(folder / self.weights_file, DescriptorNetwork)
         export_descriptor(best, folder / ONNX, self.kind)
         return folder / ONNX
-
-    def card(self, best: Point) -> tuple[str, list[str]]:
-        count = sum(parameter.numel() for parameter in self.network.parameters())
-        rows = [{"pairs": kind, "correct": best[f"{kind} correct"]} for kind in KINDS]
-        return f"a network of {count:,} parameters that describes keypoints.", [
-            "Share of keypoints that are mutual nearest neighbours and right to 3 px, on pairs of",
-            "views of the validation images, by whose mean this step was chosen:",
-            "",
-            Table("measures", "", {"pairs": "", "correct": ".3f"}, rows).to_markdown(),
-            "",
-            f"Score {best['score']:.4f} at step {best['step']:,}.",
-        ]

@@ -22,13 +22,13 @@ SHARPNESS = 25.0
 the loss: it cannot be lowered by sharper logits."""
 
 TEMPERATURE = 0.6
-"""Of the soft choice of the best, in units of those logits."""
+"""Temperature of the soft choice of keypoints, in units of the logits. Chosen by hand."""
 
 CLOSE_SHARE = 0.7
-"""Of the reward of a keypoint that is found again within 3 px, what it gets only within 1 px."""
+"""This share of a keypoint's reward requires its repetition within 1 px, the rest within 3 px."""
 
 MIN_CHOICE = 0.1
-"""Candidates that are chosen with less than this have and are no partners."""
+"""Candidates with a smaller probability of being chosen get no partners. Chosen by hand."""
 
 MIN_SPREAD = 1e-3
 BISECTIONS = 40

@@ -21,7 +21,7 @@ from ...evaluation.metrics.repeatability import mutual_nn_repeatability
 from .views import KINDS, ViewPair, draw_pair
 
 IMAGE_PIXELS = 800 * 640
-"""Of the image that budgets are for; smaller views get as many keypoints per pixel."""
+"""Pixels of the image for which budgets are given; smaller views get equally many per pixel."""
 
 BUDGETS = (512, 2048, 8192)
 RADII_PX = (1.0, 3.0)
@@ -31,12 +31,12 @@ RATIO = 0.85
 SIDE_PX = 256
 
 Detect = Callable[[np.ndarray], Keypoints]
-"""From a (H, W) uint8 image to keypoints."""
+"""A function from an (H, W) uint8 image to keypoints."""
 
 
 MEASURES = [f"@{radius:g} px {budget}" for budget in BUDGETS for radius in RADII_PX] + ["correct"]
-"""Of a kind of pair: mean repeatability by budget and radius, and mean matches correct to 1 px (of
-upright RootSIFT of size 4, mutual, ratio .85) over `MATCHING_BUDGET`."""
+"""Measures of a kind of pair: mean repeatability by radius and budget, and the mean fraction of
+`MATCHING_BUDGET` that matches correctly (1 px; upright RootSIFT of size 4, mutual, ratio 0.85)."""
 
 
 def validation_pairs(files: Sequence[Path], pairs_per_kind: int) -> list[ViewPair]:

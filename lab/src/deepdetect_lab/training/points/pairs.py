@@ -18,12 +18,12 @@ from ..recipe import PointsTrainingOptions
 from .views import KINDS, ViewPair, draw_pair
 
 MAX_CANDIDATES = 2000
-"""Of each view; the strongest are ranked."""
+"""Number of strongest candidates of each view that are ranked. Chosen by hand; not measured."""
 
 REACH_PX = 3.0
 
 MIN_OVERLAP = 0.04
-"""Of the second view: pairs that share less are drawn again."""
+"""Pairs are drawn again if their views share a smaller fraction. Chosen by hand; not measured."""
 
 ATTEMPTS = 5
 

@@ -16,31 +16,27 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from deepdetect._shared.atomic import atomic_path
-from deepdetect._shared.records import key
 from deepdetect.detector.points.detection import detect_points
 from deepdetect.detector.points.ranker import MAX_DEVIATIONS, Ranker, load_ranker
 
-from ...evaluation.report import Table
-from ..checkpoint import Point
 from ..recipe import PointsTrainingOptions
 from ..sampler import milestones
-from ..trainer import Trainer
+from ..trainer import Trainer, digests, seeded
 from .losses import pair_loss
-from .measure import MEASURES, measure, validation_pairs
+from .measure import measure, validation_pairs
 from .pairs import CandidatePair, PairDataset
-from .views import KINDS
 
 STATISTICS_PAIRS = 64
-"""Of views, whose features give mean and deviation."""
+"""Number of pairs whose features give the mean and standard deviation. Chosen by hand."""
 
 WARM_UP_STEPS = 100
 FINAL_RATE = 0.02
-"""Of the learning rate, at the end of the cosine annealing."""
+"""Cosine annealing ends at this fraction of the learning rate. Chosen by hand; not measured."""
 
 WEIGHT_DECAY = 1e-4
 
 AVERAGE_DECAY = 0.995
-"""Of the running mean of the weights, which is what is measured and kept."""
+"""Decay per step of the weights' exponential average, which is saved. Chosen by hand."""
 
 HIDDEN_UNITS = (48, 32)
 MIN_DEVIATION = 1e-3
@@ -98,6 +94,12 @@ class RankerTrainer(Trainer):
     """A ranker of points, and the folders of images whose views it is trained on."""
 
     objective, sign = "score", -1
+    purpose = "that ranks maxima of |det Hessian| by how surely they are found again"
+    measures = (
+        "On pairs of views of the validation images, by kind: one-to-one repeatability within 1 "
+        "and 3 px by number of keypoints (for an image of 800x640), and matches correct to 1 px "
+        "over the number of keypoints"
+    )
     weights_file = "best.npz"
     max_gradient_norm = 1.0
     average_decay = AVERAGE_DECAY
@@ -117,9 +119,8 @@ class RankerTrainer(Trainer):
         pairs = (dataset[2**31, number] for number in range(STATISTICS_PAIRS))  # not trained on
         features = np.concatenate([view.features for pair in pairs for view in pair.views])
         features = features.astype(np.float64)
-        with torch.random.fork_rng(devices=()):  # the caller's random numbers are left alone
-            torch.default_generator.manual_seed(options.seed)
-            self.network = RankerModule(features.mean(0), features.std(0))
+        make = partial(RankerModule, features.mean(0), features.std(0))
+        self.network = seeded(make, options.seed)
         self.average = copy.deepcopy(self.network)
         self.optimizers = [
             torch.optim.AdamW(
@@ -128,10 +129,7 @@ class RankerTrainer(Trainer):
         ]
         self.steps = options.steps
         self.milestones = {0} | milestones(options.steps, options.val_count)
-        self.origin = {
-            "images_digest": key(self.files)[:16],
-            "validation_digest": key(validation)[:16],
-        }
+        self.origin = digests(images, validation)
         self.notes = {"images": str(len(self.files))}
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
@@ -144,9 +142,6 @@ class RankerTrainer(Trainer):
             num_workers=self.num_workers,
             generator=torch.Generator(),
         )
-
-    def pixels(self, batch: Sequence[CandidatePair]) -> int:
-        return 2 * len(batch) * self.options.side**2
 
     def loss(self, batch: Sequence[CandidatePair]) -> Tensor:
         """Return the mean loss of some pairs; those with nothing to see count as 0."""
@@ -175,21 +170,3 @@ class RankerTrainer(Trainer):
     def read_notes(self, path: Path) -> Mapping[str, Any]:
         notes: dict[str, Any] = json.loads(load_ranker(path).notes)
         return notes
-
-    def card(self, best: Point) -> tuple[str, list[str]]:
-        count = sum(parameter.numel() for parameter in self.network.parameters())
-        network = (
-            f"a perceptron of {count:,} parameters that ranks maxima of |det Hessian| in a scale\n"
-            "space by how surely they are found again."
-        )
-        columns = {"pairs": "", **dict.fromkeys(MEASURES, ".3f")}
-        rows = [{"pairs": kind, **{m: best[f"{kind} {m}"] for m in MEASURES}} for kind in KINDS]
-        return network, [
-            "On synthetic pairs of views of the validation images, by whose score this step was",
-            "chosen: one-to-one repeatability by number of keypoints (of an image of 800x640), and",
-            "matches correct to 1 px over the number of keypoints.",
-            "",
-            Table("measures", "", columns, rows).to_markdown(),
-            "",
-            f"Score {best['score']:.4f} at step {best['step']:,}.",
-        ]

@@ -116,7 +116,8 @@ FOCAL_SIDES = (1.2, 3.0)
 """Focal length in sides of the view: fields of view from 45 to 19 degrees."""
 
 SHRUNK_SCALE, LEAST_SIDE_PX = 0.9, 8
-"""Below this scale a photograph is shrunk by area first, to at least this many pixels a side."""
+"""Photographs are first shrunk by area averaging if their scale is below the first number; their
+sides keep at least the second number of pixels."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
-// A worker whose tasks are called as functions that return promises, and the worker's end of it.
+// Workers: tasks are called like functions that return promises, and answered in the worker.
 
-/** What the page may say to the user, unlike errors of the program. */
+/** An error with a sentence for the user, unlike errors of the program. */
 export class UserError extends Error {}
 
 export class Background {
@@ -8,7 +8,7 @@ export class Background {
     this.calls = new Map();
     this.next = 0;
     this.hasAnswered = false;
-    this.failure = null; // why it could not be started
+    this.failure = null; // the error if the worker could not start
     this.worker = new Worker(url, { type: "module" });
     this.worker.onmessage = ({ data: { id, result, error } }) => {
       this.hasAnswered = true;
@@ -26,7 +26,7 @@ export class Background {
     };
   }
 
-  /** The sentence for an error that no task has caught; without a message a file could not be loaded. */
+  /** Returns a sentence for an uncaught error; without a message, a file could not be loaded. */
   explain(message) {
     if (this.hasAnswered) return `The page has failed (${message}): load it again.`;
     return message ? "This browser is too old for the page: use a newer one."
@@ -44,7 +44,7 @@ export class Background {
   }
 }
 
-/** A worker that does one task after the other: each can be cancelled, the one under way too. */
+/** A worker that runs one task after the other; each can be cancelled, also while it runs. */
 export class CancellableBackground {
   constructor(url) {
     this.url = url;
@@ -55,7 +55,7 @@ export class CancellableBackground {
 
   /**
    * @param {string} task @param {object} values
-   * @param {AbortSignal} [signal] cancels it: the promise is then rejected with the signal's reason
+   * @param {AbortSignal} [signal] cancels the task: the promise is rejected with the signal's reason
    * @returns {Promise<any>}
    */
   call(task, values, signal) {
@@ -80,7 +80,7 @@ export class CancellableBackground {
     call.reject(reason);
     this.waiting = this.waiting.filter((other) => other !== call);
     if (this.running !== call) return;
-    this.background.worker.terminate(); // it is in the middle of it, and hears nothing
+    this.background.worker.terminate(); // a busy worker receives no messages
     this.background = new Background(this.url);
     this.running = null;
     this.runNext();
@@ -88,10 +88,10 @@ export class CancellableBackground {
 }
 
 /**
- * Answers calls, in a worker.
+ * Answers calls inside a worker.
  *
  * @param {Object<string, (values: any) => any>} tasks
- * @param {(reason: string) => string} explain the sentence for an error of the program
+ * @param {(reason: string) => string} explain returns the sentence for an error of the program
  */
 export function answer(tasks, explain) {
   self.onmessage = async ({ data: { id, task, values } }) => {

@@ -1,4 +1,4 @@
-// Decoding of files, upright, and rows of their pixels.
+// Decoding of image files, rotated upright, and reading of their rows.
 import { UserError } from "./background.js";
 import { MIN_SIDE } from "./pixels.js";
 
@@ -6,7 +6,7 @@ const MAX_FILE_MB = 100;
 const MAX_MEGAPIXELS = 100;
 
 /**
- * Decodes a file, and gives its pixels to a function.
+ * Decodes a file and passes its size and a reader of its rows to a function.
  *
  * @template Result
  * @param {Blob} file @param {string} name
@@ -16,14 +16,14 @@ const MAX_MEGAPIXELS = 100;
  */
 export async function decode(file, name, use) {
   if (file.size > MAX_FILE_MB * 1e6) {
-    throw new UserError(`${name} is over ${MAX_FILE_MB} MB: use a smaller picture.`);
+    throw new UserError(`${name} is over ${MAX_FILE_MB} MB: use a smaller image.`);
   }
   let bitmap;
   try {
     bitmap = await createImageBitmap(file, { imageOrientation: "from-image",
                                              colorSpaceConversion: "none" });
   } catch {
-    throw new UserError(`${name} is not a picture that this browser can read: use JPEG or PNG.`);
+    throw new UserError(`${name} is not an image that this browser can read: use JPEG or PNG.`);
   }
   try {
     const { width, height } = bitmap;
@@ -42,9 +42,9 @@ export async function decode(file, name, use) {
 function check(width, height, name) {
   if (Math.min(width, height) < MIN_SIDE) {
     throw new UserError(`${name} is ${width}x${height} pixels: both sides must be at least `
-                        + `${MIN_SIDE}, use a larger picture.`);
+                        + `${MIN_SIDE}, use a larger image.`);
   }
   if (width * height > MAX_MEGAPIXELS * 1e6) {
-    throw new UserError(`${name} has over ${MAX_MEGAPIXELS} megapixels: use a smaller picture.`);
+    throw new UserError(`${name} has over ${MAX_MEGAPIXELS} megapixels: use a smaller image.`);
   }
 }

@@ -1,13 +1,13 @@
-// What is found in a picture, each once, when it is first asked for: its heat map, for which the
-// network is run, and its points, for which it is not.
+// The heat map of an image, for which the network runs, and its points, for which it does not.
+// Both are computed once, at the first request.
 import { Background, CancellableBackground } from "./background.js";
 import { during, page } from "./page.js";
 import { ALL_CANDIDATES } from "./points/ranking.js";
 
 const pictureWorker = new Background(new URL("picture_worker.js", import.meta.url));
 const pointsWorker = new CancellableBackground(new URL("points_worker.js", import.meta.url));
-let opened = null; // a promise of what runs the network
-const runs = { network: 0, points: 0 }; // how often: sliders must not change it
+let opened = null; // promise of the runtime of the network
+const runs = { network: 0, points: 0 }; // counts for tests: sliders must not change them
 
 function counted(kind) {
   document.body.dataset[`${kind}Runs`] = String(++runs[kind]);
@@ -15,19 +15,19 @@ function counted(kind) {
 
 export const isOpened = () => opened !== null;
 
-/** Opens what runs the network, or another. @returns {Promise<string>} what that is, in words */
+/** Opens a runtime for the network, or changes it. @returns {Promise<string>} its description */
 export function openNetwork(options) {
   const network = pictureWorker.call("open", options);
   opened ??= network;
-  network.then(() => { opened = network; }, () => {}); // the other one may have failed
+  network.then(() => { opened = network; }, () => {}); // replaces one that may have failed
   return network;
 }
 
-/** Reads a file, at the size at which the network sees it. */
+/** Reads a file at the size of the network's input. */
 export const readPicture = (file) =>
-  during("Reading the picture…", pictureWorker.call("read", { file, name: file.name }));
+  during("Reading the image…", pictureWorker.call("read", { file, name: file.name }));
 
-/** Remembers the result of a task in a picture, unless it fails: then it may be tried again. */
+/** Runs a task once for an image and stores its result; a task that failed can run again. */
 function once(picture, name, task) {
   picture.pending ??= {};
   picture.pending[name] ??= task().then((result) => {
@@ -38,7 +38,7 @@ function once(picture, name, task) {
   return picture.pending[name];
 }
 
-/** Runs the network on a picture, where that has not been done. @param {import("./page.js").Picture} picture */
+/** Runs the network on an image, unless it has a heat map. @param {import("./page.js").Picture} picture */
 export async function findHeatMap(picture) {
   if (picture.map) return;
   await once(picture, "map", async () => {
@@ -53,12 +53,12 @@ export async function findHeatMap(picture) {
 
 const token = () => (page.server ? page.token : null);
 
-/** Whether so many of the strongest candidates of a picture are ranked. */
+/** Returns whether at least `limit` of the strongest candidates of an image are ranked. */
 export const isRanked = (picture, limit = ALL_CANDIDATES) => picture.ranking?.limit >= limit;
 
-/** Ranks the points of a picture, where that has not been done; it fails where the picture is removed. */
+/** Ranks the points of an image, unless that is done; fails if the image is removed. */
 export async function findPoints(picture, limit = ALL_CANDIDATES) {
-  while (!isRanked(picture, limit)) { // fewer may be at work
+  while (!isRanked(picture, limit)) { // a pending task may rank fewer
     await once(picture, "ranking", async () => {
       const { file, name, rgba, width, height, original } = picture;
       const values = { file, name, rgba, width, height, original, limit, token: token() };
@@ -70,13 +70,13 @@ export async function findPoints(picture, limit = ALL_CANDIDATES) {
   }
 }
 
-/** Describes points of a picture. @returns {Promise<import("./learned.js").Described>} */
+/** Describes points of an image. @returns {Promise<import("./learned.js").Described>} */
 export function describe({ ranking, removal }, points) {
   const { gray, width, height } = ranking;
   return pointsWorker.call("describe", { gray, width, height, points, token: token() }, removal.signal);
 }
 
-/** The angles of points of a picture. @returns {Promise<Float32Array>} degrees */
+/** Returns the angles of points of an image. @returns {Promise<Float32Array>} degrees */
 export function anglesOf({ ranking }, points) {
   const { gray, width, height } = ranking;
   return pointsWorker.call("angles", { gray, width, height, points });

@@ -1,11 +1,11 @@
-// Files that the user keeps: CSV as `deepdetect` writes it, JSON, and PNG.
+// Files to download: CSV as `deepdetect` writes it, JSON, PNG, and video.
 
-const DIGITS = 7; // of a number: those of float32
+const DIGITS = 7; // significant digits, as in float32
 
-/** A number as Python's "%.7g" writes it, but for exponents. */
+/** Formats a number as Python's "%.7g" does, except for exponents. */
 const written = (value) => String(Number(value.toPrecision(DIGITS)));
 
-/** Rows of numbers, with a header as `deepdetect detect --format csv` writes it. */
+/** Formats rows of numbers with a header, as `deepdetect detect --format csv` does. */
 export function toCsv(header, rows) {
   return [header, ...rows.map((row) => row.map(written).join(","))].join("\n") + "\n";
 }
@@ -27,18 +27,18 @@ export function save(name, content, type = "text/plain") {
 /** @param {HTMLCanvasElement} canvas */
 export async function savePng(name, canvas) {
   const blob = await new Promise((resolve) => canvas.toBlob(resolve, "image/png"));
-  if (!blob) throw new Error("The picture is too large for this browser to save: use a smaller one.");
+  if (!blob) throw new Error("The image is too large for this browser to save: use a smaller one.");
   save(name, blob);
 }
 
 /**
- * Saves what is drawn on a canvas within some seconds as a video.
+ * Saves an animation on a canvas, of some seconds, as a video.
  *
  * @param {HTMLCanvasElement} canvas @param {(progress: number) => void} drawAt from 0 to 1
  */
 export async function saveVideo(name, canvas, seconds, drawAt) {
   if (!canvas.captureStream || typeof MediaRecorder === "undefined") {
-    throw new Error("This browser records no videos: save the picture, or use another browser.");
+    throw new Error("This browser cannot record videos: save the image, or use another browser.");
   }
   const recorder = new MediaRecorder(canvas.captureStream());
   const parts = [];
@@ -57,5 +57,5 @@ export async function saveVideo(name, canvas, seconds, drawAt) {
   save(`${name}.${type.includes("mp4") ? "mp4" : "webm"}`, new Blob(parts, { type }));
 }
 
-/** The name of a file without its folder and ending. */
+/** Returns the name of a file without its folder and suffix. */
 export const stem = (name) => name.replace(/^.*[\\/]/, "").replace(/\.[^.]*$/, "") || "picture";

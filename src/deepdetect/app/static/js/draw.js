@@ -1,13 +1,13 @@
-// Drawing of pictures, keypoints, heat maps and matches on canvases.
+// Drawing of images, keypoints, heat maps and matches on canvases.
 
 const VIRIDIS = [[68, 1, 84], [72, 40, 120], [62, 74, 137], [49, 104, 142], [38, 130, 142],
                  [31, 158, 137], [53, 183, 121], [109, 205, 89], [180, 222, 44], [253, 231, 37]];
 const MARK = [60, 255, 60];
 const DIMMED = 0.5;
-const MAX_LINES = 200; // of matches that are drawn, evenly among all: more cannot be told apart
+const MAX_LINES = 200; // number of matches drawn, evenly chosen: more cannot be distinguished
 const MAX_CIRCLES = 5000; // more keypoints than this are drawn as single pixels
-const STRIP_RATIO = 8; // of the sides: pictures that are longer would be too thin on the page
-const MAX_HEIGHT_PER_WIDTH = 4; // of matches: higher canvases than browsers have would be needed
+const STRIP_RATIO = 8; // longer images are not fitted to the page, where they would be too thin
+const MAX_HEIGHT_PER_WIDTH = 4; // bounds the height of drawn matches, as browsers limit canvases
 
 export function newCanvas(width, height) {
   const canvas = document.createElement("canvas");
@@ -23,7 +23,7 @@ export function canvasOf(rgba, width, height) {
   return canvas;
 }
 
-/** Shows a picture below what is drawn over it; long strips in their own size, to scroll along them. */
+/** Shows an image below its overlay; long strips keep their own size, so that one can scroll. */
 export function showPicture(canvas, picture) {
   if (canvas.source === picture) return;
   canvas.source = picture;
@@ -61,7 +61,7 @@ export function drawHeatMap(canvas, map) {
 }
 
 /**
- * Marks pixels over a transparent canvas.
+ * Marks pixels on a transparent canvas.
  *
  * @param {ArrayLike<number>} pixels numbered row by row
  */
@@ -75,11 +75,11 @@ export function drawPixels(canvas, picture, pixels) {
 }
 
 /**
- * Draws keypoints over a transparent canvas: circles when they are few, else pixels.
+ * Draws keypoints on a transparent canvas: a few as circles, many as pixels.
  *
  * @param {Float32Array} xy
- * @param {(k: number) => number} radiusOf in pixels of the picture
- * @param {number} unit pixels of the picture that make one pixel of the screen
+ * @param {(k: number) => number} radiusOf in pixels of the image
+ * @param {number} unit pixels of the image per pixel of the screen
  */
 export function drawCircles(canvas, picture, xy, radiusOf, unit) {
   const count = xy.length / 2;
@@ -92,7 +92,7 @@ export function drawCircles(canvas, picture, xy, radiusOf, unit) {
   context.clearRect(0, 0, canvas.width, canvas.height);
   context.beginPath();
   for (let k = 0; k < count; k++) {
-    const [x, y] = [xy[2 * k] + 0.5, xy[2 * k + 1] + 0.5]; // a canvas counts from the corner
+    const [x, y] = [xy[2 * k] + 0.5, xy[2 * k + 1] + 0.5]; // the origin of a canvas is the corner
     context.moveTo(x + radiusOf(k), y);
     context.arc(x, y, radiusOf(k), 0, 2 * Math.PI);
   }
@@ -101,7 +101,7 @@ export function drawCircles(canvas, picture, xy, radiusOf, unit) {
   context.stroke();
 }
 
-/** The picture, dimmed, with its keypoints: what is saved as PNG. */
+/** Returns the dimmed image with its keypoints, to be saved as PNG. */
 export function composeKeypoints(picture, overlay) {
   const canvas = newCanvas(picture.width, picture.height);
   const context = canvas.getContext("2d");
@@ -113,11 +113,11 @@ export function composeKeypoints(picture, overlay) {
 }
 
 /**
- * Draws two pictures beside or above each other, and lines between matches.
+ * Draws two images side by side or stacked, and lines between their matches.
  *
  * @param {boolean[] | Uint8Array} good matches to draw in colours; others are red
- * @param {number | null} hovered the match that stands out
- * @returns {Line[]} those that are drawn
+ * @param {number | null} hovered the highlighted match
+ * @returns {Line[]} lines that are drawn
  *
  * @typedef {{k: number, from: [number, number], to: [number, number]}} Line in pixels of the canvas
  */
@@ -145,7 +145,7 @@ export function drawMatches(canvas, pictures, points0, points1, good,
     return { k, from: place(points0, k, [0, 0]), to: place(points1, k, corner) };
   });
   const draw = ({ k, from, to }) => {
-    // Neighbours have like colours, so that one that goes elsewhere stands out.
+    // Neighbouring matches have similar colours, so that an outlier stands out.
     const hue = 360 * points0[2 * k] / first.width;
     context.strokeStyle = good[k] ? `hsl(${hue} 95% ${45 + 25 * points0[2 * k + 1] / first.height}%)`
                                   : "rgba(230, 40, 40, 0.55)";
@@ -173,7 +173,7 @@ export function drawMatches(canvas, pictures, points0, points1, good,
   return lines;
 }
 
-/** The match whose line is nearest to a place, null where none is within reach. @param {Line[]} lines */
+/** Returns the match whose line is nearest to a position, or null beyond the reach. @param {Line[]} lines */
 export function nearestLine(lines, x, y, reach) {
   let [nearest, least] = [null, reach];
   for (const { k, from, to } of lines) {

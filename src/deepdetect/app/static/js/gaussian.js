@@ -1,10 +1,10 @@
-// Gaussian blur of float32, as cv2.GaussianBlur computes it on processors with fused multiply-add:
-// equal to the last bit, but for up to seven columns at the right of widths that are not multiples of 8.
+// Gaussian blur of float32, bit-equal to cv2.GaussianBlur on processors with fused multiply-add, except
+// in up to seven columns at the right of images whose width is not a multiple of 8.
 
 const RADIUS_PER_SIGMA = 4;
 const fround = Math.fround;
 
-/** @returns {Float64Array} 2 r + 1 float32 weights that add up to 1 */
+/** @returns {Float64Array} 2 r + 1 float32 weights whose sum is 1 */
 function kernelOf(sigma) {
   const radius = Math.floor(Math.round(2 * RADIUS_PER_SIGMA * sigma + 1) / 2);
   const kernel = Float64Array.from({ length: 2 * radius + 1 },
@@ -13,7 +13,7 @@ function kernelOf(sigma) {
   return kernel.map((value) => fround(value / total));
 }
 
-/** The place of row or column `k` in a picture that is mirrored at its outermost ones. */
+/** Returns the row or column that `k` means if the image is mirrored at its outermost ones. */
 function mirrored(k, side) {
   if (side === 1) return 0;
   while (k < 0 || k >= side) k = k < 0 ? -k : 2 * side - 2 - k;
@@ -23,7 +23,7 @@ function mirrored(k, side) {
 /**
  * @param {Float32Array | Uint8Array} image
  * @param {Float32Array} result may be `image` itself
- * @param {Float32Array} room of the same length
+ * @param {Float32Array} room buffer of the same length
  */
 export function blur(image, width, height, sigma, result = new Float32Array(image.length),
                      room = new Float32Array(image.length)) {
@@ -33,7 +33,7 @@ export function blur(image, width, height, sigma, result = new Float32Array(imag
   return result;
 }
 
-/** Products are exact in float64, so that each sum is rounded once, as a fused one is. */
+/** Products are exact in float64, so each sum is rounded once, as in fused multiply-add. */
 function blurRows(image, width, height, kernel, result) {
   const [taps, radius] = [kernel.length, kernel.length >> 1];
   const padded = new Float64Array(width + 2 * radius + 3);
@@ -46,7 +46,7 @@ function blurRows(image, width, height, kernel, result) {
       padded[k] = image[start + places[k]];
       padded[radius + width + k] = image[start + places[radius + k]];
     }
-    for (let x = 0; x < width; x += 4) { // four sums at once: they do not wait for each other
+    for (let x = 0; x < width; x += 4) { // four independent sums run in parallel
       let [a, b, c, d] = [0, 0, 0, 0];
       for (let k = 0; k < taps; k++) {
         const weight = kernel[k];

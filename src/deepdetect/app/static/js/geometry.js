@@ -1,18 +1,18 @@
-// The geometry that matches agree with: a homography, or a fundamental matrix where they show depth,
-// by RANSAC, and how surely it is not chance (a contrario: Moisan and Stival, 2004). Which of both is
-// decided as in `deepdetect.geometry.two_view`.
+// Geometry of matches by RANSAC: a homography, or a fundamental matrix if they show depth. Whether it
+// can be trusted is decided a contrario (Moisan and Stival, 2004), and which of both it is, as in
+// `deepdetect.geometry.two_view`.
 
 const MAX_ERROR_PX = 3;
 const ROUNDS = 3000;
 const LOCAL_REACHES = [3, 3, 3, 2, 2, 2, 1]; // in units of the largest error (LO-RANSAC: Chum et al., 2003)
 const MAX_LOG10_NFA = -6;
-// Several matches along one edge are no independent evidence: it is counted by places that lie apart.
-const MIN_PLACES = 9; // Brown and Lowe, 2007: over 8
-const PLACE_WIDTH = 0.02; // of the diagonal: by it, 7 to 9 wrong matches along edges were 4 or 5 places
-const EPIPOLES = 1000; // tried, each of two matches off the plane
-const MAX_EPIPOLE_DISTANCE_PX = 1.5; // by which a match may miss the line through the epipole
-const MIN_FRACTION_OF_PLANE = 0.2; // that agree with an epipole, relative to the matches on the plane
-const MIN_FRACTION_OF_REST = 0.5; // the same, of the matches off the plane
+// Matches along one edge are not independent evidence, so inliers must lie in separate places.
+const MIN_PLACES = 9; // as in Brown and Lowe, 2007: more than 8 inliers
+const PLACE_WIDTH = 0.02; // share of the diagonal; so 7 to 9 wrong matches along edges count as 4 or 5
+const EPIPOLES = 1000; // number of samples, each of two matches off the plane
+const MAX_EPIPOLE_DISTANCE_PX = 1.5; // largest distance of a match from its line through the epipole
+const MIN_FRACTION_OF_PLANE = 0.2; // inliers of an epipole per match on the plane
+const MIN_FRACTION_OF_REST = 0.5; // inliers of an epipole per match off the plane
 
 const MODELS = {
   homography: { sample: 4, fit: fitHomography, error: transferError },
@@ -22,14 +22,14 @@ const MODELS = {
 /**
  * @typedef {object} Geometry
  * @property {"homography" | "fundamental" | "none"} model
- * @property {number[] | null} matrix 3x3, row by row, from the first picture to the second
- * @property {Uint8Array} inliers 1 where a match agrees with it
+ * @property {number[] | null} matrix 3x3, row by row, from the first image to the second
+ * @property {Uint8Array} inliers 1 for each match that agrees with it
  */
 
 /**
  * @param {Float32Array} points0
  * @param {Float32Array} points1
- * @param {[number, number][]} sizes width and height of both pictures
+ * @param {[number, number][]} sizes width and height of both images
  * @returns {Geometry}
  */
 export function estimateGeometry(points0, points1, sizes) {
@@ -44,8 +44,8 @@ export function estimateGeometry(points0, points1, sizes) {
 }
 
 /**
- * Whether most matches off a plane move along lines through one epipole, and there are many (Chum,
- * Werner and Matas, 2005).
+ * Returns whether many matches lie off a plane, and most of these move along lines through one
+ * epipole (Chum, Werner and Matas, 2005).
  */
 function showsDepth(points0, points1, homography) {
   const count = points0.length / 2;
@@ -54,7 +54,7 @@ function showsDepth(points0, points1, homography) {
   const [width, height] = [[across, left], [down, top]].map(
     ([values, least]) => values.reduce((a, b) => Math.max(a, b)) - least);
   const scale = Math.max(width, height);
-  const off = []; // where the plane would be seen, the line to where it is, and the place itself
+  const off = []; // projections of points off the plane, and the lines to their true positions
   for (let k = 0; k < count; k++) {
     if (transferError(homography, points0, points1, k) < MAX_ERROR_PX) continue;
     const [first, second] = [project(homography, points0[2 * k], points0[2 * k + 1]), [across[k], down[k]]]
@@ -87,7 +87,7 @@ const cross = ([a, b, c], [x, y, z]) => [b * z - c * y, c * x - a * z, a * y - b
 
 const sum = (values) => values.reduce((total, value) => total + value, 0);
 
-/** How many of the matches that agree lie apart in both pictures. */
+/** Counts the inliers that are separated from each other in both images. */
 function countPlaces(points0, points1, inliers, sizes) {
   const [apart0, apart1] = sizes.map((size) => PLACE_WIDTH * Math.hypot(...size));
   const isNear = (points, j, k, apart) =>
@@ -99,7 +99,7 @@ function countPlaces(points0, points1, inliers, sizes) {
   return places.length;
 }
 
-/** The expected number of geometries that as many of wrong matches would agree with, log10. */
+/** Returns the log10 number of false alarms: geometries with as many inliers among random matches. */
 function log10NfaOf(model, inliers, [width, height]) {
   const chance = model === "homography" ? Math.PI * MAX_ERROR_PX ** 2 / (width * height)
                                         : 2 * MAX_ERROR_PX * Math.hypot(width, height) / (width * height);
@@ -140,7 +140,7 @@ function ransac(model, points0, points1) {
     const rows = new Set();
     while (rows.size < sample) rows.add(Math.floor(random() * count));
     if (!judge(fit(points0, points1, [...rows]))) continue;
-    let local = best.matrix; // all that are near fit better than a sample does
+    let local = best.matrix; // local optimisation: all near matches give a better fit than a sample
     for (const reach of LOCAL_REACHES) {
       const near = places.filter((k) => error(local, points0, points1, k) <= reach * MAX_ERROR_PX);
       local = fit(points0, points1, near);
@@ -155,7 +155,7 @@ function ransac(model, points0, points1) {
 
 const rowsOf = (inliers) => [...inliers.keys()].filter((k) => inliers[k]);
 
-/** Random numbers that are the same each time (mulberry32). */
+/** Returns a generator of reproducible random numbers (mulberry32). */
 function generator(seed) {
   return () => {
     seed = (seed + 0x6d2b79f5) | 0;
@@ -165,7 +165,7 @@ function generator(seed) {
   };
 }
 
-/** The place of a point under a homography. */
+/** Maps a point by a homography. */
 export function project(matrix, x, y) {
   const w = matrix[6] * x + matrix[7] * y + matrix[8];
   return [(matrix[0] * x + matrix[1] * y + matrix[2]) / w,
@@ -177,7 +177,7 @@ function transferError(matrix, points0, points1, k) {
   return Math.hypot(x - points1[2 * k], y - points1[2 * k + 1]);
 }
 
-/** The larger distance of the two points from the epipolar line of the other. */
+/** Returns the larger distance of the two points from the epipolar line of the other. */
 function epipolarError(f, points0, points1, k) {
   const [x, y, u, v] = [points0[2 * k], points0[2 * k + 1], points1[2 * k], points1[2 * k + 1]];
   const line1 = [f[0] * x + f[1] * y + f[2], f[3] * x + f[4] * y + f[5]];
@@ -186,7 +186,7 @@ function epipolarError(f, points0, points1, k) {
   return residual / Math.max(1e-12, Math.min(Math.hypot(...line0), Math.hypot(...line1)));
 }
 
-/** Moves points to mean 0 and mean distance sqrt 2 (Hartley, 1997). */
+/** Returns the matrix that moves points to mean 0 and mean distance sqrt 2 (Hartley, 1997). */
 function normalisation(points, rows) {
   let [x, y, distance] = [0, 0, 0];
   for (const k of rows) [x, y] = [x + points[2 * k] / rows.length, y + points[2 * k + 1] / rows.length];
@@ -213,7 +213,7 @@ function fitFundamental(points0, points1, rows) {
     const [u, v] = project(t1, points1[2 * k], points1[2 * k + 1]);
     return [[u * x, u * y, u, v * x, v * y, v, x, y, 1]];
   });
-  // Its rank is two: what it does to its weakest direction is taken away.
+  // Enforce rank two: remove the part that acts on the weakest direction.
   const gram = multiply(transpose(found), found);
   const weak = smallestEigenvector(gram, 3);
   const image = [0, 1, 2].map((r) => found[3 * r] * weak[0] + found[3 * r + 1] * weak[1] + found[3 * r + 2] * weak[2]);
@@ -233,7 +233,7 @@ function nullVector(rows, equations) {
   return smallestEigenvector([...gram], 9);
 }
 
-/** Of a symmetric matrix, by Jacobi's rotations. */
+/** Returns the eigenvector of the smallest eigenvalue of a symmetric matrix (Jacobi's method). */
 export function smallestEigenvector(matrix, size) {
   const a = [...matrix];
   const vectors = Array.from(a, (_, k) => (k % (size + 1) ? 0 : 1));

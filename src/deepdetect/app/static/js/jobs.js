@@ -1,12 +1,12 @@
-// Tasks that Python does: sending the pictures, asking how far they are, cancelling.
+// Tasks that run in Python: they are sent, polled for progress, and cancelled.
 import { page } from "./page.js";
 
 const ASK_EVERY_MS = 400;
 
-/** "one sentence" of the server as the page shows it: "One sentence." */
+/** Turns "one sentence" of the server into "One sentence." for the page. */
 export const sentence = (text) => text.replace(/^./, (c) => c.toUpperCase()).replace(/[^.!?]$/, "$&.");
 
-/** Asks the server; what it refuses is thrown as its sentence. */
+/** Sends a request; an error of the server is thrown with its sentence. */
 async function ask(path, options = {}) {
   let response;
   try {
@@ -20,7 +20,7 @@ async function ask(path, options = {}) {
   return response;
 }
 
-/** A length, a description in JSON of that length, and the files. */
+/** Packs a length, a description in JSON of that length, and the files. */
 function packed(files, options) {
   const list = files.map((file) => ({ name: file.webkitRelativePath || file.name, size: file.size }));
   const description = new TextEncoder().encode(JSON.stringify({ files: list, options }));
@@ -29,16 +29,16 @@ function packed(files, options) {
   return new Blob([length.buffer, description, ...files]);
 }
 
-/** A task at work. */
+/** A running task. */
 export class Task {
   /** Sends the files. @param {string} kind @param {File[]} files @param {object} options */
   static async start(kind, files, options) {
     const { file_mb: fileMb, task_mb: taskMb, files: most } = page.server.limits;
     const large = files.find((file) => file.size > fileMb * 1e6);
-    if (large) throw new Error(`${large.name} is over ${fileMb} MB: use a smaller picture.`);
-    if (files.length > most) throw new Error(`Give at most ${most} pictures at once.`);
+    if (large) throw new Error(`${large.name} is over ${fileMb} MB: use a smaller image.`);
+    if (files.length > most) throw new Error(`Give at most ${most} images at once.`);
     if (files.reduce((sum, file) => sum + file.size, 0) > taskMb * 1e6) {
-      throw new Error(`The pictures are over ${taskMb} MB together: give fewer.`);
+      throw new Error(`The images are over ${taskMb} MB together: give fewer.`);
     }
     const query = new URLSearchParams({ kind });
     const answer = await ask(`/api/jobs?${query}`, { method: "POST", body: packed(files, options) });
@@ -48,7 +48,7 @@ export class Task {
   constructor(name) {
     this.address = `/api/jobs/${name}`;
     this.cancelled = false;
-    // Nothing stays where the page is closed.
+    // Closing the page removes the task.
     this.leave = () => fetch(this.address, { method: "DELETE", keepalive: true,
                                              headers: { "Authorization": `Bearer ${page.token}` } });
     addEventListener("pagehide", this.leave);
@@ -66,15 +66,15 @@ export class Task {
     return null;
   }
 
-  /** @returns {Promise<Blob>} a file of the result */
+  /** @returns {Promise<Blob>} one file of the result */
   async file(name) {
     return (await ask(`${this.address}/files/${name}`)).blob();
   }
 
-  /** Ends the task, and has its files removed. */
+  /** Ends the task and removes its files. */
   async forget() {
     this.cancelled = true;
     removeEventListener("pagehide", this.leave);
-    await ask(this.address, { method: "DELETE" }).catch(() => {}); // it may be gone already
+    await ask(this.address, { method: "DELETE" }).catch(() => {}); // the task may be gone already
   }
 }

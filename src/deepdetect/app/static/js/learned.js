@@ -1,19 +1,19 @@
-// Learned descriptors, turned and matched as `deepdetect.features.learned` does it.
+// Learned descriptors, rotated and matched as in `deepdetect.features.learned`.
 import { mutualMatches } from "./matching.js";
 
 export const RATIO = 0.88;
-const CONSTANT = 16; // the first numbers are the same in a picture that is turned
-// The others are the real and then the imaginary parts of complex numbers, which turn as often.
+const CONSTANT = 16; // the first numbers do not change if the image is rotated
+// The rest are the real and then the imaginary parts of complex numbers, with these frequencies.
 const FREQUENCIES = [12, 8, 4].flatMap((count, k) => Array(count).fill(k + 1));
 export const LENGTH = CONSTANT + 2 * FREQUENCIES.length;
-const UPRIGHT_DEGREES = 15; // the network bears turns up to this
-export const TURNED_KEYPOINTS = 512; // the best of each picture tell by how much one is turned
+const UPRIGHT_DEGREES = 15; // the network tolerates rotations up to this
+export const TURNED_KEYPOINTS = 512; // the best keypoints of each image give the relative rotation
 const HISTOGRAM_DEGREES = 10;
-const NEAR_DEGREES = 20; // of the fullest bin
+const NEAR_DEGREES = 20; // largest distance from the fullest bin
 
 const wrapped = (degrees) => ((degrees + 180) % 360 + 360) % 360 - 180;
 
-/** Descriptors as in a picture that is turned. @param {(k: number) => number} degreesOf each */
+/** Returns descriptors as in a rotated image. @param {(k: number) => number} degreesOf each row */
 export function turnDescriptors(descriptors, degreesOf) {
   const result = descriptors.slice();
   for (let row = 0, start = 0; start < result.length; row++, start += LENGTH) {
@@ -30,7 +30,7 @@ export function turnDescriptors(descriptors, degreesOf) {
 }
 
 /**
- * Matches upright descriptors, of which one picture's are turned back.
+ * Matches upright descriptors of two images after undoing their relative rotation.
  *
  * @typedef {{upright: Float32Array, angles: Float32Array}} Described angles of `TURNED_KEYPOINTS`
  * @param {Described} first @param {Described} second @returns {import("./matching.js").Pairs}
@@ -44,13 +44,13 @@ export function matchLearned(first, second) {
   const turn = commonTurn(differences);
   const turned = mutualMatches(first.upright, turnDescriptors(second.upright, () => -turn), LENGTH);
   if (Math.abs(wrapped(turn)) < UPRIGHT_DEGREES) return turned;
-  // Where few match, it is chance which turn most of them show.
+  // With few matches, the most frequent rotation may be a matter of chance.
   const upright = mutualMatches(first.upright, second.upright, LENGTH);
   const count = ({ ratios }) => ratios.filter((ratio) => ratio < RATIO).length;
   return count(upright) >= count(turned) ? upright : turned;
 }
 
-/** The angle that most differences of angles are near; 0 without any. */
+/** Returns the most frequent rotation among differences of angles, or 0 without any. */
 function commonTurn(degrees) {
   const bins = new Uint32Array(360 / HISTOGRAM_DEGREES);
   for (const each of degrees) bins[Math.floor((each + 360) % 360 / HISTOGRAM_DEGREES)]++;

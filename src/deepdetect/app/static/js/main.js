@@ -1,4 +1,4 @@
-// The page: where pictures come from, which view is shown, and what runs the network.
+// The page: it takes images, chooses the view, and opens the runtime of the network.
 import { isOpened, openNetwork, readPicture } from "./detection.js";
 import { canvasOf, newCanvas } from "./draw.js";
 import { activePicture, counted, during, element, page, showError } from "./page.js";
@@ -19,10 +19,10 @@ const VIEWS = {
 
 let current = "keypoints";
 
-/** How often it was started over: what was being read before is not added any more. */
+/** Number of restarts: an image that was being read before one is not added. */
 let restarts = 0;
 
-/** Why pictures cannot be taken, where the network was not asked for. */
+/** Message for images that are given before the network is opened. */
 let unready = "The page could not be loaded completely: load it again.";
 
 async function start() {
@@ -36,34 +36,34 @@ async function start() {
   element("use-folder").hidden = !page.token;
   element("power").textContent = alone ? "In this browser" : "With Python";
   element("promise").textContent = alone
-    ? "Your pictures stay on this device: the network runs in this browser."
-    : "Your pictures stay on this computer, and are forgotten after each task.";
+    ? "Your images stay on this device: the network runs in this browser."
+    : "Your images stay on this computer, and are removed after each task.";
   if (!alone && !page.token) {
-    unready = "Open the address that deepdetect app has printed: it ends in a key.";
+    unready = "Open the address that deepdetect app printed: it ends in a key.";
     showError(unready);
     return;
   }
   if (!alone) python.offer(() => showView("wipe"));
   if (alone && "serviceWorker" in navigator && config.offline) {
-    navigator.serviceWorker.register("sw.js").catch(() => {}); // without it, only when online
+    navigator.serviceWorker.register("sw.js").catch(() => {}); // without it, the page works only online
   }
   const open = (processor) => openNetwork({ engine: config.engine, token: page.token, processor });
   open("processor").then(sayWhere, (error) => showError(error.message));
   await showExamples();
   if (!config.webgpu) return;
-  hasGraphics().then((found) => { if (found) offerGraphics(() => open("graphics")); }); // pictures do not wait
+  hasGraphics().then((found) => { if (found) offerGraphics(() => open("graphics")); }); // not awaited
 }
 
 function sayWhere(words) {
   element("engine").textContent = `The network runs ${words}.`;
 }
 
-/** @returns {Promise<boolean>} whether there is a graphics card that networks can run on */
+/** @returns {Promise<boolean>} whether networks can run on a graphics card */
 async function hasGraphics() {
   return Boolean(await navigator.gpu?.requestAdapter().catch(() => null));
 }
 
-/** Lets the network run on the graphics card, from the next picture on. */
+/** Offers to run the network on the graphics card, from the next image on. */
 function offerGraphics(open) {
   const button = element("graphics");
   button.hidden = false;
@@ -73,7 +73,7 @@ function offerGraphics(open) {
   });
 }
 
-/** Takes the key of this start from the address, where nobody should see or copy it. */
+/** Takes the key of this start, and removes it from the address, so that nobody copies it. */
 function takeToken() {
   const given = new URLSearchParams(location.hash.slice(1)).get("key");
   if (given) {
@@ -83,7 +83,7 @@ function takeToken() {
   return sessionStorage.getItem("key") ?? "";
 }
 
-/** Takes the key of a new start, whose address differs from that of the open page in it alone. */
+/** Takes the key of a new start, whose address differs only in the key, and reloads the page. */
 function takeNewToken() {
   const old = page.token;
   if (page.server && takeToken() !== old) location.reload();
@@ -110,7 +110,7 @@ async function showExamples() {
   }));
 }
 
-/** Does something; what goes wrong is said in one sentence. */
+/** Runs a task and shows the message of its error. */
 async function guarded(task) {
   showError("");
   try {
@@ -120,15 +120,15 @@ async function guarded(task) {
   }
 }
 
-/** Reads files; what is found in them is asked for by the view. */
+/** Reads files and adds them as images; the view then computes what it shows. */
 async function addPictures(files) {
-  await starting; // pictures may come before it has asked for the network
+  await starting; // images may come before the network is opened
   if (!isOpened()) throw new Error(unready);
   const room = MAX_PICTURES - page.pictures.length;
   if (files.length > room) {
     const advice = page.server ? " or use a folder under “3D, panorama, folder”." : ".";
-    throw new Error(room ? `Give at most ${counted(room, "picture")}${advice}`
-                         : "There are two pictures already: remove one, or start over.");
+    throw new Error(room ? `Give at most ${counted(room, "image")}${advice}`
+                         : "There are already two images: remove one, or start over.");
   }
   const started = restarts;
   for (const file of files) {
@@ -137,11 +137,11 @@ async function addPictures(files) {
       read = await readPicture(file);
     } catch (error) {
       if (restarts !== started) return;
-      if (page.pictures.length) showView(current); // what was read before it
+      if (page.pictures.length) showView(current); // shows the images read before
       throw error;
     }
     if (restarts !== started) return;
-    if (page.pictures.length >= MAX_PICTURES) return; // of two that were given at once
+    if (page.pictures.length >= MAX_PICTURES) return; // another call has added one meanwhile
     page.pictures.push({ name: file.name, file, ...read, removal: new AbortController(),
                          canvas: canvasOf(read.rgba, read.width, read.height) });
     if (file === files.at(-1)) break;
@@ -163,19 +163,19 @@ function removePicture(picture) {
   focusStart();
 }
 
-/** Moves to the start when the button that was pressed is gone. */
+/** Moves the focus to a start button, because the pressed button is gone. */
 function focusStart() {
   const next = page.pictures.length ? element("add") : element("start").querySelector("button");
   next.focus();
 }
 
-/** Shows the view that is chosen, of the pictures that are there. */
+/** Shows the chosen view of the present images. */
 function showPictures() {
   listPictures();
   if (page.pictures.length) guarded(VIEWS[current].show);
 }
 
-/** Lists the pictures that are there, and forgets what belongs to others. */
+/** Lists the present images, and drops results of others. */
 function listPictures() {
   const { pictures } = page;
   matches.reset();
@@ -192,7 +192,7 @@ function listPictures() {
     group.querySelectorAll("input")[page.active].checked = true;
   }
   element("files").replaceChildren(...pictures.map(pictureItem));
-  element("add").textContent = pictures.length ? "Add a second picture" : "Add pictures";
+  element("add").textContent = pictures.length ? "Add a second image" : "Add images";
 }
 
 function pictureItem(picture) {
@@ -207,7 +207,7 @@ function pictureItem(picture) {
   name.title = picture.name;
   const { width, height } = picture.original;
   const reduced = width !== picture.width || height !== picture.height;
-  size.textContent = `${width}×${height}${reduced ? `, seen as ${picture.width}×${picture.height}` : ""}`;
+  size.textContent = `${width}×${height}${reduced ? `, scaled to ${picture.width}×${picture.height}` : ""}`;
   const remove = document.createElement("button");
   remove.type = "button";
   remove.className = "quiet remove";
@@ -219,7 +219,7 @@ function pictureItem(picture) {
 }
 
 async function showView(name) {
-  if (!page.pictures.length && name !== "python") showPictures(); // there is nothing to look at
+  if (!page.pictures.length && name !== "python") showPictures(); // shows the start
   current = name;
   for (const tab of element("tabs").children) {
     const chosen = tab.id === `tab-${name}`;

@@ -1,12 +1,12 @@
-// Mutual nearest neighbours of descriptors, with the ratio of the best to the second best distance.
+// Mutual nearest neighbours of descriptors, with the ratio of the best to the second-best distance.
 
 /**
  * @typedef {object} Pairs
- * @property {Uint32Array} rows0 @property {Uint32Array} rows1 of the descriptors
- * @property {Float32Array} ratios in [0, 1]: the lower, the more the match stands out
+ * @property {Uint32Array} rows0 @property {Uint32Array} rows1 rows of the descriptors
+ * @property {Float32Array} ratios in [0, 1]: lower is more distinctive
  */
 
-/** @param {Float32Array} first @param {Float32Array} second rows of a length @returns {Pairs} */
+/** @param {Float32Array} first @param {Float32Array} second rows of this length @returns {Pairs} */
 export function mutualMatches(first, second, length) {
   const [count0, count1] = [first.length / length, second.length / length];
   const best0 = new Int32Array(count0).fill(-1);
@@ -44,14 +44,14 @@ export function mutualMatches(first, second, length) {
   };
 }
 
-/** The products of two rows with all of the others, four by four: each value is loaded for several. */
+/** Computes dot products of two rows with all others, four at a time, to reuse loaded values. */
 function multiplyTwo([first, second], i, next, length, result) {
   const count = result.length / 2;
   const [a, b] = [i * length, next * length];
   for (let j = 0; j < count; j += 4) {
     const j1 = Math.min(j + 1, count - 1), j2 = Math.min(j + 2, count - 1), j3 = Math.min(j + 3, count - 1);
     const c = j * length, d = j1 * length, e = j2 * length, f = j3 * length;
-    let ac = 0, ad = 0, ae = 0, af = 0; // not as lists, which the loop would make anew
+    let ac = 0, ad = 0, ae = 0, af = 0; // single variables, because lists would be allocated each time
     let bc = 0, bd = 0, be = 0, bf = 0;
     for (let k = 0; k < length; k++) {
       const x = first[a + k], y = first[b + k];

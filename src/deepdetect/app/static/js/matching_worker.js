@@ -1,4 +1,4 @@
-// Matches described keypoints of two pictures beside the page.
+// Worker that matches described keypoints of two images.
 import { answer } from "./background.js";
 import { estimateGeometry, project } from "./geometry.js";
 import { matchLearned } from "./learned.js";
@@ -9,13 +9,13 @@ const take = (xy, rows) => Float32Array.from({ length: 2 * rows.length },
                                              (_, k) => xy[2 * rows[k >> 1] + (k & 1)]);
 
 answer({
-  /** @returns mutual nearest neighbours with their ratios, as positions */
+  /** @returns positions of mutual nearest neighbours, with their ratios */
   match({ pictures }) {
     const { rows0, rows1, ratios } = matchLearned(...pictures);
     return { points0: take(pictures[0].xy, rows0), points1: take(pictures[1].xy, rows1), ratios };
   },
 
-  /** @returns {{matches: number, agreeing: number}} of SIFT's keypoints, at most `count` of a picture */
+  /** @returns {{matches: number, agreeing: number}} for SIFT, with at most `count` keypoints per image */
   sift({ pictures, count }) {
     const [first, second] = pictures.map(({ gray, width, height }) => findSift(gray, width, height, count));
     const { rows0, rows1, ratios } = mutualMatches(first.descriptors, second.descriptors, LENGTH);
@@ -29,7 +29,7 @@ answer({
     return estimateGeometry(points0, points1, sizes);
   },
 
-  /** Draws the second picture in the frame of the first; transparent where it shows nothing. */
+  /** Warps the second image into the frame of the first; pixels without image are transparent. */
   warp({ rgba, size, matrix, target }) {
     const result = new Uint8ClampedArray(4 * target.width * target.height);
     for (let y = 0, at = 0; y < target.height; y++) {
@@ -50,4 +50,4 @@ answer({
     }
     return result;
   },
-}, (reason) => `The pictures could not be matched (${reason}).`);
+}, (reason) => `The images could not be matched (${reason}).`);

@@ -1,20 +1,20 @@
-// The dominant orientation of the gradients around keypoints (Lowe, 2004, Section 5), as
-// `deepdetect.features.scale_space` assigns it.
+// Dominant orientation of the gradients around keypoints (Lowe, 2004, Section 5), as in
+// `deepdetect.features.scale_space`.
 import { SIZE_PER_SIGMA, layersOf } from "./scale_space.js";
 import { roundHalfEven } from "./selection.js";
 
 const BINS = 36;
 const WINDOW_PER_SIGMA = 1.5;
 const RADIUS_PER_WINDOW = 3;
-const PEAK_FRACTION = 0.8; // of the highest bin, above which a keypoint is also one of that direction
+const PEAK_FRACTION = 0.8; // a peak above this share of the highest gives a keypoint of its own
 const fround = Math.fround;
 
-// OpenCV's polynomial for the arc tangent, in degrees: other values would count for other bins.
+// OpenCV's polynomial for the arc tangent, in degrees: exact values could fall into other bins.
 const ARC = [0.9997878412794807, -0.3258083974640975, 0.1555786518463281, -0.04432655554792128]
   .map((value) => fround(fround(value) * fround(180 / Math.PI)));
 const EPSILON = 2.220446049250313e-16;
 
-/** The direction of (x, y) in degrees from 0 to 360. */
+/** Returns the direction of (x, y) in degrees from 0 to 360. */
 function degrees(y, x) {
   const [across, down] = [Math.abs(x), Math.abs(y)];
   const c = fround(Math.min(across, down) / fround(Math.max(across, down) + fround(EPSILON)));
@@ -43,7 +43,7 @@ export function dominantAngles(gray, width, height, { xy, sizes }) {
   return angles;
 }
 
-/** The votes of the gradients in a Gaussian window around a pixel for each direction. */
+/** Returns the histogram of gradient directions in a Gaussian window around a pixel. */
 export function votesAround({ image, width, height }, x, y, window) {
   const radius = roundHalfEven(RADIUS_PER_WINDOW * window);
   const weights = Array.from({ length: radius + 1 }, (_, k) => Math.exp(-0.5 * (k / window) ** 2));
@@ -67,13 +67,13 @@ function smoothed(votes) {
     (6 * value + 4 * (at(k - 1) + at(k + 1)) + at(k - 2) + at(k + 2)) / 16);
 }
 
-/** The direction of the highest bin of the smoothed votes. */
+/** Returns the direction of the highest bin of the smoothed histogram. */
 function highest(votes) {
   const smooth = smoothed(votes);
   return refined(smooth, smooth.indexOf(Math.max(...smooth)));
 }
 
-/** The directions of all bins that stand out nearly as much as the highest. */
+/** Returns the directions of all peaks that are nearly as high as the highest one. */
 export function directions(votes) {
   const smooth = smoothed(votes);
   const least = PEAK_FRACTION * Math.max(...smooth);
@@ -81,7 +81,7 @@ export function directions(votes) {
     && smooth[k] > smooth[(k + 1) % BINS]).map((k) => refined(smooth, k));
 }
 
-/** The direction of a bin in degrees, refined by a parabola. */
+/** Returns the direction of a bin in degrees, refined by a parabola. */
 function refined(smooth, best) {
   const [left, middle, right] = [-1, 0, 1].map((step) => smooth[(best + step + BINS) % BINS]);
   const curvature = left - 2 * middle + right;

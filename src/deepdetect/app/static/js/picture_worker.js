@@ -1,4 +1,4 @@
-// Reads pictures and runs the network, beside the page: by ONNX Runtime here, or by Python.
+// Worker that reads images and runs the network, by ONNX Runtime in the browser or by Python.
 import { UserError, answer } from "./background.js";
 import { decode } from "./decoding.js";
 import { isConstant, networkSize, reduceByArea, toPlanes } from "./pixels.js";
@@ -8,14 +8,14 @@ import { prepare } from "./selection.js";
 let runNetwork = null;
 
 const tasks = {
-  /** Opens the network. @returns {Promise<string>} what runs it, in words */
+  /** Opens the network. @returns {Promise<string>} a description of its runtime */
   async open({ engine, token, processor }) {
     const opened = engine === "python" ? pythonNetwork(token) : await openedHere(processor);
     runNetwork = opened.run;
     return opened.words;
   },
 
-  /** Decodes a file, upright, and reduces it to the size at which the network sees it. */
+  /** Decodes a file, upright, and scales it down to the size of the network's input. */
   read({ file, name }) {
     return decode(file, name, ({ width, height }, readRows) => {
       const [newWidth, newHeight] = networkSize(width, height);
@@ -52,7 +52,7 @@ async function browserNetwork(processor) {
     return Float32Array.from(logits);
   };
   let last = Promise.resolve();
-  const run = (...picture) => { // one after the other: two at once would wait for ever with WebGPU
+  const run = (...picture) => { // one after the other: with WebGPU two at once would never end
     const own = last.then(() => runOne(...picture));
     last = own.catch(() => {});
     return own;
@@ -74,4 +74,4 @@ function pythonNetwork(token) {
   return { run, words: "in Python on this computer" };
 }
 
-answer(tasks, (reason) => `The picture could not be worked on (${reason}): try a smaller one.`);
+answer(tasks, (reason) => `The image could not be processed (${reason}): try a smaller one.`);

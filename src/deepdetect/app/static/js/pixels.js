@@ -1,15 +1,15 @@
-// Pixels as the network takes them: the sizes, the reduction and the arithmetic of the package.
+// Input of the network: sizes, scaling and conversion of pixels, as in the Python package.
 import { roundHalfEven } from "./selection.js";
 
-export const MAX_PIXELS = 2_000_000; // larger photographs are reduced to that, as `detect` does
+export const MAX_PIXELS = 2_000_000; // larger images are scaled down to this, as by `detect`
 export const MIN_SIDE = 16;
 const STRIDE = 8;
 
-/** How pixels lie in memory, and how many values of each are reduced. */
+/** Layout of pixels: the step from one to the next, and the number of values to scale. */
 export const COLOUR = { step: 4, values: 3 };
 export const GRAY = { step: 1, values: 1 };
 
-/** The size at which the network sees a photograph: its own, or about two megapixels. */
+/** Returns the size of the network's input: that of the image, or about two megapixels. */
 export function networkSize(width, height) {
   if (width * height <= MAX_PIXELS) return [width, height];
   const scale = (MAX_PIXELS / (height * width)) ** 0.5;
@@ -17,14 +17,14 @@ export function networkSize(width, height) {
     (side) => Math.max(STRIDE, roundHalfEven(side * scale / STRIDE) * STRIDE));
 }
 
-/** The size at which points are looked for, which needs no multiples of 8. */
+/** Returns the size at which points are detected, which need not be multiples of 8. */
 export function pointsSize(width, height) {
   if (width * height <= MAX_PIXELS) return [width, height];
   const scale = (MAX_PIXELS / (height * width)) ** 0.5;
   return [width, height].map((side) => Math.max(1, roundHalfEven(side * scale)));
 }
 
-/** RGB planes from 0 to 1, one after the other, of RGBA bytes. */
+/** Converts RGBA bytes to RGB planes from 0 to 1, one after the other. */
 export function toPlanes(rgba, pixels) {
   const planes = new Float32Array(3 * pixels);
   const unit = Math.fround(1 / 255);
@@ -34,7 +34,7 @@ export function toPlanes(rgba, pixels) {
   return planes;
 }
 
-/** Whether all pixels have one colour: there is nothing to detect. */
+/** Returns whether all pixels have one colour, so that there is nothing to detect. */
 export function isConstant(rgba) {
   for (let k = 4; k < rgba.length; k++) {
     if (k % 4 !== 3 && rgba[k] !== rgba[k % 4]) return false;
@@ -42,7 +42,7 @@ export function isConstant(rgba) {
   return true;
 }
 
-/** 8-bit luma (ITU-R BT.601), with OpenCV's whole numbers. */
+/** Returns 8-bit luma (ITU-R BT.601), with OpenCV's integer arithmetic. */
 export function luma(rgba) {
   const gray = new Uint8Array(rgba.length / 4);
   for (let k = 0; k < gray.length; k++) {
@@ -51,7 +51,7 @@ export function luma(rgba) {
   return gray;
 }
 
-/** Weights of OpenCV's area averaging along one axis: for each target, its sources. */
+/** Returns weights of OpenCV's area averaging along one axis: [source, weight] for each target. */
 function areaWeights(from, to) {
   const scale = from / to;
   return Array.from({ length: to }, (_, target) => {
@@ -70,23 +70,23 @@ function areaWeights(from, to) {
 }
 
 /**
- * Reduces a photograph by area averaging, as `cv2.resize` with INTER_AREA does.
+ * Scales an image down by area averaging, as `cv2.resize` with INTER_AREA does.
  *
- * @param {(top: number, rows: number) => Uint8ClampedArray} readRows gives bytes of rows
+ * @param {(top: number, rows: number) => Uint8ClampedArray} readRows returns bytes of rows
  */
 export function reduceByArea(readRows, width, height, newWidth, newHeight,
                              { step, values } = COLOUR) {
   const across = areaWeights(width, newWidth);
   const down = areaWeights(height, newHeight);
   const halved = width === 2 * newWidth && height === 2 * newHeight;
-  const round = halved ? Math.round : roundHalfEven; // OpenCV has code of its own for halves
+  const round = halved ? Math.round : roundHalfEven; // OpenCV has separate code for half the size
   const result = new Uint8ClampedArray(step * newWidth * newHeight).fill(255);
   const sum = new Float32Array(values * newWidth);
   const line = new Float32Array(values * newWidth);
   const bandRows = Math.max(1, Math.floor(2 ** 20 / width));
   let [band, bandTop, reduced] = [null, 0, -1];
   const reduceRow = (row) => {
-    if (row === reduced) return; // a row at a border counts for two targets
+    if (row === reduced) return; // a row on a boundary contributes to two targets
     if (band === null || row < bandTop || row >= bandTop + bandRows) {
       bandTop = row - row % bandRows;
       band = readRows(bandTop, Math.min(bandRows, height - bandTop));

@@ -1,4 +1,4 @@
-// Ranks and describes the points of pictures, by ONNX Runtime here or by Python, beside the page.
+// Worker that ranks and describes points of images, by ONNX Runtime in the browser or by Python.
 import { UserError, answer } from "./background.js";
 import { decode } from "./decoding.js";
 import { TURNED_KEYPOINTS } from "./learned.js";
@@ -7,7 +7,7 @@ import { GRAY, luma, pointsSize, reduceByArea } from "./pixels.js";
 import { ALL_CANDIDATES, rankingOf } from "./points/ranking.js";
 import { askPython, openModel } from "./runtime.js";
 
-const STRIDE = 128; // the network of the descriptors halves a picture seven times
+const STRIDE = 128; // the descriptor network halves an image seven times
 const models = {};
 
 async function opened(name) {
@@ -15,11 +15,11 @@ async function opened(name) {
     return models[name] ??= await openModel(name);
   } catch (error) {
     if (error instanceof UserError) throw error;
-    throw new UserError(`What finds and describes points could not be loaded (${error.message}): load the page again.`);
+    throw new UserError(`The models for points could not be loaded (${error.message}): load the page again.`);
   }
 }
 
-/** Candidates, the strongest first: x, y, sigmas and logits. Python gives all. */
+/** Returns candidates, strongest first: x, y, sigmas and logits. Python returns all of them. */
 async function candidatesOf({ gray, width, height }, limit, token) {
   if (token !== null) {
     const rows = await askPython("candidates", width, height, gray, token);
@@ -32,7 +32,7 @@ async function candidatesOf({ gray, width, height }, limit, token) {
                  limit: ["int64", BigInt64Array.of(BigInt(limit)), [1]] });
 }
 
-/** Descriptors of points as in a picture that is not turned, rows of 64. */
+/** Returns upright descriptors of points, rows of 64 numbers. */
 async function uprightDescriptors({ gray, width, height, points: { xy, sizes } }, token) {
   const count = sizes.length;
   if (!count) return new Float32Array(0);
@@ -52,7 +52,7 @@ async function uprightDescriptors({ gray, width, height, points: { xy, sizes } }
   return descriptors;
 }
 
-/** The luma of a file at the size at which points are looked for. */
+/** Returns the luma of a file at the size at which points are detected. */
 function reducedLuma(file, name) {
   return decode(file, name, ({ width, height }, readRows) => {
     const [newWidth, newHeight] = pointsSize(width, height);
@@ -64,8 +64,8 @@ function reducedLuma(file, name) {
 
 answer({
   /**
-   * Ranks the candidates of a picture; what the network sees is enough where it is the whole. The
-   * token is that of Python, null where the browser is alone.
+   * Ranks the candidates of an image, whose file is read again if the network's input was scaled
+   * down. The token is Python's, or null if the page runs in the browser only.
    */
   async rank({ file, name, rgba, width, height, original, limit, token }) {
     const whole = width === original.width && height === original.height;
@@ -74,7 +74,7 @@ answer({
     return { ...seen, limit: ranked, ...rankingOf(await candidatesOf(seen, limit, token)) };
   },
 
-  /** @returns {Float32Array} angles of points in degrees */
+  /** @returns {Float32Array} angles of the points in degrees */
   angles: ({ gray, width, height, points }) => dominantAngles(gray, width, height, points),
 
   /** Describes points. @returns {Promise<import("./learned.js").Described>} */
@@ -84,4 +84,4 @@ answer({
     return { upright: await uprightDescriptors(picture, token),
              angles: dominantAngles(gray, width, height, best) };
   },
-}, (reason) => `The points could not be found (${reason}): try a smaller picture.`);
+}, (reason) => `The points could not be found (${reason}): try a smaller image.`);

@@ -1,10 +1,10 @@
-// ONNX Runtime in a worker, for files of this page.
+// ONNX Runtime in a worker, for the models of this page; and requests to Python.
 import { UserError } from "./background.js";
 
 const MAX_THREADS = 4;
-const GZIP = [0x1f, 0x8b]; // the first bytes of such a file
+const GZIP = [0x1f, 0x8b]; // first bytes of a gzip file
 
-/** The content of a file that the build has compressed, and that some web servers unpack themselves. */
+/** Returns the contents of a file that the build has compressed, unless the web server unpacks it. */
 async function unpacked(response) {
   const content = await response.arrayBuffer();
   const [first, second] = new Uint8Array(content);
@@ -18,11 +18,11 @@ async function unpacked(response) {
 /**
  * Opens a model, on the processor (WebAssembly) or on the graphics card (WebGPU).
  *
- * @param {string} name of its file
- * @param {boolean} graphics
+ * @param {string} name name of its file
+ * @param {boolean} graphics whether to use the graphics card
  * @returns {Promise<(inputs: Object<string, [string, ArrayLike<number>, number[]]>,
- *           outputs?: string[]) => Promise<Object<string, Float32Array>>>} runs it with the types,
- *           values and sides of its inputs
+ *           outputs?: string[]) => Promise<Object<string, Float32Array>>>} a function that runs the
+ *           model, given types, values and shapes of its inputs
  */
 export async function openModel(name, graphics = false) {
   const response = await fetch(new URL(`../model/${name}`, import.meta.url)).catch(() => {
@@ -34,7 +34,7 @@ export async function openModel(name, graphics = false) {
   const ort = await import(`${folder}ort.${graphics ? "webgpu" : "wasm"}.min.mjs`);
   ort.env.logLevel = "error";
   ort.env.wasm.wasmPaths = folder;
-  if (!ort.env.wasm.wasmBinary) { // one for all models
+  if (!ort.env.wasm.wasmBinary) { // shared by all models
     const binary = await fetch(`${folder}ort-wasm-simd-threaded.${graphics ? "asyncify." : ""}wasm.packed`);
     if (!binary.ok) throw new Error("a file of ONNX Runtime is missing");
     ort.env.wasm.wasmBinary = await unpacked(binary);
@@ -50,7 +50,7 @@ export async function openModel(name, graphics = false) {
   };
 }
 
-/** Asks Python on this computer. @returns {Promise<Float32Array>} */
+/** Sends a request to Python on this computer. @returns {Promise<Float32Array>} */
 export async function askPython(task, width, height, body, token) {
   let response;
   try {

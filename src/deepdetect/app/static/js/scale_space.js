@@ -1,15 +1,14 @@
-// SIFT's Gaussian scale space, as `deepdetect.features.scale_space` builds it: which of its images
-// belongs to a keypoint of some size.
+// SIFT's Gaussian scale space, as in `deepdetect.features.scale_space`, and the layers of keypoints.
 import { blur } from "./gaussian.js";
 import { roundHalfEven } from "./selection.js";
 
-export const LAYERS = 3; // of an octave that hold keypoints
+export const LAYERS = 3; // layers of an octave that can have keypoints
 export const BASE_SIGMA_PX = 1.6;
-export const CAMERA_SIGMA_PX = 0.5; // blur that a picture is assumed to have
+export const CAMERA_SIGMA_PX = 0.5; // assumed blur of an image
 export const SIZE_PER_SIGMA = 2;
 const MIN_SIDE_PX = 8;
 
-/** The layer whose sigma is nearest to that of a keypoint, counted from the first of octave 0. */
+/** Returns the layer whose sigma is nearest to that of a keypoint, counted from octave 0. */
 function nearestLayer(size, width, height) {
   const step = roundHalfEven(LAYERS * Math.log2(size / SIZE_PER_SIGMA / BASE_SIGMA_PX));
   const lastOctave = Math.max(0, Math.floor(Math.log2(Math.min(width, height) / MIN_SIDE_PX)));
@@ -17,14 +16,14 @@ function nearestLayer(size, width, height) {
 }
 
 /**
- * Goes through the images of the scale space, from fine to coarse, that are nearest to the sizes of keypoints.
+ * Yields, from fine to coarse, the layers of the scale space that are nearest to the sizes of keypoints.
  *
  * @param {Uint8Array} gray @param {ArrayLike<number>} sizes diameters in pixels
  * @yields {{image: Float32Array, width: number, height: number, scale: number, rows: number[]}} the
- *   pixel (x, y) is at (x, y) * scale of the picture; rows are those of the keypoints
+ *   pixel (x, y) is at (x, y) * scale in the input; rows are those of its keypoints
  */
 export function* layersOf(gray, width, height, sizes) {
-  const rows = new Map(); // of each layer
+  const rows = new Map(); // rows of keypoints by layer
   for (let row = 0; row < sizes.length; row++) {
     const layer = nearestLayer(sizes[row], width, height);
     if (!rows.has(layer)) rows.set(layer, []);
@@ -45,7 +44,7 @@ export function* layersOf(gray, width, height, sizes) {
   }
 }
 
-/** Every second pixel of every second row. */
+/** Returns every second pixel of every second row. */
 export function halved(image, width, height) {
   const [newWidth, newHeight] = [width, height].map((side) => Math.ceil(side / 2));
   const result = new Float32Array(newWidth * newHeight);

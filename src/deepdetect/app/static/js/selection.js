@@ -1,29 +1,29 @@
-// Keypoints of a heat map, as `deepdetect.features.selection` selects them, to the last bit.
+// Selection of keypoints from a heat map, bit-equal to `deepdetect.features.selection`.
 // Pixels: x right, y down, the centre of the first pixel is (0, 0).
 
 const MAX_COORDINATE_BITS = 12;
 const fround = Math.fround;
 
 /**
- * What every selection needs of a map, computed once: then a selection takes milliseconds.
+ * A heat map with what every selection needs, computed once, so that selections take milliseconds.
  *
  * @typedef {object} HeatMap
  * @property {number} width
  * @property {number} height
- * @property {Float32Array} logits by which pixels are ranked
- * @property {Float32Array} probability their sigmoid
- * @property {Float32Array} sorted the logits in rising order
+ * @property {Float32Array} logits scores by which pixels are ranked
+ * @property {Float32Array} probability sigmoid of the logits
+ * @property {Float32Array} sorted logits in ascending order
  */
 
 /**
- * Which keypoints are wanted: the options of `DeepDetect.detect`.
+ * Choice of keypoints, as the options of `DeepDetect.detect`.
  *
  * @typedef {object} Options
  * @property {number} threshold in [0, 1]
  * @property {number | null} density keypoints per pixel in (0, 1]; replaces the threshold
  */
 
-/** @param {Float32Array} logits @returns {Float32Array} probabilities, in float32 throughout */
+/** @param {Float32Array} logits @returns {Float32Array} probabilities, computed in float32 */
 function sigmoid(logits) {
   const result = new Float32Array(logits.length);
   for (let k = 0; k < logits.length; k++) {
@@ -33,7 +33,7 @@ function sigmoid(logits) {
   return result;
 }
 
-/** Ranks a pixel as an ordered dither does: the first N are spread evenly, for any N. */
+/** Returns the rank of a pixel in an ordered dither, whose first N pixels are spread evenly. */
 export function bayerOrder(column, row, width, height) {
   const longest = Math.max(width, height) - 1;
   const bits = Math.min(MAX_COORDINATE_BITS, Math.max(1, 32 - Math.clz32(longest)));
@@ -43,7 +43,7 @@ export function bayerOrder(column, row, width, height) {
     column >>= 1;
     row >>= 1;
   }
-  return order; // whole numbers: no division is needed to compare them
+  return order; // not normalised, because only the order matters
 }
 
 /** @param {Float32Array} logits @returns {HeatMap} */
@@ -52,7 +52,7 @@ export function prepare(logits, width, height) {
   return { width, height, logits, probability, sorted: logits.slice().sort() };
 }
 
-/** The number of leading entries for which a test holds that holds for no later one. */
+/** Returns the number of leading entries for which a test holds, by bisection. */
 function leading(length, holds) {
   let [low, high] = [0, length];
   while (low < high) {
@@ -63,22 +63,22 @@ function leading(length, holds) {
   return low;
 }
 
-/** Python's `round`: halves to the even neighbour. */
+/** Rounds as Python does: halves to the even neighbour. */
 export function roundHalfEven(value) {
   const below = Math.floor(value);
   const rest = value - below;
   return rest > 0.5 || (rest === 0.5 && below % 2) ? below + 1 : below;
 }
 
-/** @param {HeatMap} map @param {Options} options @returns {Uint32Array} pixels, in their order */
+/** @param {HeatMap} map @param {Options} options @returns {Uint32Array} pixels in ascending order */
 export function select(map, options) {
   if (options.density === null) return above(map.probability, fround(options.threshold));
   return highest(map, roundHalfEven(options.density * map.logits.length));
 }
 
-// The loops over all pixels are plain: they run while a slider moves.
+// The loops over all pixels are simple, because they run while a slider moves.
 
-/** The pixels with a probability above a threshold. */
+/** Returns the pixels with a probability above a threshold. */
 function above(probability, threshold) {
   const found = new Uint32Array(probability.length);
   let count = 0;
@@ -86,7 +86,7 @@ function above(probability, threshold) {
   return found.subarray(0, count);
 }
 
-/** The `wanted` pixels of highest rank, among those that are possible at all. */
+/** Returns the `wanted` pixels of highest rank whose probability is not 0. */
 function highest({ logits, probability, sorted, width, height }, wanted) {
   if (wanted === 0) return new Uint32Array(0);
   const last = sorted[logits.length - wanted];

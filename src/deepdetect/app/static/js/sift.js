@@ -1,21 +1,21 @@
-// SIFT (Lowe, 2004) with OpenCV's constants and its precise doubling: what the page compares with.
+// SIFT (Lowe, 2004), for comparison, with OpenCV's constants and its precise upscaling.
 import { blur } from "./gaussian.js";
 import { directions, votesAround } from "./orientation.js";
 import { BASE_SIGMA_PX, CAMERA_SIGMA_PX, LAYERS, halved } from "./scale_space.js";
 
 export const LENGTH = 128;
-export const RATIO = 0.8; // to the second best distance (Lowe)
+export const RATIO = 0.8; // Lowe's limit of the ratio test
 const MIN_CONTRAST = 0.04 * 255 / LAYERS;
 const MAX_EDGE_RATIO = 10;
 const BORDER_PX = 5;
-const STEPS = 5; // to the true place of an extremum
+const STEPS = 5; // largest number of refinement steps of an extremum
 const WINDOW_PER_SIGMA = 1.5;
-const [CELLS, BINS] = [4, 8]; // of a descriptor, each way and in each cell
+const [CELLS, BINS] = [4, 8]; // cells of a descriptor along a side, and bins of a cell
 const CELL_PER_SIGMA = 3;
-const LARGEST = 0.2; // part of a descriptor: light from a side changes few of them
+const LARGEST = 0.2; // largest entry of a descriptor, for robustness to non-linear illumination
 
 /**
- * The strongest keypoints with their descriptors, rows of 128 of length 1.
+ * Returns the strongest keypoints with their descriptors, rows of 128 numbers and length 1.
  *
  * @param {Uint8Array} gray @returns {{xy: Float32Array, descriptors: Float32Array}}
  */
@@ -46,7 +46,7 @@ export function findSift(gray, width, height, count) {
   return { xy: Float32Array.from(found.flatMap(({ x, y, layer: { scale } }) => [x * scale, y * scale])), descriptors };
 }
 
-/** Twice as large, so that (x, y) is at (2 x, 2 y). */
+/** Returns the image at twice the size, where (x, y) is at (2 x, 2 y). */
 function doubled(gray, width, height) {
   const image = new Float32Array(4 * width * height);
   for (let y = 0, at = 0; y < 2 * height; y++) {
@@ -59,7 +59,7 @@ function doubled(gray, width, height) {
   return { image, width: 2 * width, height: 2 * height };
 }
 
-/** Keypoints of the images of an octave: extrema of their differences, once for each direction. */
+/** Returns the keypoints of an octave: extrema of differences, one for each dominant direction. */
 function keypointsOf(images) {
   const { width, height } = images[0];
   const differences = images.slice(1).map(({ image }, k) => image.map((value, at) => value - images[k].image[at]));
@@ -86,7 +86,7 @@ function keypointsOf(images) {
   return found;
 }
 
-/** The true place of an extremum, by its derivatives; null where it is weak, or on an edge. */
+/** Refines the position of an extremum; returns null if it is weak or on an edge. */
 function located(differences, width, height, x, y, k) {
   for (let step = 0; step < STEPS; step++) {
     const at = y * width + x;
@@ -116,13 +116,13 @@ function located(differences, width, height, x, y, k) {
   return null;
 }
 
-/** Histograms of the gradients in 4x4 cells around a keypoint, turned by its angle. */
+/** Returns histograms of gradients in 4x4 cells around a keypoint, rotated by its angle. */
 function describe({ x, y, sigma, angle, layer: { image, width, height } }) {
   const [column, row] = [Math.round(x), Math.round(y)];
   const cell = CELL_PER_SIGMA * sigma;
   const radius = Math.min(Math.round(cell * Math.SQRT2 * (CELLS + 1) / 2), Math.floor(Math.hypot(width, height)));
   const [cos, sin] = [Math.cos(angle * Math.PI / 180) / cell, Math.sin(angle * Math.PI / 180) / cell];
-  const side = CELLS + 2; // a cell more at each side takes what falls beyond
+  const side = CELLS + 2; // an extra cell at each side receives votes beyond the border
   const votes = new Float64Array(side * side * BINS);
   for (let v = Math.max(1, row - radius); v <= Math.min(height - 2, row + radius); v++) {
     for (let u = Math.max(1, column - radius); u <= Math.min(width - 2, column + radius); u++) {

@@ -1,5 +1,4 @@
-// Points of all scales, chosen from the ranking of a picture as `deepdetect.PointDetector(N)`
-// chooses them.
+// Choice of points of all scales from the ranking of an image, as by `deepdetect.PointDetector(N)`.
 import { spreadByDistance, spreadOverGrid, suppressNeighbors } from "./suppression.js";
 
 const CANDIDATES_PER_KEYPOINT = 6;
@@ -10,7 +9,7 @@ const DISTANCE_PER_SIGMA = 1;
 const SIZE_PER_SIGMA = 2.5;
 
 /**
- * Points in pixels of the picture that was ranked, best first.
+ * Points in pixels of the ranked image, best first.
  *
  * @typedef {object} Points
  * @property {Float32Array} xy @property {Float32Array} scores @property {Float32Array} sizes diameters
@@ -18,7 +17,7 @@ const SIZE_PER_SIGMA = 2.5;
 
 /**
  * @param {import("./ranking.js").Ranking} ranking
- * @param {number} count at most this many
+ * @param {number} count largest number of points
  * @param {"none" | "grid" | "anms"} spread
  * @returns {Points}
  */
@@ -43,10 +42,10 @@ export function choosePoints(ranking, count, spread = "none") {
   };
 }
 
-/** A logit of the ranker as a score in (0, 1), without ties at its ends. */
+/** Maps a logit of the ranker to a score in (0, 1), without saturation. */
 const scoreOf = (logit) => 0.5 + 0.5 * logit / (1 + Math.abs(logit));
 
-/** How many candidates are ranked where so many points are wanted: those of the strongest response. */
+/** Returns how many of the strongest candidates are ranked to get `count` points. */
 export const candidatesFor = (count) => Math.max(CANDIDATES_PER_KEYPOINT * count, MIN_CANDIDATES);
 
 function strongest({ strengthRanks }, count) {

@@ -1,5 +1,5 @@
-// The candidates of a picture in the order of the ranker: of all, points of any number are chosen in
-// milliseconds.
+// Candidates of an image in the order of the ranker, from which any number of points can be chosen
+// in milliseconds.
 
 export const ALL_CANDIDATES = Number.MAX_SAFE_INTEGER;
 
@@ -8,19 +8,19 @@ export const ALL_CANDIDATES = Number.MAX_SAFE_INTEGER;
  *
  * @typedef {object} Ranking
  * @property {Float32Array} xy x0, y0, x1, y1, ... sub-pixel, the centre of the first pixel is (0, 0)
- * @property {Float32Array} sigmas of their levels in pixels
- * @property {Float32Array} logits of the ranker
- * @property {Uint32Array} strengthRanks their place in the order of |det Hessian|
+ * @property {Float32Array} sigmas scales in pixels
+ * @property {Float32Array} logits scores of the ranker
+ * @property {Uint32Array} strengthRanks ranks by |det Hessian|
  */
 
 /**
  * @param {{x: Float32Array, y: Float32Array, sigmas: Float32Array, logits: Float32Array}} candidates
- *   the strongest first; behind the last some may have logits of -infinity
+ *   strongest first, padded with entries whose logit is -infinity
  * @returns {Ranking}
  */
 export function rankingOf({ x, y, sigmas, logits }) {
   const end = logits.indexOf(-Infinity);
-  // Of equals the stronger one comes first, as in the package.
+  // Among equal logits the stronger candidate comes first, as in the package.
   const order = Uint32Array.from((end < 0 ? logits : logits.subarray(0, end)).keys())
     .sort((a, b) => logits[b] - logits[a] || a - b);
   return {

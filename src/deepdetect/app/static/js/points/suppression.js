@@ -1,23 +1,23 @@
-// Greedy suppression of points, as `deepdetect.features.selection` does it.
+// Greedy suppression of points, as in `deepdetect.features.selection`.
 
-const DISTANCE_STEP_PX = 0.25; // to which the distance of `spreadByDistance` is found
+const DISTANCE_STEP_PX = 0.25; // accuracy of the distance of `spreadByDistance`
 
 /**
- * Goes through points, best first, and keeps those that are not near a kept one.
+ * Keeps points, best first, that are not near one already kept.
  *
- * @param {Float32Array} xy x0, y0, x1, y1, ... inside of the picture
+ * @param {Float32Array} xy x0, y0, x1, y1, ... inside the image
  * @param {{width: number, height: number}} picture
- * @param {Uint32Array} rows of the points, in the order in which they are gone through
- * @param {Float64Array} radii of all points: near is closer than the smaller radius of both
- * @param {number} least of the radii
- * @param {number} limit no more than this many are needed
- * @returns {Uint32Array} the rows that are kept
+ * @param {Uint32Array} rows rows of the points, best first
+ * @param {Float64Array} radii radii of all points: near means closer than the smaller of two radii
+ * @param {number} least smallest radius
+ * @param {number} limit largest number of points to keep
+ * @returns {Uint32Array} rows that are kept
  */
 export function suppressNeighbors(xy, { width, height }, rows, radii, least, limit = rows.length) {
   const columns = Math.floor(width / least) + 1;
   const lines = Math.floor(height / least) + 1;
-  const heads = new Int32Array(columns * lines).fill(-1); // the last kept point of each cell
-  const before = new Int32Array(rows.length); // the one that was kept in the same cell before it
+  const heads = new Int32Array(columns * lines).fill(-1); // last kept point of each cell
+  const before = new Int32Array(rows.length); // point kept before it in the same cell
   const kept = new Uint32Array(Math.min(rows.length, limit));
   let count = 0;
   const isNear = (x, y, radius, column, line) => {
@@ -49,7 +49,7 @@ export function suppressNeighbors(xy, { width, height }, rows, radii, least, lim
 }
 
 /**
- * The best points that are as far from each other as their number allows: adaptive non-maximal
+ * Returns the best points at the largest distance that their number allows: adaptive non-maximal
  * suppression (Brown, Szeliski and Winder, 2005), by bisection of the distance.
  *
  * @param {Uint32Array} rows best first @returns {Uint32Array} rows
@@ -72,10 +72,10 @@ export function spreadByDistance(xy, picture, rows, count) {
   return best.slice(0, count);
 }
 
-/** In turn the best of each cell of a grid; rows stay in their order. */
+/** Chooses the best point of each cell of a grid, then the second best, and so on. */
 export function spreadOverGrid(xy, { width, height }, rows, count, gridCells) {
   const side = Math.max(width, height) / gridCells;
-  const filled = new Uint32Array((gridCells + 1) ** 2); // how many points of each cell have come
+  const filled = new Uint32Array((gridCells + 1) ** 2); // number of points seen in each cell
   const turns = [];
   for (const row of rows) {
     const cell = Math.floor(Math.max(xy[2 * row + 1], 0) / side) * (gridCells + 1)

@@ -1,4 +1,4 @@
-// The heat map of a picture, over the picture.
+// View of the heat map over its image.
 import { findHeatMap } from "../detection.js";
 import { drawHeatMap, showPicture } from "../draw.js";
 import { savePng, stem } from "../downloads.js";
@@ -7,7 +7,7 @@ import { activePicture, element, onceAFrame, page, reported } from "../page.js";
 const view = element("view-heatmap");
 const form = view.querySelector("form");
 
-/** Shows the picture, and its heat map when there is one. */
+/** Shows the image, and its heat map once it is computed. */
 export async function show() {
   draw();
   const picture = activePicture();

@@ -1,4 +1,4 @@
-// The keypoints of a picture: which ones, how many, and files of them.
+// View of the keypoints of an image, with controls and downloads.
 import { anglesOf, findHeatMap, findPoints, isRanked } from "../detection.js";
 import { composeKeypoints, drawCircles, drawPixels, showPicture } from "../draw.js";
 import { save, savePng, stem, toCsv, toJson } from "../downloads.js";
@@ -10,30 +10,30 @@ import { select } from "../selection.js";
 const NUMBERS = [10, 20, 50, 100, 200, 300, 500, 750, 1000, 1500, 2000, 3000, 4000, 5000, 7500,
                  10_000, 15_000, 20_000, 30_000, 50_000];
 
-/** What a kind of keypoints needs of a picture, and what is said of it. */
+/** The kinds of keypoints: how they are found and chosen, and a hint about them. */
 const KINDS = {
   dense: {
     find: findHeatMap, isFound: (picture) => picture.map, choose: chooseDense,
-    hint: "Every pixel that passes, of photographs over two megapixels in the reduced picture.",
+    hint: "All pixels that pass. Images over two megapixels are scaled down first.",
   },
   points: {
     find: (picture) => findPoints(picture), isFound: (picture) => isRanked(picture), choose: chooseOfAllScales,
-    hint: "The best places of all scales to find again in another photograph, with their sizes, as "
-      + "PointDetector(N) gives them. The network is not run for them.",
+    hint: "The points of all scales that are easiest to find again in another image, with their sizes, "
+      + "as from PointDetector(N). The network is not run for them.",
   },
 };
 const SPREADS = {
-  none: "The best, wherever they are.",
-  grid: "In turn the best of each cell: 16 cells along the longer side.",
-  anms: "As far from each other as their number allows (adaptive non-maximal suppression).",
+  none: "The best points, wherever they are.",
+  grid: "The best point of each cell in turn, with 16 cells along the longer side.",
+  anms: "Points as far from each other as their number allows (adaptive non-maximal suppression).",
 };
 
 const view = element("view-keypoints");
 const form = view.querySelector("form");
-let shown = null; // the last selection: what is drawn and downloaded
-let isAwaited = false; // the number of keypoints is said when it is there
+let shown = null; // the last selection, which is drawn and downloaded
+let isAwaited = false; // whether to announce the next number of keypoints
 
-/** What the controls say. */
+/** Returns the state of the controls. */
 function options() {
   const chosen = new FormData(form);
   const density = chosen.get("by") === "density";
@@ -67,15 +67,15 @@ function showControls({ kind, density, threshold, spread }) {
 }
 
 /**
- * What is chosen of a picture.
+ * The chosen keypoints of an image.
  *
  * @typedef {object} Selection
  * @property {number} count
- * @property {string} what it is, for those who hear the page
+ * @property {string} what a description for screen readers
  * @property {(overlay: HTMLCanvasElement, unit: number) => void} draw
- * @property {string[]} columns of its files
- * @property {() => number[][] | Promise<number[][]>} rows in the photograph's own pixels
- * @property {object} options of Python that give the same, in the picture as it was seen
+ * @property {string[]} columns names of the columns in files
+ * @property {() => number[][] | Promise<number[][]>} rows in pixels of the original image
+ * @property {object} options options of Python that give the same keypoints in the scaled image
  */
 
 /** @returns {Selection} */
@@ -118,7 +118,7 @@ function chooseOfAllScales(picture, { maxKeypoints, spread }) {
   };
 }
 
-/** Shows the picture, and its keypoints once they are there. */
+/** Shows the image, and its keypoints once they are found. */
 export async function show() {
   draw();
   const picture = activePicture();
@@ -126,12 +126,12 @@ export async function show() {
   try {
     await KINDS[options().kind].find(picture);
   } catch (error) {
-    if (page.pictures.includes(picture)) throw error; // of one that was removed nobody asks
+    if (page.pictures.includes(picture)) throw error; // errors of removed images do not matter
   }
-  if (!shown) draw(); // a slider that was moved meanwhile waits here for each of its moves
+  if (!shown) draw(); // each move of a slider meanwhile has waited here
 }
 
-/** Shows the picture alone. */
+/** Shows the image without keypoints. */
 export function preview() {
   shown = null;
   const picture = activePicture();

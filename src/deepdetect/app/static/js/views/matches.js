@@ -1,4 +1,4 @@
-// Matches of two pictures by descriptors, their lines, and the geometry that they agree with.
+// View of the matches of two images by descriptors, and of their geometry.
 import { Background } from "../background.js";
 import { describe, findPoints } from "../detection.js";
 import { drawMatches, nearestLine, newCanvas } from "../draw.js";
@@ -6,13 +6,13 @@ import { save, savePng, stem, toCsv, toJson } from "../downloads.js";
 import { allRescaled, announce, counted, during, element, onceAFrame, page, reported, toOriginal } from "../page.js";
 import { candidatesFor, choosePoints } from "../points/detection.js";
 
-const NARROW_PX = 640; // below it the pictures stand above each other
+const NARROW_PX = 640; // on a narrower page, the images are stacked
 const SAVED_WIDTH_PX = 1600;
 const MAX_ZOOM = 8;
-const MAX_WIDTH_PX = 4096; // of a canvas: an enlarged one is not drawn finer
-const HOVER_PX = 8; // of the screen, from a line
+const MAX_WIDTH_PX = 4096; // largest width of a canvas; further zooming only enlarges its pixels
+const HOVER_PX = 8; // distance of the pointer from a line, in pixels of the screen
 const MODELS = {
-  homography: "one homography: a plane, or a turn of the camera",
+  homography: "one homography: a plane, or a rotated camera",
   fundamental: "one epipolar geometry: a scene with depth",
 };
 
@@ -21,11 +21,11 @@ const form = view.querySelector("form");
 const stage = view.querySelector(".stage");
 const canvas = view.querySelector(".lines");
 const background = new Background(new URL("../matching_worker.js", import.meta.url));
-let found = null; // mutual matches of the pictures with their ratios
-let pending = null; // the matching that is at work, or was the last
-let kept = null; // those under the ratio, with their geometry
-let [zoom, lines, hovered] = [1, [], null]; // how the matches are drawn
-let [matchings, filterings, comparisons] = [0, 0, 0]; // how many were begun: only what the last one finds is shown
+let found = null; // mutual matches of the images, with their ratios
+let pending = null; // the running matching, or the last one
+let kept = null; // matches that pass the ratio test, with their geometry
+let [zoom, lines, hovered] = [1, [], null]; // state of the drawing
+let [matchings, filterings, comparisons] = [0, 0, 0]; // numbers of starts: only the last one's result counts
 
 export const matchingTask = (task, values) => background.call(task, values);
 
@@ -38,7 +38,7 @@ function showControls() {
   form.querySelector('output[for="thickness"]').textContent = element("thickness").value;
 }
 
-/** The described points of a picture, and the size that they were found in. */
+/** Returns the described points of an image, and the image size in which they were found. */
 async function pointsOf(picture, number) {
   await findPoints(picture, candidatesFor(number));
   const { width, height } = picture.ranking;
@@ -46,7 +46,7 @@ async function pointsOf(picture, number) {
   return { width, height, xy, ...await during("Describing points…", describe(picture, { xy, sizes })) };
 }
 
-/** Matches the pictures where that has not been done, and finds their geometry. */
+/** Matches the images, unless that is done, and estimates their geometry. */
 export async function match() {
   showControls();
   const [first, second] = page.pictures;
@@ -54,7 +54,7 @@ export async function match() {
   const key = [first, second, count()];
   const same = (other) => other?.key.every((value, k) => value === key[k]);
   if (!same(pending)) {
-    const own = ++matchings; // what is at work for other options is not wanted any more
+    const own = ++matchings; // the result of a running matching with other options is dropped
     pending = { key, done: same(found) ? null : matchNew(key, () => own === matchings) };
   }
   const own = pending;
@@ -62,12 +62,12 @@ export async function match() {
     await own.done;
   } catch (error) {
     if (own !== pending) return;
-    pending = null; // it may be tried again
+    pending = null; // allows another attempt
     throw error;
   }
 }
 
-/** Matches pictures, and finds the geometry of their matches. */
+/** Matches images, and estimates the geometry of their matches. */
 async function matchNew(key, isWanted) {
   const [first, second, number] = key;
   const pictures = [];
@@ -84,20 +84,20 @@ async function matchNew(key, isWanted) {
   reported(compareWithSift);
 }
 
-/** Says how many matches SIFT finds in the same pictures, where that is asked for. */
+/** Shows how many matches SIFT finds in the same images, if the user wants that. */
 async function compareWithSift() {
   const [own, output] = [++comparisons, element("sift-count")];
   output.textContent = "";
   if (!found || !element("sift").checked) return;
   const [first, second, number] = found.key;
   const pictures = [first, second].map(({ ranking: { gray, width, height } }) => ({ gray, width, height }));
-  const sift = await during("Matching by SIFT…", background.call("sift", { pictures, count: number }));
+  const sift = await during("Matching with SIFT…", background.call("sift", { pictures, count: number }));
   if (own !== comparisons) return;
   output.textContent = `SIFT: ${counted(sift.matches, "match")}, of which ${
     sift.agreeing.toLocaleString("en")} agree with one geometry.`;
 }
 
-/** Keeps the matches under the ratio, and estimates the geometry that they agree with. */
+/** Keeps the matches that pass the ratio test, and estimates their geometry. */
 async function filter() {
   showControls();
   if (!found) return;
@@ -118,13 +118,13 @@ async function filter() {
   announce(element("match-count").textContent);
 }
 
-/** The matches with their geometry, once they are there. */
+/** Returns the matches with their geometry, once they are found. */
 export async function matched() {
   await match();
   return kept;
 }
 
-/** Which rows are drawn and saved. */
+/** Returns the rows of matches that are drawn and saved. */
 function rowsShown() {
   const only = element("agreeing").checked && kept.model !== "none";
   return [...kept.ratios.keys()].filter((k) => !only || kept.inliers[k]);
@@ -145,7 +145,7 @@ export function draw() {
   const text = counted(kept.ratios.length, "match");
   element("match-count").textContent = text;
   const doubt = kept.ratios.length ? "No geometry explains them better than chance: most may be wrong."
-                                   : "Nothing in one picture is like anything in the other.";
+                                   : "The two images have nothing similar.";
   const hint = kept.model === "none" ? doubt
     : `${agreeing.toLocaleString("en")} agree with ${MODELS[kept.model]}.`;
   const sample = lines.length < rowsShown().length ? ` ${lines.length} of them are drawn.` : "";
@@ -163,7 +163,7 @@ function paint(target, width, stacked, lineWidth) {
                      { stacked, width, thickness, hovered });
 }
 
-/** Rows of x0, y0, x1, y1, score and inlier, in the photographs' own pixels. */
+/** Returns rows of x0, y0, x1, y1, score and inlier, in pixels of the original images. */
 function rowsSaved() {
   const place = (picture, points, k) => toOriginal(picture, points[2 * k], points[2 * k + 1]);
   return rowsShown().map((k) => [...place(kept.first, kept.points0, k),
@@ -188,7 +188,7 @@ const downloads = {
   },
 };
 
-/** Forgets the matches of pictures that are gone. */
+/** Drops the matches of removed images. */
 export function reset() {
   [found, pending, kept] = [null, null, null];
   [zoom, lines, hovered] = [1, [], null];
@@ -200,7 +200,7 @@ export function reset() {
   element("match-hint").textContent = "";
 }
 
-/** Enlarges the matches; what is at a place of the window stays there. */
+/** Zooms the matches; the point at a position of the window stays there. */
 function enlarge(factor, clientX, clientY) {
   const before = canvas.getBoundingClientRect();
   zoom = Math.max(1, Math.min(MAX_ZOOM, zoom * factor));
@@ -213,7 +213,7 @@ function enlarge(factor, clientX, clientY) {
 function setUpStage() {
   const redraw = onceAFrame(draw);
   stage.addEventListener("wheel", (event) => {
-    if (!kept || event.deltaY >= 0 && zoom === 1) return; // the page scrolls
+    if (!kept || event.deltaY >= 0 && zoom === 1) return; // lets the page scroll
     event.preventDefault();
     enlarge(Math.exp(-event.deltaY * (event.deltaMode ? 0.05 : 0.0015)), event.clientX, event.clientY);
   }, { passive: false });

@@ -1,13 +1,13 @@
-// What Python does better: matching, registration, panoramas, 3D models, folders.
+// View of tasks that run in Python: guided matching, registration, panoramas, 3D models, folders.
 import { Task } from "../jobs.js";
 import { save } from "../downloads.js";
 import { announce, element, page, showError } from "../page.js";
 import { compare } from "./wipe.js";
 
-let work = null; // the task that is at work: what was asked, and whether it was cancelled
-let last = null; // the task that was begun last
-let given = ""; // the number that a task takes
-let urls = []; // of files of the result that is shown
+let work = null; // the running task: its kind, and whether it was cancelled
+let last = null; // the task that was started last
+let given = ""; // the number that the user has entered for a task
+let urls = []; // addresses of files of the displayed result
 
 export function setUp() {
   element("job-cancel").onclick = () => cancel();
@@ -51,18 +51,18 @@ function askForFolder(use) {
   const input = element("folder");
   input.onchange = () => {
     const { suffixes } = page.server;
-    const files = [...input.files] // those that Python takes of a folder, in its order
+    const files = [...input.files] // the files that Python would take from a folder, in its order
       .filter(({ name, webkitRelativePath: path }) => !/\/\./.test(path)
         && suffixes.some((suffix) => name.toLowerCase().endsWith(suffix)))
       .sort((a, b) => a.webkitRelativePath.localeCompare(b.webkitRelativePath, "en", { numeric: true }));
     input.value = "";
     if (files.length) use(files);
-    else showError("There is no picture in this folder: choose another one.");
+    else showError("There are no images in this folder: choose another one.");
   };
   input.click();
 }
 
-/** Says which tasks can be done with the pictures that are there. */
+/** Enables the tasks that can run with the present images. */
 export function show() {
   element("pair-tasks").hidden = page.pictures.length === 0;
   for (const each of page.server?.tasks ?? []) {
@@ -81,7 +81,7 @@ async function run(each, files, showWipe) {
   work = last = own;
   const options = Number(given) > 0 && "focal_px" in each.options ? { focal_px: Number(given) } : {};
   const tell = (...told) => own.cancelled || progress(each.title, ...told);
-  tell("sending the pictures", 0, 0);
+  tell("sending the images", 0, 0);
   show();
   try {
     own.task = await Task.start(each.kind, files, options);
@@ -90,7 +90,7 @@ async function run(each, files, showWipe) {
   } catch (error) {
     if (!own.cancelled) showError(error.message);
   } finally {
-    if (work === own) { // after a cancelled task another one may be at work
+    if (work === own) { // after a cancelled task, another one may be running
       work = null;
       end(each.kind);
     }
@@ -98,7 +98,7 @@ async function run(each, files, showWipe) {
   }
 }
 
-/** Lets the next task begin; those who use the keyboard are back where they were. */
+/** Allows the next task, and moves the keyboard focus back to the button of this one. */
 function end(kind) {
   const focused = element("job-progress").contains(document.activeElement);
   element("job-progress").hidden = true;
@@ -111,7 +111,7 @@ function progress(title, stage, done, total) {
   if (element("job-progress").hidden) {
     element("job-progress").hidden = false;
     element("job-empty").hidden = true;
-    element("job-cancel").focus(); // the button that was pressed can no longer be
+    element("job-cancel").focus(); // the pressed button is now disabled
   }
   const text = `${title}: ${stage}`;
   if (element("job-stage").textContent !== text) announce(text);
@@ -138,7 +138,7 @@ async function cancel() {
 
 async function showResult(own, { numbers, shown, files }, showWipe) {
   const { each, task } = own;
-  // All files are fetched before the server forgets them.
+  // Fetch all files before the server removes them.
   const blobs = new Map();
   for (const name of new Set([shown, ...files])) blobs.set(name, await task.file(name));
   if (own.cancelled) return;
@@ -170,7 +170,7 @@ async function showResult(own, { numbers, shown, files }, showWipe) {
   announce(`${each.title} is done: ${Object.entries(numbers).map((pair) => pair.join(" ")).join(", ")}`);
 }
 
-/** The viewer of a model in a frame of its own; the promise holds when it is there. */
+/** Returns a frame with the viewer of a model; its promise `loaded` settles when it is loaded. */
 function modelFrame(address) {
   const frame = document.createElement("iframe");
   frame.title = "3D model";
@@ -213,7 +213,7 @@ function clear() {
   element("job-numbers").replaceChildren();
 }
 
-/** Ends the task of pictures that are gone, and forgets its result; folders stay. */
+/** Ends the task of removed images and drops its result; tasks for folders stay. */
 export function reset() {
   if (last?.each.folder) return show();
   cancel();

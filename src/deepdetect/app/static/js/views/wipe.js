@@ -1,22 +1,22 @@
-// Before and after: the second picture in the frame of the first, up to a line that moves.
+// Comparison of two images: the second is warped to the first, and shown right of a movable line.
 import { canvasOf, newCanvas, showPicture } from "../draw.js";
 import { savePng, saveVideo, stem } from "../downloads.js";
 import { during, element, page, reported } from "../page.js";
 import { matched, matchingTask } from "./matches.js";
 
-const VIDEO_S = 4; // the line goes there and back
+const VIDEO_S = 4; // length of the video, in which the line moves across and back
 
 const view = element("view-wipe");
 const layers = view.querySelector(".layers");
-let shown = null; // the pictures that are compared, and the second one as it is drawn
+let shown = null; // the first image, and the second one as it is drawn over it
 
-/** Draws the second picture over the first one, registered where one homography fits. */
+/** Draws the second image over the first one, warped if a homography fits. */
 export async function prepare() {
   const [first, second] = page.pictures;
   view.querySelector(".empty").hidden = Boolean(second);
-  layers.hidden = !second || !shown; // of other pictures
+  layers.hidden = !second || !shown; // hides a comparison of other images
   if (!second) return;
-  if (shown?.given === first) return draw(); // what Python has registered
+  if (shown?.given === first) return draw(); // registered by Python
   const isCurrent = () => page.pictures[0] === first && page.pictures[1] === second;
   const matches = await matched();
   if (!isCurrent()) return;
@@ -30,21 +30,21 @@ export async function prepare() {
   }));
   if (!isCurrent() || shown?.given === first) return;
   show(first, canvasOf(rgba, first.width, first.height), fits
-    ? "The second picture is registered to the first, by the homography of their matches."
-    : "No homography aligns these pictures, so the second one is only stretched to the same size.");
+    ? "The second image is registered to the first, by the homography of their matches."
+    : "No homography aligns these images, so the second one is only stretched to the same size.");
   shown.matches = matches;
 }
 
-/** Shows the second picture as Python has registered it. */
+/** Shows the second image as Python has registered it. */
 export function compare(bitmap) {
   const [first] = page.pictures;
   const canvas = newCanvas(first.width, first.height);
   canvas.getContext("2d").drawImage(bitmap, 0, 0, first.width, first.height);
-  show(first, canvas, "The second picture is registered to the first by guided matching, in Python.");
+  show(first, canvas, "The second image is registered to the first by guided matching, in Python.");
   shown.given = first;
 }
 
-/** Shows a picture and another one in its frame. */
+/** Shows an image and another one in its frame. */
 function show(first, warped, hint) {
   shown = { first, warped };
   const [below, above] = view.querySelectorAll("canvas");
@@ -63,7 +63,7 @@ export function draw() {
   view.querySelector(".edge").style.left = `${share}%`;
 }
 
-/** Draws the pictures of a comparison on a canvas of their size, the line at a share of the width. */
+/** Draws both images on a canvas of their size, with the line at a share of the width. */
 function compose(canvas, { first, warped }, share) {
   const context = canvas.getContext("2d");
   const edge = Math.round(first.width * share);
