@@ -167,7 +167,7 @@ def test_a_second_run_reads_what_the_first_has_kept(folder: Path, tmp_path: Path
 
 def test_too_few_matches_are_a_failure_not_an_error(folder: Path) -> None:
     (pair,) = load_posed_scenes(folder)[0].pairs
-    nothing = np.empty((0, 2)), np.empty((0, 2)), 1.0, "", ""
+    nothing = np.empty((0, 2)), np.empty((0, 2)), 1.0, ""
     found = pose_row(Run(folder), PoseMethod("nothing", "Nothing", lambda _: nothing), pair)
     assert found["rotation error, °"] == found["pose error, °"] == INF
     assert (found["matches"], found["agreeing within 1 px"]) == (0, 0.0)
