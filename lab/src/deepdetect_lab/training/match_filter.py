@@ -84,11 +84,12 @@ WEIGHT_DECAY = 0.01
 """Weight decay, the default of AdamW."""
 
 LEFT_OUT_SHARE, FEWEST_SHARE = 0.5, 0.02
-"""In the first share of the pairs, some matches are randomly left out. At least the second share of
-the matches stays. It is only 2 %, since the filter is meant for pairs with few matches."""
+"""The first is the share of the pairs in which some matches are randomly left out. The second is
+the smallest share of matches that stay. It is only 2 %, since the filter is meant for pairs with
+few matches."""
 
 TURNED_SHARE = 0.3
-"""In this share of the pairs, both images are rotated together by any angle. Chosen by hand."""
+"""Share of the pairs of which both images are rotated together by any angle. Chosen by hand."""
 
 VALIDATION_SEED = 1
 """Seed of the validation pairs, which does not depend on the seed of the run."""

@@ -131,8 +131,9 @@ at 99 % of all places, and at most 0.5 pixels."""
 
 @dataclass(frozen=True)
 class View:
-    """The map from a view to a photograph: a displacement (S, S, 2) by a relief in pixels, followed
-    by a homography.
+    """The map from a view to a photograph: a homography after a displacement by a relief, if any.
+
+    The relief holds a displacement in pixels, (S, S, 2), for each pixel of the view.
     """
 
     matrix: np.ndarray
@@ -197,8 +198,9 @@ class Pose:
 def draw_layers(
     rng: np.random.Generator, files: Sequence[Path], side_px: int = SIDE_PX
 ) -> tuple[list[Layer], list[float], float]:
-    """Draw a scene; return its layers from back to front, the scale of each view, and the absolute
-    angle in radians between the views.
+    """Draw a scene: its layers from back to front, the scale of each view, and the angle between.
+
+    The angle is the absolute rotation between the two views, in radians.
     """
     photograph = _draw_photograph(rng, files)
     middle = np.array(photograph.shape[1::-1]) / 2 + rng.uniform(-OFFSET_PX, OFFSET_PX, 2)
@@ -326,7 +328,7 @@ def correspond(
 
     `tops` holds the number of the top layer in each pixel of both views. Returns the positions
     (N, 2) in the second view, the Jacobians (N, 2, 2) of the map, and whether each position is
-    visible in both views (N,).
+    visible in the second view (N,).
     """
     there, jacobians = np.zeros_like(xy), np.zeros((len(xy), 2, 2))
     layer_of, visible = _at(tops[0], xy), np.zeros(len(xy), bool)
