@@ -52,9 +52,9 @@ MIN_GROWTH = 0.02
 second view, because these surfaces are seen at a grazing angle."""
 
 CLEAN_SHARE, RANDOM_SHARE = 0.6, 0.7
-"""In the first share of the pairs, keypoints are detected before light and noise are changed, to
-simulate a repeatable detector. In the second share, random keypoints are taken instead of the
-strongest."""
+"""The first is the share of the pairs whose keypoints are detected before light and noise are
+changed, to simulate a repeatable detector. The second is the share with random keypoints instead of
+the strongest."""
 
 JITTER_PX = 0.5
 """Keypoints in the first view are moved by up to half a pixel along each axis, like positions that
