@@ -196,9 +196,7 @@ def compress(image: np.ndarray, quality: int) -> np.ndarray:
     kind = [cv2.IMWRITE_JPEG_QUALITY, quality]
     if image.ndim == 2:
         return cv2.imdecode(cv2.imencode(".jpg", image, kind)[1], cv2.IMREAD_GRAYSCALE)
-    bgr = cv2.cvtColor(
-        image, cv2.COLOR_RGB2BGR
-    )  # OpenCV's order, so that JPEG computes the right luma
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)  # OpenCV's order, for the luma of JPEG
     stored = cv2.imencode(".jpg", bgr, kind)[1]
     return cv2.cvtColor(cv2.imdecode(stored, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
