@@ -32,7 +32,7 @@ class Darkening:
 
 
 BRIGHTNESS, CONTRAST = (0.2, 0.45), (0.3, 0.55)
-"""Ranges of the two factors of a `Darkening`. The product of the factors stays below 0.25, so that a
+"""Ranges of the two factors of a `Darkening`. The product of the factors stays below 0.25. So a
 darkened image spans fewer than 64 grey levels, the limit of low visibility."""
 
 # What `augment` draws from.
@@ -76,7 +76,7 @@ def darken(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:
 def transpose(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mirror a crop and its label along the diagonal.
 
-    Of all label detectors, only BRISK would label the mirrored crop differently.
+    BRISK is the only label detector that would label the mirrored crop differently.
     """
     # OpenCV copies a hundred times faster than a NumPy view.
     return cv2.transpose(image), cv2.transpose(mask.view(np.uint8)).view(bool)
