@@ -32,7 +32,7 @@ from .download import RemoteFile
 
 CROP_SIDE_PX = 480
 JPEG_QUALITY = 97
-"""At this JPEG quality labels hardly change, because compression errors are smaller than image
+"""Labels hardly change at this JPEG quality, because compression errors are smaller than image
 noise."""
 
 VALIDATION_SHARE = 1 / 20
