@@ -20,12 +20,11 @@ from deepdetect.geometry.transforms import transform_points
 from .homography import Sizes, project_visible
 
 CHANCE_POINTS = 20_000
-"""For the chance level of fewer keypoints, random points are drawn repeatedly up to this total
-number, so that the level has little noise. Chosen by hand; not measured."""
+"""Random points for the chance level are drawn repeatedly up to this total number, so that the
+level has little noise for few keypoints. Chosen by hand; not measured."""
 
 MAX_DRAWS = 100
-"""Largest number of draws for the chance level. Without a limit, few keypoints would need too
-many."""
+"""The chance level uses at most this number of draws, because few keypoints would need too many."""
 
 MIN_POINTS_FOR_THREADS = 20_000
 
