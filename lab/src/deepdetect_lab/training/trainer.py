@@ -189,7 +189,7 @@ class Trainer(abc.ABC):
                 log(line)
         measured = {point["step"] for point in state.points}
         if state.step in self.milestones and state.step not in measured:
-            self._validate(state, folder)  # first, or interrupted before
+            self._validate(state, folder)  # at the start or after an interruption
         started, pixels = time.monotonic(), 0
         saved = started
         bar = progress(self.steps, "training", "step", log is None, state.step)

@@ -50,7 +50,7 @@ def detect_hessian(gray: np.ndarray, sigma_px: float = SIGMA_PX) -> Keypoints:
 
 
 def detect_hessian_scales(gray: np.ndarray) -> Keypoints:
-    """Detect maxima at each scale; keypoints close to a better keypoint of any scale are removed."""
+    """Detect maxima at each scale, without those close to a better keypoint of any scale."""
     scales = [detect_hessian(gray, sigma) for sigma in SIGMAS_PX]
     xy, scores = (np.concatenate([getattr(p, name) for p in scales]) for name in ("xy", "scores"))
     sizes = np.repeat([SIZE_PER_SIGMA * sigma for sigma in SIGMAS_PX], [len(p) for p in scales])

@@ -47,8 +47,8 @@ MIN_MATCHES = 6
 """Five matches always fit an essential matrix exactly, so at least one more is needed."""
 
 NO_FAR_POINTS = 1e9
-"""Largest distance, in baselines, of points that count when OpenCV chooses one of four poses. The
-value is so large that all points count."""
+"""Points farther away than this, in baselines, do not count when OpenCV chooses one of four poses.
+The value is so large that all points count."""
 
 BUDGET = 8192
 RATIO = 0.8

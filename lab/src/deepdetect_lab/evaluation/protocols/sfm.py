@@ -280,7 +280,7 @@ Views = Mapping[str, PosedView]
 
 
 def _apart(views: Views, others: Views, truth: Views) -> float | None:
-    """Return the mean distance of the camera centres of two models, in units of the ground truth."""
+    """Return the mean distance between camera centres of two models, in the ground truth's unit."""
     names = sorted(set(views) & set(others))
     if len(names) < MIN_IMAGES:
         return None

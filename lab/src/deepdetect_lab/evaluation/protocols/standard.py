@@ -173,7 +173,10 @@ def _at_budget(
 
 
 def repeated(rows: Rows, budget: int | None, radius: float, name: str = "repeated") -> float | None:
-    """Return the mean repeatability, or with another name that value; None if unfilled."""
+    """Return the mean of a value of `pair_row`, by default the repeatability.
+
+    It is None if the methods do not fill the budget.
+    """
     filled = mean(rows, ("keypoints", budget))
     if filled is None or (budget is not None and filled < MIN_FILLED * budget):
         return None

@@ -157,7 +157,7 @@ def paper_points(
 
 
 def paper_settings(scene: CalibratedStereoPair) -> tuple[float, np.ndarray]:
-    """Return ratio and camera matrix of the authors, or for other scenes their usual ratio."""
+    """Return ratio and camera matrix from the authors, or the scene's own and their usual ratio."""
     camera = scene.calibration.camera0.matrix
     own = 0.9, camera[0, 0], camera[0, 2], camera[1, 2]
     ratio, focal, x, y = PAPER_SETTINGS.get(scene.name, own)
@@ -167,7 +167,7 @@ def paper_settings(scene: CalibratedStereoPair) -> tuple[float, np.ndarray]:
 def essential_inliers(
     points0: np.ndarray, points1: np.ndarray, camera_matrix: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the inliers of the essential matrix. They are triangulated only to include its time."""
+    """Return the inliers of the essential matrix. Triangulation is only run for its time."""
     if len(points0) < 6:
         return points0[:0], points1[:0]
     essential, inliers = cv2.findEssentialMat(
