@@ -48,7 +48,7 @@ class BenchmarkOptions:
         others: further local features.
         channels: order of the colour channels in the paper's protocol; the paper's code uses "bgr".
         geometry_weights: one or more weights for stereo pairs.
-        max_pairs: largest number of pairs per scene, evenly spaced. 1 takes the last pair.
+        max_pairs: largest number of pairs per scene, evenly spaced (1: the last pair).
         max_images: largest number of images per scene: the first images of a sequence, otherwise
             evenly spaced images.
         ranker: npz file of `deepdetect dev train-points` that ranks the keypoints. None: the
