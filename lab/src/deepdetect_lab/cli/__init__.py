@@ -10,7 +10,7 @@ COMMANDS = {
         ),
     },
 }
-"""Commands by group; each has the module of its function and a summary."""
+"""Commands by group. Each command has the module of its function, and a summary."""
 
 DEVELOPMENT = {
     "Measuring": {

@@ -58,7 +58,7 @@ def evaluate(
         deepdetect dev evaluate samples/ --oxford oxford/ --equal-density --compare other.onnx
 
     Args:
-        compare: Evaluate these weights too, beside the first; may be repeated.
+        compare: Evaluate these weights too, next to the first; may be repeated.
         scale: Score the images scaled by this factor too, on labels of their own; may be repeated.
             The images then need no masks.
     """
@@ -114,7 +114,7 @@ def evaluate_stereo(
     weights: list[str] | None = None,
     label_settings: list[str] | None = None,
 ) -> cli.Result:
-    """Match rectified stereo pairs and evaluate the matches by their true disparity.
+    """Match rectified stereo pairs and evaluate the matches with the true disparity.
 
     Matching uses neither the rectification nor the true disparity. A match is correct within 1 px.
     Random points of the same density and all pixels are the baselines.

@@ -67,7 +67,7 @@ RECIPE = cli.From(
 )
 DEVICE = cli.From(DeviceOptions, "device")
 SHARDS = replace(RECIPE, common="max_images augmentations", more="short_sides square val_fraction")
-"""Options of a recipe that cannot change after the labels are made."""
+"""Options of a recipe that must not change after the shards are written."""
 
 SHARD_SIZE = cli.From(write_shards, "shard_size", more="")
 ENGINE = replace(EXTRACTION, common="")
@@ -86,7 +86,7 @@ FILTER_RUN = replace(PAIRS_RUN, common="validation")
 def chosen_label_settings(
     detectors: str | None = None, label_settings: str | None = None
 ) -> LabelOptions:
-    """Find label settings by name or TOML file; given detectors replace its detectors.
+    """Find label settings by name or TOML file, and replace the detectors if others are given.
 
     Args:
         detectors: Detectors, separated by commas: sift, orb, brisk, fast, agast, harris,

@@ -17,8 +17,8 @@ from deepdetect._shared.image_array import srgb_to_linear
 from deepdetect._shared.opencv import cv2
 
 FULL_WELL = 10_000.0
-"""Mean number of electrons of white in full light, for each colour of each pixel. Shot noise is
-Poisson noise of this number. Chosen by hand; not measured."""
+"""Mean number of electrons for white in full light, per pixel and colour. The electrons follow a
+Poisson distribution, which gives the shot noise. Chosen by hand; not measured."""
 
 READ_NOISE = 3.0
 """Standard deviation of Gaussian read noise, in electrons. Chosen by hand; not measured."""
@@ -43,7 +43,7 @@ class Degradation:
 
 
 def degrade(rgb: np.ndarray, degradation: Degradation) -> np.ndarray:
-    """Return a degraded copy of (H, W, 3) uint8 sRGB; it is the same in every call."""
+    """Return a degraded copy of an image, (H, W, 3) uint8 sRGB, the same in every call."""
     own = int.from_bytes(hashlib.sha256(rgb.tobytes()).digest()[:8], "little")
     return degradation.apply(to_linear(rgb), np.random.default_rng([0, own]))
 
@@ -61,7 +61,7 @@ def to_srgb(linear: np.ndarray) -> np.ndarray:
 
 
 def darken(linear: np.ndarray, generator: np.random.Generator, fraction: float) -> np.ndarray:
-    """Simulate a photograph in a fraction of the light, with the same exposure and gain."""
+    """Simulate a photograph taken in a fraction of the light, with the same exposure and gain."""
     electrons = generator.poisson(linear * (fraction * FULL_WELL)).astype(np.float32)
     electrons += generator.normal(0, READ_NOISE, linear.shape).astype(np.float32)
     return to_srgb(electrons / FULL_WELL)
@@ -73,12 +73,12 @@ def blur_gaussian(linear: np.ndarray, _: np.random.Generator, sigma_px: float) -
 
 
 def blur_motion(linear: np.ndarray, generator: np.random.Generator, length_px: float) -> np.ndarray:
-    """Simulate uniform camera motion in a random direction, which the image determines."""
+    """Simulate uniform camera motion of a length in pixels, in a random direction."""
     return to_srgb(cv2.filter2D(linear, -1, motion_kernel(length_px, generator.uniform(0, np.pi))))
 
 
 def motion_kernel(length_px: float, angle: float) -> np.ndarray:
-    """Return the kernel of uniform motion along a line centred at the pixel; its sum is 1.
+    """Return the kernel, with sum 1, of uniform motion along a line centred at the pixel.
 
     The angle of the line is in radians, from x towards y.
     """

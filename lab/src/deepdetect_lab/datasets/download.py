@@ -27,10 +27,10 @@ from deepdetect.io.image import find_images
 from deepdetect.io.image_file import IMAGE_SUFFIXES
 
 CHUNK_BYTES = 1 << 16
-"""Downloads are written in blocks of this size, so that an interruption loses at most one."""
+"""Downloads are written in blocks of this size, so that an interruption loses at most one block."""
 
 TIMEOUT_SECONDS = 60.0
-"""A host is given up if it sends nothing for this long. Chosen by hand; not measured."""
+"""A host is given up if it sends nothing for this time. Chosen by hand; not measured."""
 
 ARCHIVE_SUFFIXES = (".zip", ".tar.gz", ".tgz", ".tar")
 
@@ -38,7 +38,7 @@ WRITE_ERRORS = (
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO),
     *(errno.EMFILE, errno.ENFILE),
 )
-"""Errors of the disk or the system; other errors of unpacking mean a bad archive."""
+"""Errors of the disk or the system. All other errors while unpacking mean a bad archive."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,9 @@ class RemoteFile:
     """A file to download.
 
     Attributes:
-        urls: addresses, the official host first, then mirrors; they are tried in this order.
+        urls: addresses in the order in which they are tried: the official host, then mirrors.
         size: approximate size in bytes.
-        checksum: "md5:..." or "sha256:..."; None: the contents of the data set are checked.
+        checksum: "md5:..." or "sha256:...". With None the data set's contents are checked instead.
         into: folder of the data set to unpack an archive into, or path of a single file.
         inside: folder of the archive whose contents are used.
         suffixes: endings of the files to unpack from a tar archive; empty for all files.
@@ -77,10 +77,10 @@ class RemoteDataset:
         files: archives to unpack, and single files.
         images: number of images.
         licence: the terms of use.
-        contents: `content_digest` of files by their path in the data set; it does not depend on
+        contents: `content_digest` of files by their path in the data set. It does not depend on
             the archive or the image format.
         texts: contents of text files to write, by path in the data set.
-        prepare: function that converts the unpacked files in a folder to the data set; its second
+        prepare: function that converts the unpacked files in a folder to the data set. Its second
             argument says whether progress bars are off.
     """
 
@@ -102,8 +102,8 @@ class RemoteDataset:
 def get_dataset(dataset: RemoteDataset, folder: str | Path, *, quiet: bool = True) -> Path:
     """Download and unpack a data set, unless the folder already holds it.
 
-    An interrupted download is resumed. The folder appears when all images are complete and correct;
-    then the archives are removed.
+    An interrupted download is resumed. The folder appears when all images are complete and correct.
+    Then the archives are removed.
 
     Args:
         dataset: the data set.
@@ -190,8 +190,8 @@ def has_checksum(path: Path, checksum: str) -> bool:
 def content_digest(folder: Path, name: str) -> str | None:
     """Return the SHA-256 of a file's content in any format; None if there is no such file.
 
-    Images are named without suffix. Their digest covers pixels, shape and type, so a lossless copy
-    in another format has the same digest. The digest of other files covers the words without white
+    The name of an image has no suffix. The digest of an image covers pixels, shape and type, so a
+    lossless copy in another format has the same digest. The digest of a text file ignores white
     space.
     """
     path = folder / name
@@ -274,7 +274,7 @@ def _assemble(dataset: RemoteDataset, paths: Sequence[Path], final: Path, quiet:
         _check(dataset, unfinished, "the download")
     except DeepDetectError:
         shutil.rmtree(unfinished)
-        for path in paths:  # otherwise the same wrong files would be used again
+        for path in paths:  # otherwise the next call would use the same wrong files
             path.unlink()
         raise
     if final.exists():
@@ -291,7 +291,7 @@ def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
         else:
             with tarfile.open(archive) as tar:
                 while tar.fileobj.read(CHUNK_BYTES):
-                    pass  # reads gzip to its end, where its checksum is
+                    pass  # reads a gzip file to its end, where its checksum is
                 endings = file.suffixes or ("",)
                 members = [m for m in tar if not m.isdir() and m.name.lower().endswith(endings)]
                 _extract(members, lambda one: _extract_file(tar, one, target), quiet)
@@ -308,7 +308,7 @@ def _unpack(file: RemoteFile, archive: Path, target: Path, quiet: bool) -> None:
 
 
 def _extract_file(tar: tarfile.TarFile, member: tarfile.TarInfo, target: Path) -> None:
-    """Extract a file of a tar archive into a folder; a link becomes a copy.
+    """Extract a file of a tar archive into a folder, as a copy if it is a link.
 
     Python's own filter for safe extraction exists only since 3.11.4.
     """

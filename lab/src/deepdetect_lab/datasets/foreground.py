@@ -1,6 +1,6 @@
 """Photographs with a mask of their foreground, for example ECSSD (Yan et al., 2013).
 
-A folder holds pairs NAME.jpg (or .png) and NAME_mask.png; masks are white on the foreground.
+A folder holds pairs NAME.jpg (or .png) and NAME_mask.png. Masks are white on the foreground.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class MaskedPhotograph:
 
 
 def load_foreground(folder: str | Path) -> list[MaskedPhotograph]:
-    """List the photographs with masks; raise an ImageError without any."""
+    """List the photographs with masks in a folder; raise an ImageError if there are none."""
     found = []
     for mask in sorted(Path(folder).glob("*_mask.png")):
         stem = mask.name.removesuffix("_mask.png")

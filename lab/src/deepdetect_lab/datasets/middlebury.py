@@ -6,8 +6,8 @@ says how grey values are converted to disparities in pixels::
     {"ground_truth": {"file": "disparity.png", "value_per_pixel": 4.0,
                       "resolution_factor": 1.0, "unknown": 0}}
 
-The disparity in pixels of the full-size image is the grey value divided by value_per_pixel;
-resolution_factor is the width of the disparity map divided by that of the image.
+The disparity in pixels of the full-size image is the grey value divided by value_per_pixel. The
+resolution_factor is the width of the disparity map divided by the width of the image.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from deepdetect.io.image_file import open_image
 
 @dataclass(frozen=True, eq=False)
 class StereoPair:
-    """Two rectified views; the left pixel (x, y) matches the right pixel (x - disparity, y).
+    """Two rectified views. The left pixel (x, y) matches the right pixel (x - disparity, y).
 
     Attributes:
         name: the scene's name.
@@ -50,7 +50,7 @@ class CalibratedStereoPair(StereoPair):
 
 
 def load_middlebury(folder: str | Path) -> StereoPair:
-    """Load a scene with its ground truth, at the size and in pixels of the images."""
+    """Load a scene with its ground truth, upscaled to the size of the images if it is smaller."""
     root, left, right = _load_views(folder)
     path = root / "calib.json"
     try:

@@ -1,4 +1,4 @@
-"""Choose, reproducibly, the pairs of a collection of images to match."""
+"""Choose image pairs of a collection for matching, in a reproducible way."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ Item = TypeVar("Item")
 
 
 FRAME_DISTANCES = (1, 3, 5, 10, 15, 20)
-"""Distances in frames between the images of a sequence's pairs. Chosen by hand; not measured."""
+"""Images of a pair from a sequence are this number of frames apart. Chosen by hand; not
+measured."""
 
 
 def unordered_pairs(count: int, max_pairs: int) -> list[tuple[int, int]]:
     """Choose all pairs of unordered images, or `max_pairs` evenly spaced ones if there are more."""
-    # Pairs are not listed, because ten thousand images have fifty million.
+    # Not all pairs are listed, because ten thousand images have fifty million pairs.
     ends = np.cumsum(np.arange(count - 1, 0, -1))
     ranks = np.array(evenly_spaced(range(count * (count - 1) // 2), max_pairs), int)
     first = np.searchsorted(ends, ranks, side="right")
@@ -27,7 +28,7 @@ def unordered_pairs(count: int, max_pairs: int) -> list[tuple[int, int]]:
 def sequence_pairs(
     frames: Sequence[int], max_pairs: int, distances: Sequence[int]
 ) -> list[tuple[int, int]]:
-    """Choose pairs of frame numbers, equally many at each distance and evenly spaced."""
+    """Choose evenly spaced pairs of frame numbers, equally many at each distance in frames."""
     existing = set(frames)
     starts_per_distance = max(1, max_pairs // len(distances))
     pairs = [

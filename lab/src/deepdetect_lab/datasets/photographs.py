@@ -1,7 +1,7 @@
 """Training photographs: crops of photographs in public repositories, each with its licence.
 
-Their list, `known/photographs.csv.gz`, was made by `benchmarks/list_photographs.py` of commit
-81b8253. It has no near-duplicates and no images of the data sets used for evaluation.
+`benchmarks/list_photographs.py` of commit 81b8253 made the list `known/photographs.csv.gz`. It has
+no near-duplicates and no images of the data sets used for evaluation.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ from .download import RemoteFile
 
 CROP_SIDE_PX = 480
 JPEG_QUALITY = 97
-"""Labels hardly change at this JPEG quality, because the loss is smaller than image noise."""
+"""Labels hardly change at this JPEG quality, because compression errors are smaller than image
+noise."""
 
 VALIDATION_SHARE = 1 / 20
 
@@ -40,7 +41,7 @@ FREE_LICENCES = ("CC0", "CC BY", "CC BY-SA", "Unsplash")
 """Prefixes of licences that allow any use, including use of weights trained on the images."""
 
 RESTRICTED = re.compile(r"\b(n[cd]|non-?commercial|no-?deriv\w*)\b", re.IGNORECASE)
-"""Restrictions in licences that begin like a free one."""
+"""Restrictions in the names of licences that begin like a free licence."""
 
 LICENCES_FILE = "licences.csv"
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
@@ -49,9 +50,9 @@ SOURCES_FOLDER = "sources"
 
 @dataclass(frozen=True)
 class Source:
-    """A GitHub repository "OWNER/NAME" at a commit; `megabytes` is the size of its archive.
+    """A GitHub repository "OWNER/NAME" at a commit, as source of crops.
 
-    The names of its crops begin with `name`.
+    `megabytes` is the size of its archive. The names of its crops begin with `name`.
     """
 
     name: str
@@ -97,18 +98,18 @@ class Crop:
 
     @property
     def is_free(self) -> bool:
-        """Whether the licence allows any use, as CC BY does, unlike CC BY-NC and CC BY-ND."""
+        """Whether the licence allows any use, like CC BY, and unlike CC BY-NC and CC BY-ND."""
         return self.licence.startswith(FREE_LICENCES) and not RESTRICTED.search(self.licence)
 
     @property
     def part(self) -> str:
-        """Part of the data set, "train" or "val"; it is the same for all crops of a photograph."""
+        """Part of the data set, "train" or "val", the same for all crops of a photograph."""
         return "val" if int(self.sha256[:8], 16) < VALIDATION_SHARE * 2**32 else "train"
 
 
 @cache
 def listed_crops() -> tuple[Crop, ...]:
-    """Return all crops, with those of a photograph in a row."""
+    """Return all crops. The crops of one photograph follow each other."""
     file = resources.files(__package__).joinpath("known/photographs.csv.gz")
     text = gzip.decompress(file.read_bytes()).decode()
     return tuple(
@@ -120,7 +121,7 @@ def listed_crops() -> tuple[Crop, ...]:
 def write_crops(folder: Path, quiet: bool, crops: Sequence[Crop]) -> None:
     """Replace the repositories in `sources` by crops in `train` and `val`, and licences.csv.
 
-    Crops of the same photograph must be in a row.
+    Crops of the same photograph must follow each other.
     """
     rows = [("file", "picture", "licence", "sha256")]
     with progress(len(crops), "cropping", "crop", quiet) as bar:
@@ -138,7 +139,7 @@ def write_crops(folder: Path, quiet: bool, crops: Sequence[Crop]) -> None:
 
 
 def _cut(sources: Path, crops: Sequence[Crop]) -> Iterator[tuple[Crop, Image.Image]]:
-    """Yield crops with their pixels; each photograph is read once for all of its crops."""
+    """Yield each crop with its image. A photograph is read once for all of its crops."""
     for listed, of_picture in groupby(crops, attrgetter("source", "path", "sha256")):
         source, path, sha256 = listed
         try:

@@ -34,14 +34,14 @@ NOT_IN_D2NET_SUBSET = {
     *("i_contruction", "i_crownnight", "i_dc", "i_pencils", "i_whitebuilding"),
     *("v_artisans", "v_astronautis", "v_talent"),
 }
-"""HPatches scenes above 1600x1200 pixels, which most papers leave out, as D2-Net's paper does."""
+"""HPatches scenes above 1600x1200 pixels. Most papers leave them out, for example D2-Net's."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlanarPair:
-    """Two images of a plane, or from one viewpoint; the number of the first image is 1.
+    """Two images of a plane, or from one viewpoint. The first is image number 1 of its scene.
 
-    The (3, 3) homography maps columns (x, y, 1) of the first image to the second; the centre of the
+    The (3, 3) homography maps columns (x, y, 1) of the first image to the second. The centre of the
     first pixel is (0, 0). `kind` is the change between the images, "" if unknown.
     """
 
@@ -71,7 +71,7 @@ class PlanarScene:
         return [self.pairs[0].first, *(pair.second for pair in self.pairs)]
 
     def with_max_pairs(self, max_pairs: int) -> PlanarScene:
-        """Return the scene with at most `max_pairs` evenly spaced pairs; 1 takes the last pair."""
+        """Return the scene with at most `max_pairs` evenly spaced pairs. 1 takes the last pair."""
         kept = self.pairs[-1:] if max_pairs == 1 else evenly_spaced(self.pairs, max_pairs)
         return replace(self, pairs=tuple(kept))
 
@@ -102,7 +102,8 @@ def load_oxford(
 def load_hpatches(folder: str | Path) -> list[PlanarScene]:
     """List the HPatches scenes in a folder, at most 116 (Balntas et al., 2017).
 
-    The folders i_NAME (light) and v_NAME (viewpoint) hold 1.ppm (or .png) to 6 and H_1_2 to H_1_6.
+    The folders i_NAME (light) and v_NAME (viewpoint) hold the images 1.ppm to 6.ppm (or .png) and
+    the homographies H_1_2 to H_1_6.
     """
     root = Path(folder)
     homographies = [f"H_1_{number}" for number in range(2, 7)]
@@ -138,7 +139,7 @@ def _load_scene(
 ) -> PlanarScene:
     """Load images PREFIX1, PREFIX2, ... and the homographies from the first to each other image.
 
-    Suffixes are tried in the given order; `layout` is a text that says what the folder must hold.
+    Suffixes are tried in the given order. `layout` is a text that says what the folder must hold.
     """
     files = []
     for number in range(1, len(homographies) + 2):

@@ -1,13 +1,13 @@
 """Read folders of images with known cameras, in three public layouts, or with GPS positions.
 
 - Strecha et al. (2008): NNNN.jpg or .png with NNNN.camera (or NNNN.jpg.camera).
-- KITTI odometry (Geiger et al., 2012): NNNNNN.png or .jpg with calib.txt, whose first line is the
-  projection matrix of the images' camera, or K.txt, its camera matrix, and poses.txt, whose line N
-  belongs to image N.
+- KITTI odometry (Geiger et al., 2012): NNNNNN.png or .jpg with calib.txt or K.txt, and with
+  poses.txt. The first line of calib.txt is the projection matrix of the camera. K.txt is its
+  camera matrix. Line N of poses.txt belongs to image N.
 - COLMAP (Schönberger and Frahm, 2016): a text or binary model without distortion in the folder, in
   sparse/ or in sparse/0/, and images in the folder or in images/. pycolmap reads the model.
 
-Intrinsics refer to the image files; if the camera is for another image size, they are scaled.
+Intrinsics refer to the image files. If a camera is given for another image size, they are scaled.
 """
 
 from __future__ import annotations
@@ -30,17 +30,18 @@ from .pair_selection import FRAME_DISTANCES, sequence_pairs, unordered_pairs
 SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 
 MAX_ROTATION_ERROR = 1e-3
-"""Rotations may deviate from orthonormal matrices by this much, since files have few digits."""
+"""Rotation matrices may deviate from orthonormal ones by this value, since files have few
+digits."""
 
 MAX_ASPECT_ERROR = 0.01
-"""Aspect ratios of image and camera may differ by this fraction, since sizes are rounded."""
+"""The aspect ratios of image and camera may differ by this fraction, since sizes are rounded."""
 
 COLMAP_FILES = ("images.bin", "images.txt")
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """An image and its camera; the centre of the first pixel is (0, 0).
+    """An image and its camera. The centre of the first pixel is (0, 0).
 
     Attributes:
         path: the image's file.
@@ -57,7 +58,7 @@ class PosedImage:
 
 @dataclass(frozen=True, eq=False)
 class PosedPair:
-    """Two images of a scene and their distance in frames, None for unordered images."""
+    """Two images of a scene. `frame_distance` is None for unordered images."""
 
     scene: str
     first: PosedImage
@@ -81,7 +82,7 @@ class PosedPair:
 
     @property
     def fundamental(self) -> np.ndarray:
-        """The (3, 3) fundamental matrix in pixels, x1^T F x0 = 0."""
+        """The (3, 3) fundamental matrix F in pixels, with x1^T F x0 = 0."""
         essential = cross_matrix(self.translation) @ self.rotation
         inverses = [np.linalg.inv(image.intrinsics) for image in (self.first, self.second)]
         return inverses[1].T @ essential @ inverses[0]
@@ -95,8 +96,8 @@ class PosedScene:
         name: name of the folder.
         images: all images, sorted by name.
         pairs: the chosen pairs.
-        located_only: whether only camera positions are known, in metres, from GPS; intrinsics and
-            rotations are then meaningless, and there are no pairs.
+        located_only: whether only camera positions are known, in metres, from GPS. Then intrinsics
+            and rotations are meaningless, and there are no pairs.
     """
 
     name: str
@@ -112,8 +113,8 @@ def load_posed_scenes(
 
     Args:
         folder: a scene in one of the three layouts, or a folder of scenes.
-        max_pairs: largest number of pairs of a scene. Pairs of unordered images are evenly spaced;
-            a sequence has equally many pairs at each of `FRAME_DISTANCES`.
+        max_pairs: largest number of pairs of a scene. Pairs of unordered images are evenly spaced.
+            A sequence has equally many pairs at each of `FRAME_DISTANCES`.
         located: also read folders whose first image has a GPS position.
 
     Raises:
@@ -168,7 +169,11 @@ def _load_scene(
 
 
 def _read_strecha(folder: Path) -> list[PosedImage]:
-    """Read K, a row of zeros, axes and centre of the camera in the world, and the image size."""
+    """Read the .camera files of a folder.
+
+    A file holds K, a row of zeros, the axes and the centre of the camera in the world, and the
+    image size.
+    """
     images = []
     for file in sorted(folder.glob("*.camera")):
         numbers = _numbers(_text(file).split(), 26, str(file))
@@ -213,7 +218,8 @@ def _read_kitti(folder: Path) -> list[PosedImage]:
         axes, centre = pose[:, :3], pose[:, 3]
         image = _posed_image(path, projection[:, :3], axes.T, -axes.T @ centre, where)
         _image_size(path)  # raises errors for damaged images and for EXIF rotations
-        # Poses are those of the first camera; the last column gives the images' offset from it.
+        # The poses are those of KITTI's first camera. The last column of the projection matrix
+        # gives the offset of the images' camera from it.
         offset = np.linalg.solve(image.intrinsics, projection[:, 3])
         images.append(replace(image, translation=image.translation + offset))
     return images
@@ -276,7 +282,7 @@ def _posed_image(
     translation: np.ndarray,
     where: str | Path,
 ) -> PosedImage:
-    """Check an image's camera and return both."""
+    """Check the camera of an image, and return the image with its camera."""
     wrong = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if wrong > MAX_ROTATION_ERROR or np.linalg.det(rotation) < 0:
         raise ImageError(f"{where} is not a rotation: its columns must be orthonormal")
@@ -292,7 +298,7 @@ def _posed_image(
 def _scaled(
     intrinsics: np.ndarray, size: tuple[float, float], image: Path, file: Path
 ) -> np.ndarray:
-    """Scale intrinsics of a (width, height) to the image so that image borders coincide."""
+    """Scale intrinsics from a size (width, height) to the image's; image borders coincide."""
     own = _image_size(image)
     if min(size) <= 0 or abs(own[0] * size[1] / (own[1] * size[0]) - 1) > MAX_ASPECT_ERROR:
         raise ImageError(

@@ -31,7 +31,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {
     "foreground": ("paper", "foreground"),
     "low-visibility": ("planar", "low_visibility"),
 }
-"""Each benchmark has a module of `protocols`, which is imported when it runs, and a function."""
+"""Benchmarks by name: a module of `protocols`, which is imported when it runs, and its function."""
 
 
 def run_benchmarks(
@@ -45,7 +45,8 @@ def run_benchmarks(
     """Run benchmarks of `BENCHMARKS` and collect their report.
 
     The data folder has a subfolder for each data set, or is the folder of the only data set.
-    Without a cache folder no results are kept. If data are missing, only their benchmark fails.
+    Without a cache folder no results are kept. If a data set is missing, only the benchmarks that
+    use it fail.
     """
     started = time.monotonic()
     entries = [look_up("benchmark", name, BENCHMARKS) for name in names]
@@ -75,7 +76,7 @@ def run_benchmarks(
 
 
 def _weights(names: Sequence[str], options: BenchmarkOptions) -> dict[str, str]:
-    """Return the names of the evaluated weights, with the beginning of their SHA-256."""
+    """Return the evaluated weights by name, with the beginning of their SHA-256."""
     files = {}
     if set(names) != {"middlebury"}:
         files["weights (SHA-256)"] = [options.detector.weights]

@@ -1,4 +1,4 @@
-"""Pictures of point clouds from any side, by matplotlib."""
+"""Draw point clouds from any direction with matplotlib."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from deepdetect.geometry.point_cloud import PointCloud, robust_box
 from deepdetect.viz.draw import add_caption, join_pictures
 
 DPI = 100
-"""Pixels to an inch, in which matplotlib counts."""
+"""Pixels per inch, because matplotlib takes sizes in inches."""
 
 POINT_AREA = 1.5
 """Area of a drawn point, in units of (1/72 inch)^2. It is 1.7 pixels wide, so that a surface with
 one point per image pixel has no gaps in side views."""
 
 ZOOM = 2.2
-"""Zoom of the plot; at 1 the robust box of a cloud fills less than half of the figure's width."""
+"""Zoom of the plot. At 1 the robust box of a cloud fills less than half of the figure's width."""
 
 
 def draw_cloud(
@@ -31,10 +31,10 @@ def draw_cloud(
     size: tuple[int, int] = (800, 600),
     like: PointCloud | None = None,
 ) -> np.ndarray:
-    """Draw a cloud on white, (H, W, 3) uint8; near points hide far ones.
+    """Draw a cloud on a white image, (H, W, 3) uint8. Near points hide far ones.
 
-    It is seen from the right (azimuth) and from above (elevation), in degrees; the robust box of
-    another cloud, or its own, fills the picture.
+    The camera is moved to the right by the azimuth and up by the elevation, in degrees. The robust
+    box of the cloud, or of the cloud `like`, fills the image.
     """
     figure = Figure((size[0] / DPI, size[1] / DPI), DPI)
     canvas: Any = FigureCanvasAgg(figure)
@@ -58,7 +58,7 @@ def draw_cloud(
 def draw_clouds(left: np.ndarray, clouds: Mapping[str, PointCloud], width: int = 796) -> np.ndarray:
     """Draw the left image and clouds by title in a grid of two columns.
 
-    All are seen from one place, which the one with the most points decides.
+    All clouds are drawn from the same viewpoint, which fits the cloud with the most points.
     """
     size = (width, max(1, round(width * left.shape[0] / left.shape[1])))
     shrinks = left.shape[1] > width

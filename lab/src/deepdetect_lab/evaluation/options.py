@@ -1,4 +1,4 @@
-"""Options of a benchmark, and the local features that it compares."""
+"""Options of benchmarks, and the local features that they compare."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from .baselines.random import all_pixels_feature, random_feature
 
 PROTOCOLS = ("paper", "standard", "guided", "degraded")
 DEFAULT_PROTOCOLS = PROTOCOLS[:3]
-"""The default leaves out "degraded", because it measures everything five times."""
+"""The default protocols do not include "degraded", because it measures everything five times."""
 
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
 PAPER_RESOLUTION_PX = 480
 
 BASELINES: dict[str, LocalFeature] = {**CLASSICAL, **HESSIAN}
-"""Classical baselines by name: those of the paper and those of the standard protocol only."""
+"""Classical baselines by name, from the paper and the standard protocol."""
 
 
 @suggest_keywords
@@ -48,9 +48,9 @@ class BenchmarkOptions:
         others: further local features.
         channels: order of the colour channels in the paper's protocol; the paper's code uses "bgr".
         geometry_weights: one or more weights for stereo pairs.
-        max_pairs: largest number of pairs per scene, evenly spaced; 1 takes the last pair.
-        max_images: largest number of images per scene: the first ones of a sequence, else evenly
-            spaced ones.
+        max_pairs: largest number of pairs per scene, evenly spaced (1: the last pair).
+        max_images: largest number of images per scene: the first images of a sequence, otherwise
+            evenly spaced images.
         ranker: npz file of `deepdetect dev train-points` that ranks the keypoints. None: the
             bundled file.
 
@@ -94,7 +94,7 @@ class BenchmarkOptions:
         return self.detector.configured(HeatmapOptions("native", self.channels))
 
     def deepdetect_native(self) -> LocalFeature:
-        """Return DeepDetect at native image resolution; all pixels over 0.5 are keypoints."""
+        """Return DeepDetect at native image resolution, with all pixels over 0.5 as keypoints."""
         title = "DeepDetect, native resolution, all pixels over 0.5"
         return deepdetect_feature(self.native_detector(), name="deepdetect-native", title=title)
 
@@ -144,7 +144,7 @@ class BenchmarkOptions:
 
 
 def without_repeats(features: Sequence[LocalFeature]) -> list[LocalFeature]:
-    """Remove repeated features; raise an OptionError if two different ones share a name."""
+    """Remove repeated features; raise an OptionError if two different features share a name."""
     by_name: dict[str, LocalFeature] = {}
     for feature in features:
         if by_name.setdefault(feature.name, feature).version != feature.version:

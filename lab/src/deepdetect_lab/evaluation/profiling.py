@@ -25,15 +25,15 @@ class Profile:
 
 
 _highest = 0
-"""The highest peak that was reset, in bytes."""
+"""Highest peak memory in bytes before the operating system's counter was last reset."""
 
 
 @contextmanager
 def profiled() -> Iterator[Profile]:
-    """Measure time and memory growth of a block; read the values after the block.
+    """Measure the time and memory growth of a block. The values are set after the block.
 
-    The memory is exact on Linux, which is told to forget the peak where a block begins; elsewhere a
-    peak counts where it is the highest of the process so far. No two blocks may run at a time.
+    On Linux the memory is exact, because the peak is reset when the block begins. On other systems
+    only a new highest peak of the process is noticed. Two blocks must not run at the same time.
     """
     global _highest
     _highest = peak_memory()
@@ -51,7 +51,7 @@ def peak_memory() -> int:
 
 
 def _memory(name: str) -> int:
-    """Return a memory value of /proc/self/status in bytes; the peak so far on other systems."""
+    """Return a memory value of /proc/self/status in bytes, or the peak memory on other systems."""
     # Linux's ru_maxrss includes the memory of the parent process; /proc/self/status is exact.
     with suppress(OSError), open("/proc/self/status", encoding="ascii") as status:
         return next(int(line.split()[1]) * 1024 for line in status if line.startswith(f"{name}:"))
@@ -66,14 +66,14 @@ def _memory(name: str) -> int:
 def run_in_child(function: Callable[..., Outcome], *arguments: Any) -> Outcome:
     """Call a module-level function in a new process, so that `peak_memory` measures only its work.
 
-    OpenCV and our kernels use one thread there. Errors of the function are passed on; a
+    OpenCV and our kernels use one thread in that process. Errors of the function are raised here. A
     DeepDetectError is raised if the process is killed.
     """
     import multiprocessing
     from concurrent.futures import ProcessPoolExecutor
     from concurrent.futures.process import BrokenProcessPool
 
-    # A forked process would start with all memory of this one, so a new one is spawned.
+    # A forked process would start with all memory of its parent, so a new process is spawned.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context, initializer=start_child) as pool:
         try:

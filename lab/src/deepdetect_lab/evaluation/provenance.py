@@ -18,7 +18,7 @@ PACKAGES = ("numpy", *DISTRIBUTIONS, "pillow", *RUNTIMES)
 
 
 def provenance() -> dict[str, str]:
-    """Return by name the values that every checkpoint, weights file and report records."""
+    """Return the command, versions and machine by name, for weights files and reports."""
     program, *arguments = sys.argv or [""]
     name = Path(program).name
     command = ["deepdetect" if name == "__main__.py" else name, *arguments]

@@ -26,12 +26,12 @@ Rows = list[Row]
 
 
 def where(rows: Iterable[Row], **wanted: Any) -> Rows:
-    """Return the rows that have these values."""
+    """Return the rows that have the wanted values."""
     return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
 
 
 def mean(rows: Iterable[Row], name: Any) -> float | None:
-    """Return the mean of the values of this name that are not NaN; None if there are none left."""
+    """Return the mean of the rows' values of this name without NaN; None if no value is left."""
     return mean_of(row[name] for row in rows)
 
 
@@ -45,8 +45,8 @@ def mean_of(values: Iterable[float | None]) -> float | None:
 class Table:
     """A table whose key, for example "oxford_matches", is the name of its file.
 
-    The columns give the format specification of their numbers, such as ",d", by title. The rows
-    have cells by title; one that is missing, None or NaN is a dash.
+    `columns` holds the number format of each column, such as ",d", by title. Rows hold cells by
+    column title. A cell that is missing, None or NaN is shown as a dash.
     """
 
     key: str
@@ -67,7 +67,7 @@ class Table:
         ]
 
     def to_markdown(self) -> str:
-        """Write the table in Markdown; names are aligned left, numbers right."""
+        """Write the table in Markdown, with names aligned left and numbers aligned right."""
 
         def line(cells: Iterable[str]) -> str:
             return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
@@ -129,7 +129,8 @@ def tabulate(
 ) -> Table:
     """Make a table from the rows of `Run.rows`, with a line for each method.
 
-    With groups, each combination of their values has its own lines, and they are the first columns.
+    With groups, each combination of their values has its own lines. The groups are the first
+    columns.
     """
     lines = []
     for group in groups:
@@ -165,8 +166,8 @@ class Section:
 class Report:
     """The report of a benchmark.
 
-    `metadata` describes the run. `skipped` lists what was not measured, with reasons; `failures`
-    are the requested measurements among them that failed.
+    `metadata` describes the run. `skipped` lists what was not measured, with reasons. `failures`
+    lists the requested measurements that failed.
     """
 
     title: str
@@ -180,7 +181,7 @@ class Report:
         return [table for section in self.sections for table in section.tables]
 
     def values(self) -> dict[str, Any]:
-        """Return the report as plain values: each row a dict by the columns' titles."""
+        """Return the report as plain values. Each row is a dict by column title."""
         return {
             "title": self.title,
             "metadata": self.metadata,
@@ -222,7 +223,7 @@ WIDEST = 1600
 
 
 def bar_chart(values: Mapping[str, float], label: str, highlighted: Sequence[str] = ()) -> bytes:
-    """Draw horizontal bars by name, each with its value; highlighted ones have another colour."""
+    """Draw horizontal bars by name, each with its value. Highlighted bars have another colour."""
     figure = _figure(8, 0.32 * len(values) + 1)
     axes = figure.subplots()
     colors = ["C1" if name in highlighted else "C0" for name in values]
@@ -241,14 +242,14 @@ def line_chart(
     x_label: str,
     y_label: str,
 ) -> bytes:
-    """Draw lines of (x, y) values with a legend; a line of one value is drawn as a point."""
+    """Draw lines of (x, y) values with a legend. A line of one value is drawn as a point."""
     figure = _figure(11, max(4.5, 0.27 * len(lines) + 0.5))
     axes = figure.subplots()
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
     axes.grid(alpha=0.3)
     for k, (name, (x, y)) in enumerate(lines.items()):
-        # Colours repeat after ten lines; markers and dashes then change.
+        # Colours repeat after ten lines. Then markers and dashes change.
         marker, dash = MARKERS[k // 10 % len(MARKERS)], DASHES[k // 10 % len(DASHES)]
         axes.plot(x, y, label=name, color=f"C{k % 10}", marker=marker, linestyle=dash)
     if lines:
@@ -257,7 +258,7 @@ def line_chart(
 
 
 def picture(rgb: np.ndarray) -> bytes:
-    """Encode an (H, W, 3) uint8 RGB image as PNG; images wider than `WIDEST` are shrunk."""
+    """Encode an (H, W, 3) uint8 RGB image as PNG. Images wider than `WIDEST` are shrunk."""
     if rgb.shape[1] > WIDEST:
         size = (WIDEST, round(rgb.shape[0] * WIDEST / rgb.shape[1]))
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)

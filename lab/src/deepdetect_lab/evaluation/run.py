@@ -72,7 +72,7 @@ class MatchSettings:
 class PairMatches:
     """The (M, 2) matched positions of a pair, and the positions of all keypoints used.
 
-    `seconds` is the time of description and matching when they were computed.
+    `seconds` is the time that description and matching took when they were computed.
     """
 
     points0: np.ndarray
@@ -87,8 +87,8 @@ class Run:
 
     Args:
         data: folder of the data sets, or folder of the only data set needed.
-        cache: folder for the results of stages; each file is named by a digest of all inputs.
-            Damaged files are computed again; old files are never removed. None: no cache.
+        cache: folder for the results of stages. Each file is named by a digest of all inputs.
+            Damaged files are computed again. Old files are never removed. None: no cache.
         quiet: show no progress bars.
 
     Attributes:
@@ -129,7 +129,7 @@ class Run:
         except (CacheError, OptionError):
             raise
         except (DeepDetectError, cv2.error) as error:
-            reason = getattr(error, "err", None) or error  # without OpenCV's source files
+            reason = getattr(error, "err", None) or error  # without OpenCV's file names
             self.fail(f"{name}: {first_line(reason)}")
             return None
 
@@ -145,10 +145,10 @@ class Run:
         items: Mapping[str, Any],
         measure: Callable[[Any, Any], Row],
     ) -> Rows:
-        """Measure each method on each item; items are given by name.
+        """Measure each method on each item. Items are given by name.
 
         Methods have a name and may have a title. `what` begins the texts of the progress bar and of
-        failures. Rows hold the names as "method" and "item"; failed measurements have no row.
+        failures. Rows hold the names as "method" and "item". Failed measurements have no row.
         """
         rows: Rows = []
         with progress(len(methods) * len(items), "benchmark", "task", self.quiet) as bar:
@@ -165,8 +165,8 @@ class Run:
     def cached(self, stage: str, depends: object, make: Callable[[], Row]) -> Row:
         """Read a result of one of `STAGES` from the cache, or compute it and keep it.
 
-        A result holds arrays, numbers and texts. The values of `depends` identify it; a path is
-        identified by the content of its file.
+        A result holds arrays, numbers and texts. The values of `depends` identify the result. The
+        content of its file identifies a path.
         """
         path = None
         kept: Mapping[str, np.ndarray] | None = None
@@ -238,7 +238,10 @@ class Run:
     def _descriptors(
         self, feature: LocalFeature, images: tuple[Path, Path], both: Sequence[Keypoints]
     ) -> tuple[list[np.ndarray], float]:
-        """Describe both images; the last pair's descriptors are kept for other match settings."""
+        """Describe the keypoints of both images; return the descriptors and the seconds.
+
+        The descriptors of the last pair are kept for other match settings.
+        """
         name = key(*feature.key, images, [len(keypoints) for keypoints in both])
         if self._described is None or self._described[0] != name:
             self._described = None  # frees memory before new descriptors are computed

@@ -1,4 +1,4 @@
-"""Matching by descriptors alone, as in the paper: the comparison method for guided matching."""
+"""Matching by descriptors alone, as in the paper, with which guided matching is compared."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ PAPER_RATIO = 0.99
 """The ratio test of the authors' published code keeps matches with a ratio under 0.99."""
 
 UPRIGHT_SIFT = PointDescriptor(angle_deg=0.0)
-"""SIFT of the paper's size, but upright: OpenCV uses the paper's angle of -1 as an angle."""
+"""SIFT descriptor of the paper's size, but with angle 0. The paper sets the angle -1 for "unset",
+but OpenCV takes it as -1 degree."""
 
 
 def match_unguided(
@@ -38,7 +39,7 @@ def match_unguided(
     Args:
         image0, image1: images in any form that `load_image` accepts.
         detector: object with a method `heatmap` or `detect`.
-        selection: which pixels of a heat map become keypoints; None: those over 0.5.
+        selection: which pixels of a heat map become keypoints. None: all pixels over 0.5.
         descriptor: descriptor of the keypoints.
         matcher, ratio, mutual, seed: as in `match_features`.
     """

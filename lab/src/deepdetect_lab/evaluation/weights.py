@@ -39,13 +39,13 @@ class OxfordScore:
     """Scores of weights on the Oxford scenes, with RGB images resized to 480x480.
 
     Attributes:
-        density: keypoints per pixel at each of the paper's thresholds, mean over all images; with
-            equal density only at the first threshold.
+        density: keypoints per pixel at each of the paper's thresholds, mean over all images. With
+            equal density there is only the first threshold.
         repeatability: the paper's clipped repeatability by scene, mean over its five pairs.
         correct: number of correct matches by pair (FLANN, ratio 0.99, error under 1 px by the
             published homography), mean over several seeds of FLANN.
         matches: number of all matches that pass the ratio test, by pair, mean over the seeds.
-        failures: a sentence for each image or pair that failed; the means do not include it.
+        failures: a sentence for each image or pair that failed. The means do not include these.
     """
 
     density: dict[float, float]
@@ -62,8 +62,8 @@ class ForegroundScore:
     Attributes:
         fraction: fraction of the keypoints on the foreground, mean over the photographs.
         density: keypoints per pixel, mean over the photographs.
-        covered: fraction of the pixels on the foreground, which random keypoints reach.
-        photographs: number of photographs measured, those with a keypoint.
+        covered: fraction of the pixels on the foreground, the score of random keypoints.
+        photographs: number of photographs with a keypoint, which are measured.
         failures: a sentence for each photograph that could not be measured.
     """
 
@@ -83,8 +83,8 @@ class Evaluation:
         scales: agreement with the labels of scaled images, by scale and visibility.
         oxford: scores by the paper's protocol.
         foreground: scores on photographs with a known foreground.
-        failures: a sentence for each sample that cannot be read and is not in the scores; `oxford`
-            and `foreground` have their own.
+        failures: a sentence for each sample that cannot be read and is not in the scores. `oxford`
+            and `foreground` have their own failures.
     """
 
     masks: dict[str, MaskScore] = field(default_factory=dict)
@@ -187,7 +187,7 @@ def evaluate_oxford(
 ) -> OxfordScore:
     """Evaluate weights, or anything with a method `heatmap`, on scenes of `load_oxford`.
 
-    A DeepDetect gets images resized to 480x480, whatever its own resolution; its other options
+    A DeepDetect gets images resized to 480x480, whatever its own resolution. Its other options
     stay. With `equal_density` it takes as many keypoints per image as the label marks.
     """
     detector = _of_paper(detector, equal_density)
@@ -229,7 +229,7 @@ def evaluate_foreground(
     equal_density: bool = False,
     quiet: bool = True,
 ) -> ForegroundScore:
-    """Measure the fraction of keypoints on the foreground; arguments as in `evaluate_oxford`."""
+    """Measure the fraction of keypoints on the foreground, as `evaluate_oxford` does."""
     run = Run(Path(), quiet=quiet)
     rows = foreground_rows(run, [_feature(_of_paper(detector, equal_density))], images)
     known = [row for row in rows if row["density"] > 0]

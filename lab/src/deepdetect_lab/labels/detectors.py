@@ -20,7 +20,7 @@ from deepdetect._shared.opencv import cv2, opencv_factory
 Value = bool | int | float
 Settings = Mapping[str, Any]
 Range = tuple[float, float] | range
-"""A tuple of the smallest and the largest value, or a range of all values."""
+"""The smallest and the largest allowed value as a tuple, or all allowed integers as a range."""
 
 AGAST_OAST_9_16 = 3
 """The value of `AgastFeatureDetector::OAST_9_16`, which some OpenCV versions do not export."""
@@ -31,7 +31,8 @@ GRAY_LEVELS = (0, 255)
 BLOCK_SIZES = (1, 255)
 KERNEL_SIZES = range(1, 32, 2)
 CANNY_THRESHOLDS = (0, 2040)
-"""The sum of the absolute gradients of the 3x3 Sobel filter has this range, in grey levels."""
+"""Canny's thresholds apply to the sum of the absolute gradients in x and y of the 3x3 Sobel filter,
+which lies in this range in grey levels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +42,8 @@ class LabelDetector:
     Attributes:
         kind: whether it marks keypoints or edges (the two masks of the paper's Figure 4).
         function: function from an (H, W) uint8 grey image and all settings to an (H, W) bool mask.
-        settings: value of each setting for normal images, and the range of numeric settings.
-        low_visibility: changed settings for images with few grey levels.
+        settings: value of each setting for normal images, and the allowed range of numeric ones.
+        low_visibility: settings that differ for images with few grey levels.
     """
 
     kind: Literal["keypoint", "edge"]
@@ -56,12 +57,15 @@ class LabelDetector:
         return {name: value for name, (value, _) in self.settings.items()}
 
     def mask(self, gray: np.ndarray, **settings: Value) -> np.ndarray:
-        """Return the (H, W) bool mask of an (H, W) uint8 image, with changed settings."""
+        """Return the mask, (H, W) bool, of an (H, W) uint8 image; `settings` replace defaults."""
         return self.function(gray, {**self.defaults, **settings})
 
 
 def pixels_mask(shape: tuple[int, ...], xy: np.ndarray) -> np.ndarray:
-    """Mark the pixel nearest to each of (N, 2) points inside the image; halves round to even."""
+    """Return a mask, bool, of the pixels nearest to the points (N, 2) that are inside the image.
+
+    Halves are rounded to even.
+    """
     mask = np.zeros(shape[:2], dtype=bool)
     column, row = np.rint(np.asarray(xy, dtype=np.float64).reshape(-1, 2)).astype(np.intp).T
     inside = (column >= 0) & (column < mask.shape[1]) & (row >= 0) & (row < mask.shape[0])
@@ -88,7 +92,7 @@ def _sift(gray: np.ndarray, settings: Settings) -> np.ndarray:
 
 
 def _orb(gray: np.ndarray, settings: Settings) -> np.ndarray:
-    """Detect FAST corners on an image pyramid (Rublee et al., 2011); by default all are kept."""
+    """Detect FAST corners on an image pyramid, by default all of them (Rublee et al., 2011)."""
     # OpenCV fails on pyramid levels smaller than a pixel.
     most = 1 + int(math.log(min(gray.shape)) / math.log(settings["scale_factor"]))
     detector = cv2.ORB_create(
@@ -103,13 +107,16 @@ def _orb(gray: np.ndarray, settings: Settings) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def _brisk_detector(threshold: int, octaves: int) -> cv2.Feature2D:
-    """Make a BRISK detector, cached because making its pattern takes as long as a dark image."""
+    """Make a BRISK detector.
+
+    It is cached, because computing its pattern takes as long as detection in a dark image.
+    """
     return opencv_factory("BRISK_create")(thresh=threshold, octaves=octaves)
 
 
 def _brisk(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """Detect AGAST corners in a scale space (Leutenegger et al., 2011)."""
-    # OpenCV fails on octaves smaller than a pixel; each has a layer of 2/3 of its size.
+    # OpenCV fails on layers smaller than a pixel. Each octave has a layer of 2/3 of its size.
     most = (2 * min(gray.shape) // 3).bit_length()
     return _marked(gray, _brisk_detector(settings["threshold"], min(settings["octaves"], most)))
 
@@ -124,7 +131,7 @@ def _fast(gray: np.ndarray, settings: Settings) -> np.ndarray:
 def _agast(gray: np.ndarray, settings: Settings) -> np.ndarray:
     """Detect corners by the segment test with an adaptive decision tree (Mair et al., 2010).
 
-    With equal settings the mask equals that of FAST; only the order of comparisons differs.
+    With equal settings the mask equals FAST's, since only the order of comparisons differs.
     """
     create = opencv_factory("AgastFeatureDetector_create")
     return _marked(gray, create(settings["threshold"], settings["suppression"], AGAST_OAST_9_16))

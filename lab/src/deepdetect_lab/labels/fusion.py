@@ -1,6 +1,7 @@
 """Keypoint-edge fusion: the pixelwise OR of the label detectors (paper, Section III-A).
 
-It labels images, and image files, for which it writes 1-bit PNG masks.
+It labels images in memory, and image files. The masks of image files are written as 1-bit PNG
+files.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from .detectors import DETECTORS
 from .settings import LabelOptions, Visibility
 
 LOW_VISIBILITY_RANGE = 64
-"""An image has low visibility if its luma spans fewer grey levels (measured: `visibility_of`)."""
+"""An image has low visibility if its luma spans fewer grey levels than this (measurements:
+`visibility_of`)."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -90,7 +92,7 @@ def fuse(
         channels: order of the colour channels if the image is an array, as in `load_image`.
 
     Returns:
-        The label; its `mask` is the pixelwise OR.
+        The label, whose `mask` is the pixelwise OR of the detectors' masks.
 
     Raises:
         ImageError: the image cannot be read or is unsuitable.
@@ -117,7 +119,7 @@ def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
     """Draw the paper's Figure 4: image, keypoint mask, edge mask, and their combination.
 
     Returns:
-        Four panels in a row; captions of masks give their density.
+        Four panels in a row. The captions of the masks give their density.
     """
     panels = [add_caption(rgb, f"image ({label.visibility} visibility settings)")]
     masks = {"keypoints": label.keypoints, "edges": label.edges, "combined": label.mask}
@@ -129,7 +131,7 @@ def draw_label(rgb: np.ndarray, label: Label) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LabelTask:
-    """An image file to label and the mask file; `figure` is a file for the paper's Figure 4."""
+    """An image file to label and its mask file. `figure` is a file for the paper's Figure 4."""
 
     image: Path
     mask: Path
@@ -145,11 +147,11 @@ class LabelTask:
 
 
 def label_file(task: LabelTask) -> dict[str, Any] | str:
-    """Write the mask of an image file; return its values, or an error text for the image."""
+    """Write the mask of an image file; return the values for its record, or an error text."""
     try:
         rgb = load_image(task.image)
         label = fuse(luma(rgb), task.options)
-    except MissingExtraError:  # concerns all images
+    except MissingExtraError:  # affects all images
         raise
     except DeepDetectError as error:
         return str(error)

@@ -1,4 +1,4 @@
-"""Settings of labels: detectors and parameters, chosen by name, TOML file, or one by one."""
+"""Settings of labels: detectors and their parameters, by name, from a TOML file, or one by one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .detectors import DETECTOR_NAMES, DETECTORS, Value, select_detectors
 Visibility = Literal["normal", "low"]
 
 Settings = Mapping[str, Mapping[str, Mapping[str, Value]]]
-"""Changed settings by detector, section and parameter, as in a settings file."""
+"""Changed settings by detector, section ("normal" or "low_visibility") and parameter."""
 
 SECTIONS: dict[Visibility, str] = {"normal": "normal", "low": "low_visibility"}
 
@@ -62,7 +62,7 @@ class LabelOptions:
             )
 
     def with_detectors(self, names: tuple[str, ...]) -> LabelOptions:
-        """Return the options with other detectors, without settings of omitted detectors."""
+        """Return the options with other detectors; settings of omitted detectors are removed."""
         kept = {name: self.settings[name] for name in self.settings if name in names}
         return replace(self, detectors=names, settings=kept)
 
@@ -109,7 +109,7 @@ def _checked_value(detector: str, name: str, value: Any) -> Value:
 
 LABEL_SETTINGS: dict[str, LabelOptions] = {
     "paper": LabelOptions(),
-    # Denser labels suit geometry; chosen by true stereo matches (docs/training.md).
+    # Denser labels suit geometry. They were chosen by correct stereo matches (docs/training.md).
     "dense": LabelOptions(settings={"sobel": {"normal": {"relative_threshold": 0.02}}}),
 }
 

@@ -18,7 +18,7 @@ from deepdetect.detector.network.onnx_export import OnnxOptions, write_model
 from deepdetect.detector.network.onnx_graph import add_padding
 
 OPSET = 17
-"""This ONNX operator set is chosen because ONNX Runtime 1.24, OpenVINO and OpenCV 4 read it."""
+"""Version of the ONNX operator set, which ONNX Runtime 1.24, OpenVINO and OpenCV 4 can read."""
 
 
 def to_onnx(
@@ -28,7 +28,7 @@ def to_onnx(
     axes: Mapping[str, Mapping[int, str]],
     training: Any = torch.onnx.TrainingMode.EVAL,
 ) -> onnx.ModelProto:
-    """Trace a network with named inputs; `axes` names the dynamic axes of inputs and output."""
+    """Trace a network with named inputs to ONNX. `axes` names dynamic axes of inputs and output."""
     written = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # warnings of the tracer
@@ -49,10 +49,10 @@ def to_onnx(
 
 def export_onnx(network: nn.Module, path: str | Path) -> None:
     """Write a network that predicts heat maps for any image size, atomically."""
-    # This name is part of all node names, on which `tiling` relies.
+    # The name "network" becomes part of all node names, on which `tiling` relies.
     module = nn.Sequential(OrderedDict(network=network))
     axes = {0: "batch", 2: "height", 3: "width"}
-    # Batch normalisation is kept as nodes, which `add_padding` folds in float64.
+    # Batch normalisations stay separate nodes, because `add_padding` folds them in float64.
     model = to_onnx(
         module,
         {"image": torch.zeros(2, 3, 64, 96)},

@@ -20,27 +20,30 @@ from torch.nn.functional import (
 )
 
 HALF, QUARTER, EIGHTH = 16, 32, 40
-"""Number of channels at 1/2, 1/4 and 1/8 of the size; 1/2 has fewest, since it takes most time."""
+"""Numbers of channels at 1/2, 1/4 and 1/8 of the image size. The number at 1/2 is the smallest,
+because the layers there take most time."""
 
 RED, GREEN, BLUE = 9798, 19235, 3735
 """Weights of the luma (BT.601) in units of 1/32,768, as in OpenCV."""
 
 BINS = 24
-"""Number of bins of the luma's histogram; a value is split between the two nearest bins. Chosen by
+"""Number of bins of the luma's histogram. A value is split between the two nearest bins. Chosen by
 hand; not measured."""
 
 HISTOGRAM_STEP_PX = 8
 """The histogram samples every 8th pixel in both directions to save time."""
 
 GAIN_RANGE = (-1, 5)
-"""Range of the gain's logarithm, since dark images span only 1/100 of the grey levels."""
+"""Range of the logarithm of the gain on the luma. It is this large because dark images may span
+only 1/100 of the grey levels."""
 
 
 class Luma(nn.Module):
     """Map (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W), OpenCV's 8-bit luma divided by 255.
 
     Labels are computed from this luma, and in dark images a single grey level matters. All values
-    are integers below 2^24, which float32 holds exactly; GPUs would round convolutions (TF32).
+    are integers below 2^24, which float32 holds exactly. It is no convolution, because GPUs would
+    round one (TF32).
     """
 
     def forward(self, image: Tensor) -> Tensor:
@@ -50,9 +53,10 @@ class Luma(nn.Module):
 
 
 class Exposure(nn.Module):
-    """Map (B, 1, H, W) luma to (B, BINS + 2, 1, 1) features and its (B, 1, 1, 1) mean.
+    """Map luma (B, 1, H, W) to features (B, BINS + 2, 1, 1), and to its mean (B, 1, 1, 1).
 
-    Features are the logarithms of the histogram, the mean, and the logarithm of the variance.
+    The features are the logarithms of the histogram's bins, the mean, and the logarithm of the
+    variance.
     """
 
     def forward(self, luma: Tensor) -> tuple[Tensor, Tensor]:
@@ -79,7 +83,7 @@ class Perceptron(nn.Sequential):
 
 
 class Convolution(nn.Module):
-    """Convolution, batch normalisation and ReLU; stride 2 halves the size."""
+    """A convolution with batch normalisation and ReLU. A stride of 2 halves the size."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1, kernel: int = 3) -> None:
         super().__init__()
@@ -91,7 +95,7 @@ class Convolution(nn.Module):
 
 
 class FastNetwork(nn.Module):
-    """The network: it predicts a logit per pixel of an image whose sides are multiples of 8.
+    """The fast network predicts a logit per pixel of an image whose sides are multiples of 8.
 
     It has 57,613 parameters and needs 632 million multiply-adds at 640x480.
 
@@ -121,7 +125,7 @@ class FastNetwork(nn.Module):
         self.logits = nn.Conv2d(HALF, 4, 1)
         nn.init.constant_(
             self.get_parameter("logits.bias"), -1.0
-        )  # about the fraction of marked pixels
+        )  # the logit of about the fraction of marked pixels
 
     def forward(self, image: Tensor) -> Tensor:
         """Map (B, 3, H, W) RGB in [0, 1] to (B, 1, H, W) logits."""

@@ -27,7 +27,8 @@ Sides are multiples of `STRIDE`. To add a network, write a module in this packag
 
 
 FOLDER = Path(__file__).parents[1] / "weights"
-"""Folder of trained weights from which training can start; `deepdetect` has them in ONNX files."""
+"""Folder of trained weights from which training can start. The package `deepdetect` has the same
+weights in ONNX files."""
 
 
 def find_weights(weights: str | Path) -> Path:
@@ -50,7 +51,8 @@ def save_tensors(tensors: Mapping[str, Tensor], path: str | Path, notes: dict[st
 def load_network(path: str | Path, *kinds: type[nn.Module]) -> nn.Module:
     """Make a network from a weights file, in evaluation mode.
 
-    The network is the one of those kinds (default: `NETWORKS`) that shares most tensors with it.
+    The network's class is the one of `kinds` (default: `NETWORKS`) that shares most tensor names
+    with the file.
     """
     if not Path(path).is_file():
         raise MissingWeightsError(f"there is no weights file {path}: check the path")
@@ -104,7 +106,7 @@ def read_notes(path: str | Path) -> dict[str, str]:
 
 
 def weights_digest(network: nn.Module) -> str:
-    """Return the SHA-256 of a network's state, which does not depend on its file."""
+    """Return the SHA-256 of a network's state, which does not depend on the file format."""
     digest = hashlib.sha256()
     for name, value in sorted(network.state_dict().items()):
         digest.update(name.encode())

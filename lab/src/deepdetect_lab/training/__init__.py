@@ -1,6 +1,6 @@
 """Training: images -> views -> labels -> crops -> weights.
 
-A `CropDataset` and a seeded `CropSampler` make a torch `DataLoader`; `train` does it all.
+A `CropDataset` and a seeded `CropSampler` make a torch `DataLoader`. `train` does all these steps.
 """
 
 import lazy_loader

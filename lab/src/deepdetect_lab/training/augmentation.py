@@ -16,8 +16,8 @@ from .synthetic import WHITE, Camera, Effect, Light, blur, record, relight
 RED, GREEN, BLUE = 0.299, 0.587, 0.114  # of the luma (BT.601)
 
 AUGMENTATION_VERSION = 3
-"""Version in the names of augmented views. Increase it when `augment` changes, because old labels
-then do not fit."""
+"""This version is part of the names of augmented views. Increase it when `augment` changes, because
+old labels then do not fit the views."""
 
 
 @dataclass(frozen=True)
@@ -32,18 +32,19 @@ class Darkening:
 
 
 BRIGHTNESS, CONTRAST = (0.2, 0.45), (0.3, 0.55)
-"""Ranges of the factors of a `Darkening`. Their product stays under 0.25, so that a darkened image
-spans under 64 grey levels, the limit of low visibility."""
+"""Ranges of the two factors of a `Darkening`. The product of the factors stays below 0.25. So a
+darkened image spans fewer than 64 grey levels, the limit of low visibility."""
 
 # What `augment` draws from.
 TURN_PROBABILITY = 0.5
-"""Share of views rotated by any angle; the others stay sharp, since rotation blurs."""
+"""Share of the views that are rotated by any angle. All other views stay sharp, since the
+interpolation of a rotation blurs."""
 
 CROP_SCALE = (0.7, 1.0)
 """Range of the crop's side as a fraction of the largest that fits. Chosen by hand; not measured."""
 
 INTERPOLATIONS = ("NEAREST", "LINEAR", "CUBIC", "AREA", "LANCZOS4")
-"""OpenCV interpolations, one of which downscales an upright view."""
+"""OpenCV interpolations, from which one is drawn to downscale an upright view."""
 
 LIGHT = Light(
     share=0.5,
@@ -59,7 +60,7 @@ MAX_JITTER_SATURATION = 1.2
 
 
 def draw_darkening(generator: np.random.Generator) -> Darkening:
-    """Draw both factors, rounded to thousandths to fit into a file name."""
+    """Draw brightness and contrast, rounded to thousandths to keep file names short."""
     return Darkening(
         round(float(generator.uniform(*BRIGHTNESS)), 3),
         round(float(generator.uniform(*CONTRAST)), 3),
@@ -73,16 +74,19 @@ def darken(rgb: np.ndarray, darkening: Darkening) -> np.ndarray:
 
 
 def transpose(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mirror a crop and its label along the diagonal; only BRISK would label it differently."""
+    """Mirror a crop and its label along the diagonal.
+
+    BRISK is the only label detector that would label the mirrored crop differently.
+    """
     # OpenCV copies a hundred times faster than a NumPy view.
     return cv2.transpose(image), cv2.transpose(mask.view(np.uint8)).view(bool)
 
 
 def jitter_color(rgb: np.ndarray, generator: np.random.Generator, exact: bool) -> np.ndarray:
-    """Remove the colours or rotate the hue, both with the same luma, of (H, W, 3) uint8 RGB.
+    """Remove the colours or rotate the hue of (H, W, 3) uint8 RGB; the luma stays the same.
 
-    If `exact`, colours are removed, because a rotation may change the luma by one level, which
-    matters for keypoints of dark images.
+    With `exact` colours are always removed, because a hue rotation may change the luma by one grey
+    level. In dark images this changes keypoints.
     """
     if exact or generator.random() < 0.5:
         return cv2.cvtColor(luma(rgb), cv2.COLOR_GRAY2RGB)
@@ -113,10 +117,10 @@ def rotate_hue(rgb: np.ndarray, angle: float, saturation: float) -> np.ndarray:
 
 
 def augment(rgb: np.ndarray, side: int, seed: int) -> np.ndarray:
-    """Make a (side, side, 3) view of a part of an image: rotated, relit, blurred, compressed.
+    """Make a (side, side, 3) view of a random part of an image, with random augmentations.
 
-    Its label is made from the view itself. Other versions of NumPy and OpenCV may give slightly
-    different views for the same seed.
+    The view may be rotated, relit, blurred, noisy or compressed. Its label is made from the view
+    itself. Other versions of NumPy and OpenCV may give slightly different views for the same seed.
     """
     generator = np.random.default_rng([AUGMENTATION_VERSION, seed])
     turned = generator.random() < TURN_PROBABILITY
@@ -133,7 +137,7 @@ def _rotated_crop(rgb: np.ndarray, side: int, generator: np.random.Generator) ->
     extent = abs(cosine) + abs(sine)  # extent of a rotated unit square
     window = (min(rgb.shape[:2]) - 1) / extent * generator.uniform(*CROP_SCALE)
     step = window / side
-    if step > 1:  # averaged before coarser sampling
+    if step > 1:  # area averaging first, against aliasing
         factor = 1 / step
         size = (max(round(rgb.shape[1] * factor), 1), max(round(rgb.shape[0] * factor), 1))
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)

@@ -28,7 +28,10 @@ def save_checkpoint(
     optimizers: Sequence[Optimizer],
     metadata: Mapping[str, Any],
 ) -> None:
-    """Write tensors "network.NAME", "average.NAME", "optimizer.MOMENT.PARAMETER", and JSON."""
+    """Write the tensors of a run, and its metadata as JSON, to a checkpoint.
+
+    Tensors are named "network.NAME", "average.NAME" and "optimizer.MOMENT.PARAMETER".
+    """
     tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
     tensors |= {f"average.{name}": value for name, value in average.state_dict().items()}
     for name, parameter in network.named_parameters():
@@ -60,9 +63,9 @@ def restore(
     average: nn.Module,
     optimizers: Sequence[Optimizer],
 ) -> None:
-    """Restore a network, its average and its optimisers from a checkpoint of the same run.
+    """Restore a network, its moving average and its optimisers from a checkpoint of the same run.
 
-    The run must be the same, because fused optimisers write beyond moments of another shape.
+    The shapes must match: a fused optimiser would write past the end of moments of another shape.
     """
     for kind, module in (("network", network), ("average", average)):
         module.load_state_dict({name: tensors[f"{kind}.{name}"] for name in module.state_dict()})
@@ -81,7 +84,7 @@ def restore(
 
 
 def _like(value: Tensor, parameter: Tensor) -> Tensor:
-    """Move a moment to its parameter's device and memory layout, on which fused Adam relies."""
+    """Copy a moment to its parameter's device and memory layout, since fused Adam requires both."""
     if value.shape == parameter.shape:
         return torch.empty_like(parameter).copy_(value)
     return value.to(parameter.device, copy=True)

@@ -38,10 +38,10 @@ from .views import (
 
 
 class FolderSource:
-    """Image files, and labels in 1-bit PNG files in a subfolder for the label settings.
+    """Images in files, and their labels as 1-bit PNG files in a subfolder per label settings.
 
-    Labels are named by the content of the image, so a replaced image gets a new label. Up to
-    `memory_bytes` of views are kept in memory; further views are rendered each time.
+    A label's file name holds a digest of the image, so a replaced image gets a new label. Views are
+    kept in memory up to `memory_bytes`. Further views are rendered each time.
     """
 
     shard_sizes = None
@@ -67,7 +67,7 @@ class FolderSource:
         return {**self.__dict__, "_kept": {}}  # a spawned process keeps its own views
 
     def label_path(self, image: SourceImage, view: View) -> Path:
-        """Return the file of a label."""
+        """Return the path of the label of a view."""
         return self.label_folder / f"{image.path.stem}_{image.digest}_{view.name}.png"
 
     def load(self, index: int, view: View) -> tuple[np.ndarray, np.ndarray]:
@@ -91,18 +91,18 @@ class FolderSource:
     def make_labels(
         self, views: Sequence[tuple[View, ...]], workers: int | None = None, quiet: bool = True
     ) -> int:
-        """Make the missing labels of views of each image in processes; return their number.
+        """Make the missing labels of the `views` of each image in parallel; return their number.
 
-        The rendered views are kept in memory.
+        The rendered views are kept in memory as far as they fit.
 
         Raises:
-            BatchError: images cannot be read; all other labels are made.
+            BatchError: images cannot be read. The labels of all other images are made.
         """
         tasks, memory = [], self.memory_bytes
         for index, (image, needed) in enumerate(zip(self.images, views, strict=True)):
             files = {view: self.label_path(image, view) for view in needed}
             if missing := {view: path for view, path in files.items() if not path.exists()}:
-                memory -= sum(4 * view.short_side**2 for view in missing)  # at least
+                memory -= sum(4 * view.short_side**2 for view in missing)  # lower bound
                 tasks.append((index, image.path, missing, memory > 0))
         total = sum(len(missing) for _, _, missing, _ in tasks)
         failures = []
@@ -122,13 +122,16 @@ class FolderSource:
 
 
 LabelTask = tuple[int, Path, dict[View, Path], bool]
-"""Number and file of an image, the labels to write, and whether to return its views."""
+"""Index and file of an image, the label files to write, and whether to return its views."""
 
 
 def _make_labels(
     task: LabelTask, options: LabelOptions
 ) -> tuple[LabelTask, dict[View, tuple[np.ndarray, np.ndarray]], str]:
-    """Write the labels of an image; return views with labels, and an error if there is one."""
+    """Write the labels of an image; return the task, its views with labels, and an error text.
+
+    The error text is empty if the image can be read.
+    """
     _, file, labels, keep = task
     made = {}
     try:
@@ -148,9 +151,10 @@ ImageSource = FolderSource | ShardSource
 
 
 class CropDataset(Dataset[tuple[Tensor, Tensor]]):
-    """Random augmented crops of views, indexed by a `CropSampler`.
+    """Random augmented crops of views, indexed by the `CropIndex` entries of a `CropSampler`.
 
-    A crop depends only on index and seed: (crop, crop, 3) uint8 RGB, (crop, crop) bool label.
+    An item is an image, (crop, crop, 3) uint8 RGB, and its labels, (crop, crop) bool. It depends
+    only on its index and the seed of the options.
     """
 
     def __init__(self, source: ImageSource, options: TrainingOptions) -> None:
@@ -226,9 +230,10 @@ def prepare_data(
     processes: int = 1,
     quiet: bool = True,
 ) -> TrainingData:
-    """List the images of a run and make missing labels of their views; arguments as in `train`.
+    """List the images of a run, and make the missing labels of their views.
 
-    `processes` is the number of loading processes, each of which keeps its own views in memory.
+    The arguments are those of `train`. `processes` is the number of loading processes, each of
+    which keeps its own views in memory.
     """
     images, output = Path(images), Path(output)
     folder = output / "labels" if labels is None else Path(labels)
@@ -260,9 +265,10 @@ def prepare_data(
 
 @contextlib.contextmanager
 def loading(loader: DataLoader[Any]) -> Iterator[Iterator[Any]]:
-    """Yield an iterator over a loader; errors in its processes are raised unchanged.
+    """Yield an iterator over a loader, and raise errors of its processes unchanged.
 
-    OpenCV uses one thread meanwhile, because a forked process cannot use its parent's threads.
+    OpenCV uses one thread in this context, because a forked process cannot use its parent's
+    threads.
     """
     batches: Any = None
     try:
@@ -270,13 +276,13 @@ def loading(loader: DataLoader[Any]) -> Iterator[Iterator[Any]]:
             batches = iter(loader)
             yield batches
     except DeepDetectError as error:
-        # torch puts the whole traceback into the message.
+        # torch puts the whole traceback of the process into the message.
         text = str(error).strip()
         if not text.startswith("Caught "):
             raise
         raise type(error)(text.splitlines()[-1].partition(": ")[2]) from None
     finally:
-        # torch ends the processes with the iterator, which an error keeps alive; left to the
-        # garbage collector, that takes five seconds (their queues are collected first).
+        # torch ends the processes when the iterator is deleted, but an error keeps it alive. The
+        # garbage collector would take five seconds, because it collects their queues first.
         if loader.num_workers and batches is not None:
             batches._shutdown_workers()

@@ -1,4 +1,4 @@
-"""Training of the detector network: labelled crops, loss per pixel, validation."""
+"""Training of the detector network on labelled crops with a loss per pixel."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ ONNX = "deepdetect.onnx"
 def initial_network(
     options: TrainingOptions, init_weights: InitWeights | None
 ) -> tuple[TrainingOptions, nn.Module]:
-    """Make the network with initial weights, and resolve options that depend on them."""
+    """Make the network with its initial weights, and set options that depend on the weights."""
     make = look_up("network", options.network, NETWORKS)
     if init_weights is not None:
         if options.frozen_batch_norm is None:
@@ -119,11 +119,11 @@ class DenseTrainer(Trainer):
     def _set_up(self) -> nn.Module:
         if not self.compiled:
             return self.network
-        # Not dynamic, because each stage has one shape, which gets its own code.
+        # Each stage has one input shape, for which it gets its own code.
         return torch.compile(self.network, dynamic=False)  # type: ignore[return-value]
 
     def to_device(self, values: Tensor) -> Tensor:
-        """Copy a tensor to the device, asynchronously if it is pinned."""
+        """Copy a tensor to the device, asynchronously if its memory is pinned."""
         return values.to(self.device, non_blocking=True)
 
     def to_float(self, images: Tensor) -> Tensor:
@@ -131,7 +131,7 @@ class DenseTrainer(Trainer):
         return self.to_device(images).permute(0, 3, 1, 2).float().div_(255)
 
     def logits(self, images: Tensor) -> Tensor:
-        """Run the network for training; return float32 logits."""
+        """Run the network on images for training; return float32 logits (B, 1, H, W)."""
         try:
             with torch.autocast(self.device.type, torch.bfloat16, enabled=self.bfloat16):
                 return self._forward(images).float()
@@ -150,7 +150,7 @@ class DenseTrainer(Trainer):
         return torch.cuda.max_memory_allocated() if self.device.type == "cuda" else 0
 
     def describe(self) -> str:
-        """Return a text that says how the network runs."""
+        """Return a text with the device and precision, and whether the network is compiled."""
         precision = "bfloat16" if self.bfloat16 else "float32"
         return f"{self.device.type}, {precision}, {'compiled' if self.compiled else 'eager'}"
 
@@ -164,7 +164,7 @@ class DenseTrainer(Trainer):
             dataset,
             num_workers=self.device_options.worker_count,
             pin_memory=self.device.type == "cuda",
-            generator=torch.Generator(),  # not torch's own, whose state is the user's
+            generator=torch.Generator(),  # torch's own would change the user's random state
             **batches,
         )
 
@@ -185,9 +185,12 @@ class DenseTrainer(Trainer):
         return binary_cross_entropy_with_logits(logits, truth, pos_weight=self._pos_weight(images))
 
     def _pos_weight(self, images: Tensor) -> Tensor | None:
-        """Return the weights of the images' marked pixels, (B, 1, 1, 1) or (1,); None: all 1."""
+        """Return the loss weight of marked pixels in each image, (B, 1, 1, 1) or (1,).
+
+        None means that all weights are 1.
+        """
         normal, dark = self.options.pos_weight, self.options.low_light_pos_weight
-        if dark is None or dark == normal:  # the visibility of images does not matter
+        if dark is None or dark == normal:  # the weight does not depend on the visibility
             return None if normal == 1 else self.to_device(torch.tensor([normal]))
         weights = {"normal": normal, "low": dark}
         each = [weights[visibility_of(luma(image))] for image in images.numpy()]
@@ -214,7 +217,7 @@ class DenseTrainer(Trainer):
 
     @torch.inference_mode()
     def heatmap(self, image: Tensor) -> np.ndarray:
-        """Run the network, in evaluation mode, in float32 on (H, W, 3) uint8 of any size."""
+        """Run the averaged network on an image, (H, W, 3) uint8; return probabilities (H, W)."""
         height, width = image.shape[:2]
         batch = self.to_float(image[None])
         batch = pad(batch, (0, -width % 8, 0, -height % 8), mode="replicate")
@@ -229,7 +232,7 @@ class DenseTrainer(Trainer):
 
 
 def freeze_batch_norm(network: nn.Module) -> None:
-    """Make batch normalisations use their current statistics, until `network.train()`."""
+    """Make batch normalisations use their running statistics until `network.train()` is called."""
     for module in network.modules():
         if isinstance(module, nn.modules.batchnorm._BatchNorm):
             module.eval()

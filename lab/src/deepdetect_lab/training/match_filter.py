@@ -1,7 +1,8 @@
 """Training of the match filter, which separates correct and wrong matches by their neighbours.
 
-Keypoints of two views of a synthetic scene, and now and then of unrelated scenes, are described in
-one of two ways and matched; which matches are right is known.
+Each sample is a pair of views of a synthetic scene, or now and then of two unrelated scenes. The
+keypoints are described by the learned descriptor or RootSIFT, and matched. The ground truth says
+which matches are correct.
 """
 
 from __future__ import annotations
@@ -42,32 +43,38 @@ from .trainer import Trainer, digests, seeded, with_plateau
 ONNX = "match_filter.onnx"
 
 WIDTH, ROUNDS = 32, 3
-"""Number of features of a match, and of rounds in which neighbours update them. Chosen by hand."""
+"""The first is the number of features of a match. The second is the number of rounds of message
+passing between neighbouring matches. Both are chosen by hand."""
 
 OF_A_MATCH, OF_TWO = 4, 11
-"""Numbers of input features of a match, and of a match relative to its neighbour."""
+"""The first is the number of input features of a match, the second that of a pair of neighbours."""
 
 RATIO_RANGE, RATIO_SCALE, RATIO_OFFSET = (0.05, 1.2), 3, 0.5
-"""Ratios are clipped to this range. Their logarithm is scaled and shifted to a mean near 0 and a
-standard deviation near 1. Mutual matches can have ratios above 1."""
+"""Distance ratios of the ratio test are clipped to this range. The logarithm of the ratio is scaled
+and shifted to a mean near 0 and a standard deviation near 1. Mutual matches can have ratios above
+1."""
 
 MEAN_COSINE = 0.7
-"""Approximate mean cosine of the keypoints' rotation, which is subtracted from the feature."""
+"""Approximate mean cosine of the rotation between matched keypoints. It is subtracted, so that the
+feature has a mean near 0."""
 
 LEAST_TRUST = 0.5
-"""It is added to the sum of the neighbours' weights, so that their weighted mean is near 0 if all
+"""This is added to the sum of the neighbours' weights. So their weighted mean is near 0 if all
 weights are near 0. Chosen by hand."""
 
 SIDE_PX, KEYPOINTS, LEAST_MATCHES = 512, 2048, 9
-"""Side of the views in pixels; largest number of keypoints of each; smallest number of matches of a
-pair, one more than the neighbours of a match."""
+"""The views are squares with the first number of pixels a side, and have at most the second number
+of keypoints. A pair has at least the third number of matches, one more than a match has
+neighbours."""
 
 UNRELATED = 7
-"""Every 7th pair shows two unrelated photographs; 7 is odd, so that both descriptors get some."""
+"""Every 7th pair shows two unrelated photographs. The two descriptors alternate, so the number is
+odd to give unrelated pairs to both."""
 
 RIGHT_PX, WRONG_PX = 3.0, 5.0
-"""Matches with an error below the first distance are correct, above the second wrong. Others are
-ignored, because the ground truth is only accurate to a pixel or two."""
+"""Matches with an error below the first distance are correct, those with an error above the second
+are wrong. Matches in between are ignored, because the ground truth is only accurate to a pixel or
+two."""
 
 WARM_UP_STEPS, DECAY_SHARE = 50, 0.7
 """The learning rate rises over these steps, and falls linearly to 0 over this last share of the
@@ -77,11 +84,12 @@ WEIGHT_DECAY = 0.01
 """Weight decay, the default of AdamW."""
 
 LEFT_OUT_SHARE, FEWEST_SHARE = 0.5, 0.02
-"""Share of the pairs whose matches are randomly left out, and the smallest share of matches kept:
-2 %, since the filter is meant for pairs with few matches."""
+"""The first is the share of the pairs in which some matches are randomly left out. The second is
+the smallest share of matches that stay. It is only 2 %, since the filter is meant for pairs with
+few matches."""
 
 TURNED_SHARE = 0.3
-"""Share of the pairs that are rotated as a whole, by any angle. Chosen by hand."""
+"""Share of the pairs of which both images are rotated together by any angle. Chosen by hand."""
 
 VALIDATION_SEED = 1
 """Seed of the validation pairs, which does not depend on the seed of the run."""
@@ -91,7 +99,7 @@ Sample = tuple[dict[str, np.ndarray], np.ndarray]
 
 
 class MatchFilter(nn.Module):
-    """A network from matches and their neighbours to the logits of being correct."""
+    """A network that maps matches and their neighbours to the logits that they are correct."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -116,7 +124,11 @@ class MatchFilter(nn.Module):
         ratios: Tensor,
         around: Tensor,
     ) -> Tensor:
-        """Map (M, 2) pixels, (M,) sizes, rotations (radians), ratios, (M, 2 K) neighbours' rows."""
+        """Return the (M,) logits that matches are correct.
+
+        The inputs are positions (M, 2) and sizes (M,) in pixels in both images, rotations (M,) in
+        radians, distance ratios (M,), and the rows (M, 2 K) of the neighbours in both images.
+        """
         growth, cosine, sine = (sizes1 / sizes0).log(), turns.cos(), turns.sin()
         distinct = RATIO_SCALE * ratios.clamp(*RATIO_RANGE).log() + RATIO_OFFSET
         own = torch.stack([distinct, growth, cosine - MEAN_COSINE, sine], 1)
@@ -134,25 +146,32 @@ class MatchFilter(nn.Module):
     def _compare(
         self, xy0: Tensor, xy1: Tensor, growth: Tensor, cosine: Tensor, sine: Tensor, around: Tensor
     ) -> Tensor:
-        """Return (M, 2 K, 11): positions of neighbours relative to a match, in their distance."""
+        """Return (M, 2 K, 11) features of each match relative to its K neighbours in each image.
+
+        They are offsets, in units of the median distance to the neighbours, and logarithms of
+        scale changes.
+        """
         there0, there1 = xy0[around] - xy0[:, None], xy1[around] - xy1[:, None]
         away0, away1 = (each.square().sum(2).sqrt() for each in (there0, there1))
         middle = AROUND // 2
         unit = (away0[:, middle] * away1[:, AROUND + middle]).sqrt()[:, None, None] + 1
-        # Predicted from the size and angle of the match itself.
+        # Offsets in the second image, predicted from the size and angle of the match itself.
         (x, y), c, s = there0.unbind(2), cosine[:, None], sine[:, None]
         expected = torch.stack([c * x - s * y, s * x + c * y], 2) * growth.exp()[:, None, None]
         lengths = [there0, there1, 2 * (there1 - there0), 2 * (there1 - expected)]
         stretch = ((away1 + 1) / (away0 + 1)).log()
         growths = [stretch, growth[:, None] - stretch, growth[around] - growth[:, None]]
         scaled = torch.cat(lengths, 2) / unit
-        # Inverse hyperbolic sine, which the exporter lacks.
+        # This is the inverse hyperbolic sine, because the ONNX exporter lacks it.
         scaled = scaled.sign() * (scaled.abs() + (scaled * scaled + 1).sqrt()).log()
         return torch.cat([scaled, torch.stack(growths, 2)], 2)
 
 
 def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
-    """Draw, describe and match a pair of views; it depends on the seed and its number."""
+    """Draw a pair of views, describe and match their keypoints, and return features and errors.
+
+    The pair only depends on the files, the seed and its number.
+    """
     rng = np.random.default_rng([seed, number])
     detector = PointDetector(KEYPOINTS, descriptor=(LEARNED, ROOT_SIFT)[number % 2])
 
@@ -172,7 +191,8 @@ def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
         if number % UNRELATED:
             there, _, seen = correspond(layers, tops, xy0)
             errors[seen] = np.linalg.norm(there - xy1, axis=1)[seen]
-            # Matches in areas mirrored at the photograph's border may be correct or wrong.
+            # Beyond its border, the photograph is mirrored. Matches there get an error that is
+            # ignored, because they may be correct or wrong.
             row, column = np.rint(xy0).astype(int).clip(0, SIDE_PX - 1).T[::-1]
             for k, layer in enumerate(layers):
                 place = layer.views[0].to_photograph(xy0)
@@ -185,7 +205,7 @@ def draw_sample(files: Sequence[Path], seed: int, number: int) -> Sample:
 
 
 def draw_samples(files: Sequence[Path], seed: int, count: int, quiet: bool = True) -> list[Sample]:
-    """Draw pairs in parallel; each depends only on the seed and its number."""
+    """Draw pairs of views in parallel. Each only depends on the seed and its number."""
     made = []
     with progress(count, "drawing pairs", "pair", quiet) as bar:
         for sample in map_in_processes(partial(draw_sample, files, seed), range(count)):
@@ -195,7 +215,7 @@ def draw_samples(files: Sequence[Path], seed: int, count: int, quiet: bool = Tru
 
 
 def mutual_matches(features0: Keypoints, features1: Keypoints) -> DescriptorMatches:
-    """Match by mutual nearest neighbours alone."""
+    """Match descriptors by mutual nearest neighbours, without a ratio test."""
     match = partial(match_descriptors, matcher=exact_neighbours, ratio=math.inf, mutual=True)
     if features0.descriptor_type == LEARNED:
         return match_learned(features0, features1, match)
@@ -229,7 +249,7 @@ def vary(rng: np.random.Generator, sample: Sample) -> Sample:
 
 
 def join(samples: Sequence[Sample]) -> tuple[list[Tensor], Tensor]:
-    """Concatenate several pairs; matches of different pairs are never neighbours."""
+    """Concatenate several pairs into one batch. Matches of different pairs are not neighbours."""
     starts = np.cumsum([0, *(len(errors) for _, errors in samples[:-1])])
     moved = [
         {**values, "around": values["around"] + start}
@@ -240,12 +260,12 @@ def join(samples: Sequence[Sample]) -> tuple[list[Tensor], Tensor]:
 
 
 def known(errors: Tensor) -> Tensor:
-    """Return which matches are clearly correct or wrong, by their errors."""
+    """Return which matches are clearly correct or clearly wrong by their errors in pixels."""
     return (errors < RIGHT_PX) | (errors > WRONG_PX)
 
 
 class BatchDataset(Dataset[tuple[list[Tensor], Tensor]]):
-    """Batches by step: randomly varied pairs, which depend on the seed and the step."""
+    """The batch of each step: randomly varied pairs that only depend on the seed and the step."""
 
     def __init__(self, samples: Sequence[Sample], options: MatchFilterTrainingOptions) -> None:
         self.samples, self.options = samples, options
@@ -292,7 +312,7 @@ class MatchFilterTrainer(Trainer):
         self.notes = {"images": str(len(images))}
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return the loader of the batches of some steps, as of `join`."""
+        """Return the loader of the batches of some steps, each as returned by `join`."""
         steps = range(first, self.steps if last is None else last)
         dataset = BatchDataset(self.samples, self.options)
         return DataLoader(dataset, batch_size=None, sampler=steps, generator=torch.Generator())
@@ -309,7 +329,7 @@ class MatchFilterTrainer(Trainer):
         return self.options.learning_rate * factor
 
     def validate(self, step: int) -> dict[str, float]:
-        """Measure the weights so far."""
+        """Measure the current weights on the validation pairs."""
         return measure(self.average, self.held_out)
 
     def export(self, folder: Path) -> Path:
@@ -319,7 +339,7 @@ class MatchFilterTrainer(Trainer):
 
 
 RATIOS = {LEARNED: LEARNED_RATIO, ROOT_SIFT: RATIO}
-"""Ratio test with which the filter is compared, by kind of descriptor."""
+"""Thresholds of the ratio test with which the filter is compared, by descriptor."""
 
 WAYS = ("ratio test", "filter", "filter, as precise")
 MEASURES = ("right", "precision", "of unrelated views")
@@ -327,7 +347,11 @@ MEASURES = ("right", "precision", "of unrelated views")
 
 @torch.no_grad()
 def measure(network: MatchFilter, samples: Sequence[Sample]) -> dict[str, float]:
-    """Return the loss, and measures of ratio test, filter, and filter at equal precision."""
+    """Return the loss, and measures of the ratio test and the filter on validation pairs.
+
+    The filter is measured at logit 0, and at the threshold where it is as precise as the ratio
+    test.
+    """
     found, losses = {}, []
     for offset, (name, limit) in enumerate(RATIOS.items()):
         own = samples[offset::2]

@@ -10,18 +10,20 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 BETA = 0.95
-"""Decay of the three running means of `Soap`, as in its paper."""
+"""Decay of the running means of `Soap`, as in its paper, and of the momentum of `Muon`."""
 
 EPS = 1e-8
 PRECONDITION_FREQUENCY = 10
-"""Number of steps between updates of the basis."""
+"""Number of steps between updates of the eigenbasis of `Soap`."""
 
 NEWTON_SCHULZ = (3.4445, -4.775, 2.0315)
-"""Coefficients of the polynomial that maps singular values to near 1 (Keller Jordan, "Muon")."""
+"""Coefficients of the polynomial whose iteration maps singular values to near 1 (Keller Jordan,
+"Muon"), in ascending order of the powers 1, 3 and 5."""
 
 NEWTON_SCHULZ_STEPS = 5
 MUON_RMS = 0.2
-"""Root mean square of a step in units of the learning rate, as for Adam (arXiv:2502.16982)."""
+"""Root mean square of a Muon step in units of the learning rate, about as large as that of an Adam
+step (arXiv:2502.16982)."""
 
 MUON_WEIGHT_DECAY = 0.01
 INITIAL_POWER_ITERATIONS = 3
@@ -41,10 +43,10 @@ def make_optimizers(name: str, network: nn.Module) -> list[Optimizer]:
 
 
 class KernelOptimizer(Optimizer):
-    """An optimiser of matrices and of kernels, seen as matrices with one row per output channel.
+    """An optimiser of matrices and kernels. A kernel is a matrix with a row per output channel.
 
-    The whole state consists of tensors per parameter, so that safetensors can store it and a
-    resumed run is bit-identical.
+    The whole state consists of tensors per parameter. So safetensors can store it, and a resumed
+    run is bit-identical.
     """
 
     def __init__(self, parameters: Iterable[nn.Parameter], lr: float = 1e-3) -> None:
@@ -66,8 +68,8 @@ class KernelOptimizer(Optimizer):
 class Soap(KernelOptimizer):
     """SOAP (arXiv:2409.11321): Adam in the eigenbasis of Shampoo's preconditioner.
 
-    The first step only computes the first basis. pytorch-optimizer's version is not used, because
-    its state holds lists and numbers, with a basis for each axis of a kernel.
+    The first step only computes the first eigenbasis. The version of pytorch-optimizer is not used,
+    because its state holds lists and numbers, and it has a basis for each axis of a kernel.
     """
 
     def _step(self, parameter: nn.Parameter, gradient: Tensor, learning_rate: float) -> None:
@@ -93,7 +95,7 @@ class Soap(KernelOptimizer):
 
 
 def _update_basis(state: dict[str, Tensor], side: str, axis: int) -> None:
-    """Update the eigenvectors of one side by a power iteration."""
+    """Update the eigenvectors of the left or right preconditioner by one power iteration."""
     matrix, basis = state[side], state[f"{side}_basis"]
     order = (basis.T @ matrix @ basis).diagonal().argsort(descending=True)
     state["exp_avg_sq"].copy_(state["exp_avg_sq"].index_select(axis, order))
@@ -101,7 +103,7 @@ def _update_basis(state: dict[str, Tensor], side: str, axis: int) -> None:
 
 
 def _initial_state(gradient: Tensor) -> dict[str, Tensor]:
-    """Return the state of a parameter at its first gradient, a matrix."""
+    """Return the state of a parameter from its first gradient, a matrix."""
     state = {
         "step": torch.zeros(()),
         "exp_avg": torch.zeros_like(gradient),
@@ -130,7 +132,7 @@ class Muon(KernelOptimizer):
 
 
 def _orthogonalized(matrix: Tensor) -> Tensor:
-    """Return a matrix with the same singular vectors, and singular values of about 1."""
+    """Orthogonalise a matrix: keep its singular vectors, and map singular values to about 1."""
     tall = matrix.shape[0] > matrix.shape[1]
     x = (matrix.T if tall else matrix) / (matrix.norm() + 1e-7)
     x = x.bfloat16()

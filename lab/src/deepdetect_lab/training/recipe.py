@@ -23,7 +23,7 @@ class Stage:
 
     Attributes:
         crop: side of the square crops in pixels, a multiple of 8.
-        batch: crops per batch.
+        batch: number of crops per batch.
         epochs: number of times that each image is used.
         sides: shorter sides of the views to crop; default: all that are large enough.
     """
@@ -45,7 +45,7 @@ class Stage:
 
     @classmethod
     def parse(cls, text: str) -> Stage:
-        """Read a stage from its text CROPxBATCHxEPOCHS, with @SIDE,SIDE for some views only.
+        """Read a stage from a text CROPxBATCHxEPOCHS, or with @SIDE,SIDE for views of some sizes.
 
         Example:
             >>> Stage.parse("240x16x40@240")
@@ -350,12 +350,12 @@ _ESPNET = TrainingOptions(
 )
 
 PRESETS: dict[str, TrainingOptions] = {
-    # Whole views of several sizes, in normal and dark light; the average of the weights.
+    # Whole views of several sizes, in normal and dark light, with averaged weights.
     "default": TrainingOptions(),
-    # Small crops first; images of several sizes keep their aspect ratio.
+    # Small crops come first. Images of several sizes keep their aspect ratio.
     "espnet": _ESPNET,
-    # The paper's (Section III-B): about 33,000 images to train on and 8,000 for validation,
-    # squashed to 480x480, a quarter darkened, 100 epochs in batches of 64.
+    # The paper's recipe (Section III-B): about 33,000 images to train on and 8,000 for validation,
+    # squashed to 480x480, a quarter of them darkened, 100 epochs in batches of 64.
     "paper": replace(
         _ESPNET,
         stages=(Stage(480, 64, 100),),
@@ -367,8 +367,8 @@ PRESETS: dict[str, TrainingOptions] = {
         color_jitter=0.0,
         val_count=20,
     ),
-    # For two-view geometry (the paper's second weights, Figure 8): normal light only, denser
-    # labels. Meant to start from trained weights.
+    # For two-view geometry (the paper's second weights, Figure 8), with denser labels and only in
+    # normal light. It is meant to start from trained weights.
     "dense": TrainingOptions(
         dark_fraction=0.0, labels=LABEL_SETTINGS["dense"], learning_rate=1.5e-3
     ),

@@ -1,6 +1,6 @@
 """Train networks, and `profile` the speed of a run.
 
-Torch is imported by a run, not with this module, because other commands start faster without it.
+Functions import torch when they run, so that other commands start faster.
 """
 
 from __future__ import annotations
@@ -117,7 +117,8 @@ def train_on_pairs(
         log: function for lines of text for the user; None also turns off progress bars.
 
     Returns:
-        The weights' files, of which `PointDetector` takes those of ranker and descriptor.
+        The files of the weights, and the training curves. `PointDetector` reads the weights of
+        rankers and descriptors.
 
     Raises:
         ImageError: a folder is missing or empty.
@@ -152,7 +153,7 @@ def train_on_pairs(
 def _files(
     images: str | Path, validation: str | Path, output: str | Path
 ) -> tuple[list[Path], list[Path]]:
-    """List training and validation images, without figures that the run writes."""
+    """List training and validation images, without the figures that the run writes."""
     images, validation, output = Path(images), Path(validation), Path(output)
     return find_images(images, [output, validation]), find_images(validation, [output, images])
 
@@ -166,7 +167,10 @@ def _dense_trainer(
     log: Log | None = None,
     **data: Any,
 ) -> DenseTrainer:
-    """Make the labels and the trainer; `data` are further arguments of `train`."""
+    """Make the labels and the trainer of the detector network.
+
+    `data` are further arguments of `train`.
+    """
     from .dataset import prepare_data
     from .dense import DenseTrainer, initial_network
 
@@ -179,8 +183,9 @@ def _dense_trainer(
 
 
 TIMED_STEPS, WARM_UP_STEPS = 30, 5
-"""Number of steps of each stage that `profile` times, and of steps before them, in which networks
-are compiled, memory is allocated and first views are rendered."""
+"""The first is the number of steps of each stage that `profile` times. The second is the number of
+steps before these, in which networks are compiled, memory is allocated and first views are
+rendered."""
 
 
 def profile(
@@ -193,8 +198,9 @@ def profile(
 ) -> list[dict[str, Any]]:
     """Time some steps of each stage of a `train` run; only the label cache is written.
 
-    Returns for each stage the crops per second, the same in units of 480x480 images, the fraction
-    of the time spent waiting for data, and the peak memory so far (0 if unknown).
+    Returns for each stage the crops per second, the same speed in images of 480x480 pixels per
+    second, the fraction of the time spent waiting for data, and the peak memory so far (0 if
+    unknown).
     """
     from ..evaluation.profiling import peak_memory
     from .dataset import loading

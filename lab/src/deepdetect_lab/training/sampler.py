@@ -1,6 +1,6 @@
 """The steps of a run and their batches, which depend only on the seed and the step.
 
-So a resumed run gets exactly the batches of an uninterrupted run.
+So a resumed run gets exactly the same batches as an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ FINAL_LEARNING_RATE = 1e-6
 """Cosine annealing ends at this learning rate (paper, Section III-B)."""
 
 SHUFFLED_SHARDS = 4
-"""Number of shards read at a time, whose images are shuffled. Chosen by hand; not measured."""
+"""Number of shards that are read at a time and whose images are shuffled together. Chosen by hand;
+not measured."""
 
 
 class CropIndex(NamedTuple):
-    """Number of an image, epoch, position of the image in the epoch, and stage."""
+    """Index of a crop: number of the image, epoch, position in the epoch's order, and stage."""
 
     image: int
     epoch: int
@@ -90,7 +91,8 @@ class CropSampler(Sampler[list[CropIndex]]):
         schedule: the steps.
         shard_sizes: number of images in each shard, whose images are read together; None if
             images can be read in any order.
-        first_step, last_step: from which step on, and before which; default: all.
+        first_step, last_step: the first step, and the step before which the batches end; by default
+            all steps.
 
     Example:
         >>> schedule = Schedule(TrainingOptions(stages=(Stage(240, 2, 1),)), images=4)
@@ -128,11 +130,14 @@ class CropSampler(Sampler[list[CropIndex]]):
         return batch
 
 
-@functools.lru_cache(maxsize=16)  # interleaved stages are in epochs of their own
+@functools.lru_cache(maxsize=16)  # each of the interleaved stages has its own epoch
 def epoch_order(
     seed: int, epoch: int, count: int, shard_sizes: tuple[int, ...] | None = None
 ) -> np.ndarray:
-    """Return the numbers of the images in the order of an epoch, by a few shards at a time."""
+    """Return the numbers of the images in the random order of an epoch.
+
+    With shards, the images of a few shards at a time are shuffled.
+    """
     if shard_sizes is None:
         return np.random.default_rng([seed, 1, epoch]).permutation(count)
     shards = np.split(np.arange(count), np.cumsum(shard_sizes)[:-1])

@@ -2,8 +2,8 @@
 
 Both views are warped (zoom, rotation, tilt, perspective), the second also by a smooth relief. Parts
 of other photographs may be in front, each with a small motion of its own. So networks learn depth
-and occlusion without pairs of real photographs. Learned descriptor and match filter are trained on
-them.
+and occlusion without pairs of real photographs. The learned descriptor and the match filter are
+trained on these scenes.
 """
 
 from __future__ import annotations
@@ -34,91 +34,107 @@ from .synthetic import (
 Drawn = TypeVar("Drawn")
 
 SIDE_PX = 256
-"""Default side of the square views, for which perspectives are given. Chosen by hand."""
+"""Default side of the square views in pixels, to which `PERSPECTIVE` refers. Chosen by hand."""
 
 MARGIN_PX = 6
-"""Keypoints this near to the border of a view are not used, because their context is cut off."""
+"""Keypoints within this distance of a view's border are not used, because part of their
+surroundings is cut off."""
 
 OFFSET_PX = 90.0
-"""The centre of the first view is up to 90 pixels from that of the photograph along each axis, so
-that photographs of 480 pixels are sometimes seen in every part."""
+"""The first view is centred up to 90 pixels from the photograph's centre along each axis. So every
+part of a photograph of 480 pixels is seen by some views."""
 
 SCALE = Effect(1, math.log(0.6), math.log(1.5))
-"""Log scale of the first view, in pixels of the photograph per pixel. Chosen by hand."""
+"""Logarithm of the first view's scale, in pixels of the photograph per pixel of the view. Chosen by
+hand."""
 
 SCALE_LIMITS = (0.42, 1.8)
-"""Scales of both views, in pixels of the photograph per pixel, are kept in this range if the zoom
-allows: enlarged views would be blurred, reduced ones would mostly show mirrored borders."""
+"""Scales of both views, in pixels of the photograph per pixel of the view, stay in this range if
+the zoom allows. Below it views would be blurred, above it they would mostly show the mirrored
+borders of the photograph."""
 
 ZOOMS = (Effect(1, -0.2, 0.2), Effect(0.5, -math.log(2.1), math.log(2.1)))
 FAR_ZOOM = Effect(0.18, math.log(1.8), math.log(4.2))
-"""Log zoom from the first to the second view. The last effect that is drawn counts; the far zoom
-goes in or out. An earlier descriptor, trained on less zoom, was worse on zoomed images."""
+"""Logarithm of the zoom from the first to the second view. If several of these effects are drawn,
+the last one counts. The far zoom enlarges or reduces. An earlier descriptor, trained on less zoom,
+was worse on zoomed images."""
 
 ROTATED_SHARES, UPRIGHT_DEVIATIONS = (0.3, 0.45), (0.12, 0.15)
-"""Shares of first views, and of second relative to first views, that are rotated by any angle. The
-others have these standard deviations in radians, about 8 degrees, like hand-held cameras."""
+"""The first share of the first views is rotated by any angle, and so is the second share of the
+second views relative to the first. All other rotations are normally distributed with these standard
+deviations in radians (about 8 degrees, like hand-held cameras)."""
 
 NORMAL_TILT, TILT_DEVIATION, LARGEST_TILT = 0.7, 0.35, 2.5
-"""Tilt is the ratio of the scales along two axes. For this share of second views its logarithm is
-normal with this deviation; for the others it is even, up to a tilt of 2.5, a plane seen at 66
-degrees, beyond which little of it can be described."""
+"""A tilt is the ratio of the scales along two axes. In the first share of the second views, its
+logarithm is normal with the second number as standard deviation. In all other second views, the
+logarithm is uniform up to a tilt of 2.5. This is a plane seen at 66 degrees. Beyond it, little of
+the plane can be described."""
 
 FIRST_TILT, FRONT_TILT = 0.15, 0.3
-"""Tilts of first views exceed 1 by at most these values, for the scene and for parts in front."""
+"""Tilts of first views exceed 1 by at most these values. The first is for the scene, the second for
+parts in front."""
 
 PERSPECTIVE, FIRST_PERSPECTIVE = 0.0009, 0.5
-"""Standard deviation of both coefficients of the perspective, per pixel of a view of `SIDE_PX`: the
-scale changes by 11 % from the middle to a border. First views have half of it."""
+"""The first is the standard deviation of both perspective coefficients, per pixel of a view of
+`SIDE_PX`. It changes the scale by 11 % from the middle to a border. For first views, it is
+multiplied by the second."""
 
 SHIFT_DEVIATION = 18.0
 """Standard deviation of the second view's shift, in pixels of the first. Chosen by hand."""
 
 RELIEF_SHARE, RELIEF_PX = 0.45, (1.5, 5.0)
-"""Share of second views with a relief, and range of its height's standard deviation in pixels."""
+"""The first is the share of second views with a relief. The second is the range of the relief's
+standard deviation in pixels."""
 
 SMOOTH_CELLS = (3, 8)
-"""Relief and shapes have 3 to 7 random values along a side: with more, a relief could not be
-inverted and shapes would be smaller than what a keypoint is described by."""
+"""Reliefs and the outlines of parts in front have 3 to 7 random values along a side. With more, a
+relief could not be inverted, and parts would be smaller than the area that describes a keypoint."""
 
 FRONT_SHARE, FRONT_COUNTS, OTHER_PHOTOGRAPH_SHARE = 0.5, (1, 1, 2, 3), 0.8
-"""Share of the pairs with parts in front; how many, each as likely as another; and the share of the
-parts that are of another photograph."""
+"""The first is the share of the pairs with parts in front. Their number is drawn evenly from the
+second. The third is the share of the parts that are cut from another photograph."""
 
 SHAPE_PX, UNCOVERED = 480, (0.6, 0.88)
-"""Parts in front are where smooth noise of 480 pixels a side is above one of these quantiles: they
-cover 12 to 40 % of their photograph, in blobs of any shape."""
+"""A part in front covers its photograph where smooth noise, 480 pixels a side, is above a quantile
+drawn from this range. So parts are blobs of any shape, over 12 to 40 % of their photograph."""
 
 FRONT_OFFSET_PX, FRONT_SCALE, FRONT_ANGLE = 60.0, 0.2, 0.3
-"""How a part in front lies to the scene in the first view: up to this offset in pixels of the
-photograph along each axis; standard deviations of the logarithm of its scale and of its angle in
-radians."""
+"""The pose of a part in front relative to the scene, in the first view. The first is the largest
+offset along each axis, in pixels of the photograph. The second and third are the standard
+deviations of the logarithm of the scale and of the angle in radians."""
 
 MOTION_SHIFT, MOTION_SCALE, MOTION_ANGLE, MOTION_TILT = 22.0, 0.12, 0.06, 0.15
-"""How a part in front moves relative to the scene: standard deviations of the shift in pixels of
-the view, of the logarithm of the scale, of the angle in radians, of the logarithm of the tilt."""
+"""The motion of a part in front relative to the scene, as standard deviations: of the shift in
+pixels of the view, the logarithm of the scale, the angle in radians, and the logarithm of the
+tilt."""
 
 ALIASED_SCALE, PIXEL_SIGMA = 1.15, 0.5
-"""Photographs reduced by more than the first factor are blurred before sampling, as if pixels of
-both images were Gaussians with the second number as sigma, in pixels."""
+"""A photograph that is reduced by more than the first factor is blurred before sampling, against
+aliasing. The blur takes pixels with a Gaussian footprint (sigma: the second number, in pixels) from
+the size of the photograph's pixels to the size of the view's."""
 
 COVERED = 0.5
-"""A part in front covers a pixel if its share is at least this."""
+"""A part in front counts as visible in a pixel if it covers more than this share of the pixel."""
 
 STEP_PX = 2.0
-"""Derivatives are differences over this step to both sides: more than what is rounded."""
+"""Derivatives are central differences over this step in pixels. Much smaller steps would suffer
+from rounding."""
 
 ATTEMPTS = 200
-"""Scenes are redrawn this often; photographs that then still share too little have no detail."""
+"""Scenes are redrawn up to this number of times, until the views share enough keypoints. If they
+never do, the photographs have too little detail."""
 
 ITERATIONS = 5
-"""Fixed-point iterations to invert a relief: after five, the error is below 0.01 pixels at 99 % of
-all places and 0.5 pixels at the worst."""
+"""Number of fixed-point iterations to invert a relief. After five, the error is below 0.01 pixels
+at 99 % of all places, and at most 0.5 pixels."""
 
 
 @dataclass(frozen=True)
 class View:
-    """Map from a view to a photograph: a (S, S, 2) displacement by a relief, then a homography."""
+    """The map from a view to a photograph: a homography after a displacement by a relief, if any.
+
+    The relief holds a displacement in pixels, (S, S, 2), for each pixel of the view.
+    """
 
     matrix: np.ndarray
     relief: np.ndarray | None = None
@@ -137,7 +153,7 @@ class View:
         return result
 
     def render(self, image: np.ndarray, border: int = cv2.BORDER_REFLECT_101) -> np.ndarray:
-        """Return what the view shows of an image, (S, S) float32."""
+        """Warp an image into the view; return (S, S) float32."""
         at = self.to_photograph(pixels(self.side_px))
         return cv2.remap(image, at, None, cv2.INTER_LINEAR, borderMode=border).astype(np.float32)
 
@@ -150,7 +166,7 @@ class View:
 
 
 class Layer(NamedTuple):
-    """A photograph, RGB, in both views; (H, W) float32 in [0, 1] where it covers what is behind."""
+    """An RGB photograph with its two views, and its shape: an opacity mask, (H, W) in [0, 1]."""
 
     photograph: np.ndarray
     views: tuple[View, View]
@@ -159,7 +175,7 @@ class Layer(NamedTuple):
 
 @dataclass(frozen=True)
 class Pose:
-    """Pose of a view: its centre in the photograph, scale, angle and tilt."""
+    """Pose of a view: its centre in the photograph, scale, angle in radians, and tilt."""
 
     middle: np.ndarray
     scale: float
@@ -169,7 +185,10 @@ class Pose:
     def draw_matrix(
         self, rng: np.random.Generator, side_px: int, perspective: float = 1
     ) -> np.ndarray:
-        """Draw the homography from the view, with a direction of the tilt and a perspective."""
+        """Draw the homography from the view to the photograph.
+
+        The direction of the tilt and the perspective are random.
+        """
         azimuth, root = rng.uniform(0, math.pi), math.sqrt(self.tilt)
         linear = rotation(self.angle) @ scaled_along(azimuth, root, 1 / root) * self.scale
         bend = perspective * SIDE_PX / side_px * rng.normal(0, PERSPECTIVE, 2)
@@ -179,7 +198,10 @@ class Pose:
 def draw_layers(
     rng: np.random.Generator, files: Sequence[Path], side_px: int = SIDE_PX
 ) -> tuple[list[Layer], list[float], float]:
-    """Draw what two views show, from the back: layers, the views' scales, the angle in radians."""
+    """Draw a scene: its layers from back to front, the scale of each view, and the angle between.
+
+    The angle is the absolute rotation between the two views, in radians.
+    """
     photograph = _draw_photograph(rng, files)
     middle = np.array(photograph.shape[1::-1]) / 2 + rng.uniform(-OFFSET_PX, OFFSET_PX, 2)
     scales = _draw_scales(rng)
@@ -204,7 +226,7 @@ def draw_layers(
 
 
 def draw_until_seen(draw: Callable[[], Drawn | None]) -> Drawn:
-    """Draw until a draw succeeds; raise an OptionError if the photographs show too little."""
+    """Call `draw` until it succeeds; raise an OptionError if the photographs show too little."""
     for _ in range(ATTEMPTS):
         if (drawn := draw()) is not None:
             return drawn
@@ -216,7 +238,7 @@ def _draw_photograph(rng: np.random.Generator, files: Sequence[Path]) -> np.ndar
 
 
 def _draw_scales(rng: np.random.Generator) -> list[float]:
-    """Draw the scale of each view, in pixels of the photograph per pixel."""
+    """Draw the scale of each view, in pixels of the photograph per pixel of the view."""
     scale, zoom = math.exp(SCALE.strength(rng)), 1.0
     for effect in ZOOMS:
         if effect.happens(rng):
@@ -230,7 +252,7 @@ def _draw_scales(rng: np.random.Generator) -> list[float]:
 
 
 def _draw_relief(rng: np.random.Generator, side_px: int) -> np.ndarray:
-    """Draw the displacement in pixels of each place of a view, all in one direction."""
+    """Draw the displacement (S, S, 2) of each pixel of a view, all along one direction."""
     azimuth = rng.uniform(0, 2 * math.pi)
     height = smooth_noise(rng, side_px, SMOOTH_CELLS) * rng.uniform(*RELIEF_PX)
     moved = np.stack([height * math.cos(azimuth), height * math.sin(azimuth)], -1)
@@ -240,7 +262,7 @@ def _draw_relief(rng: np.random.Generator, side_px: int) -> np.ndarray:
 def _draw_front(
     rng: np.random.Generator, files: Sequence[Path], scene: Layer, poses: tuple[Pose, Pose]
 ) -> Layer:
-    """Draw a part in front of a scene; it moves with the scene, plus a small motion of its own."""
+    """Draw a part in front of a scene. It moves with the scene, plus a small motion of its own."""
     first, second = poses
     side_px = scene.views[0].side_px
     other = happens(rng, OTHER_PHOTOGRAPH_SHARE)
@@ -267,9 +289,9 @@ def _draw_front(
 def render_layers(
     layers: Sequence[Layer], side: int, scale: float, mixture: np.ndarray | None = None
 ) -> tuple[np.ndarray, ...]:
-    """Return one of the views, (S, S) float32, and the number of the layer in each pixel.
+    """Render one of the two views; return (S, S) float32 and the number of each pixel's top layer.
 
-    In luma, or in a (1, 3) mixture of colours.
+    The view shows the luma, or the mixture of colour channels with the weights (1, 3).
     """
     size = (layers[0].views[side].side_px,) * 2
     view, top = np.zeros(size, np.float32), np.zeros(size, np.uint8)
@@ -290,7 +312,10 @@ def render_layers(
 
 
 def mix_colours(photograph: np.ndarray, mixture: np.ndarray) -> np.ndarray:
-    """Return (H, W) uint8 of (H, W, 3), lifted as far as colours that count less than 0 need."""
+    """Mix the colour channels of (H, W, 3) uint8 with weights (1, 3); return (H, W) uint8.
+
+    Negative weights are compensated by an offset, so that values do not fall below 0.
+    """
     mixed = cv2.transform(photograph.astype(np.float32), mixture)
     lifted: np.ndarray = np.clip(mixed - 255 * np.minimum(mixture, 0).sum(), 0, 255)
     return lifted.astype(np.uint8)
@@ -299,10 +324,11 @@ def mix_colours(photograph: np.ndarray, mixture: np.ndarray) -> np.ndarray:
 def correspond(
     layers: Sequence[Layer], tops: Sequence[np.ndarray], xy: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where the second view shows (N, 2) float32 positions of the first one.
+    """Map positions (N, 2) float32 of the first view to the second view.
 
-    By the layers, and their numbers in the pixels of both views: (N, 2) positions, (N, 2, 2)
-    derivatives of these by those given, and (N,) whether they are seen.
+    `tops` holds the number of the top layer in each pixel of both views. Returns the positions
+    (N, 2) in the second view, the Jacobians (N, 2, 2) of the map, and whether each position is
+    visible in the second view (N,).
     """
     there, jacobians = np.zeros_like(xy), np.zeros((len(xy), 2, 2))
     layer_of, visible = _at(tops[0], xy), np.zeros(len(xy), bool)

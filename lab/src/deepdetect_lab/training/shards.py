@@ -1,7 +1,7 @@
 """Store images and labels in shards, for data sets larger than memory or on slow disks.
 
-A shard is an uncompressed tar file in the layout of WebDataset. For every image it has the file,
-its name, and the labels of its views. The sampler reads a few shards at a time.
+A shard is an uncompressed tar file in the layout of WebDataset. For every image it holds the file,
+the file's name, and the labels of the image's views. The sampler reads a few shards at a time.
 """
 
 from __future__ import annotations
@@ -50,7 +50,10 @@ Files = tuple[tuple[Path, int], ...]
 
 @dataclass(frozen=True)
 class Shards:
-    """A folder of shards: files and their numbers of images; file names hold a content digest."""
+    """A folder of shards: each file with its number of images.
+
+    The file names hold a digest of the content.
+    """
 
     folder: Path
     training: Files
@@ -76,7 +79,7 @@ class Shards:
 
 
 class ShardSource:
-    """Images in shards; the recipe determines their views."""
+    """Images and labels in shards. The recipe determines the views of the images."""
 
     def __init__(self, files: Files, options: TrainingOptions) -> None:
         self.files, self.options = files, options
@@ -87,7 +90,7 @@ class ShardSource:
         return self.ends[-1] if self.ends else 0
 
     def __getitem__(self, index: int) -> SourceImage:
-        """Return an image; its path is the name in the original folder."""
+        """Return an image. Its path is relative to the original folder."""
         shard, key, sample = self._sample(index)
         name = _read(shard, sample["name.txt"]).decode()
         return SourceImage(Path(name), key.rpartition("_")[2], *views_of(name, self.options))
@@ -106,7 +109,7 @@ class ShardSource:
         return image, mask
 
     def _sample(self, index: int) -> tuple[Path, str, Mapping[str, tuple[int, int]]]:
-        """Return the shard of an image, its key, and offset and size of its files."""
+        """Return the shard of an image, the image's key, and offset and size of its files."""
         number = bisect.bisect_right(self.ends, index)
         path, count = self.files[number]
         samples = _read_members(path)
@@ -134,7 +137,7 @@ def write_shards(
 
     Args:
         images: folder of images.
-        output: another folder, for the shards.
+        output: folder for the shards, not that of the images.
         options: the recipe of later runs, which determines the validation images.
         shard_size: approximate number of images per shard.
         workers: number of processes; default one per processor.
@@ -144,7 +147,7 @@ def write_shards(
     Raises:
         ImageError: the folder is missing, or has too few images.
         OptionError: the folder has shards that were made with other options.
-        BatchError: images cannot be read; the shards without them are kept.
+        BatchError: images cannot be read. Shards without these images are kept.
         DeepDetectError: a shard cannot be written.
 
     Example:
@@ -192,19 +195,22 @@ def write_shards(
     index: dict[str, Any] = {"options": _fixed_options(options)}
     for kind, shards in files.items():
         index[kind] = [{"file": path.name, "images": count} for path, count in shards]
-    with atomic_path(output / INDEX) as temporary:  # after all shards
+    with atomic_path(output / INDEX) as temporary:  # written last, so shards are complete
         temporary.write_text(json.dumps(index, indent=1))
     return Shards(output, tuple(files["training"]), tuple(files["validation"]))
 
 
 ShardTask = tuple[Path, Sequence[tuple[str, SourceImage, Sequence[View]]]]
-"""A shard to write: its path, and name, image and views of each image."""
+"""A shard to write: its path, and for each image the name, the `SourceImage` and the views."""
 
 
 def _deal(
     images: Sequence[SourceImage], root: Path, shard_size: int
 ) -> list[list[tuple[str, SourceImage]]]:
-    """Assign images to shards by checksums of names, so new images change few shards."""
+    """Assign images to shards by checksums of their names, so that new images change few shards.
+
+    Returns the (name, image) pairs of each shard.
+    """
     shards: list[list[tuple[str, SourceImage]]] = [[] for _ in range(-(-len(images) // shard_size))]
     for image in images:
         name = image.path.relative_to(root).as_posix()
@@ -247,7 +253,7 @@ def _files_of(
 
 @functools.lru_cache(maxsize=64)
 def _read_members(path: Path) -> list[tuple[str, dict[str, tuple[int, int]]]]:
-    """List the images of a shard: key, and offset and size of the files of each."""
+    """List the images of a shard: the key of each, and the offset and size of each of its files."""
     samples: dict[str, dict[str, tuple[int, int]]] = {}
     try:
         with tarfile.open(path, "r:") as tar:
@@ -288,7 +294,7 @@ def _damaged(path: Path, reason: object) -> ImageError:
 
 
 def _fixed_options(options: TrainingOptions) -> dict[str, Any]:
-    """Return the options that cannot change after labels are made, as read back from JSON."""
+    """Return the options that must not change after the shards are written, as JSON values."""
     names = ("short_sides", "square", "max_images", "val_fraction", "augmentations")
     fixed = {name: plain(getattr(options, name)) for name in names}
     return {**fixed, "labels": label_key(options.labels)}

@@ -1,7 +1,7 @@
-"""Synthetic views, for all trainings: where a view is taken from, its light, blur, noise and JPEG.
+"""Synthetic views for all trainings: homographies, and changes of light, blur, noise and JPEG.
 
-What is done to a view stands here once. How often and how strongly is the recipe of a task: `Light`
-and `Camera`, of `Effect`s, beside the views of that task.
+This module holds the operations. How often and how strongly a training applies them is its recipe:
+`Light` and `Camera`, which consist of `Effect`s.
 """
 
 from __future__ import annotations
@@ -24,37 +24,40 @@ MIDDLE_GREY = 0.5
 """Contrast is changed around this value of [0, 1], so that the mean brightness stays."""
 
 NOISE_CELLS = (2, 5)
-"""Smooth light has 2 to 4 random values along a side: it varies over half the view or more, as
-light in a room does."""
+"""Smooth light is interpolated from 2 to 4 random values along a side. So it varies over a quarter
+to half of the view, like light in a room."""
 
 LIT_RANGE = (0.15, 1.6)
-"""Smooth light multiplies values by no less and no more: darker places would show nothing, brighter
-ones only white."""
+"""Smooth light multiplies values by factors in this range. Darker areas would show nothing, and
+brighter ones would be white."""
 
 SHADOW_REACH_PX = 80.0
 """The edge of a shadow passes the middle of the view within 80 pixels, so that both sides are
 seen."""
 
 SHADOW_EDGE_PX = (0.7, 8.0)
-"""The edge of a shadow is blurred by a sigma of 0.7 pixels (the sun, near) to 8 (a window)."""
+"""The edge of a shadow is blurred by a Gaussian with a sigma from 0.7 pixels (sunlight, object
+close to the surface) to 8 (light from a window)."""
 
 CURVE_TONES = 6
 """A curve of tones rises through 6 random values between black and white."""
 
 DARK_NOISE_LEVELS, DARK_NOISE_LIGHT = (0.2, 0.6, 3.0), 0.25
-"""Sigma of the noise in little light is at least 0.2 grey levels. Its maximum grows from 0.6
-without light to 3.0 at 1/4 of the light, since fewer photons have less shot noise."""
+"""The first three are standard deviations of the noise of dark views, in grey levels. The smallest
+is 0.2. The largest grows from 0.6 without light to 3.0 at 1/4 of the light (the second number),
+because shot noise grows with the number of photons."""
 
 
 def happens(rng: np.random.Generator, share: float) -> bool:
-    """Whether something happens to a view; if to all or to none, nothing is drawn."""
+    """Draw whether an effect with this share happens; nothing is drawn if it is 0 or 1."""
     return share >= 1 or (share > 0 and rng.random() < share)
 
 
 class Effect(NamedTuple):
-    """How often something happens to a view, and how strongly.
+    """An effect on views: the share of the views that get it, and the range of its strength.
 
-    The strength is drawn evenly; a power above 1 makes low ones more frequent, below 1 high ones.
+    The strength is drawn uniformly if `power` is 1. A power above 1 makes low strengths more
+    frequent, a power below 1 high ones.
     """
 
     share: float
@@ -63,15 +66,15 @@ class Effect(NamedTuple):
     power: float = 1
 
     def happens(self, rng: np.random.Generator) -> bool:
-        """Whether it happens to a view."""
+        """Draw whether the effect happens to a view."""
         return happens(rng, self.share)
 
     def strength(self, rng: np.random.Generator) -> float:
-        """Draw how strongly it happens."""
+        """Draw the strength of the effect."""
         return self.low + (self.high - self.low) * float(rng.random()) ** self.power
 
     def whole(self, rng: np.random.Generator) -> int:
-        """Draw a whole number, below the high end."""
+        """Draw the strength as a whole number, excluding the upper end of the range."""
         return int(rng.integers(int(self.low), int(self.high)))
 
 
@@ -83,15 +86,15 @@ class Light:
     """How `relight` changes values in [0, 1].
 
     Attributes:
-        share: of the views that are changed at all.
-        field: smooth light: by which fraction it varies.
-        shadow: a shadow with an edge: the fraction of the light that it takes.
-        log_gamma: natural logarithm of the exponent.
-        curve: share of the views with any rising curve of tones.
-        contrast: factor around the middle grey.
+        share: share of the views that are changed at all.
+        field: smooth light. The strength is the fraction by which it varies.
+        shadow: a shadow with an edge. The strength is the fraction of the light that it removes.
+        log_gamma: natural logarithm of the exponent of a gamma curve.
+        curve: share of the views with a random increasing tone curve.
+        contrast: factor of the contrast around the middle grey.
         log_gain: natural logarithm of the factor of all values.
-        ramp: light that grows along a line: by which fraction from border to border.
-        shift: range of what is added with a contrast or a gain.
+        ramp: light that increases linearly by this fraction from border to border.
+        shift: range of the offset that is added together with a contrast or a gain.
     """
 
     share: float = 1
@@ -107,14 +110,16 @@ class Light:
 
 @dataclass(frozen=True)
 class Camera:
-    """What `blur` and `record` do.
+    """How `blur` and `record` degrade a view.
 
     Attributes:
-        blur: sigma of a Gaussian in pixels.
-        motion: of the views that are not blurred so: length of a motion in whole pixels.
-        log_dark: natural logarithm of the fraction of the light that is left, with noise.
-        noise: of the other views: sigma in grey levels, by the first of these that happens.
-        jpeg: quality, a whole number.
+        blur: Gaussian blur. The strength is its sigma in pixels.
+        motion: motion blur of views without a Gaussian blur. The strength is a length in whole
+            pixels.
+        log_dark: natural logarithm of the fraction of the light that is left. It adds noise.
+        noise: noise of views that are not dark. The strength is the sigma in grey levels. The first
+            effect that happens is used.
+        jpeg: JPEG compression. The strength is the quality, a whole number.
     """
 
     blur: Effect = NEVER
@@ -125,7 +130,10 @@ class Camera:
 
 
 def relight(rng: np.random.Generator, view: np.ndarray, light: Light) -> np.ndarray:
-    """Change the light of (S, S) values in [0, 1]; of any shape without field, shadow and ramp."""
+    """Change the light of a view, (S, S) in [0, 1].
+
+    Without `field`, `shadow` and `ramp` values can have any shape.
+    """
     if not happens(rng, light.share):
         return view
     if light.field.happens(rng):
@@ -154,7 +162,7 @@ def relight(rng: np.random.Generator, view: np.ndarray, light: Light) -> np.ndar
 
 
 def blur(rng: np.random.Generator, view: np.ndarray, camera: Camera) -> np.ndarray:
-    """Blur a view of any type as an unfocused lens or a motion does, if the recipe says so."""
+    """Blur a view of any type by defocus or motion, if the recipe's effects happen."""
     if camera.blur.happens(rng):
         return cv2.GaussianBlur(view, (0, 0), camera.blur.strength(rng))
     if camera.motion.happens(rng):
@@ -164,7 +172,7 @@ def blur(rng: np.random.Generator, view: np.ndarray, camera: Camera) -> np.ndarr
 
 
 def record(rng: np.random.Generator, levels: np.ndarray, camera: Camera) -> np.ndarray:
-    """Make the uint8 image that a camera stores of a view in grey levels, any float type."""
+    """Simulate a camera: darken a float view in grey levels, add noise, compress; return uint8."""
     if camera.log_dark.happens(rng):
         light = math.exp(camera.log_dark.strength(rng))
         least, *most = DARK_NOISE_LEVELS
@@ -184,11 +192,11 @@ def _add_noise(rng: np.random.Generator, levels: np.ndarray, sigma: float) -> np
 
 
 def compress(image: np.ndarray, quality: int) -> np.ndarray:
-    """Store a grey or RGB uint8 image as JPEG, and read it again."""
+    """Compress a grey or RGB uint8 image as JPEG, and decode it again."""
     kind = [cv2.IMWRITE_JPEG_QUALITY, quality]
     if image.ndim == 2:
         return cv2.imdecode(cv2.imencode(".jpg", image, kind)[1], cv2.IMREAD_GRAYSCALE)
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)  # OpenCV's order, so that luma is luma
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)  # OpenCV's order, for the luma of JPEG
     stored = cv2.imencode(".jpg", bgr, kind)[1]
     return cv2.cvtColor(cv2.imdecode(stored, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
@@ -198,8 +206,9 @@ def view_homography(
 ) -> np.ndarray:
     """Return the (3, 3) homography from the pixels of a square view to those of a photograph.
 
-    The middle of the view shows the place, around which (2, 2) maps pixels of the view to those of
-    the photograph, after the perspective, (2,) per pixel of the view.
+    The centre of the view shows the point `place` of the photograph. The perspective (2,), per
+    pixel of the view, is applied first. Then `linear` (2, 2) maps offsets from the centre of the
+    view to offsets from `place`.
     """
     affine, bent, shift = np.eye(3), np.eye(3), np.eye(3)
     affine[:2, :2], affine[:2, 2] = linear, place
@@ -209,18 +218,21 @@ def view_homography(
 
 
 def rotation(angle: float) -> np.ndarray:
-    """Return the (2, 2) rotation by an angle in radians, from x towards y."""
+    """Return the rotation matrix (2, 2) for an angle in radians, from x towards y."""
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, -s], [s, c]])
 
 
 def scaled_along(azimuth: float, along: float, across: float) -> np.ndarray:
-    """Return the (2, 2) map that scales along a direction, in radians, and across it."""
+    """Return the matrix (2, 2) that scales along a direction, in radians, and across it."""
     return rotation(azimuth) @ np.diag([along, across]) @ rotation(-azimuth)
 
 
 def smooth_noise(rng: np.random.Generator, side_px: int, cells: tuple[int, int]) -> np.ndarray:
-    """Draw (S, S) float32 normal values, interpolated between a number of cells along a side."""
+    """Draw smooth noise, (S, S) float32: a coarse grid of normal values, interpolated.
+
+    The number of values along a side is drawn from the range `cells`, which excludes its end.
+    """
     noise = rng.standard_normal((int(rng.integers(*cells)),) * 2).astype(np.float32)
     return cv2.resize(noise, (side_px, side_px), interpolation=cv2.INTER_CUBIC)
 

@@ -41,7 +41,10 @@ CHECKPOINT_INTERVAL_S = 60.0
 
 @dataclass
 class TrainingState:
-    """The steps done, the curves, and the losses of the batches since their last point."""
+    """Progress of a run: steps done, and points of the training curves.
+
+    The sum and the number of batch losses are those since the last point.
+    """
 
     step: int = 0
     loss_sum: float = 0.0
@@ -54,12 +57,12 @@ class TrainingResult:
     """The results of a run.
 
     Attributes:
-        weights: the weights that the validation found best, safetensors or npz.
-        onnx: the same weights as ONNX, for `DeepDetect(weights=...)`, or as a descriptor; None for
-            a ranker.
-        points: the curves: losses and measures by name, for each validation.
-        best: the point of those weights.
-        images_per_second: mean rate, in 480x480 images' worth of pixels; 0 for a training on pairs.
+        weights: file of the weights that are best in the validation, safetensors or npz.
+        onnx: ONNX file with the same weights; None for a ranker.
+        points: points of the training curves: losses and measures by name, for each validation.
+        best: the point of the best weights.
+        images_per_second: mean speed, counted in images of 480x480 pixels; 0 for a training on
+            pairs.
     """
 
     weights: Path
@@ -74,20 +77,20 @@ class Trainer(abc.ABC):
 
     Attributes:
         network: the network that is trained.
-        average: exponential average of its state, which is validated and saved.
-        average_decay: decay of the average per step; 0: the average is the network itself.
-        optimizers: the optimisers of its parameters.
+        average: exponential moving average of the network's state, which is validated and saved.
+        average_decay: decay of the average per step. With 0 the average equals the network.
+        optimizers: the optimisers of the network's parameters.
         options: the recipe.
-        origin: digests of the images and the initial weights; a run is only resumed if recipe and
+        origin: digests of the images and the initial weights. A run is only resumed if recipe and
             origin are the same.
         notes: further notes for the weights file.
-        purpose: what the network does, for the model card.
-        measures: what the measures are, for the model card.
-        introduction: lines for the user before the first step.
+        purpose: what the network does, as a text for the model card.
+        measures: what the validation measures, as a text for the model card.
+        introduction: lines that are shown to the user before the first step.
         steps: number of steps of the whole run.
-        milestones: numbers of steps after which it is validated.
-        objective: name of the value by which the best weights are chosen.
-        sign: 1 if the lowest value is the best, -1 if the highest is.
+        milestones: numbers of steps after which the network is validated.
+        objective: name of the measure by which the best weights are chosen.
+        sign: 1 if the lowest value of the measure is the best, -1 if the highest is.
         weights_file: name of the file of the best weights.
         max_gradient_norm: gradients with a larger norm are scaled down to it.
     """
@@ -114,7 +117,7 @@ class Trainer(abc.ABC):
         """Return the loader of the batches of some steps."""
 
     def pixels(self, batch: Any) -> int:
-        """Return the number of pixels in a batch, by which the speed is told."""
+        """Return the number of pixels in a batch, from which the reported speed is computed."""
         return 0
 
     @abc.abstractmethod
@@ -127,10 +130,10 @@ class Trainer(abc.ABC):
 
     @abc.abstractmethod
     def validate(self, step: int) -> dict[str, float]:
-        """Validate the weights after a number of steps."""
+        """Validate the weights after a number of steps; return the measures by name."""
 
     def save(self, path: Path, notes: Mapping[str, Any]) -> None:
-        """Write the average weights."""
+        """Write the averaged weights with notes."""
         save_tensors(self.average.state_dict(), path, dict(notes))
 
     def read_notes(self, path: Path) -> Mapping[str, Any]:
@@ -142,7 +145,7 @@ class Trainer(abc.ABC):
         return None
 
     def training_step(self, batch: Any, step: int) -> float:
-        """Take an optimiser step after `step` others, and return the loss.
+        """Take the optimiser step with number `step`, from 0, on a batch; return the loss.
 
         Raises:
             OptionError: the loss or its gradients are not finite.
@@ -169,7 +172,7 @@ class Trainer(abc.ABC):
         for mean, state in zip(*states, strict=True):
             if mean.is_floating_point():
                 mean.lerp_(state, 1 - decay)
-            else:  # a count
+            else:  # the number of batches that a batch normalisation has seen
                 mean.copy_(state)
         return value
 
@@ -178,7 +181,7 @@ class Trainer(abc.ABC):
 
         Raises:
             OptionError: the folder holds a run with other options, images or initial weights.
-            WeightsError: its checkpoint is damaged, or its best weights are missing.
+            WeightsError: the checkpoint is damaged, or the file of the best weights is missing.
         """
         state = self._resume(folder)
         if log is not None and state.step < self.steps:
@@ -186,7 +189,7 @@ class Trainer(abc.ABC):
                 log(line)
         measured = {point["step"] for point in state.points}
         if state.step in self.milestones and state.step not in measured:
-            self._validate(state, folder)  # the start, or an interrupted validation
+            self._validate(state, folder)  # at the start or after an interruption
         started, pixels = time.monotonic(), 0
         saved = started
         bar = progress(self.steps, "training", "step", log is None, state.step)
@@ -297,24 +300,27 @@ class Trainer(abc.ABC):
 
 
 def seeded(make: Callable[[], Network], seed: int) -> Network:
-    """Make a network with random weights by a seed; the caller's random numbers are left alone."""
+    """Make a network with random weights by a seed, without changing the caller's random state."""
     with torch.random.fork_rng(devices=()):
         torch.default_generator.manual_seed(seed)
         return make()
 
 
 def digests(images: Sequence[Path], validation: Sequence[Path]) -> dict[str, str]:
-    """Return the origin of a run on images, by their content and names."""
+    """Return digests of training and validation images, as `origin` of a run."""
     return {"images_digest": key(images)[:16], "validation_digest": key(validation)[:16]}
 
 
 def with_plateau(step: int, steps: int, warm_up: float, decay_share: float) -> float:
-    """Return a factor of the learning rate: a warm-up over steps, 1, a linear decay to 0."""
+    """Return the factor of the learning rate in a step.
+
+    It rises to 1 over `warm_up` steps, and falls linearly to 0 over the last share of the steps.
+    """
     return min(1, (step + 1) / warm_up, (1 - step / steps) / decay_share)
 
 
 def save_curves(points: Sequence[Point], folder: Path) -> None:
-    """Write curves.csv, and curves.png (paper, Figure 5)."""
+    """Write the training curves to curves.csv and curves.png (paper, Figure 5)."""
     with atomic_path(folder / "curves.csv") as temporary:
         temporary.write_text(_curves(points).to_csv(), newline="")
     steps = [point["step"] for point in points]

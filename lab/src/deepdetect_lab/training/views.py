@@ -1,4 +1,4 @@
-"""Source images of a run, their views (size, light, augmentation), and labels of views."""
+"""Source images of a run, their views (of some size, light and augmentation), and their labels."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from .recipe import TrainingOptions
 class View:
     """A view of an image for the network: shorter side in pixels, light and shape.
 
-    It is the whole image, its central square, the image resized to a square, or an augmented square
-    by a seed.
+    It shows the whole image, its central square, the image resized to a square, or an augmented
+    square part. `augmentation` is the seed of the augmented part.
     """
 
     short_side: int
@@ -107,7 +107,7 @@ def label_view(rgb: np.ndarray, view: View, options: LabelOptions) -> np.ndarray
 
 
 def label_key(options: LabelOptions) -> str:
-    """Return a digest of everything else that changes a label, except image and view."""
+    """Return a digest of the label settings, on which a label depends besides image and view."""
     names = options.detectors
     return key({n: [options.parameters(n, "normal"), options.parameters(n, "low")] for n in names})
 
@@ -115,7 +115,10 @@ def label_key(options: LabelOptions) -> str:
 def list_images(
     root: Path, options: TrainingOptions, exclude: Sequence[Path] = (), limit: int | None = None
 ) -> list[SourceImage]:
-    """List the images in a folder, recursively; a limit selects by checksums of names."""
+    """List the images in a folder, recursively.
+
+    If there are more than `limit`, checksums of their names decide which are used.
+    """
     paths = find_images(root, exclude)
     if limit is not None and len(paths) > limit:
         chosen = sorted(paths, key=lambda path: (zlib.crc32(path.name.encode()), path))[:limit]
@@ -131,9 +134,9 @@ def list_images(
 def train_val_split(
     images: Sequence[SourceImage], val_fraction: float = 0.05
 ) -> tuple[list[SourceImage], list[SourceImage]]:
-    """Split images into training images and about a fraction for validation.
+    """Split images into training images and about the given fraction of validation images.
 
-    Checksums of names decide, so that an image keeps its part when others are added.
+    Checksums of names decide, so that an image stays in its part when other images are added.
     """
     training: list[SourceImage] = []
     validation: list[SourceImage] = []

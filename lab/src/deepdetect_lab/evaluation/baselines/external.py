@@ -7,10 +7,10 @@ distance) and `version`. Change `version` whenever the results change, because t
 notices changes in the module's own file.
 
 An ONNX file has one input in [0, 1], 1x3xHxW RGB or 1x1xHxW grey (the mean of the channels). Its
-size is fixed or free. The outputs are those of the dict, in pixels of the input, as XFeat has them;
-a leading dimension of 1 is allowed. Alternatively they are maps, as EdgePoint2 has them: `scores`,
+size is fixed or free. The outputs have the names of the dict, in pixels of the input, as in XFeat.
+A leading dimension of 1 is allowed. Alternatively the outputs are maps, as in EdgePoint2: `scores`,
 1x1xHxW logits whose maxima are the keypoints, and `descriptors`, 1xDxhxw. Images are resized to the
-fixed size, or for maps to sides that are multiples of 32; keypoints are scaled back.
+fixed size, or for maps to sides that are multiples of 32. Keypoints are scaled back.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ from .method import COMMON_DESCRIPTOR, BaselineError, LocalFeature
 from .opencv import CLASSICAL
 
 MAP_SIDE, MAP_BORDER_PX, MAP_LEAST_LOGIT, MAP_WINDOW = 32, 4, -5, np.ones((5, 5), np.uint8)
-"""Values of EdgePoint2, used for ONNX files with maps: the divisor of the sides, the distance of
-keypoints from the border, their smallest logit, and the window of non-maximum suppression."""
+"""Values of EdgePoint2, used for ONNX files with maps. In this order, they are the divisor of the
+sides in pixels, the smallest distance of keypoints from the border, the smallest logit of
+keypoints, and the window of non-maximum suppression."""
 
 
 def find_feature(word: str) -> LocalFeature:
@@ -58,7 +59,7 @@ def find_feature(word: str) -> LocalFeature:
 
 
 def plugin_feature(target: str) -> LocalFeature:
-    """Make a local feature of a function in an installed module or one in the current folder."""
+    """Make a local feature of a function in a module that is installed or in the current folder."""
     module, _, name = target.partition(":")
     here = str(Path.cwd())
     sys.path.insert(0, here)
@@ -106,7 +107,7 @@ def onnx_feature(
 
 
 class _Network(NamedTuple):
-    """An open ONNX file; in `shapes`, sides that are not fixed are not ints."""
+    """An open ONNX file. In `shapes`, sides that are not fixed are not ints."""
 
     shapes: list[list[Any]]
     outputs: list[str]
@@ -146,7 +147,7 @@ def _run_onnx(network: _Network, rgb: np.ndarray) -> dict[str, np.ndarray]:
         side if isinstance(side, int) else max(1, round(own / MAP_SIDE)) * MAP_SIDE if maps else own
         for side, own in zip(sides, (height, width), strict=True)
     ]
-    # Images are downscaled by area averaging, which would repeat pixels if they were upscaled.
+    # Area averaging is only for downscaling, because it repeats pixels when upscaling.
     smaller = wanted[0] <= height and wanted[1] <= width
     method = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
     resized = cv2.resize(rgb, (wanted[1], wanted[0]), interpolation=method)
@@ -162,7 +163,7 @@ def _run_onnx(network: _Network, rgb: np.ndarray) -> dict[str, np.ndarray]:
             for name, rank in (("keypoints", 2), ("scores", 1), ("descriptors", 2))
             if (value := found.get(name)) is not None
         }
-    # Image borders coincide; they are half a pixel outside the first pixel centre.
+    # Image borders coincide. They are half a pixel away from the centres of the outer pixels.
     scale = np.array([width / wanted[1], height / wanted[0]])
     return {**parts, "keypoints": (parts["keypoints"] + 0.5) * scale - 0.5}
 

@@ -1,6 +1,6 @@
 """Detect maxima of |det Hessian| at one scale and in scale space, ranked by this response.
 
-This baseline is one line of OpenCV per scale without training; a learned ranking must beat it.
+This baseline takes one line of OpenCV per scale and no training. A learned ranking must beat it.
 """
 
 from __future__ import annotations
@@ -15,14 +15,16 @@ from deepdetect.io.image import luma
 from .method import PAPER_DESCRIPTOR, LocalFeature, OwnScaleDescriptor
 
 SIGMA_PX = 3.0
-"""Scale of the baseline with one scale. Chosen by hand; not measured."""
+"""Scale (Gaussian sigma) of the baseline with a single scale. Chosen by hand; not measured."""
 
 SIGMAS_PX = tuple(float(sigma) for sigma in np.geomspace(1.5, 9.1, 7))
-"""Scales in pixels, each 1.35 times the one before. Chosen by hand; not measured."""
+"""Scales (Gaussian sigmas) in pixels, each 1.35 times the previous scale. Chosen by hand; not
+measured."""
 
 NMS_RADIUS = 2
 DISTANCE_PX = 2.0
-"""Keypoints of all scales are at least this far apart. Chosen by hand; not measured."""
+"""Keypoints, also of different scales, are at least this far apart. Chosen by hand; not
+measured."""
 
 SIZE_PER_SIGMA = 5.0
 """The diameter of a keypoint is 5 sigma, so it covers 2.5 sigma around its centre."""
@@ -48,7 +50,7 @@ def detect_hessian(gray: np.ndarray, sigma_px: float = SIGMA_PX) -> Keypoints:
 
 
 def detect_hessian_scales(gray: np.ndarray) -> Keypoints:
-    """Detect maxima at each scale; near neighbours of any scale are suppressed by the best."""
+    """Detect maxima at each scale, without those close to a better keypoint of any scale."""
     scales = [detect_hessian(gray, sigma) for sigma in SIGMAS_PX]
     xy, scores = (np.concatenate([getattr(p, name) for p in scales]) for name in ("xy", "scores"))
     sizes = np.repeat([SIZE_PER_SIGMA * sigma for sigma in SIGMAS_PX], [len(p) for p in scales])
@@ -73,4 +75,4 @@ HESSIAN: dict[str, LocalFeature] = {
         ),
     )
 }
-"""The Hessian baselines by name; only the standard protocol uses them."""
+"""The Hessian baselines by name, which only the standard protocol uses."""

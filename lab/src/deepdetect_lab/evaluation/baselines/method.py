@@ -33,7 +33,7 @@ class LocalFeature:
         describe: function from the image and its keypoints to (N, D) descriptors.
         binary: descriptors are compared by Hamming distance instead of Euclidean distance.
         learned: descriptors were learned for their detector and need no ratio test.
-        version: everything besides the name that changes results; it is part of the cache key.
+        version: everything besides the name that changes results. It is part of the cache key.
         detection: cache key of the keypoints if several features share them.
         own_scale: descriptor at the keypoints' own sizes and angles, if they have sizes.
     """
@@ -60,7 +60,7 @@ class LocalFeature:
 
 @dataclass(frozen=True)
 class PointDescriptor:
-    """A descriptor of keypoint positions with a fixed size and angle; the defaults are the paper's.
+    """A descriptor at a fixed size and angle for all keypoints, by default those of the paper.
 
     An angle of -1 means "unset" in OpenCV.
     """
@@ -77,14 +77,14 @@ class PointDescriptor:
 PAPER_DESCRIPTOR = PointDescriptor()
 
 COMMON_DESCRIPTOR = PointDescriptor("rootsift", 4.0, 0.0)
-"""The standard protocol describes keypoints with it if a detector has no own descriptors."""
+"""The standard protocol uses this descriptor for detectors without a descriptor of their own."""
 
 
 @dataclass(frozen=True)
 class OwnScaleDescriptor:
-    """RootSIFT at the keypoints' own sizes and angles; default angle: the dominant gradient.
+    """RootSIFT at the keypoints' own sizes and angles; by default the angle of the main gradient.
 
-    A descriptor covers a square whose side is six times the size; `size_factor` scales the size.
+    A descriptor covers a square whose side is six times the size. `size_factor` scales the size.
     """
 
     size_factor: float = 1.0

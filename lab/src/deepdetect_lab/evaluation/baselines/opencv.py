@@ -48,7 +48,7 @@ OPENCV_SETTINGS: dict[str, tuple[str, str, Mapping[str, Any]]] = {
         {"threshold": 1, "nonmaxSuppression": False, "type": AGAST_7_12D},
     ),
 }
-"""Title, OpenCV's factory and changed settings of each detector; low settings are the paper's."""
+"""Title, OpenCV factory and changed settings of each detector. Low settings are from the paper."""
 
 
 def _make(name: str) -> cv2.Feature2D:
@@ -106,7 +106,8 @@ def _harris(
 ) -> LocalFeature:
     """Make the Harris detector (1988) as in the paper.
 
-    A keypoint is any pixel whose response, dilated by 3x3, exceeds a fraction of the largest.
+    Every pixel whose response, dilated by 3x3, exceeds a fraction of the largest response is a
+    keypoint.
     """
 
     def detect(rgb: np.ndarray) -> Keypoints:
@@ -117,7 +118,7 @@ def _harris(
 
 
 def _harris_maxima(rgb: np.ndarray) -> Keypoints:
-    """Detect Harris corners as is usual: one keypoint per corner, ranked by response."""
+    """Detect Harris corners in the usual way: one keypoint per corner, ranked by response."""
     response = cv2.cornerHarris(luma(rgb), 3, 3, 0.04)
     return _pixels(response, (response == cv2.dilate(response, None)) & (response > 0))
 
@@ -149,7 +150,7 @@ def _shi_tomasi_eigenvalue(rgb: np.ndarray) -> Keypoints:
     if corners is not None:
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01)
         fine = cv2.cornerSubPix(gray, corners.copy(), (2, 2), (-1, -1), criteria)
-        # If the refinement moves far away, there is no corner to converge to.
+        # A refinement that moves farther than 1 px has no corner to converge to.
         stayed = np.abs(fine - corners).max(2, keepdims=True) < 1
         corners = np.where(stayed, fine, corners)
     return _corners(rgb, corners, scores)
@@ -183,12 +184,12 @@ STANDARD: dict[str, LocalFeature] = {
         "shi-tomasi-eigenvalue", "Shi-Tomasi, sub-pixel", _shi_tomasi_eigenvalue, "SIFT_create"
     ),
 }
-"""Replacements of default settings for comparisons of the best N keypoints. They give enough
-keypoints, ranked by score."""
+"""Detectors that replace those with default settings when the best N keypoints are compared. They
+give enough keypoints, ranked by score."""
 
 
 def with_kd_trees(features: Iterable[LocalFeature]) -> list[LocalFeature]:
-    """Add a copy of each binary feature with low settings, matched as bytes by kd-trees."""
+    """Add a copy of each binary feature with low settings whose descriptor bytes kd-trees match."""
     found: list[LocalFeature] = []
     for feature in features:
         found.append(feature)

@@ -1,4 +1,4 @@
-"""Chance baselines: detectors that do not look at the image."""
+"""Chance baselines: detectors that do not use the content of the image."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ class AllPixels:
     """A detector that marks every pixel as a keypoint."""
 
     def heatmap(self, image: object) -> np.ndarray:
-        """Return ones."""
+        """Return 1 for each pixel."""
         return np.ones(load_image(image).shape[:2], np.float32)
 
 
 def random_feature(like: LocalFeature, name: str = "random") -> LocalFeature:
-    """Make a baseline of random pixels, as many per image as another feature finds."""
+    """Make a baseline of random pixels, as many per image as the feature `like` finds."""
 
     def detect(rgb: np.ndarray) -> Keypoints:
-        # The image gives the seed, so the two images of a pair get different pixels.
+        # The seed is computed from the image, so the two images of a pair get different pixels.
         seed = int.from_bytes(hashlib.sha256(rgb.tobytes()).digest()[:4], "little")
         count = len(like.detect(rgb))
         size = (rgb.shape[1], rgb.shape[0])

@@ -1,4 +1,4 @@
-"""Evaluate points, matches and estimated homographies by the true homography."""
+"""Evaluate points, matches and estimated homographies with the true homography."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from deepdetect.geometry.transforms import transfer_errors, transform_points
 CORNER_THRESHOLDS_PX = (1.0, 3.0, 5.0)
 
 MATCH_THRESHOLDS_PX = tuple(range(1, 11))
-"""Thresholds of the mean matching accuracy, as D2-Net's paper has them."""
+"""Thresholds of the mean matching accuracy, as in D2-Net's paper."""
 
 Sizes = tuple[tuple[int, int], tuple[int, int]]
 """(width, height) of each of the two images."""
 
 
 def inside(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return which (N, 2) points are inside an image, (N,) bool; false if a point is not finite.
+    """Return which points (N, 2) are inside an image, (N,) bool; false if a point is not finite.
 
     The image extends half a pixel beyond the centres of its outer pixels.
     """
@@ -30,7 +30,7 @@ def inside(points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 def project_visible(
     points: np.ndarray, homography: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
-    """Map (N, 2) points into another image; points that it does not show become NaN.
+    """Map points (N, 2) into another image. Points that the other image does not show become NaN.
 
     A homography also maps points beyond the horizon, where the plane is invisible. There it flips
     the orientation: the determinant of its Jacobian, det(H) / depth^3, is negative.
@@ -49,12 +49,12 @@ def match_accuracy(
     homography: np.ndarray,
     sizes: Sizes,
 ) -> dict[Any, Any]:
-    """Evaluate (M, 2) matched positions of two images, given all (N, 2) keypoints of both.
+    """Evaluate matched positions (M, 2) of two images, given all keypoints (N, 2) of both.
 
-    Returns the number of "matches" and, for thresholds of 1 to 10 px in the second image:
-    ("correct", px), the number of matches within the threshold; ("precision", px), their fraction
-    (D2-Net's matching accuracy); and ("score", px), Mikolajczyk's matching score: correct matches
-    that both images show, divided by the keypoints that could have a match.
+    Returns the number of "matches", and three values for each threshold of 1 to 10 px in the second
+    image. ("correct", px) is the number of matches within the threshold. ("precision", px) is their
+    fraction, D2-Net's matching accuracy. ("score", px) is Mikolajczyk's matching score, the number
+    of correct matches in the overlap divided by the number of keypoints that could have a match.
     """
     errors = transfer_errors(points0, points1, homography)
     back = np.linalg.inv(homography)
@@ -91,15 +91,15 @@ def corner_error(estimated: np.ndarray | None, true: np.ndarray, size: tuple[int
 
 
 def accuracy_at(errors: Sequence[float], threshold: float) -> float:
-    """Return the fraction of the errors that are at most the threshold; 0 without errors."""
+    """Return the fraction of the errors that are at most the threshold; 0 if there are none."""
     return float(np.mean(np.asarray(errors) <= threshold)) if len(errors) else 0.0
 
 
 def area_under_curve(errors: Sequence[float], threshold: float) -> float:
     """Return the area under the cumulative error curve up to a threshold, divided by it.
 
-    SuperGlue and glue-factory define it so: the curve consists of straight lines from (0, 0), so
-    the area exceeds the mean of `accuracy_at` by up to half the share of one error.
+    As in SuperGlue and glue-factory, the curve consists of straight lines from (0, 0). So the area
+    exceeds the mean of `accuracy_at` by up to half the share of one error.
     """
     if not len(errors):
         return 0.0

@@ -13,14 +13,14 @@ from deepdetect.geometry.similarity import least_squares_similarity
 from deepdetect.geometry.transforms import epipolar_errors
 
 POSE_THRESHOLDS_DEG = (5.0, 10.0, 20.0)
-"""Thresholds of the AUC, as SuperGlue's paper has them."""
+"""Thresholds of the AUC in degrees, as in SuperGlue's paper."""
 
 LINE_WIDTH = 0.01
 """Camera centres count as collinear if their spread across a line is below this fraction of the
 spread along it. Chosen by hand; not measured."""
 
 EPIPOLAR_THRESHOLD_PX = 1.0
-"""A match agrees with the true pose if its Sampson distance is smaller. Chosen by hand."""
+"""A match agrees with the true pose if its Sampson distance is below this. Chosen by hand."""
 
 
 def rotation_error(estimated: np.ndarray, true: np.ndarray) -> float:
@@ -84,7 +84,7 @@ def relative_pose_errors(
 ) -> list[float]:
     """Return the error of each pair's relative pose in degrees, for `area_under_curve`.
 
-    The error is the larger of rotation error and translation error (angles); it is infinite if one
+    The error is the larger of the angular errors of rotation and translation. It is infinite if one
     of the two cameras is missing. No alignment is needed.
     """
     errors = []

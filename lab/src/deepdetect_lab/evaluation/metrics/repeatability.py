@@ -2,7 +2,8 @@
 
 In the paper's definition several keypoints may share a partner and all keypoints count, so a full
 grid of pixels scores best. With mutual nearest neighbours a keypoint has at most one partner, and
-only points that both images show count. The value of as many random points is the chance level.
+only points in the overlap count. The chance level is the repeatability of equally many random
+points.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from deepdetect.geometry.transforms import transform_points
 from .homography import Sizes, project_visible
 
 CHANCE_POINTS = 20_000
-"""Fewer keypoints are drawn several times for the chance level, so that it has little noise, until
-this many random points are drawn. Chosen by hand; not measured."""
+"""Random points for the chance level are drawn repeatedly up to this total number, so that the
+level has little noise for few keypoints. Chosen by hand; not measured."""
 
 MAX_DRAWS = 100
-"""The number of draws is limited, because few keypoints would need too many."""
+"""The chance level uses at most this number of draws, because few keypoints would need too many."""
 
 MIN_POINTS_FOR_THREADS = 20_000
 
@@ -60,9 +61,9 @@ def mutual_nn_repeatability(
     """Measure the repeatability by mutual nearest neighbours in the overlap, and its chance level.
 
     Returns three values for each radius. The first is the number of mutual neighbours divided by
-    the smaller number of keypoints in the overlap. The second is the same for as many random
-    points, or NaN if not requested; they are at pixel centres if all keypoints are. The third is
-    the mean distance of the partners in pixels, or NaN without partners.
+    the smaller number of keypoints in the overlap. The second is the same for equally many random
+    points, or NaN if not requested. Random points are at pixel centres if all keypoints are. The
+    third is the mean distance of the partners in pixels, or NaN without partners.
     """
     visible = _in_overlap(points0, points1, homography, sizes)
     distances = _mutual_distances(*visible, max(radii_px))
@@ -82,7 +83,7 @@ def mutual_nn_repeatability(
 def _in_overlap(
     points0: np.ndarray, points1: np.ndarray, homography: np.ndarray, sizes: Sizes
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points of both images that the other one shows, in the second image."""
+    """Return the points of both images in the overlap, in pixels of the second image."""
     mapped = project_visible(points0, homography, sizes[1])
     back = project_visible(points1, np.linalg.inv(homography), sizes[0])
     points1 = np.asarray(points1, np.float64).reshape(-1, 2)
@@ -95,7 +96,7 @@ def _kd_tree(points: np.ndarray) -> Any:
 
 def _nearest(tree: Any, points: np.ndarray, radius_px: float) -> tuple[np.ndarray, np.ndarray]:
     """Return distances (infinite beyond the radius) and indices of the nearest tree points."""
-    # The upper bound of the search is exclusive; it saves time.
+    # The upper bound saves time. It is exclusive in the search, so it is just above the radius.
     bound = np.nextafter(radius_px, np.inf)
     workers = -1 if min(tree.n, len(points)) > MIN_POINTS_FOR_THREADS else 1
     distance, rows = tree.query(points, distance_upper_bound=bound, workers=workers)
@@ -103,7 +104,7 @@ def _nearest(tree: Any, points: np.ndarray, radius_px: float) -> tuple[np.ndarra
 
 
 def _mutual_distances(points0: np.ndarray, points1: np.ndarray, radius_px: float) -> np.ndarray:
-    """Return the distances between mutual nearest neighbours."""
+    """Return the distances between mutual nearest neighbours within the radius, in pixels."""
     if not len(points0) or not len(points1):
         return np.empty(0)
     distance, nearest = _nearest(_kd_tree(points1), points0, radius_px)
@@ -119,11 +120,11 @@ def _chance(
     radii_px: Sequence[float],
     on_pixels: bool,
 ) -> list[float]:
-    """Return the values for equally many random points in the overlap of each image.
+    """Return the repeatability at each radius of equally many random points in the overlap.
 
-    If little moves between the images, points at pixel centres coincide more often: five centres
-    are within 1 px of a centre, in an area of 3.14. So random points are at pixel centres only if
-    the keypoints are.
+    Random points are at pixel centres only if the keypoints are. If little moves between the
+    images, points at pixel centres coincide more often than others: five pixel centres are within
+    1 px of a centre, although the area is 3.14 pixels.
     """
     fewest = min(counts)
     if not fewest:
@@ -133,7 +134,7 @@ def _chance(
     draws = min(-(-CHANCE_POINTS // fewest), MAX_DRAWS)
     found = np.zeros(len(radii_px))
     for _ in range(draws):
-        # Classical detectors may mark pixels repeatedly; random points then also repeat.
+        # Classical detectors may mark a pixel several times. Then random points also repeat.
         drawn = [
             grid[generator.choice(len(grid), count, replace=count > len(grid))]
             for grid, count in zip(grids, counts, strict=True)
@@ -145,9 +146,9 @@ def _chance(
     return [float(value) for value in found / (draws * fewest)]
 
 
-@lru_cache(maxsize=2)  # all keypoint budgets of a pair share it
+@lru_cache(maxsize=2)  # all keypoint budgets of a pair use the same grids
 def _overlapping_grids(homography: bytes, sizes: Sizes) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixels of both images that the other one shows, in the second image."""
+    """Return the pixels of both images in the overlap, in coordinates of the second image."""
 
     def grid(size: tuple[int, int]) -> np.ndarray:
         row, column = np.indices((size[1], size[0]))

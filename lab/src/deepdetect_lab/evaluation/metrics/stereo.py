@@ -1,4 +1,4 @@
-"""Evaluate matches and points of a rectified stereo pair by its true disparity."""
+"""Evaluate matches and points of a rectified stereo pair with its true disparity."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ DISPARITY_TOLERANCES_PX = (0.5, 1.0, 2.0, 4.0)
 def stereo_score(
     points0: np.ndarray, points1: np.ndarray, disparity: np.ndarray
 ) -> dict[str, float]:
-    """Score (N, 2) matches by the (H, W) true disparity of the left image; NaN is unknown."""
+    """Score matches (N, 2) with the true disparity (H, W) of the left image; NaN is unknown."""
     return score_errors(disparity_errors(points0, points1, disparity))
 
 
 def disparity_scores(
     pixels: np.ndarray, disparity: np.ndarray, truth: np.ndarray
 ) -> dict[str, float]:
-    """Evaluate (N,) disparities at (N, 2) pixels by the (H, W) true disparity; NaN is unknown.
+    """Evaluate disparities (N,) at pixels (N, 2) with the true disparity (H, W); NaN is unknown.
 
-    Returns values by column title: "1 - bad-t" and the mean error of points with ground truth; the
-    completeness, the fraction of pixels with ground truth (occluded ones included) that have a
-    point with an error of at most 1 px; and the number and accuracy of points whose counterpart is
-    outside the right image.
+    Returns values by column title. "1 - bad-t" and the mean error are those of points with ground
+    truth. The completeness is the fraction of pixels with ground truth (occluded ones included)
+    that have a point with an error of at most 1 px. Further values are the number and accuracy of
+    points whose counterpart is outside the right image.
     """
     disparity = np.asarray(disparity, np.float64)
     columns, rows = np.rint(np.asarray(pixels, np.float64).reshape(-1, 2)).astype(np.int64).T

@@ -1,7 +1,7 @@
-"""Measure how much of the images dense points cover, and how well independent halves agree.
+"""Measure the coverage of the images by dense points, and how well independent halves agree.
 
-They are compared with OpenCV's semi-global matching of pairs rectified by the same cameras, or with
-clouds of other programs, such as OpenMVS or COLMAP, from the same model.
+The dense points are compared with OpenCV's semi-global matching of pairs rectified by the same
+cameras, or with clouds that other programs, such as OpenMVS or COLMAP, made from the same model.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ from .stereo_pipelines import sgbm_disparity
 SGBM = "SGBM, OpenCV"
 
 APART = 0.01
-"""Two depths are of different surfaces if their relative difference is larger. Chosen by hand."""
+"""Two depths belong to different surfaces if their relative difference is larger than this. Chosen
+by hand."""
 
 DENSE_COLUMNS = {
     "scene": "",
@@ -60,8 +61,8 @@ DENSE_NOTE = (
 
 
 CELL_PX = 4
-"""Clouds are compared in square cells of this side, since other programs reconstruct only every
-second pixel."""
+"""Clouds are compared in square cells with this side in pixels, since other programs reconstruct
+only every second pixel."""
 
 CLOUD_COLUMNS = {
     "cloud": "",
@@ -112,7 +113,7 @@ def compare_clouds(model: Path, clouds: Sequence[Path]) -> Rows:
 def measure_dense_points(
     images: Sequence[Path], cameras: Mapping[str, Camera], detector: PointDetector
 ) -> Row:
-    """Reconstruct dense points of images; call it in a separate process.
+    """Reconstruct and measure the dense points of images. Call it in a separate process.
 
     Returns the `DENSE_COLUMNS` from "points" on, and those of SGBM with its name and a space before
     them. If there is no model, it returns only "points": 0.
@@ -165,7 +166,7 @@ def measure_dense_points(
 
 
 def _agreement(pairs: Sequence[Sequence[np.ndarray]], name: str = "halves") -> Row:
-    """Compare pairs of depth maps of the same view; unknown depths are infinite.
+    """Compare pairs of depth maps of the same view. Unknown depths are infinite.
 
     Returns an empty row if no pixel has both depths.
     """
@@ -185,7 +186,7 @@ def _agreement(pairs: Sequence[Sequence[np.ndarray]], name: str = "halves") -> R
 def _sgbm_points(
     one: tuple[np.ndarray, PosedView], other: tuple[np.ndarray, PosedView], seen: np.ndarray
 ) -> np.ndarray:
-    """Return (N, 3) points of an image, from OpenCV's semi-global matching with another image.
+    """Match an image with another by OpenCV's semi-global matching; return points (N, 3).
 
     Each image is given as RGB and view. The disparity range is that of the sparse points.
     """
@@ -209,7 +210,8 @@ def _sgbm_points(
             (rgb0, rgb1), matrices, (turn0, turn1), (first, second), strict=True
         )
     ]
-    # Cameras above each other are matched along columns, others along rows, possibly reversed.
+    # Views of cameras above each other are matched along columns, all others along rows. The
+    # direction may be reversed.
     axis = int(abs(second[1, 3]) > abs(second[0, 3]))
     if axis:
         views = [np.ascontiguousarray(view.transpose(1, 0, 2)) for view in views]
@@ -245,7 +247,7 @@ def read_ply_points(path: Path) -> np.ndarray:
     """
     try:
         head, end, rest = path.read_bytes().partition(b"end_header")
-        head = head.decode("ascii", "replace").encode("ascii", "replace")  # any text
+        head = head.decode("ascii", "replace").encode("ascii", "replace")  # comments may be odd
         vertices = plyfile.PlyData.read(BytesIO(head + end + rest))["vertex"]
         points = np.column_stack([vertices[axis] for axis in "xyz"]).astype(np.float64)
     except FileNotFoundError:

@@ -1,6 +1,6 @@
 """Compare guided matching with matching by descriptors alone and with chance.
 
-Guided matching increases the matches of any points, so counts only mean something next to chance.
+Guided matching finds more matches for any points, so counts only mean something next to chance.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def guided_sections(
 ) -> list[Section]:
     """Match pairs by descriptors alone and with guidance.
 
-    `truths` maps names of ground truths to the same pairs with these true homographies.
+    `truths` maps the name of each ground truth to the pairs with its homographies.
     """
     if "guided" not in options.protocols:
         return []
@@ -101,7 +101,7 @@ def guided_sections(
 
 
 def guided_row(run: Run, feature: LocalFeature, by_truth: Mapping[str, PlanarPair]) -> Row:
-    """Return the cells of `COLUMNS` by name of the ground truth."""
+    """Return the cells of `COLUMNS` for a pair with each ground truth, by its name."""
     pair = next(iter(by_truth.values()))
     images = (pair.first, pair.second)
     alone = run.matches(feature, images, PAPER_MATCHING)
@@ -145,7 +145,7 @@ def _guided_cells(
 
 
 def guided_by(models: Sequence[str]) -> str:
-    """Name the geometries that guided, and the number of guided seeds if not all were guided."""
+    """Name the models that guided the matching, and the number of guided runs if not all were."""
     trusted = [model for model in models if model != "none"]
     names = " or ".join(dict.fromkeys(trusted)) or "none"
     if len(trusted) in (0, len(models)):
@@ -158,10 +158,10 @@ def _correct(points0: np.ndarray, points1: np.ndarray, pair: PlanarPair) -> np.n
 
 
 def match_guided(run: Run, feature: LocalFeature, pair: PlanarPair, seed: int) -> Row:
-    """Match a pair with guided matching, cached; its true homography is not used.
+    """Match a pair with guided matching, cached. The pair's true homography is not used.
 
-    Returns "model", the geometry that guided ("none": no matches); its "matrix"; the (M, 2)
-    "points0" and "points1"; and the "seconds" of guided matching alone.
+    Returns the "model" that guided the matching ("none" without matches), its "matrix", the matched
+    positions "points0" and "points1", (M, 2) each, and the "seconds" of guided matching alone.
     """
     images = (pair.first, pair.second)
     first, second = (run.keypoints(feature, image)[0].xy for image in images)

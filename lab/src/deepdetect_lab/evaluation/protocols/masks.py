@@ -18,10 +18,12 @@ from deepdetect.io.masks import load_mask
 from ...labels import LabelOptions, fuse, visibility_of
 
 EPSILON = 1e-7
-"""Probabilities keep this distance from 0 and 1, since float32 numbers near 1 differ by 6e-8."""
+"""Probabilities are clipped to this distance from 0 and 1 for the logarithm. Float32 numbers just
+below 1 differ by 6e-8."""
 
 NUM_BINS = 20
-"""Number of equal bins for the calibration error. Chosen by hand; not measured."""
+"""Number of equally wide bins of probability for the calibration error. Chosen by hand; not
+measured."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +32,11 @@ class MaskScore:
 
     Attributes:
         loss: binary cross-entropy per pixel (natural logarithm), mean over the images.
-        iou: intersection over union of known mask and heat map thresholded at 0.5, mean over the
-            images; 1 if both are empty.
+        iou: intersection over union of the known mask and the heat map thresholded at 0.5, mean
+            over the images. It is 1 if both are empty.
         images: number of images.
-        calibration_error: expected calibration error (Naeini et al., 2015) over all pixels: the
-            mean difference, over bins, between probability and fraction of marked pixels.
+        calibration_error: expected calibration error (Naeini et al., 2015) over all pixels. It is
+            the mean over bins of the difference between probability and fraction of marked pixels.
         density: keypoints per pixel at threshold 0.5.
         label_density: fraction of pixels that the masks mark.
     """
@@ -48,7 +50,7 @@ class MaskScore:
 
 
 def score_heatmap(heatmap: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
-    """Return the loss and the IoU of a (H, W) probability against a (H, W) bool mask."""
+    """Return the loss and the IoU of probabilities (H, W) compared with a bool mask (H, W)."""
     probability = np.clip(heatmap.astype(np.float64), EPSILON, 1 - EPSILON)
     loss = -np.log(np.where(mask, probability, 1 - probability)).mean()
     predicted = heatmap > 0.5
@@ -58,7 +60,7 @@ def score_heatmap(heatmap: np.ndarray, mask: np.ndarray) -> tuple[float, float]:
 
 
 Measured = tuple[float, float, np.ndarray]
-"""Loss, IoU, and (4, 20) sums by bin: pixels, probabilities, marked and predicted pixels."""
+"""Loss, IoU, and sums by bin, (4, 20): pixels, probabilities, marked pixels, predicted pixels."""
 
 
 def measure_heatmap(heatmap: np.ndarray, mask: np.ndarray) -> Measured:
@@ -71,7 +73,7 @@ def measure_heatmap(heatmap: np.ndarray, mask: np.ndarray) -> Measured:
 
 
 def mean_score(measured: Sequence[Measured]) -> MaskScore:
-    """Return the score of images: loss and IoU averaged by image, the others over all pixels."""
+    """Return the score of images. Loss and IoU are means over images, other values over pixels."""
     loss = sum(loss for loss, _, _ in measured) / len(measured)
     iou = sum(iou for _, iou, _ in measured) / len(measured)
     pixels, probabilities, marked, predicted = np.sum([sums for *_, sums in measured], axis=0)
@@ -82,7 +84,7 @@ def mean_score(measured: Sequence[Measured]) -> MaskScore:
 
 
 CERTAIN_LOGIT = 200.0
-"""The probability of this logit is 1 in float32, and that of its negative is 0."""
+"""Logit whose probability is exactly 1 in float32. The probability of its negative is 0."""
 
 
 def sample_images(folder: str | Path) -> list[Path]:
@@ -122,7 +124,7 @@ def score_samples(
 
 
 def _by_visibility(images: Iterable[tuple[str, Measured]]) -> dict[str, MaskScore]:
-    """Score images by visibility, "normal" or "low"; a visibility without images is left out."""
+    """Score images by visibility, "normal" or "low", without a visibility that has no images."""
     measured: dict[str, list[Measured]] = {"normal": [], "low": []}
     for visibility, one in images:
         measured[visibility].append(one)
@@ -191,7 +193,7 @@ class LabelDetector:
 
 
 class LabelDensityDetector:
-    """A detector that takes the most probable pixels of each image, as many as its label marks.
+    """A detector that takes the most probable pixels of each image, as many as the label marks.
 
     Weights that mark more pixels get a higher repeatability and more matches for this reason alone.
     This detector compares weights at equal numbers of keypoints.

@@ -45,16 +45,18 @@ OXFORD_PAIRS = (
 """The pairs of the paper's Table II: scene and number of the second image."""
 
 CORRECT_PX = 1.0
-"""A match is correct if its error by the true homography is strictly smaller."""
+"""A match is correct if its error by the true homography is strictly below this."""
 
 PAPER_MATCHING = MatchSettings(matcher="flann", ratio=0.99)
 
 SEEDS = 3
-"""Seeds of FLANN are averaged, because its random trees change the counts by some per cent."""
+"""Counts are averaged over this number of FLANN seeds, because FLANN's random trees change them by
+some per cent."""
 
 FEW_MATCHES = 1000
 MANY_SEEDS = 64
-"""Pairs with fewer correct matches use more seeds: counts of about 100 (graf) vary by a tenth."""
+"""Pairs with less than the first number of correct matches use the second number of seeds, because
+counts of about 100 (graf) vary by a tenth."""
 
 REPEATABILITY_NOTE = (
     "Number of points of the first image that map to less than 1 px from a point of the second, "
@@ -193,7 +195,7 @@ def foreground_rows(
 ) -> Rows:
     """Measure the fraction of keypoints on the foreground (NaN without any) and their density.
 
-    The "covered" fraction of the pixels is the value of random keypoints.
+    "covered" is the fraction of pixels on the foreground, the value of random keypoints.
     """
 
     def measure(feature: LocalFeature, image: MaskedPhotograph) -> Row:

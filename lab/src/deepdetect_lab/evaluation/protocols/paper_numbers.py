@@ -34,8 +34,8 @@ OXFORD_REPEATABILITY = _by_method("oxford_repeatability")
 HPATCHES_REPEATABILITY = _by_method("hpatches_repeatability")
 
 NOT_IN_DENSITY = "trees"
-"""The paper leaves this scene out of its densities: without it our 14 densities of classical
-detectors equal the printed ones; with it twelve differ, by up to 11 %."""
+"""The paper leaves this scene out of its densities. Without the scene our 14 densities of classical
+detectors equal the printed ones. With it twelve of them differ, by up to 11 %."""
 
 
 def paper_title(title: str) -> str:
@@ -44,7 +44,7 @@ def paper_title(title: str) -> str:
 
 
 def with_paper_rows(table: Table, paper: Paper) -> Table:
-    """Insert the paper's numbers below each of our rows; rows that only it has come last."""
+    """Insert the paper's numbers below each of our rows. Rows that only the paper has come last."""
     first, *titles = table.columns
     ours = [row[first] for row in table.rows]
     rows: Rows = []

@@ -39,7 +39,7 @@ KEYPOINT_SCENES = ("graf", "bikes", "leuven")
 GUIDED_PAIRS = (*paper.OXFORD_PAIRS, ("boat", 6), ("bark", 6))
 
 FIGURE_7_SCENES = 4
-"""Number of drawn scenes: half change in illumination, half in viewpoint."""
+"""Number of scenes in Figure 7, half with changing light, half with changing viewpoint."""
 
 TRUTHS = {
     "published": (

@@ -47,13 +47,14 @@ MIN_MATCHES = 6
 """Five matches always fit an essential matrix exactly, so at least one more is needed."""
 
 NO_FAR_POINTS = 1e9
-"""Points farther away, in baselines, do not count when OpenCV chooses one of four poses. The
-value is so large that all points count."""
+"""Points farther away than this, in baselines, do not count when OpenCV chooses one of four poses.
+The value is so large that all points count."""
 
 BUDGET = 8192
 RATIO = 0.8
 GOOD_DEG = 5.0
-"""A pose counts as correct under this error, in degrees, where methods are compared by pair."""
+"""A pose with an error below this, in degrees, counts as correct when methods are compared by
+pair."""
 
 STRAIGHT_AHEAD = "no matches: straight ahead"
 
@@ -83,15 +84,15 @@ NOTE = (
 )
 
 Found = tuple[np.ndarray, np.ndarray, float, str]
-"""The (M, 2) matched positions of two images, the seconds, and the geometry that guided:
-"homography", "fundamental" or "none"; "" for methods without guidance."""
+"""The matched positions of both images, (M, 2) each, the seconds, and the model that guided the
+matching: "homography", "fundamental" or "none", or "" for methods without guidance."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseMethod:
     """A row of the tables.
 
-    `match` finds the matches of two images; with None the pose is always straight ahead. `name` and
+    `match` finds the matches of two images. With None the pose is always straight ahead. `name` and
     `version` identify the results in the cache.
     """
 
@@ -193,7 +194,7 @@ def pose_row(run: Run, method: PoseMethod, pair: PosedPair) -> Row:
 
 
 def pose_errors(pose: tuple[np.ndarray, np.ndarray] | None, pair: PosedPair) -> Row:
-    """Return a pose's errors in degrees by column title; they are infinite without a pose."""
+    """Return the errors of a pose in degrees by column title, infinite without a pose."""
     rotation = translation = float("inf")
     if pose is not None:
         rotation = rotation_error(pose[0], pair.rotation)
@@ -233,7 +234,7 @@ def estimate_pose(
 
 
 def _of_camera(points: np.ndarray, intrinsics: np.ndarray, camera: np.ndarray) -> np.ndarray:
-    """Map positions to another camera with the same pose."""
+    """Map pixel positions to those in another camera with the same pose."""
     homogeneous = np.column_stack([np.asarray(points, np.float64), np.ones(len(points))])
     return np.ascontiguousarray((homogeneous @ (camera @ np.linalg.inv(intrinsics)).T)[:, :2])
 

@@ -1,7 +1,8 @@
 """Evaluate structure from motion on scenes with known cameras: ranked points, SIFT, chance.
 
-All methods use the stages of `reconstruct_many` with the same options. Only the keypoints differ,
-and for SIFT the matches. Each method runs in its own process, so that its memory can be measured.
+All methods use the stages of `reconstruct_many` with the same options. They only differ in the
+keypoints, and SIFT also in the matches. Each method runs in its own process, so that its memory can
+be measured.
 """
 
 from __future__ import annotations
@@ -43,12 +44,14 @@ from .dense_points import DENSE_COLUMNS, DENSE_NOTE, SGBM, measure_dense_points
 MIN_IMAGES = 3
 
 POSE_THRESHOLDS_DEG = (0.5, 1.0, 5.0)
-"""AUC thresholds; they are below those of image pairs, since adjusted cameras are more accurate."""
+"""Thresholds of the AUC in degrees. They are below those for image pairs, since bundle-adjusted
+cameras are more accurate."""
 
 DATABASE = "sift.db"
 
 OPTIONS = MultiViewOptions(pairs="exhaustive")
-"""All methods use these options: the defaults of `reconstruct_many`, but all pairs are matched."""
+"""Options of all methods. They are the defaults of `reconstruct_many`, except that all pairs are
+matched."""
 
 KINDS = ("true", "estimated")
 MODEL_COLUMNS = {"sparse points": ",d", "track length": ".2f", "reprojection error, px": ".3f"}
@@ -112,9 +115,9 @@ Pair = tuple[str, str]
 class SfmMethod:
     """A row of the tables; `name` is the title, and `name` and `version` identify cached results.
 
-    `find` writes the keypoints of images into a folder, `match` returns the matches of pairs; both
-    are module-level functions. With `chance` the time of `find` is not reported. `refined` says
-    whether COLMAP's tracks are refined, and `tracks` is the option `matches`.
+    `find` writes the keypoints of images into a folder, and `match` returns the matches of pairs.
+    Both are module-level functions. With `chance` the time of `find` is not reported. `refined`
+    says whether COLMAP's tracks are refined, and `tracks` is the option `matches`.
     """
 
     name: str
@@ -169,7 +172,7 @@ def sfm(run: Run, options: BenchmarkOptions) -> list[Section]:
 
 
 def choose_images(scene: PosedScene, most: int) -> PosedScene:
-    """Limit the images of a scene: the first ones of a sequence, else evenly spaced ones.
+    """Limit the images of a scene to the first ones of a sequence, or to evenly spaced ones.
 
     Evenly spaced frames of a long sequence would not overlap.
     """
@@ -277,7 +280,7 @@ Views = Mapping[str, PosedView]
 
 
 def _apart(views: Views, others: Views, truth: Views) -> float | None:
-    """Return the mean distance between two models' camera centres, in units of the ground truth."""
+    """Return the mean distance between camera centres of two models, in the ground truth's unit."""
     names = sorted(set(views) & set(others))
     if len(names) < MIN_IMAGES:
         return None
@@ -334,7 +337,7 @@ def find_sift(stages: Stages, folder: Path) -> None:
 
 
 def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
-    """Match by pycolmap's matcher with its defaults; verification is the same for all methods."""
+    """Match by pycolmap's matcher with its defaults, with the verification of all methods."""
     with quiet_pycolmap() as pycolmap:
         how = pycolmap.FeatureMatchingOptions()
         how.num_threads = 1
@@ -354,7 +357,7 @@ def match_sift(stages: Stages, pairs: Sequence[Pair]) -> dict[Pair, np.ndarray]:
 
 
 def run_method(method: SfmMethod, images: Sequence[Path], cameras: Mapping[str, Camera]) -> Row:
-    """Reconstruct images by a method; call it in a separate process.
+    """Reconstruct images by a method. Call it in a separate process.
 
     Returns the `COST_COLUMNS`, and the values of `_unpacked` with prefixes "true " and
     "estimated ".
@@ -398,10 +401,10 @@ def _times() -> np.ndarray:
 
 
 def _unpacked(model: Any) -> Row:
-    """Return the values to keep of a pycolmap model, or of None.
+    """Return the results that are kept of a pycolmap model, or of None if there is no model.
 
-    They are the "names" and (N, 12) "poses" (rotation, translation) of its images, and the
-    `MODEL_COLUMNS`.
+    They are the "names" and "poses" (rotation and translation, (N, 12)) of the registered images,
+    and the `MODEL_COLUMNS`.
     """
     columns: Row = {**dict.fromkeys(MODEL_COLUMNS, np.nan), "sparse points": 0}
     if model is None:

@@ -40,19 +40,20 @@ from ..report import (
 from ..run import MatchSettings, Run
 
 BUDGETS: tuple[int | None, ...] = (512, 1024, 2048, 4096, 8192, None)
-"""Budgets, the numbers of best keypoints that are compared; None takes all."""
+"""Budgets, which are the numbers of best keypoints that are compared. None takes all keypoints."""
 
 RADII_PX = (1.0, 2.0, 3.0)
 SEEDS = 5
 MATCHING_BUDGET = 2048
 RATIO = 0.85
-"""Ratio test for descriptors that are not learned. Chosen by hand; not measured."""
+"""Threshold of the ratio test for descriptors that are not learned. Chosen by hand; not
+measured."""
 
 INLIER_THRESHOLD_PX = 3.0
 
 MIN_FILLED = 0.9
-"""A budget is shown if a method finds at least this fraction of it on average, because otherwise
-numbers of keypoints would differ. Chosen by hand."""
+"""Results at a budget are shown if a method finds at least this fraction of the budget on average,
+because otherwise numbers of keypoints would differ. Chosen by hand."""
 
 MAX_CHANCE = 0.95
 """Chance correction is left out above this chance level, since it would divide by nearly 0."""
@@ -99,10 +100,12 @@ def pair_row(run: Run, feature: LocalFeature, pair: PlanarPair) -> Row:
     """Measure a feature on a pair.
 
     Returns:
-        Values by name: "kind"; ("keypoints", budget) in the image that has fewer; ("repeated",
-        budget, radius), "chance" and "localization" likewise; ("coverage", budget) of the first
-        image; "matches", ("correct", px), ("precision", px) and ("score", px); "all matches" and
-        ("accuracy", px) without a ratio test; and "corner errors" by seed.
+        Values by name. The "kind" is that of the pair. ("keypoints", budget) is the number in the
+        image that has fewer. ("repeated", budget, radius) is the repeatability. "chance" and
+        "localization" have the same indices. ("coverage", budget) is that of the first image.
+        "matches", ("correct", px), ("precision", px) and ("score", px) are those of
+        `match_accuracy`. "all matches" and ("accuracy", px) are without a ratio test. "corner
+        errors" are given by seed.
     """
     images = (pair.first, pair.second)
     first, second = (run.keypoints(feature, image)[0] for image in images)
@@ -136,7 +139,7 @@ def pair_row(run: Run, feature: LocalFeature, pair: PlanarPair) -> Row:
         **{("accuracy", px): without_ratio["precision", px] for px in MATCH_THRESHOLDS_PX},
         "corner errors": run.cached("corner_errors", depends, corner_errors)["errors"].tolist(),
     }
-    # Positions count once, although SIFT repeats some with other orientations.
+    # Each position counts once, although SIFT repeats some positions with other orientations.
     places = [first.distinct(), second.distinct()]
     for budget in BUDGETS:
         row |= _at_budget(run, feature, pair, places, budget)
@@ -170,7 +173,10 @@ def _at_budget(
 
 
 def repeated(rows: Rows, budget: int | None, radius: float, name: str = "repeated") -> float | None:
-    """Return the mean repeatability, or its "chance"; None if the budget is not filled."""
+    """Return the mean of a value of `pair_row`, by default the repeatability.
+
+    It is None if the methods do not fill the budget.
+    """
     filled = mean(rows, ("keypoints", budget))
     if filled is None or (budget is not None and filled < MIN_FILLED * budget):
         return None

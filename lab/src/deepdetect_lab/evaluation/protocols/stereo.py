@@ -25,9 +25,11 @@ from .paper_numbers import FIGURE_8, with_paper_column
 from .stereo_pipelines import ROUNDS, Pipeline, pipelines
 
 TRUTH_OFFSETS = {"dolls": 2}
-"""Stereo baselines by which the ground truth's view is to the left of the left image.
+"""Distances, in stereo baselines, by which the view of the ground truth lies to the left of the
+left image.
 
-After this shift its photometric error is below 0.7 of that before; both versions are evaluated.
+The shift reduces the photometric error of the ground truth to below 0.7 times the original. Both
+versions are evaluated.
 """
 
 AS_IT_IS = ""
@@ -151,9 +153,9 @@ def _triangulate(
 def clouds_figure(
     pair: CalibratedStereoPair, compared: Sequence[Pipeline], found: Mapping[str, Row]
 ) -> Figure | None:
-    """Draw Figure 8: points of the pipelines that the paper draws; None without points."""
+    """Draw Figure 8 with the points of the pipelines that the paper draws; None without points."""
     clouds = {}
-    # Ours come last, as in the paper.
+    # Our pipeline comes last, as in the paper.
     for pipeline in sorted(compared, key=lambda pipeline: pipeline.drawn == "ours"):
         points = found.get(pipeline.name)
         if not pipeline.drawn or points is None:
@@ -172,16 +174,16 @@ def clouds_figure(
 
 
 def ground_truths(scene: Path) -> Mapping[str, np.ndarray | None]:
-    """Return the true disparities of a scene: that of its file and, for some, a shifted one."""
+    """Return the true disparity of a scene from its file and, for some scenes, also shifted."""
     disparity = load_middlebury(scene).disparity
     offset = TRUTH_OFFSETS.get(scene.name, 0)
     return {AS_IT_IS: disparity} | ({SHIFTED: shift_view(disparity, offset)} if offset else {})
 
 
 def shift_view(disparity: np.ndarray, baselines: int) -> np.ndarray:
-    """Warp a disparity map to a view some stereo baselines to the right; hidden pixels are NaN.
+    """Warp a disparity map to a view that is `baselines` stereo baselines farther to the right.
 
-    If several points map to one pixel, the nearest is visible.
+    If several points map to one pixel, the nearest is visible. Pixels without a point are NaN.
     """
     rows, columns = np.nonzero(np.isfinite(disparity))
     values = disparity[rows, columns]

@@ -21,9 +21,9 @@ def score_stereo_matches(
 ) -> list[dict[str, Any]]:
     """Match rectified pairs with several sources of keypoints, and evaluate the matches.
 
-    Descriptors are matched over the whole image; neither the rectification nor the true disparity
-    is used. The result of a source is followed by that of random points at its density, because
-    more keypoints always find more matches. All pixels come last.
+    Descriptors are matched over the whole image, without using the rectification or the true
+    disparity. The result of each source is followed by that of random points at the same density,
+    because more keypoints always find more matches. The result of all pixels comes last.
     """
     rows: list[dict[str, Any]] = []
     with progress(len(pairs) * (2 * len(sources) + 1), "matching", "pair", quiet) as bar:

@@ -27,19 +27,20 @@ from ..options import PAPER_RESOLUTION_PX, BenchmarkOptions
 from .paper_numbers import FIGURE_8
 
 ROUNDS = 3
-"""Pipelines that take seconds run this often, and the run of median time is reported."""
+"""Pipelines that take seconds run this number of times. The run of median time is reported."""
 
 Points = tuple[np.ndarray, np.ndarray, int]
-"""(N, 2) float32 pixels of the left image, (N,) float32 disparities, and the number of filled-in
-disparities."""
+"""Positions in pixels of the left image, (N, 2) float32, their disparities, (N,) float32, and the
+number of filled-in disparities."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
-    """A function from two images to points; `name` is also the title in tables.
+    """A pipeline from two images to points. `name` is also the title in tables.
 
-    `prepare` returns what is timed. Results depend on `version` besides the name. `drawn` is the
-    title in Figure 8 (empty: not drawn), `paper` the number of points in the paper by scene.
+    `prepare` returns the function that is timed. Results depend on name and `version`. `drawn` is
+    the title in Figure 8, or empty if the pipeline is not drawn. `paper` is the number of points in
+    the paper by scene.
     """
 
     name: str
@@ -127,7 +128,7 @@ def _paper(feature: LocalFeature, drawn: str = "", paper: Mapping[str, float] = 
         return points0.astype(np.float32), disparity, 0
 
     def prepare(scene: CalibratedStereoPair) -> Callable[[], Points]:
-        feature.detect(scene.left)  # the first run of a size takes longer
+        feature.detect(scene.left)  # the first run at an image size takes longer
         return partial(run, scene)
 
     return Pipeline(feature.title, prepare, feature.version, 1, drawn, paper)
@@ -156,7 +157,7 @@ def paper_points(
 
 
 def paper_settings(scene: CalibratedStereoPair) -> tuple[float, np.ndarray]:
-    """Return the authors' ratio and camera matrix; other scenes get the most frequent ratio."""
+    """Return ratio and camera matrix from the authors, or the scene's own and their usual ratio."""
     camera = scene.calibration.camera0.matrix
     own = 0.9, camera[0, 0], camera[0, 2], camera[1, 2]
     ratio, focal, x, y = PAPER_SETTINGS.get(scene.name, own)
@@ -166,7 +167,7 @@ def paper_settings(scene: CalibratedStereoPair) -> tuple[float, np.ndarray]:
 def essential_inliers(
     points0: np.ndarray, points1: np.ndarray, camera_matrix: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the inliers of the essential matrix; triangulation only adds its time."""
+    """Return the inliers of the essential matrix. Triangulation is only run for its time."""
     if len(points0) < 6:
         return points0[:0], points1[:0]
     essential, inliers = cv2.findEssentialMat(
@@ -191,7 +192,8 @@ def essential_inliers(
 def sgbm(scene: CalibratedStereoPair) -> Points:
     """Run OpenCV's semi-global matching on every pixel, with the disparity range that ours finds.
 
-    The range starts at 0 or below. Views are extended by it, so that margins also get values.
+    The range starts at 0 or below. Views are extended by the range, so that pixels near the borders
+    also get disparities.
     """
     gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (scene.left, scene.right)]
     search = find_disparity_range(*gray)
@@ -213,8 +215,8 @@ def sgbm_disparity(
 ) -> np.ndarray:
     """Run OpenCV's semi-global matching on RGB views, extended by borders on the left and right.
 
-    The number of tried disparities is a multiple of 16. Returns (H, W) float32 disparities in
-    pixels, NaN where none was found.
+    The number of tried disparities is a multiple of 16. Returns disparities in pixels, (H, W)
+    float32, NaN where none was found.
     """
     matcher = cv2.StereoSGBM_create(
         minDisparity=min_disparity,

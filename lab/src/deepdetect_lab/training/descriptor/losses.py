@@ -1,4 +1,4 @@
-"""Loss of pairs of views, and the validation metric: the fraction of correct mutual matches."""
+"""The contrastive loss of pairs of views, and the fraction of correct mutual matches as metric."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ from .network import DescriptorNetwork, turn
 from .views import Pair
 
 NEAR_PX = 3.0
-"""Keypoints within this distance of the true position are ignored as negatives by the loss, and
-correct in the metric."""
+"""Keypoints within this distance of the true position are not negatives in the loss. In the metric,
+they are correct."""
 
 MAX_LOG_TEMPERATURE = 4.3
 UPRIGHT, ANGLE_NOISE = 0.45, 0.15
-"""Pairs rotated by less than the first angle, in radians, count as upright. Errors of simulated
-keypoint angles have the second as standard deviation. Chosen by hand; not measured."""
+"""Pairs rotated by less than the first angle, in radians, count as upright. The second is the
+standard deviation in radians of the simulated errors of keypoint angles. Both are chosen by hand
+and not measured."""
 
 KINDS = ("upright", "turned", "zoomed")
 
 
 def kind_of(angle: float, zoom: float) -> str:
-    """Return the kind of a pair, one of `KINDS`, by rotation and zoom between its views."""
+    """Return the kind of a pair, one of `KINDS`, by the rotation and log zoom between its views."""
     if zoom > 0.6:  # by 1.8
         return "zoomed"
     return "upright" if angle < UPRIGHT else "turned"
 
 
 def describe_views(network: DescriptorNetwork, batch: Pair) -> tuple[Tensor, Tensor]:
-    """Return the upright descriptors of both views, (B, N, 64) each."""
+    """Describe the keypoints of both views without rotation by their angles; (B, N, 64) each."""
     images = batch.images.transpose(0, 1).flatten(0, 1)[:, None].float() / 255
     with torch.autocast(images.device.type, torch.bfloat16):
         maps = network.maps(images.contiguous(memory_format=torch.channels_last))
@@ -43,7 +44,7 @@ def describe_views(network: DescriptorNetwork, batch: Pair) -> tuple[Tensor, Ten
 
 
 def mirror(batch: Pair, which: Tensor) -> Pair:
-    """Mirror some (B,) of the pairs left to right."""
+    """Mirror the pairs that are marked in `which`, (B,) bool, left to right."""
 
     def mirrored(xy: Tensor) -> Tensor:
         x, y = xy.unbind(-1)
@@ -60,11 +61,12 @@ def mirror(batch: Pair, which: Tensor) -> Pair:
 def contrastive_loss(
     network: DescriptorNetwork, batch: Pair, generator: np.random.Generator, counted: int = 1
 ) -> Tensor:
-    """Return the cross-entropy of the right keypoint among all of the other view (InfoNCE).
+    """Return the symmetric InfoNCE loss, the cross-entropy of the true match among all keypoints.
 
-    In both directions. Half of the pairs are mirrored. Turned pairs are turned back by angles as
-    detectors measure them, each `counted` so many times; of those that hardly are, half stay as
-    upright images will be.
+    Half of the pairs are mirrored. The descriptors of the second view are rotated back by the
+    keypoints' relative angles, with the noise of a detector and multiplied by `counted` (see
+    `angles_counted`). Half of the pairs rotated by less than `UPRIGHT` are left as they are,
+    because descriptors of upright images are not rotated in use.
     """
     device, count = batch.turns.device, len(batch.turn)
     mirrored, kept = torch.from_numpy(generator.random((2, count)) < 0.5).to(device)
@@ -95,7 +97,7 @@ def shares_right(
 ) -> dict[str, float]:
     """Return the share of keypoints that are correct mutual nearest neighbours, by kind of pair.
 
-    The network is in evaluation mode; there are pairs of all of `KINDS`.
+    The network must be in evaluation mode, and there must be pairs of each of `KINDS`.
     """
     shares: dict[str, list[float]] = {kind: [] for kind in KINDS}
     generator = np.random.default_rng(1)

@@ -1,10 +1,10 @@
-"""The network of the learned descriptor: features of the whole image, read at keypoints.
+"""The network of the learned descriptor: feature maps of the whole image, sampled at keypoints.
 
-`DescriptorNetwork.maps` makes features at 1/2 to 1/16 of the size, of the image and of it reduced
-to 1/2 and 1/4, by the same kernels; `describe` reads them at each keypoint, those of the image and
-those of the octave of the keypoint's own size, and a perceptron makes 64 numbers of them. These are
-of an upright image: the first 16 do not change where it is turned, the others turn with it
-(`deepdetect.features.learned`).
+`DescriptorNetwork.maps` computes feature maps at 1/2 to 1/16 of the image size. The same kernels
+are applied to three octaves: the image, and the image reduced to 1/2 and 1/4. `describe` samples
+the maps of the first octave and of the octave that fits the keypoint's size. A perceptron maps the
+samples to a descriptor of 64 numbers. The first 16 numbers do not change when the image is rotated.
+The other 48 rotate with the image (`deepdetect.features.learned`).
 """
 
 from __future__ import annotations
@@ -20,16 +20,19 @@ from torch.nn.functional import avg_pool2d, batch_norm, interpolate, normalize, 
 from deepdetect.features.learned import CONSTANT, FREQUENCIES
 
 HALF, QUARTER, EIGHTH, SIXTEENTH, COARSEST, HIDDEN = 16, 32, 64, 96, 128, 160
-"""Numbers of channels at 1/2 to 1/32 of the image size, and of the perceptron."""
+"""The first five are the numbers of channels at 1/2, 1/4, 1/8, 1/16 and 1/32 of the image size. The
+last is the number of hidden units of the perceptron."""
 
 DIMENSIONS = CONSTANT + 2 * len(FREQUENCIES)
 OCTAVES = 3
 FIRST_OCTAVE_PX = 4.5
-"""Keypoints up to this size are described in the full image, up to twice this size at 1/2."""
+"""Keypoints up to this size are described in the full image. Larger ones are described in the image
+reduced to 1/2 or 1/4, or between two octaves."""
 
 SMALLEST_SIZE_PX = 2.5
 NOISE = 1 / 255
-"""Variations below one grey level are not amplified to full contrast, since they are noise."""
+"""Standard deviation of noise in local contrast, one grey level. Smaller variations are not
+amplified to full contrast."""
 
 CELL_PX, CELLS = 8, 5
 """Local contrast is computed over squares of 5 cells of 8 pixels. Chosen by hand; not measured."""
@@ -38,10 +41,10 @@ BATCH_MOMENTUM = 0.1
 
 
 class Convolution(nn.Module):
-    """A convolution, batch normalisation, ReLU.
+    """A convolution with batch normalisation and ReLU.
 
-    All octaves use the batch statistics of the first octave, since the trained network has a single
-    normalisation for all.
+    In training, all octaves use the batch statistics of the first octave, since the trained network
+    has a single normalisation for all octaves.
     """
 
     def __init__(self, inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> None:
@@ -69,7 +72,7 @@ class Convolution(nn.Module):
 
 
 class Halving(nn.Module):
-    """Two convolutions; the first halves the size."""
+    """Two convolutions, of which the first halves width and height."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -106,11 +109,14 @@ class DescriptorNetwork(nn.Module):
         self.temperature = nn.Parameter(torch.tensor(math.log(20.0)))  # of the loss
 
     def forward(self, luma: Tensor, xy: Tensor, sizes: Tensor) -> Tensor:
-        """Map (B, 1, H, W) in [0, 1], (B, N, 2) and (B, N) pixels to (B, N, 64) of length 1."""
+        """Return (B, N, 64) descriptors of length 1 from luma (B, 1, H, W) in [0, 1].
+
+        Positions (B, N, 2) and sizes (B, N) of the keypoints are in pixels.
+        """
         return self.describe(self.maps(luma), xy, sizes)
 
     def maps(self, luma: Tensor) -> list[list[Tensor]]:
-        """Return for each octave features at 1/2, 1/4, 1/8, 1/8 with context, and 1/16."""
+        """Return the feature maps of each octave: at 1/2, 1/4, 1/8, 1/8 with context, and 1/16."""
         x, result = _normalized(luma), []
         for octave in range(OCTAVES):
             if octave:
@@ -127,7 +133,7 @@ class DescriptorNetwork(nn.Module):
         return result
 
     def describe(self, maps: list[list[Tensor]], xy: Tensor, sizes: Tensor) -> Tensor:
-        """Return (B, N, 64) descriptors from the feature maps."""
+        """Return (B, N, 64) descriptors at keypoints, from the feature maps of all octaves."""
         octaves = [
             torch.cat(
                 [
@@ -153,7 +159,7 @@ class DescriptorNetwork(nn.Module):
 
 
 def _normalized(luma: Tensor) -> Tensor:
-    """Return (B, 2, H, W): luma normalised by global contrast, and by local contrast."""
+    """Return (B, 2, H, W): the luma normalised by global contrast, and by local contrast."""
     mean = luma.mean((2, 3), keepdim=True)
     variance = (luma - mean).square().mean((2, 3), keepdim=True)
     whole = (luma - mean) / (variance + 1e-6).sqrt()
@@ -172,10 +178,10 @@ def _doubled(features: Tensor) -> Tensor:
 
 
 def _read(features: Tensor, xy: Tensor) -> Tensor:
-    """Return (B, N, C) values of (B, C, H, W) at positions, bilinearly, as of the nearest inside.
+    """Sample (B, C, H, W) bilinearly at positions; return (B, N, C).
 
-    Rows of the pixels are gathered: twenty times as fast on a CPU as grid_sample, of which each
-    channel has its own place in memory.
+    Positions outside are clamped to the border. This gathers all channels of a pixel at once, which
+    is twenty times as fast on a CPU as `grid_sample`, which reads each channel separately.
     """
     shape = torch._shape_as_tensor(features)
     last = shape[[3, 2]].to(xy.dtype) - 1
@@ -195,7 +201,7 @@ def _read(features: Tensor, xy: Tensor) -> Tensor:
 
 
 def turn(descriptors: Tensor, angles: Tensor) -> Tensor:
-    """Rotate (..., 64) descriptors by (...) radians, as `turn_descriptors` does by degrees."""
+    """Rotate descriptors (..., 64) by angles (...) in radians, like `turn_descriptors` in NumPy."""
     turns = angles[..., None] * torch.from_numpy(FREQUENCIES).to(angles)
     constant, numbers = descriptors[..., :CONSTANT], descriptors[..., CONSTANT:]
     (real, imaginary), (c, s) = numbers.chunk(2, -1), (turns.cos(), turns.sin())

@@ -28,11 +28,12 @@ from .views import Pair, draw_pair
 ONNX = "descriptor.onnx"
 
 REUSE, WINDOW, FIRST_BATCHES = 4, 4096, 8
-"""A pair is used in 4 steps on average, because drawing takes longer than a training step. The last
-4,096 pairs are kept for this. The first step draws 8 batches."""
+"""Each pair is used in 4 steps on average, because drawing pairs takes longer than a training step.
+Steps choose from the last 4,096 pairs. The first step chooses from 8 batches."""
 
 WARM_UP_STEPS, WARM_UP_SHARE = 300, 0.15
-"""Number of warm-up steps, but at most this share of all steps. Chosen by hand; not measured."""
+"""The warm-up takes the first number of steps, but at most the second share of all steps. Both are
+chosen by hand and not measured."""
 
 DECAY_SHARE = 0.65
 """The learning rate falls linearly to 0 over this last share of the steps. Chosen by hand."""
@@ -42,7 +43,7 @@ VECTOR_RATE = 0.4
 
 
 def pairs_of_step(options: DescriptorTrainingOptions, step: int) -> np.ndarray:
-    """Return the numbers of the pairs that a step trains on, out of a window that moves on."""
+    """Return the numbers of the pairs that a step trains on, drawn from a sliding window."""
     last = (step + 1) * options.pairs // REUSE + FIRST_BATCHES * options.pairs
     generator = np.random.default_rng([options.seed, 4, step])
     return generator.integers(max(0, last - WINDOW), last, options.pairs)
@@ -51,7 +52,7 @@ def pairs_of_step(options: DescriptorTrainingOptions, step: int) -> np.ndarray:
 def pairs_to_draw(
     options: DescriptorTrainingOptions, first: int, last: int
 ) -> Iterator[tuple[int, list[int]]]:
-    """Yield each step with the numbers of its pairs that no step since the first one had."""
+    """Yield each step with the numbers of its new pairs, which no step since `first` has used."""
     drawn: set[int] = set()
     for step in range(first, last):
         wanted = set(pairs_of_step(options, step).tolist())
@@ -60,18 +61,18 @@ def pairs_to_draw(
 
 
 def draw_numbered(files: Sequence[Path], cross_modal: bool, *seed: int) -> Pair:
-    """Draw a pair by a seed; an OptionError where the images show too little."""
+    """Draw a pair by a seed; raise an OptionError if the images show too little."""
     generator = np.random.default_rng(seed)
     return draw_until_seen(lambda: draw_pair(generator, files, cross_modal))
 
 
 def stack(pairs: Sequence[Pair]) -> Pair:
-    """Make a batch, of tensors."""
+    """Stack pairs of arrays into a batch of tensors."""
     return Pair(*(torch.from_numpy(np.stack(values)) for values in zip(*pairs, strict=True)))
 
 
 class PairDataset(Dataset[tuple[int, list[int], Pair | None]]):
-    """Pairs by step; each is a pure function of the seed and its number."""
+    """The new pairs of each step. A pair is a pure function of the seed and its number."""
 
     def __init__(self, files: Sequence[Path], options: DescriptorTrainingOptions) -> None:
         self.files, self.options = files, options
@@ -84,7 +85,7 @@ class PairDataset(Dataset[tuple[int, list[int], Pair | None]]):
 
 
 def validation_batches(files: Sequence[Path], options: DescriptorTrainingOptions) -> list[Pair]:
-    """Draw the fixed pairs that weights are measured on, as many of each of `KINDS`."""
+    """Draw the fixed validation pairs, equally many of each of `KINDS`, in batches."""
     pairs: dict[str, list[Pair]] = {kind: [] for kind in KINDS}
     number = 0
     while min(map(len, pairs.values())) < options.val_pairs:
@@ -97,7 +98,7 @@ def validation_batches(files: Sequence[Path], options: DescriptorTrainingOptions
 
 
 class DescriptorTrainer(Trainer):
-    """A network that describes keypoints, and the images whose views it is trained on."""
+    """Training of the descriptor network on views of images."""
 
     objective, sign = "score", -1
     purpose = "that describes keypoints"
@@ -137,7 +138,7 @@ class DescriptorTrainer(Trainer):
         self.network = network.to(self.device).to(memory_format=torch.channels_last)
         self.average = copy.deepcopy(self.network).eval()
         self.network.train()
-        # The kernels of the first layer and of sizes are no maps between many features.
+        # Muon is for maps between many features, unlike the first layer and those of the size.
         kernels: list[Any] = []
         vectors: list[Any] = []
         for name, parameter in self.network.named_parameters():
@@ -150,7 +151,7 @@ class DescriptorTrainer(Trainer):
         self.milestones = milestones(options.steps, options.val_count)
 
     def loader(self, first: int = 0, last: int | None = None) -> DataLoader[Any]:
-        """Return the loader of some steps: the step, numbers of pairs, and these pairs."""
+        """Return the loader of some steps: a step, its new pairs' numbers, and the new pairs."""
         to_draw = pairs_to_draw(self.options, first, self.steps if last is None else last)
         return DataLoader(
             PairDataset(self.files, self.options),
@@ -161,9 +162,10 @@ class DescriptorTrainer(Trainer):
         )
 
     def loss(self, batch: tuple[int, list[int], Pair | None]) -> Tensor:
-        """Return the loss of a step's pairs, of which the batch has those it is the first to see.
+        """Return the loss of a step's pairs.
 
-        They come into the window, on the device, in place of older ones; the others are there.
+        The batch holds the step's new pairs. They replace older pairs in the window, which is on
+        the device and already holds the step's other pairs.
         """
         step, numbers, pairs = batch
         if pairs is not None:

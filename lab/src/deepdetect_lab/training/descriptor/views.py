@@ -1,7 +1,7 @@
-"""Draw pairs of views of one photograph with the keypoints that both show, as training sees them.
+"""Draw training pairs: two views of a synthetic scene, and the keypoints visible in both.
 
-The views are those of a synthetic scene, each with its own light, blur, noise and JPEG. So depth,
-occlusion and darkness are seen without any pair of real photographs.
+Each view has its own light, blur, noise and JPEG compression. So the descriptor learns depth,
+occlusion and darkness without pairs of real photographs.
 """
 
 from __future__ import annotations
@@ -32,38 +32,41 @@ from ..synthetic import (
 )
 
 KEYPOINTS = 256
-"""A pair has at most this many keypoints, since all are compared with all; 256 fill a view."""
+"""A pair has at most this many keypoints, because the loss compares all with all. They are enough
+to fill a view."""
 
 LEAST_KEYPOINTS, LEAST_IF_ZOOMED, ZOOMED = 64, 40, 0.8
-"""Pairs that share fewer keypoints are drawn again. Above the last log zoom the limit is lower."""
+"""Pairs with fewer common keypoints than the first number are drawn again. If the logarithm of the
+zoom is above the third, the limit is the second."""
 
 STRONGEST, MAX_FIRST_SIGMA_PX = 600, 5.1
-"""Candidates in the first view that are taken at most, and their largest sigma: larger ones have no
-surroundings in a view of 256 pixels."""
+"""The first is the largest number of candidates in the first view. The second limits their sigma,
+because the surroundings of larger ones do not fit into a view of 256 pixels."""
 
 SIGMA_RANGE_PX = (1.0, 13.0)
-"""Sigmas of keypoints in the second view: smaller ones cannot be described, larger ones not
-seen."""
+"""Range of the sigmas of keypoints in the second view. Smaller keypoints cannot be described, and
+the surroundings of larger ones do not fit into the view."""
 
 MIN_GROWTH = 0.02
-"""Keypoints are left out if areas grow by less from the first to the second view, since such places
-are seen from the side."""
+"""Keypoints are left out if areas around them change by less than this factor from the first to the
+second view, because these surfaces are seen at a grazing angle."""
 
 CLEAN_SHARE, RANDOM_SHARE = 0.6, 0.7
-"""Shares of the pairs whose keypoints are found in the view before light and noise, as a repeatable
-detector would; and of which random keypoints are taken, not the strongest."""
+"""The first is the share of the pairs whose keypoints are detected before light and noise are
+changed, to simulate a repeatable detector. The second is the share with random keypoints instead of
+the strongest."""
 
 JITTER_PX = 0.5
-"""Keypoints in the first view are moved by up to half a pixel along each axis, as by a pixel
-grid."""
+"""Keypoints in the first view are moved by up to half a pixel along each axis, like positions that
+are rounded to pixels."""
 
 SIZE_ERRORS, SMALL_ERROR_SHARE = (0.12, 0.4), 0.6
-"""Standard deviations of the logarithm of a keypoint's size in the second view, and the share with
-the smaller: detectors measure sizes with errors, of which some are large."""
+"""Keypoint sizes in the second view have errors, as those of detectors do. The first are two
+standard deviations of their logarithm. The second is the share with the smaller one."""
 
 PLACE_ERROR_PX, PLACE_ERROR_PER_SIGMA, PLACE_ERROR_SIGMA = 0.225, 0.162, 6.0
-"""Standard deviation of a keypoint's place in the second view: pixels, and more for each pixel of
-its sigma, up to this sigma."""
+"""The standard deviation of a keypoint's position in the second view is the first number of pixels
+plus the second for each pixel of its sigma. Sigmas above the third count as the third."""
 
 UNCHANGED_SHARE = 0.15
 """Share of views without changes of light, blur or noise. Chosen by hand; not measured."""
@@ -83,39 +86,41 @@ CAMERA = Camera(
     noise=(Effect(0.35, 1, 14),),
     jpeg=Effect(0.3, 8, 75),
 )
-"""The recipe of each view, down to 1/50 of the light and to JPEG of quality 8, the least that both
-are met with in use. What single ranges contribute was not measured."""
+"""The recipe of each view. It goes down to 1/50 of the light and to JPEG of quality 8, the lowest
+values that occur in use. What the single ranges contribute was not measured."""
 
 CROSS_MODAL_SHARE, MIXED_SHARE = 0.6, 0.45
-"""Shares of the pairs for images of different sensors in which one view has other tones, and in
-which one is of another mixture of colours."""
+"""Shares of the pairs for a descriptor of images of different sensors. In the first share, the
+tones of one view are changed. In the second, one view shows another mixture of the colours."""
 
 ONE_COLOUR_SHARE, MIXTURE_DEVIATION, LEAST_WEIGHT = 0.4, 0.6, 0.5
-"""Share of the mixtures that are one colour alone; the standard deviation of the weights of the
-others around 1/3; weights are divided by their sum, of absolute values, unless it is below this."""
+"""The first is the share of mixtures that are a single colour channel. The weights of all other
+mixtures are normal with mean 1/3 and the second as standard deviation. They are divided by the sum
+of their absolute values, or by the third if that is larger."""
 
 TONES = {"negative": 0.35, "curve": 0.7, "curves": 0.88}
-"""Other tones by kind, with cumulative shares; what is left is edges."""
+"""Cumulative shares of the kinds of changed tones. The remaining share shows edges."""
 
 CURVE_TONES = (3, 8)
-"""Any curve of tones has 3 to 7 random values: with more it would be noise."""
+"""A tone curve has 3 to 7 random values. With more, it would turn the image into noise."""
 
 EDGE_SIGMA_PX, EDGE_QUANTILE = (0.7, 1.5), 0.98
-"""Edges are gradients after a blur by one of these sigmas; this quantile of them becomes white."""
+"""Edges are gradient magnitudes after a blur with a sigma in pixels from the first range. The
+second is the quantile of the magnitudes that becomes white."""
 
 DARK_EDGES_SHARE = 0.5
 
 
 class Pair(NamedTuple):
-    """Two views and their keypoints, row by row: arrays, or tensors with another axis for a batch.
+    """Two views and their corresponding keypoints, as arrays, or as tensors of a batch (B, ...).
 
     Attributes:
         images: (2, S, S) uint8.
         positions0, positions1: (N, 2) float32 pixels.
         sizes0, sizes1: (N,) float32 pixels.
-        turns: (N,) float32 radians from the first view to the second.
-        valid: (N,) bool; the other rows are padding.
-        turn, zoom: of the whole view, absolute, in radians and as a logarithm.
+        turns: (N,) float32 rotations in radians from the first view to the second.
+        valid: (N,) bool, false for rows that are padding.
+        turn, zoom: absolute rotation in radians and absolute log zoom between the whole views.
     """
 
     images: Any
@@ -132,7 +137,7 @@ class Pair(NamedTuple):
 def draw_pair(
     rng: np.random.Generator, files: Sequence[Path], cross_modal: bool = False
 ) -> Pair | None:
-    """Draw a pair of views of one or of different sensors; None if they share too little."""
+    """Draw a pair of views of one or two sensors; None if they share too few keypoints."""
     layers, scales, turn = draw_layers(rng, files)
     mixtures: list[np.ndarray | None] = [None, None]
     if cross_modal and happens(rng, MIXED_SHARE):
@@ -179,7 +184,7 @@ def photograph_view(rng: np.random.Generator, view: np.ndarray) -> np.ndarray:
 
 
 def find_keypoints(view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return (N, 2) positions and (N,) sigmas of the strongest candidates for points."""
+    """Return the positions (N, 2) and sigmas (N,) in pixels of a view's strongest candidates."""
     found = find_candidates(build_scale_space(view))
     inside = (found.xy > MARGIN_PX) & (found.xy < len(view) - 1 - MARGIN_PX)
     rows = np.flatnonzero(inside.all(1) & (found.sigma_px < MAX_FIRST_SIGMA_PX))
@@ -196,7 +201,7 @@ def draw_mixture(rng: np.random.Generator) -> np.ndarray:
 
 
 def change_tones(rng: np.random.Generator, view: np.ndarray) -> np.ndarray:
-    """Return a (S, S) float32 view in [0, 1] as another sensor may see it.
+    """Change a view, (S, S) float32 in [0, 1], to what another sensor may see.
 
     The view is inverted, changed by one tone curve or by two in different areas, or shown as edges.
     """

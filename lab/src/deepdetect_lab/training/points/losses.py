@@ -1,7 +1,7 @@
-"""The loss of a pair of views: less the expected fraction of keypoints that are found again.
+"""The loss of a pair of views: minus the expected fraction of keypoints that are found again.
 
-Candidates and their positions are fixed; only their order is learned. The logits have a fixed
-standard deviation, so the loss does not fall when the ranker only makes its logits sharper.
+Candidates and their positions are fixed. Only their order is learned. The logits are scaled to a
+fixed standard deviation, so that larger logits alone do not lower the loss.
 """
 
 from __future__ import annotations
@@ -18,28 +18,30 @@ from .pairs import CandidatePair, ViewCandidates
 CLOSE_PX, NEAR_PX = 1.0, 3.0
 
 SHARPNESS = 25.0
-"""Standard deviation of the logits over the keypoints of a view, to which they are scaled before
-the loss: it cannot be lowered by sharper logits."""
+"""The logits of a view's keypoints are scaled to this standard deviation before the loss, so that
+larger logits alone do not lower it."""
 
 TEMPERATURE = 0.6
 """Temperature of the soft choice of keypoints, in units of the logits. Chosen by hand."""
 
 CLOSE_SHARE = 0.7
-"""This share of a keypoint's reward requires its repetition within 1 px, the rest within 3 px."""
+"""A keypoint gets this share of its reward only if it is found again within 1 px. For the rest, 3
+px suffice."""
 
 MIN_CHOICE = 0.1
-"""Candidates with a smaller probability of being chosen get no partners. Chosen by hand."""
+"""Candidates that are chosen with a smaller probability get no partners in the other view. Chosen
+by hand."""
 
 MIN_SPREAD = 1e-3
 BISECTIONS = 40
 
 
 def pair_loss(ranker: torch.nn.Module, pair: CandidatePair) -> Tensor:
-    """Return the loss of a pair of views, seen in both directions.
+    """Return the loss of a pair of views, averaged over both directions.
 
-    Its value is what is expected to be found again; its gradient is that at a fixed budget: a
-    candidate that becomes more likely drives out others at the border of the budget, so its reward
-    counts less theirs.
+    Its value is minus the expected fraction of keypoints that are found again. Its gradient keeps
+    the number of keypoints fixed: a candidate that becomes more likely displaces candidates near
+    the selection threshold, so their mean reward is subtracted from its own reward.
     """
     shares = [_choose(ranker, view, pair.budget) for view in pair.views]
     visible = [torch.from_numpy(view.visible) for view in pair.views]
@@ -57,7 +59,7 @@ def pair_loss(ranker: torch.nn.Module, pair: CandidatePair) -> Tensor:
 
 
 def _choose(ranker: torch.nn.Module, view: ViewCandidates, budget: float) -> Tensor:
-    """Return (N,) how surely each candidate is among the best; 0 where a better one is near."""
+    """Return the probability (N,) that each candidate is chosen; 0 if a better one is close."""
     logits = ranker(torch.from_numpy(view.features))
     radii = least_distances(view.sigma_px)  # as at run time
     kept = torch.from_numpy(suppress_neighbors(view.xy, logits.detach().numpy(), radii))
@@ -68,7 +70,7 @@ def _choose(ranker: torch.nn.Module, view: ViewCandidates, budget: float) -> Ten
 
 
 def soft_top_k(logits: Tensor, budget: float, temperature: float) -> Tensor:
-    """Return sigmoid((logits - tau) / temperature), tau so that they sum to the budget."""
+    """Return sigmoid((logits - tau) / temperature), with tau such that the sum is the budget."""
     fixed = logits.detach().double()
     if len(fixed) <= budget:
         return torch.sigmoid((logits - logits.detach().min()) / temperature + 4)
@@ -83,10 +85,11 @@ def soft_top_k(logits: Tensor, budget: float, temperature: float) -> Tensor:
 
 
 def _rewards(view: ViewCandidates, here: Tensor, there: Tensor) -> Tensor:
-    """Return what a candidate is worth: its partner's choice, by the distances of the measure.
+    """Return the reward (N,) of each candidate: the probability that its partner is chosen.
 
-    One to one, as it is measured, and among those that may be chosen: with a sum over all near
-    candidates, crowds of points are rewarded, and fewer points are found again within 1 px.
+    The reward is lower if the partner is farther than 1 px away. Partners are mutual nearest
+    neighbours among the candidates that may be chosen, as in the validation. A sum over all near
+    candidates would reward clusters, and fewer points would be found again within 1 px.
     """
     pairs = mutual_pairs(view, NEAR_PX, here.numpy() > MIN_CHOICE, there.numpy() > MIN_CHOICE)
     close = view.distance_px[pairs] <= CLOSE_PX
@@ -100,11 +103,15 @@ def _rewards(view: ViewCandidates, here: Tensor, there: Tensor) -> Tensor:
 def mutual_pairs(
     view: ViewCandidates, radius_px: float, possible_here: np.ndarray, possible_there: np.ndarray
 ) -> np.ndarray:
-    """Return which (P,) join mutual nearest neighbours among the possible candidates (N,), (M,)."""
+    """Return the indices of the pairs that are mutual nearest neighbours within a radius.
+
+    They index the P pairs of `view`. Candidates count only if they are marked in the masks
+    `possible_here` (N,) and `possible_there` (M,).
+    """
     close = view.distance_px <= radius_px
     rows = np.flatnonzero(close & possible_here[view.first] & possible_there[view.second])
     rows = rows[np.argsort(view.distance_px[rows], kind="stable")]
-    # The first of each candidate is its nearest.
+    # Rows are sorted by distance, so the first row of a candidate has its nearest neighbour.
     _, best_first = np.unique(view.first[rows], return_index=True)
     _, best_second = np.unique(view.second[rows], return_index=True)
     found: np.ndarray = rows[np.intersect1d(best_first, best_second)]

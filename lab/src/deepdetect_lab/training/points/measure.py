@@ -1,7 +1,7 @@
-"""The validation metric, on images not trained on, by the functions of the benchmark.
+"""The validation metric of the ranker, on a fixed set of synthetic pairs.
 
-One-to-one repeatability at fixed budgets, and correct matches by upright descriptors, on a fixed
-set of synthetic pairs. Points outside the image are dropped before the best are taken.
+It uses the benchmark's functions for one-to-one repeatability at fixed budgets and for correct
+matches by upright descriptors. Points outside the photograph are dropped before the best are taken.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from ...evaluation.metrics.repeatability import mutual_nn_repeatability
 from .views import KINDS, ViewPair, draw_pair
 
 IMAGE_PIXELS = 800 * 640
-"""Pixels of the image for which budgets are given; smaller views get equally many per pixel."""
+"""Budgets are numbers of keypoints for an image with this number of pixels. Smaller views get the
+same number per pixel."""
 
 BUDGETS = (512, 2048, 8192)
 RADII_PX = (1.0, 3.0)
@@ -35,12 +36,13 @@ Detect = Callable[[np.ndarray], Keypoints]
 
 
 MEASURES = [f"@{radius:g} px {budget}" for budget in BUDGETS for radius in RADII_PX] + ["correct"]
-"""Measures of a kind of pair: mean repeatability by radius and budget, and the mean fraction of
-`MATCHING_BUDGET` that matches correctly (1 px; upright RootSIFT of size 4, mutual, ratio 0.85)."""
+"""Measures of each kind of pair: the mean repeatability by radius and budget, and the mean fraction
+of `MATCHING_BUDGET` keypoints with correct matches. A match is correct within 1 px. Matches are
+mutual nearest neighbours of upright RootSIFT of size 4 that pass a ratio test at 0.85."""
 
 
 def validation_pairs(files: Sequence[Path], pairs_per_kind: int) -> list[ViewPair]:
-    """Draw the fixed set of pairs, each of another image where they suffice."""
+    """Draw the fixed set of pairs, each from a different image if there are enough."""
     order = np.random.default_rng([0, 1]).permutation(len(files))
     pairs = []
     for number in range(pairs_per_kind * len(KINDS)):
@@ -51,7 +53,7 @@ def validation_pairs(files: Sequence[Path], pairs_per_kind: int) -> list[ViewPai
 
 
 def measure(detect: Detect, pairs: Sequence[ViewPair]) -> dict[str, float]:
-    """Return the score of a detector, and "KIND MEASURE" for each kind and measure."""
+    """Return the "score" of a detector, and the value of "KIND MEASURE" for each combination."""
     repeated: dict[str, list[list[list[float]]]] = {kind: [] for kind in KINDS}
     correct: dict[str, list[float]] = {kind: [] for kind in KINDS}
     for pair in pairs:
@@ -75,7 +77,7 @@ def measure(detect: Detect, pairs: Sequence[ViewPair]) -> dict[str, float]:
         repeated[pair.kind].append(rows)
     means = np.array([np.mean(repeated[kind], axis=0) for kind in KINDS])
     matched = [float(np.mean(correct[kind])) for kind in KINDS]
-    # Upright descriptors find nothing in zoomed and turned pairs, so `correct` is half as large.
+    # Upright descriptors match nothing in zoomed and rotated pairs, so `correct` counts double.
     score = 0.8 * means.mean(0).mean() + 0.2 * 2 * float(np.mean(matched))
     found = {"score": float(score)}
     for kind, fractions, share in zip(KINDS, means, matched, strict=True):

@@ -1,4 +1,4 @@
-"""Pairs of views as the ranker sees them: candidates, features, and which see the same place."""
+"""Training pairs of the ranker: candidates of two views, their features and correspondences."""
 
 from __future__ import annotations
 
@@ -23,22 +23,23 @@ MAX_CANDIDATES = 2000
 REACH_PX = 3.0
 
 MIN_OVERLAP = 0.04
-"""Pairs are drawn again if their views share a smaller fraction. Chosen by hand; not measured."""
+"""Pairs are drawn again if their views overlap by a smaller fraction. Chosen by hand; not
+measured."""
 
 ATTEMPTS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class ViewCandidates:
-    """The candidates of one view, and those of the other view that lie close to them there.
+    """The candidates of one view, and the close pairs of them with candidates of the other view.
 
     Attributes:
         xy: (N, 2) float64 positions.
-        sigma_px: (N,) float64 of their scales.
+        sigma_px: (N,) float64 scales.
         features: (N, F) float32.
-        visible: (N,) bool: whether the other view shows the place.
-        first, second: (P,) int64 rows of candidates here, and in the other view.
-        distance_px: (P,) between the two, in pixels of the other view.
+        visible: (N,) bool, whether the other view shows the candidate's position.
+        first, second: (P,) int64 rows of the close candidates in this and in the other view.
+        distance_px: (P,) distances between close candidates, in pixels of the other view.
     """
 
     xy: np.ndarray
@@ -59,7 +60,10 @@ class CandidatePair:
 
 
 def candidate_pair(pair: ViewPair, density: float) -> CandidatePair:
-    """Find the candidates of both views, and which see the same place."""
+    """Find the candidates of both views and their correspondences.
+
+    The budget is `density`, in keypoints per pixel, times the number of pixels of a view.
+    """
     sides = []
     for image, valid in zip(pair.images, pair.valid, strict=True):
         space = build_scale_space(image)
@@ -90,7 +94,7 @@ def _correspondences(
     rows = rows[valid[row[rows], column[rows]]]
     visible = np.zeros(len(here), bool)
     visible[rows] = True
-    # A few thousand candidates: all distances are quicker than a tree, and need no package.
+    # For a few thousand candidates, computing all distances is faster than a tree.
     squared = np.square(mapped[rows, :1] - there[:, 0]) + np.square(mapped[rows, 1:] - there[:, 1])
     near, second = np.nonzero(squared < REACH_PX**2)
     first, distance = rows[near], np.sqrt(squared[near, second])
@@ -98,7 +102,7 @@ def _correspondences(
 
 
 class PairDataset(Dataset[CandidatePair]):
-    """Pairs of views of images; each a pure function of the seed, the step and its number in it."""
+    """Random pairs of views. Each is a pure function of the seed, the step and its number there."""
 
     def __init__(self, files: Sequence[Path], options: PointsTrainingOptions) -> None:
         self.files, self.options = list(files), options
@@ -119,7 +123,7 @@ class PairDataset(Dataset[CandidatePair]):
 
 
 def overlap(pair: ViewPair) -> float:
-    """Return which fraction of a view, the lesser of both, shows what the other one shows."""
+    """Return the fraction of a view that the other view also shows; the smaller of both."""
     side = pair.images[0].shape[0]
     ticks = np.linspace(0, side - 1, 24)
     grid = np.stack(np.meshgrid(ticks, ticks), -1).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""The training of the ranker: pairs of views, the loss of their order, the validation metric."""
+"""The training of the ranker: its network, batches of pairs, loss and validation."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ from .measure import measure, validation_pairs
 from .pairs import CandidatePair, PairDataset
 
 STATISTICS_PAIRS = 64
-"""Number of pairs whose features give the mean and standard deviation. Chosen by hand."""
+"""Number of pairs from whose features the mean and standard deviation for the normalisation are
+computed. Chosen by hand."""
 
 WARM_UP_STEPS = 100
 FINAL_RATE = 0.02
@@ -41,11 +42,15 @@ AVERAGE_DECAY = 0.995
 HIDDEN_UNITS = (48, 32)
 MIN_DEVIATION = 1e-3
 INITIAL_OUTPUT = 0.01
-"""The last layer starts at almost nothing: an untrained ranker ranks as |det Hessian| does."""
+"""The initial weights of the last layer are scaled by this factor to nearly 0. So an untrained
+ranker ranks by |det Hessian|."""
 
 
 class RankerModule(nn.Module):
-    """A perceptron of the features, added to the first of them; made from their statistics (F,)."""
+    """A ranker: its logit is the first feature plus the output of a perceptron of all features.
+
+    The features are normalised by their `mean` and standard `deviation`, (F,) each.
+    """
 
     mean: Tensor
     deviation: Tensor
@@ -82,7 +87,7 @@ class RankerModule(nn.Module):
 
 
 def save_ranker(ranker: Ranker, path: Path) -> None:
-    """Write a ranker as `load_ranker` reads it: the same bytes for the same ranker."""
+    """Write a ranker as an npz file for `load_ranker`; equal rankers give equal bytes."""
     arrays = {"mean": ranker.mean, "deviation": ranker.deviation}
     for k, (weight, bias) in enumerate(ranker.layers):
         arrays |= {f"weight{k}": weight, f"bias{k}": bias}
@@ -91,7 +96,7 @@ def save_ranker(ranker: Ranker, path: Path) -> None:
 
 
 class RankerTrainer(Trainer):
-    """A ranker of points, and the folders of images whose views it is trained on."""
+    """Training of a ranker of keypoints on views of images."""
 
     objective, sign = "score", -1
     purpose = "that ranks maxima of |det Hessian| by how surely they are found again"
@@ -144,7 +149,7 @@ class RankerTrainer(Trainer):
         )
 
     def loss(self, batch: Sequence[CandidatePair]) -> Tensor:
-        """Return the mean loss of some pairs; those with nothing to see count as 0."""
+        """Return the mean loss of some pairs; pairs with a view without candidates count as 0."""
         losses = [
             pair_loss(self.network, pair)
             for pair in batch

@@ -1,7 +1,8 @@
 """Synthetic pairs of views of one photograph, with the homography between them.
 
-The four kinds are those of Oxford's scenes: zoom and rotation, blur, viewpoint, light and JPEG.
-Each kind also gets a little of the others. A pair depends on photograph, kind, size and generator.
+Pairs have one of four kinds of change, as the Oxford scenes have: zoom and rotation, blur,
+viewpoint, or light and JPEG. Each kind also gets a little of the other changes. A pair only depends
+on photograph, kind, size and generator.
 """
 
 from __future__ import annotations
@@ -30,17 +31,18 @@ from ..synthetic import (
 KINDS = ("zoom", "blur", "viewpoint", "light")
 
 BORDER_PX = 4
-"""Places this close to the photograph's border are not valid: their candidates see what is
-mirrored."""
+"""Candidates within this distance of the photograph's border are not valid, because their
+surroundings include mirrored pixels."""
 
 SUPERSAMPLING = 2
 """Views are rendered with twice the pixels along each side, so that they are not aliased."""
 
 MAX_ENLARGEMENT = 2.2
-"""Zoomed views are enlarged by at most this factor, because larger ones only show blur."""
+"""Zoomed views enlarge the photograph by at most this factor, because more would only show blur."""
 
 SUBTLE = 0.25
-"""Share of views of other kinds with blur, light changes or JPEG. Chosen by hand."""
+"""Share of the views that get a weak blur, light change or JPEG compression although their kind is
+another. Chosen by hand."""
 
 CAMERA = Camera(
     blur=Effect(SUBTLE, 0.3, 1.0),
@@ -51,8 +53,9 @@ CAMERAS = {
     "blur": replace(CAMERA, blur=Effect(1, 0.5, 4.5)),
     "light": replace(CAMERA, jpeg=Effect(0.5, 5, 60)),
 }
-"""Blur, noise and JPEG of every view, and of the worse view by its kind. Oxford's JPEGs are of
-quality 40 to 2, but below 5 little is left of a view of 224 pixels."""
+"""The first is blur, noise and JPEG compression of a normal view. The second is that of the worse
+view of a pair, by its kind. Oxford's JPEG quality goes from 40 to 2, but below 5 little is left of
+a view of 224 pixels."""
 
 LIGHT = Light(
     log_gamma=Effect(1, -0.8, 0.8),
@@ -67,8 +70,8 @@ SUBTLE_LIGHT = Light(
     ramp=Effect(1, 0, 0.24),
     shift=(-0.015, 0.03),
 )
-"""Light of the worse view of its kind, with a gain down to a fifth; and of other views, 0.3 of
-that."""
+"""The first is the light of the worse view of kind "light", with a gain down to a fifth. The second
+is the light of all other views, with 0.3 times the ranges."""
 
 
 @dataclass(frozen=True)
@@ -77,13 +80,13 @@ class Change:
 
     Attributes:
         log_zoom: range of the logarithm of the zoom.
-        turn_deg: the largest rotation, either way.
-        shift: the largest distance of the middles along each axis, in sides of the first view.
+        turn_deg: the largest rotation in either direction, in degrees.
+        shift: the largest distance between the centres along each axis, in sides of the first view.
         any_turn: share of the pairs that are rotated by any angle.
-        tilt_deg: range of the tilt.
+        tilt_deg: range of the tilt in degrees.
         still: share of the pairs with neither zoom nor rotation nor tilt.
-        scales: how far first views go, on the logarithmic way from the scale that shows all of the
-            photograph to the largest.
+        scales: largest scale of first views: 0 is the scale that shows the whole shorter side of
+            the photograph, 1 the largest scale, logarithmically in between.
     """
 
     log_zoom: tuple[float, float]
@@ -96,35 +99,36 @@ class Change:
 
 
 CHANGES = {
-    # Small first views, so that the second ones, anywhere in them, are not blurred.
+    # First views are taken at small scales, so that the zoomed second views are not blurred.
     "zoom": Change((math.log(1.2), math.log(4.0)), 180, 0.3, tilt_deg=(0, 15), scales=0.3),
     "blur": Change((-0.1, 0.1), 6, 0.08),
     "viewpoint": Change((-0.25, 0.25), 25, 0.15, any_turn=0.35, tilt_deg=(15, 60)),
     "light": Change((-0.03, 0.03), 2, 0.08, still=0.3),
 }
-"""Changes up to the largest that Oxford's scenes are described with: a viewpoint of 60 degrees, a
-zoom of 4."""
+"""Changes by kind. They go up to the largest changes of the Oxford scenes, a viewpoint change of 60
+degrees and a zoom of 4."""
 
 LEAST_LOG_ZOOM = math.log(1.3)
-"""A zoom may be this large even where the second view then is enlarged by more than it should
-be."""
+"""Logarithm of a zoom that is always allowed, even if the second view is then enlarged by more than
+`MAX_ENLARGEMENT`."""
 
 ROTATED_SHARE = 0.2
-"""Share of the pairs that are rotated as a whole, by any angle. Chosen by hand."""
+"""Share of the pairs of which both views are rotated together by any angle. Chosen by hand."""
 
 FOCAL_SIDES = (1.2, 3.0)
-"""Focal length in sides of the view: fields of view from 45 to 19 degrees."""
+"""Range of the focal length, in sides of the view. It gives fields of view from 45 to 19
+degrees."""
 
 SHRUNK_SCALE, LEAST_SIDE_PX = 0.9, 8
-"""Photographs are first shrunk by area averaging if their scale is below the first number; their
+"""A photograph is first shrunk by area averaging if the view's scale is below the first number. Its
 sides keep at least the second number of pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewPair:
-    """Two views of one photograph: (H, W) uint8 images, and where they show it, (H, W) bool.
+    """Two views of one photograph, (H, W) uint8, and the pixels that show it, (H, W) bool.
 
-    The (3, 3) homography leads from the first view to the second.
+    The homography (3, 3) maps the first view to the second.
     """
 
     images: tuple[np.ndarray, np.ndarray]
@@ -142,10 +146,11 @@ def tilted_view(
     azimuth: float = 0.0,
     focal: float = 2.0,
 ) -> np.ndarray:
-    """Return the (3, 3) homography from a photograph to a view of some side in pixels.
+    """Return the homography (3, 3) from a photograph to a square view with `side` pixels a side.
 
-    The view has the place `center` in its centre, and `scale` pixels per pixel of the photograph.
-    The tilt is about an axis in the direction `azimuth`; the focal length is in sides.
+    The point `center` of the photograph is in the centre of the view, which has `scale` pixels per
+    pixel of the photograph. The tilt is about an axis in the direction `azimuth`. All angles are in
+    radians, and the focal length is in sides of the view.
     """
     linear = rotation(-angle) @ scaled_along(azimuth, 1, 1 / math.cos(tilt)) / scale
     perspective = -math.tan(tilt) / (focal * side) * rotation(-azimuth)[1]
@@ -153,7 +158,7 @@ def tilted_view(
 
 
 def draw_pair(photo: np.ndarray, kind: str, side: int, generator: np.random.Generator) -> ViewPair:
-    """Draw two square views of a photograph, (H, W) uint8 grey."""
+    """Draw two square views, of `side` pixels a side, of a photograph, (H, W) uint8 grey."""
     matrices = _draw_homographies(photo.shape, kind, side, generator)
     rendered = [render(photo, matrix, side) for matrix in matrices]
     affected = int(generator.integers(2))  # the view that has most of the blur or of the light
@@ -170,7 +175,7 @@ def draw_pair(photo: np.ndarray, kind: str, side: int, generator: np.random.Gene
 def _draw_homographies(
     shape: tuple[int, ...], kind: str, side: int, generator: np.random.Generator
 ) -> list[np.ndarray]:
-    """Draw where both views are taken from: the homographies from the photograph."""
+    """Draw the homographies from the photograph to both views."""
     change, uniform = CHANGES[kind], generator.uniform
     size = np.array(shape[::-1])
     smallest = side / size.min()  # shows all of the photograph's shorter side
@@ -197,7 +202,7 @@ def _draw_homographies(
 
 
 def render(photo: np.ndarray, matrix: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Render a view without aliasing: (side, side) uint8, and where it shows the photograph."""
+    """Render a view without aliasing; return (side, side) uint8 and its valid pixels as bool."""
     height, width = photo.shape
     x, y, w = np.linalg.solve(matrix, [(side - 1) / 2, (side - 1) / 2, 1])
     center = np.array([x / w, y / w])
@@ -228,9 +233,9 @@ def render(photo: np.ndarray, matrix: np.ndarray, side: int) -> tuple[np.ndarray
 
 
 def degrade(image: np.ndarray, kind: str, generator: np.random.Generator) -> np.ndarray:
-    """Blur, light, noise and JPEG of a kind in full, of the others now and then a little.
+    """Degrade a view, (H, W) uint8, strongly by its kind, and now and then weakly by other kinds.
 
-    The kind is "" where the view, (H, W) uint8, is the better one of its pair.
+    The kind is "" for the better view of a pair, which is only degraded weakly.
     """
     camera = CAMERAS.get(kind, CAMERA)
     values = blur(generator, image.astype(np.float32) / WHITE, camera)
