@@ -71,8 +71,7 @@ def refine_matches(
 
 
 def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
-    """Return rows of (N, 2) whole pixels: the best Shi-Tomasi corner in each of `count` cells.
-    """
+    """Return rows of (N, 2) whole pixels: the best Shi-Tomasi corner in each of `count` cells."""
     column, row = np.asarray(points, np.int64).reshape(-1, 2).T
     strength = cv2.cornerMinEigenVal(gray, CORNER_WINDOW_PX)[row, column]
     side = np.sqrt(gray.size / count)

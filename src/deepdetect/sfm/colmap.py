@@ -129,8 +129,7 @@ class CameraIntrinsics:
 
     @property
     def without_border(self) -> CameraIntrinsics:
-        """The pinhole camera, cropped by COLMAP so that undistorted images have no border.
-        """
+        """The pinhole camera, cropped by COLMAP so that undistorted images have no border."""
         pycolmap = import_pycolmap()
         cropped = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), self.colmap_camera())
         return CameraIntrinsics.of_colmap(cropped, self.source) if self.distorts else self
@@ -186,9 +185,8 @@ def initial_intrinsics(
 ) -> dict[str, CameraIntrinsics]:
     """Return the known intrinsics of each image, or initial ones to be estimated.
 
-    `focal_px` is for images whose camera is not known. If it is None, the focal length comes from
-    EXIF, or else from a guess. Images that share a camera (`MultiViewOptions.single_camera`) get
-    the same object.
+    `focal_px` is for images whose camera is not known. If it is None, EXIF or a guess gives it.
+    Images that share a camera (`MultiViewOptions.single_camera`) get the same object.
     """
     begins = {}
     for name, size in sizes.items():
@@ -208,8 +206,7 @@ def initial_intrinsics(
         name: {None: begin, True: begin.size, False: name}[single_camera]
         for name, begin in begins.items()
     }
-    # Images without EXIF come last, because the first image of a shared camera gives its focal
-    # length.
+    # Images without EXIF come last: a shared camera takes the focal length of its first image.
     for name in sorted(begins, key=lambda name: begins[name].source == "estimated"):
         shared.setdefault(keys[name], begins[name])
     return {name: shared[keys[name]] for name in sizes}

@@ -47,7 +47,7 @@ CACHED_IMAGES = 16
 """Number of undistorted images that a process caches: successive images share neighbours."""
 
 SMALL_SCALE = 0.5
-"""Semi-global matching uses copies of at most this scale. Half the size needs an eighth of the
+"""Copies for semi-global matching have at most this scale. Half of it takes an eighth of the
 time."""
 
 MAX_VOLUME = 3e7
@@ -70,8 +70,7 @@ PARALLAX_QUANTILE = 0.5
 median, because pixels near the epipole hardly move."""
 
 SAME_SURFACE_PX = 1.0
-"""Pixels are on different surfaces if their inverse depths move a match in a small copy this far
-apart."""
+"""Inverse depths are on different surfaces if they move a match in a small copy this far apart."""
 
 FIT_RADIUS_PX = 3
 """Radius of the windows in which planes are fitted to a small depth map. Chosen by hand."""
@@ -84,12 +83,10 @@ MIN_FITTED = 12
 """Number of pixels that a plane must fit: smaller isolated patches are wrong. Chosen by hand."""
 
 WINDOW_RADIUS_PX, WINDOW_SPACING_PX = 4, 2
-"""Windows with the first radius are compared at full size. Their pixels are read at the second
-spacing, which is 25 of 81. Chosen by hand."""
+"""Windows of the first radius are compared, by pixels at the second spacing. Chosen by hand."""
 
 BLUR_SIGMA_PX = 1.0
-"""Sigma of the blur before windows are compared, so that the pixels that are read represent the
-rest."""
+"""Sigma of the blur before windows are compared, so that the pixels read represent the rest."""
 
 NOISE_LEVELS = 1.0
 """Noise of a pixel in grey levels; weaker gradients do not move a depth. Chosen by hand."""
@@ -107,8 +104,7 @@ SMOOTHING_RADII = (4, 3)
 """Radii of the fits after the two refinements, in pixels of the depth map. Chosen by hand."""
 
 MIN_WEIGHT = 0.02
-"""Weight of a pixel without texture when planes are smoothed. Half of the textured pixels weigh
-more than 0.5."""
+"""Weight of a pixel without texture in smoothing; half of the textured ones exceed 0.5."""
 
 MIN_VIEWS = 3
 """Number of images that must agree on a pixel, including its own: a third image confirms the match
@@ -274,11 +270,7 @@ def _refine(
     stride_px: int,
     step: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refine the planes (H, W, 3) by matching the full-size grey images.
-
-    A plane is the inverse depth and its two slopes. Also returns the matching errors (H, W) in
-    pixels.
-    """
+    """Refine (H, W, 3) planes by matching full-size images; also return the errors in pixels."""
     from .dense_kernels import propagate_rows, refine_rows
 
     blurred = [cv2.GaussianBlur(gray.astype(np.float32), (0, 0), BLUR_SIGMA_PX) for gray in grays]
@@ -334,8 +326,7 @@ def _enclosed(planes: np.ndarray, sure: np.ndarray, stride_px: int, tolerance: f
 
 
 def _reached(known: np.ndarray, begins: np.ndarray) -> np.ndarray:
-    """Return a mask of `known` pixels and the pixels below them, up to the next surface.
-    """
+    """Return a mask of `known` pixels and the pixels below them, up to the next surface."""
     rows = np.arange(len(known))[:, None]
     last, first = (np.maximum.accumulate(np.where(each, rows, -1)) for each in (known, begins))
     return last >= first

@@ -41,8 +41,7 @@ MIN_TRIANGULATION_DEG = 1.0
 """A point needs this angle between its two outermost lines of sight. Chosen by hand."""
 
 DUPLICATE_DEPTH = 0.01
-"""A point repeats an earlier point if their depths differ by less than this share. Chosen by
-hand."""
+"""A point repeats an earlier one if their depths differ by a smaller share. Chosen by hand."""
 
 DENSE_POINT = np.dtype(
     [

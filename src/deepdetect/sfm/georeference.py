@@ -23,8 +23,7 @@ GPS_ACCURACY_M = 3.0
 """Accuracy of GPS positions that state none, in metres. Usual receivers reach it in the open."""
 
 CONTROL_ACCURACY_M = 0.1
-"""Accuracy of ground control points in metres. They are surveyed to centimetres and marked to
-within a few pixels."""
+"""Accuracy in metres of control points, surveyed to centimetres and marked within a few pixels."""
 
 MIN_FIXES = 3
 """Number of positions that must agree: with two, the rotation about their line is undetermined."""
@@ -37,8 +36,8 @@ MAX_HEADING_STD_DEG = 20.0
 """A model is georeferenced only if north has a smaller standard deviation. Chosen by hand."""
 
 MAX_OPEN_AXIS_DEG = 10.0
-"""The result notes that the rotation about an axis relies on cameras held upright if the positions
-alone leave this axis a larger standard deviation."""
+"""Above this standard deviation by positions alone, a note says that an axis is from cameras'
+up."""
 
 GRAVITY_STD_DEG = 2.0
 """Standard deviation of the angles that a gimbal reports. Chosen by hand."""
@@ -52,8 +51,7 @@ DOWNWARD_SHARE = 0.1
 look down more often than up. Chosen by hand."""
 
 MAX_DISTANCE_PX = 15.0
-"""A pixel given by the user stands for a point that projects to within this distance. Chosen by
-hand."""
+"""A pixel given by the user stands for a point projected this close to it. Chosen by hand."""
 
 NEARLY_A_LINE = "they lie nearly on a line: the rotation of the model about it follows from the \
 assumption that cameras are held upright"

@@ -169,8 +169,7 @@ def map_images(
             attempt = _sound(models, known_cameras)
             if not found or (attempt and _size(attempt[0]) > _size(found[0])):
                 found = attempt
-            # The images left out may form a larger component, such as a drive in a folder with a
-            # house.
+            # The rest may form a larger component, such as a drive in a folder with a house.
             mapped = frozenset[str]().union(*map(_names, found))
             left = [pair for pair in verified if mapped.isdisjoint(pair)]
             if found and largest_component(left) <= _size(found[0]):

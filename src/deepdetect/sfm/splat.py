@@ -30,15 +30,13 @@ next larger side covers less than the factor more of the map, as few gaps are th
 hand."""
 
 MAX_DEPTH_STEP = 0.1
-"""A pixel farther than a neighbour by this share is taken to be seen through a gap. Chosen by
-hand."""
+"""A pixel farther than a neighbour by this share is seen through a gap. Chosen by hand."""
 
 DEPTH_PERCENT = 95.0
 """Percentage of the sparse points of each view whose depths must fit into the 16 bits of a map."""
 
 MAX_VALUE_PER_UNIT = 1000.0
-"""Depth maps store thousandths, such as millimetres, as nearly all readers expect. Coarser steps
-are taken if depths would not fit into 16 bits."""
+"""Depth maps store thousandths, such as millimetres, or coarser steps if 16 bits are too few."""
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 """Transform from camera axes of nerfstudio (y up, z backward) to ours (y down, z forward)."""

@@ -171,8 +171,7 @@ class _Tracks:
     ) -> None:
         """Align patches of an image in others; patches found in `min_views` images become points.
 
-        `tracks` are rows of the model's points, whose images are searched. With None, all images
-        are.
+        `tracks` are rows of the model's points, whose images are searched. With None, all are.
         """
         own = self.numbers[name]
         pixels, points, _ = wanted
