@@ -1,9 +1,8 @@
 """Compiled kernels of dense points. Importing them loads numba; the first call compiles.
 
 Kernels work on the rows `first` to `last - 1`. The surface around a pixel is a plane, so its
-inverse depth is linear in the position of the pixel. A pixel q = (x, y) with inverse depth w
-projects into a neighbouring image at A (x, y, 1) + w b, in homogeneous coordinates, with A (3, 3)
-and b (3,).
+inverse depth is linear in the position of the pixel. A pixel (x, y) of inverse depth w projects to
+a neighbour at A (x, y, 1) + w b, in homogeneous coordinates, with A (3, 3) and b (3,).
 """
 
 from __future__ import annotations

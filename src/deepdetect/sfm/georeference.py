@@ -36,8 +36,7 @@ MAX_HEADING_STD_DEG = 20.0
 """A model is georeferenced only if north has a smaller standard deviation. Chosen by hand."""
 
 MAX_OPEN_AXIS_DEG = 10.0
-"""Above this standard deviation by positions alone, a note says that an axis is from cameras'
-up."""
+"""An axis with a larger standard deviation by positions alone relies on the cameras' up."""
 
 GRAVITY_STD_DEG = 2.0
 """Standard deviation of the angles that a gimbal reports. Chosen by hand."""

@@ -23,8 +23,8 @@ from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
 from .pair_selection import largest_component
 
 MIN_VERIFIED = 30
-"""Number of inliers that the two-view geometry of a pair needs. COLMAP also needs 30 to register an
-image. Some 20 of 8,192 keypoints agree by chance, and wrong pairs slow the mapping down tenfold."""
+"""Number of inliers that the two-view geometry of a pair needs. COLMAP also registers images by 30.
+Some 20 of 8,192 keypoints agree by chance, and wrong pairs slow the mapping down tenfold."""
 
 MAX_VERIFICATION_ERROR_PX = 4.0
 """An inlier has an error up to this, which is COLMAP's default."""

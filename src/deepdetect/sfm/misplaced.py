@@ -2,8 +2,7 @@
 
 An image that is registered early is placed by few points. If the camera moves straight ahead,
 matches that are wrong along its path agree with many places on the path. A wrong place then stays,
-because points whose depth comes from this image agree with it. Points whose depth comes from other
-images show the error.
+because points whose depth comes from this image agree with it. Other points show the error.
 """
 
 from __future__ import annotations

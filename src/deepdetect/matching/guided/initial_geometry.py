@@ -64,7 +64,7 @@ WINDOW_PX = 16
 
 MIN_GAIN = 1.2
 """Images are from two sensors if cross-modal descriptors give this many times the tentative matches
-of learned ones. The ratio is 1.5 to 30 for visible and infrared light, up to 1.17 for
+of learned ones. The ratio is 1.5 to 30 for visible and infrared light, up to 1.17 for pairs of
 photographs."""
 
 MIN_INVERTED = 0.05

@@ -62,7 +62,7 @@ MAX_DIFFERENCE_PX = 1.0
 """Neighbouring disparities that differ by more are on different surfaces. Chosen by hand."""
 
 WINDOW_RADIUS_PX = 2
-"""Radius of the fitted windows. This and the next five values suit the Motorcycle pair best."""
+"""Radius of the fitted windows. It and the next five values were chosen on the Motorcycle pair."""
 
 SMOOTHING_RADIUS_PX = 4
 """Radius of the mean over one surface before each iteration, against the parabola's bias."""
