@@ -135,7 +135,7 @@ class CameraIntrinsics:
         return CameraIntrinsics.of_colmap(cropped, self.source) if self.distorts else self
 
     def undistort(self, image: np.ndarray, pinhole: Camera | None = None) -> np.ndarray:
-        """Undistort an image (H, W) or (H, W, 3), which may be a scaled one of the camera."""
+        """Undistort an image (H, W) or (H, W, 3) of this camera, which may be scaled."""
         if not self.distorts:
             return image
         pinhole, camera = pinhole or self.pinhole, self.colmap_camera()

@@ -150,10 +150,10 @@ def _project(m, x, y, w):  # type: ignore[no-untyped-def]
 def _compare(gray, y, x, plane, same, m, other, size, radius, spacing, noise):  # type: ignore[no-untyped-def]
     """Compare the window around a pixel with that of a neighbour, warped by the plane.
 
-    Returns four numbers: the correlation, or -1 if the neighbour does not show the whole window.
-    The shift of the match along its epipolar line, in pixels: one step of Lucas-Kanade that allows
-    for another contrast and brightness. The parallax in pixels per unit of inverse depth. The
-    weight of the step, 0 without texture.
+    Returns correlation, shift, parallax and weight. The correlation is -1 if the neighbour does not
+    show the whole window. The shift, in pixels along the epipolar line, is one step of Lucas-Kanade
+    that allows for other contrast and brightness. Its weight is 0 without texture. The parallax is
+    in pixels per unit of inverse depth.
     """
     nothing = np.float32(-1), np.float32(0), 0.0, np.float32(0)
     w, right, down = plane

@@ -34,8 +34,8 @@ patches. The middle is tested by 5 x 5 pixels at the first spacing. At least the
 them must lie on the same surface, with `MIN_VIEWS` images that agree. Chosen by hand."""
 
 FILLED_RADIUS_PX, MIN_FILLED_VIEWS = 8, 2
-"""Pixels at most the first distance from a middle pixel of the same surface need only the second
-number of images. Others may not show the surface. Chosen by hand."""
+"""The second number of images is enough within the first distance of a middle pixel of the same
+surface. Other images may not show this surface. Chosen by hand."""
 
 MIN_TRIANGULATION_DEG = 1.0
 """A point needs this angle between its two outermost lines of sight. Chosen by hand."""
@@ -94,7 +94,7 @@ def fuse_depth_maps(
 
 
 def _agreed(planes: np.ndarray, count: np.ndarray, shown: np.ndarray, stride_px: int) -> np.ndarray:
-    """Return a mask of pixels on which enough images agree: `count` of `shown` covering images."""
+    """Return a mask of pixels on which enough images agree, `count` of the `shown` ones."""
     from .dense_kernels import support_rows
 
     def support(chosen: np.ndarray, reach: int, spacing: int) -> np.ndarray:

@@ -9,8 +9,8 @@ import numpy as np
 from ..batch.pair_list import Pair
 
 MIN_MATCHED = 0.5
-"""Two images can show the same scene only if this fraction of keypoints is matched, of the image
-with fewer keypoints. Chosen by hand."""
+"""Two images are taken to differ unless this fraction of the keypoints is matched, in the image
+that has fewer. Chosen by hand."""
 
 
 def largest_component(pairs: Sequence[Pair]) -> int:

@@ -25,9 +25,9 @@ SPLAT_POINTS = 200_000
 JPEG_QUALITY = 95
 
 CELLS_PX, CLOSED_GAIN = (1, 2, 3, 4, 6, 8), 1.3
-"""The first are sides of the square that a point covers in a depth map. The smallest is taken whose
-next larger side covers less than the factor more of the map, as few gaps are then left. Chosen by
-hand."""
+"""The first are sides, in pixels, of the square that a point covers in a depth map. The smallest
+side is taken for which the next one covers less than the second times as much: few gaps are left.
+Chosen by hand."""
 
 MAX_DEPTH_STEP = 0.1
 """A pixel farther than a neighbour by this share is seen through a gap. Chosen by hand."""

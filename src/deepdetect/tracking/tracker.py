@@ -33,9 +33,9 @@ CANDIDATES = 3
 """This multiple of the wanted tracks is detected as keypoints, to choose some that lie apart."""
 
 MIN_DISTANCE_PX, MIN_SPACING = 8.0, 0.35
-"""A new point keeps from all tracks the first distance, in pixels, and the second share of the
-spacing of a grid of `max_keypoints` points. Points all over the image tell more about the motion of
-the camera."""
+"""A new point is at least the first distance from all tracks, in pixels, and the second share of
+the spacing of a grid of `max_keypoints` points. Points all over the image tell more about the
+motion of the camera."""
 
 WINDOW_PX, LEVELS = 21, 3
 """The first is the side of the patch that is followed. The second is the number of pyramid levels

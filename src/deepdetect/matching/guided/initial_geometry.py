@@ -57,7 +57,8 @@ MIN_COARSE_FRACTION = 0.5
 """Fraction of the coarse matches that must also agree. Chosen on the data named above."""
 
 SIMULATED_SIDE_PX, SIMULATED_KEYPOINTS = 320, 1000
-"""Longer side and keypoints of the images to be tilted; views get half as many. Chosen by hand."""
+"""Longer side and keypoints of images to be tilted. Views get half the keypoints. Chosen by
+hand."""
 
 WINDOW_PX = 16
 """Side of the windows around matches that are checked for inverted brightness. Chosen by hand."""
