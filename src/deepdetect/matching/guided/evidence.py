@@ -238,8 +238,7 @@ def _affine_maps(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit an affine map, (3, 2), to the matches of the eight windows around each window.
 
-    `windows` (M,) are window numbers of the matches, `shape` is (rows, columns). Also returns where
-    maps exist.
+    `windows` (M,) are the matches' windows in a grid of `shape`. Also returns where maps exist.
     """
     size = shape[0] * shape[1]
 
