@@ -1,8 +1,8 @@
 """Engines that run the tasks of a collection: processes of this machine, or a Ray cluster.
 
 To add an engine, write a function with the signature of `map_in_processes` and add it to `ENGINES`.
-Ray restarts a worker that dies, and repeats its tasks: each outcome arrives once, but a function
-may run twice. So a function must write files under temporary names, and rename them.
+Ray restarts a worker that dies, and repeats its tasks. Each outcome arrives once, but a function
+may run twice. So it must write files under temporary names, and rename them.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ MAX_BLOCKS = 4096
 repeated if its worker dies."""
 
 PROCESSORS_PER_WORKER = 0.5
-"""A worker reserves this share of a processor, though it uses a whole one: after the loss of half
-the machines, the rest can hold all workers. Tasks would else wait forever for a lost worker."""
+"""A worker reserves this share of a processor, though it uses a whole one. So after the loss of
+half the machines, the rest can hold all workers. Otherwise tasks would wait forever for a lost
+worker."""
 
 OBJECT_STORE_BYTES = 200_000_000
 """Shared memory of a cluster that is started here. It can be small: results go to files."""
@@ -132,7 +133,7 @@ def _start_cluster(ray: Any, processors: int, quiet: dict[str, Any]) -> None:
 
 @contextmanager
 def _connected(ray: Any, workers: int | None) -> Iterator[None]:
-    """Connect to a cluster, or start one, unless this is done; and silence Ray Data."""
+    """Connect to a cluster or start one, unless there is a connection; silence Ray Data."""
     before = ray.is_initialized()
     quiet = {"log_to_driver": False, "logging_level": logging.ERROR}
     if not before:

@@ -1,8 +1,8 @@
 """HDF5 files that many processes fill, and that survive a killed process.
 
-An HDF5 file has one writer, and may be lost if this is killed. So each task writes a small file of
-its own, a shard, whole or not at all. At the end one process merges the shards into a copy of the
-file, which replaces the file when it is complete.
+An HDF5 file has one writer, and may be lost if the writer is killed. So each task writes a small
+file of its own, a shard, whole or not at all. At the end one process merges the shards into a copy
+of the file, which replaces the file when it is complete.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from .._shared.records import check_same, key, lock, plain
 from .engines import ENGINES
 
 SETTINGS = "deepdetect"
-"""Attribute of the file: JSON of everything except the inputs that the content depends on."""
+"""Attribute of the file: JSON of the settings that its content depends on."""
 
 STATE = "source_state"
 """Attribute of a group: the state of its input."""
@@ -51,8 +51,8 @@ MIN_SHARDS = 256
 something to do. Chosen by hand."""
 
 LARGEST_SHARD = 32
-"""A shard has at most this number of inputs, which a killed worker loses; smaller shards are more
-files. Chosen by hand."""
+"""A shard has at most this number of inputs, which are lost with a killed worker. Smaller shards
+would be more files. Chosen by hand."""
 
 State = tuple[int, ...]
 """State of an input: whole numbers that change if the input changes."""
@@ -149,7 +149,7 @@ def damaged(path: Path, error: Exception) -> InvalidFileError:
 
 @contextmanager
 def _written(path: Path, mode: str) -> Iterator[Any]:
-    """Open a temporary file to write it; turn errors of the system into an OSError with number."""
+    """Open a temporary file for writing; convert errors of the system to a numbered OSError."""
     try:
         with import_h5py().File(path, mode, libver=FORMAT) as file:
             yield file
@@ -195,7 +195,7 @@ def fill_file(
 ) -> BatchReport:
     """Make the wanted groups that are not in the file yet, in the processes of an engine.
 
-    The content depends on the settings and the inputs; shards of other settings are not used.
+    The content depends on the settings and the inputs. Shards of other settings are not used.
     `wanted` gives the possible groups of each input: if none of them exists in the given state, the
     first one is made. `others_stay` decides for each group of another input, or of an input that
     fails, whether it stays in the file.

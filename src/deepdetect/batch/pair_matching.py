@@ -163,7 +163,7 @@ def match_pairs(
 
 
 def first_keypoints(features: Path) -> Keypoints | None:
-    """Return the first undamaged keypoints in a file: all images have the same kind."""
+    """Return the first undamaged keypoints in a file, because all images have the same kind."""
     with open_hdf5(features) as file:
         for name in feature_names(file):
             with suppress(InvalidFileError):

@@ -25,15 +25,15 @@ COMPARED_KEYPOINTS = 512
 """Images are compared by this number of their best keypoints. Chosen by hand."""
 
 WORDS, DESCRIPTORS_OF_WORD = 64, 8
-"""The vocabulary has this number of words, or fewer if each would have fewer than the second number
-of descriptors. Chosen by hand."""
+"""The vocabulary has the first number of words, or fewer if each would have fewer than the second
+number of descriptors. Chosen by hand."""
 
 KMEANS_ITERATIONS = 10
 TRAINING_IMAGES, TRAINING_DESCRIPTORS = 500, 50_000
 """The vocabulary is trained on at most these numbers of images and descriptors, to save time."""
 
 COMPARED_ROWS = 256
-"""This number of images is compared with all others at once, which takes 300 MB for 100,000."""
+"""This many images are compared with all others at once: 300 MB for a total of 100,000 images."""
 
 
 def similar_pairs(
@@ -82,9 +82,9 @@ def vlad_vectors(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Describe each image by one vector: VLAD with the sum of each word normalised to length 1.
 
-    `descriptors` returns those of an image, (N_i, D) float32 of length 1. Returns vectors (M,
-    WORDS * D) of length 1, and the rows (M,) of their images. Images without descriptors, or with
-    another D than most images, are left out.
+    `descriptors` returns the descriptors of an image, (N_i, D) float32 of length 1. Returns vectors
+    (M, WORDS * D) of length 1, and the rows (M,) of their images. Images without descriptors, or
+    with another D than most images, are left out.
     """
     rng = np.random.default_rng(seed)
     described = (own for k in rng.permutation(count).tolist() if len(own := descriptors(k)))

@@ -130,7 +130,7 @@ def check_names(names: Iterable[str]) -> None:
 
 
 def check_upright(paths: Iterable[Path]) -> None:
-    """Raise an OptionError for images that EXIF rotates, for programs that ignore this.
+    """Raise an OptionError for images that EXIF rotates, because hloc ignores EXIF.
 
     Images that cannot be read are not checked.
     """

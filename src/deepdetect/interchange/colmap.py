@@ -1,4 +1,4 @@
-"""Files of COLMAP: a database, or text files of features and matches; for units, `sfm.colmap`."""
+"""Files of COLMAP: a database, or text files. `sfm.colmap` describes the units."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ MAX_ALL_PAIRS = 50
 """If no pairs are given, all pairs of up to this number of images are matched. Chosen by hand."""
 
 MATCHES_SUFFIX = "_matches"
-"""Files of `deepdetect match` have names that end so."""
+"""Names of files of `deepdetect match` have this ending."""
 
 
 @suggest_keywords
@@ -125,7 +125,7 @@ def read_matches_file(path: Path, keypoints: Mapping[str, Keypoints]) -> dict[Pa
 
 
 def _add_matches(found: dict[Pair, PairMatches], pair: Pair, matches: PairMatches) -> None:
-    """Add the matches of a pair, also to those of the same pair in the other order."""
+    """Add the matches of a pair, and join them with those of the pair in the other order."""
     other = found.get(pair[::-1])
     if other is None:
         found[pair] = matches
@@ -162,7 +162,7 @@ def _read_archives(paths: Sequence[Path], folder: Path | None) -> Collection:
 
 
 def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
-    """Return the names of images by what npz files may be called: their path, or a unique stem."""
+    """Map paths and unique stems of images, which may be names of npz files, to image names."""
     if folder is None:
         return None
     names: dict[str, set[str]] = {}
@@ -174,7 +174,7 @@ def _names_by_stem(folder: Path | None) -> dict[str, str] | None:
 
 
 def _name_of(path: Path, names: Mapping[str, str]) -> str:
-    """Return the image of an npz file: the one whose path has the longest end in common with it."""
+    """Return the image whose path has the longest end in common with that of an npz file."""
     parts = path.with_suffix("").parts
     for first in range(len(parts)):
         if (key := "/".join(parts[first:])) in names:

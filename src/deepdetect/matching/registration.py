@@ -40,7 +40,7 @@ measure how well unrelated content correlates. Chosen by hand."""
 
 MIN_DEVIATIONS = 4.0
 """Images agree if their correlation exceeds the mean of the shifted ones by this many standard
-deviations: 9 to 70 on images 1 with 4 and 6 of eight scenes of Oxford, up to 1.8 between scenes."""
+deviations. It was 9 to 70 for images 1 with 4 and 6 of Oxford's scenes, 1.8 between scenes."""
 
 COMPARED_SIDE_PX = 480
 """Images are reduced to this longer side before they are compared. Chosen by hand."""
@@ -81,7 +81,7 @@ class Registration:
         )
 
     def checkerboard(self) -> np.ndarray:
-        """Return a checkerboard of both images: edges continue if they fit; (H, W, 3) uint8."""
+        """Return a checkerboard of both images, (H, W, 3) uint8; edges continue if images fit."""
         height, width = self.valid.shape
         side = max(1, min(height, width) // SQUARES)
         row, column = np.indices((height, width)) // side
@@ -89,7 +89,7 @@ class Registration:
         return np.where(second[..., None], to_8_bits(self.warped), self.first)
 
     def difference(self) -> np.ndarray:
-        """Return the absolute colour difference, 0 outside the overlap; (H, W, 3) uint8."""
+        """Return the absolute colour difference, (H, W, 3) uint8, and 0 outside the overlap."""
         return np.where(self.valid[..., None], cv2.absdiff(self.first, to_8_bits(self.warped)), 0)
 
 

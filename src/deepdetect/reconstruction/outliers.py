@@ -3,7 +3,7 @@
 SOR is that of PCL and Open3D (Rusu et al., "Towards 3D point cloud based object maps for household
 environments", 2008), but in `disparity_space`, where points of a stereo pair are evenly spaced. On
 a street of 2 to 125 baselines with 3 % outliers it removed 96 % of them and no other points; in 3D
-space it would have removed 10 %, and 1.8 % of the others.
+space it would have removed 10 % of them, and 1.8 % of the other points.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class PointFilterOptions:
 def sor_inliers(
     points: np.ndarray, point_filter: PointFilterOptions = PointFilterOptions()
 ) -> np.ndarray:
-    """Return (N,) bool: which points (N, 3) have others close to them."""
+    """Return (N,) bool: which points (N, 3) are no statistical outliers."""
     if len(points) < 2:
         return np.ones(len(points), bool)
     distances = mean_neighbor_distances(points, point_filter.sor_neighbors)

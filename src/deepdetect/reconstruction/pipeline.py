@@ -44,9 +44,9 @@ SOR_WINDOW_PX = 9
 """SOR of rectified pairs compares a pixel with those in a window of this side. Chosen by hand."""
 
 MIN_UNIQUE_FRACTION, MIN_MATCHED_FRACTION = 0.1, 0.25
-"""This fraction of the keypoints must have a unique match on their row: for unrelated images it was
-up to 0.005, for rectified pairs at least 0.35. The second fraction must have a match if matches
-need not be unique: it was up to 0.16, and at least 0.64."""
+"""Fractions of the keypoints that must have a match on their row. The first is for unique matches:
+unrelated images had up to 0.005, rectified pairs at least 0.35. The second is for matches that need
+not be unique: unrelated images had up to 0.16, rectified pairs at least 0.64."""
 
 
 @suggest_keywords
@@ -282,11 +282,11 @@ def sor_inliers_on_grid(
     size: tuple[int, int],
     point_filter: PointFilterOptions = PointFilterOptions(),
 ) -> np.ndarray:
-    """Return (N,) bool: which whole pixels (N, 2) of a rectified pair are like those around them.
+    """Return (N,) bool: which pixels (N, 2) of a rectified pair are no statistical outliers.
 
-    It is `sor_inliers` with all pixels of a window as neighbors, and the root mean square of the
-    differences of disparity as distance, which takes three box filters. A pixel alone in its window
-    is an outlier only if most pixels are not alone.
+    This is `sor_inliers` with all pixels of a window as neighbors. The distance is the root mean
+    square of the differences of disparity, which takes three box filters. A pixel alone in its
+    window is an outlier only if most pixels are not alone.
     """
     if not len(pixels):
         return np.ones(0, bool)

@@ -29,8 +29,8 @@ MIN_DISPARITY_SPREAD_PX = 2.0
 matches at whole pixels always spread by 1."""
 
 MIN_PLANAR_SPREAD_PX = 8.0
-"""Disparities must spread by this much if one homography explains the pair: those of a slanted
-plane do so, those of a camera that rotated a little spread less."""
+"""If one homography explains a pair, its disparities must spread by this much. Disparities of a
+slanted plane do, those of a camera that only rotated a little spread less."""
 
 GRID_SIZE_PX = 8
 """Each cell of the left image of this size gives one match. Chosen by hand."""
@@ -50,38 +50,41 @@ MAX_COARSE_ROW_ERROR_PX = 0.6
 matches, in pixels of the full images: many matches together are more accurate than each alone."""
 
 MAX_FOCAL_DIFFERENCE_FRACTION = 0.01
-"""Focal lengths of rectified views may differ by this, so that those given to three digits pass. At
-0.01 a row is off by 2 px, 200 px from the middle."""
+"""Focal lengths of rectified views may differ by this fraction, so that values given to three
+digits pass. A row 200 px from the middle is then off by 2 px."""
 
 MAX_CY_DIFFERENCE_PX = 2.0
-"""cy of rectified views may differ by this, twice what a match may be off its row."""
+"""cy of rectified views may differ by this, twice the distance that a match may be off its row."""
 
 MIN_DEPTH_SPREAD_PX = 0.5
 """Disparities of a scene with depth spread by more, from the 5th to the 95th percentile. Chosen by
 hand."""
 
 MIN_DISPARITY_PX = -1.0
-"""A point with a smaller disparity, with its offset, is behind the cameras; one pixel is noise."""
+"""A point is behind the cameras if its disparity plus the calibration's offset is below this. One
+pixel is allowed for noise."""
 
 MAX_BEHIND_FRACTION = 0.25
-"""A calibration is wrong if more points lie behind the cameras. Chosen by hand."""
+"""A calibration is wrong if a larger fraction of points lies behind the cameras. Chosen by hand."""
 
 MAX_ROTATION_ERROR_PX, MIN_ROTATION_FRACTION = 0.3, 0.5
-"""A rotation explains a disparity up to this error, and a pair if it explains more than this share
-of the disparities: it was 0.64 or more for four views rotated by half a degree to two."""
+"""A rotation explains a disparity up to the first error. It explains a pair if it explains more
+than the second share of the disparities, which was 0.64 or more for four views rotated by half a
+degree to two."""
 
 MAX_RATIO_TO_PLANE = 0.5
-"""The median error of the rotation must be below this share of that of the best plane in disparity:
-it was up to 0.33 for rotated views, and at least 5.3 for slanted walls."""
+"""The median error of the rotation, divided by that of the best plane in disparity, must be below
+this. The ratio was up to 0.33 for rotated views, and at least 5.3 for slanted walls."""
 
 MAX_OFF_ROW_PX = 1.0
-"""A rotation may move matches, all found on rows, off their rows by this median distance."""
+"""Matches are found on rows. A rotation may move them off their rows by this median distance."""
 
 ROBUST_ITERATIONS = 12
 
 ROTATION_GRID_SIZE_PX, MIN_ROTATION_MATCHES, MAX_ROTATION_SAMPLES = 16, 30, 50_000
-"""A rotation is fitted to one disparity per cell of this size, if there are enough of them, and to
-at most a random sample of this number. Chosen by hand."""
+"""A rotation is fitted to one disparity per cell of the first size, if there are at least the
+second number of them. If there are more disparities than the third number, a random sample is used.
+Chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,7 @@ class Rectification:
         swapped: the pair is rectified, but left and right are exchanged.
         on_rows: number of `matches` whose rows differ by at most one.
         by_fundamental: number of matches that a fundamental matrix explains as closely.
-        by_other_rows: number that rows explain which are shifted, tilted and scaled.
+        by_other_rows: number of matches on rows that are shifted, tilted and scaled.
         matches: number of matches that were used, one per cell.
         vertical_offset: median of y in the second minus y in the first image, in pixels, of the
             matches that the fundamental matrix explains.
@@ -115,7 +118,7 @@ class Rectification:
 def find_rectification(
     gray0: np.ndarray, gray1: np.ndarray, offset_px: float = 0.0, seed: int = 0
 ) -> tuple[Rectification, TentativeMatches | None]:
-    """Decide whether two images (H, W) are rectified; small copies of large images may decide.
+    """Decide whether two images (H, W) are rectified, from small copies if these are decisive.
 
     `offset_px` is added to a disparity before it gives a depth. Also returns the tentative matches
     of larger copies, if they were needed.
@@ -164,9 +167,9 @@ def _coarse_pass(
 
 
 def _row_error(points0: np.ndarray, points1: np.ndarray, seed: int) -> float:
-    """Return how far rows of a pair that looks rectified are off, for most of its matches.
+    """Return the error in pixels of the rows of a pair that looks rectified, as a high quantile.
 
-    A single match is too coarse to tell. So a function of position (for rotated views and lens
+    A single match is too inaccurate for this. So a function of position (for rotated views and lens
     distortion) and disparity (for a camera that also moved up or down) is fitted to the distances
     of all matches from their rows.
     """
@@ -298,8 +301,9 @@ def check_pure_rotation(
     """Raise a NoDepthError if a rotation explains the disparities far better than a plane does.
 
     A rotation by an angle a about the vertical moves pixels along their rows by f a (1 + x^2) to
-    first order, where x is the slope of the ray: like a wall, but curved. It is not noticed if the
-    focal length is far off, the camera also tilted, or the curvature is below the noise.
+    first order, where x is the slope of the ray: like a wall, but curved. The rotation is not
+    noticed if the focal length is far off, the camera also tilted, or the curvature is below the
+    noise.
     """
     chosen = np.arange(len(pixels))
     if len(chosen) > MAX_ROTATION_SAMPLES:

@@ -52,7 +52,7 @@ class Reconstruction:
             of the points from their matches, in pixels (root mean square of both images).
         keypoints: number of keypoints in the left image.
         matches: number of matches that were triangulated.
-        dropped: number of these that each check removed, in order.
+        dropped: number of matches that each check removed, in order.
         seconds: time of each stage.
     """
 

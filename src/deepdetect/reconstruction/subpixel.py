@@ -28,14 +28,15 @@ MIN_CORRELATION = 0.8
 """A match whose patches correlate less in the end has not converged. Chosen by hand."""
 
 CONVERGENCE_PX, COARSE_CONVERGENCE_PX = 0.01, 0.05
-"""A smaller step ends the second and the first alignment. The first only prepares the second."""
+"""A step below the first number ends the last alignment, one below the second ends the first
+alignment, which only prepares the last."""
 
 AFFINITY_WINDOW_PX = 15
 """The affinity of a patch is fitted to the matches in a window of this side. Chosen by hand."""
 
 AFFINITY_REGULARIZATION = 20.0
-"""The similarity weighs as much in this fit as this number of matches all over the window, so few
-matches, or matches on one line, do not give an affinity of their own. Chosen by hand."""
+"""The similarity weighs as much in the fit of an affinity as this number of matches all over the
+window. So few matches, or matches on one line, give nearly the similarity. Chosen by hand."""
 
 MAX_SIMILARITY_SAMPLES = 5000
 """The similarity is estimated from at most this number of matches, to save time."""
@@ -47,10 +48,11 @@ CORNER_WINDOW_PX = 7
 def refine_matches(
     gray0: np.ndarray, gray1: np.ndarray, points0: np.ndarray, points1: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refine the second positions (N, 2) of matches from whole pixels, good to a pixel or two.
+    """Refine the second positions (N, 2) of matches, which must be right to a pixel or two.
 
-    Returns (N, 2) float64 positions, and (N,) bool whether they converged. Patches that are flat,
-    cross the border, move too far or stay too different do not converge, and keep their position.
+    The first positions are rounded to whole pixels. Returns (N, 2) float64 second positions, and
+    (N,) bool whether they converged. Patches that are flat, cross the border, move too far or stay
+    too different do not converge, and keep their position.
     """
     pixels0 = np.rint(points0).astype(np.int64)
     start = np.array(points1, np.float64, order="C")
@@ -69,7 +71,7 @@ def refine_matches(
 
 
 def spread_corners(gray: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
-    """Return rows (M,) of whole pixels (N, 2): the best Shi-Tomasi corner of `count` cells."""
+    """Return rows of (N, 2) whole pixels: the best Shi-Tomasi corner in each of `count` cells."""
     column, row = np.asarray(points, np.int64).reshape(-1, 2).T
     strength = cv2.cornerMinEigenVal(gray, CORNER_WINDOW_PX)[row, column]
     side = np.sqrt(gray.size / count)

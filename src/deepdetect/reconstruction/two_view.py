@@ -1,6 +1,6 @@
 """3D points from the matches of two calibrated images that need not be rectified.
 
-The pose is estimated from matches at corners, refined to sub-pixel accuracy; all matches are then
+The pose is estimated from matches at corners, refined to sub-pixel accuracy. All matches are then
 triangulated as they are. Checks in between raise an error that says why there is no depth.
 """
 
@@ -40,8 +40,8 @@ MAX_SCENE_DISTANCE_PX = SCENE_THRESHOLDS_PX["fundamental"]
 """A pose that is compared with a fundamental matrix explains a match up to the same distance."""
 
 MIN_POSE_RATIO = 0.75
-"""The essential matrix must explain this share of the matches of the fundamental matrix: a correct
-calibration explains as many. Chosen by hand."""
+"""The essential matrix must explain this share of the matches that the fundamental matrix explains.
+With a correct calibration it explains as many. Chosen by hand."""
 
 MIN_IN_FRONT_FRACTION = 0.75
 """This fraction of the inliers of a pose must lie in front of both cameras. Chosen by hand."""
@@ -83,7 +83,7 @@ def reconstruct_two_view(
     seed: int,
     timer: StageTimer,
 ) -> dict[str, Any]:
-    """Reconstruct points from sub-pixel matches and uint8 luma; return fields of the result."""
+    """Triangulate the matches of two uint8 luma images; return fields of `Reconstruction`."""
     points0, points1 = matches.points0.astype(np.float64), matches.points1.astype(np.float64)
     dropped: dict[str, int] = {}
     with timer.stage("sub-pixel"):

@@ -34,12 +34,12 @@ ROWS = 256
 """An image is undistorted in strips of this number of rows, which bounds the memory."""
 
 ESTIMATED_FOCAL_FACTOR = 1.2
-"""An unknown focal length is estimated from this multiple of the longer side on, as in COLMAP."""
+"""The estimate of an unknown focal length starts at this times the longer side, as in COLMAP."""
 
 
 @contextmanager
 def quiet_pycolmap() -> Iterator[Any]:
-    """Return pycolmap, which logs nothing inside the `with` block."""
+    """Return pycolmap with its log switched off inside the `with` block."""
     pycolmap = import_pycolmap()
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
@@ -56,9 +56,9 @@ class CameraIntrinsics:
     Attributes:
         model: name, such as "PINHOLE" or "SIMPLE_RADIAL".
         size: (width, height) in pixels.
-        params: COLMAP's parameters: focal lengths, principal point, then distortion; the centre of
+        params: COLMAP's parameters: focal lengths, principal point, then distortion. The centre of
             the first pixel is (0.5, 0.5).
-        source: where they come from: "given", "focal_px", "EXIF", or "estimated".
+        source: where the parameters come from: "given", "focal_px", "EXIF", or "estimated".
     """
 
     model: str
@@ -101,7 +101,7 @@ class CameraIntrinsics:
 
     @property
     def distorts(self) -> bool:
-        """Whether the camera has distortion: its images differ from those of a pinhole camera."""
+        """Whether the camera model has distortion, that is, is not a pinhole camera."""
         return self.model not in ("PINHOLE", "SIMPLE_PINHOLE")
 
     @property
@@ -113,7 +113,7 @@ class CameraIntrinsics:
         return Camera(self.size, focal, (centre[0] - PIXEL_CENTRE, centre[1] - PIXEL_CENTRE))
 
     def to_pinhole(self, xy: np.ndarray) -> np.ndarray:
-        """Return undistorted positions: from (N, 2) pixels of the image to the pinhole camera."""
+        """Map (N, 2) pixels of the image to pixels of the pinhole camera, without distortion."""
         if not self.distorts or not len(xy):
             return xy
         pinhole = self.pinhole
@@ -121,7 +121,7 @@ class CameraIntrinsics:
         return np.asarray(rays * pinhole.focal_px + np.array(pinhole.centre))
 
     def from_pinhole(self, xy: np.ndarray) -> np.ndarray:
-        """Return distorted positions: from (N, 2) pixels of the pinhole camera to the image."""
+        """Map (N, 2) pixels of the pinhole camera to pixels of the image, with distortion."""
         if not self.distorts or not len(xy):
             return xy
         found = self.colmap_camera().img_from_cam(self.pinhole.rays(xy))
@@ -129,13 +129,13 @@ class CameraIntrinsics:
 
     @property
     def without_border(self) -> CameraIntrinsics:
-        """A pinhole camera, cropped as COLMAP does it to what this camera shows."""
+        """The pinhole camera, cropped by COLMAP so that undistorted images have no border."""
         pycolmap = import_pycolmap()
         cropped = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), self.colmap_camera())
         return CameraIntrinsics.of_colmap(cropped, self.source) if self.distorts else self
 
     def undistort(self, image: np.ndarray, pinhole: Camera | None = None) -> np.ndarray:
-        """Return an image (H, W) or (H, W, 3), which may be scaled, without its distortion."""
+        """Undistort an image (H, W) or (H, W, 3) of this camera, which may be scaled."""
         if not self.distorts:
             return image
         pinhole, camera = pinhole or self.pinhole, self.colmap_camera()
@@ -185,8 +185,8 @@ def initial_intrinsics(
 ) -> dict[str, CameraIntrinsics]:
     """Return the known intrinsics of each image, or initial ones to be estimated.
 
-    `focal_px` is for images whose camera is not known; if it is None, EXIF or a guess takes its
-    place. Images that share a camera (`MultiViewOptions.single_camera`) get the same object.
+    `focal_px` is for images whose camera is not known. If it is None, EXIF or a guess gives it.
+    Images that share a camera (`MultiViewOptions.single_camera`) get the same object.
     """
     begins = {}
     for name, size in sizes.items():
@@ -206,7 +206,7 @@ def initial_intrinsics(
         name: {None: begin, True: begin.size, False: name}[single_camera]
         for name, begin in begins.items()
     }
-    # Images without EXIF come last: the first one gives the focal length of a shared camera.
+    # Images without EXIF come last: a shared camera takes the focal length of its first image.
     for name in sorted(begins, key=lambda name: begins[name].source == "estimated"):
         shared.setdefault(keys[name], begins[name])
     return {name: shared[keys[name]] for name in sizes}
@@ -264,11 +264,11 @@ def orientations_of(points: Keypoints) -> np.ndarray:
 
 
 def sift_bytes(keypoints: Keypoints) -> np.ndarray | None:
-    """Return descriptors as (N, 128) uint8 as SIFT's, or None if they are of another kind.
+    """Return descriptors in the format of SIFT, (N, 128) uint8, or None if they do not fit it.
 
     Descriptors of length 1 are multiplied by 512, as in SIFT. The 64 numbers of learned descriptors
-    become 128: their positive and their negative parts. COLMAP can then compare them; one or two of
-    100 correct matches are lost by the rounding. Its vocabulary trees are only for SIFT.
+    become 128: their positive and their negative parts. COLMAP can then compare them. The rounding
+    loses one or two of 100 correct matches. COLMAP's vocabulary trees suit only SIFT.
     """
     found = keypoints.descriptors
     if found is not None and is_learned(keypoints.descriptor_type):

@@ -1,8 +1,8 @@
 """Compiled kernels of dense points. Importing them loads numba; the first call compiles.
 
 Kernels work on the rows `first` to `last - 1`. The surface around a pixel is a plane, so its
-inverse depth is linear in the position of the pixel. A neighbour sees the pixel q of inverse depth
-w at A (q, 1) + w b, in homogeneous coordinates, with A (3, 3) and b (3,).
+inverse depth is linear in the position of the pixel. A pixel (x, y) of inverse depth w projects to
+a neighbour at A (x, y, 1) + w b, in homogeneous coordinates, with A (3, 3) and b (3,).
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from .._shared.kernels import compiled
 from ..matching.stereo.kernels import count_bits
 
 HIDDEN = np.uint64(1) << np.uint64(63)
-"""This bit above the 62 bits of a census marks places that the neighbour does not show."""
+"""This bit, above the 62 bits of a census, marks pixels outside the neighbouring image."""
 
 MIN_TEXTURE = np.float32(0.18)
-"""A window has texture if the variance of its gradients along the epipolar line exceeds this share
-of the variance of the noise. Plain skies have less, with JPEG artefacts; weathered stone has more.
+"""A window has texture if the variance of its gradients along the epipolar line exceeds that of the
+noise by this share. Plain skies with JPEG artefacts stay below it, weathered stone is above.
 """
 
 MIN_GAIN = np.float32(0.2)
-"""Shifts are divided by the relative contrast of the neighbour, or by this if it is smaller."""
+"""A shift is divided by the neighbour's contrast relative to the reference, at least by this."""
 
 
 @compiled(nogil=True)
 def _two_best(y, census, neighbours, columns, rows, hidden_cost, line):  # type: ignore[no-untyped-def]
-    """Write the sum of the two smallest distances to the neighbours, (D, W) uint8, for one row."""
+    """Write the sum of the two smallest Hamming distances to the neighbours, for one row (D, W)."""
     count, width = line.shape
     least, second = np.empty((2, width), np.uint8)
     for d in range(count):
@@ -139,7 +139,7 @@ def fit_rows(first, last, planes, weights, radius, tolerance, min_pixels, out): 
 
 @compiled(nogil=True, inline="always")
 def _project(m, x, y, w):  # type: ignore[no-untyped-def]
-    """Return where a neighbour sees the pixel (x, y) of inverse depth w, and its relative depth."""
+    """Project pixel (x, y) with inverse depth w to a neighbour: position and relative depth."""
     z = m[2, 0] * x + m[2, 1] * y + m[2, 2] + w * m[2, 3]
     across = m[0, 0] * x + m[0, 1] * y + m[0, 2] + w * m[0, 3]
     down = m[1, 0] * x + m[1, 1] * y + m[1, 2] + w * m[1, 3]
@@ -150,10 +150,10 @@ def _project(m, x, y, w):  # type: ignore[no-untyped-def]
 def _compare(gray, y, x, plane, same, m, other, size, radius, spacing, noise):  # type: ignore[no-untyped-def]
     """Compare the window around a pixel with that of a neighbour, warped by the plane.
 
-    Returns their correlation; by how many pixels the match should move along its epipolar line (one
-    step of Lucas-Kanade that allows for other contrast and brightness); how far it moves per unit
-    of inverse depth; and the weight of this step, 0 without texture. The correlation is -1 if the
-    neighbour does not show the whole window.
+    Returns correlation, shift, parallax and weight. The correlation is -1 if the neighbour does not
+    show the whole window. The shift, in pixels along the epipolar line, is one step of Lucas-Kanade
+    that allows for other contrast and brightness. Its weight is 0 without texture. The parallax is
+    in pixels per unit of inverse depth.
     """
     nothing = np.float32(-1), np.float32(0), 0.0, np.float32(0)
     w, right, down = plane
@@ -236,10 +236,11 @@ def propagate_rows(  # type: ignore[no-untyped-def]
     first, last, planes, scores, jump, sure, stride, gray, neighbours, sizes, maps, radius, spacing,
     noise, out, found,
 ):  # fmt: skip
-    """Give pixels that correlate less than `sure` the plane of one of four others, if it is better.
+    """Give pixels below the correlation `sure` the best plane of four pixels `jump` away.
 
-    The others are `jump` pixels of `planes` away. `scores` (H, W) are the correlations of the given
-    planes, `found` those of the new ones. `refine_rows` describes the other arguments.
+    A pixel keeps its plane if none of the four correlates better. `scores` (H, W) are the
+    correlations of the given planes, `found` the correlations of the new planes. `refine_rows`
+    describes the other arguments.
     """
     height, width = gray.shape
     rows, columns = planes.shape[:2]
@@ -283,7 +284,7 @@ def refine_rows(  # type: ignore[no-untyped-def]
     pixel of `gray`. `neighbours` (K, H', W') float32 have (width, height) `sizes`, and `maps`
     (K, 3, 4) are A and b. Every `spacing`-th pixel of the window is used if it is on the same
     surface. `errors` are root mean square distances in pixels to the matches of each neighbour
-    alone. If fewer than `min_number` neighbours correlate, the depth becomes NaN; if none has
+    alone. If fewer than `min_number` neighbours correlate, the depth becomes NaN. If none has
     texture along its epipolar line, the depth stays. `certainty` is 0 in both cases.
     """
     height, width = gray.shape
@@ -334,14 +335,15 @@ def fuse_rows(  # type: ignore[no-untyped-def]
     first, last, planes, neighbours, sizes, stride, there, back, rays, centres, max_error,
     max_difference, min_angle, fused, views, shown,
 ):  # fmt: skip
-    """Write the mean inverse depth of the depth maps that agree on each pixel of the first one.
+    """Write the mean inverse depth of the depth maps that agree on each pixel of the first map.
 
     `planes` (H, W, 3) and `neighbours` (K, H', W', 3), NaN where unknown, are at every `stride`-th
-    pixel; `sizes` (K, 2) are the rows and columns of the neighbours. `there` and `back` (K, 3, 4)
-    are A and b to the neighbours and from them. `rays` (3, 3) maps pixels to lines of sight;
-    `centres` (K, 3) are camera centres of the neighbours in the same frame. A neighbour agrees if
-    its own surface reprojects to within `max_error` pixels. `views` (H, W) is the number of images
-    that agree, including the first, or 0; `shown` (H, W) the number whose frame contains the point.
+    pixel. `sizes` (K, 2) are the rows and columns of the neighbours. `there` and `back` (K, 3, 4)
+    are A and b from the first image to the neighbours, and back. `rays` (3, 3) maps pixels to lines
+    of sight. `centres` (K, 3) are camera centres of the neighbours in the same frame. A neighbour
+    agrees if its own surface reprojects to within `max_error` pixels. `views` (H, W) is the number
+    of images that agree, including the first, or 0. `shown` (H, W) is the number whose frame
+    contains the point.
     """
     for row in range(first, last):
         for column in range(planes.shape[1]):
@@ -386,11 +388,11 @@ def fuse_rows(  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True)
 def support_rows(first, last, planes, stride, chosen, reach, spacing, tolerance, support):  # type: ignore[no-untyped-def]
-    """Write the share of the pixels around each one that are `chosen` (H, W) and on its surface.
+    """Write, per pixel, the share of the pixels around it that are `chosen` and on its surface.
 
-    They are every `spacing`-th pixel of a square up to `reach` pixels away, as far as it lies in
-    the image. `planes` are as in `fuse_rows`. A pixel is on the surface if its inverse depth
-    differs from the plane by at most `tolerance`, relative to the inverse depth.
+    The pixels around it are every `spacing`-th pixel of a square, up to `reach` pixels away, inside
+    the image. `chosen` is (H, W), and `planes` are as in `fuse_rows`. A pixel is on the surface if
+    its inverse depth differs from the plane by at most `tolerance`, relative to the inverse depth.
     """
     height, width = chosen.shape
     for row in range(first, last):

@@ -1,7 +1,7 @@
 """Depth maps of images with known cameras.
 
 Semi-global matching of small copies gives the first inverse depths. Pixels that correlate badly
-then take over the planes of others, and a fit to the grey values at full size refines all of them.
+then take over planes of other pixels, and matching of the full-size grey images refines all planes.
 Each pixel has a plane, so slanted surfaces are matched as well as frontal ones. A pixel without
 texture gets a depth only between textured pixels of the same surface.
 """
@@ -47,28 +47,30 @@ CACHED_IMAGES = 16
 """Number of undistorted images that a process caches: successive images share neighbours."""
 
 SMALL_SCALE = 0.5
-"""Copies for semi-global matching have at most this scale; half the size costs an eighth."""
+"""Copies for semi-global matching have at most this scale. Half of it takes an eighth of the
+time."""
 
 MAX_VOLUME = 3e7
 """A copy with more pixels times inverse depths is scaled down further, which bounds the memory."""
 
 TAIL_FRACTION, DEPTH_MARGIN = 0.002, 0.2
-"""The search ignores this fraction of the sparse points at each end of their inverse depths, which
-may be wrong, and then extends the range by the second fraction at each end. Chosen by hand."""
+"""The search range leaves out the first fraction of the sparse points at each end of their inverse
+depths, because such points may be wrong. It is then extended at each end by the second fraction of
+its length. Chosen by hand."""
 
 MIN_FAR = 0.1
 """The search ends at this share of the smallest inverse depth of a sparse point. Chosen by hand."""
 
 MAX_APPROACH = 0.5
-"""Images are first aligned at one depth, which must lie ahead of all cameras: the foremost one has
-covered at most this share of the way to it. Chosen by hand."""
+"""Images are first aligned at one depth, which must lie ahead of all cameras. The foremost camera
+has covered at most this share of the distance to that depth. Chosen by hand."""
 
 PARALLAX_QUANTILE = 0.5
-"""The search takes such steps that a pixel at this quantile moves by one pixel in each: the median,
-because pixels near the epipole hardly move."""
+"""A step of the search moves a pixel at this quantile of all motions by one pixel. It is the
+median, because pixels near the epipole hardly move."""
 
 SAME_SURFACE_PX = 1.0
-"""Two inverse depths are on different surfaces if a match in a small copy moves by more."""
+"""Inverse depths are on different surfaces if they move a match in a small copy this far apart."""
 
 FIT_RADIUS_PX = 3
 """Radius of the windows in which planes are fitted to a small depth map. Chosen by hand."""
@@ -81,10 +83,10 @@ MIN_FITTED = 12
 """Number of pixels that a plane must fit: smaller isolated patches are wrong. Chosen by hand."""
 
 WINDOW_RADIUS_PX, WINDOW_SPACING_PX = 4, 2
-"""Windows of this radius are compared at full size, by 25 of their 81 pixels. Chosen by hand."""
+"""Windows of the first radius are compared, by pixels at the second spacing. Chosen by hand."""
 
 BLUR_SIGMA_PX = 1.0
-"""Sigma of the blur before this comparison, so that the pixels that are read represent the rest."""
+"""Sigma of the blur before windows are compared, so that the pixels read represent the rest."""
 
 NOISE_LEVELS = 1.0
 """Noise of a pixel in grey levels; weaker gradients do not move a depth. Chosen by hand."""
@@ -102,22 +104,22 @@ SMOOTHING_RADII = (4, 3)
 """Radii of the fits after the two refinements, in pixels of the depth map. Chosen by hand."""
 
 MIN_WEIGHT = 0.02
-"""Weight of a pixel without texture in these fits; half of the textured ones have more than 0.5."""
+"""Weight of a pixel without texture in smoothing; half of the textured ones exceed 0.5."""
 
 MIN_VIEWS = 3
-"""Number of images that must agree on a pixel, including its own: a third one confirms the match of
-two. `fusion` asks for other numbers in some places."""
+"""Number of images that must agree on a pixel, including its own: a third image confirms the match
+of two. `fusion` asks for other numbers in some places."""
 
 DEPTH_PIXEL = np.dtype(
     [("plane", np.float32, 3), ("error", np.float32), ("color", np.uint8, 3)], align=True
 )
 """Pixel of a depth map. `plane` is the inverse depth (NaN if unknown) and its change per pixel of
-the image to the right and down; `error` the root mean square distance in pixels to the matches that
-each neighbour alone would give; `color` is sRGB."""
+the image to the right and down. `error` is the root mean square distance in pixels to the matches
+that each neighbour alone would give. `color` is sRGB."""
 
 
 def find_references(sparse: SparseModel) -> list[list[RegisteredImage]]:
-    """Return each image with its best neighbours, those that share many points at a good angle."""
+    """Return each image with its best neighbours, which share many points at a good angle."""
     found = []
     for image in sorted(sparse.images.values(), key=lambda image: -len(image.points)):
         scored: list[tuple[float, RegisteredImage]] = []
@@ -141,10 +143,10 @@ def find_references(sparse: SparseModel) -> list[list[RegisteredImage]]:
 def depth_map(
     folder: Path, images: Sequence[RegisteredImage], points: np.ndarray, stride_px: int
 ) -> np.ndarray:
-    """Return the depth map of the first image, matched with the others; (H, W) `DEPTH_PIXEL`.
+    """Match the first image with the others; return its depth map, (H, W) `DEPTH_PIXEL`.
 
-    It has every `stride_px`-th pixel of a row and of a column. The search covers the depths of
-    `points`, those of the sparse model.
+    The map has every `stride_px`-th pixel of a row and of a column. The search covers the depths of
+    the `points` (N, 3) of the sparse model.
     """
     rgbs, views = zip(*(prepared_image(folder, image) for image in images), strict=True)
     grays = [luma(rgb) for rgb in rgbs]
@@ -178,7 +180,7 @@ def _search(
     """Search the range `searched` of inverse depths by semi-global matching of small copies.
 
     Returns (h, w, 3) planes in pixels of the small copy of the first image, and the step of the
-    inverse depth, which moves a match there by one pixel.
+    inverse depth, which moves a match in the small copy by one pixel.
     """
     from .dense_kernels import choose_rows, cost_rows
 
@@ -268,7 +270,7 @@ def _refine(
     stride_px: int,
     step: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Refine (H, W, 3) planes by the grey values at full size; also return errors in pixels."""
+    """Refine (H, W, 3) planes by matching full-size images; also return the errors in pixels."""
     from .dense_kernels import propagate_rows, refine_rows
 
     blurred = [cv2.GaussianBlur(gray.astype(np.float32), (0, 0), BLUR_SIGMA_PX) for gray in grays]
@@ -324,14 +326,14 @@ def _enclosed(planes: np.ndarray, sure: np.ndarray, stride_px: int, tolerance: f
 
 
 def _reached(known: np.ndarray, begins: np.ndarray) -> np.ndarray:
-    """Return a mask of `known` pixels and those below one, up to where a new surface begins."""
+    """Return a mask of `known` pixels and the pixels below them, up to the next surface."""
     rows = np.arange(len(known))[:, None]
     last, first = (np.maximum.accumulate(np.where(each, rows, -1)) for each in (known, begins))
     return last >= first
 
 
 def relative_projection(first: PosedView, second: PosedView) -> tuple[np.ndarray, np.ndarray]:
-    """Return A (3, 3) and b (3,): the pixel q of inverse depth w is seen at A (q, 1) + w b."""
+    """Return A (3, 3) and b (3,): (x, y) with inverse depth w projects to A (x, y, 1) + w b."""
     moved, matrix = second.relative_to(first), second.camera.matrix
     return matrix @ moved.rotation @ np.linalg.inv(first.camera.matrix), matrix @ moved.translation
 
@@ -339,13 +341,13 @@ def relative_projection(first: PosedView, second: PosedView) -> tuple[np.ndarray
 def relative_projections(
     first: PosedView, others: Sequence[PosedView], back: bool = False
 ) -> np.ndarray:
-    """Return (K, 3, 4) `relative_projection` to others, or `back` from them."""
+    """Return A and b, (K, 3, 4), from the first view to the others, or `back` from them."""
     pairs = [(other, first) if back else (first, other) for other in others]
     return np.array([np.column_stack(relative_projection(*pair)) for pair in pairs])
 
 
 def _parallax(first: PosedView, second: PosedView, inverse_depth: float) -> float:
-    """Return how far matches move per unit of inverse depth, in pixels, as a quantile of the image.
+    """Return the motion of matches in pixels per unit of inverse depth, as a quantile of the image.
 
     Near the epipole, which lies ahead of a camera that moves forward, they do not move.
     """

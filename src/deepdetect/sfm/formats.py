@@ -26,14 +26,15 @@ from .splat import write_splat
 FormatName = Literal["laz", "map", "mesh", "splat", "text"]
 
 LAZ_STEP_M = 0.001
-"""Precision of the coordinates in LAZ files."""
+"""Precision of the coordinates in LAZ files, in metres."""
 
 MESH_MARGIN = 0.5
 """A mesh leaves out points farther from the robust bounding box than this share of its size."""
 
 MESH_DEPTHS, MESH_TRIM = (6, 12), 3
-"""Bounds of the depth of the octree, which follows the number of points; and number of levels by
-which the octree may be coarser than that before the surface is trimmed. Chosen by hand."""
+"""The first two bound the depth of the octree, which grows with the number of points. The surface
+is trimmed where the octree is coarser than this depth by more than the third number of levels.
+Chosen by hand."""
 
 MIN_MESH_POINTS = 100
 """A mesh needs this number of points: with a handful, COLMAP's meshing crashes the process."""

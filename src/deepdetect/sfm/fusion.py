@@ -21,27 +21,27 @@ MAX_DEPTH_DIFFERENCE = 0.01
 also allows 1 %."""
 
 MIN_ALL_VIEWS, ENOUGH_VIEWS = 4, 5
-"""A pixel becomes a point wherever it lies if the second number of images agree, or if all images
-that cover it agree and these are at least the first number. Chosen by hand."""
+"""A pixel becomes a point, wherever it lies, if at least the second number of images agree on it.
+If fewer images cover it, all of them must agree, and at least the first number. Chosen by hand."""
 
 EDGE_RADIUS_PX = 8
-"""Only these numbers count within this distance of a farther surface: there, windows give pixels of
+"""Pixels this near to a farther surface need `MIN_ALL_VIEWS` or `ENOUGH_VIEWS`. Windows there give
 the background the depth of the foreground in all images alike. Chosen by hand."""
 
 MIDDLE_SPACING_PX, MIN_MIDDLE_SHARE = 10, 0.6
 """`MIN_VIEWS` images are enough in the middle of a surface, because most wrong points are on small
-patches. A pixel is in the middle if this share of the 5 x 5 pixels around it, at this spacing, is
-agreed on by `MIN_VIEWS` and on its surface. Chosen by hand."""
+patches. The middle is tested by 5 x 5 pixels at the first spacing. At least the second share of
+them must lie on the same surface, with `MIN_VIEWS` images that agree. Chosen by hand."""
 
 FILLED_RADIUS_PX, MIN_FILLED_VIEWS = 8, 2
-"""This number of images is enough within this distance of such a pixel, on the same surface, which
-may be occluded in the others, or beyond their border. Chosen by hand."""
+"""The second number of images is enough within the first distance of a middle pixel of the same
+surface. Other images may not show this surface. Chosen by hand."""
 
 MIN_TRIANGULATION_DEG = 1.0
 """A point needs this angle between its two outermost lines of sight. Chosen by hand."""
 
 DUPLICATE_DEPTH = 0.01
-"""A point repeats an earlier one if their depths differ by less, relative. Chosen by hand."""
+"""A point repeats an earlier one if their depths differ by a smaller share. Chosen by hand."""
 
 DENSE_POINT = np.dtype(
     [
@@ -94,7 +94,7 @@ def fuse_depth_maps(
 
 
 def _agreed(planes: np.ndarray, count: np.ndarray, shown: np.ndarray, stride_px: int) -> np.ndarray:
-    """Return a mask of the pixels on which enough images agree: `count` of the `shown` ones."""
+    """Return a mask of pixels on which enough images agree, `count` of the `shown` ones."""
     from .dense_kernels import support_rows
 
     def support(chosen: np.ndarray, reach: int, spacing: int) -> np.ndarray:
@@ -119,7 +119,7 @@ def _agreed(planes: np.ndarray, count: np.ndarray, shown: np.ndarray, stride_px:
 
 
 def merge_dense_points(parts: Iterable[tuple[PosedView, np.ndarray]], stride_px: int) -> np.ndarray:
-    """Join the points of all references, and leave out those that repeat an earlier one."""
+    """Join the points of all reference images, without points that repeat earlier ones."""
     kept, boxes = [np.empty(0, DENSE_POINT)], [np.empty((0, 3))]
     for view, own in parts:
         near = (_may_show(view, box, stride_px) for box in boxes)
@@ -136,7 +136,7 @@ def merge_dense_points(parts: Iterable[tuple[PosedView, np.ndarray]], stride_px:
 
 
 def _may_show(view: PosedView, corners: np.ndarray, margin_px: int) -> bool:
-    """Return whether a box may be in view: its corners are not all beyond one side of a frustum."""
+    """Return whether a box may be in view, with not all corners beyond one side of the frustum."""
     seen = (corners @ view.rotation.T + view.translation) @ view.camera.matrix.T
     xy, depth = seen[:, :2], seen[:, 2:]
     inside = [depth, xy + margin_px * depth, (np.array(view.camera.size) + margin_px) * depth - xy]

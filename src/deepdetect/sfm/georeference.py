@@ -20,37 +20,37 @@ from .colmap import import_pycolmap
 from .mapping import SparseModel
 
 GPS_ACCURACY_M = 3.0
-"""Accuracy of a GPS position that does not state its own: that of usual receivers in the open."""
+"""Accuracy of GPS positions that state none, in metres. Usual receivers reach it in the open."""
 
 CONTROL_ACCURACY_M = 0.1
-"""Accuracy of ground control points, surveyed to centimetres and marked to within a few pixels."""
+"""Accuracy in metres of control points, surveyed to centimetres and marked within a few pixels."""
 
 MIN_FIXES = 3
 """Number of positions that must agree: with two, the rotation about their line is undetermined."""
 
 MAX_SCALE_STD = 0.25
-"""A model gets a place only if the relative standard deviation of its scale is smaller. It is large
-if positions lie close together for their accuracy. Chosen by hand."""
+"""A model is georeferenced only if the relative standard deviation of its scale is smaller. This
+deviation is large if positions lie too close together for their accuracy. Chosen by hand."""
 
 MAX_HEADING_STD_DEG = 20.0
-"""A model gets a place only if north has a smaller standard deviation. Chosen by hand."""
+"""A model is georeferenced only if north has a smaller standard deviation. Chosen by hand."""
 
 MAX_OPEN_AXIS_DEG = 10.0
-"""The cameras' up decides on an axis if positions alone leave it a larger standard deviation."""
+"""An axis with a larger standard deviation by positions alone relies on the cameras' up."""
 
 GRAVITY_STD_DEG = 2.0
-"""Standard deviation of the angles of a gimbal. Chosen by hand."""
+"""Standard deviation of the angles that a gimbal reports. Chosen by hand."""
 
 UPRIGHT_STD_DEG, AHEAD_STD_DEG = 5.0, 25.0
-"""Standard deviations of the tilt of the rows of a photograph, which are taken to be level, and of
-the mean tilt of the optical axes. Chosen by hand."""
+"""The rows of a photograph are assumed to be level, with the first standard deviation. The mean
+tilt of the optical axes is assumed to be 0, with the second. Chosen by hand."""
 
 DOWNWARD_SHARE = 0.1
-"""Weight of the optical axes in the estimate of up, relative to the columns of the images: cameras
-look down rather than up. Chosen by hand."""
+"""Weight of the optical axes in the estimate of up, relative to the columns of the images. Cameras
+look down more often than up. Chosen by hand."""
 
 MAX_DISTANCE_PX = 15.0
-"""A named pixel means the point of the model that is seen within this distance. Chosen by hand."""
+"""A pixel given by the user stands for a point projected this close to it. Chosen by hand."""
 
 NEARLY_A_LINE = "they lie nearly on a line: the rotation of the model about it follows from the \
 assumption that cameras are held upright"
@@ -247,9 +247,9 @@ def upright(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Estimate the direction of up from cameras; also return what `fit_similarity` takes as level.
 
-    Level directions are those across the gravity that a gimbal reports. Without a gimbal, the rows
-    of the photographs are taken to be level, and less certainly the optical axes. Returns the unit
-    vector up, the level vectors (L, 3) and their standard deviations (L,) in radians.
+    Level directions are perpendicular to the gravity that a gimbal reports. Without a gimbal, the
+    rows of the photographs are assumed to be level and, less certainly, the optical axes. Returns
+    the unit vector up, the level vectors (L, 3) and their standard deviations (L,) in radians.
     """
     level, stds, down = [], [], []
     for name, view in views.items():
@@ -342,7 +342,7 @@ def _seen_by_several(
 
 
 def _by_file_name(names: Iterable[str]) -> dict[str, str]:
-    """Return the names of images, by themselves and by file names that only one image has."""
+    """Map the full names of images, and file names that only one of them has, to full names."""
     names = [*names]
     counts = Counter(Path(name).name for name in names)
     alone = {Path(name).name: name for name in names if counts[Path(name).name] == 1}
@@ -367,8 +367,8 @@ def scale_by_distance(
 ) -> float:
     """Return the metres per unit of a model, from a known distance of two cameras or points.
 
-    An end is the name of an image, for the position of its camera, or NAME:X,Y, for the one of the
-    `points` (N, 3) at this pixel.
+    An end is the name of an image, which stands for its camera, or NAME:X,Y, which stands for the
+    point of `points` (N, 3) at this pixel.
     """
     one, other = (_end(end, sparse, points) for end in (end0, end1))
     length = float(np.linalg.norm(one - other))

@@ -23,29 +23,30 @@ from .colmap import PIXEL_CENTRE, CameraIntrinsics, quiet_pycolmap
 from .pair_selection import largest_component
 
 MIN_VERIFIED = 30
-"""Number of inliers that the two-view geometry of a pair needs; COLMAP also registers an image by
-30. Some 20 of 8,192 keypoints agree by chance, and wrong pairs slow the mapping down tenfold."""
+"""Number of inliers that the two-view geometry of a pair needs. COLMAP also registers images by 30.
+Some 20 of 8,192 keypoints agree by chance, and wrong pairs slow the mapping down tenfold."""
 
 MAX_VERIFICATION_ERROR_PX = 4.0
 """An inlier has an error up to this, which is COLMAP's default."""
 
 MAX_TRIALS = 5000
-"""RANSAC draws at most this number of samples for a pair. COLMAP's 10,000, which few pairs except
-those of different places reach, cost more time than the mapping if many pairs are compared."""
+"""RANSAC draws at most this number of samples for a pair. COLMAP's limit of 10,000 is reached
+mostly by pairs of different places. If many pairs are compared, it costs more time than the
+mapping."""
 
 MIN_VIEWS = 3
 """A model needs this number of images; `reconstruct` is for two."""
 
 MAX_MODELS = 5
-"""Number of unconnected components of the images of which models are made. Chosen by hand."""
+"""Models are made of at most this number of unconnected components. Chosen by hand."""
 
 MAX_FIRST_PAIRS = 20
 """Number of pairs with which the mapping of a component may try to begin. Chosen by hand."""
 
 FORWARD_ANGLE_DEG = 4.0
-"""The first pair of a second attempt needs this triangulation angle, and may have moved straight
-ahead. The attempt follows if COLMAP's 16 degrees without such motion find no first pair, as in a
-clip from a car, or leave out more images than they map. Chosen by hand."""
+"""Triangulation angle of the first pair in a second attempt, which also allows motion straight
+ahead. It follows if the first attempt, with COLMAP's 16 degrees and no such motion, finds no first
+pair, as in a clip from a car, or leaves out more images than it maps. Chosen by hand."""
 
 ROBUST_SCALE_PX = 1.0
 """Scale of the Cauchy loss of the last adjustment: larger errors count less. Chosen by hand."""
@@ -54,9 +55,9 @@ MAX_REFINED_ERROR_PX = 1.0
 """Refined tracks lose observations with a larger error: such a patch shows something else."""
 
 ROUGH_TOLERANCE, TOLERANCE = 1e-6, 1e-8
-"""An adjustment ends if a step reduces the cost by a smaller fraction: before wrong tracks are left
-out, and in the last adjustment. Smaller tolerances move cameras by under a thousandth of their
-error, and take four times as long."""
+"""An adjustment ends if a step reduces the cost by a smaller fraction. The first is for the
+adjustment before wrong tracks are left out, the second for the last one. Smaller tolerances move
+cameras by under a thousandth of their error, and take four times as long."""
 
 MIN_ANGLE_DEG = 1.0
 """A point needs two lines of sight at this angle. Chosen by hand; COLMAP asks for 1.5 degrees."""
@@ -65,8 +66,8 @@ MIN_FOCAL_RATIO, MAX_FOCAL_RATIO, MAX_DISTORTION = 0.1, 10.0, 1.0
 """COLMAP's bounds of the focal length relative to the longer side, and of distortion parameters."""
 
 MIN_VIEWS_OF_PRINCIPAL_POINT = 8
-"""Number of images of each camera from which on principal points are estimated; with fewer they are
-the middle of the image. Chosen by hand."""
+"""Principal points are estimated if each camera took at least this number of images. Otherwise they
+are the middle of the image. Chosen by hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +89,7 @@ class SparseModel:
     """Cameras and sparse points, in the frame and unit of the model.
 
     Images are in COLMAP's order. Points are (P, 3), their sRGB colours (P, 3) uint8, their mean
-    reprojection errors (P,) in pixels; `tracks` (P,) is the number of images that see each point.
+    reprojection errors (P,) in pixels. `tracks` (P,) is the number of images that see each point.
     """
 
     images: Mapping[str, RegisteredImage]
@@ -135,7 +136,7 @@ def map_images(
 ) -> tuple[Any, list[frozenset[str]]]:
     """Estimate the poses of all images that are connected, from a database of verified pairs.
 
-    Known cameras stay fixed; `registered` is called with the number of images just added. Returns
+    Known cameras stay fixed. `registered` is called with the number of images just added. Returns
     the largest `pycolmap.Reconstruction`, and the names in each other component.
     """
     with quiet_pycolmap() as pycolmap:
@@ -168,7 +169,7 @@ def map_images(
             attempt = _sound(models, known_cameras)
             if not found or (attempt and _size(attempt[0]) > _size(found[0])):
                 found = attempt
-            # The rest may be larger than the model, as a drive in a folder with some of a house.
+            # The rest may form a larger component, such as a drive in a folder with a house.
             mapped = frozenset[str]().union(*map(_names, found))
             left = [pair for pair in verified if mapped.isdisjoint(pair)]
             if found and largest_component(left) <= _size(found[0]):
@@ -233,7 +234,7 @@ def _names(model: Any) -> frozenset[str]:
 
 
 def read_sparse_model(model: Any, sources: Mapping[str, str] = {}) -> SparseModel:
-    """Return cameras and points of a `pycolmap.Reconstruction`; `sources` are for intrinsics."""
+    """Convert a `pycolmap.Reconstruction`; `sources` name the origin of intrinsics, by image."""
     points = np.empty((len(model.points3D), 3))
     colors = np.empty(points.shape, np.uint8)
     row_of = {}
@@ -281,7 +282,7 @@ def adjust(model: Any, known_cameras: bool, tolerance: float = TOLERANCE) -> Non
 
 
 def adjust_refined(model: Any, known_cameras: bool) -> None:
-    """Adjust a model with refined tracks twice; the first adjustment shows which are wrong."""
+    """Bundle-adjust a model with refined tracks twice, removing wrong observations before each."""
     for max_error_px, tolerance in (
         (MAX_VERIFICATION_ERROR_PX, ROUGH_TOLERANCE),
         (MAX_REFINED_ERROR_PX, TOLERANCE),

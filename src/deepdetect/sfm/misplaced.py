@@ -2,7 +2,7 @@
 
 An image that is registered early is placed by few points. If the camera moves straight ahead,
 matches that are wrong along its path agree with many places on the path. A wrong place then stays,
-because points whose depth comes from this image agree with it. Points of the others show the error.
+because points whose depth comes from this image agree with it. Other points show the error.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ MIN_SPREAD_DEG = MIN_ANGLE_DEG / 2
 square angle about their mean. With less, the tested image itself gave the point its depth."""
 
 MIN_GAIN = 1.5
-"""Ratio of the points that agree with another pose to those that agree with the pose in the model,
-from which on the image is moved. It is within 1 % of 1 for images in their right place, and was 3
-or more for others."""
+"""An image is moved to another pose if at least this many times as many points agree with that pose
+as with the pose in the model. The ratio was within 1 % of 1 for images in their right place, and 3
+or more for misplaced ones."""
 
 MAX_ROUNDS = 3
-"""Number of rounds of checks: images that were moved give better points to check others by."""
+"""Number of rounds of checks. Corrected images give better points for checking other images."""
 
 MIN_KEPT = 0.9
-"""Fraction of observations that new points must keep, else the correction is undone. It was 0.99
-where a correction helped."""
+"""A correction is undone if the new points keep a smaller fraction of the observations. The
+fraction was 0.99 where a correction helped."""
 
 
 def correct_places(
@@ -130,7 +130,7 @@ class _Points:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Match keypoints of an image to points that other images determine; return rows of both.
 
-        `matches` are (M, 2) rows of keypoints of the image and of each other one.
+        `matches` are numbers of other images, each with (M, 2) rows of keypoints of both images.
         """
         own, sights = self._sights[number]
         counts, sums = self._counts.copy(), self._sums.copy()

@@ -9,8 +9,8 @@ import numpy as np
 from ..batch.pair_list import Pair
 
 MIN_MATCHED = 0.5
-"""Two images can show the same only if at least this fraction of the keypoints of the one with
-fewer is matched. Chosen by hand."""
+"""Two images are taken to differ unless this fraction of the keypoints is matched, in the image
+that has fewer. Chosen by hand."""
 
 
 def largest_component(pairs: Sequence[Pair]) -> int:
@@ -42,7 +42,7 @@ def thin_out(
     Args:
         names: all images in order.
         near: pairs of images that show nearly the same, with their distance.
-        dropped: images left out before; those kept in their place stay.
+        dropped: images left out before, each with the image kept in its place, which stays.
     """
     partners: dict[str, dict[str, float]] = {name: {} for name in names}
     for (first, second), distance in near.items():

@@ -32,13 +32,14 @@ class MultiViewReconstruction:
         unregistered: reasons why the other images are not registered, by name.
         components: names of unregistered images that are connected with each other, the largest
             component first: each can be reconstructed alone.
-        reference: name of the image whose camera's frame is the world, or that sees most points.
+        reference: name of the image that sees most points. Its camera is the world's frame unless
+            the model has a place.
         georeference: scale and place of the model, or a sentence on why it lacks them.
         sparse: points by which the poses were estimated.
         sparse_errors: (N,) float32 mean reprojection errors of these points in pixels.
         sparse_views: (N,) int32 numbers of images that see each of these points.
         dense: dense points; empty if the options asked for none.
-        dense_errors: (M,) float32 distances in pixels to the matches in other images, as RMS.
+        dense_errors: (M,) float32 root mean square distances in pixels to matches in other images.
         dense_views: (M,) uint8 numbers of images that agree on each dense point.
         keypoints: number of keypoints, by image.
         matched: number of verified matches, by pair.

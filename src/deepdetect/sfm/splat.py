@@ -25,17 +25,18 @@ SPLAT_POINTS = 200_000
 JPEG_QUALITY = 95
 
 CELLS_PX, CLOSED_GAIN = (1, 2, 3, 4, 6, 8), 1.3
-"""Sides of the square that a point covers in a depth map. The first is taken whose successor covers
-less than this factor more of the map, as then few gaps are left. Chosen by hand."""
+"""The first are sides, in pixels, of the square that a point covers in a depth map. The smallest
+side is taken for which the next one covers less than the second times as much: few gaps are left.
+Chosen by hand."""
 
 MAX_DEPTH_STEP = 0.1
-"""A point farther than its neighbour by this share is seen through a gap. Chosen by hand."""
+"""A pixel farther than a neighbour by this share is seen through a gap. Chosen by hand."""
 
 DEPTH_PERCENT = 95.0
 """Percentage of the sparse points of each view whose depths must fit into the 16 bits of a map."""
 
 MAX_VALUE_PER_UNIT = 1000.0
-"""Depth maps store millimetres, which nearly all readers expect, unless these reach too short."""
+"""Depth maps store thousandths, such as millimetres, or coarser steps if 16 bits are too few."""
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 """Transform from camera axes of nerfstudio (y up, z backward) to ours (y down, z forward)."""
@@ -136,7 +137,7 @@ def write_splat(found: MultiViewReconstruction, folder: Path, output: Path) -> N
 
 
 def thinned(points: np.ndarray, errors: np.ndarray, count: int) -> np.ndarray:
-    """Return rows of at most `count` of (N, 3) points: the one of least error in each cell."""
+    """Return rows of at most `count` of (N, 3) points: that of least error in each cubic cell."""
     order = np.argsort(errors, kind="stable")
     if len(points) <= count:
         return order

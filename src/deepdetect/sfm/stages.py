@@ -166,7 +166,7 @@ class Stages:
         self.features = self.work / "features.h5"
 
     def folder_of(self, images: str | Path | Sequence[str | Path]) -> Path:
-        """Return the folder of the images, or of links to a list, or to images around results."""
+        """Return the images' folder, or one of links for a list, or if results are inside it."""
         if isinstance(images, (str, Path)):
             if self.output.resolve() == Path(images).resolve():
                 raise OptionError(f"{images} holds the images: give another folder with -o")
@@ -359,7 +359,7 @@ class Stages:
         return merge_dense_points(self.fused(folder, sparse), self.options.stride_px)
 
     def fused(self, folder: Path, sparse: SparseModel) -> Iterator[tuple[PosedView, np.ndarray]]:
-        """Yield each reference view with its dense points, some of which repeat those of others."""
+        """Yield each reference view with its dense points, which may repeat those of others."""
         store, stride = self.work / "dense", self.options.stride_px
         references = find_references(sparse)
         paths: dict[str, Path] = {}

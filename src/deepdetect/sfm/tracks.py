@@ -39,7 +39,7 @@ MIN_FACING = 0.3
 at least this. Chosen by hand."""
 
 MAX_GROWTH = 7.0
-"""The areas of a patch in two images may have this ratio. Chosen by hand."""
+"""The areas of a patch in two images may differ by at most this factor. Chosen by hand."""
 
 MIN_COMMON_POINTS = 10
 """Number of points that two images must share, else no patches are aligned. Chosen by hand."""
@@ -54,8 +54,8 @@ MIN_DENSE_VIEWS = 3
 """Number of images of a dense track: with two, no other image checks the match."""
 
 CACHED_IMAGES, CACHED_PIXELS = 8, 1e8
-"""The cache holds the second number of pixels, of seven bytes each, but at least the first number
-of images, because successive images share neighbours."""
+"""The cache holds images with the second number of pixels together, at seven bytes each, but at
+least the first number of images. Successive images share neighbours."""
 
 
 class Surfaces(NamedTuple):
@@ -90,8 +90,9 @@ def add_dense_tracks(
     """Add tracks of dense points to those of a model.
 
     `fused` are views, each with the `DENSE_POINT` array of its depth map. An image gives the best
-    corner of each cell of a grid, unless tracks of earlier images are near: then these match it
-    already. The model's own tracks, which are shorter, are aligned again if no new one is near.
+    corner of each cell of a grid, unless a track of an earlier image is near, which already matches
+    the corner. The model's own tracks, which are shorter, are aligned again where no new track is
+    near.
     """
     sparse = read_sparse_model(model)
     tracks = _Tracks(sparse, folder)
@@ -168,9 +169,9 @@ class _Tracks:
     def add(
         self, name: str, wanted: Surfaces, tracks: np.ndarray | None = None, min_views: int = 2
     ) -> None:
-        """Align patches of an image in others; those found in `min_views` images become points.
+        """Align patches of an image in others; patches found in `min_views` images become points.
 
-        `tracks` are rows of the model's points: their images are searched. None: all images are.
+        `tracks` are rows of the model's points, whose images are searched. With None, all are.
         """
         own = self.numbers[name]
         pixels, points, _ = wanted
@@ -231,7 +232,7 @@ class _Tracks:
         return rows[converged], xy[converged]
 
     def write(self, model: Any) -> None:
-        """Replace the tracks of a `pycolmap.Reconstruction` by these."""
+        """Replace the tracks of a `pycolmap.Reconstruction` by the tracks found here."""
         self.read.cache_clear()  # the next adjustment needs the memory
         with quiet_pycolmap() as pycolmap:
             numbers = {image.name: number for number, image in model.images.items()}

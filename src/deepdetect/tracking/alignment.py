@@ -24,11 +24,11 @@ BORDER_PX = 3
 
 MAX_ITERATIONS = 30
 CONVERGENCE_PX = 0.03
-"""A patch that moves by less has converged; OpenCV 4 reads images at steps of 1/32 px."""
+"""A patch that moves by less has converged. OpenCV 4 reads images at steps of 1/32 px."""
 
 MAX_SHIFT_PX = 3.0
-"""A patch may move by this from its expected position, as translation alone may be off by it where
-surfaces come nearer. Chosen by hand."""
+"""A patch may move by this much from its expected position. Tracking by translation alone has such
+errors where surfaces come nearer. Chosen by hand."""
 
 MIN_CORRELATION = 0.8
 """A patch that correlates less is not found. Chosen by hand."""
@@ -38,8 +38,8 @@ MAX_GROWTH = 4.0
 shows too few of its pixels. Chosen by hand."""
 
 RIDGE = 1e-4
-"""This share of their scale is added to the normal equations, since parallel edges make these
-singular. Chosen by hand."""
+"""This share of the scale of the normal equations is added to their diagonal, because parallel
+edges make them singular. Chosen by hand."""
 
 MOST_READ = 1 << 14
 """Number of patches read at once, since OpenCV limits the sides of an image to 32,767."""
@@ -104,7 +104,7 @@ def find_patches(
     """Find patches in a blurred image near (N, 2) expected positions.
 
     Returns (N, 2) positions and (N, 2, 2) affinities, float64, and (N,) bool whether each was
-    found; positions and affinities of the others are meaningless.
+    found. Positions and affinities of patches that were not found are meaningless.
     """
     found, affinities = xy.astype(np.float64), patches.affinities.copy()
     arrived = np.zeros(len(xy), bool)

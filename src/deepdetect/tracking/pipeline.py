@@ -25,7 +25,7 @@ from .tracks import TrackDrawer, TrackedFrame, write_tracks
 from .video import Frame, FrameSource, check_video_name, write_video
 
 MIN_SIDE_PX = 32
-"""Frames must not be scaled down to a shorter longer side. Chosen by hand."""
+"""`max_side`, the longer side of scaled frames, must be at least this. Chosen by hand."""
 
 RATE_FRAMES = 10
 """The displayed frame rate is a mean over this number of frames."""

@@ -30,15 +30,16 @@ Detect = Callable[[np.ndarray], Keypoints]
 """Function that returns the keypoints of a (H, W, 3) uint8 RGB image."""
 
 CANDIDATES = 3
-"""Keypoints are detected in this multiple of the wanted tracks, to choose some that lie apart."""
+"""This multiple of the wanted tracks is detected as keypoints, to choose some that lie apart."""
 
 MIN_DISTANCE_PX, MIN_SPACING = 8.0, 0.35
-"""A new point has this distance from all tracks, in pixels and as a share of the spacing of a grid
-of `max_keypoints` points: points all over the image tell more about the motion of the camera."""
+"""A new point is at least the first distance from all tracks, in pixels, and the second share of
+the spacing of a grid of `max_keypoints` points. Points all over the image tell more about the
+motion of the camera."""
 
 WINDOW_PX, LEVELS = 21, 3
-"""The patch that is followed has this side, and the pyramid this number of levels above the image,
-each of which doubles how far points may move between frames. Both are OpenCV's defaults."""
+"""The first is the side of the patch that is followed. The second is the number of pyramid levels
+above the image. Each doubles how far points may move between frames. Both are OpenCV's defaults."""
 
 BORDER_PX = 2.0
 """Points nearer to the border of the image are dropped. Chosen by hand."""

@@ -31,7 +31,7 @@ class TrackedFrame:
         tracks: (N,) int64 numbers of the tracks, ascending; a track keeps its number.
         xy: (N, 2) float32 positions, centre of the first pixel (0, 0).
         scores: (N,) float32 scores of the keypoints with which the tracks began.
-        ages: (N,) int64 frames since then, 0 if a track begins here.
+        ages: (N,) int64 frames since the tracks began, 0 if a track begins here.
 
     Raises:
         OptionError: the arrays do not have one row for each track.

@@ -1,8 +1,8 @@
 """Simulated views, for pairs whose viewpoints differ too much for descriptors alone.
 
 Yu and Morel, "ASIFT: A New Framework for Fully Affine Invariant Image Comparison", 2009. Oblique
-views of one image are simulated in several directions and compared with the other image; then the
-other way round. The views stay upright: learned descriptors tolerate the rotations in between.
+views of one image are simulated in several directions and compared with the other image. Then the
+images change roles. The views stay upright: learned descriptors tolerate the rotations in between.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ ROUNDING = 1e-9
 OUTSIDE: dict[str, Any] = {"borderValue": 128}
 
 TILT, DIRECTIONS = 4.0, 8
-"""Compression of one direction in the simulated views, and the number of directions. Learned
-descriptors alone tolerate tilts of two or three. All of 60 oblique pairs with tilts of 2 to 6 that
-were lost otherwise showed a geometry then; with a tilt of 3 and five directions 55 did, with SIFT
-and tilts of 2 and 4 in 30 views 33."""
+"""The first is the compression of a simulated view along one direction, the second the number of
+directions. Learned descriptors alone tolerate tilts of two or three. On 60 oblique pairs with tilts
+of 2 to 6 that fail without views, all showed a geometry. A tilt of 3 and five directions gave 55,
+SIFT with tilts of 2 and 4 in 30 views gave 33."""
 
 
 def learned_points(gray: np.ndarray, max_keypoints: int) -> Keypoints:
@@ -54,9 +54,9 @@ def _detector(max_keypoints: int) -> PointDetector:
 def simulated_views(
     grays: tuple[np.ndarray, np.ndarray], max_keypoints: int
 ) -> Iterator[tuple[int, Keypoints]]:
-    """Yield the described points of oblique views, at their positions in the image itself.
+    """Yield the described keypoints of oblique views, at their positions in the original image.
 
-    The number of the image, 0 or 1, comes with each view; those of the first image come first.
+    Each view comes with the number of its image, 0 or 1. Views of the first image come first.
     """
 
     def see(side: int, rotation_deg: float) -> tuple[int, Keypoints]:

@@ -1,7 +1,7 @@
 """Sparse matches along known epipolar lines.
 
-A ratio test over the whole image rejects everything that recurs. With a known fundamental matrix, a
-partner can only lie near a line, and keypoints elsewhere show how similar wrong partners are.
+A ratio test over the whole image rejects repeated structure. With a known fundamental matrix, a
+match can only lie near a line, and keypoints elsewhere show how similar wrong matches are.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from ...features.keypoints import Keypoints
 from ...geometry.transforms import translation_matrix
 
 MAX_DISTANCE_PX = 3.0
-"""Both keypoints of a match lie this near to each other's epipolar line. Chosen by hand."""
+"""The keypoints of a match lie within this distance of each other's line. Chosen by hand."""
 
 MAX_RATIO_ELSEWHERE = 0.95
-"""The descriptor distance of a match may be this fraction of that to the most similar keypoint far
-from the line, which is certainly wrong. Chosen by hand."""
+"""The descriptor distance of a match must be below this fraction of the distance to the most
+similar keypoint far from the line, which is certainly wrong. Chosen by hand."""
 
 MAX_RATIO_NEAR = 0.85
-"""The same ratio, to the second-best keypoint near the line. Chosen by hand."""
+"""The ratio test among the keypoints near the line has this limit. Chosen by hand."""
 
 MIN_SEPARATION_PX = 5.0
-"""Keypoints this near to the best one show the same place and are no rivals. Chosen by hand."""
+"""Keypoints this near to the best show the same place and are not compared. Chosen by hand."""
 
 NULL_SHIFTS = (0.05, 0.1)
-"""Shifts of lines that count chance matches, as fractions of the longer side. Chosen by hand."""
+"""Lines shifted by these fractions of the longer side find chance matches. Chosen by hand."""
 
 
 def epipolar_search(
@@ -131,7 +131,8 @@ def log10_p_value(
 
     `used` are the positions in the first image of all matches that the matrix was estimated from,
     correct or wrong: they are not new evidence. The same lines, moved elsewhere, only find matches
-    by chance. Their mean is that of a Poisson distribution, which gives the probability.
+    by chance. The mean of their number is that of a Poisson distribution, which gives the
+    probability.
     """
     distances = _squared_distances(first, second)
     known = {(float(x), float(y)) for x, y in np.asarray(used, np.float32)}

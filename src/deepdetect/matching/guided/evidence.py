@@ -52,15 +52,16 @@ MIN_RELATIVE_CORRELATION = 0.4
 have up to 0.27, Strecha's entry up to 0.40, synthetic facades of one window 0.48 or more."""
 
 MIN_OVERLAP = 0.6
-"""A shift must keep this fraction of the overlap: what distinguishes both places may be hidden."""
+"""Shifts must keep this fraction of the overlap, because distinctive content may be hidden."""
 
 MIN_ZNCC, MIN_ZNCC_GAIN = 0.5, 0.2
-"""A homography explains a place if the ZNCC there is above the first, and explains it alone if that
-of the other homography is lower by the second. Chosen by hand."""
+"""A homography explains a place if the ZNCC there is above the first. It explains the place alone
+if the ZNCC of the other homography is lower by the second. Chosen by hand."""
 
 MIN_OWN_FRACTION, MIN_OWN_RATIO = 0.02, 2.0
-"""The places that a homography explains alone must be this fraction of all explained places, and
-this many times those that its shifted copy explains alone. Chosen by hand."""
+"""The places that a homography explains alone must be at least the first fraction of all explained
+places, and the second number times the places that its shifted copy explains alone. Chosen by
+hand."""
 
 MIN_EXPLAINED_FRACTION = 0.25
 """A homography must explain this fraction of the places of sparse matches if few places can be
@@ -90,7 +91,8 @@ NEIGHBOURS = 8
 
 MAX_MOVE_DIFFERENCE, MOVE_NOISE_PX = 0.35, 2.0
 """Steps between matches agree if rotation and scale differ by at most the first, relative to the
-scale, as tilt and depth allow; the second is the error of a step in pixels. Chosen by hand."""
+scale. This allows for tilt and depth. The second is the error of a step in pixels. Chosen by
+hand."""
 
 
 def is_repeated(
@@ -103,7 +105,7 @@ def is_repeated(
 ) -> bool:
     """Return whether a shifted copy of a homography explains (N, 2) points as well as it does.
 
-    The points are those of dense matches, or `distinct` ones: of sparse matches by the ratio test.
+    The points are those of dense matches or, if `distinct`, of sparse matches by the ratio test.
     `sparse` are all tentative matches, (M, 2) in both images, many of them wrong: relative to the
     correct homography, what lies off the plane moves towards an epipole.
     """
@@ -222,7 +224,7 @@ def compare_held_out(
 
 
 def _mean_around(values: np.ndarray) -> np.ndarray:
-    """Average each window with those around it, (rows, columns); NaN where it is unknown itself."""
+    """Average the values of windows, (rows, columns), over 3 x 3 windows; NaN stays NaN."""
     known = np.isfinite(values)
     total, count = (
         cv2.boxFilter(part, cv2.CV_64F, (3, 3), borderType=cv2.BORDER_CONSTANT)
@@ -234,9 +236,9 @@ def _mean_around(values: np.ndarray) -> np.ndarray:
 def _affine_maps(
     windows: np.ndarray, points0: np.ndarray, points1: np.ndarray, shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Fit an affine map, (3, 2), to the matches of the windows around each of (rows, columns).
+    """Fit an affine map, (3, 2), to the matches of the eight windows around each window.
 
-    `windows` has the number of the window of each match. Also returns where there is a map.
+    `windows` (M,) are the matches' windows in a grid of `shape`. Also returns where maps exist.
     """
     size = shape[0] * shape[1]
 

@@ -42,7 +42,7 @@ from .tentative_matches import (
 )
 
 LEARNED_KEYPOINTS = 2048
-"""Points with learned descriptors, used if SIFT's keypoints show no geometry. Chosen by hand."""
+"""Number of learned keypoints, used if SIFT's keypoints show no geometry. Chosen by hand."""
 
 COARSE_SIDE_PX, COARSE_KEYPOINTS = 640, 2000
 """Longer side and keypoints of the copies for the coarse pass. Chosen on the data named above."""
@@ -51,30 +51,32 @@ MIN_COARSE_INLIERS = 50
 """The coarse pass, or given points, decide if this many matches agree with a homography."""
 
 MIN_COARSE_DEPTH_INLIERS = 200
-"""The same number for a fundamental matrix. Chosen on the data named above."""
+"""Inliers of a fundamental matrix for the coarse pass to decide. Chosen on the data named above."""
 
 MIN_COARSE_FRACTION = 0.5
 """Fraction of the coarse matches that must also agree. Chosen on the data named above."""
 
 SIMULATED_SIDE_PX, SIMULATED_KEYPOINTS = 320, 1000
-"""Longer side and keypoints of the images to be tilted; views get half as many. Chosen by hand."""
+"""Longer side and keypoints of images to be tilted. Views get half the keypoints. Chosen by
+hand."""
 
 WINDOW_PX = 16
 """Side of the windows around matches that are checked for inverted brightness. Chosen by hand."""
 
 MIN_GAIN = 1.2
 """Images are from two sensors if cross-modal descriptors give this many times the tentative matches
-of learned ones: visible and infrared light 1.5 to 30, photographs and wide pairs up to 1.17."""
+of learned ones. The ratio is 1.5 to 30 for visible and infrared light, up to 1.17 for pairs of
+photographs."""
 
 MIN_INVERTED = 0.05
 """Images are also from two sensors if this fraction of the inliers is dark in one and bright in the
 other. Wide pairs of the KITTI clips have up to 0.04, from wrong matches."""
 
 MAX_LEARNED_LOG10_NFA, MAX_CROSS_MODAL_LOG10_NFA = -10.0, -22.0
-"""The log10 number of false alarms must be below these if only learned, or only cross-modal,
-descriptors show a geometry: networks also see the borders of images, which lie in the same places.
-Unrelated photographs reach -8 with learned ones; with cross-modal ones noise of 320x240 reaches
--20, visible and infrared light -24 or less."""
+"""The log10 number of false alarms must be below the first if only learned descriptors show a
+geometry, below the second if only cross-modal ones do. Networks also see the borders of images,
+which lie in the same places. Unrelated photographs reach -8 with learned descriptors. With
+cross-modal ones, noise of 320x240 pixels reaches -20, visible and infrared light -24 or less."""
 
 MAX_MATCHES_TO_SEARCH = 200
 """A fundamental matrix with fewer inliers leads to a search for more along its lines."""
@@ -86,8 +88,8 @@ chance: further matches along epipolar lines are counted."""
 
 Source = TentativeMatches | Pair | tuple[Keypoints, Keypoints] | None
 """What a geometry is found from: tentative matches, positions of another matcher's matches ((K, 2)
-in both images), or keypoints of both images. Keypoints are only matched themselves if they are
-enough points of all scales; otherwise, and for None, SIFT's keypoints are."""
+in both images), or keypoints of both images. Given keypoints are matched only if they are enough
+points of all scales. Otherwise, and for None, SIFT keypoints are matched."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -95,7 +97,7 @@ class InitialGeometry(TwoViewModel):
     """A model of tentative matches, at the images' own size; "none" if none can be trusted.
 
     `points0` and `points1` are its inliers, `others` the outliers, or None if the caller prescribed
-    the model. `num_views` views were simulated. Another model would be found from the same
+    the model. `num_views` views were simulated. Another model can be estimated from the same
     `source`. A `learned` geometry comes from learned points, a `cross_modal` one from two sensors.
     """
 
@@ -126,7 +128,7 @@ class InitialGeometry(TwoViewModel):
         return np.concatenate([self.points0, points0]), np.concatenate([self.points1, points1])
 
     def untrusted(self) -> InitialGeometry:
-        """Return that no geometry can be trusted, keeping its number of false alarms."""
+        """Return a geometry that cannot be trusted, with the same number of false alarms."""
         nowhere = np.empty((0, 2))
         return replace(self, model="none", matrix=None, points0=nowhere, points1=nowhere)
 
@@ -211,9 +213,9 @@ def _geometry_of_keypoints(
 def _learned_geometry(grays: Pair, model: str, seed: int) -> InitialGeometry:
     """Find the geometry from points with learned descriptors, also between different sensors.
 
-    In different light, in the dark, under blur or from another side two to fifteen times as many of
-    them agree as of SIFT's keypoints; SIFT has more if one image is four times as large. SIFT's
-    positions are more exact, which helps to tell depth from a plane.
+    In different light, in the dark, under blur or from another side, these points have two to
+    fifteen times as many inliers as SIFT's keypoints. SIFT has more if one image is four times as
+    large. SIFT's positions are more exact, which helps to tell depth from a plane.
     """
     as_it_is = _learned_matches(grays, COARSE_SIDE_PX, LEARNED_KEYPOINTS)
     seen = as_it_is.views, as_it_is.features

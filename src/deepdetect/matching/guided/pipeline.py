@@ -46,23 +46,23 @@ MATCHED_PX = 9
 """Side of the window around a match in which the first image counts as matched. Chosen by hand."""
 
 MIN_OFF_PLANE_FRACTION = 0.02
-"""A scene has depth if this many dense matches are off the plane, relative to those on it, and
-equally many of the sparse ones. Their patches must not fit the plane. The planes of Oxford, which
+"""A scene has depth if the dense matches off the plane are at least this fraction of those on it,
+and the sparse matches likewise. Their patches must not fit the plane. The planes of Oxford, which
 are not quite flat, have up to 0.013, facades 0.032 or more."""
 
 MAX_MOVING_PLANES = 3
-"""Planes that are tested for independent motion: the first ones may be part of the static scene."""
+"""Number of planes tested for independent motion, as the first may belong to the static scene."""
 
 MIN_ON_LINES = 0.33
 """A plane is static if this fraction of its matches lies on the epipolar lines of the rest. Planes
 that were pasted into scenes with depth have up to 0.3."""
 
 MIN_REST_FRACTION, MIN_REST_RATIO = 0.5, 1.05
-"""The rest of a scene with a moving plane needs a matrix of its own if that has this fraction of
-its matches as inliers, and this many times those of the common matrix. Chosen by hand."""
+"""The rest of a scene with a moving plane gets its own matrix if the first fraction of its matches
+are inliers, and the second number times as many as for the common matrix. Chosen by hand."""
 
 MAX_REST_LOG10_NFA = -20.0
-"""The rest must agree on an epipole with this log10 number of false alarms; a plane has -7."""
+"""The rest must agree on an epipole with a smaller log10 number of false alarms. A plane has -7."""
 
 MAX_PARALLAX_LOG10_NFA = -40.0
 """Sparse matches off the plane also prove depth if they agree on an epipole this clearly. Planes of
@@ -72,8 +72,8 @@ SCENE_MATCHES = 1000
 """Number of random dense matches that the type of a scene is judged by. Chosen by hand."""
 
 DOMINANT_FRACTION, MIN_PLANE_FRACTION = 0.5, 0.2
-"""A plane is dominant with the first fraction of these matches, and tested for repeated patterns
-from the second on. Chosen by hand."""
+"""A plane is dominant if it has the first fraction of these matches. It is tested for repeated
+patterns if it has the second. Chosen by hand."""
 
 MAX_CLEAR_LOG10_NFA, MIN_CLEAR_CORRELATION = -12.0, 0.5
 """Confidence is "high" if the log10 number of false alarms is below the first and the correlation
@@ -97,7 +97,7 @@ MIN_ALIKE_FRACTION = 0.3
 """This fraction of the sparse matches must be verified: at random places up to a tenth is."""
 
 MAX_DISTANCE_PX = 1.0
-"""A partner lies this near to where the homography maps the keypoint. Chosen by hand."""
+"""A match lies this near to where the homography maps the keypoint. Chosen by hand."""
 
 MIN_PROPOSED_FRACTION = 0.25
 """If a smaller fraction of the visible keypoints has a partner under the homography, keypoints are

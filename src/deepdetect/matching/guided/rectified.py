@@ -49,8 +49,8 @@ MARGIN_PX, MARGIN_FRACTION = 4.0, 0.25
 length. Chosen on the data named above."""
 
 MIN_FRACTION_OF_ONE_SIGN = 0.8
-"""If this fraction of the sparse matches grows about an epipole, or shrinks, the range extends only
-`MARGIN_PX` in the other direction. Chosen on the data named above."""
+"""If this fraction of the sparse matches moves away from an epipole, or towards it, the range
+extends only by `MARGIN_PX` in the other direction. Chosen on the data named above."""
 
 CORRELATION_WINDOW_PX, CORRELATION_SIGMA_PX = 9, 1.0
 """Matched views are compared in windows of this side, blurred with this sigma."""
@@ -70,15 +70,16 @@ NULL_FRACTION = 0.25
 """This fraction of the rows is matched with unrelated rows to measure chance. Chosen by hand."""
 
 MAX_ROW_ERROR_PX, ROW_QUANTILE = 0.5, 0.9
-"""The images are not rectified again if this fraction of the tracked corners (second) has rows this
-near (first) to the lines of the new matrix. Chosen on the data named above."""
+"""The images are not rectified again if the second fraction of the tracked corners has rows within
+the first distance of the lines of the new matrix. Chosen on the data named above."""
 
 MAX_RANGE_EXCESS = 1.25
-"""Scaled-down images are also rectified again if more than this times the range that was found had
-to be searched. Chosen on the data named above."""
+"""Scaled-down images are also rectified again if the searched range was more than this times the
+range that was found. Chosen on the data named above."""
 
 MIN_SIGMA_PX = 0.1
-"""A track or sparse match never counts as more exact than this. Chosen on the data named above."""
+"""Tracks and sparse matches have at least this standard deviation. Chosen on the data named
+above."""
 
 TRACKED_CORNERS, TRACKED_WINDOW_PX = 2000, 15
 """Corners that are tracked, and the side of their windows. Chosen on the data named above."""
@@ -94,8 +95,8 @@ NEAR_PLANE_FRACTION = 0.8
 matches, the nearest to a known plane, are searched: anything far in front of it is lost."""
 
 MAX_DISAGREEMENT_PX = 3.0
-"""Maximum difference in disparity for a sparse match to agree, in pixels: it was found in images of
-another scale. Chosen on the data named above."""
+"""A sparse match agrees with a disparity up to this difference, in pixels. It was found in images
+of another scale. Chosen on the data named above."""
 
 MIN_AGREEMENT = 0.6
 """This fraction of the sparse matches must agree with the disparities: on facades a quarter of them
@@ -106,7 +107,7 @@ belong to the next window on the same line."""
 class RectifiedView:
     """Two images, at `scale`, in a common frame, and the disparities between them, (H, W) each.
 
-    `disparity` is NaN where no match is kept; `relied` marks the matches that geometry may rely on;
+    `disparity` is NaN where no match is kept. `relied` marks the matches that geometry may rely on.
     `correlation` is the local ZNCC of both views once the disparity is removed.
     """
 

@@ -19,8 +19,9 @@ from ...features.sift import correlation_distance, dense_sift, sift_gradient, to
 from ...geometry.images import gaussian_means, window_sums
 
 DESCRIPTOR_REACH = 36
-"""Radius in pixels of what the largest descriptors see, with gradient and blur. Further from all
-edges a shifted image has the descriptors of the image itself, which are computed once."""
+"""Radius in pixels of the area that the largest descriptor depends on, with gradient and blur.
+Farther from all edges, shifting the image only shifts its descriptors, so they are computed
+once."""
 
 KEYPOINT_SIZES_PX = (3.0, 8.0)
 """Descriptors are compared at these keypoint diameters. Chosen by hand."""
@@ -36,8 +37,8 @@ SMOOTHING_SIGMA_PX = 2.5
 """Sigma of the Gaussian mean over neighbouring points, in pixels. Chosen by hand."""
 
 WINDOWS_PX = (101, 31)
-"""A point passes if most points in windows of both sides around it do. The smaller one, against
-chance matches around a small plane, was chosen on six synthetic pairs."""
+"""A point passes if most points pass in windows of both sides around it. The smaller window is
+against chance matches around a small plane. It was chosen on six synthetic pairs."""
 
 MIN_SUPPORT = 0.5
 """Fraction of the points in a window that must pass: most of them."""
@@ -52,7 +53,7 @@ MAX_NULL_BLOCKS = 256
 """Each shift uses up to this many random blocks: all of them up to a megapixel."""
 
 MIN_POINTS_OF_MEAN = 100
-"""The mean descriptor is subtracted only from this many points on: that of few is close to each."""
+"""The mean descriptor is subtracted if there are this many: a mean of few is close to each one."""
 
 MIN_NULL_DISTANCE = 1e-6
 """The distance of equal descriptors is at most this, by rounding."""
@@ -76,7 +77,7 @@ class NullPairs:
 def dissimilarity(
     gray0: np.ndarray, warped: np.ndarray, valid: np.ndarray, pixels: np.ndarray, seed: int = 0
 ) -> np.ndarray:
-    """Compare the patches around (N, 2) whole pixels of the first image, `gray0`.
+    """Compare patches of two aligned images around (N, 2) whole pixels of the first, `gray0`.
 
     `warped` is the second image in the frame of the first, with content where `valid`. Returns (N,)
     float32: 1 - correlation, averaged over neighbours, divided by the bound below which the

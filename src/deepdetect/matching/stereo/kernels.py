@@ -1,7 +1,7 @@
 """The compiled parts of stereo matching. Importing them takes numba; the first call compiles.
 
 Kernels named `..._rows` process the rows `first` to `last - 1` of their arrays. The innermost axis
-is the disparity or the pixel of a row, so that vector registers process many; sums have 16 bits.
+is the disparity or the pixel of a row, so that vector registers process many. Sums have 16 bits.
 """
 
 from __future__ import annotations
@@ -98,8 +98,9 @@ def _step(before, least, cost, total, after, p1, p2):  # type: ignore[no-untyped
     """Advance one pixel along a path, and return the lowest cost there.
 
     `before` and `after`, (D + 2,) uint16, are the costs of the path, with one end on each side;
-    `least` is the lowest of `before`, and `cost`, (D,) uint8, are those of this pixel. The path is
-    added to `total`. `p1` and `p2` are the penalties for a disparity that changes by one or more.
+    `least` is the lowest of `before`, and `cost`, (D,) uint8, are the matching costs of this pixel.
+    The path is added to `total`. `p1` and `p2` are the penalties for a disparity that changes by
+    one or more.
     """
     count = cost.shape[0]
     jump = np.uint16(least + p2)
@@ -157,7 +158,7 @@ def best_of_rows(first, last, total, min_disparity, count, disparity, consistent
 
     `total` is (H, W, D) uint16 from `min_disparity` on; the first `count` disparities may be
     chosen. The outputs are the fields of `sgm.SGMResult`. A parabola through the lowest cost and
-    its two neighbours makes the disparity sub-pixel; views are consistent if they agree within one.
+    its two neighbours makes the disparity sub-pixel. Views are consistent if they agree within one.
     """
     width = total.shape[1]
     best = np.empty(width, np.int64)
@@ -349,7 +350,7 @@ def extrapolate_rows(  # type: ignore[no-untyped-def]
         start = 0
         while start < width and not known[y, start]:
             start += 1
-        # At most twice the extrapolated distance of the surface is used.
+        # The line is fitted to at most twice as many pixels as are extrapolated.
         wanted = 2 * max(start, min_support)
         support = 0
         before = np.float32(0)

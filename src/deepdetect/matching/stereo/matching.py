@@ -33,11 +33,11 @@ SPECKLE_SUBDIVISIONS = 4
 """Steps per pixel of the integer disparities for OpenCV's speckle filter. Chosen by hand."""
 
 BORDER_PX = 4
-"""Matches this near to the border of the right image are dropped: windows there give what lies just
-outside the disparity of what lies inside. Chosen by hand."""
+"""Matches this near to the border of the right image are dropped, because windows give content just
+outside the image the disparity of content inside. Chosen by hand."""
 
 OCCLUDING_EDGE_PX = 1
-"""Outermost pixels of a nearer surface that are dropped if occlusions are filled."""
+"""Width of the edge of a nearer surface that is dropped if occlusions are filled."""
 
 OCCLUSION_SLACK_PX = 8
 """A gap may be this much wider than the disparity step: windows reach over both ends."""
@@ -56,8 +56,8 @@ TAIL_FRACTION = 0.01
 
 SEARCH_MARGIN_PX = 1.5
 SEARCH_MARGIN_FRACTION = 0.2
-"""Both ends are extended by these pixels of the small copy, and this fraction of the range, for
-objects too small to be seen there."""
+"""The range is extended at both ends by the first, in pixels of the small copy, plus the second as
+a fraction of its length, for objects too small to be seen in the copy."""
 
 
 @suggest_keywords
@@ -101,7 +101,7 @@ class DisparityOptions:
 
 
 DENSE = DisparityOptions(uniqueness_ratio=1.0, discontinuity_margin_px=0, fill_occlusions=True)
-"""Options for many pixels: discontinuities are kept, occlusions are filled where that is safe."""
+"""Options for dense maps: discontinuities are kept, occlusions are filled where that is safe."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,10 +177,11 @@ def disparity_map(
 ) -> DisparityMap:
     """Find the disparity of every pixel of the left view of a rectified pair.
 
-    Census transform and semi-global matching. A disparity is kept if both views agree, no other
-    place on the row is as good, and it is neither in a small isolated patch nor near a disparity
-    discontinuity. It is then refined to sub-pixel accuracy. The light may differ between the views.
-    No detector is used; for rectified pairs `reconstruct` samples this map at keypoints.
+    The method is semi-global matching of census transforms. A disparity is kept if both views
+    agree, no other place on the row is as good, and it is neither in a small isolated patch nor
+    near a disparity discontinuity. It is then refined to sub-pixel accuracy. The light may differ
+    between the views. No detector is used; for rectified pairs `reconstruct` samples this map at
+    keypoints.
 
     Args:
         image0, image1: the left and the right image, of the same size, anything `load_image` takes;
@@ -300,7 +301,7 @@ def filter_speckles(disparity: np.ndarray, known: np.ndarray, max_area_px: int) 
 
 
 def near_discontinuity(disparity: np.ndarray, known: np.ndarray, distance_px: int) -> np.ndarray:
-    """Find the pixels this near to a disparity discontinuity, along rows, columns or both.
+    """Find the pixels within `distance_px` of a disparity discontinuity, along rows or columns.
 
     A window there sees both surfaces, and gives pixels next to the nearer one its disparity. Where
     nothing is known, the farther of both sides is assumed to continue.
@@ -356,8 +357,9 @@ def extrapolate_disparity(
 
     Only pixels whose match would lie outside the right image are extrapolated, because visible
     surfaces have matches of their own, and only where `carried`, the choice of semi-global
-    matching, agrees. The line is trusted n pixels beyond the known ones if the line through the n
-    known pixels from the nth on predicts those before to within `MAX_DIFFERENCE_PX`.
+    matching, agrees. The line is trusted n pixels beyond the surface if, at its edge, the line
+    through its pixels n to 2 n agrees with the line through its first n pixels to within
+    `MAX_DIFFERENCE_PX`.
     """
     from .kernels import extrapolate_rows
 

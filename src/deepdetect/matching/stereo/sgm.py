@@ -40,7 +40,7 @@ SAMPLED_ROW_STEP = 48
 BAND_OVERLAP_PX = 32
 """Paths enter a band from this many rows above and below it. Chosen by hand."""
 
-# The penalties are the best of a few that were tried on the Motorcycle pair; noisy images of full
+# The penalties are the best of a few that were tried on the Motorcycle pair. Noisy images of full
 # size would need larger ones.
 P1_BITS = 20
 """Penalty for a disparity that changes by one pixel along a path, in census bits per pixel."""
@@ -54,15 +54,15 @@ P2_HALF_GRADIENT_LEVELS = 8
 MIN_P2_BITS = 1.25 * P1_BITS
 
 OUTSIDE_COST = 0.6
-"""Cost of a match outside the right image, between 0, the median of the pair's matches, and 1, a
-wrong place. Between them a surface that leaves the image is continued from its neighbours; with
-less, more of what is seen at the border is lost in noisy views."""
+"""Cost of a match outside the right image. The cost is 0 for the median of the pair's matches, and
+1 for a wrong match. In between, a surface that leaves the image is continued from its neighbours.
+With less, more content at the border is lost in noisy views."""
 
 MAX_DIFFERENCE_PX = 1.0
 """Neighbouring disparities that differ by more are on different surfaces. Chosen by hand."""
 
 WINDOW_RADIUS_PX = 2
-"""Radius of the fitted windows. Chosen on the Motorcycle pair, as the next five values."""
+"""Radius of the fitted windows. It and the next five values were chosen on the Motorcycle pair."""
 
 SMOOTHING_RADIUS_PX = 4
 """Radius of the mean over one surface before each iteration, against the parabola's bias."""
@@ -155,7 +155,7 @@ def matching_cost(
 ) -> np.ndarray:
     """Return the costs of `count` disparities for each pixel of two censuses, (H, W, count) uint8.
 
-    A cost is a quarter of the sum over 3 x 3 pixels; `outside` is the distance of matches outside.
+    A cost is a quarter of the sum over 3 x 3 pixels; `outside` is the distance outside the image.
     """
     from .kernels import cost_rows
 
@@ -179,7 +179,7 @@ def is_textured(gray: np.ndarray) -> np.ndarray:
 def match_distance(censuses: Pair, disparities: DisparityRange) -> float:
     """Return the median distance of a pair's matches in bits, from the censuses of some rows.
 
-    A match is what both views find nearest without any path. Noise increases its distance.
+    A match here has the least cost in both views, without paths. Noise increases its distance.
     """
     height = len(censuses[0])
     centres = np.arange(min(SAMPLED_ROW_STEP // 2, height // 2), height, SAMPLED_ROW_STEP)
@@ -196,7 +196,7 @@ def match_distance(censuses: Pair, disparities: DisparityRange) -> float:
 
 
 def aggregate(gray: np.ndarray, cost: np.ndarray) -> np.ndarray:
-    """Sum (H, W, D) uint8 costs over the eight paths; uint16."""
+    """Sum (H, W, D) uint8 costs along paths of eight directions; return uint16."""
     from .kernels import sum_along_paths
 
     height, width = gray.shape

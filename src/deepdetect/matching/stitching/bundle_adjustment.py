@@ -148,7 +148,7 @@ def level_cameras(cameras: Cameras, reference: int) -> dict[int, RotatingCamera]
 def _in_units(
     homographies: Matrices, pairs: Sequence[RegisteredPair], sizes: Sizes
 ) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], Links]:
-    """Return maps from pixels to units around the image centre; homographies, links in units."""
+    """Return maps from pixels to units of the fit, and homographies and links in these units."""
     to_unit = {}
     for number in homographies:
         x, y = (np.array(sizes[number]) - 1) / (2 * UNIT_PX)

@@ -22,7 +22,7 @@ SEAM_MEGAPIXELS = 0.5
 """Exposure and seams are found on a small canvas of at most this size. Chosen by hand."""
 
 MIN_OVERLAP_PX = 100
-"""Brightness is compared if two images overlap by more pixels there. Chosen by hand."""
+"""Brightness is compared if two images share more pixels of the small canvas. Chosen by hand."""
 
 SEAM_TOLERANCE_PX, SEAM_PERCENT = 1.0, 90.0
 """Parallax is reported if this percentile of displacements along a seam exceeds the tolerance, in
