@@ -30,12 +30,10 @@ RADIUS_PER_WINDOW = 3.0
 """Radius within which pixels vote, in sigmas of the Gaussian window, as in OpenCV."""
 
 CHUNK = 64
-"""The minimum of each chunk of this many distances is stored, so that the nearest neighbours are
-found in one pass."""
+"""The minima of chunks of this many distances are stored, to find the nearest in one pass."""
 
 MIN_SQUARED_NORMS = 1e-3
-"""The product of two squared norms is at least this before it divides, because a descriptor that
-equals the mean has norm 0."""
+"""Minimum of the product of two squared norms: a descriptor that equals the mean has norm 0."""
 
 
 @compiled(nogil=True, fastmath=True)
@@ -134,7 +132,7 @@ def _add(out, weights, a, b, c, d):  # type: ignore[no-untyped-def]
 
 @compiled(nogil=True, fastmath=True, inline="always")
 def _normalise(histogram, numbers, out):  # type: ignore[no-untyped-def]
-    """Clip a descriptor at 0.2 of its norm, scale its norm to 512 and round, as Lowe and OpenCV do."""
+    """Clip a descriptor at 0.2 of its norm, scale it to norm 512 and round, as in OpenCV."""
     total = np.float32(0)
     for b in range(4):
         for c in range(0, 4 * numbers, numbers):
@@ -156,7 +154,7 @@ def _normalise(histogram, numbers, out):  # type: ignore[no-untyped-def]
                 out[32 * b + 8 * c + o] = np.uint8(min(np.float32(255), value))
 
 
-# No full fastmath: with its approximate division and root equal descriptors do not give 0.
+# With full fastmath, division and root are approximate, so equal descriptors do not give 0.
 @compiled(nogil=True, fastmath={"reassoc", "nsz", "contract"})
 def correlation_distances(start, stop, first, rows0, second, rows1, mean, out):  # type: ignore[no-untyped-def]
     """Write 1 - correlation of the descriptor pairs `start` to `stop` (exclusive) into `out`."""
@@ -220,7 +218,7 @@ def _insert(row, distance, best, second, nearer, farther):  # type: ignore[no-un
     return best, second, nearer, farther
 
 
-# Assuming no NaN lets vector registers find minima.
+# If NaN cannot occur, vector instructions find minima.
 @compiled(nogil=True, fastmath={"nnan", "nsz"})
 def scan_products(products, terms0, terms1, start, rows, values, nearest, best, second):  # type: ignore[no-untyped-def]
     """Find nearest neighbours in both directions between a block of queries and the base.
@@ -384,8 +382,7 @@ ATAN = tuple(
     np.float32(np.float32(c) * np.float32(180 / np.pi))
     for c in (0.9997878412794807, -0.3258083974640975, 0.1555786518463281, -0.04432655554792128)
 )
-"""Coefficients of OpenCV's approximate arctangent, converted to degrees, so that votes go to the
-same bins as in OpenCV."""
+"""Coefficients of OpenCV's arctangent, in degrees, so that votes go to the same bins as there."""
 
 
 @compiled(nogil=True, error_model="numpy")

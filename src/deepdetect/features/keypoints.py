@@ -321,7 +321,7 @@ def bayer_order(xy: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     column, row = np.rint(np.asarray(xy).reshape(-1, 2)).astype(np.int64).T
     bits = min(MAX_COORDINATE_BITS, max(1, (max(size) - 1).bit_length()))
     order = np.zeros(len(row), np.int64)
-    for _ in range(bits):  # the lowest bits of the position become the highest of the rank
+    for _ in range(bits):  # the lowest bits of the position become the highest bits of the rank
         order = 4 * order + 2 * ((column ^ row) & 1) + (row & 1)
         column, row = column >> 1, row >> 1
     return (order / 4**bits).astype(np.float32)

@@ -30,8 +30,7 @@ CONSTANT = 16
 
 FREQUENCIES = np.repeat([1, 2, 3], [12, 8, 4])
 """The remaining 48 numbers of a descriptor are the real parts and then the imaginary parts of 24
-complex numbers. Rotating the image multiplies the phase of each by its factor here times the
-angle of the rotation."""
+complex numbers. Rotating the image adds the angle, times the factor here, to each one's phase."""
 
 UPRIGHT_DEGREES = 15.0
 """Rotations below this angle are not corrected: the network has learned to tolerate them."""
@@ -41,7 +40,8 @@ TURNED_KEYPOINTS = 512
 
 HISTOGRAM_DEGREES = 10
 NEAR_DEGREES = 20
-"""Width of the bins of angles; angles this near to the fullest bin are averaged. Chosen by hand."""
+"""The first is the width of the bins of a histogram of angles, the second the distance from the
+fullest bin within which the median is taken. Both are in degrees and were chosen by hand."""
 
 
 def is_learned(descriptor_type: str | None) -> bool:
@@ -100,7 +100,7 @@ def match_learned(
 
 
 def common_turn(degrees: np.ndarray) -> float:
-    """Return the most frequent of (N,) differences of angles, in degrees; 0 without any."""
+    """Return the most frequent of (N,) rotation angles, in degrees; 0 if there are none."""
     degrees = degrees % 360
     bins = np.bincount((degrees // HISTOGRAM_DEGREES).astype(int), minlength=36)
     fullest = int((bins + np.roll(bins, 1) + np.roll(bins, -1)).argmax())

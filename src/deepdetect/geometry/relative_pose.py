@@ -40,9 +40,8 @@ MAX_MATCHES = 50_000
 class Triangulation:
     """Points (N, 3) float64 in the frame of the first camera, not finite where rays are parallel.
 
-    `cheirality` (N,) bool says which points lie in front of both cameras. The (N,) reprojection
-    errors in pixels are the root mean square of both images. The (N,) angles between the rays are
-    in radians.
+    `cheirality` (N,) bool tells the points in front of both cameras. The (N,) reprojection errors
+    in pixels are the root mean square of both images. The (N,) angles of the rays are in radians.
     """
 
     points: np.ndarray

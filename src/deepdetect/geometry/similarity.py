@@ -39,7 +39,7 @@ WRONG_STDS = 5.0
 """A point with a residual above this many standard deviations gets no weight. Chosen by hand."""
 
 PRIOR_COUNT = 6.0
-"""Where residuals are few, the stated accuracy counts, too: as this many. Chosen by hand."""
+"""The stated accuracy counts as this many residuals: few residuals say little. Chosen by hand."""
 
 MAD_STD = 1.4826
 """Standard deviation of a normal distribution, divided by the median of absolute values."""

@@ -21,15 +21,15 @@ from .interface import (
 )
 
 COMPILED_LAYERS = 100
-"""Number of compiled layers that are kept; the least recently used are dropped first. A layer is
-compiled for each image size. OpenVINO's own limit of 5000 fills half a gigabyte if sizes vary."""
+"""Size of OpenVINO's cache of compiled layers, which drops the least recently used first. Each layer
+is compiled for each image size. OpenVINO's default, 5000, fills 0.5 GB if image sizes vary."""
 
 
 class OpenVinoNetwork:
     """A network run by OpenVINO on the CPU.
 
-    After memory was short, the file is read and compiled again: the old model gives wrong results,
-    and one compiled from the same graph crashes.
+    After a lack of memory, the file is read and compiled again: the old model gives wrong results,
+    and a model compiled again from the same graph crashes.
     """
 
     def __init__(
