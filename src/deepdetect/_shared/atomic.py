@@ -1,4 +1,4 @@
-"""Files that appear whole under their final name, or not at all; folders for temporary files."""
+"""Atomic writing of files under temporary names, and folders for temporary files."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ ABANDONED_S = 24 * 3600.0
 """A temporary file of another machine is abandoned if it is older than this. Chosen by hand."""
 
 STEM_LENGTH = 40
-"""A temporary name, which must not be too long, has this number of characters of the final one."""
+"""A temporary name contains at most this many characters of the final name, which may be long."""
 
-# An owner is a machine, a process and a random number.
+# The owner in a temporary name is a machine, a process and a random number.
 _OWNER = re.compile(r"(?P<machine>[0-9a-f]{8})-(?P<process>\d+)-[0-9a-f]{8}")
 
-# A temporary name is the stem, the owner, "part" and the suffix of the final file.
+# A temporary name has the stem of the final name, the owner, "part" and the final suffix.
 _TEMPORARY = re.compile(rf"\..*\.{_OWNER.pattern}\.part(\..*)?")
 
 
@@ -97,7 +97,7 @@ def _abandoned(folder: Path, names: re.Pattern[str]) -> list[Path]:
 
 
 def _has_ended(path: Path, machine: str, process: str) -> bool:
-    """Return whether a process has ended; on another machine or in a container, after a day."""
+    """Return whether a process has ended; one of another machine or container counts so after a day."""
     try:
         if machine != _machine() or os.name != "posix":
             return time.time() - path.lstat().st_mtime > ABANDONED_S

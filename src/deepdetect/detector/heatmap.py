@@ -153,7 +153,7 @@ def _enlarged(logits: np.ndarray, shape: tuple[int, ...]) -> Maps:
 
 def _tiled(network: Network, shape: tuple[int, ...], options: HeatmapOptions) -> Run | None:
     """Return a function that runs the network in tiles, or None if the image is run as a whole."""
-    path = getattr(network, "onnx_path", None)  # torch, bfloat16 and others cannot be tiled
+    path = getattr(network, "onnx_path", None)  # networks in torch or bfloat16 cannot be tiled
     area = None if options.tile_megapixels == "auto" else float(options.tile_megapixels)
     most = available_memory() / BYTES_PER_PIXEL if area is None else area * 1e6
     if not is_native(shape, options) or shape[0] * shape[1] <= most:

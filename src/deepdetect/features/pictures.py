@@ -25,7 +25,7 @@ AREA_OF_KEYPOINT_PX = 200
 so that they can be told apart. Chosen by hand."""
 
 LEAST_LEVEL = 0.35
-"""Keypoints use the colour scale (0 to 1) from here: darker colours are hard to see. Chosen by hand."""
+"""Keypoints use the colour scale from here: darker colours are hard to see. Chosen by hand."""
 
 
 def draw_best_keypoints(rgb: np.ndarray, keypoints: Keypoints) -> np.ndarray:

@@ -39,7 +39,7 @@ def nearest_layers(sizes: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarra
 
 
 def packed_octaves(sizes: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return where SIFT describes keypoints of (N,) sizes: octave and layer, packed as in OpenCV."""
+    """Return where SIFT describes keypoints of (N,) sizes: octave and layer, packed by OpenCV."""
     octaves, layers = nearest_layers(sizes, shape)
     return (octaves & 255) | (layers << 8)
 

@@ -108,7 +108,7 @@ def sift_gradient(gray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _taps(size: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights of the pixels around a keypoint, and where they are not 0.
 
-    The weights are (4, T) float32, a row per spatial bin, the spans (4, 3) int64 (`describe_tiles`).
+    The weights are (4, T) float32, a row per bin. The (4, 3) int64 spans suit `describe_tiles`.
     """
     from .kernels import TAPS_AT_ONCE
 

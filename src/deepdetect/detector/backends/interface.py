@@ -57,7 +57,7 @@ def as_logits(
             f"{path} does not fit: it gives a {output.dtype} map of shape {output.shape} for an "
             f"image that needs float32 {wanted}; use other weights"
         )
-    low, high = float(output.min()), float(output.max())  # NaN if there is any
+    low, high = float(output.min()), float(output.max())  # the sum is NaN if any value is
     if not (np.isfinite(low) and np.isfinite(high)):
         raise WeightsError(
             f"{path} gives values that are not finite: it is damaged, or its training diverged; "
@@ -93,6 +93,6 @@ def failed_run(error: Exception, image_shape: tuple[int, ...]) -> Exception:
 
 
 def _reason(error: Exception) -> str:
-    """Return the line of a runtime's message that gives the reason; OpenVINO's begin with file names."""
+    """Return the line of a runtime's message with the reason: OpenVINO's begin with file names."""
     lines = str(error).strip().splitlines() or [type(error).__name__]
     return lines[-1] if lines[0].startswith("Exception from") else lines[0]

@@ -21,8 +21,8 @@ from .interface import (
 )
 
 COMPILED_LAYERS = 100
-"""Size of OpenVINO's cache of compiled layers, which drops the least recently used first. Each layer
-is compiled for each image size. OpenVINO's default, 5000, fills 0.5 GB if image sizes vary."""
+"""Number of compiled layers that OpenVINO caches. It drops the least recently used first. Each layer
+is compiled for each image size. OpenVINO's default, 5000, fills 0.5 GB if sizes vary."""
 
 
 class OpenVinoNetwork:
@@ -54,7 +54,7 @@ class OpenVinoNetwork:
         except Exception as error:  # its exceptions share no base class
             self._model = None
             raise failed_run(error, image.shape) from None
-        # If memory is short, it may also return nothing, or the map of the previous image.
+        # If memory is short, OpenVINO may also return nothing, or the previous image's map.
         if self._works and output.shape[2:] != image.shape[2:]:
             self._model = None
             raise MemoryError("OpenVINO gave a map of another size")

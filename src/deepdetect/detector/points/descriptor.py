@@ -1,4 +1,4 @@
-"""The learned descriptor: a network maps the whole image, and its output is sampled at keypoints."""
+"""The learned descriptor: a network runs on the whole image and is sampled at the keypoints."""
 
 from __future__ import annotations
 

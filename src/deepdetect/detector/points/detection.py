@@ -34,7 +34,7 @@ GRID_CELLS = 16
 """Number of cells along the longer side for the spread "grid". Chosen by hand."""
 
 DISTANCE_PX = 2.0
-"""Minimum distance between keypoints. 1.5 and 2.3 px change the ranker's score by less than 0.003."""
+"""Minimum distance of keypoints. 1.5 and 2.3 px change the ranker's score by less than 0.003."""
 
 DISTANCE_PER_SIGMA = 1.0
 """Minimum distance of two keypoints relative to the smaller one's sigma, so that one structure is
@@ -101,7 +101,7 @@ def rank_candidates(
         wanted = ~check_ignore(ignore, gray.shape)[candidates.row, candidates.column]
         rows = rows[wanted[rows]]
     rows = rows[:strongest]
-    # Those of all scales in one tile share the processor's cache.
+    # Candidates of all scales in one tile share the processor's cache.
     tiles = (candidates.row // TILE_PX << 8) + candidates.column // TILE_PX
     candidates = candidates[rows[np.argsort(tiles[rows].astype(np.uint16), kind="stable")]]
     return candidates, (ranker or load_ranker()).rank(describe_candidates(space, candidates))
