@@ -48,7 +48,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         temporary.touch(exist_ok=False)  # keeps the folder from being removed as empty
         yield temporary
         temporary.replace(final)
-    except DeepDetectError:  # one for a missing file is also an OSError
+    except DeepDetectError:  # the error for a missing file is also an OSError
         raise
     except OSError as error:
         raise DeepDetectError(
@@ -97,7 +97,7 @@ def _abandoned(folder: Path, names: re.Pattern[str]) -> list[Path]:
 
 
 def _has_ended(path: Path, machine: str, process: str) -> bool:
-    """Return whether a process has ended; one of another machine or container counts so after a day."""
+    """Return whether a process has ended. On another machine, it counts as ended after a day."""
     try:
         if machine != _machine() or os.name != "posix":
             return time.time() - path.lstat().st_mtime > ABANDONED_S

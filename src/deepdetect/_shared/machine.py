@@ -200,8 +200,8 @@ def limited_threads(threads: int | None) -> Iterator[None]:
 def thread_limit() -> int | None:
     """Return how many threads this process may use, or None for a library's own number.
 
-    The variable OMP_NUM_THREADS is respected. Worker processes get an explicit number, because ONNX
-    Runtime's default threads are bound to the same processors in every process.
+    OMP_NUM_THREADS is respected. Worker processes, and processes that may not use all processors,
+    get a number: by default ONNX Runtime binds threads to the same processors in every process.
     """
     if chosen := getattr(_chosen, "threads", None):
         return int(chosen)
@@ -266,7 +266,7 @@ def available_memory() -> int:
 
 
 def needed_memory(**counts: float) -> float:
-    """Return the bytes that a step needs for numbers of items, `counts`, named as in `BYTES_PER`."""
+    """Return the bytes that a step needs for `counts` of items, named as in `BYTES_PER`."""
     return sum(BYTES_PER[name] * count for name, count in counts.items())
 
 

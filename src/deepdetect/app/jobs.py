@@ -1,4 +1,4 @@
-"""Running tasks: each has a process and a folder, both removed when the page no longer asks."""
+"""Running tasks, each with a process and a folder. Both are removed when the page stops asking."""
 
 from __future__ import annotations
 

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     import torch
 
 OVERSHOOT = 0.25
-"""Tensors may exceed [0, 1] by this much and are clipped: bicubic filters overshoot."""
+"""Values of tensors may exceed [0, 1] by this much, because bicubic filters overshoot. They are then
+clipped."""
 
 
 def load_tensor(image: Any) -> np.ndarray:

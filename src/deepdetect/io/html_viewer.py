@@ -27,8 +27,8 @@ MAX_LEVEL = 65535
 """Positions are stored in 16 bits per axis."""
 
 MARGIN = 1.0
-"""Points farther outside the robust box than its size times this are left out, because a few distant
-points would make the quantisation steps coarse for all. Chosen by hand."""
+"""Points farther outside the robust box than this times its size are left out, because a few very
+distant points would make the quantisation steps coarse for all. Chosen by hand."""
 
 CAMERA_SIZE = 0.35
 """Depth of a camera's pyramid relative to the distance to the nearest camera. Chosen by hand."""
@@ -79,7 +79,7 @@ def write_html_page(
         "caption": "\n".join(
             f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in caption.items()
         ),
-        "cloud": json.dumps(_description(cloud, stored, cameras)),  # has no text of users to escape
+        "cloud": json.dumps(_description(cloud, stored, cameras)),  # contains no text of users to escape
         "positions": _base64(stored.levels.astype("<u2")),
         "colors": _base64(stored.colors),
     }
@@ -92,7 +92,7 @@ def write_html_page(
 def page_points(cloud: PointCloud) -> PagePoints:
     """Quantise positions to 16 bits per axis, without those far outside the robust box."""
     box = robust_box(cloud)
-    # Points on a line or a plane have a flat box: its radius gives the least margin.
+    # The box of points on a line or a plane is flat, so its radius gives a least margin.
     margin = MARGIN * np.maximum(box.high - box.low, box.radius * 1e-3)
     near = ((cloud.points >= box.low - margin) & (cloud.points <= box.high + margin)).all(1)
     points = cloud.points[near].astype(np.float64)

@@ -134,7 +134,7 @@ def _load(
     *,
     deep: bool = False,
     raw: bool = False,
-    **for_arrays: Any,  # `options` may come from a command, whose options apply to files only
+    **for_arrays: Any,  # options of a command apply to files only
 ) -> np.ndarray:
     if is_file(image):
         rgb = _read_file(image, options, deep, raw)

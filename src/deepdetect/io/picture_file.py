@@ -95,7 +95,7 @@ class Metadata:
     def encode(self, rgb: np.ndarray, suffix: str, settings: list[int]) -> bytes:
         """Return a PNG or JPEG file of an (H, W, 3) RGB image."""
         parts = {cv2.IMAGE_METADATA_ICCP: self._profile_of(b"RGB ")}
-        with suppress(struct.error):  # numbers that Pillow can read but not write
+        with suppress(struct.error):  # EXIF may have numbers that Pillow can read but not write
             if exif := self._exif_of(rgb):
                 parts[cv2.IMAGE_METADATA_EXIF] = exif.tobytes().removeprefix(b"Exif\0\0")
         kept = {kind: np.frombuffer(part, np.uint8) for kind, part in parts.items() if part}
@@ -167,7 +167,7 @@ class Metadata:
 
 
 def _can_be_written(values: dict[int, Any]) -> bool:
-    """Return whether Pillow can write the EXIF values: it also reads numbers that it cannot write."""
+    """Return whether there are EXIF values, and Pillow can write them: some it can only read."""
     from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
     directory = ImageFileDirectory_v2()
@@ -271,7 +271,7 @@ def _kept_exif(exif: Any) -> Any:
 
 
 def _of_tiff(file: Any) -> tuple[Metadata, Any]:
-    """Return the metadata of a TIFF file except EXIF and georeference, and the page that is read."""
+    """Return a TIFF file's metadata except EXIF and georeference, and the page that is read."""
     from tifffile import TiffFile
 
     file.seek(0)

@@ -34,8 +34,7 @@ ORIENTATION, MAX_SAMPLE_VALUE, NO_DATA = 274, 281, 42113
 """Codes of tags; GDAL defines the last one."""
 
 MAX_BYTES_PER_PIXEL = 256
-"""Files with more bytes per pixel than this are rejected: a small file can claim any number of
-bands."""
+"""Files with more bytes per pixel are rejected, since a small file can claim any band count."""
 
 
 def read_tiff(
@@ -185,7 +184,7 @@ def _white(page: Any) -> int | None:
 def _read_by_pillow(
     file: BinaryIO, stored: list[Any], page: Any, name: str, options: ReadingOptions
 ) -> np.ndarray:
-    """Decode an image by Pillow if tifffile would need imagecodecs and Pillow decodes it correctly."""
+    """Decode by Pillow what tifffile cannot decode without imagecodecs, or raise an error."""
     bits, photometric = page.bitspersample, int(page.photometric)
     plain = page.dtype.kind in ("b", "u") and (
         bits in (1, 8) or (bits == 16 and page.samplesperpixel == 1)

@@ -21,8 +21,8 @@ from .interface import (
 )
 
 COMPILED_LAYERS = 100
-"""Number of compiled layers that OpenVINO caches. It drops the least recently used first. Each layer
-is compiled for each image size. OpenVINO's default, 5000, fills 0.5 GB if sizes vary."""
+"""Number of compiled layers that OpenVINO caches; the least recently used are dropped. Each layer is
+compiled for each image size. OpenVINO's default, 5000, fills 0.5 GB if sizes vary."""
 
 
 class OpenVinoNetwork:
