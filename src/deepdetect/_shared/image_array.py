@@ -96,7 +96,7 @@ def to_8_bits(rgb: np.ndarray) -> np.ndarray:
 
 
 def fill_planes(rgb: np.ndarray, planes: np.ndarray) -> None:
-    """Write an (H, W, 3) image into larger (3, H', W') planes, repeating the last row and column."""
+    """Write (H, W, 3) pixels into larger (3, H', W') planes; repeat the last row and column."""
     below, right = planes.shape[1] - rgb.shape[0], planes.shape[2] - rgb.shape[1]
     if below or right:
         rgb = np.pad(rgb, ((0, below), (0, right), (0, 0)), mode="edge")

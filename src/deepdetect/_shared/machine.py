@@ -38,8 +38,8 @@ TASKS_PER_WORKER = 8
 while it waits for the outcome of the first. Chosen by hand."""
 
 UNWANTED_TASK_S = 20.0
-"""After the work is interrupted or fails, a running task is killed if it takes longer than this to
-end."""
+"""Seconds that a running task has to end after the work was interrupted or failed, before it is
+killed."""
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables from which libraries take their number of threads when they are loaded."""

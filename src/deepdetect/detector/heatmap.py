@@ -26,8 +26,7 @@ MAX_AUTO_PIXELS = 2_000_000
 mostly show blur and noise."""
 
 RELEASE_PIXELS = 20_000_000
-"""For images with more pixels than this, the network's memory is released before the maps are
-computed."""
+"""The network's memory is released before the maps of images with more pixels are computed."""
 
 MIN_TILE_MEGAPIXELS = 1.5
 """Minimum size of a tile: smaller tiles would consist mostly of overlap."""

@@ -140,7 +140,7 @@ def _open(path: Path, threads: int | None, state: tuple[int, int]) -> TiledNetwo
 
 
 class _Span(NamedTuple):
-    """A tile on one axis, in strides: `seen` is read, `core` is written, `inner` is core in seen."""
+    """A tile on one axis, in strides: `seen` is read, `core` written, `inner` is core in seen."""
 
     seen: slice
     core: slice

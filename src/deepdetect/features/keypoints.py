@@ -222,7 +222,7 @@ class Keypoints:
     def draw(self, image: Any, *, channels: Channels = "rgb") -> np.ndarray:
         """Draw the keypoints on their image, which is dimmed.
 
-        A circle shows the size of a keypoint, three pixels if it has none. More than 5,000
+        A circle shows the size of a keypoint; without sizes all have three pixels. More than 5,000
         keypoints are drawn as single pixels.
 
         Args:
@@ -259,9 +259,7 @@ class Keypoints:
         return self[np.sort(np.lexsort((order, -ranks))[:count])]
 
     def distinct(self) -> Keypoints:
-        """Keep one keypoint per position, the one with the highest score.
-
-        SIFT repeats a position if it has several dominant angles.
+        """Keep the best keypoint of each position: SIFT repeats positions with several angles."""
         order = np.argsort(-self.scores, kind="stable")
         # Comparing both float32 as one number is ten times faster than rows; + 0 turns -0 into 0.
         keys = np.ascontiguousarray(self.xy[order] + np.float32(0)).view(np.uint64).ravel()

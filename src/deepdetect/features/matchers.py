@@ -25,14 +25,14 @@ BLOCK_SIZE = 2_000_000
 """Exact search works on blocks of this many float32 numbers: 8 MB, which fit most caches."""
 
 MAX_EXACT_BYTES = 2**24 // (2 * 255**2)
-"""Up to this length, distances of uint8 descriptors are exact in single precision."""
+"""Distances of uint8 descriptors up to this length are exact in single precision."""
 
 PRODUCTS = Path(__file__).with_name("products")
 """ONNX files of one matrix product each, made by `tools/product_graphs.py`. NumPy's product in
 single precision takes twice the time, and its threads keep processors busy afterwards."""
 
 MAX_EXACT_PRODUCT = 4e8
-"""Up to this product of both numbers of keypoints, the search is exact. Chosen by hand."""
+"""The search is exact up to this product of both numbers of keypoints. Chosen by hand."""
 
 FLANN_INDEX_KDTREE, TREES, CHECKS = 1, 5, 50
 """FLANN's code for kd-trees, number of trees and of visited leaves, as in the paper's code."""

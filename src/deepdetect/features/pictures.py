@@ -21,8 +21,8 @@ from .selection import spread_over_grid
 
 SHOWN_KEYPOINTS = 1000
 AREA_OF_KEYPOINT_PX = 200
-"""At most the first number of keypoints is drawn, and in small images one per this area (second),
-so that they can be told apart. Chosen by hand."""
+"""The first is the maximum number of keypoints that are drawn. Small images get one keypoint per
+this area in pixels (the second), so that all can be told apart. Chosen by hand."""
 
 LEAST_LEVEL = 0.35
 """Keypoints use the colour scale from here: darker colours are hard to see. Chosen by hand."""

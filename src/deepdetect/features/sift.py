@@ -25,7 +25,7 @@ DENSE_SIZES_PX = (2.0, 8.0)
 """Range of keypoint diameters that `dense_sift` supports."""
 
 MIN_DENSE_DENSITY = 0.02
-"""Above this number of keypoints per pixel, `dense_sift` is faster than one keypoint at a time."""
+"""`dense_sift` is faster than one keypoint at a time above this number of keypoints per pixel."""
 
 BIN_WIDTH = 1.5
 """Width of a spatial bin in units of the keypoint's diameter, as in OpenCV."""

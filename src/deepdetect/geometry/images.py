@@ -69,7 +69,7 @@ def warp_bands(
 ) -> np.ndarray:
     """Warp (H, W, C) of any type as `warp_to_reference` does; pixels without data are `no_data`.
 
-    Result pixels that depend on a `no_data` pixel are `no_data`, too. None fills with 0.
+    Result pixels that depend on a `no_data` pixel also become `no_data`. None fills with 0.
     """
     whole = np.iinfo(bands.dtype) if bands.dtype.kind in "iu" else None
     if whole and no_data is not None and not whole.min <= no_data <= whole.max:

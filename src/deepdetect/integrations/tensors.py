@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     import torch
 
 OVERSHOOT = 0.25
-"""Values of tensors may exceed [0, 1] by this much, because bicubic filters overshoot. They are then
-clipped."""
+"""Tensors may exceed [0, 1] by this much, because bicubic filters overshoot. They are clipped."""
 
 
 def load_tensor(image: Any) -> np.ndarray:

@@ -13,8 +13,8 @@ from .._shared.records import save_arrays
 MAX_UINT16 = 65535
 
 HEADROOM = 4.0
-"""The scale covers depths up to this many times the 99th percentile. Covering outliers, too, would
-make its steps coarse."""
+"""The scale covers depths up to this many times the 99th percentile. If it also covered outliers,
+its steps would be coarse."""
 
 
 def save_depth_png(

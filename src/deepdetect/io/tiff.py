@@ -184,7 +184,7 @@ def _white(page: Any) -> int | None:
 def _read_by_pillow(
     file: BinaryIO, stored: list[Any], page: Any, name: str, options: ReadingOptions
 ) -> np.ndarray:
-    """Decode by Pillow what tifffile cannot decode without imagecodecs, or raise an error."""
+    """Decode by Pillow what tifffile cannot without imagecodecs; raise if Pillow cannot, either."""
     bits, photometric = page.bitspersample, int(page.photometric)
     plain = page.dtype.kind in ("b", "u") and (
         bits in (1, 8) or (bits == 16 and page.samplesperpixel == 1)

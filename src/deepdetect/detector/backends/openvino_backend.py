@@ -21,7 +21,7 @@ from .interface import (
 )
 
 COMPILED_LAYERS = 100
-"""Number of compiled layers that OpenVINO caches; the least recently used are dropped. Each layer is
+"""Number of compiled layers that OpenVINO caches. The least recently used are dropped. A layer is
 compiled for each image size. OpenVINO's default, 5000, fills 0.5 GB if sizes vary."""
 
 
