@@ -57,7 +57,7 @@ def triangulate(
     rotation: np.ndarray,
     translation: np.ndarray,
 ) -> Triangulation:
-    """Triangulate (N, 2) matches in pixels by the relative pose of the second camera.
+    """Triangulate (N, 2) matches in pixels by the pose X1 = rotation @ X0 + translation.
 
     The positions are first moved onto corresponding epipolar lines (`correct_matches`), which is
     the maximum likelihood estimate for equal noise in both images. The two rays then meet, and the

@@ -228,7 +228,7 @@ def least_squares_similarity(
 
 
 def _spread(residuals: np.ndarray, known: np.ndarray, accuracy: float) -> np.ndarray:
-    """Return the (3,) standard deviations of the targets; x and y have the same."""
+    """Return the (3,) standard deviations of the targets, the same for x and y."""
     stds = []
     for axes, lost in (([0, 1], 5), ([2], 2)):  # `lost`: number of fitted parameters
         values = np.abs(residuals[:, axes][known[:, axes]])
